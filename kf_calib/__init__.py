@@ -1,0 +1,1 @@
+"""kf_calib: sequential Kalman-filter calibration of accelerometers on a stationary gimballed bench."""

@@ -1,0 +1,298 @@
+"""The bench: gimbal chain, Earth and gravity; platform angles in, specific force of the platform out.
+
+Frames (right-handed): n = North, Up, East; b = bench, n turned about the vertical by the azimuth;
+p = platform. ``C_bp = Rot(axis1, q1) Rot(axis2, q2) ...``, outer axis first, each gimbal turning about
+that axis of its parent; ``f_p = C_bp^T f_b``. All angles zero: y up, accelerometer 2 reads +g.
+
+Reference ``base``: angles are relative to the bench, ``f_b = (0, g, 0)``. Reference ``inertial``: the platform is
+held in inertial space, angles are relative to the bench frame as it stood at the first sample, and gravity turns
+with the Earth: ``f_b(t) = Rot(omega, |omega| t) (0, g, 0)``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kf_calib.errors import BenchError
+from kf_calib.samples import Floats, Times
+
+EARTH_RATE_RADPS = 7.292115e-5
+"""Earth's rotation in inertial space (WGS 84), rad/s: 15.041 deg/h."""
+
+FORMAT_VERSION = "1"
+Vector = tuple[float, float, float]
+_LETTERS: dict[str, Vector] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_FREE_TEXT = ("block_serial", "bench", "operator", "note")
+_NUMBERS = (
+    "gravity_mps2", "latitude_deg", "height_m", "azimuth_deg", "angle_sigma_deg", "scatter_sigma_mps2",
+)  # fmt: skip
+_KEYS = frozenset(("format_version", "axes", "reference", "nominal", *_NUMBERS, *_FREE_TEXT))
+
+
+def normal_gravity(latitude_deg: float, height_m: float = 0.0) -> float:
+    """Normal gravity on the WGS 84 ellipsoid, m/s^2 (Somigliana), continued to ``height_m`` above it.
+
+    gamma = gamma_e (1 + k sin^2 B) / sqrt(1 - e^2 sin^2 B);
+    gamma_h = gamma (1 - 2 (1 + f + m - 2 f sin^2 B) h/a + 3 h^2/a^2).
+    Source: NGA.STND.0036 (WGS 84, 2014), eq. 4-1 and 4-3. Local gravity differs by up to about 1e-3 m/s^2:
+    a metrologist states a measured value instead.
+    """
+    if not abs(latitude_deg) <= 90.0:
+        raise BenchError(f"latitude {latitude_deg:g} deg is not between -90 and 90: give latitude_deg in degrees.")
+    semi_major_m, flattening, m = 6378137.0, 1 / 298.257223563, 0.00344978650684
+    sin2 = math.sin(math.radians(latitude_deg)) ** 2
+    surface = 9.7803253359 * (1 + 0.001931852652458 * sin2) / math.sqrt(1 - 6.694379990141e-3 * sin2)
+    ratio = height_m / semi_major_m
+    return surface * (1 - 2 * (1 + flattening + m - 2 * flattening * sin2) * ratio + 3 * ratio**2)
+
+
+def parse_axes(text: str) -> tuple[Vector, ...]:
+    """Axes, outer to inner, from ``"y z x"``: letters (a minus sign reverses) or three comma-separated numbers."""
+    return tuple(_parse_axis(word) for word in text.split())
+
+
+def _parse_axis(word: str) -> Vector:
+    sign, letter = (-1.0, word[1:]) if word.startswith("-") else (1.0, word)
+    if letter.lower() in _LETTERS:
+        x, y, z = _LETTERS[letter.lower()]
+        return (sign * x + 0.0, sign * y + 0.0, sign * z + 0.0)
+    try:
+        numbers = [float(part) for part in word.split(",")]
+    except ValueError:
+        numbers = []
+    length = math.hypot(*numbers) if len(numbers) == 3 else 0.0
+    if not (math.isfinite(length) and length > 0):
+        raise BenchError(
+            f"axis {word!r} is not known: give each gimbal axis, outer first, as x, y, z or three "
+            'comma-separated numbers, for example --axes "y z x".'
+        )
+    return (numbers[0] / length, numbers[1] / length, numbers[2] / length)
+
+
+def _format_axis(axis: Vector) -> str:
+    for letter, unit in _LETTERS.items():
+        if axis == unit:
+            return letter
+        if axis == tuple(-part for part in unit):
+            return f"-{letter}"
+    return ",".join(repr(float(part)) for part in axis)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What is known of the bench before the first sample (metadata record ``kf_calib.bench``).
+
+    axes: unit vectors, outer to inner; empty where an attitude quaternion is recorded instead of angles.
+    angle_sigma_deg: repeatability of setting an orientation, 1 sigma; None: not known, to be estimated.
+    scatter_sigma_mps2: scatter of each sensor from dwell to dwell, 1 sigma; None: not known, to be estimated.
+    nominal: nominal parameters that differ from the paper's, in the units of the estimates (rad, 1, m/s^2).
+    """
+
+    axes: tuple[Vector, ...]
+    gravity_mps2: float
+    reference: Literal["base", "inertial"] = "base"
+    latitude_deg: float | None = None
+    height_m: float = 0.0
+    azimuth_deg: float = 0.0
+    angle_sigma_deg: float | None = None
+    scatter_sigma_mps2: float | None = None
+    nominal: Mapping[str, float] = field(default_factory=dict[str, float])
+    notes: Mapping[str, str] = field(default_factory=dict[str, str])
+
+    def __post_init__(self) -> None:
+        if self.reference not in ("base", "inertial"):
+            raise BenchError(
+                f"reference {self.reference!r} is not known: use base (angles relative to the bench) "
+                "or inertial (stabilised platform)."
+            )
+        if self.reference == "inertial" and self.latitude_deg is None:
+            raise BenchError(
+                "an inertially held platform needs the latitude, because gravity turns with the Earth in it: "
+                "give latitude_deg (--latitude)."
+            )
+        if self.latitude_deg is not None and not abs(self.latitude_deg) <= 90.0:
+            raise BenchError(f"latitude_deg {self.latitude_deg:g} is not between -90 and 90: check its unit.")
+        if not 1.0 <= self.gravity_mps2 <= 30.0:
+            raise BenchError(
+                f"gravity of {self.gravity_mps2:g} m/s^2 is not possible: give gravity_mps2 in m/s^2, about 9.8."
+            )
+        for key in ("angle_sigma_deg", "scatter_sigma_mps2"):
+            value = getattr(self, key)
+            if value is not None and not 0.0 <= value < math.inf:
+                raise BenchError(f"{key} {value:g} must be zero or positive; leave it out where it is not known.")
+
+    @property
+    def pose_width(self) -> int:
+        return len(self.axes) or 4
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, str], has_angles: bool = True) -> Bench:
+        """The bench from the strings of a metadata record (FORMAT.md), or from options of the same names."""
+        unknown = sorted(set(metadata) - _KEYS)
+        if unknown:
+            raise BenchError(f"bench key {unknown[0]!r} is not known: use one of {', '.join(sorted(_KEYS))}.")
+        version = metadata.get("format_version", FORMAT_VERSION)
+        if version != FORMAT_VERSION:
+            raise BenchError(
+                f"the recording has format_version {version!r}, this program reads {FORMAT_VERSION}: update kf_calib."
+            )
+        numbers = {key: _number(key, metadata[key]) for key in _NUMBERS if metadata.get(key, "") != ""}
+        if has_angles and not metadata.get("axes", "").strip():
+            raise BenchError(
+                "the gimbal axes are not stated, so the angles cannot be used: give them outer to inner, "
+                'for example --axes "y z x".'
+            )
+        if "gravity_mps2" not in numbers:
+            if "latitude_deg" not in numbers:
+                raise BenchError(
+                    "neither gravity nor latitude is stated: give --gravity in m/s^2 (best), or --latitude in degrees."
+                )
+            numbers["gravity_mps2"] = normal_gravity(numbers["latitude_deg"], numbers.get("height_m", 0.0))
+        return cls(
+            axes=parse_axes(metadata["axes"]) if has_angles else (),
+            reference=metadata.get("reference", "base"),  # type: ignore[arg-type]  # checked in __post_init__
+            nominal=_nominal(metadata.get("nominal", "{}")),
+            notes={key: metadata[key] for key in _FREE_TEXT if metadata.get(key)},
+            **numbers,  # type: ignore[arg-type]
+        )
+
+    def to_metadata(self) -> dict[str, str]:
+        """The strings of a metadata record; ``from_metadata`` of it gives this bench again."""
+        numbers = {key: getattr(self, key) for key in _NUMBERS}
+        return {
+            "format_version": FORMAT_VERSION,
+            **({"axes": " ".join(map(_format_axis, self.axes))} if self.axes else {}),
+            "reference": self.reference,
+            **{key: repr(float(value)) for key, value in numbers.items() if value is not None},
+            **({"nominal": json.dumps(dict(self.nominal))} if self.nominal else {}),
+            **self.notes,
+        }
+
+    def attitude(self, pose: ArrayLike) -> Floats:
+        """C_bp (n, 3, 3) of poses (n, k): gimbal angles in rad, or quaternions x y z w."""
+        columns = [self.to_platform(np.eye(3)[:, i], np.asarray(pose, float)) for i in range(3)]
+        return np.stack(columns, axis=1)  # row i of C_bp is bench axis i seen in the platform
+
+    def to_platform(self, vector: Floats, pose: Floats) -> Floats:
+        """C_bp^T vector: a bench vector (3,) or (n, 3) seen in the platform at poses (n, k); returns (n, 3)."""
+        if not self.axes:
+            x, y, z, w = np.moveaxis(pose / np.linalg.norm(pose, axis=-1, keepdims=True), -1, 0)
+            return _turn_by_quaternion(vector, np.stack([-x, -y, -z], axis=-1), w[..., None])
+        for axis, angle_rad in zip(self.axes, np.moveaxis(pose, -1, 0), strict=True):
+            vector = turn(vector, np.array(axis), -angle_rad)
+        return vector
+
+    @property
+    def earth_rate_radps(self) -> Floats:
+        """Earth's rotation seen from the bench frame, (3,) rad/s; needs the latitude."""
+        if self.latitude_deg is None:
+            raise BenchError("the Earth's rotation needs the latitude: give latitude_deg (--latitude).")
+        latitude, azimuth = math.radians(self.latitude_deg), math.radians(self.azimuth_deg)
+        north, up = math.cos(latitude), math.sin(latitude)
+        return EARTH_RATE_RADPS * np.array([north * math.cos(azimuth), up, -north * math.sin(azimuth)])
+
+    def specific_force(self, elapsed_s: Floats, pose: Floats) -> Floats:
+        """f_p (n, 3), m/s^2, at ``elapsed_s`` (n,) since the first sample and poses (n, k)."""
+        up = np.array([0.0, self.gravity_mps2, 0.0])
+        if self.reference == "inertial":
+            rate = self.earth_rate_radps
+            speed = float(np.linalg.norm(rate))
+            up = turn(up, rate / speed, speed * np.asarray(elapsed_s, float))
+        return self.to_platform(up, np.asarray(pose, float))
+
+
+def _number(key: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise BenchError(f"bench key {key} is {text!r}, which is not a number.")
+    return value
+
+
+def _nominal(text: str) -> dict[str, float]:
+    try:
+        return {str(symbol): float(value) for symbol, value in json.loads(text).items()}
+    except (ValueError, TypeError, AttributeError):
+        raise BenchError(f'bench key nominal is {text!r}: it must be a JSON object such as {{"theta1": 0}}.') from None
+
+
+def turn(vector: Floats, axis: Floats, angle_rad: Floats | float) -> Floats:
+    """Rot(axis, angle) vector by Rodrigues' formula; vector (3,) or (n, 3), angle scalar or (n,); returns (..., 3)."""
+    cos, sin = np.cos(angle_rad)[..., None], np.sin(angle_rad)[..., None]
+    along = (vector @ axis)[..., None] * axis
+    return along + cos * (vector - along) + sin * np.cross(axis, vector)
+
+
+def _turn_by_quaternion(vector: Floats, imaginary: Floats, real: Floats) -> Floats:
+    doubled = 2.0 * np.cross(imaginary, np.broadcast_to(vector, imaginary.shape))
+    return vector + real * doubled + np.cross(imaginary, doubled)
+
+
+def unwrap_pose(pose: Floats, is_quaternion: bool, previous: Floats | None = None) -> Floats:
+    """Poses (n, k) made continuous: angles within half a turn, quaternions on the sign, of the pose before."""
+    stacked = pose if previous is None else np.vstack([previous, pose])
+    if len(stacked) < 2:
+        return pose
+    if is_quaternion:
+        flips = np.cumprod(np.where(np.einsum("ij,ij->i", stacked[1:], stacked[:-1]) < 0, -1.0, 1.0))
+        smooth = np.concatenate([stacked[:1], stacked[1:] * flips[:, None]])
+    else:
+        smooth = np.unwrap(stacked, axis=0)
+    return smooth if previous is None else smooth[1:]
+
+
+def interpolate_pose(at_ns: Times, time_ns: Times, pose: Floats, is_quaternion: bool) -> Floats:
+    """Poses at ``at_ns``: straight lines between continuous angles, slerp between quaternions; held at the ends."""
+    before = np.clip(np.searchsorted(time_ns, at_ns, side="right") - 1, 0, max(len(time_ns) - 2, 0))
+    after = np.minimum(before + 1, len(time_ns) - 1)
+    span = np.maximum(time_ns[after] - time_ns[before], 1)
+    weight = np.clip((at_ns - time_ns[before]) / span, 0.0, 1.0)[:, None]
+    start, end = pose[before], pose[after]
+    if not is_quaternion:
+        return start + weight * (end - start)
+    return slerp(start, end, weight)
+
+
+def slerp(start: Floats, end: Floats, weight: Floats) -> Floats:
+    """Quaternions (n, 4) on the great arc from ``start`` to ``end`` at ``weight`` (n, 1); the shorter way round."""
+    start = start / np.linalg.norm(start, axis=-1, keepdims=True)
+    end = end / np.linalg.norm(end, axis=-1, keepdims=True)
+    end = np.where(np.sum(start * end, axis=-1, keepdims=True) < 0, -end, end)
+    # atan2 of the chord halves keeps small arcs exact, where acos of a dot product near 1 loses half the digits
+    half = np.arctan2(np.linalg.norm(end - start, axis=-1), np.linalg.norm(end + start, axis=-1))[:, None]
+    arc = 2.0 * half
+    near = arc < 1e-12
+    safe = np.where(near, 1.0, np.sin(arc))
+    left = np.where(near, 1.0 - weight, np.sin((1.0 - weight) * arc) / safe)
+    right = np.where(near, weight, np.sin(weight * arc) / safe)
+    return left * start + right * end
+
+
+def pose_distance(one: Floats, other: Floats, is_quaternion: bool) -> Floats:
+    """How far apart two poses (..., k) are, rad: the largest angle difference, or the angle of the rotation."""
+    if not is_quaternion:
+        return np.max(np.abs(one - other), axis=-1)
+    one = one / np.linalg.norm(one, axis=-1, keepdims=True)
+    other = other / np.linalg.norm(other, axis=-1, keepdims=True)
+    other = np.where(np.sum(one * other, axis=-1, keepdims=True) < 0, -other, other)
+    chord = np.linalg.norm(one - other, axis=-1), np.linalg.norm(one + other, axis=-1)
+    return 4.0 * np.arctan2(*chord)
+
+
+def mean_pose(pose: Floats) -> Floats:
+    """The mean (k,) of continuous poses (n, k) that lie close together (quaternions: of one sign, then normalised)."""
+    return pose.mean(axis=0)
+
+
+def axes_of(names: Iterable[str]) -> tuple[Vector, ...]:
+    """Axes from single words: ``axes_of("yzx")``."""
+    return parse_axes(" ".join(names))
