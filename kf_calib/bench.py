@@ -229,7 +229,9 @@ def turn(vector: Floats, axis: Floats, angle_rad: Floats | float) -> Floats:
     """Rot(axis, angle) vector by Rodrigues' formula; vector (3,) or (n, 3), angle scalar or (n,); returns (..., 3)."""
     cos, sin = np.cos(angle_rad)[..., None], np.sin(angle_rad)[..., None]
     along = (vector @ axis)[..., None] * axis
-    return along + cos * (vector - along) + sin * np.cross(axis, vector)
+    x, y, z = axis.tolist()
+    across = vector @ np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # axis x vector; np.cross costs ten times more
+    return along + cos * (vector - along) + sin * across
 
 
 def _turn_by_quaternion(vector: Floats, imaginary: Floats, real: Floats) -> Floats:

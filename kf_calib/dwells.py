@@ -1,0 +1,388 @@
+"""Dwells: the stretches in which the platform stands still, cut from the raw streams as they arrive.
+
+Stillness is judged on the platform angles: an interval between two pose messages is still when it lies in a window of
+``window_s`` over which the pose moves by no more than ``tolerance_deg``. Where angles are absent during a motion
+(two messages far apart in time and in angle) the readings decide where the one dwell ended and the next began.
+Samples of a slew stay in the recording and out of the static fit; so do ``settle_s`` after each arrival and
+``lead_s`` before each departure. What comes out does not depend on how the streams were chopped into batches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+
+from kf_calib.bench import Bench, interpolate_pose, mean_pose, pose_distance, unwrap_pose
+from kf_calib.samples import Batch, Floats, Source, Stream, Times
+
+BLOCK_SAMPLES = 4096
+"""Samples of one block at the most: small enough for the cache, large enough to amortise a call."""
+
+_SECOND_NS = 1_000_000_000
+_HOLD_NS = _SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
+_LEAP_NS = 10 * _SECOND_NS  # a stamp this far ahead, with the next one behind it, is a damaged stamp
+_PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
+
+
+@dataclass(frozen=True)
+class Stillness:
+    """When the platform counts as still."""
+
+    tolerance_deg: float = 0.05
+    window_s: float = 1.0
+    settle_s: float = 1.0
+    lead_s: float = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Up to 4096 consecutive readings of one dwell.
+
+    elapsed_s (n,) since the first sample of the recording; accel_mps2 (n, 3); pose (1, k): the mean of the angle
+    messages while the platform stands still, or (n, k) where it creeps; temperature_c (n,), NaN where not measured.
+    """
+
+    dwell: int
+    elapsed_s: Floats
+    accel_mps2: Floats
+    pose: Floats
+    temperature_c: Floats
+
+
+@dataclass
+class Tally:
+    """What became of every sample that was read; ``sentences`` says what a user should know of it."""
+
+    read: int = 0
+    used: int = 0
+    moving: int = 0
+    settling: int = 0
+    not_finite: int = 0
+    repeated: int = 0
+    backward: int = 0
+    leaping: int = 0
+    without_pose: int = 0
+    poses_dropped: int = 0
+    gated: int = 0
+    first_backward_s: float | None = None
+
+    def sentences(self) -> list[str]:
+        said = {
+            "not_finite": "{} readings were not finite (NaN or infinite) and were dropped.",
+            "repeated": "{} readings repeated the stamp before them and were dropped.",
+            "leaping": "{} readings had a stamp far ahead of their neighbours and were dropped.",
+            "without_pose": "{} readings had no platform angle within 1 s of them and were dropped.",
+            "poses_dropped": "{} angle messages were not finite or not in order of time and were dropped.",
+            "gated": "{} readings were outliers (innovation gate) and were rejected; --no-gate keeps them.",
+        }
+        out = [text.format(getattr(self, key)) for key, text in said.items() if getattr(self, key)]
+        if self.backward:
+            out.append(
+                f"{self.backward} readings had stamps that jumped back (first at {self.first_backward_s:.3f} s) "
+                "and were dropped."
+            )
+        return out
+
+
+class _Order:
+    """Keeps the samples of a stream whose stamps advance; counts the others."""
+
+    def __init__(self) -> None:
+        self.last_ns: int | None = None
+        self._held = Stream.empty(0)
+
+    def __call__(self, stream: Stream, tally: Tally | None = None, first_ns: int | None = None) -> Stream:
+        if self._held.time_ns.size:
+            stream, self._held = self._held + stream, Stream.empty(0)
+        if not len(stream):
+            return stream
+        steps = np.diff(stream.time_ns, prepend=stream.time_ns[0] - 1 if self.last_ns is None else self.last_ns)
+        if steps.min() > 0 and steps.max() < _LEAP_NS:
+            self.last_ns = int(stream.time_ns[-1])
+            return stream
+        return self._one_by_one(stream, tally or Tally(), first_ns)
+
+    def _one_by_one(self, stream: Stream, tally: Tally, first_ns: int | None) -> Stream:
+        stamps: list[int] = stream.time_ns.tolist()
+        keep = np.zeros(len(stamps), bool)
+        for i, stamp in enumerate(stamps):
+            if self.last_ns is not None and stamp <= self.last_ns:
+                if stamp == self.last_ns:
+                    tally.repeated += 1
+                else:
+                    tally.backward += 1
+                    if tally.first_backward_s is None:
+                        tally.first_backward_s = (self.last_ns - (first_ns or stamps[0])) / _SECOND_NS
+                continue
+            if self.last_ns is not None and stamp - self.last_ns >= _LEAP_NS:
+                if i + 1 == len(stamps):  # only the next stamp can tell a gap from a damaged stamp
+                    self._held = stream[i:]
+                    break
+                if stamps[i + 1] < stamp:
+                    tally.leaping += 1
+                    continue
+            keep[i] = True
+            self.last_ns = stamp
+        return stream[keep]
+
+    def flush(self) -> Stream:
+        held, self._held = self._held, Stream.empty(0)
+        return held
+
+
+class _Event(Enum):
+    LEAVE = 0
+    ARRIVE = 1
+
+
+@dataclass
+class _Dwell:
+    """The open dwell: its number, the first stamp that may be used, and the first pose message that belongs to it."""
+
+    number: int
+    usable_ns: int
+    first_pose_ns: int
+
+
+@dataclass
+class Segmenter:
+    """Cuts batches into blocks of dwells; ``push`` what has arrived, then ``finish``."""
+
+    bench: Bench
+    stillness: Stillness = field(default_factory=Stillness)
+    tally: Tally = field(default_factory=Tally)
+
+    def __post_init__(self) -> None:
+        self.first_ns: int | None = None
+        self.dwell_count = 0
+        self._accel = Stream.empty(3)
+        self._pose = Stream.empty(self.bench.pose_width)
+        self._temperature = Stream.empty(1)
+        self._orders = (_Order(), _Order(), _Order())
+        self._decided_ns: int | None = None  # intervals of poses before this stamp have been judged
+        self._cover_ns = -(1 << 62)  # a still window judged earlier reaches to here
+        self._dwell: _Dwell | None = None
+        self._begun = False
+
+    def push(self, batch: Batch) -> Iterator[Block]:
+        """Blocks that are complete once this batch is known."""
+        self._take(batch)
+        yield from self._advance(final=False)
+
+    def finish(self) -> Iterator[Block]:
+        """The blocks still open at the end of the streams."""
+        accel, pose, temperature = (order.flush() for order in self._orders)
+        self._take(Batch(accel, pose, temperature), counted=True)
+        yield from self._advance(final=True)
+
+    def _take(self, batch: Batch, counted: bool = False) -> None:
+        accel, pose = batch.accel, batch.pose
+        if not counted:
+            self.tally.read += len(accel)
+        if len(accel):
+            finite = np.isfinite(accel.values).all(axis=1) if not np.isfinite(accel.values).all() else None
+            if finite is not None:
+                self.tally.not_finite += int((~finite).sum())
+                accel = accel[finite]
+            accel = self._orders[0](accel, self.tally, self.first_ns)
+            if self.first_ns is None and len(accel):
+                self.first_ns = int(accel.time_ns[0])
+            self._accel += accel
+        if len(pose):
+            before = len(pose)
+            pose = self._orders[1](pose[np.isfinite(pose.values).all(axis=1)])
+            self.tally.poses_dropped += before - len(pose)
+            previous = self._pose.values[-1:] if len(self._pose) else None
+            self._pose += Stream(pose.time_ns, unwrap_pose(pose.values, not self.bench.axes, previous))
+        if len(batch.temperature):
+            warm = batch.temperature
+            self._temperature += self._orders[2](warm[np.isfinite(warm.values[:, 0])])
+
+    def _advance(self, final: bool) -> Iterator[Block]:
+        for stamp, event, settle in self._judge(final):
+            if event is _Event.ARRIVE:
+                self._discard(stamp)
+                self.dwell_count += 1
+                self._dwell = _Dwell(self.dwell_count - 1, stamp + settle, self._next_pose_ns(stamp))
+            else:
+                yield from self._emit(stamp, closing=True)
+                self._dwell = None
+        horizon = self._horizon(final)
+        if horizon is None:
+            return
+        if self._dwell is not None:
+            yield from self._emit(horizon, closing=final)
+        else:
+            self._discard(horizon)
+        self._forget()
+        if final:
+            self.tally.without_pose += len(self._accel)
+            self._accel = Stream.empty(3)
+
+    def _judge(self, final: bool) -> list[tuple[int, _Event, int]]:
+        """Arrivals and departures in the pose intervals that can be judged by now: (stamp, event, settling in ns)."""
+        times, poses = self._pose.time_ns, self._pose.values
+        start = 0 if self._decided_ns is None else int(np.searchsorted(times, self._decided_ns))
+        times, poses = times[start:], poses[start:]
+        if len(times) < 2:
+            return self._lone_pose(times) if final else []
+        window_ns = round(self.stillness.window_s * _SECOND_NS)
+        ends = np.searchsorted(times, times + window_ns)
+        known = ends < len(times)
+        ends = np.minimum(ends, len(times) - 1)
+        count = len(times) - 1 if final else int(known[:-1].sum())
+        if count == 0:
+            return []
+        still = self._still(times, poses, ends, known | final)[:count]
+        events = self._events(times, still)
+        self._decided_ns = int(times[count])
+        return events
+
+    def _lone_pose(self, times: Times) -> list[tuple[int, _Event, int]]:
+        """A single pose message makes one dwell of all the readings around it."""
+        if self._begun or not len(times) or not len(self._accel):
+            return []
+        self._begun, self._decided_ns = True, int(times[0])
+        return [(int(min(self._accel.time_ns[0], times[0])), _Event.ARRIVE, 0)]
+
+    def _still(self, times: Times, poses: Floats, ends: Times, known: Floats) -> Floats:
+        """Which intervals between consecutive poses are still, (m - 1,) bool."""
+        tolerance = np.radians(self.stillness.tolerance_deg)
+        steps = pose_distance(poses[1:], poses[:-1], not self.bench.axes) <= tolerance
+        broken = np.concatenate([[0], np.cumsum(~steps)])
+        rest = pose_distance(poses[ends], poses, not self.bench.axes) <= tolerance
+        rest &= (broken[ends] == broken) & known & (ends > np.arange(len(ends)))
+        reach = np.maximum.accumulate(np.where(rest, times[ends], self._cover_ns))
+        self._cover_ns = int(reach[-1])
+        return (reach[:-1] > times[:-1]) & steps
+
+    def _events(self, times: Times, still: Floats) -> list[tuple[int, _Event, int]]:
+        settle_ns = round(self.stillness.settle_s * _SECOND_NS)
+        lead_ns = round(self.stillness.lead_s * _SECOND_NS)
+        window_ns = round(self.stillness.window_s * _SECOND_NS)
+        in_dwell, events = self._dwell is not None, list[tuple[int, _Event, int]]()
+        unresolved = ~still & (np.diff(times[: len(still) + 1]) > window_ns)
+        changes = np.flatnonzero(np.diff(still, prepend=in_dwell) | unresolved)
+        for j in changes:
+            begin, end = int(times[j]), int(times[j + 1])
+            if still[j] and not in_dwell:
+                first = not self._begun
+                events.append((begin - (_HOLD_NS if first else 0), _Event.ARRIVE, 0 if first else settle_ns))
+                in_dwell = True
+            elif unresolved[j]:
+                leave, arrive = self._resolve_by_readings(begin, end)
+                if not in_dwell and leave > begin:
+                    events.append((begin - (0 if self._begun else _HOLD_NS), _Event.ARRIVE, 0))
+                    in_dwell = True
+                if in_dwell:
+                    events.append((leave - lead_ns, _Event.LEAVE, 0))
+                events.append((arrive, _Event.ARRIVE, settle_ns))
+                in_dwell = True
+            elif not still[j] and in_dwell:
+                events.append((begin - lead_ns, _Event.LEAVE, 0))
+                in_dwell = False
+            self._begun = True
+        return events
+
+    def _resolve_by_readings(self, begin_ns: int, end_ns: int) -> tuple[int, int]:
+        """When a motion without angles began and ended, from the readings between two poses.
+
+        The readings are averaged over windows of a quarter of a second; the old dwell lasts while they stay at its
+        level, the new one reaches back as far as they are at the level they end on.
+        """
+        part = slice(*np.searchsorted(self._accel.time_ns, (begin_ns, end_ns)))
+        times, values = self._accel.time_ns[part], self._accel.values[part]
+        size = max(4, int(np.searchsorted(times, begin_ns + _SECOND_NS // 4)))
+        count = len(times) // size
+        if count < 4:
+            return begin_ns, end_ns
+        shaped = values[: count * size].reshape(count, size, 3)
+        means, scatter = shaped.mean(axis=1), np.median(shaped.std(axis=1), axis=0)
+        allowed = 6.0 * scatter + 1e-3 * self.bench.gravity_mps2
+        near_old = np.all(np.abs(means - means[0]) <= allowed, axis=1)
+        near_new = np.all(np.abs(means - means[-1]) <= allowed, axis=1)
+        kept_old = int(np.argmin(near_old)) if not near_old.all() else 0
+        kept_new = int(np.argmin(near_new[::-1])) if not near_new.all() else 0
+        leave = begin_ns if kept_old < 2 else int(times[(kept_old - 1) * size])
+        arrive = end_ns if kept_new < 2 else int(times[(count - kept_new + 1) * size])
+        return leave, max(arrive, leave)
+
+    def _next_pose_ns(self, stamp: int) -> int:
+        """The first pose message at or after an arrival: the dwell's own poses start there."""
+        index = int(np.searchsorted(self._pose.time_ns, stamp))
+        return int(self._pose.time_ns[min(index, len(self._pose) - 1)])
+
+    def _horizon(self, final: bool) -> int | None:
+        """Readings before this stamp can be released."""
+        if self._decided_ns is None:
+            if not final and len(self._accel) <= _PENDING_SAMPLES:
+                return None
+            return int(self._accel.time_ns[-1]) + 1 if len(self._accel) else None
+        if final:
+            return int(self._pose.time_ns[-1]) + _HOLD_NS if len(self._pose) > 1 else 1 << 62
+        return self._decided_ns - round(self.stillness.lead_s * _SECOND_NS)
+
+    def _discard(self, until_ns: int) -> None:
+        """Drop the readings before ``until_ns``: the platform was moving, or no angle was known."""
+        count = int(np.searchsorted(self._accel.time_ns, until_ns))
+        first_pose = int(self._pose.time_ns[0]) if len(self._pose) and not self.dwell_count else -(1 << 62)
+        early = int(np.searchsorted(self._accel.time_ns[:count], first_pose - _HOLD_NS))
+        self.tally.without_pose += early
+        self.tally.moving += count - early
+        self._accel = self._accel[count:]
+
+    def _emit(self, until_ns: int, closing: bool) -> Iterator[Block]:
+        """Blocks of the open dwell from the readings before ``until_ns``; a last short one when it closes."""
+        assert self._dwell is not None
+        count = int(np.searchsorted(self._accel.time_ns, until_ns))
+        skip = min(int(np.searchsorted(self._accel.time_ns, self._dwell.usable_ns)), count)
+        self.tally.settling += skip
+        first = skip
+        while count - first >= BLOCK_SAMPLES or (closing and count > first):
+            size = min(BLOCK_SAMPLES, count - first)
+            yield self._block(self._accel[first : first + size])
+            first += size
+        self._accel = self._accel[first:]
+
+    def _block(self, accel: Stream) -> Block:
+        assert self._dwell is not None and self.first_ns is not None
+        self.tally.used += len(accel)
+        warm = np.full(len(accel), np.nan)
+        if len(self._temperature):
+            index = np.searchsorted(self._temperature.time_ns, accel.time_ns, side="right") - 1
+            warm = np.where(index >= 0, self._temperature.values[np.maximum(index, 0), 0], np.nan)
+        elapsed_s = (accel.time_ns - self.first_ns) / _SECOND_NS
+        return Block(self._dwell.number, elapsed_s, accel.values, self._block_pose(accel.time_ns), warm)
+
+    def _block_pose(self, accel_ns: Times) -> Floats:
+        assert self._dwell is not None
+        times, poses = self._pose.time_ns, self._pose.values
+        own = int(np.searchsorted(times, self._dwell.first_pose_ns))
+        first = max(int(np.searchsorted(times, accel_ns[0])), own)
+        last = max(int(np.searchsorted(times, accel_ns[-1], side="right")), own)
+        if first == last:  # no message inside the block: the latest of this dwell before it, else its first
+            first = max(first - 1, own)
+            last = first + 1
+        inside = poses[first:last]
+        spread = np.ptp(inside, axis=0).max()
+        if spread <= np.radians(self.stillness.tolerance_deg):
+            return mean_pose(inside)[None, :]
+        around = slice(max(first - 1, own), last + 1)
+        return interpolate_pose(accel_ns, times[around], poses[around], not self.bench.axes)
+
+    def _forget(self) -> None:
+        """Drop poses and temperatures that no pending reading needs."""
+        oldest = int(self._accel.time_ns[0]) if len(self._accel) else (self._decided_ns or 0)
+        oldest = min(oldest, self._decided_ns or oldest)
+        self._pose = self._pose[max(int(np.searchsorted(self._pose.time_ns, oldest)) - 2, 0) :]
+        self._temperature = self._temperature[max(int(np.searchsorted(self._temperature.time_ns, oldest)) - 1, 0) :]
+
+
+def dwell_blocks(source: Source, segmenter: Segmenter) -> Iterator[Block]:
+    """All blocks of a source, in order."""
+    for batch in source:
+        yield from segmenter.push(batch)
+    yield from segmenter.finish()

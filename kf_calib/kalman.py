@@ -1,0 +1,116 @@
+"""The reference engine: filterpy's Kalman filter, sample by sample, as a textbook has it.
+
+The state is the affine one in units of m/s^2 (g s_i, b_i), followed by the nuisance states of the current dwell, which
+start again from their prior at each new dwell. filterpy's square-root form is used: its plain form loses digits of
+the covariance after tens of thousands of static samples with a wide prior (``form="plain"`` shows it).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from kf_calib.model import STATE_COUNT, Prior, Rows, dwell_map, state_map
+from kf_calib.noise import Noise
+from kf_calib.samples import Floats
+
+_DIFFUSE = 1e5
+"""A diffuse prior's sigma in sigmas of one reading: wide enough to bias nothing, narrow enough for doubles."""
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Affine state (12,), covariance (12, 12), sum of the samples' normalised innovations squared and their number."""
+
+    state: Floats
+    covariance: Floats
+    nis: float
+    samples: int
+
+
+def estimate(
+    rows: Iterable[Rows],
+    noise: Noise,
+    nominal_state: Floats,
+    prior_covariance: Floats | None,
+    linearised_at: Floats,
+    gravity_mps2: float,
+    walk_variance: Callable[[float], Floats] | None = None,
+    form: Literal["square-root", "plain"] = "square-root",
+) -> Posterior:
+    """Run the filter over all rows. ``prior_covariance`` None: diffuse. ``walk_variance(elapsed_s)``: Q of the biases."""
+    scale = np.where(np.arange(STATE_COUNT) % 4 == 3, 1.0, gravity_mps2)
+    used = np.flatnonzero(noise.dwell_sigmas > 0)
+    maps = np.concatenate([state_map() / scale, dwell_map(linearised_at)[:, :, used]], axis=2)
+    if prior_covariance is None:
+        widest = max(noise.effective_sigma_mps2.max(), noise.scatter_mps2.max(), gravity_mps2 * noise.setting_rad)
+        root = _DIFFUSE * widest * np.eye(STATE_COUNT)
+    else:
+        root = np.linalg.cholesky(prior_covariance * np.outer(scale, scale))
+    kf = _Filter(form, nominal_state * scale, root, noise.dwell_sigmas[used], noise.effective_sigma_mps2)
+    dwell, nis, samples, previous_s = -1, 0.0, 0, None
+    for block in rows:
+        if block.dwell != dwell:
+            begin = float(block.elapsed_s[0])
+            if walk_variance is not None and previous_s is not None:
+                kf.walk(walk_variance(begin - previous_s))
+            kf.enter_dwell()
+            dwell, previous_s = block.dwell, begin
+        observations = np.einsum("nc,icp->nip", block.columns, maps)
+        for observation, reading in zip(observations, block.readings, strict=True):
+            nis += kf.update(observation, reading)
+        samples += len(block.readings)
+    state, covariance = kf.posterior()
+    return Posterior(state / scale, covariance / np.outer(scale, scale), nis, samples)
+
+
+class _Filter:
+    """One of filterpy's two filters behind the few calls needed here."""
+
+    def __init__(self, form: str, state: Floats, root: Floats, dwell_sigmas: Floats, sigma: Floats) -> None:
+        from filterpy.kalman import KalmanFilter, SquareRootKalmanFilter
+
+        self.plain = form == "plain"
+        self.dwell_sigmas = dwell_sigmas
+        size = STATE_COUNT + len(dwell_sigmas)
+        kf: Any = (KalmanFilter if self.plain else SquareRootKalmanFilter)(dim_x=size, dim_z=3)
+        kf.x = np.concatenate([state, np.zeros(len(dwell_sigmas))])  # 1-D: a column would broadcast to (n, 3)
+        full = np.zeros((size, size))
+        full[:STATE_COUNT, :STATE_COUNT] = root
+        if self.plain:
+            kf.P, kf.R = full @ full.T, np.diag(sigma**2)
+        else:
+            kf._P1_2, kf._R1_2 = full, np.diag(sigma)  # its setters would square the roots and lose half the digits
+        self.kf = kf
+
+    def enter_dwell(self) -> None:
+        """The nuisance states start from their prior, independent of everything before."""
+        own = slice(STATE_COUNT, None)
+        self.kf.x[own] = 0.0
+        matrix, sigma = (self.kf.P, self.dwell_sigmas**2) if self.plain else (self.kf._P1_2, self.dwell_sigmas)
+        matrix[own, :] = 0.0
+        matrix[:, own] = 0.0  # the root is lower triangular: its leading block is the root of the leading covariance
+        matrix[own, own] = np.diag(sigma)
+
+    def walk(self, variance: Floats) -> None:
+        """Time update with F = I; filterpy's Q is the identity until it is set."""
+        steps = np.zeros(len(self.kf.x))
+        steps[3:STATE_COUNT:4] = variance
+        if self.plain:
+            self.kf.Q = np.diag(steps)
+        else:
+            self.kf._Q1_2 = np.diag(np.sqrt(steps))  # the setter needs a positive definite Q
+        self.kf.predict()
+
+    def update(self, observation: Floats, reading: Floats) -> float:
+        """One sample; returns its normalised innovation squared, y S^-1 y."""
+        self.kf.H = observation
+        self.kf.update(reading)
+        return float(self.kf.y @ self.kf.SI @ self.kf.y)
+
+    def posterior(self) -> tuple[Floats, Floats]:
+        part = slice(0, STATE_COUNT)
+        return self.kf.x[part].copy(), self.kf.P[part, part].copy()

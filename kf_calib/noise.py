@@ -1,0 +1,201 @@
+"""The noise model: what the readings of a still platform scatter by, within a dwell and from dwell to dwell.
+
+Three parts (all 1 sigma): sigma_w, the noise of a reading within a dwell, with an inflation kappa for its
+autocorrelation (kappa = spectral density at zero frequency / that of white noise of the same variance, so that the mean of
+n readings has variance kappa sigma_w^2 / n); the setting error sigma_alpha, one small rotation a dwell, common to the
+three accelerometers; and sigma_s, the scatter of each sensor from dwell to dwell. Each is stated or estimated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from kf_calib.samples import Floats
+
+if TYPE_CHECKING:
+    from kf_calib.information import Autocovariance, DwellFactor
+
+FLOOR_MPS2 = 1e-9
+"""Readings that are exactly constant get this sigma: the rounding of a double is 1e-15 m/s^2."""
+
+_MAX_ORDER = 20
+_SIGNIFICANT = 5.41  # 1 % point of the likelihood ratio of a variance against zero: half of chi2 with 1 dof
+
+
+@dataclass(frozen=True)
+class Noise:
+    """sigma_mps2, inflation, scatter_mps2: (3,) each; setting_rad; which of the dwell parts were stated."""
+
+    sigma_mps2: Floats
+    inflation: Floats
+    setting_rad: float = 0.0
+    scatter_mps2: Floats = None  # type: ignore[assignment]  # set in __post_init__
+    setting_stated: bool = False
+    scatter_stated: bool = False
+
+    def __post_init__(self) -> None:
+        if self.scatter_mps2 is None:  # pyright: ignore[reportUnnecessaryComparison]
+            object.__setattr__(self, "scatter_mps2", np.zeros(3))
+
+    @property
+    def effective_sigma_mps2(self) -> Floats:
+        """Sigma (3,) of white readings whose mean is as uncertain as that of the true, correlated ones."""
+        return np.maximum(self.sigma_mps2, FLOOR_MPS2) * np.sqrt(self.inflation)
+
+    @property
+    def dwell_sigmas(self) -> Floats:
+        """Sigma (6,) of a dwell's nuisance states: three rotations in rad, three offsets in m/s^2; 0: absent."""
+        return np.concatenate([np.full(3, self.setting_rad), self.scatter_mps2])
+
+
+def within_dwells(dwells: Sequence[DwellFactor]) -> Noise:
+    """sigma_w and kappa of each accelerometer, pooled over the dwells.
+
+    The residual sum of squares of a dwell has expectation sigma^2 (n - kappa - 3): the fitted mean takes kappa,
+    three further columns one each.
+    """
+    total = dwells[0].autocovariance
+    for dwell in dwells[1:]:
+        total += dwell.autocovariance
+    inflation = np.array([_inflation(total, i) for i in range(3)])
+    squares = np.sum([np.diag(d.factor[4:, 4:].T @ d.factor[4:, 4:]) for d in dwells], axis=0)
+    freedom = np.sum([np.maximum(d.count - 3 - np.minimum(inflation, d.count), 0) for d in dwells], axis=0)
+    return Noise(np.sqrt(squares / np.maximum(freedom, 1.0)), inflation)
+
+
+def _inflation(total: Autocovariance, channel: int) -> float:
+    """kappa from an autoregression fitted to the autocovariance (Yule-Walker), its order chosen by BIC.
+
+    kappa = v / (gamma_0 (1 - sum a)^2), v the variance of the autoregression's innovations (Percival and Walden, 1993,
+    ch. 9). The autocovariance of readings less their block mean is low by kappa gamma_0 / n at every lag; that is
+    put back by iteration. Never below 1: a noise that averages faster than white is not relied on.
+    """
+    if total.count < 64 or total.products[0, channel] <= 0:
+        return 1.0
+    mean_block = total.count / total.blocks
+    lags = min(_MAX_ORDER, total.count // 16, int(mean_block) // 4)
+    raw = total.products[: lags + 1, channel] / np.maximum(total.pairs[: lags + 1], 1.0)
+    kappa = 1.0
+    for _ in range(10):
+        gamma = raw + kappa * raw[0] / max(mean_block - kappa, 1.0)
+        before, kappa = kappa, min(_autoregressive_inflation(gamma, total.count), mean_block / 4)
+        if abs(kappa - before) < 1e-3 * kappa:
+            break
+    return max(kappa, 1.0)
+
+
+def _autoregressive_inflation(gamma: Floats, count: int) -> float:
+    """Levinson-Durbin over all orders; kappa of the order with the least BIC."""
+    a, variance = np.zeros(0), float(gamma[0])
+    best = (count * np.log(variance), 1.0)
+    for order in range(1, len(gamma)):
+        reflection = (gamma[order] - a @ gamma[order - 1 : 0 : -1]) / variance
+        if not abs(reflection) < 1:
+            break
+        a = np.append(a - reflection * a[::-1], reflection)
+        variance *= 1 - reflection**2
+        score = count * np.log(variance) + order * np.log(count)
+        gain = float((1 - a.sum()) ** 2)
+        if score < best[0] and gain > 0:
+            best = (score, variance / gamma[0] / gain)
+    return best[1]
+
+
+def with_dwell_parts(
+    within: Noise, dwells: Sequence[DwellFactor], state: Floats, angle_sigma_deg: float | None, scatter_mps2: float | None
+) -> Noise:
+    """The noise with its dwell parts: as stated, else estimated by restricted maximum likelihood where significant.
+
+    Of the parts not stated, the combination with the best likelihood is taken, each part charged for by the 1 % point
+    of its ratio against zero. Fewer than 6 degrees of freedom between dwells: nothing is estimated.
+    """
+    from scipy.optimize import minimize
+    from scipy.special import chdtrc
+
+    stated = replace(
+        within,
+        setting_rad=np.radians(angle_sigma_deg or 0.0),
+        scatter_mps2=np.full(3, scatter_mps2 or 0.0),
+        setting_stated=angle_sigma_deg is not None,
+        scatter_stated=scatter_mps2 is not None,
+    )
+    means = np.array([dwell.means for dwell in dwells])
+    counts = np.array([dwell.count for dwell in dwells], float)
+    freedom = 3 * len(dwells) - 12
+    if freedom < 6 or (stated.setting_stated and stated.scatter_stated):
+        return stated
+    if chdtrc(freedom, _misfit(stated, means, counts, state)) > 0.1:  # nothing to explain: spares the search
+        return stated
+
+    def likelihood(logs: Floats, parts: tuple[str, ...]) -> float:
+        return restricted_log_likelihood(_unpack(stated, logs, parts), means, counts, state)
+
+    best, best_score = stated, likelihood(np.zeros(0), ())
+    free = (() if stated.setting_stated else ("setting",), () if stated.scatter_stated else ("scatter",))
+    for parts in {free[0], free[1], free[0] + free[1]} - {()}:
+        begin = _spread(means, parts)
+        found = minimize(lambda logs, p=parts: -likelihood(logs, p), begin, method="Nelder-Mead",
+                         options={"xatol": 1e-3, "fatol": 1e-4, "maxiter": 600})  # fmt: skip
+        score = -float(found.fun) - 0.5 * _SIGNIFICANT * len(begin)
+        if score > best_score:
+            best, best_score = _unpack(stated, found.x, parts), score
+    return best
+
+
+def _spread(means: Floats, parts: tuple[str, ...]) -> Floats:
+    """A starting point of the search: log sigmas at the size of the misfit of the dwell means."""
+    columns, readings = means[:, :4], means[:, 4:]
+    residual = readings - columns @ np.linalg.lstsq(columns, readings, rcond=1e-9)[0]
+    size = np.sqrt(np.mean(residual**2, axis=0)) + FLOOR_MPS2
+    gravity = np.linalg.norm(columns[:, 1:], axis=1).mean()
+    logs = ([np.log(size.mean() / gravity)] if "setting" in parts else []) + (
+        list(np.log(size)) if "scatter" in parts else []
+    )
+    return np.array(logs)
+
+
+def _unpack(noise: Noise, logs: Floats, parts: tuple[str, ...]) -> Noise:
+    if "setting" in parts:
+        noise = replace(noise, setting_rad=float(np.exp(logs[0])))
+    if "scatter" in parts:
+        noise = replace(noise, scatter_mps2=np.exp(logs[-3:]))
+    return noise
+
+
+def mean_covariances(noise: Noise, means: Floats, counts: Floats, state: Floats) -> Floats:
+    """Covariance (D, 3, 3) of the dwells' mean readings about the model.
+
+    diag(kappa sigma_w^2 / n + sigma_s^2) + sigma_alpha^2 S (|f|^2 I - f f^T) S^T, S the sensitivities (rows).
+    """
+    force, sensitivity = means[:, 1:4], state.reshape(3, 4)[:, :3]
+    across = np.einsum("di,di->d", force, force)[:, None, None] * np.eye(3) - force[:, :, None] * force[:, None, :]
+    own = noise.effective_sigma_mps2**2 / counts[:, None] + noise.scatter_mps2**2
+    return own[:, :, None] * np.eye(3) + noise.setting_rad**2 * sensitivity @ across @ sensitivity.T
+
+
+def _misfit(noise: Noise, means: Floats, counts: Floats, state: Floats) -> float:
+    """Chi-squared of the dwell means about their generalised least-squares fit."""
+    return float(_between(noise, means, counts, state)[0][12, 12] ** 2)
+
+
+def restricted_log_likelihood(noise: Noise, means: Floats, counts: Floats, state: Floats) -> float:
+    """REML of the dwell means (D, 7): -1/2 (sum log|V_d| + log|sum A' V^-1 A| + r' V^-1 r), up to a constant."""
+    upper, log_roots = _between(noise, means, counts, state)
+    determinant = np.abs(np.diag(upper))
+    seen = determinant[:12] > 1e-9 * determinant[:12].max()
+    return float(-log_roots - np.log(determinant[:12][seen]).sum() - 0.5 * determinant[12] ** 2)
+
+
+def _between(noise: Noise, means: Floats, counts: Floats, state: Floats) -> tuple[Floats, float]:
+    """Triangle (13, 13) of the whitened dwell means [A | z], and the sum of log|V_d|^(1/2)."""
+    root = np.linalg.cholesky(mean_covariances(noise, means, counts, state))
+    design = np.zeros((len(means), 3, 13))
+    for i in range(3):
+        design[:, i, 4 * i : 4 * i + 4] = means[:, :4]
+        design[:, i, 12] = means[:, 4 + i]
+    upper = np.linalg.qr(np.linalg.solve(root, design).reshape(-1, 13), mode="r")
+    return upper, float(np.log(np.einsum("dii->di", root)).sum())

@@ -1,0 +1,105 @@
+"""The seed paper's twelve parameters and the affine state they are a closed form of.
+
+Reading i = s_i . f + b_i with the sensitivity s_i = K_i E_i. For accelerometers 1 and 3
+``E = (cos phi cos theta, sin theta, -sin phi cos theta)``, for 2
+``E = (sin nu1, sqrt(1 - sin^2 nu1 - sin^2 nu2), -sin nu2)`` (M. D. Grebenkin, Vestnik MEPhI 8(3), 2019, eq. 1-6).
+State order: s1x s1y s1z b1, s2x s2y s2z b2, s3x s3y s3z b3. Angles in rad, K without unit, b in m/s^2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from kf_calib.errors import BenchError
+from kf_calib.samples import Floats
+
+SYMBOLS = ("theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3")
+UNITS = ("rad", "rad", "1", "m/s^2") * 3
+NOMINAL: dict[str, float] = dict.fromkeys(SYMBOLS, 0.0) | {
+    "theta1": math.radians(0.5), "theta3": math.radians(0.5), "phi3": -math.pi / 2, "K1": 1.0, "K2": 1.0, "K3": 1.0,
+}  # fmt: skip
+
+
+def nominal(differing: Mapping[str, float] | None = None) -> Floats:
+    """The nominal parameters (12,): the paper's, except for those given (rad, 1, m/s^2)."""
+    unknown = sorted(set(differing or ()) - set(SYMBOLS))
+    if unknown:
+        raise BenchError(f"nominal names {unknown[0]!r}, which is no parameter: use {', '.join(SYMBOLS)}.")
+    values = NOMINAL | dict(differing or {})
+    return np.array([values[symbol] for symbol in SYMBOLS])
+
+
+def state_of(parameters: Floats) -> Floats:
+    """The affine state (12,) of the paper's parameters (12,)."""
+    state = np.empty(12)
+    for i, (p1, p2, scale, bias) in enumerate(np.reshape(parameters, (3, 4))):
+        state[4 * i : 4 * i + 3] = scale * _axis(i, p1, p2)
+        state[4 * i + 3] = bias
+    return state
+
+
+def _axis(i: int, p1: float, p2: float) -> Floats:
+    if i == 1:
+        return np.array([math.sin(p1), math.sqrt(1 - math.sin(p1) ** 2 - math.sin(p2) ** 2), -math.sin(p2)])
+    return np.array([math.cos(p2) * math.cos(p1), math.sin(p1), -math.sin(p2) * math.cos(p1)])
+
+
+def parameters_of(state: Floats) -> Floats:
+    """The paper's parameters (..., 12) of affine states (..., 12); exact for any size of misalignment."""
+    out = np.empty_like(state)
+    for i in range(3):
+        s = state[..., 4 * i : 4 * i + 3]
+        scale = np.linalg.norm(s, axis=-1)
+        x, y, z = np.moveaxis(s / scale[..., None], -1, 0)
+        angles = (np.arcsin(x), -np.arcsin(z)) if i == 1 else (np.arcsin(y), np.arctan2(-z, x))
+        out[..., 4 * i], out[..., 4 * i + 1] = angles
+        out[..., 4 * i + 2], out[..., 4 * i + 3] = scale, state[..., 4 * i + 3]
+    return out
+
+
+def jacobian(state: Floats) -> Floats:
+    """d parameters / d state (12, 12) at an affine state, in closed form; carries a covariance over."""
+    out = np.zeros((12, 12))
+    for i in range(3):
+        rows = slice(4 * i, 4 * i + 4)
+        s = state[4 * i : 4 * i + 3]
+        scale = float(np.linalg.norm(s))
+        axis = s / scale
+        block = np.eye(4)
+        if i == 1:
+            block[0, :3] = _arcsine_gradient(axis, 0) / scale
+            block[1, :3] = -_arcsine_gradient(axis, 2) / scale
+        else:
+            block[0, :3] = _arcsine_gradient(axis, 1) / scale
+            block[1, :3] = np.array([axis[2], 0.0, -axis[0]]) / (scale * (axis[0] ** 2 + axis[2] ** 2))
+        block[2, :3] = axis
+        out[rows, rows] = block
+    return out
+
+
+def _arcsine_gradient(axis: Floats, k: int) -> Floats:
+    """Gradient of asin(s_k / |s|) with respect to s, times |s|."""
+    return (np.eye(3)[k] - axis[k] * axis) / math.sqrt(1 - axis[k] ** 2)
+
+
+def sensitivity_jacobian(parameters: Floats) -> Floats:
+    """d state / d parameters (12, 12), in closed form: its blocks are the paper's H transposed (eq. 8-10).
+
+    The paper's print has misprints (signs in (8), missing squares in (9), sqrt(1 - sin^2) for sin in (10));
+    these are derived from (3) and checked against finite differences.
+    """
+    out = np.zeros((12, 12))
+    for i, (p1, p2, scale, _) in enumerate(np.reshape(parameters, (3, 4))):
+        c1, s1, c2, s2 = math.cos(p1), math.sin(p1), math.cos(p2), math.sin(p2)
+        axis = _axis(i, p1, p2)
+        if i == 1:
+            first, second = (c1, -c1 * s1 / axis[1], 0.0), (0.0, -c2 * s2 / axis[1], -c2)
+        else:
+            first, second = (-c2 * s1, c1, s2 * s1), (-s2 * c1, 0.0, -c2 * c1)
+        block = np.eye(4)
+        block[:3, :3] = np.column_stack([scale * np.array(first), scale * np.array(second), axis])
+        out[4 * i : 4 * i + 4, 4 * i : 4 * i + 4] = block
+    return out
