@@ -20,7 +20,7 @@ from kf_calib.dwells import Segmenter, Stillness, Tally, dwell_blocks
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.information import DwellFactor, Folder, Step
 from kf_calib.model import PRIORS, STATE_COUNT, Prior, Rows, model_rows
-from kf_calib.noise import Noise, mean_covariances, with_dwell_parts, within_dwells
+from kf_calib.noise import Noise, considered, mean_covariances, mean_design, with_dwell_parts, within_dwells
 from kf_calib.samples import Floats, Source
 
 SAME_POSE_DEG = 1.0
@@ -154,6 +154,11 @@ class Calibration:
             for k, symbol in enumerate(paper.SYMBOLS)
         }
 
+    def considering(self, state: Floats, covariance: Floats) -> Estimate:
+        """Another engine's state and covariance, the latter enlarged by what is considered only."""
+        extra = considered(self.noise, *_means([visit.dwell for visit in self.visits]), self.linearised_at).sum(axis=0)
+        return Estimate(state, covariance + covariance @ extra @ covariance, self.estimate.undetermined)
+
     def __str__(self) -> str:
         from kf_calib.views.console import plain_summary
 
@@ -164,14 +169,15 @@ class Calibration:
         nominal_state = paper.state_of(paper.nominal(self.bench.nominal))
         walks = _walk_variances([visit.dwell for visit in self.visits], self.settings)
         factor = information.start(self.settings.prior, paper.nominal(self.bench.nominal), nominal_state)
+        extra = np.zeros((STATE_COUNT, STATE_COUNT))
         for index, (visit, walk) in enumerate(zip(self.visits, walks, strict=True)):
-            before = information.predict(factor, walk)
-            dwell = visit.dwell
+            before, extra_before, dwell = information.predict(factor, walk), extra, visit.dwell
             for end_s, count, part in (*dwell.snapshots, (dwell.end_s, dwell.count, dwell.factor)):
-                piece = replace(dwell, factor=part, count=count)
-                rows = information.whitened([piece], self.noise, self.estimate.state)[0]
+                piece = [replace(dwell, factor=part, count=count)]
+                rows = information.whitened(piece, self.noise.weights, self.linearised_at)[0]
                 factor = information.update(before, rows).factor
-                yield end_s, index, Estimate(*information.solve(factor, nominal_state))
+                extra = extra_before + considered(self.noise, *_means(piece), self.linearised_at)[0]
+                yield end_s, index, _estimate(factor, nominal_state, extra)
 
 
 @dataclass
@@ -227,13 +233,14 @@ def evaluate(dwells: list[DwellFactor], bench: Bench, settings: Settings) -> Cal
     nominal_state = paper.state_of(nominal)
     walks = _walk_variances(dwells, settings)
     noise, state = _noise_and_state(dwells, bench, nominal_state)
-    rows = information.whitened(dwells, noise, state)
+    rows = information.whitened(dwells, noise.weights, state)
     steps = information.run(information.start(settings.prior, nominal, nominal_state), rows, walks)
-    final = Estimate(*information.solve(steps[-1].factor, nominal_state))
-    means = np.array([dwell.means for dwell in dwells])
+    extra = considered(noise, *_means(dwells), state)
+    final = _estimate(steps[-1].factor, nominal_state, extra.sum(axis=0))
+    means, _ = _means(dwells)
     residuals = means[:, 4:] - _predicted(means, final.state)
-    visits = _visits(dwells, steps, residuals, noise, nominal_state, settings, bench)
-    held_out, floor = _held_out(dwells, rows, noise, state, nominal_state)
+    visits = _visits(dwells, steps, residuals, noise, extra, nominal_state, settings, bench)
+    held_out, floor = _held_out(dwells, rows, extra, noise, state, nominal_state)
     judged = _consistency(dwells, noise, state)
     return Calibration(
         bench, settings, noise, state, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), held_out, floor,
@@ -250,7 +257,7 @@ def filterpy_estimate(
     counted = {visit.dwell.number for visit in result.visits}
     posterior = kalman.estimate(
         (rows for rows in Pass(source, result.settings).rows() if rows.dwell in counted),
-        result.noise,
+        result.noise.weights,
         paper.state_of(nominal),
         None if prior.diffuse else prior.covariance(nominal),
         result.linearised_at,
@@ -258,7 +265,7 @@ def filterpy_estimate(
         (lambda elapsed_s: np.full(3, q**2 * elapsed_s)) if q else None,
         form,
     )
-    return Estimate(posterior.state, posterior.covariance, result.estimate.undetermined)
+    return result.considering(posterior.state, posterior.covariance)
 
 
 def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> None:
@@ -304,7 +311,7 @@ def _noise_and_state(dwells: list[DwellFactor], bench: Bench, nominal_state: Flo
     within = within_dwells(dwells)
     noise, state = within, nominal_state
     for _ in range(3):
-        rows = information.whitened(dwells, noise, state)
+        rows = information.whitened(dwells, noise.weights, state)
         empty = information.start(Prior(), nominal_state, nominal_state)
         factor = information.update(empty, rows.reshape(-1, STATE_COUNT + 1)).factor
         state = information.solve(factor, nominal_state)[0]
@@ -319,39 +326,41 @@ def _walk_variances(dwells: list[DwellFactor], settings: Settings) -> Floats:
     return np.repeat(settings.walk_mps2_per_sqrt_s**2 * gaps[:, None], 3, axis=1)
 
 
+def _means(dwells: list[DwellFactor]) -> tuple[Floats, Floats]:
+    """Mean regressors and readings (D, 7) of the dwells, and their counts (D,)."""
+    return np.array([dwell.means for dwell in dwells]), np.array([dwell.count for dwell in dwells], float)
+
+
+def _estimate(factor: Floats, nominal_state: Floats, extra: Floats) -> Estimate:
+    """The estimate of a factor, its covariance P enlarged to P + P B P by what is considered, B = ``extra`` (12, 12)."""
+    state, covariance, undetermined = information.solve(factor, nominal_state)
+    return Estimate(state, covariance + covariance @ extra @ covariance, undetermined)
+
+
 def _predicted(means: Floats, state: Floats) -> Floats:
     """Mean readings (..., 3) of dwells with mean regressors (..., 4+)."""
     sensitivity = state.reshape(3, 4)
     return means[..., 1:4] @ sensitivity[:, :3].T + sensitivity[:, 3]
 
 
-def _mean_rows(means: Floats) -> Floats:
-    """H (..., 3, 12) of the mean readings of dwells."""
-    out = np.zeros((*means.shape[:-1], 3, STATE_COUNT))
-    for i in range(3):
-        out[..., i, 4 * i : 4 * i + 3] = means[..., 1:4]
-        out[..., i, 4 * i + 3] = 1.0
-    return out
-
-
 def _visits(
     dwells: list[DwellFactor], steps: list[Step], residuals: Floats, noise: Noise,
-    nominal_state: Floats, settings: Settings, bench: Bench,
+    extra: Floats, nominal_state: Floats, settings: Settings, bench: Bench,
 ) -> tuple[Visit, ...]:  # fmt: skip
-    means = np.array([dwell.means for dwell in dwells])
-    counts = np.array([dwell.count for dwell in dwells], float)
+    means, counts = _means(dwells)
     own = mean_covariances(noise, means, counts, nominal_state)
+    extra = np.cumsum(extra, axis=0)
     walks = _walk_variances(dwells, settings)
     before = information.start(settings.prior, paper.nominal(bench.nominal), nominal_state)
     visits = list[Visit]()
     for k, (dwell, step) in enumerate(zip(dwells, steps, strict=True)):
-        state, covariance, undetermined = information.solve(information.predict(before, walks[k]), nominal_state)
+        known = _estimate(information.predict(before, walks[k]), nominal_state, extra[k - 1] if k else 0.0 * extra[0])
         innovation, sigma = np.full(3, np.nan), np.full(3, np.nan)
-        if not undetermined.size:
-            rows = _mean_rows(means[k])
-            innovation = means[k, 4:] - _predicted(means[k], state)
-            sigma = np.sqrt(np.diag(rows @ covariance @ rows.T + own[k]))
-        estimate = Estimate(*information.solve(step.factor, nominal_state))
+        if not known.undetermined.size:
+            rows = mean_design(means[k])
+            innovation = means[k, 4:] - _predicted(means[k], known.state)
+            sigma = np.sqrt(np.diag(rows @ known.covariance @ rows.T + own[k]))
+        estimate = _estimate(step.factor, nominal_state, extra[k])
         visits.append(Visit(dwell, estimate, step.nis, step.dof, innovation, sigma, residuals[k]))
         before = step.factor
     return tuple(visits)
@@ -390,7 +399,7 @@ def orientations(dwells: list[DwellFactor]) -> list[list[int]]:
 
 
 def _held_out(
-    dwells: list[DwellFactor], rows: Floats, noise: Noise, state: Floats, nominal_state: Floats
+    dwells: list[DwellFactor], rows: Floats, extra: Floats, noise: Noise, state: Floats, nominal_state: Floats
 ) -> tuple[float | None, float | None]:
     """Rms error of the dwell means of orientations left out of the fit, and the rms the noise alone would give.
 
@@ -406,14 +415,14 @@ def _held_out(
         tails.insert(0, information.update(tails[0], factor).factor)
     errors, expected = list[Floats](), list[Floats]()
     for group, head, tail in zip(groups, heads, tails, strict=True):
-        left, covariance, undetermined = information.solve(information.update(head, tail).factor, nominal_state)
-        if undetermined.size:
+        rest = extra.sum(axis=0) - extra[group].sum(axis=0)
+        left = _estimate(information.update(head, tail).factor, nominal_state, rest)
+        if left.undetermined.size:
             return None, None
-        means = np.array([dwells[k].means for k in group])
-        counts = np.array([dwells[k].count for k in group], float)
-        design = _mean_rows(means)
-        spread = design @ covariance @ np.swapaxes(design, 1, 2) + mean_covariances(noise, means, counts, state)
-        errors.append(((means[:, 4:] - _predicted(means, left)) ** 2).ravel())
+        means, counts = _means([dwells[k] for k in group])
+        design = mean_design(means)
+        spread = design @ left.covariance @ np.swapaxes(design, 1, 2) + mean_covariances(noise, means, counts, state)
+        errors.append(((means[:, 4:] - _predicted(means, left.state)) ** 2).ravel())
         expected.append(np.einsum("dii->di", spread).ravel())
     return float(np.sqrt(np.mean(np.concatenate(errors)))), float(np.sqrt(np.mean(np.concatenate(expected))))
 
@@ -441,6 +450,12 @@ def _remarks(
     if noise.inflation.max() > 1.5:
         kappa = ", ".join(f"{value:.3g}" for value in noise.inflation)
         yield f"the noise within a dwell is correlated: sigmas allow for it by inflating its variance by {kappa}."
+    if not noise.checked and noise.scatter_mps2.any() and not noise.scatter_stated:
+        yield (
+            f"{len(orientations(dwells))} orientations cannot tell a setting error of the angles from scatter of the "
+            f"sensors: dwells are weighted alike and their whole misfit ({noise.scatter_mps2[0]:.2g} m/s^2) counts in "
+            "every sigma; at least 12 spread orientations would tell."
+        )
     if not noise.setting_stated and noise.setting_rad > 0:
         yield (
             f"angle_sigma_deg was not stated; {np.degrees(noise.setting_rad):.2g} deg was estimated from the misfit "

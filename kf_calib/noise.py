@@ -28,7 +28,12 @@ _SIGNIFICANT = 5.41  # 1 % point of the likelihood ratio of a variance against z
 
 @dataclass(frozen=True)
 class Noise:
-    """sigma_mps2, inflation, scatter_mps2: (3,) each; setting_rad; which of the dwell parts were stated."""
+    """sigma_mps2, inflation, scatter_mps2: (3,) each; setting_rad; which of the dwell parts were stated.
+
+    checked: enough orientations to check that a setting error only turns the specific force. The estimate then leans
+    on the readings along it, which no rotation changes; otherwise dwells weigh by their scatter alone, and the
+    setting error is *considered* (Schmidt): it enlarges the covariance and moves no estimate.
+    """
 
     sigma_mps2: Floats
     inflation: Floats
@@ -36,6 +41,7 @@ class Noise:
     scatter_mps2: Floats = None  # type: ignore[assignment]  # set in __post_init__
     setting_stated: bool = False
     scatter_stated: bool = False
+    checked: bool = True
 
     def __post_init__(self) -> None:
         if self.scatter_mps2 is None:  # pyright: ignore[reportUnnecessaryComparison]
@@ -45,6 +51,11 @@ class Noise:
     def effective_sigma_mps2(self) -> Floats:
         """Sigma (3,) of white readings whose mean is as uncertain as that of the true, correlated ones."""
         return np.maximum(self.sigma_mps2, FLOOR_MPS2) * np.sqrt(self.inflation)
+
+    @property
+    def weights(self) -> Noise:
+        """The noise by which dwells are weighted."""
+        return self if self.checked else replace(self, setting_rad=0.0)
 
     @property
     def dwell_sigmas(self) -> Floats:
@@ -111,39 +122,60 @@ def with_dwell_parts(
     """The noise with its dwell parts: as stated, else estimated by restricted maximum likelihood where significant.
 
     Of the parts not stated, the combination with the best likelihood is taken, each part charged for by the 1 % point
-    of its ratio against zero. Fewer than 6 degrees of freedom between dwells: nothing is estimated.
+    of its ratio against zero. Fewer than 6 degrees of freedom between dwells: nothing is estimated. Too few
+    orientations to tell a setting error from the sensors' scatter: the whole misfit counts as scatter.
     """
-    from scipy.optimize import minimize
     from scipy.special import chdtrc
 
+    means = np.array([dwell.means for dwell in dwells])
+    counts = np.array([dwell.count for dwell in dwells], float)
     stated = replace(
         within,
-        setting_rad=np.radians(angle_sigma_deg or 0.0),
+        setting_rad=float(np.radians(angle_sigma_deg or 0.0)),
         scatter_mps2=np.full(3, scatter_mps2 or 0.0),
         setting_stated=angle_sigma_deg is not None,
         scatter_stated=scatter_mps2 is not None,
+        checked=_setting_is_checked(means),
     )
-    means = np.array([dwell.means for dwell in dwells])
-    counts = np.array([dwell.count for dwell in dwells], float)
     freedom = 3 * len(dwells) - 12
     if freedom < 6 or (stated.setting_stated and stated.scatter_stated):
         return stated
-    if chdtrc(freedom, _misfit(stated, means, counts, state)) > 0.1:  # nothing to explain: spares the search
+    if chdtrc(freedom, _misfit(stated.weights, means, counts, state)) > 0.1:  # nothing to explain: spares the search
         return stated
-
-    def likelihood(logs: Floats, parts: tuple[str, ...]) -> float:
-        return restricted_log_likelihood(_unpack(stated, logs, parts), means, counts, state)
-
-    best, best_score = stated, likelihood(np.zeros(0), ())
-    free = (() if stated.setting_stated else ("setting",), () if stated.scatter_stated else ("scatter",))
-    for parts in {free[0], free[1], free[0] + free[1]} - {()}:
-        begin = _spread(means, parts)
-        found = minimize(lambda logs, p=parts: -likelihood(logs, p), begin, method="Nelder-Mead",
-                         options={"xatol": 1e-3, "fatol": 1e-4, "maxiter": 600})  # fmt: skip
-        score = -float(found.fun) - 0.5 * _SIGNIFICANT * len(begin)
+    if not stated.checked:
+        free = [()] if stated.scatter_stated else [("common",)]
+    else:
+        setting = () if stated.setting_stated else ("setting",)
+        scatter = () if stated.scatter_stated else ("scatter",)
+        free = [setting, scatter, setting + scatter]
+    best, best_score = stated, restricted_log_likelihood(stated.weights, means, counts, state)
+    for parts in {parts for parts in free if parts}:
+        found, score = _most_likely(stated, parts, means, counts, state)
         if score > best_score:
-            best, best_score = _unpack(stated, found.x, parts), score
+            best, best_score = found, score
     return best
+
+
+def _setting_is_checked(means: Floats) -> bool:
+    """Whether the readings along f overdetermine what they see by 3 or more: f^T S f + f^T b, 9 numbers at most."""
+    x, y, z = means[:, 1:4].T / np.linalg.norm(means[:, 1:4], axis=1).mean()
+    design = np.column_stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z])
+    directions = len(np.unique(np.round(design[:, 6:], 2), axis=0))
+    return directions - int(np.linalg.matrix_rank(design, tol=0.02)) >= 3
+
+
+def _most_likely(
+    stated: Noise, parts: tuple[str, ...], means: Floats, counts: Floats, state: Floats
+) -> tuple[Noise, float]:
+    """The noise with the most likely sizes of ``parts``, and its log-likelihood less the charge for them."""
+    from scipy.optimize import minimize
+
+    def cost(logs: Floats) -> float:
+        return -restricted_log_likelihood(_unpack(stated, logs, parts).weights, means, counts, state)
+
+    begin = _spread(means, parts)
+    found = minimize(cost, begin, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4, "maxiter": 600})
+    return _unpack(stated, found.x, parts), -float(found.fun) - 0.5 * _SIGNIFICANT * len(begin)
 
 
 def _spread(means: Floats, parts: tuple[str, ...]) -> Floats:
@@ -154,7 +186,7 @@ def _spread(means: Floats, parts: tuple[str, ...]) -> Floats:
     gravity = np.linalg.norm(columns[:, 1:], axis=1).mean()
     logs = ([np.log(size.mean() / gravity)] if "setting" in parts else []) + (
         list(np.log(size)) if "scatter" in parts else []
-    )
+    ) + ([np.log(size.mean())] if "common" in parts else [])
     return np.array(logs)
 
 
@@ -163,6 +195,8 @@ def _unpack(noise: Noise, logs: Floats, parts: tuple[str, ...]) -> Noise:
         noise = replace(noise, setting_rad=float(np.exp(logs[0])))
     if "scatter" in parts:
         noise = replace(noise, scatter_mps2=np.exp(logs[-3:]))
+    if "common" in parts:
+        noise = replace(noise, scatter_mps2=np.full(3, np.exp(logs[-1])))
     return noise
 
 
@@ -171,10 +205,37 @@ def mean_covariances(noise: Noise, means: Floats, counts: Floats, state: Floats)
 
     diag(kappa sigma_w^2 / n + sigma_s^2) + sigma_alpha^2 S (|f|^2 I - f f^T) S^T, S the sensitivities (rows).
     """
+    own = noise.effective_sigma_mps2**2 / counts[:, None] + noise.scatter_mps2**2
+    return own[:, :, None] * np.eye(3) + noise.setting_rad**2 * _turned(means, state)
+
+
+def _turned(means: Floats, state: Floats) -> Floats:
+    """Covariance (D, 3, 3) of the mean readings per unit variance of a random small rotation."""
     force, sensitivity = means[:, 1:4], state.reshape(3, 4)[:, :3]
     across = np.einsum("di,di->d", force, force)[:, None, None] * np.eye(3) - force[:, :, None] * force[:, None, :]
-    own = noise.effective_sigma_mps2**2 / counts[:, None] + noise.scatter_mps2**2
-    return own[:, :, None] * np.eye(3) + noise.setting_rad**2 * sensitivity @ across @ sensitivity.T
+    return sensitivity @ across @ sensitivity.T
+
+
+def considered(noise: Noise, means: Floats, counts: Floats, state: Floats) -> Floats:
+    """What each dwell's setting error adds to the information about the gain, (D, 12, 12); zeros where it is weighted.
+
+    With weights W and design A, the covariance is P + P B P, B = sum A^T W dV W A, dV the setting error's part: the
+    Schmidt-Kalman filter's covariance (Bierman, 1977, ch. VIII), in batch terms a sandwich.
+    """
+    if noise.checked or not noise.setting_rad:
+        return np.zeros((len(means), 12, 12))
+    weight = 1.0 / np.einsum("dii->di", mean_covariances(noise.weights, means, counts, state))
+    design = weight[:, :, None] * mean_design(means)
+    return noise.setting_rad**2 * np.swapaxes(design, 1, 2) @ _turned(means, state) @ design
+
+
+def mean_design(means: Floats) -> Floats:
+    """A (..., 3, 12): the mean readings of dwells with mean regressors (..., 4+) on the affine state."""
+    out = np.zeros((*means.shape[:-1], 3, 12))
+    for i in range(3):
+        out[..., i, 4 * i : 4 * i + 3] = means[..., 1:4]
+        out[..., i, 4 * i + 3] = 1.0
+    return out
 
 
 def _misfit(noise: Noise, means: Floats, counts: Floats, state: Floats) -> float:
@@ -193,9 +254,6 @@ def restricted_log_likelihood(noise: Noise, means: Floats, counts: Floats, state
 def _between(noise: Noise, means: Floats, counts: Floats, state: Floats) -> tuple[Floats, float]:
     """Triangle (13, 13) of the whitened dwell means [A | z], and the sum of log|V_d|^(1/2)."""
     root = np.linalg.cholesky(mean_covariances(noise, means, counts, state))
-    design = np.zeros((len(means), 3, 13))
-    for i in range(3):
-        design[:, i, 4 * i : 4 * i + 4] = means[:, :4]
-        design[:, i, 12] = means[:, 4 + i]
+    design = np.concatenate([mean_design(means), means[:, 4:, None]], axis=2)
     upper = np.linalg.qr(np.linalg.solve(root, design).reshape(-1, 13), mode="r")
     return upper, float(np.log(np.einsum("dii->di", root)).sum())

@@ -1,0 +1,101 @@
+"""The same recording three ways: block engine, filterpy sample by sample, batch least squares.
+
+The three agree to rounding on a diffuse prior without process noise. Where they may differ, and why: a stated prior
+and a walk of the biases are known to the filters only; the gate is shared by all three.
+"""
+
+from __future__ import annotations
+
+import time
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from kf_calib.batch import least_squares
+from kf_calib.calibration import Calibration, Estimate, Pass, Settings, calibrate, filterpy_estimate
+from kf_calib.samples import Floats, Source
+
+
+Extra = TypeVar("Extra")
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way of estimating: wall seconds, peak memory in MB (numpy's and Python's), distance from the block engine.
+
+    max_difference_sigma: largest |difference| of the twelve parameters in sigma; max_relative_variance: of diag P.
+    """
+
+    estimate: Estimate
+    wall_s: float
+    peak_mb: float
+    max_difference_sigma: float = 0.0
+    max_relative_variance: float = 0.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    result: Calibration
+    ways: dict[str, Way]
+    remarks: tuple[str, ...]
+
+    @property
+    def max_difference_sigma(self) -> float:
+        return max(way.max_difference_sigma for way in self.ways.values())
+
+
+def compare(source: Source, settings: Settings | None = None) -> Comparison:
+    """Run all three ways, each over the source from its start, and measure them."""
+    settings = replace(settings or Settings(), engine="block")
+    result, block = _measured(lambda: (done := calibrate(source, settings), done.estimate))
+
+    def batch() -> tuple[None, Estimate]:
+        counted = {visit.dwell.number for visit in result.visits}
+        rows = (rows for rows in Pass(source, settings).rows() if rows.dwell in counted)
+        return None, result.considering(*least_squares(rows, result.noise.weights, result.linearised_at))
+
+    ways = {
+        "block": block,
+        "filterpy": _measured(lambda: (None, filterpy_estimate(source, result)))[1],
+        "batch": _measured(batch)[1],
+    }
+    seen = ~result.estimate.unseen
+    ways = {name: _against(way, block.estimate, seen) for name, way in ways.items()}
+    return Comparison(result, ways, tuple(_remarks(settings, result)))
+
+
+def _measured(run: Callable[[], tuple[Extra, Estimate]]) -> tuple[Extra, Way]:
+    tracemalloc.start()
+    begin = time.perf_counter()
+    extra, estimate = run()
+    wall_s = time.perf_counter() - begin
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return extra, Way(estimate, wall_s, peak / 1e6)
+
+
+def _against(way: Way, reference: Estimate, seen: Floats) -> Way:
+    sigma = np.sqrt(np.diag(reference.parameter_covariance))
+    difference = np.abs(way.estimate.parameters - reference.parameters) / sigma
+    variance = np.abs(np.diag(way.estimate.covariance) / np.diag(reference.covariance) - 1)
+    return replace(
+        way,
+        max_difference_sigma=float(difference[seen].max(initial=0.0)),
+        max_relative_variance=float(variance[seen].max(initial=0.0)),
+    )
+
+
+def _remarks(settings: Settings, result: Calibration) -> list[str]:
+    said = []
+    if not settings.prior.diffuse:
+        said.append("a prior was stated: the filters use it, batch least squares does not, so it may differ.")
+    if settings.walk_mps2_per_sqrt_s:
+        said.append("the biases walk: the filters follow them, batch least squares holds them still, so it may differ.")
+    if result.tally.gated:
+        said.append(f"the gate rejected {result.tally.gated} readings, the same ones for all three.")
+    if not said:
+        said.append("diffuse prior, no process noise, the same gate: the three may differ by rounding only.")
+    return said

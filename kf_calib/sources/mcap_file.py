@@ -1,0 +1,498 @@
+"""An MCAP file read in bulk: whole chunks of records, whatever state the file is in.
+
+A file is a sequence of records (opcode u8, length u64, content), most of them packed into chunks with a checksum.
+A recorder that was killed leaves no footer; a failing disk flips bits. Everything whole is read, everything lost is
+told in one sentence through ``warn``. Where the summary at the file's end is whole (it has a checksum of its own), its
+list of chunks leads past damage; without it nothing behind a damaged length can be found.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from io import BytesIO
+from itertools import accumulate
+from pathlib import Path
+from typing import IO, TypeVar
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Header, MetadataIndex, Schema, Statistics
+from numpy.typing import NDArray
+
+from kf_calib.errors import InputError
+
+MAGIC = b"\x89MCAP0\r\n"
+HEAD = struct.Struct("<BQ")  # opcode, length of the content
+MESSAGE_FIELDS = 22  # channel u16, sequence u32, log time u64, publish time u64; then the message itself
+
+Warn = Callable[[str], None]
+Integers = NDArray[np.int64]
+
+_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of its offsets, CRC
+_CHUNK = struct.Struct("<QQQII")  # first and last time, size and CRC uncompressed, length of the compression's name
+_CHUNK_LIMIT = 1 << 30
+_SUMMARY_LIMIT = 1 << 28
+_BLOCK = 1 << 20  # smaller chunks are joined: every block costs some hundred microseconds besides its messages
+_PIECE = 1 << 20
+_AHEAD = 2
+_LONGEST_SPAN_S = 1e7  # a longer one is damage itself
+_MOST_KINDS = 16  # of record heads; beyond that, searching for them costs more than walking
+
+# What may stand in the data section, with the least length of its content
+_LEAST = {
+    Opcode.HEADER: 8, Opcode.SCHEMA: 14, Opcode.CHANNEL: 16, Opcode.MESSAGE: MESSAGE_FIELDS, Opcode.CHUNK: 40,
+    Opcode.MESSAGE_INDEX: 6, Opcode.ATTACHMENT: 36, Opcode.METADATA: 8, Opcode.DATA_END: 4,
+}  # fmt: skip
+_FIRST_PRIVATE_OPCODE = 0x80
+_LOOSE = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA)
+_Record = TypeVar("_Record")
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+class DamagedError(Exception):
+    """A stretch of the file is not what MCAP says it must be; the text says how."""
+
+
+class _ExactStream(ReadDataStream):
+    def read(self, length: int) -> bytes:
+        data = super().read(length)
+        if len(data) != length:
+            raise EndOfFile
+        return data
+
+
+def parse(read: Callable[[ReadDataStream], _Record], content: bytes) -> _Record:
+    """The record in ``content``; ``read`` is its class's reader. Raises DamagedError unless it fits exactly."""
+    stream = _ExactStream(BytesIO(content))
+    try:
+        record = read(stream)
+    except (McapError, struct.error, ValueError) as error:
+        raise DamagedError("a record does not parse") from error
+    if stream.count != len(content):
+        raise DamagedError("a record is longer than what it holds")
+    return record
+
+
+def unpack_chunk(content: bytes) -> bytes:
+    """The records in the content of a chunk record. Raises DamagedError where size or checksum do not fit."""
+    _, _, size, crc, name_length = _CHUNK.unpack_from(content)
+    start = _CHUNK.size + name_length + 8
+    if start > len(content) or int.from_bytes(content[start - 8 : start], "little") != len(content) - start:
+        raise DamagedError("its lengths contradict each other")
+    if size > _CHUNK_LIMIT:
+        raise DamagedError(f"it claims to hold {size} bytes, the limit is {_CHUNK_LIMIT}")
+    data = _decompress(content[_CHUNK.size : start - 8], content[start:], size)
+    if len(data) != size:
+        raise DamagedError(f"it holds {len(data)} bytes in place of {size}")
+    if crc and zlib.crc32(data) != crc:
+        raise DamagedError("its checksum does not fit")
+    return data
+
+
+def _decompress(compression: bytes, data: bytes, size: int) -> bytes:
+    try:
+        match compression:
+            case b"":
+                return data
+            case b"zstd":
+                if zstandard.frame_content_size(data) not in (-1, size):  # the frame's claim is what gets allocated
+                    raise DamagedError("its sizes contradict each other")
+                return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+            case b"lz4":
+                return lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+            case _:
+                raise DamagedError(f"its compression {compression.decode(errors='replace')!r} is not known")
+    except (zstandard.ZstdError, RuntimeError, MemoryError) as error:
+        raise DamagedError("it does not decompress") from error
+
+
+@dataclass
+class Summary:
+    """What the end of a finished file tells of the whole; ``start`` is the byte where that end begins."""
+
+    start: int
+    schemas: list[Schema] = field(default_factory=list[Schema])
+    channels: list[Channel] = field(default_factory=list[Channel])
+    chunks: list[ChunkIndex] = field(default_factory=list[ChunkIndex])
+    metadata: list[MetadataIndex] = field(default_factory=list[MetadataIndex])
+    message_counts: dict[int, int] = field(default_factory=dict[int, int])
+
+    @classmethod
+    def read(cls, file: IO[bytes], size: int) -> Summary:
+        """The summary of a file of ``size`` bytes. Raises DamagedError where there is none or it is not whole."""
+        footer_start = size - _FOOTER.size - len(MAGIC)
+        if footer_start < len(MAGIC):
+            raise DamagedError("it has no footer")
+        file.seek(footer_start)
+        footer, magic = file.read(_FOOTER.size), file.read(len(MAGIC))
+        opcode, length, start, _, crc = _FOOTER.unpack(footer)
+        if magic != MAGIC or (opcode, length) != (Opcode.FOOTER, _FOOTER.size - HEAD.size):
+            raise DamagedError("it has no footer")
+        start = start or footer_start
+        if not footer_start - _SUMMARY_LIMIT <= start <= footer_start or start < len(MAGIC):
+            raise DamagedError("its footer is damaged")
+        file.seek(start)
+        content = file.read(footer_start - start)
+        if crc and zlib.crc32(footer[:-4], zlib.crc32(content)) != crc:
+            raise DamagedError("the checksum of its summary does not fit")
+        summary = cls(start)
+        summary._fill(content)
+        return summary
+
+    def _fill(self, content: bytes) -> None:
+        position = 0
+        while position < len(content):
+            opcode, record, position = _record_at(content, position)
+            match opcode:
+                case Opcode.SCHEMA:
+                    self.schemas.append(parse(Schema.read, record))
+                case Opcode.CHANNEL:
+                    self.channels.append(parse(Channel.read, record))
+                case Opcode.CHUNK_INDEX:
+                    self.chunks.append(parse(ChunkIndex.read, record))
+                case Opcode.METADATA_INDEX:
+                    self.metadata.append(parse(MetadataIndex.read, record))
+                case Opcode.STATISTICS:
+                    self.message_counts = parse(Statistics.read, record).channel_message_counts
+                case _:
+                    pass
+        self.chunks.sort(key=lambda index: index.chunk_start_offset)
+
+
+def _record_at(data: bytes, position: int) -> tuple[int, bytes, int]:
+    if position + HEAD.size > len(data):
+        raise DamagedError("a record has no room for its head")
+    opcode, length = HEAD.unpack_from(data, position)
+    start = position + HEAD.size
+    if start + length > len(data):
+        raise DamagedError("a record ends outside its section")
+    return opcode, data[start : start + length], start + length
+
+
+@dataclass(frozen=True)
+class Block:
+    """Records of the file as they lie in it: what some chunks hold, and what lies outside chunks, joined together.
+
+    borders: bytes of ``data`` where its parts end, ascending, the last one its size; damage does not spread over them.
+    end: byte of the file up to which it has been read.
+    """
+
+    data: bytes
+    borders: tuple[int, ...]
+    end: int
+
+
+class McapFile:
+    """An MCAP file on disk. ``summary`` is None where the file's end is missing or damaged: ``trouble`` says so."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.summary: Summary | None = None
+        self.trouble = ""
+        with self.open() as file:
+            self.size = file.seek(0, 2)
+            file.seek(0)
+            if not self.size:
+                raise InputError(f"{path} is empty: nothing was recorded in it.")
+            if file.read(len(MAGIC)) != MAGIC:
+                raise InputError(f"{path} is not an MCAP file (its first bytes differ): give a .mcap recording.")
+            try:
+                self.summary = Summary.read(file, self.size)
+            except DamagedError as damage:
+                self.trouble = f"{path} was not finished or has lost its end ({damage}): what is whole in it is used."
+
+    def open(self) -> IO[bytes]:
+        try:
+            return self.path.open("rb")
+        except FileNotFoundError:
+            raise InputError(f"{self.path} does not exist: check the path.") from None
+        except IsADirectoryError:
+            raise InputError(f"{self.path} is a directory: give a .mcap file in it.") from None
+        except OSError as error:
+            raise InputError(f"{self.path} cannot be read ({error.strerror}): check its permissions.") from error
+
+    def record_at(self, position: int) -> bytes:
+        """The content of the record at byte ``position``. Raises DamagedError where none is."""
+        with self.open() as file:
+            file.seek(position)
+            head = file.read(HEAD.size)
+            length = HEAD.unpack(head)[1] if len(head) == HEAD.size else self.size
+            if length > self.size - position - HEAD.size:
+                raise DamagedError("a record ends outside the file")
+            return file.read(length)
+
+    def blocks(self, warn: Warn) -> Iterator[Block]:
+        """Every whole stretch of records, from the start; ``warn`` is told what is lost. Raises InputError."""
+        with self.open() as file:
+            walk = _Walk(self, file, warn)
+            try:
+                yield from _ahead(walk.unpack, walk.parcels())
+            except OSError as error:
+                raise InputError(f"{self.path} cannot be read ({error.strerror}): check its medium.") from error
+            walk.compare_checksum()
+
+
+def _ahead(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
+    """``map(work, items)``, a few items ahead in a thread: unpacking and checksums leave the interpreter free."""
+    with ThreadPoolExecutor(max_workers=1) as worker:
+        coming: deque[Future[_Result]] = deque()
+        for item in items:
+            coming.append(worker.submit(work, item))
+            if len(coming) > _AHEAD:
+                yield coming.popleft().result()
+        while coming:
+            yield coming.popleft().result()
+
+
+@dataclass
+class _Parcel:
+    """Records (start, opcode, content) taken from the file to become one block of ``size`` bytes."""
+
+    records: list[tuple[int, int, bytes]] = field(default_factory=list[tuple[int, int, bytes]])
+    size: int = 0
+    end: int = 0
+
+
+class _Walk:
+    """One passage through the data section, keeping the checksum of all that it passed."""
+
+    def __init__(self, mcap: McapFile, file: IO[bytes], warn: Warn) -> None:
+        self.path = mcap.path
+        self.file = file
+        self.warn = warn
+        self.end = mcap.summary.start if mcap.summary else file.seek(0, 2)
+        self.chunks = {index.chunk_start_offset: index for index in mcap.summary.chunks} if mcap.summary else {}
+        self.chunk_starts = sorted(self.chunks)
+        self.indexed = mcap.summary is not None
+        self.position = file.seek(0)
+        self.crc = self.crc_before_end = self.stated_crc = 0
+        self.whole = True  # nothing lost so far
+        self.unchecked = False  # readings were passed that no chunk's checksum covers
+        self._take(len(MAGIC))
+
+    def parcels(self) -> Iterator[_Parcel]:
+        parcel = _Parcel()
+        for start, opcode, content in self._records():
+            if opcode != Opcode.CHUNK and opcode not in _LOOSE:
+                continue
+            parcel.records.append((start, opcode, content))
+            parcel.size += _CHUNK.unpack_from(content)[2] if opcode == Opcode.CHUNK else len(content)
+            if parcel.size >= _BLOCK:
+                parcel.end = self.position
+                yield parcel
+                parcel = _Parcel()
+        if parcel.records:
+            parcel.end = self.position
+            yield parcel
+
+    def unpack(self, parcel: _Parcel) -> Block:
+        parts: list[bytes] = []
+        for start, opcode, content in parcel.records:
+            if opcode == Opcode.CHUNK:
+                parts.append(self._unpack_chunk(start, content))
+            else:
+                parts.append(HEAD.pack(opcode, len(content)) + content)
+                self.unchecked |= opcode == Opcode.MESSAGE
+        borders = tuple(accumulate(map(len, parts)))
+        return Block(parts[0] if len(parts) == 1 else b"".join(parts), borders, parcel.end)
+
+    def compare_checksum(self) -> None:
+        """Checks what lies outside chunks, once all has been read and unpacked."""
+        if self.stated_crc and self.whole and self.crc_before_end != self.stated_crc:
+            self.warn(
+                f"{self.path}: data section CRC mismatch although all chunks are whole, so something between "
+                "them is damaged: check the bench's description."
+            )
+        if self.unchecked and not self.stated_crc:
+            self.warn(f"{self.path} carries no checksums of its readings: damage in it would pass unnoticed.")
+
+    def _records(self) -> Iterator[tuple[int, int, bytes]]:
+        """Start, opcode and content of record after record; attachments and kinds not known are passed over."""
+        while self.position < self.end:
+            start, limit, crc = self.position, self._limit(), self.crc
+            head = self._take(min(HEAD.size, limit - start))
+            opcode, length = HEAD.unpack(head.ljust(HEAD.size, b"\x00"))
+            if not self._plausible(start, opcode, length, limit):
+                self._lose(start, opcode, limit)
+                continue
+            if opcode == Opcode.ATTACHMENT or opcode >= _FIRST_PRIVATE_OPCODE or length > _CHUNK_LIMIT + _PIECE:
+                self._pass_over(opcode, length)
+                continue
+            content = self._take(length)
+            if opcode == Opcode.DATA_END:
+                self.crc_before_end, self.stated_crc = crc, int.from_bytes(content[:4], "little")
+                return
+            if not _consistent(opcode, content):
+                self.whole = False
+                self.warn(f"{self.path}: the record at byte {start} is damaged: its {length} bytes are passed over.")
+                continue
+            yield start, opcode, content
+
+    def _take(self, length: int) -> bytes:
+        data = self.file.read(length)
+        self.crc = zlib.crc32(data, self.crc)
+        self.position += length
+        return data
+
+    def _limit(self) -> int:
+        """Where the record at the present position must have ended: at the next chunk known of, or the end."""
+        later = bisect_right(self.chunk_starts, self.position)
+        return self.chunk_starts[later] if later < len(self.chunk_starts) else self.end
+
+    def _plausible(self, start: int, opcode: int, length: int, limit: int) -> bool:
+        if start in self.chunks and (opcode, length + HEAD.size) != (Opcode.CHUNK, self.chunks[start].chunk_length):
+            return False
+        known = opcode >= _FIRST_PRIVATE_OPCODE or length >= _LEAST.get(opcode, length + 1)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        return known and start + HEAD.size + length <= limit
+
+    def _pass_over(self, opcode: int, length: int) -> None:
+        if opcode != Opcode.ATTACHMENT:
+            start = self.position - HEAD.size
+            self.warn(f"{self.path}: the record of kind {opcode} at byte {start} ({length} bytes) is passed over.")
+        for taken in range(0, length, _PIECE):
+            self._take(min(_PIECE, length - taken))
+
+    def _lose(self, start: int, opcode: int, limit: int) -> None:
+        """Goes on at ``limit``, because nothing tells where the record at ``start`` ends."""
+        self.whole = False
+        count = limit - start
+        if self.indexed:
+            index = self.chunks.get(start)
+            span = _span(index.message_start_time, index.message_end_time) if index else ""
+            self.warn(f"{self.path} is damaged at byte {start}: {count} bytes{span} are lost.")
+        elif opcode in _LEAST or count < HEAD.size:
+            times = self.file.read(16) if opcode == Opcode.CHUNK else b""
+            span = _span(*struct.unpack("<QQ", times)) if len(times) == 16 else ""
+            self.warn(f"{self.path} breaks off in a record: the {count} bytes{span} from byte {start} on are lost.")
+        else:
+            self.warn(f"{self.path} is damaged at byte {start}: the {count} bytes from there to its end are lost.")
+        self.position = self.file.seek(limit)
+
+    def _unpack_chunk(self, start: int, content: bytes) -> bytes:
+        first_ns, last_ns, _, crc, _ = _CHUNK.unpack_from(content)
+        self.unchecked |= crc == 0
+        try:
+            return unpack_chunk(content)
+        except DamagedError as damage:
+            self.whole = False
+            lost = f"its {len(content)} bytes{_span(first_ns, last_ns)} are lost"
+            self.warn(f"{self.path}: the chunk at byte {start} is damaged ({damage}): {lost}.")
+            return b""
+
+
+def _consistent(opcode: int, content: bytes) -> bool:
+    if opcode == Opcode.MESSAGE_INDEX:
+        return int.from_bytes(content[2:6], "little") == len(content) - 6
+    try:
+        return opcode != Opcode.HEADER or bool(parse(Header.read, content))
+    except DamagedError:
+        return False
+
+
+def _span(first_ns: int, last_ns: int) -> str:
+    seconds = (last_ns - first_ns) / 1e9
+    return f", about {seconds:.3g} s of readings," if 0 <= seconds < _LONGEST_SPAN_S else ""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Messages of one channel and one length: byte of the block where each starts (n,), bytes that each takes."""
+
+    channel: int
+    at: Integers
+    size: int
+
+
+@dataclass(frozen=True)
+class Messages:
+    """What a block holds: messages, opcode and content of other records, and how many bytes make no sense."""
+
+    groups: list[Group]
+    others: list[tuple[int, bytes]]
+    lost: int
+
+
+_MESSAGE = int(Opcode.MESSAGE)  # a plain int: comparing a whole block with an enum would widen it first
+_HEADS = np.dtype(
+    {"names": ["length", "channel"], "formats": ["<i8", "<u2"], "offsets": [1, 9], "itemsize": HEAD.size + 2}
+)
+
+
+class MessageFinder:
+    """Finds the messages of block after block.
+
+    The kinds of record head (length and channel) met before are searched for in the whole block at once. What is
+    found is right if each record ends where the next begins, from the block's first byte to its last; if not, the
+    block is walked through record by record. The file's own message index is not needed, and being covered by no
+    chunk's checksum it could not be trusted without the same proof.
+    """
+
+    def __init__(self) -> None:
+        self._known: list[int] = []
+
+    def __call__(self, block: Block) -> Messages:
+        return self._search(block.data) or self._walk(block.data, block.borders)
+
+    def _search(self, data: bytes) -> Messages | None:
+        room = len(data) - (HEAD.size + MESSAGE_FIELDS) + 1
+        if not self._known or room <= 0:
+            return None
+        start = np.flatnonzero(np.frombuffer(data, np.uint8)[:room] == _MESSAGE)
+        key = _keys(data, start)
+        is_kind = [key == known for known in self._known]
+        found = np.logical_or.reduce(is_kind)
+        first, end = start[found], start[found] + HEAD.size + (key[found] >> _CHANNEL_BITS)
+        if not len(first) or first[0] != 0 or end[-1] != len(data) or np.any(first[1:] != end[:-1]):
+            return None
+        groups = [_group(known, start[mask]) for known, mask in zip(self._known, is_kind, strict=True)]
+        return Messages(groups, others=[], lost=0)
+
+    def _walk(self, data: bytes, borders: tuple[int, ...]) -> Messages:
+        starts: list[int] = []
+        others: list[tuple[int, bytes]] = []
+        position = lost = 0
+        for border in borders:
+            while position < border:
+                opcode, length = HEAD.unpack_from(data, position) if position + HEAD.size <= border else (0, 0)
+                content = position + HEAD.size
+                if not opcode or content + length > border or (opcode == _MESSAGE and length < MESSAGE_FIELDS):
+                    lost += border - position
+                    break
+                if opcode == _MESSAGE:
+                    starts.append(position)
+                else:
+                    others.append((opcode, data[content : content + length]))
+                position = content + length
+            position = border
+        start = np.array(starts, np.int64)
+        key = _keys(data, start)
+        kinds: list[int] = np.unique(key).tolist()
+        self._known = sorted({*self._known, *kinds})
+        if len(self._known) > _MOST_KINDS:
+            self._known = []
+        return Messages([_group(kind, start[key == kind]) for kind in kinds], others, lost)
+
+
+_CHANNEL_BITS = 16
+
+
+def _keys(data: bytes, start: Integers) -> Integers:
+    """Length and channel of the records at ``start`` in one number each."""
+    heads = np.ndarray((max(len(data) - _HEADS.itemsize + 1, 0),), _HEADS, data, strides=(1,))
+    return (heads["length"][start] << _CHANNEL_BITS) | heads["channel"][start]
+
+
+def _group(key: int, start: Integers) -> Group:
+    length, channel = key >> _CHANNEL_BITS, key & (1 << _CHANNEL_BITS) - 1
+    return Group(channel, start + (HEAD.size + MESSAGE_FIELDS), length - MESSAGE_FIELDS)

@@ -1,0 +1,166 @@
+"""Writes batches to an MCAP recording (FORMAT.md) that survives its writer being killed at any moment."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Self
+
+import numpy as np
+from mcap.writer import Writer
+
+from kf_calib.bench import Bench
+from kf_calib.errors import InputError, KfCalibError
+from kf_calib.samples import Batch, Stream
+from kf_calib.sources import cdr
+from kf_calib.sources.recording import (
+    ACCEL_TOPIC,
+    ANGLES_TOPIC,
+    ATTITUDE_TOPIC,
+    BENCH_RECORD,
+    CHECKSUM_KEY,
+    TEMPERATURE_TOPIC,
+    bench_checksum,
+)
+
+_AXIS_NAMES = {2: ("outer", "inner"), 3: ("outer", "middle", "inner")}
+
+
+class Recorder:
+    """An open recording of ``bench``; a context manager that finishes the file.
+
+    flush_s: a write that comes this long (wall clock) after the last one brought to the disk is brought there too.
+    chunk_size: bytes of readings packed into one chunk at most.
+    Raises InputError where the file exists (unless ``overwrite``) or cannot be made, KfCalibError where it cannot be
+    written on; what was written till then stays readable.
+    """
+
+    def __init__(
+        self,
+        path: str | PathLike[str],
+        bench: Bench,
+        *,
+        flush_s: float = 1.0,
+        chunk_size: int = 1 << 20,
+        overwrite: bool = False,
+    ) -> None:
+        self.path = Path(path)
+        self._file: IO[bytes] | None = self._create(overwrite)
+        self._flush_s = flush_s
+        self._flushed_s = time.monotonic()
+        self._writer = Writer(self._file, chunk_size=chunk_size, enable_data_crcs=True)
+        names = _AXIS_NAMES.get(len(bench.axes)) or [f"axis{i}" for i in range(len(bench.axes))]
+        self._channels = (
+            _Channel(ACCEL_TOPIC, cdr.IMU, cdr.imu_message("accelerometer")),
+            _Channel(ANGLES_TOPIC, cdr.JOINT_STATE, cdr.joint_state_message("platform", names))
+            if bench.axes
+            else _Channel(ATTITUDE_TOPIC, cdr.QUATERNION, cdr.quaternion_message("platform")),
+            _Channel(TEMPERATURE_TOPIC, cdr.TEMPERATURE, cdr.temperature_message("accelerometer")),
+        )
+        with self._storing():
+            self._writer.start(profile="ros2")
+            metadata = bench.to_metadata()
+            self._writer.add_metadata(BENCH_RECORD, metadata | {CHECKSUM_KEY: bench_checksum(metadata)})
+            for channel in self._channels[:2]:  # so that even a recording without samples says what it is
+                channel.register(self._writer)
+            self._sync()
+
+    def write(self, batch: Batch) -> None:
+        """Adds the samples of ``batch`` in the order of their stamps. Raises InputError where they do not fit."""
+        streams = (batch.accel, batch.pose, batch.temperature)
+        messages: list[bytes] = []
+        ids: list[int] = []
+        for channel, stream in zip(self._channels, streams, strict=True):
+            if len(stream):
+                messages += self._pack(channel, stream)
+                ids += [channel.register(self._writer)] * len(stream)
+        stamps = np.concatenate([stream.time_ns for stream in streams])
+        order = np.argsort(stamps, kind="stable")
+        with self._storing():
+            for i, stamp in zip(order.tolist(), stamps[order].tolist(), strict=True):
+                self._writer.add_message(ids[i], log_time=stamp, data=messages[i], publish_time=stamp)
+            if time.monotonic() - self._flushed_s >= self._flush_s:
+                self._sync()
+
+    def end_dwell(self) -> None:
+        """Brings all samples so far to the disk: they are safe when this returns."""
+        with self._storing():
+            self._sync()
+
+    def close(self) -> None:
+        """Finishes the file. A second call does nothing."""
+        if self._file is None:
+            return
+        with self._storing():
+            self._writer.finish()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _create(self, overwrite: bool) -> IO[bytes]:
+        try:
+            return self.path.open("wb" if overwrite else "xb")
+        except FileExistsError:
+            raise InputError(f"{self.path} exists already: give another name, or --overwrite to replace it.") from None
+        except OSError as error:
+            raise InputError(f"{self.path} cannot be created ({error.strerror}): choose another place.") from error
+
+    def _pack(self, channel: _Channel, stream: Stream) -> list[bytes]:
+        try:
+            return cdr.pack(channel.kind, channel.template, stream)
+        except cdr.CdrError as error:
+            raise InputError(f"samples for {channel.topic} do not fit into {self.path}: {error}.") from error
+
+    def _sync(self) -> None:
+        if self._file is not None:
+            self._writer.flush()
+            os.fsync(self._file.fileno())
+            self._flushed_s = time.monotonic()
+
+    @contextmanager
+    def _storing(self) -> Iterator[None]:
+        """Gives the file up on any failure in here: the chunk in hand may be half there, what precedes it is whole."""
+        if self._file is None:
+            raise KfCalibError(f"{self.path} is closed: nothing more can be recorded in it.")
+        try:
+            yield
+        except BaseException as error:
+            file, self._file = self._file, None
+            with suppress(OSError):  # what is left in its buffer fails again
+                file.close()
+            if isinstance(error, OSError):
+                raise KfCalibError(
+                    f"{self.path} cannot be written on ({error.strerror}): it holds what was recorded till then; "
+                    "make room and record the rest into a new file."
+                ) from error
+            raise
+
+
+@dataclass
+class _Channel:
+    topic: str
+    kind: cdr.MessageType
+    template: bytes
+    id: int = 0
+
+    def register(self, writer: Writer) -> int:
+        """The channel's number in the file, made known there on first use."""
+        if not self.id:
+            schema = writer.register_schema(self.kind.name, "ros2msg", self.kind.schema.encode())
+            self.id = writer.register_channel(self.topic, "cdr", schema)
+        return self.id

@@ -1,0 +1,130 @@
+"""Results as text: Rich tables for a terminal, the same as plain text elsewhere."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from rich.console import Console, Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from kf_calib.calibration import Calibration, Parameter, orientations
+from kf_calib.comparison import Comparison
+
+_SHOWN = {"rad": ("arcsec", 180 * 3600 / math.pi), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
+_GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
+
+
+def symbol(name: str) -> str:
+    """``theta1`` as it is printed in the paper."""
+    for latin, greek in _GREEK.items():
+        name = name.replace(latin, greek)
+    return name
+
+
+def rounded(value: float, sigma: float) -> tuple[str, str]:
+    """Value and sigma as text, to two significant digits of sigma (GUM 7.2.6)."""
+    if not (math.isfinite(sigma) and sigma > 0):
+        return f"{value:.6g}", f"{sigma:.2g}"
+    decimals = max(0, 1 - math.floor(math.log10(sigma)))
+    return f"{value:.{decimals}f}", f"{sigma:.{decimals}f}"
+
+
+def _row(parameter: Parameter) -> tuple[str, str, str, str, str]:
+    if parameter.value is None or parameter.sigma is None:
+        return symbol(parameter.symbol), "not seen", "", "", ""
+    unit, factor = _SHOWN[parameter.unit]
+    deviation, sigma = rounded((parameter.value - parameter.nominal) * factor, parameter.sigma * factor)
+    whole, of = (np.degrees(parameter.value), np.degrees(parameter.sigma)) if parameter.unit == "rad" else (
+        parameter.value, parameter.sigma)  # fmt: skip
+    suffix = " deg" if parameter.unit == "rad" else ""
+    sign = "" if deviation.startswith("-") else "+"
+    return symbol(parameter.symbol), f"{rounded(whole, of)[0]}{suffix}", f"{sign}{deviation}", f"± {sigma}", unit
+
+
+def parameter_table(parameters: Sequence[Parameter]) -> Table:
+    """Value, deviation from nominal and sigma (1 sigma) of each parameter."""
+    table = Table(title="Parameters (1σ)", title_justify="left")
+    for heading in ("parameter", "value", "less nominal", "sigma", "unit"):
+        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
+    for k, parameter in enumerate(parameters):
+        table.add_row(*_row(parameter), end_section=k % 4 == 3)
+    return table
+
+
+def noise_table(result: Calibration) -> Table:
+    """The noise model, an accelerometer a column."""
+    noise, table = result.noise, Table(title="Noise (1σ)", title_justify="left")
+    for heading in ("", "accelerometer 1", "accelerometer 2", "accelerometer 3", "unit"):
+        table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
+    table.add_row("within a dwell", *(f"{value:.3g}" for value in noise.sigma_mps2), "m/s^2")
+    table.add_row("inflation by correlation", *(f"{value:.3g}" for value in noise.inflation), "of variance")
+    table.add_row(
+        f"dwell to dwell, {_origin(noise.scatter_stated)}", *(f"{value:.3g}" for value in noise.scatter_mps2), "m/s^2"
+    )
+    table.add_row(
+        f"setting of angles, {_origin(noise.setting_stated)}", *[f"{np.degrees(noise.setting_rad):.3g}"] * 3, "deg"
+    )
+    return table
+
+
+def _origin(stated: bool) -> str:
+    return "stated" if stated else "estimated"
+
+
+def verdict(result: Calibration) -> str:
+    """One sentence: does the model agree with the measurements, and by how much is it off where it was not fitted."""
+    judged = result.consistency
+    if judged.p_value is None:
+        text = "Nothing is left over to judge the model by."
+    else:
+        word = "agree" if judged.consistent else "DISAGREE"
+        text = f"Model and measurements {word} (p = {judged.p_value:.2g}, NIS/dof = {judged.nis_per_dof:.3g})."
+    if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2 is not None:
+        text += (
+            f" Orientations left out are predicted to {result.held_out_rms_mps2:.2g} m/s^2 rms; "
+            f"noise alone gives {result.held_out_floor_mps2:.2g}."
+        )
+    return text
+
+
+def summary(result: Calibration) -> RenderableType:
+    """What a replay prints."""
+    tally, dwells = result.tally, [visit.dwell for visit in result.visits]
+    head = (
+        f"{tally.used} of {tally.read} readings used, {len(dwells)} dwells in {len(orientations(dwells))} orientations "
+        f"({tally.moving} readings moving, {tally.settling} settling)"
+    )
+    parts: list[RenderableType] = [
+        head, parameter_table(list(result.parameters.values())), noise_table(result),
+        Text(verdict(result), style="bold green" if result.consistency.consistent else "bold yellow"),
+    ]  # fmt: skip
+    parts += [Text(f"Note: {warning}", style="yellow") for warning in result.warnings]
+    return Group(*parts)
+
+
+def comparison_table(compared: Comparison) -> RenderableType:
+    """What ``compare`` prints: each way's time, memory and largest difference from the block engine."""
+    table = Table(title="The same recording, three ways", title_justify="left")
+    for heading in ("way", "wall s", "peak MB", "largest difference, σ", "of diag P"):
+        table.add_column(heading, justify="left" if heading == "way" else "right")
+    for name, way in compared.ways.items():
+        table.add_row(
+            name, f"{way.wall_s:.3f}", f"{way.peak_mb:.1f}", f"{way.max_difference_sigma:.1e}",
+            f"{way.max_relative_variance:.1e}",
+        )  # fmt: skip
+    return Group(table, *(Text(f"Note: {sentence}") for sentence in compared.remarks))
+
+
+def plain(renderable: RenderableType, width: int = 110) -> str:
+    """As text without colour or control characters."""
+    out = io.StringIO()
+    Console(file=out, width=width, no_color=True, highlight=False).print(renderable)
+    return "\n".join(line.rstrip() for line in out.getvalue().splitlines())
+
+
+def plain_summary(result: Calibration) -> str:
+    return plain(summary(result))

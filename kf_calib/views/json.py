@@ -1,0 +1,85 @@
+"""Results as JSON objects, with the keys that outside programs rely on; NaN and infinity become null."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from kf_calib.calibration import Calibration, orientations
+from kf_calib.comparison import Comparison
+
+
+def replay_object(result: Calibration) -> dict[str, Any]:
+    """What ``replay --json`` prints."""
+    judged, noise, dwells = result.consistency, result.noise, [visit.dwell for visit in result.visits]
+    return _clean(
+        {
+            "samples": result.tally.used,
+            "dwells": len(dwells),
+            "orientations": len(orientations(dwells)),
+            "engine": result.settings.engine,
+            "model": [],
+            "parameters": [
+                {"symbol": p.symbol, "value": p.value, "sigma": p.sigma, "unit": p.unit, "nominal": p.nominal}
+                for p in result.parameters.values()
+            ],
+            "noise": {
+                "sigma_mps2": noise.sigma_mps2,
+                "inflation": noise.inflation,
+                "dwell_sigma_mps2": noise.scatter_mps2,
+                "dwell_sigma_stated": noise.scatter_stated,
+                "angle_sigma_deg": math.degrees(noise.setting_rad),
+                "angle_sigma_stated": noise.setting_stated,
+            },
+            "consistency": {
+                "consistent": judged.consistent,
+                "p_value": judged.p_value,
+                "nis_per_dof": judged.nis_per_dof,
+                "dof": judged.dof,
+            },
+            "residual_rms_mps2": result.residual_rms_mps2,
+            "held_out_rms_mps2": result.held_out_rms_mps2,
+            "held_out_floor_mps2": result.held_out_floor_mps2,
+            "counts": {key: value for key, value in vars(result.tally).items() if isinstance(value, int)},
+            "warnings": list(result.warnings),
+        }
+    )
+
+
+def compare_object(compared: Comparison) -> dict[str, Any]:
+    """What ``compare --json`` prints: parameters of each way beside its time, memory and distance."""
+    return _clean(
+        {
+            "max_difference_sigma": compared.max_difference_sigma,
+            "engines": {
+                name: {
+                    "wall_s": way.wall_s,
+                    "peak_mb": way.peak_mb,
+                    "max_difference_sigma": way.max_difference_sigma,
+                    "max_relative_variance": way.max_relative_variance,
+                    "values": way.estimate.parameters,
+                    "sigmas": way.estimate.sigma,
+                }
+                for name, way in compared.ways.items()
+            },
+            "parameters": [p.symbol for p in compared.result.parameters.values()],
+            "remarks": list(compared.remarks),
+            "warnings": list(compared.result.warnings),
+        }
+    )
+
+
+def _clean(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _clean(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [_clean(item) for item in value]
+    if isinstance(value, np.bool_ | bool):
+        return bool(value)
+    if isinstance(value, np.integer | int):
+        return int(value)
+    if isinstance(value, np.floating | float):
+        return float(value) if math.isfinite(value) else None
+    return value

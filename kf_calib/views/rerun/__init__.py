@@ -1,0 +1,67 @@
+"""The Rerun view of a replay: sigmas falling, axes and their uncertainty in the platform, innovations, correlations.
+
+A thin bridge: every number comes from the ``Calibration``, is scaled to a unit an engineer reads, and is sent in
+columns. Two timelines: ``bench_time`` (since the first sample; points within the dwells too) and ``orientation``
+(the count of dwells from 1; 0 is a stated prior). Angles are in arcsec, scale factors in ppm, biases, innovations in
+um/s^2. Where the orientations so far do not determine a parameter there is no point.
+
+Entities: ``parameters/ACCELEROMETER/SYMBOL/{log10_sigma,deviation,band}``, ``platform/...``, ``innovation/CHANNEL/{value,bound}``,
+``innovation/CHANNEL/in_sigma``, ``nis/{value,above,band}``, ``correlation/...``, ``bench/{dwell,pose/...}``, ``summary``.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import rerun as rr
+
+from kf_calib.calibration import Calibration
+from kf_calib.errors import InputError
+from kf_calib.views.rerun.correlation import log_correlation
+from kf_calib.views.rerun.layout import TABS, layout
+from kf_calib.views.rerun.names import BENCH_TIME, ORIENTATION
+from kf_calib.views.rerun.platform import log_platform
+from kf_calib.views.rerun.series import History, log_bench, log_innovations, log_nis, log_parameters
+from kf_calib.views.rerun.summary import summary
+
+__all__ = ["BENCH_TIME", "ORIENTATION", "TABS", "layout", "log", "save"]
+
+
+def save(result: Calibration, path: str | Path, timeline: str = BENCH_TIME, tab: str = TABS[0]) -> Path:
+    """Write the view of a run to an .rrd file that opens laid out, on ``timeline``, at the run's end, ``tab`` in front."""
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise InputError(f"the Rerun recording {path} cannot be written: there is no folder {path.parent}.")
+    # an identity of its own: two views written by one process would else be merged by the viewer
+    with _strict(), rr.RecordingStream("kf_calib", recording_id=uuid.uuid4()) as stream:
+        stream.save(path, default_blueprint=layout(result, timeline, tab))
+        log(result, stream)
+        stream.flush()
+        stream.disconnect()
+    return path
+
+
+def log(result: Calibration, stream: rr.RecordingStream) -> None:
+    """Send everything a run showed to a recording stream: a file, or a viewer that is open."""
+    with _strict():
+        log_parameters(History.of(result), stream)
+        log_platform(result, stream)
+        log_innovations(result.visits, stream)
+        log_nis(result.visits, stream)
+        log_correlation(result.visits, stream)
+        log_bench(result, stream)
+        stream.log("summary", rr.TextDocument(summary(result), media_type=rr.MediaType.MARKDOWN), static=True)
+
+
+@contextmanager
+def _strict() -> Iterator[None]:
+    """Mistakes in what is logged raise, rather than leave a hole in the view; the caller's mode is given back."""
+    before = rr.strict_mode()
+    rr.set_strict_mode(True)
+    try:
+        yield
+    finally:
+        rr.set_strict_mode(before)

@@ -1,0 +1,61 @@
+"""What the panels share: timelines, colours, labels and units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib import paper
+
+BENCH_TIME = "bench_time"
+ORIENTATION = "orientation"
+
+Colour = tuple[int, int, int]
+ACCELEROMETERS: tuple[Colour, Colour, Colour] = ((235, 115, 40), (40, 185, 130), (85, 160, 245))
+"""One colour an accelerometer in all panels: in the order of x, y, z, and told apart by colour-blind eyes."""
+PALE: tuple[Colour, Colour, Colour] = ((255, 190, 130), (150, 235, 195), (175, 215, 255))
+"""The same accelerometers' second angle."""
+GREY: Colour = (135, 135, 140)
+WHITE: Colour = (235, 235, 235)
+GIMBALS: tuple[Colour, ...] = ((205, 160, 255), (255, 160, 205), (225, 215, 130), (200, 200, 205))
+GOLD: Colour = (250, 210, 70)
+RED: Colour = (240, 50, 70)
+
+CHANNELS = ("a1", "a2", "a3")
+LABELS = dict(zip(paper.SYMBOLS, ("θ₁", "φ₁", "K₁", "b₁", "ν₁", "ν₂", "K₂", "b₂", "θ₃", "φ₃", "K₃", "b₃"), strict=True))
+MICRO = 1e6
+
+
+@dataclass(frozen=True)
+class Group:
+    """Parameters of one kind: what is shown is the SI value times ``per_si``, in ``unit``."""
+
+    title: str
+    unit: str
+    per_si: float
+    symbols: tuple[str, ...]
+
+
+def _of_unit(unit: str) -> tuple[str, ...]:
+    return tuple(symbol for symbol, own in zip(paper.SYMBOLS, paper.UNITS, strict=True) if own == unit)
+
+
+GROUPS = (
+    Group("angles", "arcsec", float(np.degrees(3600.0)), _of_unit("rad")),
+    Group("scale factors", "ppm", MICRO, _of_unit("1")),
+    Group("biases", "µm/s²", MICRO, _of_unit("m/s^2")),
+)
+GROUP_OF = {symbol: group for group in GROUPS for symbol in group.symbols}
+PER_SI = np.array([GROUP_OF[symbol].per_si for symbol in paper.SYMBOLS])
+
+
+def colour_of(symbol: str) -> Colour:
+    """The accelerometer's colour, paler for its second angle."""
+    accelerometer, place = divmod(paper.SYMBOLS.index(symbol), 4)
+    return PALE[accelerometer] if place == 1 else ACCELEROMETERS[accelerometer]
+
+
+def path_of(symbol: str) -> str:
+    """The parameter's entity; the accelerometer comes first, so that legends list one after the other."""
+    return f"parameters/a{paper.SYMBOLS.index(symbol) // 4 + 1}/{symbol}"

@@ -1,0 +1,189 @@
+"""What is a curve or a row of points: parameters and their sigmas, innovations, NIS, gimbal angles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from kf_calib import information, paper
+from kf_calib.calibration import Calibration, Estimate, Visit
+from kf_calib.samples import Floats
+from kf_calib.views.rerun.names import (
+    ACCELEROMETERS, BENCH_TIME, CHANNELS, GIMBALS, GREY, LABELS, MICRO, ORIENTATION, PER_SI, RED, WHITE, Colour, colour_of,
+    path_of,
+)  # fmt: skip
+
+EDGE = 0.015
+"""The view goes on for this part of the run after its end: the last points are not cut by the frame."""
+
+Counts = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class History:
+    """The parameters along the run, in shown units: deviation from nominal and sigma (n, 12), NaN where not seen.
+
+    ``orientation`` (n,) counts from 1, the prior has 0; ``whole`` (n,) tells the rows at which a dwell is complete.
+    """
+
+    elapsed_s: Floats
+    orientation: Counts
+    whole: NDArray[np.bool_]
+    deviation: Floats
+    sigma: Floats
+
+    @classmethod
+    def of(cls, result: Calibration) -> History:
+        steps = [(0.0, -1, _prior(result)), *result.trace()]
+        orientation = np.array([index for _, index, _ in steps]) + 1
+        sigma = np.array([estimate.sigma for _, _, estimate in steps])
+        deviation = np.array([estimate.parameters for _, _, estimate in steps]) - paper.nominal(result.bench.nominal)
+        return cls(
+            elapsed_s=np.array([elapsed_s for elapsed_s, _, _ in steps]),
+            orientation=orientation,
+            whole=np.append(np.diff(orientation) > 0, True),
+            deviation=np.where(np.isfinite(sigma), deviation, np.nan) * PER_SI,
+            sigma=sigma * PER_SI,
+        )
+
+
+def _prior(result: Calibration) -> Estimate:
+    nominal = paper.nominal(result.bench.nominal)
+    state = paper.state_of(nominal)
+    return Estimate(*information.solve(information.start(result.settings.prior, nominal, state), state))
+
+
+def times(elapsed_s: Floats, orientation: Counts | None = None) -> list[rr.TimeColumn]:
+    """Rows on ``bench_time``, and on ``orientation`` where given."""
+    nanoseconds = np.round(np.asarray(elapsed_s) * 1e9).astype("timedelta64[ns]")
+    bench_time = rr.TimeColumn(BENCH_TIME, duration=nanoseconds)
+    return [bench_time] if orientation is None else [bench_time, rr.TimeColumn(ORIENTATION, sequence=orientation)]
+
+
+def ends(visits: Sequence[Visit]) -> tuple[Floats, Counts]:
+    """When each dwell ended, and its number."""
+    return np.array([visit.dwell.end_s for visit in visits]), np.arange(1, len(visits) + 1)
+
+
+def log_parameters(history: History, stream: rr.RecordingStream) -> None:
+    """log10 of sigma, deviation from nominal, and the deviation less and plus one sigma."""
+    with np.errstate(divide="ignore"):
+        logs = np.log10(history.sigma)  # an exact prior has no logarithm, and no point
+    for k, symbol in enumerate(paper.SYMBOLS):
+        path, colour, label = path_of(symbol), colour_of(symbol), LABELS[symbol]
+        value, sigma = history.deviation[:, k], history.sigma[:, k]
+        _log_curve(stream, f"{path}/log10_sigma", history, logs[:, k])
+        _log_curve(stream, f"{path}/deviation", history, value)
+        _log_curve(stream, f"{path}/band", history, np.column_stack([value - sigma, value + sigma]))
+        _style(stream, f"{path}/log10_sigma", rr.SeriesLines(names=label, colors=colour, widths=1.5))
+        _style(stream, f"{path}/deviation", rr.SeriesLines(names=label, colors=colour, widths=2.0))
+        _style(stream, f"{path}/band", rr.SeriesLines(names=["−σ", "+σ"], colors=[GREY] * 2, widths=[1.0] * 2))
+
+
+def _log_curve(stream: rr.RecordingStream, path: str, history: History, values: Floats) -> None:
+    """Complete dwells on both timelines, points within a dwell in bench time only: one point an orientation."""
+    whole, elapsed_s = history.whole, history.elapsed_s
+    _send(stream, path, elapsed_s[whole], history.orientation[whole], values[whole])
+    _send(stream, path, elapsed_s[~whole], None, values[~whole])
+
+
+def _send(
+    stream: rr.RecordingStream, path: str, elapsed_s: Floats, orientation: Counts | None, values: Floats
+) -> None:
+    """One row of scalars (n,) or (n, k) a time; rows that are not finite are left out."""
+    rows = values.reshape(len(elapsed_s), -1) if len(elapsed_s) else np.empty((0, 1))
+    keep = np.isfinite(rows).all(axis=1)
+    if keep.any():
+        columns = rr.Scalars.columns(scalars=rows[keep].ravel()).partition([rows.shape[1]] * int(keep.sum()))
+        index = times(elapsed_s[keep], None if orientation is None else orientation[keep])
+        rr.send_columns(path, index, columns, recording=stream)
+
+
+def _style(stream: rr.RecordingStream, path: str, style: rr.SeriesLines | rr.SeriesPoints) -> None:
+    stream.log(path, style, static=True)
+
+
+def log_innovations(visits: Sequence[Visit], stream: rr.RecordingStream) -> None:
+    """Innovation of each dwell and channel with its bounds of 2 sigma, um/s^2; and in units of its own sigma."""
+    elapsed_s, number = ends(visits)
+    innovation = np.array([visit.innovation_mps2 for visit in visits]) * MICRO
+    sigma = np.array([visit.innovation_sigma_mps2 for visit in visits]) * MICRO
+    for i, (channel, colour) in enumerate(zip(CHANNELS, ACCELEROMETERS, strict=True)):
+        path, bound = f"innovation/{channel}", 2 * sigma[:, i]
+        _send(stream, f"{path}/value", elapsed_s, number, innovation[:, i])
+        _send(stream, f"{path}/bound", elapsed_s, number, np.column_stack([-bound, bound]))
+        _send(stream, f"{path}/in_sigma", elapsed_s, number, innovation[:, i] / sigma[:, i])
+        _style(stream, f"{path}/value", _points(channel, colour))
+        _style(stream, f"{path}/bound", _bounds("−2σ", "+2σ"))
+        _style(stream, f"{path}/in_sigma", _points(channel, colour))
+    known = np.where(np.isfinite(sigma).all(axis=1), 2.0, np.nan)
+    _send(stream, "innovation/bound", elapsed_s, number, np.column_stack([-known, known]))
+    _style(stream, "innovation/bound", _bounds("−2σ", "+2σ"))
+
+
+def log_nis(visits: Sequence[Visit], stream: rr.RecordingStream) -> None:
+    """NIS of each dwell that has degrees of freedom, with the middle 95 % of chi-squared; red above it."""
+    judged = [(k + 1, visit) for k, visit in enumerate(visits) if visit.dof > 0]
+    if not judged:
+        return
+    number = np.array([number for number, _ in judged])
+    elapsed_s, _ = ends([visit for _, visit in judged])
+    value = np.array([visit.nis for _, visit in judged])
+    band = nis_band(np.array([visit.dof for _, visit in judged]))
+    high = above(value, band)
+    for name, place, colour in (("value", ~high, WHITE), ("above", high, RED)):
+        _send(stream, f"nis/{name}", elapsed_s[place], number[place], value[place])
+        _style(stream, f"nis/{name}", _points(name, colour))
+    _send(stream, "nis/band", elapsed_s, number, band)
+    _style(stream, "nis/band", _bounds("2.5 %", "97.5 %"))
+
+
+def nis_band(dof: Counts) -> Floats:
+    """2.5 and 97.5 % points (n, 2) of chi-squared with ``dof`` (n,) degrees of freedom."""
+    return np.column_stack([chdtri(dof, 0.975), chdtri(dof, 0.025)])
+
+
+def above(value: Floats, band: Floats) -> NDArray[np.bool_]:
+    """Which NIS tell of a misfit: a small one is only luck."""
+    return value > band[:, 1]
+
+
+def _points(name: str, colour: Colour) -> rr.SeriesPoints:
+    return rr.SeriesPoints(names=name, colors=colour, markers="circle", marker_sizes=3.0)
+
+
+def _bounds(lower: str, upper: str) -> rr.SeriesLines:
+    return rr.SeriesLines(names=[lower, upper], colors=[GREY, GREY], widths=[1.0, 1.0])
+
+
+def log_bench(result: Calibration, stream: rr.RecordingStream) -> None:
+    """The lane of dwells (empty while the platform moves), and the pose: gimbal angles in deg, or the quaternion."""
+    dwells = [visit.dwell for visit in result.visits]
+    begun = np.array([dwell.start_s for dwell in dwells])
+    done, number = ends(result.visits)
+    states = rr.StateChange.columns(state=[f"{k}" for k in number])
+    rr.send_columns("bench/dwell", times(begun, number), states, recording=stream)
+    edge = done[-1] + EDGE * (done[-1] - begun[0])
+    over = rr.StateChange.columns(state=[""] * (len(dwells) + 1))
+    rr.send_columns("bench/dwell", times(np.append(done, edge)), over, recording=stream)
+    poses = np.array([dwell.pose for dwell in dwells])
+    poses = (np.degrees(poses) + 180) % 360 - 180 if result.bench.axes else poses
+    for k, (name, angle) in enumerate(zip(pose_names(result), poses.T, strict=True)):
+        colour = GIMBALS[k % len(GIMBALS)]
+        step = rr.SeriesLines(names=name.replace("_", " "), colors=colour, widths=1.5, interpolation_mode="StepMid")
+        _send(stream, f"bench/pose/{name}", done, number, angle)
+        _send(stream, f"bench/pose/{name}", begun, None, angle)
+        _style(stream, f"bench/pose/{name}", step)
+
+
+def pose_names(result: Calibration) -> list[str]:
+    """Of the gimbals, outer first, with their axes; of the quaternion's parts where there are no gimbals."""
+    if not result.bench.axes:
+        return ["q_x", "q_y", "q_z", "q_w"]
+    axes = result.bench.to_metadata()["axes"].split()
+    return [f"{k}_{axis}" for k, axis in enumerate(axes, 1)]

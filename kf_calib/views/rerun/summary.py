@@ -1,0 +1,106 @@
+"""The run in one page of Markdown: parameters, noise, misfit, warnings."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+
+import numpy as np
+
+from kf_calib.calibration import Calibration, Parameter
+from kf_calib.views.rerun.correlation import correlation
+from kf_calib.views.rerun.names import GROUP_OF, LABELS, MICRO
+
+
+def summary(result: Calibration) -> str:
+    """Markdown; deviations and sigmas in arcsec, ppm, um/s^2."""
+    blocks = [_head(result), _table(result), _verdict(result), *_warnings(result), _noise(result), *_ties(result)]
+    return "\n\n".join(blocks) + "\n"
+
+
+def _head(result: Calibration) -> str:
+    bench, count = result.bench, sum(visit.dwell.count for visit in result.visits)
+    serial = f"**{bench.notes['block_serial']}**: " if "block_serial" in bench.notes else ""
+    axes = f"axes {bench.to_metadata()['axes']}" if bench.axes else "attitude recorded"
+    held = ", inertially held" if bench.reference == "inertial" else ""
+    return f"{serial}{len(result.visits)} dwells, {count} samples; {axes}{held}, g = {bench.gravity_mps2:.6g} m/s²"
+
+
+def _table(result: Calibration) -> str:
+    head = "| | value | − nominal | ± 1σ | |\n|:--|--:|--:|--:|:--|\n"
+    return head + "\n".join(_row(parameter) for parameter in result.parameters.values())
+
+
+def _row(parameter: Parameter) -> str:
+    label, group = LABELS[parameter.symbol], GROUP_OF[parameter.symbol]
+    if parameter.value is None or parameter.sigma is None:
+        return f"| {label} | not determined | | | |"
+    per, unit = (math.degrees(1.0), "°") if parameter.unit == "rad" else (1.0, "")
+    value = fixed(parameter.value * per, parameter.sigma * per) + unit
+    deviation = fixed((parameter.value - parameter.nominal) * group.per_si, parameter.sigma * group.per_si)
+    return f"| {label} | {value} | {deviation} | {_two(parameter.sigma * group.per_si)} | {group.unit} |"
+
+
+def fixed(value: float, sigma: float) -> str:
+    """A value to the second digit of its sigma."""
+    digits = 1 - math.floor(math.log10(sigma)) if sigma > 0 else 9
+    return f"{value:.{min(max(digits, 0), 12)}f}".replace("-", "−")
+
+
+def _two(sigma: float) -> str:
+    return fixed(sigma, sigma)
+
+
+def _verdict(result: Calibration) -> str:
+    judged = result.consistency
+    if judged.p_value is None:
+        words = "nothing left over to judge the model by"
+    else:
+        yes = "agree with the model" if judged.consistent else "**disagree with the model**"
+        words = f"the dwells {yes}: p = {judged.p_value:.3g}, NIS/dof = {judged.nis_per_dof:.3g}, dof = {judged.dof}"
+    held = ""
+    if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2 is not None:
+        held = f"; held out {_micro(result.held_out_rms_mps2)} (noise alone {_micro(result.held_out_floor_mps2)})"
+    return f"**Misfit**: {words}. Residual rms {_micro(result.residual_rms_mps2)}{held} µm/s²"
+
+
+def _noise(result: Calibration) -> str:
+    noise = result.noise
+    parts = [f"{_three(noise.sigma_mps2 * MICRO)} µm/s² a reading"]
+    if noise.inflation.max() > 1.05:
+        parts.append(f"correlated: variance of means × {_three(noise.inflation)}")
+    if noise.setting_rad > 0:
+        origin = "stated" if noise.setting_stated else "estimated"
+        parts.append(f"setting error {math.degrees(noise.setting_rad) * 3600:.3g} arcsec ({origin})")
+    if noise.scatter_mps2.max() > 0:
+        origin = "stated" if noise.scatter_stated else "estimated"
+        parts.append(f"scatter {_three(noise.scatter_mps2 * MICRO)} µm/s² ({origin})")
+    return f"**Noise** (1σ): {'; '.join(parts)}"
+
+
+def _ties(result: Calibration) -> list[str]:
+    """The pairs of parameters the orientations tell apart worst."""
+    matrix = np.nan_to_num(correlation(result.estimate))
+    pairs = sorted(combinations(range(len(matrix)), 2), key=lambda pair: -abs(matrix[pair]))
+    names = list(LABELS.values())
+    strong = [f"{names[i]} {names[j]} {matrix[i, j]:+.2f}" for i, j in pairs[:4] if abs(matrix[i, j]) >= 0.5]
+    return [f"**Correlated**: {', '.join(strong)}".replace("-", "−")] if strong else []
+
+
+def _three(values: np.ndarray) -> str:
+    return ", ".join(_digits(value) for value in values)
+
+
+def _micro(value_mps2: float) -> str:
+    return _digits(value_mps2 * MICRO)
+
+
+def _warnings(result: Calibration) -> list[str]:
+    return ["**Warnings**\n\n" + "\n".join(f"- {text}" for text in result.warnings)] if result.warnings else []
+
+
+def _digits(value: float) -> str:
+    """Three significant digits, no exponent."""
+    if 0 < value < 1e-3:
+        return "< 0.001"
+    return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim="-")
