@@ -73,6 +73,8 @@ def _parse_axis(word: str) -> Vector:
             f"axis {word!r} is not known: give each gimbal axis, outer first, as x, y, z or three "
             'comma-separated numbers, for example --axes "y z x".'
         )
+    if abs(length - 1.0) < 1e-12:  # a unit vector survives being written and read again
+        length = 1.0
     return (numbers[0] / length, numbers[1] / length, numbers[2] / length)
 
 
@@ -200,11 +202,11 @@ class Bench:
 
     def specific_force(self, elapsed_s: Floats, pose: Floats) -> Floats:
         """f_p (n, 3), m/s^2, at ``elapsed_s`` (n,) since the first sample and poses (n, k)."""
-        up = np.array([0.0, self.gravity_mps2, 0.0])
+        up = np.broadcast_to([0.0, self.gravity_mps2, 0.0], (len(elapsed_s), 3))
         if self.reference == "inertial":
             rate = self.earth_rate_radps
             speed = float(np.linalg.norm(rate))
-            up = turn(up, rate / speed, speed * np.asarray(elapsed_s, float))
+            up = turn(up, rate / speed, speed * elapsed_s)
         return self.to_platform(up, np.asarray(pose, float))
 
 

@@ -75,7 +75,7 @@ class Tally:
             "repeated": "{} readings repeated the stamp before them and were dropped.",
             "leaping": "{} readings had a stamp far ahead of their neighbours and were dropped.",
             "without_pose": "{} readings had no platform angle within 1 s of them and were dropped.",
-            "poses_dropped": "{} angle messages were not finite or not in order of time and were dropped.",
+            "poses_dropped": "{} angle messages were not finite, no unit quaternion or not in order of time and were dropped.",
             "gated": "{} readings were outliers (innovation gate) and were rejected; --no-gate keeps them.",
         }
         out = [text.format(getattr(self, key)) for key, text in said.items() if getattr(self, key)]
@@ -93,6 +93,7 @@ class _Order:
     def __init__(self) -> None:
         self.last_ns: int | None = None
         self._held = Stream.empty(0)
+        self._ended = False
 
     def __call__(self, stream: Stream, tally: Tally | None = None, first_ns: int | None = None) -> Stream:
         if self._held.time_ns.size:
@@ -118,10 +119,10 @@ class _Order:
                         tally.first_backward_s = (self.last_ns - (first_ns or stamps[0])) / _SECOND_NS
                 continue
             if self.last_ns is not None and stamp - self.last_ns >= _LEAP_NS:
-                if i + 1 == len(stamps):  # only the next stamp can tell a gap from a damaged stamp
+                if i + 1 == len(stamps) and not self._ended:  # only the next stamp can tell a gap from a damaged stamp
                     self._held = stream[i:]
                     break
-                if stamps[i + 1] < stamp:
+                if i + 1 < len(stamps) and stamps[i + 1] < stamp:
                     tally.leaping += 1
                     continue
             keep[i] = True
@@ -129,6 +130,8 @@ class _Order:
         return stream[keep]
 
     def flush(self) -> Stream:
+        """What was held back at the end of the stream; to be passed through once more."""
+        self._ended = True
         held, self._held = self._held, Stream.empty(0)
         return held
 
@@ -192,14 +195,21 @@ class Segmenter:
                 self.first_ns = int(accel.time_ns[0])
             self._accel += accel
         if len(pose):
-            before = len(pose)
-            pose = self._orders[1](pose[np.isfinite(pose.values).all(axis=1)])
-            self.tally.poses_dropped += before - len(pose)
+            sound, counts = self._sound(pose.values), Tally()
+            pose = self._orders[1](pose[sound], counts)
+            self.tally.poses_dropped += int((~sound).sum()) + counts.repeated + counts.backward + counts.leaping
             previous = self._pose.values[-1:] if len(self._pose) else None
             self._pose += Stream(pose.time_ns, unwrap_pose(pose.values, not self.bench.axes, previous))
         if len(batch.temperature):
             warm = batch.temperature
             self._temperature += self._orders[2](warm[np.isfinite(warm.values[:, 0])])
+
+    def _sound(self, poses: Floats) -> Floats:
+        """Which poses can be used, (m,) bool: finite, and quaternions of nearly unit length."""
+        finite = np.isfinite(poses).all(axis=1)
+        if self.bench.axes:
+            return finite
+        return finite & (np.abs(np.linalg.norm(poses, axis=1) - 1.0) < 0.01)
 
     def _advance(self, final: bool) -> Iterator[Block]:
         for stamp, event, settle in self._judge(final):

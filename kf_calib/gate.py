@@ -38,9 +38,7 @@ def inliers(columns: Floats, readings: Floats, innovation: Floats, static: bool,
     count = len(readings)
     if count < 8:
         return None
-    rms = np.sqrt(np.einsum("ij,ij->i", innovation, innovation) / count)
-    # fewer than one reading in twenty can be an outlier unless one of them stands out here: the medians are spared
-    if (np.maximum(innovation.max(axis=1), -innovation.min(axis=1)) <= min(4.5, threshold) * rms).all():
+    if _plainly_clean(innovation, threshold):
         return None
     keep = np.ones(count, bool)
     for _ in range(5):
@@ -53,3 +51,13 @@ def inliers(columns: Floats, readings: Floats, innovation: Floats, static: bool,
         keep = now
         innovation = innovations(columns, readings, static, keep)
     return None if keep.all() or keep.sum() < 4 else keep
+
+
+def _plainly_clean(innovation: Floats, threshold: float) -> bool:
+    """Whether the medians can be spared: no reading stands out, and the rms is that of the bulk (of a sample of it)."""
+    rms = np.sqrt(np.einsum("ij,ij->i", innovation, innovation) / innovation.shape[1])
+    if (np.maximum(innovation.max(axis=1), -innovation.min(axis=1)) > min(4.5, threshold) * rms).any():
+        return False
+    sample = innovation[:, :: max(1, innovation.shape[1] // 256)]
+    bulk = _GAUSSIAN_MAD * np.median(np.abs(sample), axis=1)
+    return bool((rms <= 1.5 * bulk).all())

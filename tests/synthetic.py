@@ -38,7 +38,7 @@ class Run:
     seed: int = 0
     dwells: int = 24
     count: int = 300
-    rate_hz: float = 100.0
+    rate_hz: float = 20.0
     white_mps2: float = 1e-4
     phi: float = 0.0
     scatter_mps2: float = 0.0

@@ -175,6 +175,7 @@ class Recording:
         self._contents = self._survey()
         self._accel = self._require(_ACCEL, "convert the readings to sensor_msgs/msg/Imu")
         self._pose = self._require(_POSE, "record the angles too, as sensor_msgs/msg/JointState by the same clock")
+        self._contents.choose(_TEMPERATURE, temperature_topic)  # optional, but not to be guessed
         self.bench = self._describe_bench(overrides)
         self._opening_warnings = len(self.warnings)
 
@@ -210,13 +211,14 @@ class Recording:
             for index in summary.metadata:
                 if index.name == BENCH_RECORD and contents.bench is None:
                     self._look_up_bench(contents, index.offset)
-        if summary and (contents.bench is not None or contents.bench_damaged):
+        lists_topics = bool(contents.channels and contents.schemas)
+        if lists_topics and (contents.bench is not None or contents.bench_damaged):
             return contents
         find = MessageFinder()
         for block in self._file.blocks(warn=_ignore):
             for opcode, content in find(block).others:
                 contents.add(opcode, content, warn=_ignore)
-            if summary or self._is_settled(contents):
+            if lists_topics or self._is_settled(contents):
                 break
         return contents
 

@@ -6,16 +6,17 @@ It draws with Vulkan; where there is no graphics card, Mesa's software driver do
 
 from __future__ import annotations
 
+import io
 import os
 import socket
 import subprocess
 import sys
 import tempfile
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from kf_calib.errors import KfCalibError
 
@@ -23,10 +24,9 @@ if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
 
 _PATIENCE_S = 60.0  # software rendering on a busy machine; the usual time is 2 s
+_MENU_PX = 36  # the window's own top bar, which stays as an empty strip when its menu is hidden; cut off
 _POLL_S = 0.05
 _SETTLED = 2  # equal pictures in a row: views size their axes over the first frames
-
-_Answer = TypeVar("_Answer")
 
 
 class ScreenshotError(KfCalibError):
@@ -43,51 +43,43 @@ def screenshot(
     """Draw a recording into a PNG of ``size`` (width, height) pixels, and return its path.
 
     ``timeline`` and ``time`` move the cursor first (s on a timeline of durations, a count on a sequence);
-    without them the picture is what the file opens with. Raises ScreenshotError, InputError for no such file.
+    without them the picture is what the file opens with. Raises ScreenshotError.
     """
     rrd, png = Path(rrd_path).resolve(), Path(png_path).resolve()
     if not rrd.is_file():
         raise ScreenshotError(f"there is no recording {rrd_path}: write one with --rrd first.")
-    with _viewer(rrd, size) as (process, port, log):
-        from rerun.experimental import ViewerClient
-
-        def connect() -> ViewerClient | None:
-            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-            state = client.get_state()
-            return client if state.recordings and not state.loading else None
-
-        client = _patiently(connect, process, log)
-        client.run_command("ui.toggle_top_panel")  # the window's menu is no part of the picture
+    with viewer(rrd, size) as client:
+        client.run_command("ui.toggle_top_panel")
         if timeline is not None:
             _seek(client, timeline, time)
         picture = _settled(client)
-    try:
-        png.write_bytes(picture)
-    except OSError as error:
-        raise ScreenshotError(f"the picture {png_path} cannot be written: {error.strerror}.") from None
+    _write(picture, png)
     return png
 
 
 @contextmanager
-def _viewer(rrd: Path, size: tuple[int, int]) -> Iterator[tuple[subprocess.Popen[bytes], int, Path]]:
-    """A headless viewer of the file: its process, port and log; ended whatever happens."""
-    with tempfile.TemporaryDirectory(prefix="kf_calib_") as folder, socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = int(probe.getsockname()[1])
-        probe.close()
-        log = Path(folder, "viewer.log")
+def viewer(rrd: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
+    """A headless viewer that has loaded the file; its process is ended whatever happens."""
+    with tempfile.TemporaryDirectory(prefix="kf_calib_") as folder:
+        port, log = _free_port(), Path(folder, "viewer.log")
         command = [
-            _binary(), "--headless", "--port", str(port), "--bind", "127.0.0.1", "--window-size", "{}x{}".format(*size),
-            "--hide-welcome-screen", str(rrd),
+            _binary(), "--headless", "--port", str(port), "--bind", "127.0.0.1", "--hide-welcome-screen",
+            "--window-size", f"{size[0]}x{size[1] + _MENU_PX}", str(rrd),
         ]  # fmt: skip
         quiet = {**os.environ, "CI": "true", "RUST_LOG": "error"}  # CI: the viewer then sends no usage data
         with log.open("wb") as sink:
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, env=quiet)
         try:
-            yield process, port, log
+            yield _loaded(process, port, log)
         finally:
             process.kill()
             process.wait()
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def _binary() -> str:
@@ -97,18 +89,21 @@ def _binary() -> str:
     return str(Path(rerun_cli.__file__).with_name("rerun.exe" if sys.platform == "win32" else "rerun"))
 
 
-def _patiently(ask: Callable[[], _Answer | None], process: subprocess.Popen[bytes], log: Path) -> _Answer:
-    """Ask until there is an answer; raises where the viewer ended or time ran out."""
+def _loaded(process: subprocess.Popen[bytes], port: int, log: Path) -> ViewerClient:
+    """The viewer, once it listens and has read the file; raises where it ended or time ran out."""
+    from rerun.experimental import ViewerClient
+
     deadline = clock.monotonic() + _PATIENCE_S
     while clock.monotonic() < deadline:
         if process.poll() is not None:
             raise ScreenshotError(_obituary(log.read_text(errors="replace")))
         try:
-            answer = ask()
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            state = client.get_state()
+            if state.recordings and not state.loading:
+                return client
         except Exception:  # not listening yet: the client raises what its transport raises
-            answer = None
-        if answer is not None:
-            return answer
+            pass
         clock.sleep(_POLL_S)
     raise ScreenshotError(f"the Rerun viewer did not load the recording within {_PATIENCE_S:g} s: try again.")
 
@@ -147,3 +142,14 @@ def _settled(client: ViewerClient) -> bytes:
         equal = equal + 1 if following == picture else 0
         picture = following
     return picture
+
+
+def _write(picture: bytes, png: Path) -> None:
+    """The picture without the window's top bar."""
+    from PIL import Image
+
+    whole = Image.open(io.BytesIO(picture))
+    try:
+        whole.crop((0, _MENU_PX, whole.width, whole.height)).save(png, "PNG")
+    except OSError as error:
+        raise ScreenshotError(f"the picture {png} cannot be written ({error.strerror}).") from None

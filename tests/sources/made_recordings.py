@@ -43,9 +43,7 @@ def read(source: Source) -> Batch:
     """All batches of a source in one."""
     whole = Batch(Stream.empty(3), Stream.empty(source.bench.pose_width))
     for batch in source:
-        whole = Batch(
-            whole.accel + batch.accel, whole.pose + batch.pose, whole.temperature + batch.temperature
-        )
+        whole = Batch(whole.accel + batch.accel, whole.pose + batch.pose, whole.temperature + batch.temperature)
     return whole
 
 

@@ -100,7 +100,7 @@ def test_samples_of_a_batch_go_into_the_file_in_the_order_of_their_stamps(tmp_pa
 def test_a_file_that_exists_is_kept_unless_told_otherwise(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", made_batch(50))
     before = path.read_bytes()
-    with pytest.raises(InputError, match="exists already.*--overwrite"):
+    with pytest.raises(InputError, match=r"exists already.*--overwrite"):
         Recorder(path, BENCH)
     assert path.read_bytes() == before
     with Recorder(path, BENCH, overwrite=True):
@@ -173,7 +173,7 @@ def test_samples_reach_the_disk_by_the_clock_and_at_the_end_of_a_dwell(tmp_path:
 
 
 def test_a_full_disk_is_told_and_what_was_written_stays(tmp_path: Path) -> None:
-    path, limit = tmp_path / "a.mcap", 60_000
+    path, limit, dwell = tmp_path / "a.mcap", 60_000, 0
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
     try:

@@ -5,8 +5,9 @@ columns. Two timelines: ``bench_time`` (since the first sample; points within th
 (the count of dwells from 1; 0 is a stated prior). Angles are in arcsec, scale factors in ppm, biases, innovations in
 um/s^2. Where the orientations so far do not determine a parameter there is no point.
 
-Entities: ``parameters/ACCELEROMETER/SYMBOL/{log10_sigma,deviation,band}``, ``platform/...``, ``innovation/CHANNEL/{value,bound}``,
-``innovation/CHANNEL/in_sigma``, ``nis/{value,above,band}``, ``correlation/...``, ``bench/{dwell,pose/...}``, ``summary``.
+Entities: ``parameters/ACCELEROMETER/SYMBOL/{log10_sigma,deviation,band}``, ``platform/...``,
+``innovation/CHANNEL/{value,bound,in_sigma}``, ``nis/{value,above,band}``, ``correlation/{picture,matrix,...}``,
+``bench/{dwell,pose/...}``, ``summary``.
 """
 
 from __future__ import annotations
@@ -31,14 +32,18 @@ __all__ = ["BENCH_TIME", "ORIENTATION", "TABS", "layout", "log", "save"]
 
 
 def save(result: Calibration, path: str | Path, timeline: str = BENCH_TIME, tab: str = TABS[0]) -> Path:
-    """Write the view of a run to an .rrd file that opens laid out, on ``timeline``, at the run's end, ``tab`` in front."""
+    """Write the view of a run to an .rrd file that opens laid out, at the end of the run.
+
+    ``timeline``: BENCH_TIME or ORIENTATION; ``tab``: which of TABS is in front. Raises InputError for no such folder.
+    """
     path = Path(path)
     if not path.parent.is_dir():
         raise InputError(f"the Rerun recording {path} cannot be written: there is no folder {path.parent}.")
+    history = History.of(result)
     # an identity of its own: two views written by one process would else be merged by the viewer
     with _strict(), rr.RecordingStream("kf_calib", recording_id=uuid.uuid4()) as stream:
-        stream.save(path, default_blueprint=layout(result, timeline, tab))
-        log(result, stream)
+        stream.save(path, default_blueprint=layout(result, history, timeline, tab))
+        _log(result, history, stream)
         stream.flush()
         stream.disconnect()
     return path
@@ -47,13 +52,17 @@ def save(result: Calibration, path: str | Path, timeline: str = BENCH_TIME, tab:
 def log(result: Calibration, stream: rr.RecordingStream) -> None:
     """Send everything a run showed to a recording stream: a file, or a viewer that is open."""
     with _strict():
-        log_parameters(History.of(result), stream)
-        log_platform(result, stream)
-        log_innovations(result.visits, stream)
-        log_nis(result.visits, stream)
-        log_correlation(result.visits, stream)
-        log_bench(result, stream)
-        stream.log("summary", rr.TextDocument(summary(result), media_type=rr.MediaType.MARKDOWN), static=True)
+        _log(result, History.of(result), stream)
+
+
+def _log(result: Calibration, history: History, stream: rr.RecordingStream) -> None:
+    log_parameters(history, stream)
+    log_platform(result, stream)
+    log_innovations(result.visits, stream)
+    log_nis(result.visits, stream)
+    log_correlation(result.visits, stream)
+    log_bench(result, stream)
+    stream.log("summary", rr.TextDocument(summary(result), media_type=rr.MediaType.MARKDOWN), static=True)
 
 
 @contextmanager

@@ -19,9 +19,9 @@ WHOLE_RUN = rrb.TimeAxis(view_range=rr.TimeRange(start=_ENDLESS, end=_ENDLESS))
 """The same stretch of time in all panels: left to themselves they begin where their own data do."""
 
 
-def layout(result: Calibration, timeline: str, tab: str) -> rrb.Blueprint:
+def layout(result: Calibration, history: History, timeline: str, tab: str) -> rrb.Blueprint:
     """The blueprint for a window of about 1600 x 1000, ``tab`` (one of TABS) in front."""
-    tabs = [_overview(result), _parameters(History.of(result)), *([_innovations(result)] if _predicted(result) else [])]
+    tabs = [_overview(result), _parameters(history), *([_innovations(result)] if _predicted(result) else [])]
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=min(TABS.index(tab), len(tabs) - 1)),
         rrb.BlueprintPanel(state="hidden"),
@@ -31,25 +31,25 @@ def layout(result: Calibration, timeline: str, tab: str) -> rrb.Blueprint:
 
 
 def _overview(result: Calibration) -> rrb.Horizontal:
-    judged = [_normalised(result)] if _predicted(result) else []
-    judged += [_nis(result)] if any(visit.dof > 0 for visit in result.visits) else []
+    judged = [_normalised(result), _nis(result)] if _predicted(result) else []
     return rrb.Horizontal(
         rrb.Vertical(*_sigmas(result), _dwells(), _pose(result), row_shares=[5, 3.2, 3.2, 1.5, 3]),
-        rrb.Vertical(_platform(result), *judged, row_shares=[6, 3, 3][: 1 + len(judged)]),
-        rrb.Vertical(_summary(), _correlation(), row_shares=[6, 5]),
+        rrb.Vertical(_platform(result), *(judged or [_correlation()]), row_shares=[6, 3, 3] if judged else [1, 1]),
+        rrb.Vertical(_summary(), *([_correlation()] if judged else []), row_shares=[7, 5] if judged else [1]),
         column_shares=[5, 4.2, 3.6],
         name=TABS[0],
     )
 
 
 def _predicted(result: Calibration) -> bool:
-    """Was any dwell predicted from those before? A panel of innovations would else stand empty."""
-    return any(np.isfinite(visit.innovation_mps2).all() for visit in result.visits)
+    """Was any dwell predicted from those before? Panels of innovations and NIS would else stand empty."""
+    return any(visit.dof > 0 and np.isfinite(visit.innovation_mps2).all() for visit in result.visits)
 
 
 def _sigmas(result: Calibration) -> list[rrb.TimeSeriesView]:
-    # the curves fall, so the upper right is free; in a short run they begin late, and the left is
-    corner = rrb.Corner2D.RightTop if len(result.visits) > SHORT_RUN else rrb.Corner2D.LeftTop
+    # the curves fall, so the upper right is free; in a short run without a prior they begin late, and the left is
+    late = len(result.visits) <= SHORT_RUN and result.settings.prior.diffuse
+    corner = rrb.Corner2D.LeftTop if late else rrb.Corner2D.RightTop
     return [
         _series(
             [f"{path_of(symbol)}/log10_sigma" for symbol in group.symbols],

@@ -23,7 +23,11 @@ GOLD: Colour = (250, 210, 70)
 RED: Colour = (240, 50, 70)
 
 CHANNELS = ("a1", "a2", "a3")
-LABELS = dict(zip(paper.SYMBOLS, ("θ₁", "φ₁", "K₁", "b₁", "ν₁", "ν₂", "K₂", "b₂", "θ₃", "φ₃", "K₃", "b₃"), strict=True))
+LABELS = {
+    "theta1": "θ₁", "phi1": "φ₁", "K1": "K₁", "b1": "b₁",
+    "nu1": "ν₁", "nu2": "ν₂", "K2": "K₂", "b2": "b₂",
+    "theta3": "θ₃", "phi3": "φ₃", "K3": "K₃", "b3": "b₃",
+}  # fmt: skip
 MICRO = 1e6
 
 

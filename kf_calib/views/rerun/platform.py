@@ -10,11 +10,10 @@ import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from kf_calib import paper
 from kf_calib.calibration import Calibration, Estimate
 from kf_calib.samples import Floats
 from kf_calib.views.rerun.names import ACCELEROMETERS, GOLD, GREY, RED, WHITE
-from kf_calib.views.rerun.series import above, ends, nis_band, times
+from kf_calib.views.rerun.series import above, crowd, ends, nis_band, times
 
 FINAL_SIZE = 0.12  # of the largest final ellipsoid, as a part of the axis' length
 THINNEST = 0.012  # thinner ones could not be seen
@@ -111,7 +110,7 @@ def _log_directions(result: Calibration, stream: rr.RecordingStream) -> None:
     done, number = ends(visits)
     begun = np.array([visit.dwell.start_s for visit in visits])
     count = len(visits)
-    points = rr.Points3D.columns(positions=direction, colors=_verdicts(result), radii=[0.025] * count)
+    points = rr.Points3D.columns(positions=direction, colors=_verdicts(result), radii=[0.025 * crowd(count)] * count)
     rr.send_columns("platform/visited", times(done, number), points, recording=stream)
     arrows = rr.Arrows3D.columns(
         vectors=1.25 * direction, colors=[GOLD] * count, radii=[0.018] * count, labels=["up"] * count
@@ -120,7 +119,7 @@ def _log_directions(result: Calibration, stream: rr.RecordingStream) -> None:
 
 
 def _verdicts(result: Calibration) -> list[tuple[int, int, int]]:
-    """Grey where a dwell could not be judged, white where its NIS is inside chi-squared's 95 % band, red where above."""
+    """Grey where a dwell could not be judged, red where its NIS is above chi-squared's 95 % band, else white."""
     dof = np.array([visit.dof for visit in result.visits])
     nis = np.array([visit.nis for visit in result.visits])
     bad = above(nis, nis_band(np.maximum(dof, 1)))

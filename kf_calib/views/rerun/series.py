@@ -14,9 +14,21 @@ from kf_calib import information, paper
 from kf_calib.calibration import Calibration, Estimate, Visit
 from kf_calib.samples import Floats
 from kf_calib.views.rerun.names import (
-    ACCELEROMETERS, BENCH_TIME, CHANNELS, GIMBALS, GREY, LABELS, MICRO, ORIENTATION, PER_SI, RED, WHITE, Colour, colour_of,
+    ACCELEROMETERS,
+    BENCH_TIME,
+    CHANNELS,
+    GIMBALS,
+    GREY,
+    LABELS,
+    MICRO,
+    ORIENTATION,
+    PER_SI,
+    RED,
+    WHITE,
+    Colour,
+    colour_of,
     path_of,
-)  # fmt: skip
+)
 
 EDGE = 0.015
 """The view goes on for this part of the run after its end: the last points are not cut by the frame."""
@@ -92,9 +104,7 @@ def _log_curve(stream: rr.RecordingStream, path: str, history: History, values: 
     _send(stream, path, elapsed_s[~whole], None, values[~whole])
 
 
-def _send(
-    stream: rr.RecordingStream, path: str, elapsed_s: Floats, orientation: Counts | None, values: Floats
-) -> None:
+def _send(stream: rr.RecordingStream, path: str, elapsed_s: Floats, orientation: Counts | None, values: Floats) -> None:
     """One row of scalars (n,) or (n, k) a time; rows that are not finite are left out."""
     rows = values.reshape(len(elapsed_s), -1) if len(elapsed_s) else np.empty((0, 1))
     keep = np.isfinite(rows).all(axis=1)
@@ -118,9 +128,9 @@ def log_innovations(visits: Sequence[Visit], stream: rr.RecordingStream) -> None
         _send(stream, f"{path}/value", elapsed_s, number, innovation[:, i])
         _send(stream, f"{path}/bound", elapsed_s, number, np.column_stack([-bound, bound]))
         _send(stream, f"{path}/in_sigma", elapsed_s, number, innovation[:, i] / sigma[:, i])
-        _style(stream, f"{path}/value", _points(channel, colour))
+        _style(stream, f"{path}/value", _points(channel, colour, len(visits)))
         _style(stream, f"{path}/bound", _bounds("−2σ", "+2σ"))
-        _style(stream, f"{path}/in_sigma", _points(channel, colour))
+        _style(stream, f"{path}/in_sigma", _points(channel, colour, len(visits)))
     known = np.where(np.isfinite(sigma).all(axis=1), 2.0, np.nan)
     _send(stream, "innovation/bound", elapsed_s, number, np.column_stack([-known, known]))
     _style(stream, "innovation/bound", _bounds("−2σ", "+2σ"))
@@ -138,7 +148,7 @@ def log_nis(visits: Sequence[Visit], stream: rr.RecordingStream) -> None:
     high = above(value, band)
     for name, place, colour in (("value", ~high, WHITE), ("above", high, RED)):
         _send(stream, f"nis/{name}", elapsed_s[place], number[place], value[place])
-        _style(stream, f"nis/{name}", _points(name, colour))
+        _style(stream, f"nis/{name}", _points(name, colour, len(visits)))
     _send(stream, "nis/band", elapsed_s, number, band)
     _style(stream, "nis/band", _bounds("2.5 %", "97.5 %"))
 
@@ -153,8 +163,13 @@ def above(value: Floats, band: Floats) -> NDArray[np.bool_]:
     return value > band[:, 1]
 
 
-def _points(name: str, colour: Colour) -> rr.SeriesPoints:
-    return rr.SeriesPoints(names=name, colors=colour, markers="circle", marker_sizes=3.0)
+def _points(name: str, colour: Colour, count: int) -> rr.SeriesPoints:
+    return rr.SeriesPoints(names=name, colors=colour, markers="circle", marker_sizes=3.0 * crowd(count))
+
+
+def crowd(count: int) -> float:
+    """How much smaller marks are drawn where there are many (1 up to a hundred), so that they do not run together."""
+    return max(0.4, min(1.0, (100 / count) ** 0.5))
 
 
 def _bounds(lower: str, upper: str) -> rr.SeriesLines:

@@ -23,7 +23,8 @@ def _head(result: Calibration) -> str:
     serial = f"**{bench.notes['block_serial']}**: " if "block_serial" in bench.notes else ""
     axes = f"axes {bench.to_metadata()['axes']}" if bench.axes else "attitude recorded"
     held = ", inertially held" if bench.reference == "inertial" else ""
-    return f"{serial}{len(result.visits)} dwells, {count} samples; {axes}{held}, g = {bench.gravity_mps2:.6g} m/s²"
+    dwells = f"{len(result.visits)} dwell{'s' * (len(result.visits) != 1)}"
+    return f"{serial}{dwells}, {count} samples; {axes}{held}, g = {bench.gravity_mps2:.6g} m/s²"
 
 
 def _table(result: Calibration) -> str:
@@ -57,7 +58,8 @@ def _verdict(result: Calibration) -> str:
         words = "nothing left over to judge the model by"
     else:
         yes = "agree with the model" if judged.consistent else "**disagree with the model**"
-        words = f"the dwells {yes}: p = {judged.p_value:.3g}, NIS/dof = {judged.nis_per_dof:.3g}, dof = {judged.dof}"
+        per_dof = _digits(judged.statistic / judged.dof)
+        words = f"the dwells {yes}: p = {judged.p_value:.2g}, NIS/dof = {per_dof}, dof = {judged.dof}"
     held = ""
     if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2 is not None:
         held = f"; held out {_micro(result.held_out_rms_mps2)} (noise alone {_micro(result.held_out_floor_mps2)})"

@@ -1,0 +1,146 @@
+"""Dwells from the angles' own stillness, and from the readings where angles are absent during a motion."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from kf_calib.bench import Bench, axes_of
+from kf_calib.dwells import Segmenter, Stillness, dwell_blocks
+from kf_calib.samples import Batch, Stream
+
+S = 1_000_000_000
+BENCH = Bench(axes_of("zx"), 9.81)
+
+
+class Given:
+    warnings: tuple[str, ...] = ()
+    fraction = 1.0
+
+    def __init__(self, *batches: Batch, bench: Bench = BENCH) -> None:
+        self.batches, self.bench = batches, bench
+
+    def __iter__(self):
+        return iter(self.batches)
+
+
+def path(*points: tuple[float, float], rate_hz: float, noise_deg: float = 0.0) -> Stream:
+    """Angle messages on a broken line of (seconds, degrees) of the first axis."""
+    seconds, degrees = np.array(points).T
+    at = np.arange(seconds[0], seconds[-1], 1 / rate_hz)
+    angles = np.interp(at, seconds, degrees) + np.random.default_rng(0).normal(size=len(at)) * noise_deg
+    return Stream(np.round(at * S).astype(np.int64), np.column_stack([np.radians(angles), 0 * at]))
+
+
+def readings(pose: Stream, until_s: float, rate_hz: float = 100.0) -> Stream:
+    at = np.arange(0, until_s, 1 / rate_hz)
+    angle = np.interp(at * S, pose.time_ns, pose.values[:, 0])
+    values = 9.81 * np.column_stack([np.sin(angle), np.cos(angle), 0 * at])
+    values += np.random.default_rng(1).normal(size=values.shape) * 1e-3
+    return Stream(np.round(at * S).astype(np.int64), values)
+
+
+def spans(source: Given, **how) -> list[tuple[float, float]]:
+    segmenter = Segmenter(source.bench, Stillness(**how))
+    found: dict[int, list[float]] = {}
+    for block in dwell_blocks(source, segmenter):
+        found.setdefault(block.dwell, []).extend([block.elapsed_s[0], block.elapsed_s[-1]])
+    spans.tally = segmenter.tally
+    return [(min(times), max(times)) for times in found.values()]
+
+
+SLEWS = [(0, 0), (10, 0), (14, 40), (24, 40), (25, 80), (35, 80)]
+
+
+@pytest.mark.parametrize("rate_hz, noise_deg", [(10, 0), (100, 0), (100, 0.005), (2, 0)])
+def test_dwells_between_slews(rate_hz: float, noise_deg: float) -> None:
+    pose = path(*SLEWS, rate_hz=rate_hz, noise_deg=noise_deg)
+    got = spans(Given(Batch(readings(pose, 35), pose)))
+    assert len(got) == 3
+    for (start, end), (low, high) in zip(got, [(0, 10), (15, 24), (26, 35)], strict=True):
+        assert low - 0.01 <= start <= low + 0.6 + 1 / rate_hz
+        assert high - 0.6 - 1 / rate_hz <= end <= high
+    tally = spans.tally
+    assert tally.used + tally.moving + tally.settling + tally.without_pose == tally.read
+
+
+def test_a_slow_slew_is_no_dwell() -> None:
+    pose = path((0, 0), (10, 0), (110, 20), (120, 20), rate_hz=50)  # 0.2 deg/s
+    assert len(spans(Given(Batch(readings(pose, 120), pose)))) == 2
+
+
+def test_settling_is_left_out() -> None:
+    pose = path(*SLEWS, rate_hz=10)
+    assert spans(Given(Batch(readings(pose, 35), pose)), settle_s=3.0)[1][0] == pytest.approx(17.0, abs=0.2)
+
+
+def test_angles_absent_during_motion_readings_decide() -> None:
+    """One angle message a dwell, at its middle: the dwells reach to where the readings move."""
+    truth = path(*SLEWS, rate_hz=100)
+    sparse = Stream(np.array([5, 19, 30]) * S, np.column_stack([np.radians([0, 40, 80]), np.zeros(3)]))
+    got = spans(Given(Batch(readings(truth, 35), sparse)))
+    assert len(got) == 3
+    for (start, end), (low, high) in zip(got, [(4, 10), (14, 24), (25, 31)], strict=True):
+        assert low - 0.01 <= start <= low + 2.0 and high - 1.0 <= end <= high + 0.01
+
+
+def test_what_comes_out_does_not_depend_on_batches() -> None:
+    pose = path(*SLEWS, rate_hz=10, noise_deg=0.003)
+    accel = readings(pose, 35)
+    whole = list(dwell_blocks(Given(Batch(accel, pose)), Segmenter(BENCH)))
+    edges = np.arange(0, 36, 0.37)
+    pieces = [
+        Batch(
+            accel[(accel.time_ns >= a * S) & (accel.time_ns < b * S)],
+            pose[(pose.time_ns >= a * S) & (pose.time_ns < b * S)],
+        )
+        for a, b in itertools.pairwise(edges)
+    ]
+    again = list(dwell_blocks(Given(*pieces), Segmenter(BENCH)))
+    assert len(whole) == len(again)
+    for one, other in zip(whole, again, strict=True):
+        np.testing.assert_array_equal(one.accel_mps2, other.accel_mps2)
+        np.testing.assert_array_equal(one.pose, other.pose)
+
+
+def test_an_attitude_in_place_of_angles() -> None:
+    from scipy.spatial.transform import Rotation
+
+    pose = path(*SLEWS, rate_hz=20)
+    turns = Rotation.from_rotvec(np.outer(pose.values[:, 0], [0, 0, 1])).as_quat() * np.where(np.sin(7 * np.arange(700)) < 0, -1, 1)[:, None]
+    bench = Bench((), 9.81)
+    source = Given(Batch(readings(pose, 35), Stream(pose.time_ns, turns)), bench=bench)
+    assert len(spans(source)) == 3
+
+
+def test_bad_samples_are_dropped_and_counted() -> None:
+    pose = path((0, 0), (20, 0), rate_hz=10)
+    accel = readings(pose, 20)
+    accel.values[5, 1] = np.nan
+    accel.values[6, 2] = np.inf
+    times = accel.time_ns.copy()
+    times[10] = times[9]  # repeated
+    times[20] = times[15]  # back
+    times[30] += 3600 * S  # a damaged stamp far ahead
+    got = spans(Given(Batch(Stream(times, accel.values), pose)))
+    tally = spans.tally
+    assert (tally.not_finite, tally.repeated, tally.backward, tally.leaping) == (2, 1, 1, 1)
+    assert tally.used == 2000 - 5 and len(got) == 1
+    said = " ".join(tally.sentences())
+    assert "NaN" in said and "jumped back" in said and "repeated" in said and "far ahead" in said
+
+
+def test_readings_outside_the_angles_are_counted() -> None:
+    pose = path((5, 0), (10, 0), rate_hz=10)
+    spans(Given(Batch(readings(path((0, 0), (20, 0), rate_hz=10), 20), pose)))
+    assert spans.tally.without_pose == pytest.approx(400 + 900, abs=20)
+
+
+def test_temperature_is_the_last_one_measured() -> None:
+    pose = path((0, 0), (20, 0), rate_hz=10)
+    warm = Stream(np.array([4, 10]) * S, np.array([[20.0], [30.0]]))
+    blocks = list(dwell_blocks(Given(Batch(readings(pose, 20), pose, warm)), Segmenter(BENCH)))
+    values = np.concatenate([block.temperature_c for block in blocks])
+    assert np.isnan(values[:400]).all() and (values[400:1000] == 20).all() and (values[1000:] == 30).all()

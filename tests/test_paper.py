@@ -1,0 +1,37 @@
+"""The paper's parameters in closed form against finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kf_calib import paper
+from kf_calib.errors import BenchError
+from synthetic import NOMINAL, sensitivities
+
+RNG = np.random.default_rng(3)
+
+
+def test_nominal_is_the_papers_and_can_be_overridden() -> None:
+    np.testing.assert_array_equal(paper.nominal(), NOMINAL)
+    assert paper.nominal({"theta1": 0.0})[0] == 0.0
+    with pytest.raises(BenchError, match="theta2"):
+        paper.nominal({"theta2": 0.0})
+
+
+@pytest.mark.parametrize("size", [1e-4, 0.05, 0.3])
+def test_state_is_the_turned_axes(size: float) -> None:
+    truth = NOMINAL + RNG.normal(size=12) * size
+    rows, biases = sensitivities(truth)
+    np.testing.assert_allclose(paper.state_of(truth).reshape(3, 4), np.column_stack([rows, biases]), atol=1e-14)
+    np.testing.assert_allclose(paper.parameters_of(paper.state_of(truth)), truth, atol=1e-13)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.05, 0.3])
+def test_both_jacobians_by_finite_differences(size: float) -> None:
+    truth = NOMINAL + RNG.normal(size=12) * size
+    state, h = paper.state_of(truth), 1e-6
+    forward = np.array([(paper.state_of(truth + h * e) - paper.state_of(truth - h * e)) / (2 * h) for e in np.eye(12)]).T
+    back = np.array([(paper.parameters_of(state + h * e) - paper.parameters_of(state - h * e)) / (2 * h) for e in np.eye(12)])
+    np.testing.assert_allclose(paper.sensitivity_jacobian(truth), forward, atol=1e-9)
+    np.testing.assert_allclose(paper.jacobian(state), back.T, atol=1e-9)

@@ -1,0 +1,273 @@
+"""The Rerun view: what is in the file equals the calibration, and the file opens as a picture with something in it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kf_calib import paper
+from kf_calib.bench import Bench, axes_of
+from kf_calib.calibration import Calibration, Settings, calibrate
+from kf_calib.errors import InputError
+from kf_calib.model import PRIORS
+from kf_calib.samples import Batch, Floats, Stream
+from kf_calib.views import rerun as view
+from kf_calib.views.rerun.correlation import correlation, picture
+from kf_calib.views.rerun.layout import power
+from kf_calib.views.rerun.names import PER_SI, path_of
+from kf_calib.views.rerun.platform import magnification
+from kf_calib.views.rerun.series import nis_band
+from kf_calib.views.rerun.summary import fixed, summary
+from kf_calib.views.screenshot import ScreenshotError, screenshot
+
+STEP_NS = 10_000_000
+MOVE_NS = 2_000_000_000
+
+
+class Dwells:
+    """A source of still dwells at random orientations, readings linear in the specific force."""
+
+    def __init__(self, count: int, bench: Bench, samples: int = 300, sigma_mps2: float = 1e-4) -> None:
+        self.bench, self.warnings, self.fraction = bench, list[str](), 1.0
+        random = np.random.default_rng(7)
+        state = paper.state_of(paper.nominal() + 1e-3 * random.normal(size=12)).reshape(3, 4)
+        accel, pose, at_ns = list[Stream](), list[Stream](), 0
+        for _ in range(count):
+            time_ns = at_ns + STEP_NS * np.arange(samples)
+            own = _pose(bench, random)
+            force = np.broadcast_to(bench.specific_force(time_ns / 1e9, own[None]), (samples, 3))
+            noise = sigma_mps2 * random.normal(size=(samples, 3))
+            accel.append(Stream(time_ns, force @ state[:, :3].T + state[:, 3] + noise))
+            pose.append(Stream(time_ns[::10], np.repeat(own[None], len(time_ns[::10]), axis=0)))
+            at_ns = int(time_ns[-1]) + MOVE_NS
+        self.batch = Batch(_joined(accel), _joined(pose))
+
+    def __iter__(self) -> Iterator[Batch]:
+        yield self.batch
+
+
+def _pose(bench: Bench, random: np.random.Generator) -> Floats:
+    if bench.axes:
+        return random.uniform(-3, 3, size=3)
+    quaternion = random.normal(size=4)
+    return quaternion / np.linalg.norm(quaternion)
+
+
+def _joined(streams: list[Stream]) -> Stream:
+    return Stream(np.concatenate([s.time_ns for s in streams]), np.concatenate([s.values for s in streams]))
+
+
+GIMBALS = Bench(axes=axes_of("yzx"), gravity_mps2=9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+ATTITUDE = Bench(axes=(), gravity_mps2=9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+INERTIAL = Bench(
+    axes=axes_of("yzx"), gravity_mps2=9.81, reference="inertial", latitude_deg=50.0, angle_sigma_deg=0.0,
+    scatter_sigma_mps2=0.0,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def result() -> Calibration:
+    return calibrate(Dwells(12, GIMBALS))
+
+
+@pytest.fixture(scope="module")
+def recording(result: Calibration, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return view.save(result, tmp_path_factory.mktemp("view") / "run.rrd")
+
+
+Rows = list[tuple[float | None, int | None, list]]
+
+
+def rows_of(path: Path, component: str = "Scalars:scalars") -> dict[str, Rows]:
+    """(bench time in s, orientation, values) of every entity, in the order of the bench time."""
+    from rerun.chunk import RrdReader
+
+    out = defaultdict[str, Rows](list)
+    for chunk in RrdReader(path).stream():
+        columns = chunk.to_record_batch().to_pydict()
+        if component not in columns:
+            continue
+        times = columns.get(view.BENCH_TIME, [None])
+        numbers = columns.get(view.ORIENTATION, [None] * len(times))
+        for time, number, values in zip(times, numbers, columns[component], strict=True):
+            out[chunk.entity_path].append((None if time is None else time.total_seconds(), number, values))
+    return {entity: sorted(rows, key=lambda row: (row[0] is not None, row[0])) for entity, rows in out.items()}
+
+
+def by_orientation(rows: Rows) -> dict[int, list]:
+    return {number: values for _, number, values in rows if number is not None}
+
+
+@pytest.mark.parametrize("symbol", paper.SYMBOLS)
+def test_parameters_are_those_of_the_trace(result: Calibration, recording: Path, symbol: str) -> None:
+    k = paper.SYMBOLS.index(symbol)
+    scalars, per_si = rows_of(recording), PER_SI[k]
+    trace = [(t, e.parameters[k], e.sigma[k]) for t, _, e in result.trace() if not e.unseen[k]]
+    sigma = scalars[f"/{path_of(symbol)}/log10_sigma"]
+    np.testing.assert_allclose([row[0] for row in sigma], [t for t, _, _ in trace], atol=1e-9)
+    np.testing.assert_allclose([10 ** row[2][0] for row in sigma], [s * per_si for _, _, s in trace], rtol=1e-9)
+    nominal = paper.nominal(result.bench.nominal)[k]
+    band = np.array([row[2] for row in scalars[f"/{path_of(symbol)}/band"]])
+    np.testing.assert_allclose(band.mean(axis=1), [(v - nominal) * per_si for _, v, _ in trace], rtol=1e-9, atol=1e-7)
+    np.testing.assert_allclose(np.ptp(band, axis=1) / 2, [s * per_si for _, _, s in trace], rtol=1e-6)
+
+
+def test_one_point_an_orientation_and_none_before_it_is_determined(result: Calibration, recording: Path) -> None:
+    whole = by_orientation(rows_of(recording)["/parameters/a1/K1/log10_sigma"])
+    seen = [k for k, visit in enumerate(result.visits, 1) if not visit.estimate.unseen[2]]
+    assert list(whole) == seen
+    assert 1 not in seen
+    assert whole[12][0] == pytest.approx(np.log10(result.estimate.sigma[2] * 1e6))
+
+
+def test_innovations_and_nis_are_those_of_the_visits(result: Calibration, recording: Path) -> None:
+    scalars = rows_of(recording)
+    judged = {k: visit for k, visit in enumerate(result.visits, 1) if np.isfinite(visit.innovation_mps2).all()}
+    for i in range(3):
+        value = by_orientation(scalars[f"/innovation/a{i + 1}/value"])
+        bound = by_orientation(scalars[f"/innovation/a{i + 1}/bound"])
+        assert list(value) == list(bound) == list(judged)
+        for k, visit in judged.items():
+            assert value[k][0] == pytest.approx(visit.innovation_mps2[i] * 1e6)
+            assert bound[k] == pytest.approx(np.array([-2e6, 2e6]) * visit.innovation_sigma_mps2[i])
+    nis = by_orientation(scalars["/nis/value"]) | by_orientation(scalars.get("/nis/above", []))
+    assert {k: v[0] for k, v in nis.items()} == pytest.approx(
+        {k: visit.nis for k, visit in enumerate(result.visits, 1) if visit.dof > 0}
+    )
+
+
+def test_poses_and_correlation_are_those_of_the_visits(result: Calibration, recording: Path) -> None:
+    scalars = rows_of(recording)
+    for k, axis in enumerate("yzx"):
+        angles = by_orientation(scalars[f"/bench/pose/{k + 1}_{axis}"])
+        assert [angle[0] for angle in angles.values()] == pytest.approx(
+            [np.degrees(visit.dwell.pose[k]) for visit in result.visits]
+        )
+    matrix = np.array(by_orientation(scalars["/correlation/matrix"])[12]).reshape(12, 12)
+    np.testing.assert_allclose(matrix, correlation(result.estimate), atol=1e-9)
+    np.testing.assert_allclose(np.diag(matrix), 1.0)
+
+
+def test_axes_point_where_the_estimate_says(result: Calibration, recording: Path) -> None:
+    axes = by_orientation(rows_of(recording, "Arrows3D:vectors")["/platform/axes"])
+    sensitivity = result.estimate.state.reshape(3, 4)[:, :3]
+    expected = sensitivity / np.linalg.norm(sensitivity, axis=1, keepdims=True)
+    np.testing.assert_allclose(axes[12], expected, atol=1e-6)
+    assert axes[1] == []
+    spread = by_orientation(rows_of(recording, "Ellipsoids3D:half_sizes")["/platform/uncertainty"])
+    factor = magnification(result.estimate)
+    largest = max(np.sqrt(np.linalg.eigvalsh(result.estimate.covariance[i : i + 3, i : i + 3])[-1]) for i in (0, 4, 8))
+    assert np.max(spread[12]) == pytest.approx(factor * largest, rel=1e-5)
+    assert 0.04 < np.max(spread[12]) <= 0.121
+
+
+def test_summary_holds_every_parameter_and_every_warning(result: Calibration) -> None:
+    text = summary(result)
+    for parameter in result.parameters.values():
+        assert parameter.value is not None and parameter.sigma is not None
+        if parameter.unit == "1":
+            assert fixed(parameter.value, parameter.sigma) in text
+    assert all(warning in text for warning in result.warnings)
+    assert "agree with the model" in text
+
+
+def test_colours_of_correlations() -> None:
+    shown = picture(np.array([[1.0, -1.0], [0.0, np.nan]]))
+    assert shown[0, 0, 0] > 200 > 100 > shown[0, 0, 2]  # orange
+    assert shown[0, 1, 2] > 200 > 100 > shown[0, 1, 0]  # blue
+    assert shown[1, 0].max() < 30 < shown[1, 1].min()  # nearly black, and grey
+
+
+def test_numbers_as_they_are_printed() -> None:
+    assert [power(x) for x in (1.0, 500.0, 2e4, 1e5)] == ["1", "500", "2·10⁴", "10⁵"]
+    assert fixed(-1.23456, 0.0123) == "−1.235"
+    np.testing.assert_allclose(nis_band(np.array([3])), [[0.2158, 9.3484]], atol=1e-4)
+
+
+@pytest.mark.parametrize("bench", [ATTITUDE, INERTIAL], ids=["attitude", "inertial"])
+def test_other_benches(bench: Bench, tmp_path: Path) -> None:
+    path = view.save(calibrate(Dwells(8, bench)), tmp_path / "run.rrd")
+    assert "/parameters/a3/b3/log10_sigma" in rows_of(path)
+
+
+def test_a_prior_is_orientation_zero_and_one_dwell_is_enough(tmp_path: Path) -> None:
+    result = calibrate(Dwells(1, GIMBALS), Settings(prior=PRIORS["navigation"]))
+    path = view.save(result, tmp_path / "run.rrd", view.ORIENTATION, "Parameters")
+    sigma = by_orientation(rows_of(path)["/parameters/a2/b2/log10_sigma"])
+    assert list(sigma) == [0, 1]
+    assert sigma[0][0] == pytest.approx(np.log10(2e-2 * 1e6))
+
+
+def test_four_orientations_leave_nothing_to_judge(tmp_path: Path) -> None:
+    path = view.save(calibrate(Dwells(4, GIMBALS)), tmp_path / "run.rrd")
+    assert not any("/nis/" in entity for entity in rows_of(path))
+
+
+def test_strict_mode_of_the_caller_is_given_back(result: Calibration, tmp_path: Path) -> None:
+    import rerun
+
+    before = rerun.strict_mode()
+    view.save(result, tmp_path / "run.rrd")
+    assert rerun.strict_mode() is before
+
+
+def test_a_folder_that_is_not_there(result: Calibration, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no folder"):
+        view.save(result, tmp_path / "nowhere" / "run.rrd")
+
+
+def _drawn(recording: Path, picture: Path, **options) -> np.ndarray:
+    """The picture's pixels (h, w, 3); skips where there is no Vulkan driver."""
+    from PIL import Image
+
+    try:
+        screenshot(recording, picture, (1200, 800), **options)
+    except ScreenshotError as error:
+        if "graphics driver" in str(error):
+            pytest.skip(str(error))
+        raise
+    return np.asarray(Image.open(picture).convert("RGB"))
+
+
+def test_it_opens_as_a_picture(recording: Path, tmp_path: Path) -> None:
+    import rerun as rr
+
+    shown = _drawn(recording, tmp_path / "run.png")
+    assert shown.shape == (800, 1200, 3)
+    assert len(np.unique(shown.reshape(-1, 3), axis=0)) > 500
+    for colour in ((235, 115, 40), (40, 185, 130), (85, 160, 245)):  # the curves of each accelerometer
+        assert (np.abs(shown.astype(int) - colour).max(axis=2) < 12).sum() > 300
+    early = _drawn(recording, tmp_path / "early.png", timeline=view.ORIENTATION, time=3)
+    assert (early != shown).any(axis=2).mean() > 0.01
+    with rr.RecordingStream("empty") as stream:
+        stream.save(tmp_path / "empty.rrd")
+        stream.log("nothing", rr.TextDocument(""), static=True)
+        stream.disconnect()
+    empty = _drawn(tmp_path / "empty.rrd", tmp_path / "empty.png")
+    assert (empty != shown).any(axis=2).mean() > 0.05
+
+
+def test_no_panel_complains(recording: Path) -> None:
+    from rerun.experimental import ViewerClient
+
+    from kf_calib.views import screenshot as module
+
+    with module.viewer(recording, (1200, 800)) as client:
+        assert isinstance(client, ViewerClient)
+        client.take_screenshot()
+        state = client.get_state()
+    assert [(shown.name, report.summary) for shown in state.views for report in shown.reports] == []
+    assert len([shown for shown in state.views if shown.visible]) >= 20
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [("none.rrd", {}, "no recording"), ("run.rrd", {"timeline": "no_such_line", "time": 1.0}, "no timeline")],
+)
+def test_screenshots_that_cannot_be(recording: Path, tmp_path: Path, name: str, options: dict, message: str) -> None:
+    with pytest.raises(ScreenshotError, match=message):
+        _drawn(recording.parent / name, tmp_path / "x.png", **options)
