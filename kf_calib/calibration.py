@@ -240,7 +240,7 @@ def evaluate(dwells: list[DwellFactor], bench: Bench, settings: Settings) -> Cal
     means, _ = _means(dwells)
     residuals = means[:, 4:] - _predicted(means, final.state)
     visits = _visits(dwells, steps, residuals, noise, extra, nominal_state, settings, bench)
-    held_out, floor = _held_out(dwells, rows, extra, noise, state, nominal_state)
+    held_out, floor = _held_out(dwells, noise.judging, state, nominal_state)
     judged = _consistency(dwells, noise, state)
     return Calibration(
         bench, settings, noise, state, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), held_out, floor,
@@ -369,8 +369,7 @@ def _visits(
 def _consistency(dwells: list[DwellFactor], noise: Noise, state: Floats) -> Consistency:
     from scipy.special import fdtrc
 
-    judged = noise if noise.scatter_stated else replace(noise, scatter_mps2=np.zeros(3))
-    rows = information.whitened(dwells, judged, state).reshape(-1, STATE_COUNT + 1)
+    rows = information.whitened(dwells, noise.judging, state).reshape(-1, STATE_COUNT + 1)
     step = information.update(information.start(Prior(), state, state), rows)
     factors = np.array([dwell.factor for dwell in dwells])
     dof = 3 * int(information.informative(factors).sum()) - information.rank(step.factor)
@@ -399,13 +398,15 @@ def orientations(dwells: list[DwellFactor]) -> list[list[int]]:
 
 
 def _held_out(
-    dwells: list[DwellFactor], rows: Floats, extra: Floats, noise: Noise, state: Floats, nominal_state: Floats
+    dwells: list[DwellFactor], noise: Noise, state: Floats, nominal_state: Floats
 ) -> tuple[float | None, float | None]:
-    """Rms error of the dwell means of orientations left out of the fit, and the rms the noise alone would give.
+    """Rms error of the dwell means of orientations left out of the fit, and the rms that ``noise`` alone would give.
 
     Factors of the orientations before and after the one left out are merged: no refit from the start. None where a
     fit without one of the orientations is undetermined.
     """
+    rows = information.whitened(dwells, noise.weights, state)
+    extra = considered(noise, *_means(dwells), state)
     groups = orientations(dwells)
     own = [information.update(information.start(Prior(), state, state), rows[g].reshape(-1, 13)).factor for g in groups]
     heads, tails = [np.zeros((12, 13))], [np.zeros((12, 13))]

@@ -222,9 +222,13 @@ def run(first: Floats, rows: Iterable[Floats], walk_variances: Iterable[Floats])
 
 
 def _scaled(factor: Floats) -> tuple[Floats, Floats]:
-    """R with columns of unit length, and those lengths."""
-    scale = np.linalg.norm(factor[:, :-1], axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
+    """R in units in which its columns are of the same order, and those units (12,).
+
+    One unit for all sensitivities and one for all biases: a column of rounding size must stay small.
+    """
+    size = np.linalg.norm(factor[:, :-1], axis=0).reshape(3, 4)
+    largest = np.concatenate([np.full(3, size[:, :3].max()), size[:, 3:].max(axis=0)])
+    scale = np.tile(np.where(largest > 0, largest, 1.0), 3)
     return factor[:, :-1] / scale, scale
 
 

@@ -58,6 +58,11 @@ class Noise:
         return self if self.checked else replace(self, setting_rad=0.0)
 
     @property
+    def judging(self) -> Noise:
+        """The noise by which a misfit is judged: scatter that was estimated from the same misfit is left out."""
+        return self if self.scatter_stated else replace(self, scatter_mps2=np.zeros(3))
+
+    @property
     def dwell_sigmas(self) -> Floats:
         """Sigma (6,) of a dwell's nuisance states: three rotations in rad, three offsets in m/s^2; 0: absent."""
         return np.concatenate([np.full(3, self.setting_rad), self.scatter_mps2])

@@ -20,8 +20,8 @@ def test_outliers_are_rejected_counted_and_harmless(share: float) -> None:
     hit = rng.random(len(dirty.accel)) < share
     dirty.accel.values[hit] += rng.normal(size=(int(hit.sum()), 3)) * 0.5
     one, other = calibrate(clean), calibrate(dirty)
-    place = np.arange(len(hit)) % 300  # within the dwell: a second settles, a tenth is left out before the slew
-    evaluated = ((place >= 20) | (np.arange(len(hit)) < 300)) & (place < 298)
+    place = np.arange(len(hit)) % 300  # within the dwell: a second settles, the last angle message of a dwell ends it
+    evaluated = ((place >= 20) | (np.arange(len(hit)) < 300)) & (place < 288)
     assert other.tally.gated == pytest.approx((hit & evaluated).sum(), rel=0.03, abs=1)
     assert any("outliers" in warning for warning in other.warnings)
     shift = np.abs(other.estimate.parameters - one.estimate.parameters) / one.estimate.sigma

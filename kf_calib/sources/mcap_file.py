@@ -185,11 +185,13 @@ class Block:
     """Records of the file as they lie in it: what some chunks hold, and what lies outside chunks, joined together.
 
     borders: bytes of ``data`` where its parts end, ascending, the last one its size; damage does not spread over them.
+    index: bytes of ``data`` where messages start, if the file's index is right: no checksum of a chunk covers it.
     end: byte of the file up to which it has been read.
     """
 
     data: bytes
     borders: tuple[int, ...]
+    index: Integers
     end: int
 
 
@@ -284,28 +286,29 @@ class _Walk:
     def parcels(self) -> Iterator[_Parcel]:
         parcel = _Parcel()
         for start, opcode, content in self._records():
-            if opcode != Opcode.CHUNK and opcode not in _LOOSE:
-                continue
-            parcel.records.append((start, opcode, content))
-            parcel.size += _CHUNK.unpack_from(content)[2] if opcode == Opcode.CHUNK else len(content)
-            if parcel.size >= _BLOCK:
-                parcel.end = self.position
+            if parcel.size >= _BLOCK and opcode != Opcode.MESSAGE_INDEX:
                 yield parcel
                 parcel = _Parcel()
+            if opcode != Opcode.HEADER:
+                parcel.records.append((start, opcode, content))
+                parcel.size += _CHUNK.unpack_from(content)[2] if opcode == Opcode.CHUNK else len(content)
+                parcel.end = self.position
         if parcel.records:
-            parcel.end = self.position
             yield parcel
 
     def unpack(self, parcel: _Parcel) -> Block:
         parts: list[bytes] = []
+        borders = [0]
+        index = [np.empty(0, np.int64)]
         for start, opcode, content in parcel.records:
-            if opcode == Opcode.CHUNK:
-                parts.append(self._unpack_chunk(start, content))
-            else:
-                parts.append(HEAD.pack(opcode, len(content)) + content)
-                self.unchecked |= opcode == Opcode.MESSAGE
-        borders = tuple(accumulate(map(len, parts)))
-        return Block(parts[0] if len(parts) == 1 else b"".join(parts), borders, parcel.end)
+            if opcode == Opcode.MESSAGE_INDEX:  # it follows its chunk, and counts from the chunk's start
+                index.append(np.frombuffer(content[6:], "<i8")[1::2] + borders[max(len(parts) - 1, 0)])
+                continue
+            part = self._unpack_chunk(start, content) if opcode == Opcode.CHUNK else self._loose(opcode, content)
+            parts.append(part)
+            borders.append(borders[-1] + len(part))
+        data = parts[0] if len(parts) == 1 else b"".join(parts)
+        return Block(data, tuple(borders[1:]), np.sort(np.concatenate(index), kind="stable"), parcel.end)
 
     def compare_checksum(self) -> None:
         """Checks what lies outside chunks, once all has been read and unpacked."""
@@ -379,6 +382,10 @@ class _Walk:
             self.warn(f"{self.path} is damaged at byte {start}: the {count} bytes from there to its end are lost.")
         self.position = self.file.seek(limit)
 
+    def _loose(self, opcode: int, content: bytes) -> bytes:
+        self.unchecked |= opcode == Opcode.MESSAGE
+        return HEAD.pack(opcode, len(content)) + content
+
     def _unpack_chunk(self, start: int, content: bytes) -> bytes:
         first_ns, last_ns, _, crc, _ = _CHUNK.unpack_from(content)
         self.unchecked |= crc == 0
@@ -424,38 +431,42 @@ class Messages:
 
 
 _MESSAGE = int(Opcode.MESSAGE)  # a plain int: comparing a whole block with an enum would widen it first
-_HEADS = np.dtype(
-    {"names": ["length", "channel"], "formats": ["<i8", "<u2"], "offsets": [1, 9], "itemsize": HEAD.size + 2}
-)
+_LEAST_MESSAGE = HEAD.size + MESSAGE_FIELDS
+_HEADS = np.dtype([("opcode", "u1"), ("length", "<i8"), ("channel", "<u2")])
+_CHANNEL_SHIFT, _LENGTH_SHIFT = 8, 24
 
 
 class MessageFinder:
     """Finds the messages of block after block.
 
-    The kinds of record head (length and channel) met before are searched for in the whole block at once. What is
-    found is right if each record ends where the next begins, from the block's first byte to its last; if not, the
-    block is walked through record by record. The file's own message index is not needed, and being covered by no
-    chunk's checksum it could not be trusted without the same proof.
+    Where records may start is known from the file's index, or is every byte with a message's opcode. Of these are kept
+    the ones whose head (length and channel) was met before, all at once. They are right if each record ends where
+    the next begins, from the block's first byte to its last; if not, the block is walked through record by record.
     """
 
     def __init__(self) -> None:
         self._known: list[int] = []
 
     def __call__(self, block: Block) -> Messages:
-        return self._search(block.data) or self._walk(block.data, block.borders)
+        data = block.data
+        return (
+            self._chain(data, block.index)
+            or self._chain(data, np.flatnonzero(np.frombuffer(data, np.uint8) == _MESSAGE))
+            or self._walk(data, block.borders)
+        )
 
-    def _search(self, data: bytes) -> Messages | None:
-        room = len(data) - (HEAD.size + MESSAGE_FIELDS) + 1
-        if not self._known or room <= 0:
+    def _chain(self, data: bytes, start: Integers) -> Messages | None:
+        """The messages, if all of them are among the records at ``start`` (ascending), and nothing else is there."""
+        start = start[np.searchsorted(start, 0) : np.searchsorted(start, len(data) - _LEAST_MESSAGE, side="right")]
+        if not self._known or not len(start):
             return None
-        start = np.flatnonzero(np.frombuffer(data, np.uint8)[:room] == _MESSAGE)
-        key = _keys(data, start)
-        is_kind = [key == known for known in self._known]
-        found = np.logical_or.reduce(is_kind)
-        first, end = start[found], start[found] + HEAD.size + (key[found] >> _CHANNEL_BITS)
+        kind = _kinds(data, start)
+        masks = [kind == known for known in self._known]
+        found = np.logical_or.reduce(masks)
+        first, end = start[found], start[found] + HEAD.size + (kind[found] >> _LENGTH_SHIFT)
         if not len(first) or first[0] != 0 or end[-1] != len(data) or np.any(first[1:] != end[:-1]):
             return None
-        groups = [_group(known, start[mask]) for known, mask in zip(self._known, is_kind, strict=True)]
+        groups = [_group(known, start[mask]) for known, mask in zip(self._known, masks, strict=True)]
         return Messages(groups, others=[], lost=0)
 
     def _walk(self, data: bytes, borders: tuple[int, ...]) -> Messages:
@@ -476,23 +487,21 @@ class MessageFinder:
                 position = content + length
             position = border
         start = np.array(starts, np.int64)
-        key = _keys(data, start)
-        kinds: list[int] = np.unique(key).tolist()
+        kind = _kinds(data, start)
+        kinds: list[int] = np.unique(kind).tolist()
         self._known = sorted({*self._known, *kinds})
         if len(self._known) > _MOST_KINDS:
             self._known = []
-        return Messages([_group(kind, start[key == kind]) for kind in kinds], others, lost)
+        return Messages([_group(known, start[kind == known]) for known in kinds], others, lost)
 
 
-_CHANNEL_BITS = 16
-
-
-def _keys(data: bytes, start: Integers) -> Integers:
-    """Length and channel of the records at ``start`` in one number each."""
+def _kinds(data: bytes, start: Integers) -> Integers:
+    """Opcode, channel and length of the records at ``start`` in one number each."""
     heads = np.ndarray((max(len(data) - _HEADS.itemsize + 1, 0),), _HEADS, data, strides=(1,))
-    return (heads["length"][start] << _CHANNEL_BITS) | heads["channel"][start]
+    channel = heads["channel"][start].astype(np.int64) << _CHANNEL_SHIFT
+    return (heads["length"][start] << _LENGTH_SHIFT) | channel | heads["opcode"][start]
 
 
-def _group(key: int, start: Integers) -> Group:
-    length, channel = key >> _CHANNEL_BITS, key & (1 << _CHANNEL_BITS) - 1
-    return Group(channel, start + (HEAD.size + MESSAGE_FIELDS), length - MESSAGE_FIELDS)
+def _group(kind: int, start: Integers) -> Group:
+    channel, length = (kind >> _CHANNEL_SHIFT) & 0xFFFF, kind >> _LENGTH_SHIFT
+    return Group(channel, start + _LEAST_MESSAGE, length - MESSAGE_FIELDS)

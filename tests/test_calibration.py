@@ -1,0 +1,146 @@
+"""The main job: real data by others, misfit, held-out error, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kf_calib.bench import Bench, axes_of
+from kf_calib.calibration import Settings, calibrate, orientations
+from kf_calib.errors import InputError, UnobservableError
+from kf_calib.samples import Batch, Stream
+from kf_calib.sources.recording import Recording
+from synthetic import G, Run
+
+
+def test_a_real_imu_placed_by_hand(ferraris: Path) -> None:
+    """imucal's published scale factors; plain least squares' biases; the hand's angle errors in the sigmas."""
+    result = calibrate(Recording(ferraris))
+    values = {symbol: p.value for symbol, p in result.parameters.items()}
+    np.testing.assert_allclose([values["K1"], values["K2"], values["K3"]], [0.99675, 1.00244, 1.02340], atol=2e-4)
+    np.testing.assert_allclose([values["b1"], values["b2"], values["b3"]], [0.551, -0.620, 0.386], atol=5e-3)
+    assert result.residual_rms_mps2 == pytest.approx(0.0131, abs=3e-4)
+    assert len(result.visits) == 6
+    sigmas = {symbol: p.sigma for symbol, p in result.parameters.items()}
+    assert all(1e-3 < sigmas[f"K{i}"] < 5e-3 and 5e-3 < sigmas[f"b{i}"] < 0.05 for i in (1, 2, 3))
+    assert sigmas["theta1"] > np.radians(0.3) / 2
+    assert result.noise.setting_stated and result.consistency.consistent
+    assert result.parameters["theta1"].nominal == 0.0
+    assert any("cannot tell a setting error" in warning for warning in result.warnings)
+
+
+def test_an_effect_that_is_missing_shows_as_misfit() -> None:
+    run = Run(seed=1)
+    assert calibrate(run).consistency.consistent
+    run.accel.values[:, 0] += 3e-6 * run.accel.values[:, 0] ** 2
+    result = calibrate(run)
+    assert result.consistency.consistent is False
+    assert result.held_out_rms_mps2 > 3 * result.held_out_floor_mps2
+    assert any("an effect is missing" in warning for warning in result.warnings)
+
+
+def test_held_out_equals_refits_without_the_orientation() -> None:
+    run = Run(seed=2, dwells=8)
+    run.accel = Stream(run.accel.time_ns, run.accel.values)
+    result = calibrate(run)
+    errors = []
+    for left_out in range(8):
+        from kf_calib.calibration import evaluate
+
+        kept = [visit.dwell for k, visit in enumerate(result.visits) if k != left_out]
+        rest = evaluate(kept, replace(run.bench, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0), Settings())
+        means = result.visits[left_out].dwell.means
+        state = rest.estimate.state.reshape(3, 4)
+        errors.append(means[4:] - state[:, :3] @ means[1:4] - state[:, 3])
+    assert result.held_out_rms_mps2 == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=0.01)
+
+
+def test_repeated_poses_are_one_orientation() -> None:
+    poses = np.random.default_rng(0).uniform(-3, 3, (5, 3))
+    result = calibrate(Run(seed=3, poses=np.vstack([poses, poses])))
+    groups = orientations([visit.dwell for visit in result.visits])
+    assert groups == [[k, k + 5] for k in range(5)]
+
+
+def test_one_orientation_names_what_cannot_be_seen() -> None:
+    with pytest.raises(UnobservableError, match="theta1.*phi1.*K1.*b1.*nu1.*K3.*b3"):
+        calibrate(Run(seed=4, poses=np.zeros((1, 3))))
+
+
+def test_two_faces_name_the_unseen_and_give_the_rest() -> None:
+    result = calibrate(Run(seed=5, poses=np.array([[0.0, 0, 0], [0, np.pi, 0]]), count=600))
+    unseen = {symbol for symbol, p in result.parameters.items() if p.value is None}
+    assert unseen == {"phi1", "K1", "nu1", "nu2", "phi3", "K3"}
+    assert any("do not determine phi1, K1, nu1, nu2, phi3, K3" in warning for warning in result.warnings)
+    error = result.estimate.parameters - Run(seed=5, poses=np.zeros((1, 3))).truth
+    assert result.consistency.consistent is None and abs(error[6]) < 5 * result.parameters["K2"].sigma
+
+
+def test_four_orientations_leave_nothing_to_judge_by() -> None:
+    result = calibrate(Run(seed=6, dwells=4))
+    assert result.consistency.consistent is None
+    assert any("nothing over to judge" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize("unit, factor", [("g", 1 / 9.80665), ("mg", 1e3 / 9.80665)])
+def test_readings_in_g_are_noticed(unit: str, factor: float) -> None:
+    run = Run(seed=7, dwells=6)
+    run.accel = replace(run.accel, values=run.accel.values * factor)
+    with pytest.raises(InputError, match=f"gravity in {unit}, .*--accel-unit {unit}"):
+        calibrate(run)
+
+
+def test_counts_are_noticed() -> None:
+    run = Run(seed=7, dwells=6)
+    run.accel = replace(run.accel, values=np.round(run.accel.values * 1671.0))
+    with pytest.raises(InputError, match="look like counts"):
+        calibrate(run)
+
+
+def test_wrong_axes_are_noticed() -> None:
+    run = Run(seed=8)
+    run.bench = replace(run.bench, axes=axes_of("xzy"))
+    assert any("angles do not explain" in warning for warning in calibrate(run).warnings)
+
+
+def test_degrees_taken_for_radians_are_noticed() -> None:
+    run = Run(seed=8)
+    run.pose = replace(run.pose, values=np.degrees(run.pose.values))
+    assert any("unit of the angles" in warning for warning in calibrate(run).warnings)
+
+
+def test_noise_free_readings_do_no_harm() -> None:
+    run = Run(seed=9, white_mps2=0.0)
+    result = calibrate(run)
+    np.testing.assert_allclose(result.estimate.parameters, run.truth, atol=1e-12)
+    assert result.consistency.consistent
+
+
+def test_platform_that_never_rests_is_refused() -> None:
+    time_ns = np.arange(0, 60_000_000_000, 50_000_000)
+    angles = np.column_stack([time_ns * 1e-9] * 3)
+    run = Run(seed=10, dwells=1)
+    run.accel, run.pose = Stream(time_ns, np.full((len(time_ns), 3), G / 2)), Stream(time_ns, angles)
+    with pytest.raises(InputError, match="no dwell was found"):
+        calibrate(run)
+
+
+def test_nothing_at_all_is_refused() -> None:
+    class Empty:
+        bench = Bench(axes_of("y"), G)
+        warnings: tuple[str, ...] = ()
+        fraction = 1.0
+
+        def __iter__(self):
+            return iter([Batch(Stream.empty(3), Stream.empty(1))])
+
+    with pytest.raises(InputError, match="no accelerometer readings"):
+        calibrate(Empty())
+
+
+def test_the_result_prints_itself() -> None:
+    text = str(calibrate(Run(seed=11)))
+    assert "θ1" in text and "ppm" in text and "Model and measurements agree" in text and "\x1b" not in text

@@ -1,0 +1,58 @@
+"""The noise model against noise of known kind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from kf_calib.calibration import calibrate
+from kf_calib.information import Autocovariance
+from synthetic import Run
+
+
+def test_autocovariance_is_the_sum_of_lagged_products() -> None:
+    values = np.random.default_rng(0).normal(size=(3, 500))
+    got = Autocovariance.of(values)
+    for lag in (0, 1, 7, 64):
+        np.testing.assert_allclose(got.products[lag], np.sum(values[:, : 500 - lag] * values[:, lag:], axis=1))
+    assert got.pairs[64] == 436
+
+
+def test_white_noise_is_not_inflated() -> None:
+    inflations = [calibrate(Run(seed=seed, dwells=6)).noise.inflation for seed in range(10)]
+    assert np.mean(np.array(inflations) == 1.0) > 0.9
+
+
+@pytest.mark.parametrize("phi", [0.5, 0.9, 0.97])
+def test_ar1_inflation_is_that_of_the_mean(phi: float) -> None:
+    """kappa = (1 + phi) / (1 - phi)."""
+    result = calibrate(Run(seed=1, dwells=24, count=2000, rate_hz=100.0, phi=phi))
+    np.testing.assert_allclose(result.noise.inflation, (1 + phi) / (1 - phi), rtol=0.25)
+    np.testing.assert_allclose(result.noise.sigma_mps2, 1e-4, rtol=0.1)
+
+
+def test_ar2_resonance_is_followed_too() -> None:
+    """A noise with a spectral line averages faster near zero frequency than its variance says: never below white."""
+    run = Run(seed=2, dwells=12, count=2000, rate_hz=100.0, white_mps2=0.0)
+    a = [1.0, -2 * 0.95 * np.cos(1.0), 0.95**2]
+    run.accel.values[:] += 1e-4 * lfilter([1.0], a, np.random.default_rng(0).normal(size=run.accel.values.shape), axis=0)
+    np.testing.assert_allclose(calibrate(run).noise.inflation, 1.0)
+
+
+def test_setting_error_and_scatter_are_told_apart_and_sized() -> None:
+    settings, scatters = [], []
+    for seed in range(12):
+        setting = calibrate(Run(seed=seed, dwells=30, setting_deg=0.01, stated=False)).noise
+        assert not setting.scatter_mps2.any()
+        settings.append(np.degrees(setting.setting_rad))
+        scatter = calibrate(Run(seed=seed, dwells=30, scatter_mps2=5e-4)).noise
+        assert scatter.setting_rad == 0 or scatter.setting_stated
+        scatters.append(scatter.scatter_mps2)
+    assert np.sqrt(np.mean(np.square(settings))) == pytest.approx(0.01, rel=0.1)
+    assert np.sqrt(np.mean(np.square(scatters))) == pytest.approx(5e-4, rel=0.12)
+
+
+def test_what_is_stated_is_not_estimated() -> None:
+    noise = calibrate(Run(seed=3, setting_deg=0.01)).noise
+    assert noise.setting_stated and noise.setting_rad == pytest.approx(np.radians(0.01))
