@@ -1,1 +1,62 @@
-"""kf_calib: sequential Kalman-filter calibration of accelerometers on a stationary gimballed bench."""
+"""kf_calib: sequential Kalman-filter calibration of accelerometers on a stationary gimballed bench.
+
+    import kf_calib
+
+    run = kf_calib.calibrate(kf_calib.open_recording("run.mcap"))
+    print(run)                                  # parameters, noise, verdict
+    run.parameters["K1"].value, run.parameters["K1"].sigma
+    kf_calib.save_view(run, "run.rrd")          # opens in Rerun
+
+Conventions, kept everywhere:
+
+- Readings are specific force in m/s^2: +g when the sensitive axis points up. reading_i = K_i E_i . f + b_i.
+- Frames: n = North, Up, East; b = bench, n turned by the azimuth; p = platform, C_bp = Rot(axis1, q1) Rot(axis2, q2) ...
+  All angles zero: y up, accelerometer 2 reads +g. Right-handed, angles in rad, quaternions x y z w (platform -> bench).
+- Time: stamps are integer nanoseconds (``time_ns``); ``elapsed_s`` counts from the first reading.
+- Units are in the names: ``accel_mps2``, ``angle_sigma_deg``, ``gimbal_deg``, ``sigma_mps2``.
+- Arrays have samples (n) or dwells (D) first: readings (n, 3), factors (D, 7, 7). sigma is always 1 sigma.
+- The affine state is (s1, b1, s2, b2, s3, b3), s_i = K_i E_i; the paper's theta, phi, nu, K, b follow in closed form.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from kf_calib.bench import Bench
+    from kf_calib.calibration import Calibration, Parameter, Settings, calibrate
+    from kf_calib.comparison import compare
+    from kf_calib.errors import InputError, KfCalibError, UnobservableError
+    from kf_calib.sources.recorder import Recorder
+    from kf_calib.sources.recording import Recording as open_recording
+    from kf_calib.views.rerun import save as save_view
+
+_HOMES = {
+    "Bench": ("bench", "Bench"),
+    "Calibration": ("calibration", "Calibration"),
+    "Parameter": ("calibration", "Parameter"),
+    "Settings": ("calibration", "Settings"),
+    "calibrate": ("calibration", "calibrate"),
+    "compare": ("comparison", "compare"),
+    "InputError": ("errors", "InputError"),
+    "KfCalibError": ("errors", "KfCalibError"),
+    "UnobservableError": ("errors", "UnobservableError"),
+    "Recorder": ("sources.recorder", "Recorder"),
+    "open_recording": ("sources.recording", "Recording"),
+    "save_view": ("views.rerun", "save"),
+}
+
+__all__ = [
+    "Bench", "Calibration", "InputError", "KfCalibError", "Parameter", "Recorder", "Settings", "UnobservableError",
+    "calibrate", "compare", "open_recording", "save_view",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """Public names are imported when first used: the package itself imports in milliseconds."""
+    from importlib import import_module
+
+    if name not in _HOMES:
+        raise AttributeError(f"module 'kf_calib' has no attribute {name!r}")
+    module, attribute = _HOMES[name]
+    return getattr(import_module(f"kf_calib.{module}"), attribute)

@@ -237,7 +237,9 @@ def turn(vector: Floats, axis: Floats, angle_rad: Floats | float) -> Floats:
 
 
 def _turn_by_quaternion(vector: Floats, imaginary: Floats, real: Floats) -> Floats:
-    doubled = 2.0 * np.cross(imaginary, np.broadcast_to(vector, imaginary.shape))
+    shape = np.broadcast_shapes(vector.shape, imaginary.shape)
+    vector, imaginary = np.broadcast_to(vector, shape), np.broadcast_to(imaginary, shape)
+    doubled = 2.0 * np.cross(imaginary, vector)
     return vector + real * doubled + np.cross(imaginary, doubled)
 
 

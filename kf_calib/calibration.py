@@ -381,19 +381,24 @@ def _consistency(dwells: list[DwellFactor], noise: Noise, state: Floats) -> Cons
     return Consistency(step.nis, dof, p_value, p_value >= 0.01)
 
 
+def format_p(p_value: float | None) -> str:
+    """``= 0.034``, or a bound where the number has underflowed."""
+    return "= -" if p_value is None else "< 1e-300" if p_value < 1e-300 else f"= {p_value:.2g}"
+
+
 def orientations(dwells: list[DwellFactor]) -> list[list[int]]:
     """Dwells grouped by orientation: the same direction of gravity in the platform, and nearly the same pose."""
-    groups, seen = list[list[int]](), list[tuple[Floats, Floats]]()
-    for k, dwell in enumerate(dwells):
-        direction = dwell.means[1:4] / np.linalg.norm(dwell.means[1:4])
-        for group, (known, pose) in zip(groups, seen, strict=True):
-            apart = np.linalg.norm(direction - known), np.abs(dwell.pose - pose).max()
-            if max(apart) < np.radians(SAME_POSE_DEG):
-                group.append(k)
-                break
+    means, _ = _means(dwells)
+    direction = means[:, 1:4] / np.linalg.norm(means[:, 1:4], axis=1, keepdims=True)
+    place = np.column_stack([direction, [dwell.pose for dwell in dwells]])
+    groups, heads = list[list[int]](), np.empty((0, place.shape[1]))
+    for k, here in enumerate(place):
+        near = np.flatnonzero(np.abs(heads - here).max(axis=1) < np.radians(SAME_POSE_DEG))
+        if near.size:
+            groups[near[0]].append(k)
         else:
             groups.append([k])
-            seen.append((direction, dwell.pose))
+            heads = np.vstack([heads, here])
     return groups
 
 
@@ -436,7 +441,10 @@ def _remarks(
     if unseen:
         yield f"these orientations do not determine {', '.join(unseen)}: visit more, spread over the sphere."
     if judged.dof == 0:
-        yield f"{len(dwells)} dwells leave nothing over to judge the model by: visit at least two more orientations."
+        yield (
+            f"{len(dwells)} dwell{'s' * (len(dwells) > 1)} leave nothing over to judge the model by: "
+            "visit at least five spread orientations."
+        )
     rms = float(np.sqrt(np.mean(residuals**2)))
     if rms > 0.03 * bench.gravity_mps2:
         yield (
@@ -445,7 +453,7 @@ def _remarks(
         )
     elif judged.consistent is False:
         yield (
-            f"the dwells scatter about the model by more than the noise (p = {judged.p_value:.1e}): an effect is missing "
+            f"the dwells scatter about the model by more than the noise (p {format_p(judged.p_value)}): an effect is missing "
             "in the model, or the noise from dwell to dwell was not stated (angle_sigma_deg, scatter_sigma_mps2)."
         )
     if noise.inflation.max() > 1.5:

@@ -34,7 +34,7 @@ class Stillness:
     tolerance_deg: float = 0.05
     window_s: float = 1.0
     settle_s: float = 1.0
-    lead_s: float = 0.1
+    lead_s: float = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,14 +288,33 @@ class Segmenter:
                     events.append((begin - (0 if self._begun else _HOLD_NS), _Event.ARRIVE, 0))
                     in_dwell = True
                 if in_dwell:
-                    events.append((leave - lead_ns, _Event.LEAVE, 0))
+                    events.append((self._departure_ns(leave) - lead_ns, _Event.LEAVE, 0))
                 events.append((arrive, _Event.ARRIVE, settle_ns))
                 in_dwell = True
             elif not still[j] and in_dwell:
-                events.append((begin - lead_ns, _Event.LEAVE, 0))
+                events.append((self._departure_ns(begin) - lead_ns, _Event.LEAVE, 0))
                 in_dwell = False
             self._begun = True
         return events
+
+    def _departure_ns(self, end_ns: int) -> int:
+        """When, in the last window of a dwell that ends at ``end_ns``, the platform began to creep away.
+
+        A slew starts gently: within the tolerance it still counts as standing. The last messages are held against the
+        mean of the two windows before them, to a fiftieth of the tolerance or four sigma of the encoder.
+        """
+        window_ns = round(self.stillness.window_s * _SECOND_NS)
+        times, poses = self._pose.time_ns, self._pose.values
+        first, middle, last = np.searchsorted(times, (end_ns - 3 * window_ns, end_ns - window_ns, end_ns + 1))
+        if self._dwell is not None:
+            first = max(first, int(np.searchsorted(times, self._dwell.first_pose_ns)))
+        if middle - first < 2 or last <= middle:
+            return end_ns
+        reference = poses[first:middle]
+        apart = pose_distance(poses[middle:last], mean_pose(reference), not self.bench.axes)
+        noise = 4.0 * float(reference.std(axis=0).max())
+        away = np.flatnonzero(apart > max(np.radians(self.stillness.tolerance_deg) / 50.0, noise))
+        return int(times[max(middle + away[0] - 1, first)]) if away.size else end_ns
 
     def _resolve_by_readings(self, begin_ns: int, end_ns: int) -> tuple[int, int]:
         """When a motion without angles began and ended, from the readings between two poses.
@@ -333,7 +352,7 @@ class Segmenter:
             return int(self._accel.time_ns[-1]) + 1 if len(self._accel) else None
         if final:
             return int(self._pose.time_ns[-1]) + _HOLD_NS if len(self._pose) > 1 else 1 << 62
-        return self._decided_ns - round(self.stillness.lead_s * _SECOND_NS)
+        return self._decided_ns - round((self.stillness.lead_s + self.stillness.window_s) * _SECOND_NS)
 
     def _discard(self, until_ns: int) -> None:
         """Drop the readings before ``until_ns``: the platform was moving, or no angle was known."""
@@ -386,7 +405,7 @@ class Segmenter:
     def _forget(self) -> None:
         """Drop poses and temperatures that no pending reading needs."""
         oldest = int(self._accel.time_ns[0]) if len(self._accel) else (self._decided_ns or 0)
-        oldest = min(oldest, self._decided_ns or oldest)
+        oldest = min(oldest, (self._decided_ns or oldest) - round(4 * self.stillness.window_s * _SECOND_NS))
         self._pose = self._pose[max(int(np.searchsorted(self._pose.time_ns, oldest)) - 2, 0) :]
         self._temperature = self._temperature[max(int(np.searchsorted(self._temperature.time_ns, oldest)) - 1, 0) :]
 

@@ -208,7 +208,7 @@ def update(factor: Floats, rows: Floats) -> Step:
     upper = np.linalg.qr(np.vstack([factor, rows]), mode="r")
     after = upper[:STATE_COUNT]
     gained = rank(after) - rank(factor)
-    informative_rows = int(np.linalg.matrix_rank(rows[:, :-1])) if len(rows) else 0
+    informative_rows = int(np.linalg.matrix_rank(rows[:, :-1], rtol=1e-9)) if len(rows) else 0
     return Step(after, float(upper[STATE_COUNT, STATE_COUNT] ** 2), informative_rows - gained)
 
 

@@ -73,8 +73,8 @@ def test_one_orientation_names_what_cannot_be_seen() -> None:
 def test_two_faces_name_the_unseen_and_give_the_rest() -> None:
     result = calibrate(Run(seed=5, poses=np.array([[0.0, 0, 0], [0, np.pi, 0]]), count=600))
     unseen = {symbol for symbol, p in result.parameters.items() if p.value is None}
-    assert unseen == {"phi1", "K1", "nu1", "nu2", "phi3", "K3"}
-    assert any("do not determine phi1, K1, nu1, nu2, phi3, K3" in warning for warning in result.warnings)
+    assert unseen == {"theta1", "phi1", "K1", "nu1", "nu2", "theta3", "phi3", "K3"}  # K sin(theta) is seen, not theta
+    assert any("do not determine theta1, phi1, K1, nu1, nu2, theta3, phi3, K3" in warning for warning in result.warnings)
     error = result.estimate.parameters - Run(seed=5, poses=np.zeros((1, 3))).truth
     assert result.consistency.consistent is None and abs(error[6]) < 5 * result.parameters["K2"].sigma
 

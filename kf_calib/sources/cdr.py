@@ -279,9 +279,11 @@ class Decoder:
             if layout.names:
                 names = every["names"][at[rest]]
                 alike &= (names == names[0]).all(axis=1)
+            stamps = head["sec"].astype(np.int64) * _NS_PER_S + head["nanosec"]
+            if len(rest) == len(at) and alike.all():
+                return Stream(stamps, self._values(every["numbers"][at], layout))
             part, rest = rest[alike], rest[~alike]
-            time_ns[part] = head["sec"][alike].astype(np.int64) * _NS_PER_S + head["nanosec"][alike]
-            values[part] = self._values(every["numbers"][at[part]], layout)
+            time_ns[part], values[part] = stamps[alike], self._values(every["numbers"][at[part]], layout)
         return Stream(time_ns, values)
 
     def _layout(self, message: bytes) -> Layout:

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from io import BytesIO
-from itertools import accumulate
 from pathlib import Path
 from typing import IO, TypeVar
 
@@ -49,7 +48,7 @@ _LONGEST_SPAN_S = 1e7  # a longer one is damage itself
 _MOST_KINDS = 16  # of record heads; beyond that, searching for them costs more than walking
 
 # What may stand in the data section, with the least length of its content
-_LEAST = {
+_LEAST: dict[int, int] = {
     Opcode.HEADER: 8, Opcode.SCHEMA: 14, Opcode.CHANNEL: 16, Opcode.MESSAGE: MESSAGE_FIELDS, Opcode.CHUNK: 40,
     Opcode.MESSAGE_INDEX: 6, Opcode.ATTACHMENT: 36, Opcode.METADATA: 8, Opcode.DATA_END: 4,
 }  # fmt: skip
@@ -224,14 +223,14 @@ class McapFile:
         except OSError as error:
             raise InputError(f"{self.path} cannot be read ({error.strerror}): check its permissions.") from error
 
-    def record_at(self, position: int) -> bytes:
-        """The content of the record at byte ``position``. Raises DamagedError where none is."""
+    def record_at(self, position: int, opcode: int) -> bytes:
+        """The content of the record at byte ``position``. Raises DamagedError where there is none of that opcode."""
         with self.open() as file:
-            file.seek(position)
-            head = file.read(HEAD.size)
-            length = HEAD.unpack(head)[1] if len(head) == HEAD.size else self.size
-            if length > self.size - position - HEAD.size:
-                raise DamagedError("a record ends outside the file")
+            file.seek(min(position, self.size))
+            head = file.read(HEAD.size).ljust(HEAD.size, b"\x00")
+            found, length = HEAD.unpack(head)
+            if found != opcode or length > self.size - position - HEAD.size:
+                raise DamagedError("a record is not where it should be")
             return file.read(length)
 
     def blocks(self, warn: Warn) -> Iterator[Block]:
@@ -275,7 +274,7 @@ class _Walk:
         self.warn = warn
         self.end = mcap.summary.start if mcap.summary else file.seek(0, 2)
         self.chunks = {index.chunk_start_offset: index for index in mcap.summary.chunks} if mcap.summary else {}
-        self.chunk_starts = sorted(self.chunks)
+        self.chunk_starts = sorted(start for start in self.chunks if start < self.end)
         self.indexed = mcap.summary is not None
         self.position = file.seek(0)
         self.crc = self.crc_before_end = self.stated_crc = 0
@@ -344,6 +343,8 @@ class _Walk:
 
     def _take(self, length: int) -> bytes:
         data = self.file.read(length)
+        if len(data) != length:
+            raise InputError(f"{self.path} became shorter while it was read: read it again when it is at rest.")
         self.crc = zlib.crc32(data, self.crc)
         self.position += length
         return data
@@ -356,7 +357,7 @@ class _Walk:
     def _plausible(self, start: int, opcode: int, length: int, limit: int) -> bool:
         if start in self.chunks and (opcode, length + HEAD.size) != (Opcode.CHUNK, self.chunks[start].chunk_length):
             return False
-        known = opcode >= _FIRST_PRIVATE_OPCODE or length >= _LEAST.get(opcode, length + 1)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        known = opcode >= _FIRST_PRIVATE_OPCODE or length >= _LEAST.get(opcode, length + 1)
         return known and start + HEAD.size + length <= limit
 
     def _pass_over(self, opcode: int, length: int) -> None:
@@ -400,7 +401,8 @@ class _Walk:
 
 def _consistent(opcode: int, content: bytes) -> bool:
     if opcode == Opcode.MESSAGE_INDEX:
-        return int.from_bytes(content[2:6], "little") == len(content) - 6
+        size = len(content) - 6
+        return int.from_bytes(content[2:6], "little") == size and size % 16 == 0
     try:
         return opcode != Opcode.HEADER or bool(parse(Header.read, content))
     except DamagedError:

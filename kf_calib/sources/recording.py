@@ -232,7 +232,7 @@ class Recording:
 
     def _look_up_bench(self, contents: _Contents, position: int) -> None:
         try:
-            contents.add(Opcode.METADATA, self._file.record_at(position), warn=_ignore)
+            contents.add(Opcode.METADATA, self._file.record_at(position, Opcode.METADATA), warn=_ignore)
         except DamagedError:
             contents.bench_damaged = True
 

@@ -11,7 +11,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from kf_calib.calibration import Calibration, Parameter, orientations
+from kf_calib.calibration import Calibration, Parameter, format_p, orientations
 from kf_calib.comparison import Comparison
 
 _SHOWN = {"rad": ("arcsec", 180 * 3600 / math.pi), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
@@ -82,7 +82,7 @@ def verdict(result: Calibration) -> str:
         text = "Nothing is left over to judge the model by."
     else:
         word = "agree" if judged.consistent else "DISAGREE"
-        text = f"Model and measurements {word} (p = {judged.p_value:.2g}, NIS/dof = {judged.nis_per_dof:.3g})."
+        text = f"Model and measurements {word} (p {format_p(judged.p_value)}, NIS/dof = {judged.nis_per_dof:.3g})."
     if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2 is not None:
         text += (
             f" Orientations left out are predicted to {result.held_out_rms_mps2:.2g} m/s^2 rms; "

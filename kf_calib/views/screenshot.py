@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _PATIENCE_S = 60.0  # software rendering on a busy machine; the usual time is 2 s
 _MENU_PX = 36  # the window's own top bar, which stays as an empty strip when its menu is hidden; cut off
+_IDLE_S = 3.0  # a viewer that listens, loads nothing and shows nothing, has refused the file
 _POLL_S = 0.05
 _SETTLED = 2  # equal pictures in a row: views size their axes over the first frames
 
@@ -93,28 +94,34 @@ def _loaded(process: subprocess.Popen[bytes], port: int, log: Path) -> ViewerCli
     """The viewer, once it listens and has read the file; raises where it ended or time ran out."""
     from rerun.experimental import ViewerClient
 
-    deadline = clock.monotonic() + _PATIENCE_S
-    while clock.monotonic() < deadline:
+    began = idle_since = clock.monotonic()
+    while clock.monotonic() < began + _PATIENCE_S:
         if process.poll() is not None:
             raise ScreenshotError(_obituary(log.read_text(errors="replace")))
+        clock.sleep(_POLL_S)
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             state = client.get_state()
-            if state.recordings and not state.loading:
-                return client
         except Exception:  # not listening yet: the client raises what its transport raises
-            pass
-        clock.sleep(_POLL_S)
+            idle_since = clock.monotonic()
+            continue
+        if state.loading:
+            idle_since = clock.monotonic()
+        elif state.recordings:
+            return client
+        elif clock.monotonic() > idle_since + _IDLE_S:
+            raise ScreenshotError("the file holds nothing that Rerun can show: write it again with --rrd.")
     raise ScreenshotError(f"the Rerun viewer did not load the recording within {_PATIENCE_S:g} s: try again.")
 
 
 def _obituary(log: str) -> str:
-    if "adapter" in log or "vulkan" in log.lower():
+    """Why the viewer ended, from its log."""
+    if any(word in log for word in ("render context", "graphics adapter", "Vulkan")):
         return (
             "the Rerun viewer found no graphics driver: install Vulkan's software driver "
             "(Debian and Ubuntu: apt-get install mesa-vulkan-drivers)."
         )
-    said = next((line.strip() for line in reversed(log.splitlines()) if line.strip()), "nothing said")
+    said = next((line.strip() for line in log.splitlines() if line.strip()), "it said nothing")
     return f"the Rerun viewer ended before it drew anything ({said[:200]}): open the .rrd file with `rerun` to see why."
 
 

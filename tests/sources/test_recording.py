@@ -31,7 +31,7 @@ from mcap_ros2.decoder import DecoderFactory
 from kf_calib.bench import Bench
 from kf_calib.errors import BenchError, InputError
 from kf_calib.samples import Batch, Stream
-from kf_calib.sources import cdr
+from kf_calib.sources import cdr, mcap_file
 from kf_calib.sources.mcap_file import HEAD, MAGIC
 from kf_calib.sources.recorder import Recorder
 from kf_calib.sources.recording import Recording
@@ -42,6 +42,12 @@ ACCEL = ("/accelerometer", cdr.IMU, cdr.imu_message("accelerometer"), BATCH.acce
 ANGLES = ("/platform/angles", cdr.JOINT_STATE, JOINTS, BATCH.pose)
 HEAT = ("/temperature", cdr.TEMPERATURE, cdr.temperature_message(""), BATCH.temperature)
 Topic = tuple[str, cdr.MessageType, bytes, Stream]
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Several blocks in a small file: the first is walked through, the later ones are searched."""
+    monkeypatch.setattr(mcap_file, "_BLOCK", 10_000)
 
 
 @pytest.fixture
@@ -84,7 +90,7 @@ def write_officially(
     return path
 
 
-def records(data: bytes) -> list[tuple[int, int, int]]:
+def records(data: bytes | bytearray) -> list[tuple[int, int, int]]:
     """Start, opcode and length of each record of a file."""
     position, found = len(MAGIC), []
     while position < len(data) - len(MAGIC):
@@ -94,7 +100,7 @@ def records(data: bytes) -> list[tuple[int, int, int]]:
     return found
 
 
-def place_of(data: bytes, opcode: int, which: int = 0) -> int:
+def place_of(data: bytes | bytearray, opcode: int, which: int = 0) -> int:
     return [start for start, found, _ in records(data) if found == opcode][which]
 
 
@@ -475,6 +481,53 @@ def test_a_chunk_that_unpacks_to_more_than_it_says(tmp_path: Path, states_size: 
     assert "is damaged" in recording.warnings[1]
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda offsets: offsets[::-1],
+        lambda offsets: offsets[[0, *range(len(offsets) - 1)]],
+        lambda offsets: offsets + 1,
+        lambda offsets: offsets + (1 << 62),
+        lambda offsets: -offsets,
+        lambda offsets: offsets * 0,
+    ],
+)
+def test_a_wrong_message_index_changes_nothing(tmp_path: Path, damage: Callable[[np.ndarray], np.ndarray]) -> None:
+    path = write_officially(tmp_path / "a.mcap", chunk_size=30_000)
+    data = bytearray(path.read_bytes())
+    for start, opcode, length in records(data):
+        if opcode == Opcode.MESSAGE_INDEX:
+            entries = np.frombuffer(data, "<i8", (length - 6) // 8, start + HEAD.size + 6).copy()
+            entries[1::2] = damage(entries[1::2])
+            data[start + HEAD.size + 6 : start + HEAD.size + length] = entries.tobytes()
+    path.write_bytes(data)
+    recording = Recording(path)
+    assert_equal(read(recording), BATCH)
+    assert recording.warnings == []
+
+
+@pytest.mark.parametrize("index_types", [IndexType.ALL, IndexType.NONE])
+def test_only_the_first_block_is_walked_through(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, index_types: IndexType
+) -> None:
+    walk, walked = mcap_file.MessageFinder._walk, []
+    monkeypatch.setattr(
+        mcap_file.MessageFinder, "_walk", lambda self, *block: walked.append(block) or walk(self, *block)
+    )
+    recording = Recording(write_officially(tmp_path / "a.mcap", index_types=index_types | IndexType.METADATA))
+    walked.clear()
+    assert len(list(recording)) > 5
+    assert len(walked) == 1
+
+
+def test_a_message_index_of_odd_length_is_told(tmp_path: Path) -> None:
+    path = write_officially(tmp_path / "a.mcap", finish=False)
+    path.write_bytes(path.read_bytes() + HEAD.pack(Opcode.MESSAGE_INDEX, 11) + struct.pack("<HI", 1, 5) + bytes(5))
+    recording = Recording(path)
+    assert_equal(read(recording), BATCH)
+    assert "11 bytes are passed over" in recording.warnings[1]
+
+
 def test_a_torn_chunk_with_a_valid_checksum_costs_only_its_end(tmp_path: Path) -> None:
     """As a recorder leaves it that was interrupted between the head of a message and the message."""
     path = write_officially(tmp_path / "a.mcap", finish=False, compression=CompressionType.NONE, enable_crcs=False)
@@ -558,7 +611,8 @@ def test_a_bit_flipped_in_an_unfinished_file(tmp_path: Path, small: bytes) -> No
 # Size
 
 
-def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
     peaks: list[int] = []
     for count in (25_000, 100_000):
         path = record(tmp_path / f"{count}.mcap", made_batch(count), chunk_size=500_000)
@@ -567,5 +621,5 @@ def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
         assert sum(len(batch.accel) for batch in recording) == count
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert peaks[1] < 1.2 * peaks[0]
-    assert peaks[1] < 20_000_000
+    assert peaks[1] < 1.6 * peaks[0], "four times the samples"
+    assert peaks[1] < 12_000_000, "the readings unpacked take 40 MB"

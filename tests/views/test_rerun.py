@@ -161,7 +161,7 @@ def test_axes_point_where_the_estimate_says(result: Calibration, recording: Path
     factor = magnification(result.estimate)
     largest = max(np.sqrt(np.linalg.eigvalsh(result.estimate.covariance[i : i + 3, i : i + 3])[-1]) for i in (0, 4, 8))
     assert np.max(spread[12]) == pytest.approx(factor * largest, rel=1e-5)
-    assert 0.04 < np.max(spread[12]) <= 0.121
+    assert 0.08 <= np.max(spread[12]) <= 0.2
 
 
 def test_summary_holds_every_parameter_and_every_warning(result: Calibration) -> None:
@@ -230,6 +230,21 @@ def _drawn(recording: Path, picture: Path, **options) -> np.ndarray:
             pytest.skip(str(error))
         raise
     return np.asarray(Image.open(picture).convert("RGB"))
+
+
+def test_without_a_graphics_driver_it_says_what_to_install(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
+        monkeypatch.setenv(name, str(tmp_path / "none.json"))
+    with pytest.raises(ScreenshotError, match="mesa-vulkan-drivers"):
+        screenshot(recording, tmp_path / "x.png")
+
+
+def test_a_file_that_is_no_recording(tmp_path: Path) -> None:
+    (tmp_path / "bad.rrd").write_text("no recording")
+    with pytest.raises(ScreenshotError, match="nothing that Rerun can show"):
+        _drawn(tmp_path / "bad.rrd", tmp_path / "x.png")
 
 
 def test_it_opens_as_a_picture(recording: Path, tmp_path: Path) -> None:

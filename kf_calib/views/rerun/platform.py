@@ -15,9 +15,9 @@ from kf_calib.samples import Floats
 from kf_calib.views.rerun.names import ACCELEROMETERS, GOLD, GREY, RED, WHITE
 from kf_calib.views.rerun.series import above, crowd, ends, nis_band, times
 
-FINAL_SIZE = 0.12  # of the largest final ellipsoid, as a part of the axis' length
-THINNEST = 0.012  # thinner ones could not be seen
-LARGEST = 1.0  # larger ones would hide the scene
+FINAL_SIZE = 0.2  # of the largest final ellipsoid, as a part of the axis' length
+THINNEST = 0.015  # thinner ones could not be seen
+LARGEST = 1.2  # larger ones would hide the scene
 
 
 def magnification(estimate: Estimate) -> float | None:
@@ -75,7 +75,7 @@ def _log_axes(result: Calibration, stream: rr.RecordingStream) -> None:
         vectors=np.concatenate(vectors),
         colors=[ACCELEROMETERS[i] for i in which],
         labels=[f"E{'₁₂₃'[i]}" for i in which],
-        radii=[0.022] * len(which),
+        radii=[0.016] * len(which),
     ).partition([len(own) for own in seen])
     rr.send_columns("platform/axes", times(*ends(result.visits)), columns, recording=stream)
 
@@ -113,7 +113,7 @@ def _log_directions(result: Calibration, stream: rr.RecordingStream) -> None:
     points = rr.Points3D.columns(positions=direction, colors=_verdicts(result), radii=[0.025 * crowd(count)] * count)
     rr.send_columns("platform/visited", times(done, number), points, recording=stream)
     arrows = rr.Arrows3D.columns(
-        vectors=1.25 * direction, colors=[GOLD] * count, radii=[0.018] * count, labels=["up"] * count
+        vectors=1.25 * direction, colors=[GOLD] * count, radii=[0.016] * count, labels=["up"] * count
     )
     rr.send_columns("platform/up", times(begun, number), arrows, recording=stream)
 

@@ -1,0 +1,170 @@
+"""Batches from JSON lines (FORMAT.md): one object a line, readings and poses together or on lines of their own."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from decimal import Decimal
+from typing import Any, NoReturn
+
+import numpy as np
+
+from kf_calib.samples import Batch, Stream
+from kf_calib.sources.line_account import ACCEL_UNITS, TIME_DECIMALS, Account, LineError, stamp_ns
+
+_ACCEL = {f"accel_{unit}": factor for unit, factor in ACCEL_UNITS.items()}
+_ANGLES = {"angles_rad": 1.0, "angles_deg": math.pi / 180.0}
+_ATTITUDE = "attitude_xyzw"
+_TEMPERATURE = "temperature_c"
+_KNOWN = frozenset([*TIME_DECIMALS, *_ACCEL, *_ANGLES, _ATTITUDE, _TEMPERATURE])
+
+
+def _refuse_constant(text: str) -> NoReturn:
+    raise LineError(f"{text} is not JSON")
+
+
+_decode = json.JSONDecoder(parse_constant=_refuse_constant).decode
+_decode_exactly = json.JSONDecoder(parse_constant=_refuse_constant, parse_float=Decimal).decode
+
+
+class JsonLines:
+    """Reads JSON lines block by block.
+
+    ``columns`` renames foreign keys. ``metadata`` is the first line's ``{"bench": ...}`` as strings. ``pose_width`` is 0
+    until the first pose, which settles whether poses are angles (``has_angles``) and how many.
+    """
+
+    def __init__(self, columns: Mapping[str, str], account: Account) -> None:
+        self.metadata: dict[str, str] = {}
+        self.has_angles = True
+        self.pose_width = 0
+        self._columns, self._account = columns, account
+        self._is_first = True
+
+    @property
+    def advice(self) -> str:
+        """How readings and poses have to be named."""
+        return "name the readings accel_mps2 or accel_g, and the poses angles_rad, angles_deg or attitude_xyzw"
+
+    def read(self, lines: Sequence[str], first_line: int) -> Batch:
+        """The batch of consecutive lines, the first of them of that number."""
+        accel, pose, temperature = _Rows(), _Rows(), _Rows()
+        for number, line in enumerate(lines, start=first_line):
+            if not line or line.isspace():
+                continue
+            try:
+                self._read_line(line, accel, pose, temperature)
+            except LineError as error:
+                self._account.refuse(number, str(error))
+            except ValueError:
+                self._account.refuse(number, "it is not JSON")
+            except RecursionError:
+                self._account.refuse(number, "it is nested too deeply")
+        return Batch(accel.stream(3), pose.stream(self.pose_width), temperature.stream(1))
+
+    def _read_line(self, line: str, accel: _Rows, pose: _Rows, temperature: _Rows) -> None:
+        entry = _decode(line)
+        if not isinstance(entry, dict):
+            raise LineError("it is not a JSON object")
+        if self._columns:
+            entry = {self._columns.get(key, key): value for key, value in entry.items()}
+        if self._takes_bench(entry):
+            return
+        time_ns = self._time_ns(entry, line)
+        # everything on the line is understood before any of it is used
+        readings = self._readings(entry)
+        attitude, has_angles = self._pose(entry)
+        degrees = _numbers([entry[_TEMPERATURE]], _TEMPERATURE) if entry.get(_TEMPERATURE) is not None else None
+        if attitude and not self.pose_width:
+            self.pose_width, self.has_angles = len(attitude), has_angles
+        for rows, values in ((accel, readings), (pose, attitude), (temperature, degrees)):
+            if values:
+                rows.add(time_ns, values)
+        if not entry.keys() <= _KNOWN:
+            self._account.leave_out(key for key in entry if key not in _KNOWN)
+
+    def _takes_bench(self, entry: dict[str, Any]) -> bool:
+        """Whether this is the first line and describes the bench, which is then kept."""
+        is_first, self._is_first = self._is_first, False
+        if not is_first or "bench" not in entry:
+            return False
+        bench = entry["bench"]
+        if not isinstance(bench, dict):
+            raise LineError("bench is not a JSON object")
+        pairs = ((key, value) for key, value in bench.items() if value is not None)
+        self.metadata = {key: value if isinstance(value, str) else json.dumps(value) for key, value in pairs}
+        return True
+
+    def _time_ns(self, entry: dict[str, Any], line: str) -> int:
+        name = next((name for name in TIME_DECIMALS if name in entry), None)
+        if name is None:
+            raise LineError("it has no time stamp (time_ns or time_s)")
+        number = entry[name]
+        if type(number) is float:  # has lost digits: read the line again with all of them
+            exact = _decode_exactly(line)
+            number = next(value for key, value in exact.items() if self._columns.get(key, key) == name)
+        if type(number) not in (int, Decimal):
+            raise LineError(f"{name} is not a number")
+        return stamp_ns(number, TIME_DECIMALS[name])
+
+    def _readings(self, entry: dict[str, Any]) -> list[float] | None:
+        for name, factor in _ACCEL.items():
+            if entry.get(name) is not None:
+                values = _numbers(entry[name], name)
+                if len(values) != 3:
+                    raise LineError(f"{name} has {len(values)} numbers, not 3")
+                return values if factor == 1.0 else [factor * value for value in values]
+        return None
+
+    def _pose(self, entry: dict[str, Any]) -> tuple[list[float] | None, bool]:
+        """The pose, if any, and whether it is made of angles."""
+        for name, factor in _ANGLES.items():
+            if entry.get(name) is not None:
+                return self._fitting([factor * value for value in _numbers(entry[name], name)], name, True), True
+        if entry.get(_ATTITUDE) is None:
+            return None, True
+        values = _numbers(entry[_ATTITUDE], _ATTITUDE)
+        if len(values) != 4 or not any(values):
+            raise LineError(f"{_ATTITUDE} is not a quaternion")
+        return self._fitting(values, _ATTITUDE, False), False
+
+    def _fitting(self, values: list[float], name: str, has_angles: bool) -> list[float]:
+        if not values:
+            raise LineError(f"{name} is empty")
+        if self.pose_width and (len(values), has_angles) != (self.pose_width, self.has_angles):
+            raise LineError(f"{name} is not like the poses before it")
+        return values
+
+
+class _Rows:
+    """Stamped rows on their way to a stream."""
+
+    def __init__(self) -> None:
+        self._stamps = list[int]()
+        self._values = list[list[float]]()
+
+    def add(self, time_ns: int, values: list[float]) -> None:
+        self._stamps.append(time_ns)
+        self._values.append(values)
+
+    def stream(self, width: int) -> Stream:
+        if not self._stamps:
+            return Stream.empty(width)
+        return Stream(np.array(self._stamps, np.int64), np.array(self._values, float))
+
+
+def _numbers(values: Any, name: str) -> list[float]:
+    """Finite JSON numbers; true, "1" and 1e999 are none."""
+    if type(values) is not list:
+        raise LineError(f"{name} is not a list of numbers")
+    for value in values:
+        if type(value) is not float and type(value) is not int:
+            raise LineError(f"{name} holds what is not a number")
+    try:
+        out = [float(value) for value in values]
+    except OverflowError:
+        raise LineError(f"{name} is out of range") from None
+    if not all(map(math.isfinite, out)):
+        raise LineError(f"{name} is out of range")
+    return out

@@ -1,0 +1,64 @@
+"""What the line readers share: an account of what could not be used, and exact stamps."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from decimal import Decimal
+
+STANDARD_GRAVITY_MPS2 = 9.80665
+ACCEL_UNITS = {"mps2": 1.0, "g": STANDARD_GRAVITY_MPS2, "mg": STANDARD_GRAVITY_MPS2 / 1e3}
+TIME_DECIMALS = {"time_ns": 0, "time_us": 3, "time_ms": 6, "time_s": 9}
+"""Names of the stamp, and how many decimals its unit has in nanoseconds."""
+
+_NAMED = 8
+_NAME_LENGTH = 40
+
+
+class LineError(ValueError):
+    """A line cannot be used; the message is the reason in a few words."""
+
+
+@dataclass
+class Account:
+    """Lines read, lines that could not be used (with the first of them), and names that mean nothing to us."""
+
+    lines: int = 0
+    malformed: int = 0
+    first_malformed: str = ""
+    unknown: Counter[str] = field(default_factory=Counter[str])
+
+    def refuse(self, line: int, reason: str) -> None:
+        self.malformed += 1
+        self.first_malformed = self.first_malformed or f"line {line}: {reason}"
+
+    def leave_out(self, names: Iterable[str]) -> None:
+        """Counts values under unknown names; of the names, the first few are kept."""
+        for name in names:
+            short = name[:_NAME_LENGTH]
+            self.unknown[short if short in self.unknown or len(self.unknown) < _NAMED else "others"] += 1
+
+    def sentences(self) -> list[str]:
+        out = list[str]()
+        if self.malformed:
+            out.append(
+                f"{self.malformed} of {self.lines} lines were malformed and skipped (first {self.first_malformed})."
+            )
+        if self.unknown:
+            named = ", ".join(f"{name!r} ({count})" for name, count in self.unknown.items())
+            out.append(f"names that are not known were left out, with the values under them: {named}.")
+        return out
+
+
+def stamp_ns(number: int | Decimal, decimals: int) -> int:
+    """A stamp in whole nanoseconds from one in a unit of 10^decimals ns, exactly; halves go to the even one."""
+    if isinstance(number, Decimal):
+        if not number.is_finite() or number.adjusted() > 20:  # before an exponent is written out in full
+            raise LineError("the time stamp is out of range")
+        nanoseconds = round(number.scaleb(decimals))
+    else:
+        nanoseconds = number * 10**decimals
+    if not -(2**63) <= nanoseconds < 2**63:
+        raise LineError("the time stamp is out of range")
+    return nanoseconds

@@ -1,0 +1,199 @@
+"""Lines of JSON or CSV, from a file or live from a stream, as a source of batches (FORMAT.md, "Lines").
+
+The first line that is not empty decides: ``{`` or ``[`` begins JSON lines, anything else is the header of a CSV table.
+Bytes are taken as they arrive and cut into lines here; memory is that of one block and one line, whatever comes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from os import PathLike
+from pathlib import Path
+from types import MappingProxyType
+from typing import BinaryIO
+
+from kf_calib.bench import Bench
+from kf_calib.errors import BenchError, InputError
+from kf_calib.samples import Batch
+from kf_calib.sources.csv_lines import CsvLines
+from kf_calib.sources.json_lines import JsonLines
+from kf_calib.sources.line_account import Account
+
+_BLOCK_BYTES = 1 << 20
+_LONGEST_LINE = 1 << 20
+_SURVEY_LINES = 1_000_000  # without a pose in them, none will come
+
+
+class Lines:
+    """Lines as a ``Source``: a path can be iterated again, a stream only once.
+
+    source: path of a file, or a binary stream, which is read as data arrive. overrides: bench metadata keys that win over
+    those on the first line. columns: our name for each foreign column or key, for example ``{"acc_x[g]": "ax_g"}``.
+    name: what messages call a stream. Raises InputError where the lines cannot be used.
+    """
+
+    def __init__(
+        self,
+        source: str | PathLike[str] | BinaryIO,
+        overrides: Mapping[str, str] = MappingProxyType({}),
+        columns: Mapping[str, str] = MappingProxyType({}),
+        name: str = "standard input",
+    ) -> None:
+        self._path = Path(source) if isinstance(source, str | PathLike) else None
+        self._stream = None if isinstance(source, str | PathLike) else source
+        self.name = str(self._path) if self._path else name
+        self._overrides, self._columns = overrides, columns
+        self._bench: Bench | None = None
+        self._waiting: _Passage | None = None  # begun to learn of the bench, not yet iterated
+        self._latest: _Passage | None = None
+
+    @property
+    def bench(self) -> Bench:
+        """The bench; a stream is read for it up to the first pose, which shows how the platform is described."""
+        if self._bench is None:
+            self._waiting = self._begin()
+            self._bench = self._describe_bench(self._waiting)
+        return self._bench
+
+    @property
+    def warnings(self) -> list[str]:
+        account = self._latest.account if self._latest else Account()
+        return [f"{self.name}: {sentence}" for sentence in account.sentences()]
+
+    @property
+    def fraction(self) -> float:
+        return self._latest.fraction if self._latest else 0.0
+
+    def __iter__(self) -> Iterator[Batch]:
+        _ = self.bench  # so that a bench that cannot be used is told first
+        passage, self._waiting = self._waiting or self._begin(), None
+        return iter(passage)
+
+    def _begin(self) -> _Passage:
+        try:
+            if self._path:
+                stream, size = self._path.open("rb"), self._path.stat().st_size
+            elif self._stream is not None:
+                stream, size, self._stream = self._stream, 0, None
+            else:
+                raise InputError(f"{self.name} can be read only once: record it to a file to read it again.")
+        except OSError as error:
+            raise InputError(f"{self.name}: cannot be read ({error.strerror}).") from None
+        self._latest = _Passage(self.name, stream, size, self._columns)
+        self._latest.survey()
+        return self._latest
+
+    def _describe_bench(self, passage: _Passage) -> Bench:
+        lines = passage.parser
+        try:
+            bench = Bench.from_metadata({**lines.metadata, **self._overrides}, lines.has_angles)
+        except BenchError as error:
+            raise BenchError(f"{self.name}: {error}") from error
+        if bench.pose_width != lines.pose_width:
+            raise InputError(
+                f"{self.name}: poses have {lines.pose_width} angles and the bench has {bench.pose_width} axes: state as "
+                'many axes as there are angles, outer first, for example --axes "y z x".'
+            )
+        return bench
+
+
+class _Passage:
+    """One reading of the lines, from the first to the last; iterated once."""
+
+    parser: JsonLines | CsvLines
+
+    def __init__(self, name: str, stream: BinaryIO, size: int, columns: Mapping[str, str]) -> None:
+        self.account = Account()
+        self.fraction = 0.0 if size else math.nan
+        self._name, self._columns, self._size = name, columns, size
+        self._blocks = self._split(stream)
+        self._ahead = list[Batch]()
+        self._has_accel = False
+
+    def survey(self) -> None:
+        """Reads up to the first pose and keeps what it has read."""
+        self._open_parser()
+        while not self.parser.pose_width:
+            batch = self._next_batch()
+            if batch is None or self.account.lines > _SURVEY_LINES:
+                raise self._unusable("platform angles")
+            self._ahead.append(batch)
+
+    def __iter__(self) -> Iterator[Batch]:
+        while self._ahead:
+            yield self._ahead.pop(0)
+        while (batch := self._next_batch()) is not None:
+            yield batch
+        if not self._has_accel:
+            raise self._unusable("readings")
+
+    def _open_parser(self) -> None:
+        for lines in self._blocks:
+            for i, line in enumerate(lines):
+                text = line.lstrip("\ufeff").strip()
+                if text:
+                    self._start(text, lines[i:], i)
+                    return
+            self.account.lines += len(lines)
+        raise InputError(f"{self._name} holds no lines: check that the logger wrote any.")
+
+    def _start(self, first: str, lines: list[str], before: int) -> None:
+        """Chooses the parser by the first line and has it read the rest of the first block."""
+        self.account.lines += before
+        if first[0] in "{[":
+            self.parser = JsonLines(self._columns, self.account)
+            self._ahead.append(self._parse([first, *lines[1:]]))
+            return
+        try:
+            self.parser = CsvLines(first, self._columns, self.account)
+        except InputError as error:
+            raise InputError(f"{self._name}: {error}") from None
+        self.account.lines += 1
+        self._ahead.append(self._parse(lines[1:]))
+
+    def _next_batch(self) -> Batch | None:
+        lines = next(self._blocks, None)
+        return None if lines is None else self._parse(lines)
+
+    def _parse(self, lines: list[str]) -> Batch:
+        batch = self.parser.read(lines, self.account.lines + 1)
+        self.account.lines += len(lines)
+        self._has_accel |= len(batch.accel) > 0
+        return batch
+
+    def _split(self, stream: BinaryIO) -> Iterator[list[str]]:
+        """Whole lines, block by block as they arrive; of a line beyond 1 MiB only a stub is kept, which no parser takes."""
+        tail, position = bytearray(), 0
+        for block in self._read(stream):
+            position += len(block)
+            end = block.rfind(b"\n") + 1
+            if end:
+                yield self._decoded(bytes(tail) + block[:end])
+                self.fraction = min(position / self._size, 1.0) if self._size else math.nan
+                tail.clear()
+            if len(tail) <= _LONGEST_LINE:
+                tail += block[end:]
+        if tail:
+            yield self._decoded(bytes(tail))
+        self.fraction = 1.0
+
+    def _read(self, stream: BinaryIO) -> Iterator[bytes]:
+        read = getattr(stream, "read1", stream.read)  # read1 does not wait until a whole block has come
+        try:
+            with stream:
+                while block := read(_BLOCK_BYTES):
+                    yield block
+        except OSError as error:
+            raise InputError(f"{self._name}: cannot be read on ({error.strerror}).") from None
+
+    def _decoded(self, block: bytes) -> list[str]:
+        lines = block.decode("utf-8", errors="replace").removesuffix("\n").split("\n")
+        return lines
+
+    def _unusable(self, what: str) -> InputError:
+        said = " ".join(self.account.sentences()).rstrip(".")
+        found = f"; {said}" if said else ""
+        return InputError(
+            f"{self._name}: no {what} in {self.account.lines} lines{found}: {self.parser.advice}."
+        )
