@@ -10,7 +10,7 @@
 Conventions, kept everywhere:
 
 - Readings are specific force in m/s^2: +g when the sensitive axis points up. reading_i = K_i E_i . f + b_i.
-- Frames: n = North, Up, East; b = bench, n turned by the azimuth; p = platform, C_bp = Rot(axis1, q1) Rot(axis2, q2) ...
+- Frames: n = North, Up, East; b = bench, n turned by the azimuth; p = platform, C_bp = Rot(axis1, q1) Rot(axis2, q2)...
   All angles zero: y up, accelerometer 2 reads +g. Right-handed, angles in rad, quaternions x y z w (platform -> bench).
 - Time: stamps are integer nanoseconds (``time_ns``); ``elapsed_s`` counts from the first reading.
 - Units are in the names: ``accel_mps2``, ``angle_sigma_deg``, ``gimbal_deg``, ``sigma_mps2``.

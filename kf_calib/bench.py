@@ -159,10 +159,10 @@ class Bench:
             numbers["gravity_mps2"] = normal_gravity(numbers["latitude_deg"], numbers.get("height_m", 0.0))
         return cls(
             axes=parse_axes(metadata["axes"]) if has_angles else (),
-            reference=metadata.get("reference", "base"),  # type: ignore[arg-type]  # checked in __post_init__
+            reference=metadata.get("reference", "base"),  # type: ignore[arg-type]  # __post_init__ refuses other words
             nominal=_nominal(metadata.get("nominal", "{}")),
             notes={key: metadata[key] for key in _FREE_TEXT if metadata.get(key)},
-            **numbers,  # type: ignore[arg-type]
+            **numbers,
         )
 
     def to_metadata(self) -> dict[str, str]:
@@ -232,7 +232,9 @@ def turn(vector: Floats, axis: Floats, angle_rad: Floats | float) -> Floats:
     cos, sin = np.cos(angle_rad)[..., None], np.sin(angle_rad)[..., None]
     along = (vector @ axis)[..., None] * axis
     x, y, z = axis.tolist()
-    across = vector @ np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # axis x vector; np.cross costs ten times more
+    across = vector @ np.array(
+        [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+    )  # axis x vector; np.cross costs ten times more
     return along + cos * (vector - along) + sin * across
 
 

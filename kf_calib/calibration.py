@@ -21,7 +21,7 @@ from kf_calib.errors import InputError, UnobservableError
 from kf_calib.information import DwellFactor, Folder, Step
 from kf_calib.model import PRIORS, STATE_COUNT, Prior, Rows, model_rows
 from kf_calib.noise import Noise, considered, mean_covariances, mean_design, with_dwell_parts, within_dwells
-from kf_calib.samples import Floats, Source
+from kf_calib.samples import Floats, Mask, Source
 
 SAME_POSE_DEG = 1.0
 """Dwells whose gravity directions are closer than this are visits of one orientation."""
@@ -72,14 +72,14 @@ class Estimate:
         return jacobian @ self.covariance @ jacobian.T
 
     @cached_property
-    def unseen(self) -> Floats:
+    def unseen(self) -> Mask:
         """Which parameters the orientations do not determine, (12,) bool."""
         sigma = np.sqrt(np.diag(self.parameter_covariance))
-        unseen = sigma > [_HOPELESS[unit] for unit in paper.UNITS]
+        unseen = sigma > np.array([_HOPELESS[unit] for unit in paper.UNITS])
         if self.undetermined.size:
             basis = self.undetermined / np.linalg.norm(self.undetermined, axis=0)
             unseen |= np.linalg.norm(paper.jacobian(self.state) @ basis, axis=1) > 1e-6
-        return unseen
+        return np.asarray(unseen)
 
     @cached_property
     def sigma(self) -> Floats:
@@ -290,8 +290,8 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
                 f"state it with --accel-unit {unit}."
             )
     raise InputError(
-        f"the readings have a norm of {measured:.4g} at rest where gravity is {bench.gravity_mps2:.4g} m/s^2: they look "
-        "like counts; give the size of one count in m/s^2 with --accel-scale."
+        f"the readings have a norm of {measured:.4g} at rest where gravity is {bench.gravity_mps2:.4g} m/s^2: they "
+        "look like counts; give the size of one count in m/s^2 with --accel-scale."
     )
 
 
@@ -300,8 +300,8 @@ def refuse_unseen(result: Calibration) -> None:
     if result.estimate.unseen.all():
         count = len(result.visits)
         raise UnobservableError(
-            f"the {count} dwell{'s' * (count > 1)} of this run show too few different directions of gravity, so none of "
-            f"the parameters can be seen ({', '.join(paper.SYMBOLS)}): visit at least four spread orientations, "
+            f"the {count} dwell{'s' * (count > 1)} of this run show too few different directions of gravity, so none "
+            f"of the parameters can be seen ({', '.join(paper.SYMBOLS)}): visit at least four spread orientations, "
             "or state a --prior."
         )
 
@@ -332,7 +332,7 @@ def _means(dwells: list[DwellFactor]) -> tuple[Floats, Floats]:
 
 
 def _estimate(factor: Floats, nominal_state: Floats, extra: Floats) -> Estimate:
-    """The estimate of a factor, its covariance P enlarged to P + P B P by what is considered, B = ``extra`` (12, 12)."""
+    """The estimate of a factor, its covariance P enlarged by what is considered: P + P B P, B = ``extra`` (12, 12)."""
     state, covariance, undetermined = information.solve(factor, nominal_state)
     return Estimate(state, covariance + covariance @ extra @ covariance, undetermined)
 
@@ -448,13 +448,13 @@ def _remarks(
     rms = float(np.sqrt(np.mean(residuals**2)))
     if rms > 0.03 * bench.gravity_mps2:
         yield (
-            f"the angles do not explain the readings (residual {rms:.2g} m/s^2 rms between dwells): check the order and "
-            "sign of the axes, the unit of the angles, and which channel is which."
+            f"the angles do not explain the readings (residual {rms:.2g} m/s^2 rms between dwells): check the order "
+            "and sign of the axes, the unit of the angles, and which channel is which."
         )
     elif judged.consistent is False:
         yield (
-            f"the dwells scatter about the model by more than the noise (p {format_p(judged.p_value)}): an effect is missing "
-            "in the model, or the noise from dwell to dwell was not stated (angle_sigma_deg, scatter_sigma_mps2)."
+            f"the dwells scatter about the model by more than the noise (p {format_p(judged.p_value)}): an effect is "
+            "missing in the model, or noise from dwell to dwell was not stated (angle_sigma_deg, scatter_sigma_mps2)."
         )
     if noise.inflation.max() > 1.5:
         kappa = ", ".join(f"{value:.3g}" for value in noise.inflation)

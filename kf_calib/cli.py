@@ -37,7 +37,7 @@ _BENCH_OPTIONS = {
     "azimuth_deg": ("--azimuth", "Azimuth of the bench's x axis from North toward East, deg."),
     "angle_sigma_deg": ("--angle-sigma", "Repeatability of setting an orientation, 1 sigma, deg (0: exact)."),
     "scatter_sigma_mps2": ("--scatter-sigma", "Scatter of each sensor from dwell to dwell, 1 sigma, m/s^2."),
-    "nominal": ("--nominal", 'Nominal parameters that differ, JSON, for example \'{"theta1": 0}\'.'),
+    "nominal": ("--nominal", "Nominal parameters that differ, JSON, for example '{\"theta1\": 0}'."),
 }
 _ACCEL_UNITS = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "ug": 9.80665e-6}
 
@@ -46,7 +46,9 @@ def bench_options(command: F) -> F:
     """The keys of the bench's record, for recordings that lack them; ``--bench`` reads them from a TOML file."""
     for key, (name, text) in reversed(_BENCH_OPTIONS.items()):
         command = click.option(name, key, default=None, help=text)(command)
-    return click.option("--bench", "bench_file", type=click.Path(path_type=Path), help="TOML file of bench keys.")(command)
+    return click.option("--bench", "bench_file", type=click.Path(path_type=Path), help="TOML file of bench keys.")(
+        command
+    )
 
 
 def recording_options(command: F) -> F:
@@ -55,7 +57,9 @@ def recording_options(command: F) -> F:
         click.option("--accel-topic", help="Topic of the accelerometer, where there are several."),
         click.option("--pose-topic", help="Topic of the platform's angles or attitude."),
         click.option("--temperature-topic", help="Topic of the temperature."),
-        click.option("--accel-unit", type=click.Choice(list(_ACCEL_UNITS)), default="m/s2", help="Unit of the readings."),
+        click.option(
+            "--accel-unit", type=click.Choice(list(_ACCEL_UNITS)), default="m/s2", help="Unit of the readings."
+        ),
         click.option("--accel-scale", type=float, default=1.0, help="Size of one count, in the unit of the readings."),
     ]
     for option in reversed(options):
@@ -366,7 +370,13 @@ def simulate(out: Path, overwrite: bool, as_json: bool, **options: Any) -> None:
     with _progress(f"simulating {out.name}", as_json) as tick:
         readings, dwells, duration_s = _record(source, out, overwrite, tick)
     truth = source.write_truth(out)
-    content = {"recording": str(out), "truth": str(truth), "samples": readings, "dwells": dwells, "duration_s": duration_s}
+    content = {
+        "recording": str(out),
+        "truth": str(truth),
+        "samples": readings,
+        "dwells": dwells,
+        "duration_s": duration_s,
+    }
     if as_json:
         _print_json(content)
     else:
@@ -376,8 +386,13 @@ def simulate(out: Path, overwrite: bool, as_json: bool, **options: Any) -> None:
 @cli.command()
 @click.argument("out", type=click.Path(path_type=Path))
 @click.argument("lines", type=click.Path(path_type=Path, allow_dash=True), default="-")
-@click.option("--column", "columns", multiple=True, metavar="THEIRS=OURS",
-              help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.')
+@click.option(
+    "--column",
+    "columns",
+    multiple=True,
+    metavar="THEIRS=OURS",
+    help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.',
+)
 @bench_options
 @overwrite_option
 @json_option
@@ -421,7 +436,7 @@ def demo(folder: Path, as_json: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     recording, rrd = folder / "demo.mcap", folder / "demo.rrd"
     options = simulate.make_context("simulate", [str(recording)]).params
-    source = _simulation(options | {"dwell_s": 10.0, "seed": 2019})
+    source = _simulation(options | {"dwell_s": 15.0, "slew_degps": 90.0, "seed": 2019})
     with _progress("recording a simulated run", as_json) as tick:
         readings, dwells, duration_s = _record(source, recording, True, tick)
         truth = source.write_truth(recording)
@@ -436,7 +451,9 @@ def demo(folder: Path, as_json: bool) -> None:
         return
     from kf_calib.views.console import comparison_table, summary
 
-    click.echo(f"Recorded a simulated bench run to {recording}: {readings} readings, {dwells} dwells, {duration_s:.0f} s.\n")
+    click.echo(
+        f"Recorded a simulated bench run to {recording}: {readings} readings, {dwells} dwells, {duration_s:.0f} s.\n"
+    )
     _show(summary(compared.result))
     click.echo()
     _show(comparison_table(compared))

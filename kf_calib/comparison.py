@@ -16,8 +16,7 @@ import numpy as np
 
 from kf_calib.batch import least_squares
 from kf_calib.calibration import Calibration, Estimate, Pass, Settings, calibrate, filterpy_estimate
-from kf_calib.samples import Floats, Source
-
+from kf_calib.samples import Mask, Source
 
 Extra = TypeVar("Extra")
 
@@ -77,7 +76,7 @@ def _measured(run: Callable[[], tuple[Extra, Estimate]]) -> tuple[Extra, Way]:
     return extra, Way(estimate, wall_s, peak / 1e6)
 
 
-def _against(way: Way, reference: Estimate, seen: Floats) -> Way:
+def _against(way: Way, reference: Estimate, seen: Mask) -> Way:
     sigma = np.sqrt(np.diag(reference.parameter_covariance))
     difference = np.abs(way.estimate.parameters - reference.parameters) / sigma
     variance = np.abs(np.diag(way.estimate.covariance) / np.diag(reference.covariance) - 1)

@@ -16,7 +16,7 @@ from enum import Enum
 import numpy as np
 
 from kf_calib.bench import Bench, interpolate_pose, mean_pose, pose_distance, unwrap_pose
-from kf_calib.samples import Batch, Floats, Source, Stream, Times
+from kf_calib.samples import Batch, Floats, Mask, Source, Stream, Times
 
 BLOCK_SAMPLES = 4096
 """Samples of one block at the most: small enough for the cache, large enough to amortise a call."""
@@ -75,7 +75,7 @@ class Tally:
             "repeated": "{} readings repeated the stamp before them and were dropped.",
             "leaping": "{} readings had a stamp far ahead of their neighbours and were dropped.",
             "without_pose": "{} readings had no platform angle within 1 s of them and were dropped.",
-            "poses_dropped": "{} angle messages were not finite, no unit quaternion or not in order of time and were dropped.",
+            "poses_dropped": "{} angle messages were not finite, not in order of time or no unit quaternion: dropped.",
             "gated": "{} readings were outliers (innovation gate) and were rejected; --no-gate keeps them.",
         }
         out = [text.format(getattr(self, key)) for key, text in said.items() if getattr(self, key)]
@@ -186,7 +186,7 @@ class Segmenter:
         if not counted:
             self.tally.read += len(accel)
         if len(accel):
-            finite = np.isfinite(accel.values).all(axis=1) if not np.isfinite(accel.values).all() else None
+            finite = np.asarray(np.isfinite(accel.values).all(axis=1)) if not np.isfinite(accel.values).all() else None
             if finite is not None:
                 self.tally.not_finite += int((~finite).sum())
                 accel = accel[finite]
@@ -204,9 +204,9 @@ class Segmenter:
             warm = batch.temperature
             self._temperature += self._orders[2](warm[np.isfinite(warm.values[:, 0])])
 
-    def _sound(self, poses: Floats) -> Floats:
+    def _sound(self, poses: Floats) -> Mask:
         """Which poses can be used, (m,) bool: finite, and quaternions of nearly unit length."""
-        finite = np.isfinite(poses).all(axis=1)
+        finite: Mask = np.asarray(np.isfinite(poses).all(axis=1))
         if self.bench.axes:
             return finite
         return finite & (np.abs(np.linalg.norm(poses, axis=1) - 1.0) < 0.01)
@@ -258,7 +258,7 @@ class Segmenter:
         self._begun, self._decided_ns = True, int(times[0])
         return [(int(min(self._accel.time_ns[0], times[0])), _Event.ARRIVE, 0)]
 
-    def _still(self, times: Times, poses: Floats, ends: Times, known: Floats) -> Floats:
+    def _still(self, times: Times, poses: Floats, ends: Times, known: Mask) -> Mask:
         """Which intervals between consecutive poses are still, (m - 1,) bool."""
         tolerance = np.radians(self.stillness.tolerance_deg)
         steps = pose_distance(poses[1:], poses[:-1], not self.bench.axes) <= tolerance
@@ -269,7 +269,7 @@ class Segmenter:
         self._cover_ns = int(reach[-1])
         return (reach[:-1] > times[:-1]) & steps
 
-    def _events(self, times: Times, still: Floats) -> list[tuple[int, _Event, int]]:
+    def _events(self, times: Times, still: Mask) -> list[tuple[int, _Event, int]]:
         settle_ns = round(self.stillness.settle_s * _SECOND_NS)
         lead_ns = round(self.stillness.lead_s * _SECOND_NS)
         window_ns = round(self.stillness.window_s * _SECOND_NS)

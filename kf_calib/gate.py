@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from kf_calib.samples import Floats
+from kf_calib.samples import Floats, Mask
 
 _GAUSSIAN_MAD = 1.4826  # median absolute deviation -> sigma, for Gaussian noise
 
 
-def innovations(columns: Floats, readings: Floats, static: bool, keep: Floats | None = None) -> Floats:
+def innovations(columns: Floats, readings: Floats, static: bool, keep: Mask | None = None) -> Floats:
     """Readings (n, 3) less their least-squares fit by the columns (n, c) within the block; (3, n).
 
     In a ``static`` block (constant columns, a still platform) the fit is the mean. ``keep``: the readings fitted.
@@ -29,7 +29,7 @@ def innovations(columns: Floats, readings: Floats, static: bool, keep: Floats | 
     return channels - fitted.T @ scaled.T
 
 
-def inliers(columns: Floats, readings: Floats, innovation: Floats, static: bool, threshold: float) -> Floats | None:
+def inliers(columns: Floats, readings: Floats, innovation: Floats, static: bool, threshold: float) -> Mask | None:
     """Which readings pass, (n,) bool; None: all of them.
 
     A reading is rejected where any channel's innovation, from the block's median, exceeds ``threshold`` robust sigma
@@ -40,12 +40,12 @@ def inliers(columns: Floats, readings: Floats, innovation: Floats, static: bool,
         return None
     if _plainly_clean(innovation, threshold):
         return None
-    keep = np.ones(count, bool)
+    keep: Mask = np.ones(count, bool)
     for _ in range(5):
         centre = np.median(innovation[:, keep], axis=1, keepdims=True)
         sigma = _GAUSSIAN_MAD * np.median(np.abs(innovation[:, keep] - centre), axis=1, keepdims=True)
         sigma = np.where(sigma > 0, sigma, innovation[:, keep].std(axis=1, keepdims=True))
-        now = (np.abs(innovation - centre) <= threshold * np.maximum(sigma, 1e-12)).all(axis=0)
+        now: Mask = np.all(np.abs(innovation - centre) <= threshold * np.maximum(sigma, 1e-12), axis=0)
         if (now == keep).all():
             break
         keep = now

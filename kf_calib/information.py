@@ -13,9 +13,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from kf_calib.model import DWELL_STATES, REGRESSORS, STATE_COUNT, Prior, Rows, dwell_map, state_map
+from kf_calib.model import REGRESSORS, STATE_COUNT, Prior, Rows, dwell_map, state_map
 from kf_calib.noise import Noise
-from kf_calib.samples import Floats
+from kf_calib.samples import Floats, Mask
+from kf_calib.triangle import triangle
 
 _WIDTH = len(REGRESSORS)
 _LAGS = 64
@@ -34,7 +35,10 @@ class Autocovariance:
 
     def __add__(self, other: Autocovariance) -> Autocovariance:
         return Autocovariance(
-            self.products + other.products, self.pairs + other.pairs, self.count + other.count, self.blocks + other.blocks
+            self.products + other.products,
+            self.pairs + other.pairs,
+            self.count + other.count,
+            self.blocks + other.blocks,
         )
 
     @classmethod
@@ -76,7 +80,7 @@ class DwellFactor:
             self,
             end_s=max(self.end_s, other.end_s),
             count=count,
-            factor=np.linalg.qr(np.vstack([self.factor, other.factor]), mode="r"),
+            factor=triangle(np.vstack([self.factor, other.factor])),
             pose=shared,
             temperature_c=(self.count * self.temperature_c + other.count * other.temperature_c) / count,
             autocovariance=self.autocovariance + other.autocovariance,
@@ -104,7 +108,7 @@ def _triangle(stacked: Floats) -> Floats:
     width = stacked.shape[1]
     if len(stacked) < width:
         stacked = np.vstack([stacked, np.zeros((width - len(stacked), width))])
-    return np.linalg.qr(stacked, mode="r")
+    return triangle(stacked)
 
 
 class Folder:
@@ -139,7 +143,7 @@ def _early_snapshots(rows: Rows) -> tuple[tuple[float, int, Floats], ...]:
     return tuple(out)
 
 
-def informative(factors: Floats) -> Floats:
+def informative(factors: Floats) -> Mask:
     """Which of the first 4 rows of factors (D, 7, 7) carry model columns, (D, 4) bool.
 
     A still platform has one: the mean. The others then hold columns of rounding size and are noise.
@@ -168,7 +172,7 @@ def whitened(dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> Floa
         rows[:, :, -1] = columns[:, :, _WIDTH + i] / sigma[i]
     if count:
         out[:, 3 * _WIDTH :, :count] = np.diag(1.0 / noise.dwell_sigmas[used])
-        out = np.linalg.qr(out, mode="r")[:, count:, count:]
+        out = triangle(out)[:, count:, count:]
     return out[:, : STATE_COUNT + 1]
 
 
@@ -186,7 +190,7 @@ def start(prior: Prior, parameters: Floats, state: Floats) -> Floats:
     if prior.diffuse:
         return np.zeros((STATE_COUNT, STATE_COUNT + 1))
     root = np.linalg.inv(np.linalg.cholesky(prior.covariance(parameters)))
-    return np.linalg.qr(np.column_stack([root, root @ state]), mode="r")[:STATE_COUNT]
+    return triangle(np.column_stack([root, root @ state]))[:STATE_COUNT]
 
 
 def predict(factor: Floats, walk_variance: Floats) -> Floats:
@@ -200,12 +204,12 @@ def predict(factor: Floats, walk_variance: Floats) -> Floats:
     augmented[:count, :count] = np.diag(1.0 / np.sqrt(walk_variance[walking]))
     augmented[count:, :count] = -factor[:, biases]
     augmented[count:, count:] = factor
-    return np.linalg.qr(augmented, mode="r")[count : count + STATE_COUNT, count:]
+    return triangle(augmented)[count : count + STATE_COUNT, count:]
 
 
 def update(factor: Floats, rows: Floats) -> Step:
     """Measurement update with one dwell's whitened rows (m, 13)."""
-    upper = np.linalg.qr(np.vstack([factor, rows]), mode="r")
+    upper = triangle(np.vstack([factor, rows]))
     after = upper[:STATE_COUNT]
     gained = rank(after) - rank(factor)
     informative_rows = int(np.linalg.matrix_rank(rows[:, :-1], rtol=1e-9)) if len(rows) else 0

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from kf_calib.model import STATE_COUNT, Prior, Rows, dwell_map, state_map
+from kf_calib.model import STATE_COUNT, Rows, dwell_map, state_map
 from kf_calib.noise import Noise
 from kf_calib.samples import Floats
 
@@ -41,7 +42,7 @@ def estimate(
     walk_variance: Callable[[float], Floats] | None = None,
     form: Literal["square-root", "plain"] = "square-root",
 ) -> Posterior:
-    """Run the filter over all rows. ``prior_covariance`` None: diffuse. ``walk_variance(elapsed_s)``: Q of the biases."""
+    """Run the filter over all rows. ``prior_covariance`` None: diffuse. ``walk_variance(elapsed_s)``: the biases' Q."""
     scale = np.where(np.arange(STATE_COUNT) % 4 == 3, 1.0, gravity_mps2)
     used = np.flatnonzero(noise.dwell_sigmas > 0)
     maps = np.concatenate([state_map() / scale, dwell_map(linearised_at)[:, :, used]], axis=2)
@@ -70,7 +71,9 @@ def estimate(
 class _Filter:
     """One of filterpy's two filters behind the few calls needed here."""
 
-    def __init__(self, form: str, state: Floats, root: Floats, dwell_sigmas: Floats, sigma: Floats) -> None:
+    def __init__(
+        self, form: str, state: Floats, root: NDArray[np.floating[Any]], dwell_sigmas: Floats, sigma: Floats
+    ) -> None:
         from filterpy.kalman import KalmanFilter, SquareRootKalmanFilter
 
         self.plain = form == "plain"

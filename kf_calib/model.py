@@ -67,9 +67,7 @@ def regressors(elapsed_s: Floats, pose: Floats, bench: Bench) -> Floats:
     return out
 
 
-def model_rows(
-    blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0
-) -> Iterator[Rows]:
+def model_rows(blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0) -> Iterator[Rows]:
     """Rows of every block, outliers gated out; the same rows feed both engines and batch least squares."""
     for block in blocks:
         elapsed_s, readings = block.elapsed_s, block.accel_mps2

@@ -1,9 +1,9 @@
 """The noise model: what the readings of a still platform scatter by, within a dwell and from dwell to dwell.
 
-Three parts (all 1 sigma): sigma_w, the noise of a reading within a dwell, with an inflation kappa for its
-autocorrelation (kappa = spectral density at zero frequency / that of white noise of the same variance, so that the mean of
-n readings has variance kappa sigma_w^2 / n); the setting error sigma_alpha, one small rotation a dwell, common to the
-three accelerometers; and sigma_s, the scatter of each sensor from dwell to dwell. Each is stated or estimated.
+Three parts (all 1 sigma). sigma_w: the noise of a reading within a dwell, with an inflation kappa for its
+autocorrelation (kappa = spectral density at zero frequency / that of white noise of the same variance, so that the
+mean of n readings has variance kappa sigma_w^2 / n). sigma_alpha: the setting error, one small rotation a dwell, common
+to the three accelerometers. sigma_s: the scatter of each sensor from dwell to dwell. Each is stated or estimated.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kf_calib.samples import Floats
+from kf_calib.triangle import triangle
 
 if TYPE_CHECKING:
     from kf_calib.information import Autocovariance, DwellFactor
@@ -122,7 +123,11 @@ def _autoregressive_inflation(gamma: Floats, count: int) -> float:
 
 
 def with_dwell_parts(
-    within: Noise, dwells: Sequence[DwellFactor], state: Floats, angle_sigma_deg: float | None, scatter_mps2: float | None
+    within: Noise,
+    dwells: Sequence[DwellFactor],
+    state: Floats,
+    angle_sigma_deg: float | None,
+    scatter_mps2: float | None,
 ) -> Noise:
     """The noise with its dwell parts: as stated, else estimated by restricted maximum likelihood where significant.
 
@@ -189,9 +194,11 @@ def _spread(means: Floats, parts: tuple[str, ...]) -> Floats:
     residual = readings - columns @ np.linalg.lstsq(columns, readings, rcond=1e-9)[0]
     size = np.sqrt(np.mean(residual**2, axis=0)) + FLOOR_MPS2
     gravity = np.linalg.norm(columns[:, 1:], axis=1).mean()
-    logs = ([np.log(size.mean() / gravity)] if "setting" in parts else []) + (
-        list(np.log(size)) if "scatter" in parts else []
-    ) + ([np.log(size.mean())] if "common" in parts else [])
+    logs = (
+        ([np.log(size.mean() / gravity)] if "setting" in parts else [])
+        + (list(np.log(size)) if "scatter" in parts else [])
+        + ([np.log(size.mean())] if "common" in parts else [])
+    )
     return np.array(logs)
 
 
@@ -260,5 +267,5 @@ def _between(noise: Noise, means: Floats, counts: Floats, state: Floats) -> tupl
     """Triangle (13, 13) of the whitened dwell means [A | z], and the sum of log|V_d|^(1/2)."""
     root = np.linalg.cholesky(mean_covariances(noise, means, counts, state))
     design = np.concatenate([mean_design(means), means[:, 4:, None]], axis=2)
-    upper = np.linalg.qr(np.linalg.solve(root, design).reshape(-1, 13), mode="r")
+    upper = triangle(np.linalg.solve(root, design).reshape(-1, 13))
     return upper, float(np.log(np.einsum("dii->di", root)).sum())

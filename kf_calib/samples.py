@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 Times = NDArray[np.int64]
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +44,7 @@ class Stream:
             return later
         if not len(later):
             return self
-        return Stream(
-            np.concatenate([self.time_ns, later.time_ns]), np.concatenate([self.values, later.values])
-        )
+        return Stream(np.concatenate([self.time_ns, later.time_ns]), np.concatenate([self.values, later.values]))
 
 
 @dataclass(frozen=True, slots=True)

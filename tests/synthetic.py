@@ -13,7 +13,7 @@ from kf_calib.bench import Bench, axes_of
 from kf_calib.samples import Batch, Stream
 
 G = 9.81
-SYMBOLS = "theta1 phi1 K1 b1 nu1 nu2 K2 b2 theta3 phi3 K3 b3".split()
+SYMBOLS = ["theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3"]
 NOMINAL = np.array([np.radians(0.5), 0, 1, 0, 0, 0, 1, 0, np.radians(0.5), -np.pi / 2, 1, 0])
 
 

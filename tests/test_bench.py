@@ -9,7 +9,15 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from kf_calib.bench import (
-    EARTH_RATE_RADPS, Bench, axes_of, interpolate_pose, normal_gravity, parse_axes, pose_distance, slerp, unwrap_pose,
+    EARTH_RATE_RADPS,
+    Bench,
+    axes_of,
+    interpolate_pose,
+    normal_gravity,
+    parse_axes,
+    pose_distance,
+    slerp,
+    unwrap_pose,
 )  # fmt: skip
 from kf_calib.errors import BenchError
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from synthetic import G, Run
 
 from kf_calib.bench import Bench, axes_of
 from kf_calib.calibration import Settings, calibrate, orientations
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.samples import Batch, Stream
 from kf_calib.sources.recording import Recording
-from synthetic import G, Run
 
 
 def test_a_real_imu_placed_by_hand(ferraris: Path) -> None:
@@ -66,7 +66,7 @@ def test_repeated_poses_are_one_orientation() -> None:
 
 
 def test_one_orientation_names_what_cannot_be_seen() -> None:
-    with pytest.raises(UnobservableError, match="theta1.*phi1.*K1.*b1.*nu1.*K3.*b3"):
+    with pytest.raises(UnobservableError, match=r"theta1.*phi1.*K1.*b1.*nu1.*K3.*b3"):
         calibrate(Run(seed=4, poses=np.zeros((1, 3))))
 
 
@@ -74,7 +74,9 @@ def test_two_faces_name_the_unseen_and_give_the_rest() -> None:
     result = calibrate(Run(seed=5, poses=np.array([[0.0, 0, 0], [0, np.pi, 0]]), count=600))
     unseen = {symbol for symbol, p in result.parameters.items() if p.value is None}
     assert unseen == {"theta1", "phi1", "K1", "nu1", "nu2", "theta3", "phi3", "K3"}  # K sin(theta) is seen, not theta
-    assert any("do not determine theta1, phi1, K1, nu1, nu2, theta3, phi3, K3" in warning for warning in result.warnings)
+    assert any(
+        "do not determine theta1, phi1, K1, nu1, nu2, theta3, phi3, K3" in warning for warning in result.warnings
+    )
     error = result.estimate.parameters - Run(seed=5, poses=np.zeros((1, 3))).truth
     assert result.consistency.consistent is None and abs(error[6]) < 5 * result.parameters["K2"].sigma
 

@@ -109,7 +109,10 @@ def test_an_attitude_in_place_of_angles() -> None:
     from scipy.spatial.transform import Rotation
 
     pose = path(*SLEWS, rate_hz=20)
-    turns = Rotation.from_rotvec(np.outer(pose.values[:, 0], [0, 0, 1])).as_quat() * np.where(np.sin(7 * np.arange(700)) < 0, -1, 1)[:, None]
+    turns = (
+        Rotation.from_rotvec(np.outer(pose.values[:, 0], [0, 0, 1])).as_quat()
+        * np.where(np.sin(7 * np.arange(700)) < 0, -1, 1)[:, None]
+    )
     bench = Bench((), 9.81)
     source = Given(Batch(readings(pose, 35), Stream(pose.time_ns, turns)), bench=bench)
     assert len(spans(source)) == 3

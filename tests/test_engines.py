@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from synthetic import Run, sensitivities
 
 from kf_calib import information, paper
 from kf_calib.bench import Bench, axes_of
@@ -14,7 +15,6 @@ from kf_calib.calibration import Pass, Settings, calibrate, evaluate, filterpy_e
 from kf_calib.comparison import compare
 from kf_calib.information import Folder
 from kf_calib.model import PRIORS
-from synthetic import Run, sensitivities
 
 CASES = {
     "paper grade": Run(seed=1, dwells=8, count=150),

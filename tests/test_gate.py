@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from synthetic import Run
 
 from kf_calib.calibration import Settings, calibrate
-from synthetic import Run
 
 
 def test_nothing_is_rejected_from_clean_noise() -> None:

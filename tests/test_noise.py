@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from synthetic import Run
 
 from kf_calib.calibration import calibrate
 from kf_calib.information import Autocovariance
-from synthetic import Run
 
 
 def test_autocovariance_is_the_sum_of_lagged_products() -> None:
@@ -36,7 +36,9 @@ def test_ar2_resonance_is_followed_too() -> None:
     """A noise with a spectral line averages faster near zero frequency than its variance says: never below white."""
     run = Run(seed=2, dwells=12, count=2000, rate_hz=100.0, white_mps2=0.0)
     a = [1.0, -2 * 0.95 * np.cos(1.0), 0.95**2]
-    run.accel.values[:] += 1e-4 * lfilter([1.0], a, np.random.default_rng(0).normal(size=run.accel.values.shape), axis=0)
+    run.accel.values[:] += 1e-4 * lfilter(
+        [1.0], a, np.random.default_rng(0).normal(size=run.accel.values.shape), axis=0
+    )
     np.testing.assert_allclose(calibrate(run).noise.inflation, 1.0)
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from synthetic import NOMINAL, sensitivities
 
 from kf_calib import paper
 from kf_calib.errors import BenchError
-from synthetic import NOMINAL, sensitivities
 
 RNG = np.random.default_rng(3)
 
@@ -31,7 +31,11 @@ def test_state_is_the_turned_axes(size: float) -> None:
 def test_both_jacobians_by_finite_differences(size: float) -> None:
     truth = NOMINAL + RNG.normal(size=12) * size
     state, h = paper.state_of(truth), 1e-6
-    forward = np.array([(paper.state_of(truth + h * e) - paper.state_of(truth - h * e)) / (2 * h) for e in np.eye(12)]).T
-    back = np.array([(paper.parameters_of(state + h * e) - paper.parameters_of(state - h * e)) / (2 * h) for e in np.eye(12)])
+    forward = np.array(
+        [(paper.state_of(truth + h * e) - paper.state_of(truth - h * e)) / (2 * h) for e in np.eye(12)]
+    ).T
+    back = np.array(
+        [(paper.parameters_of(state + h * e) - paper.parameters_of(state - h * e)) / (2 * h) for e in np.eye(12)]
+    )
     np.testing.assert_allclose(paper.sensitivity_jacobian(truth), forward, atol=1e-9)
     np.testing.assert_allclose(paper.jacobian(state), back.T, atol=1e-9)

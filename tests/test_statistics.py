@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from synthetic import Run
 
 from kf_calib.calibration import calibrate
-from synthetic import Run
 
 RUNS = 1000
 CASES = {

@@ -14,7 +14,7 @@ LEVELS = [
     ["errors"],
     ["samples"],
     ["bench"],
-    ["dwells", "paper", "gate"],
+    ["triangle", "dwells", "paper", "gate"],
     ["model"],
     ["noise"],
     ["information", "kalman", "batch"],

@@ -112,7 +112,7 @@ def _joint_state_layout(message: bytes) -> Layout:
     offset = _aligned(offset, 4)
     width, offset = _uint32(message, offset), offset + 4
     values = _aligned(offset, 8) if width else offset
-    if width < count:
+    if count not in (0, width):
         raise CdrError(f"it names {count} joints but gives {width} positions")
     end = values + 8 * width
     for _ in ("velocity", "effort"):
@@ -276,7 +276,7 @@ class Decoder:
             every = np.ndarray((len(buffer) - layout.size + 1,), dtype_of(layout), buffer, strides=(1,))
             head = every["head"][at[rest]].view(_HEAD)
             alike = (head["kind"] == head["kind"][0]) & (head["frame"] == head["frame"][0])
-            if layout.names:
+            if every["names"].shape[1]:
                 names = every["names"][at[rest]]
                 alike &= (names == names[0]).all(axis=1)
             stamps = head["sec"].astype(np.int64) * _NS_PER_S + head["nanosec"]

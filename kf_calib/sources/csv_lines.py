@@ -42,7 +42,7 @@ class CsvLines:
         self.metadata: dict[str, str] = {}
         self._account = account
         self._delimiter = max(",;\t", key=header.count)
-        self._names = [_renamed(name, columns) for name in _cells(header, self._delimiter)]
+        self._names = [columns.get(name, name.lower()) for name in _cells(header, self._delimiter)]
         repeated = next((name for name in self._names if name and self._names.count(name) > 1), None)
         if repeated:
             raise InputError(f"two columns are named {repeated!r}: rename or remove one of them.")
@@ -67,7 +67,8 @@ class CsvLines:
         for number, line in enumerate(lines, start=first_line):
             if not line or line.isspace():
                 continue
-            row = _cells(line, self._delimiter) if '"' in line else line.split(self._delimiter)
+            plain = '"' not in line and " " not in line
+            row = line.split(self._delimiter) if plain else _cells(line, self._delimiter)
             if len(row) == len(self._names):
                 rows.append(row)
                 numbers.append(number)
@@ -92,17 +93,17 @@ class CsvLines:
         return Batch(accel, pose, temperature if self._temperature.at else Stream.empty(1))
 
     def _usable(self, rows: list[list[str]], numbers: list[int]) -> list[list[str]]:
-        """The rows that make a batch each on its own; the others are refused."""
-        kept = list[list[str]]()
-        for row, number in zip(rows, numbers, strict=True):
-            try:
-                self._batch([row])
-                kept.append(row)
-            except LineError as error:
-                self._account.refuse(number, str(error))
-            except (ValueError, ArithmeticError):
-                self._account.refuse(number, "a cell is not a number")
-        return kept
+        """The rows without those that cannot be used, found by halving."""
+        try:
+            self._batch(rows)
+            return rows
+        except (ValueError, ArithmeticError) as error:
+            if len(rows) == 1:
+                reason = str(error) if isinstance(error, LineError) else "a cell is not a number"
+                self._account.refuse(numbers[0], reason)
+                return []
+        half = len(rows) // 2
+        return self._usable(rows[:half], numbers[:half]) + self._usable(rows[half:], numbers[half:])
 
     def _time_column(self) -> tuple[int, int]:
         for name, decimals in TIME_DECIMALS.items():
@@ -148,17 +149,13 @@ class CsvLines:
         return repr(shown if len(shown) <= 120 else shown[:120] + "...")
 
 
-def _renamed(name: str, columns: Mapping[str, str]) -> str:
-    name = name.strip()
-    return columns.get(name, name.lower())
-
-
 def _cells(line: str, delimiter: str) -> list[str]:
-    """The cells of one line, quotes undone; a quote left open ends with the line."""
+    """The cells of one line without blanks and quotes around them; a quote left open ends with the line."""
     try:
-        return next(csv.reader([line], delimiter=delimiter), [])
+        cells = next(csv.reader([line], delimiter=delimiter), [])
     except csv.Error:  # a cell beyond csv's own limit
-        return line.split(delimiter)
+        cells = line.split(delimiter)
+    return [cell.strip() for cell in cells]
 
 
 def _stamps(cells: Iterable[str], decimals: int) -> Times:
@@ -181,10 +178,11 @@ def _stream(stamps: Times, columns: Sequence[tuple[str, ...]], wanted: _Columns)
 
 def _measured(cells: Sequence[tuple[str, ...]]) -> NDArray[np.bool_]:
     """Which rows (n,) have all the cells. Raises LineError where a row has some and not others."""
-    filled = np.array([[bool(cell and not cell.isspace()) for cell in column] for column in cells])
-    if not (filled.all(axis=0) == filled.any(axis=0)).all():
+    filled = np.array([[bool(cell) for cell in column] for column in cells])
+    complete = np.all(filled, axis=0)
+    if np.any(filled[:, ~complete]):
         raise LineError("some components of a vector are missing")
-    return filled.all(axis=0)
+    return complete
 
 
 def _scaled(values: Floats, factors: Sequence[float]) -> Floats:

@@ -31,8 +31,8 @@ _decode_exactly = json.JSONDecoder(parse_constant=_refuse_constant, parse_float=
 class JsonLines:
     """Reads JSON lines block by block.
 
-    ``columns`` renames foreign keys. ``metadata`` is the first line's ``{"bench": ...}`` as strings. ``pose_width`` is 0
-    until the first pose, which settles whether poses are angles (``has_angles``) and how many.
+    ``columns`` renames foreign keys. ``metadata`` is the first line's ``{"bench": ...}`` as strings. The first pose
+    settles whether poses are angles (``has_angles``) and how many (``pose_width``, 0 until then).
     """
 
     def __init__(self, columns: Mapping[str, str], account: Account) -> None:

@@ -7,7 +7,8 @@ Bytes are taken as they arrive and cut into lines here; memory is that of one bl
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -20,17 +21,17 @@ from kf_calib.sources.csv_lines import CsvLines
 from kf_calib.sources.json_lines import JsonLines
 from kf_calib.sources.line_account import Account
 
-_BLOCK_BYTES = 1 << 20
-_LONGEST_LINE = 1 << 20
+_BLOCK_BYTES = 1 << 18
+_LONGEST_LINE_BYTES = 1 << 20
 _SURVEY_LINES = 1_000_000  # without a pose in them, none will come
 
 
 class Lines:
     """Lines as a ``Source``: a path can be iterated again, a stream only once.
 
-    source: path of a file, or a binary stream, which is read as data arrive. overrides: bench metadata keys that win over
-    those on the first line. columns: our name for each foreign column or key, for example ``{"acc_x[g]": "ax_g"}``.
-    name: what messages call a stream. Raises InputError where the lines cannot be used.
+    source: path of a file, or a binary stream, which is read as data arrive. overrides: bench metadata keys that win
+    over those on the first line. columns: our name for each foreign column or key, for example
+    ``{"acc_x[g]": "ax_g"}``. name: what messages call a stream. Raises InputError where the lines cannot be used.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class Lines:
             if self._path:
                 stream, size = self._path.open("rb"), self._path.stat().st_size
             elif self._stream is not None:
-                stream, size, self._stream = self._stream, 0, None
+                stream, size, self._stream = self._stream, None, None
             else:
                 raise InputError(f"{self.name} can be read only once: record it to a file to read it again.")
         except OSError as error:
@@ -92,8 +93,8 @@ class Lines:
             raise BenchError(f"{self.name}: {error}") from error
         if bench.pose_width != lines.pose_width:
             raise InputError(
-                f"{self.name}: poses have {lines.pose_width} angles and the bench has {bench.pose_width} axes: state as "
-                'many axes as there are angles, outer first, for example --axes "y z x".'
+                f"{self.name}: poses have {lines.pose_width} angles and the bench has {bench.pose_width} axes: state "
+                'as many axes as there are angles, outer first, for example --axes "y z x".'
             )
         return bench
 
@@ -103,13 +104,14 @@ class _Passage:
 
     parser: JsonLines | CsvLines
 
-    def __init__(self, name: str, stream: BinaryIO, size: int, columns: Mapping[str, str]) -> None:
+    def __init__(self, name: str, stream: BinaryIO, size: int | None, columns: Mapping[str, str]) -> None:
         self.account = Account()
         self.fraction = 0.0 if size else math.nan
         self._name, self._columns, self._size = name, columns, size
+        self._is_ours = size is not None  # a file opened here
         self._blocks = self._split(stream)
         self._ahead = list[Batch]()
-        self._has_accel = False
+        self._has_accel = self._has_pose = False
 
     def survey(self) -> None:
         """Reads up to the first pose and keeps what it has read."""
@@ -125,8 +127,9 @@ class _Passage:
             yield self._ahead.pop(0)
         while (batch := self._next_batch()) is not None:
             yield batch
-        if not self._has_accel:
-            raise self._unusable("readings")
+        for what, is_met in (("readings", self._has_accel), ("platform angles", self._has_pose)):
+            if not is_met:
+                raise self._unusable(what)
 
     def _open_parser(self) -> None:
         for lines in self._blocks:
@@ -160,40 +163,48 @@ class _Passage:
         batch = self.parser.read(lines, self.account.lines + 1)
         self.account.lines += len(lines)
         self._has_accel |= len(batch.accel) > 0
+        self._has_pose |= len(batch.pose) > 0
         return batch
 
     def _split(self, stream: BinaryIO) -> Iterator[list[str]]:
-        """Whole lines, block by block as they arrive; of a line beyond 1 MiB only a stub is kept, which no parser takes."""
-        tail, position = bytearray(), 0
+        """Whole lines, block by block as they arrive; a line that is too long is refused and left empty."""
+        tail, cut, position = bytearray(), 0, 0
         for block in self._read(stream):
             position += len(block)
             end = block.rfind(b"\n") + 1
             if end:
-                yield self._decoded(bytes(tail) + block[:end])
+                lines = self._decoded(bytes(tail) + block[: end - 1], cut)
+                cut += len(lines)
                 self.fraction = min(position / self._size, 1.0) if self._size else math.nan
+                yield lines
                 tail.clear()
-            if len(tail) <= _LONGEST_LINE:
+            if len(tail) <= _LONGEST_LINE_BYTES:  # else what comes up to the next end of line is not kept
                 tail += block[end:]
         if tail:
-            yield self._decoded(bytes(tail))
+            yield self._decoded(bytes(tail), cut)
         self.fraction = 1.0
+
+    def _decoded(self, block: bytes, before: int) -> list[str]:
+        lines = block.replace(b"\r\n", b"\n").removesuffix(b"\r").split(b"\n")
+        if len(block) > _LONGEST_LINE_BYTES:
+            for i, line in enumerate(lines):
+                if len(line) > _LONGEST_LINE_BYTES:
+                    self.account.refuse(before + i + 1, "it is longer than 1 MiB")
+                    lines[i] = b""
+        return b"\n".join(lines).decode("utf-8", errors="replace").split("\n")
 
     def _read(self, stream: BinaryIO) -> Iterator[bytes]:
         read = getattr(stream, "read1", stream.read)  # read1 does not wait until a whole block has come
+        with stream if self._is_ours else nullcontext():
+            while block := self._read_block(read):
+                yield block
+
+    def _read_block(self, read: Callable[[int], bytes]) -> bytes:
         try:
-            with stream:
-                while block := read(_BLOCK_BYTES):
-                    yield block
+            return read(_BLOCK_BYTES)
         except OSError as error:
             raise InputError(f"{self._name}: cannot be read on ({error.strerror}).") from None
 
-    def _decoded(self, block: bytes) -> list[str]:
-        lines = block.decode("utf-8", errors="replace").removesuffix("\n").split("\n")
-        return lines
-
     def _unusable(self, what: str) -> InputError:
-        said = " ".join(self.account.sentences()).rstrip(".")
-        found = f"; {said}" if said else ""
-        return InputError(
-            f"{self._name}: no {what} in {self.account.lines} lines{found}: {self.parser.advice}."
-        )
+        found = "".join(f"; {sentence.rstrip('.')}" for sentence in self.account.sentences())
+        return InputError(f"{self._name}: no {what} in {self.account.lines} lines{found}: {self.parser.advice}.")

@@ -1,8 +1,8 @@
 """Noise of the simulated bench: processes that stream, and go on over dwells and batches without a seam.
 
-Every coloured noise is a sum of first-order processes ``y_n = phi y_(n-1) + s w_n``, w white with variance 1: white noise,
-AR(1), 1/f (many time constants) and the random walk (phi = 1). Each has a generator of its own, so what it yields does
-not depend on how the samples are cut into batches, nor on which other noises are on.
+Every coloured noise is a sum of first-order processes ``y_n = phi y_(n-1) + s w_n``, w white with variance 1: white
+noise, AR(1), 1/f (many time constants) and the random walk (phi = 1). Each has a generator of its own, so what it
+yields does not depend on how the samples are cut into batches, nor on which other noises are on.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _FLICKER_RATIO = 4.0
 class Noise:
     """What disturbs readings and angles. All are 1 sigma and independent between accelerometers and axes; 0: absent.
 
-    white_mps2: noise of a reading; with ``ar1_phi`` it is an AR(1) process of that correlation from sample to sample and
-        the same sigma.
-    flicker_mps2: 1/f noise, one-sided density h/f, by the floor of its Allan deviation: flicker^2 = 2 ln 2 h (IEEE 952).
+    white_mps2: noise of a reading; with ``ar1_phi`` an AR(1) process of that correlation from sample to sample and the
+        same sigma.
+    flicker_mps2: 1/f noise, one-sided density h/f, by the floor of its Allan deviation, sqrt(2 ln 2 h) (IEEE 952).
     walk_mps2_per_sqrt_s: random walk of each bias, starting from zero.
     scatter_mps2: constant offset of each accelerometer in each dwell.
     setting_sigma_deg: small rotation of the whole platform in each dwell, per axis, that the encoders do not see.

@@ -88,5 +88,5 @@ GRADES: Mapping[str, Grade] = {
     "mems": Grade(math.radians(3.0), 0.05, 0.5, Noise(white_mps2=0.02, vibration_mps2=0.05)),
 }
 """The paper's Table 1; a quartz-flexure accelerometer (100 ug, 300 ppm, 1 mrad); a consumer chip (50 mg, 5 %, 3 deg).
-The noise is what every reading has; flicker, scatter and the positioner's errors belong to a run: add them by ``replace``.
+The noise is what every reading has; flicker, scatter and the positioner's errors are a run's: ``replace`` adds them.
 """

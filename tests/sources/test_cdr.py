@@ -150,17 +150,26 @@ def test_refuses_what_it_cannot_read(kind, width, message, says) -> None:
         decode(cdr.Decoder(kind, width), [message])
 
 
-def test_refuses_joints_without_positions() -> None:
-    nameless = official(
-        cdr.JOINT_STATE, Message(header=header(0, "f"), name=["a", "b"], position=[1.0], velocity=[], effort=[])
-    )
-    with pytest.raises(cdr.CdrError, match="names 2 joints but gives 1 positions"):
-        decode(cdr.Decoder(cdr.JOINT_STATE, 2), [nameless])
+def joint_state(names: list[str], position: list[float], velocity: list[float], effort: list[float]) -> bytes:
+    fields = Message(header=header(5, "f"), name=names, position=position, velocity=velocity, effort=effort)
+    return official(cdr.JOINT_STATE, fields)
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_refuses_joints_with_another_number_of_positions(count: int) -> None:
+    with pytest.raises(cdr.CdrError, match=f"names 2 joints but gives {count} positions"):
+        decode(cdr.Decoder(cdr.JOINT_STATE, 2), [joint_state(["a", "b"], [1.0] * count, [], [])])
+
+
+def test_joints_without_names_of_one_length_but_other_counts_are_told_apart() -> None:
+    messages = [joint_state([], [1.0, 2.0], [3.0], []), joint_state([], [1.0], [2.0, 3.0], [])]
+    assert len(messages[0]) == len(messages[1])
+    with pytest.raises(cdr.CdrError, match="gives 1 positions for 2 gimbal axes"):
+        decode(cdr.Decoder(cdr.JOINT_STATE, 2), messages)
 
 
 def test_reads_past_velocities_and_efforts() -> None:
-    full = Message(header=header(5, "f"), name=["a"], position=[1.5], velocity=[2.0], effort=[3.0, 4.0])
-    found = decode(cdr.Decoder(cdr.JOINT_STATE, 1), [official(cdr.JOINT_STATE, full)])
+    found = decode(cdr.Decoder(cdr.JOINT_STATE, 1), [joint_state(["a"], [1.5], [2.0], [3.0, 4.0])])
     assert (found.time_ns.tolist(), found.values.tolist()) == ([5], [[1.5]])
 
 

@@ -172,6 +172,19 @@ def test_samples_reach_the_disk_by_the_clock_and_at_the_end_of_a_dwell(tmp_path:
         assert len(read(Recording(path)).accel) == 300
 
 
+def test_the_end_of_a_dwell_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.mcap"
+    sizes: list[int] = []
+    monkeypatch.setattr(os, "fsync", lambda _: sizes.append(path.stat().st_size))
+    with Recorder(path, BENCH) as recorder:
+        recorder.write(made_batch(100))
+        sizes.clear()
+        recorder.end_dwell()
+        assert sizes == [path.stat().st_size]
+        sizes.clear()
+    assert sizes == [path.stat().st_size]
+
+
 def test_a_full_disk_is_told_and_what_was_written_stays(tmp_path: Path) -> None:
     path, limit, dwell = tmp_path / "a.mcap", 60_000, 0
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)

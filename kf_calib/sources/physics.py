@@ -1,0 +1,150 @@
+"""What is true of the simulated bench, and the steps that make it so.
+
+A ``State`` goes through steps in three groups: the platform (angles -> attitude -> specific force), the response of the
+accelerometers (specific force -> readings), and the recording (noise). They share no formula with the estimator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from kf_calib.bench import Bench, Vector
+from kf_calib.samples import Floats
+from kf_calib.sources.gimbals import attitude, between
+from kf_calib.sources.noise_sources import Process
+from kf_calib.sources.sensors import Sensors
+
+SIDEREAL_DAY_S = 86164.0905
+"""One turn of the Earth in inertial space."""
+
+
+@dataclass(frozen=True)
+class Ambient:
+    """Temperature over time: constant + swing sin(2 pi t / period) - warm_up exp(-t / warm_up_s), degC."""
+
+    constant_c: float = 25.0
+    swing_c: float = 0.0
+    period_s: float = 14400.0
+    warm_up_c: float = 0.0
+    warm_up_s: float = 1800.0
+    sigma_c: float = 0.01  # of the recorded values
+
+    def __call__(self, time_s: Floats) -> Floats:
+        swing = self.swing_c * np.sin(2.0 * np.pi * time_s / self.period_s)
+        return self.constant_c + swing - self.warm_up_c * np.exp(-time_s / self.warm_up_s)
+
+
+@dataclass
+class State:
+    """What is true of n consecutive samples that lie within one dwell, or within one slew.
+
+    Arrays have n rows, or one where a quantity is constant over the stretch: they broadcast. ``dwell`` is the one the
+    platform is in, or was last in; ``share`` of the way to the next one it has gone.
+    """
+
+    time_s: Floats  # (n,) since the first sample
+    ambient: Ambient
+    dwell: int
+    moving: bool
+    arrival_s: float
+    share: Floats  # (n,) or (1,)
+    angles_rad: Floats  # (n, k) or (1, k); as the encoders see them, without their noise
+    attitude: Rotation = field(default_factory=Rotation.identity)  # platform -> bench
+    force_mps2: Floats = field(default_factory=lambda: np.zeros((1, 3)))  # specific force, in the platform
+    reading_mps2: Floats = field(default_factory=lambda: np.zeros((1, 3)))
+
+    @property
+    def temperature_c(self) -> Floats:
+        return self.ambient(self.time_s)
+
+    @property
+    def since_arrival_s(self) -> Floats:
+        return self.time_s - self.arrival_s
+
+    def of_dwells(self, values: Floats) -> Floats:
+        """What has ``values`` (m, k) in the dwells and passes smoothly from one to the next: (n, k) or (1, k)."""
+        return between(values, np.full(len(self.share), self.dwell), self.share)
+
+
+Step = Callable[[State], None]
+"""One part of the bench: changes what is true in a ``State``. It may remember what went before."""
+
+
+@dataclass(frozen=True)
+class Gimbals:
+    """The chain of gimbals: encoder angles -> attitude."""
+
+    axes: Sequence[Vector]
+
+    def __call__(self, state: State) -> None:
+        state.attitude = attitude(self.axes, state.angles_rad)
+
+
+@dataclass(frozen=True)
+class SettingError:
+    """The platform turned in itself by a small rotation vector in each dwell, ``rotation_rad`` (m, 3)."""
+
+    rotation_rad: Floats
+
+    def __call__(self, state: State) -> None:
+        state.attitude = state.attitude * Rotation.from_rotvec(state.of_dwells(self.rotation_rad))
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """Specific force seen by the platform: f_p = C_bp^T f_b, f_b = (0, g, 0), which turns with the Earth where the
+    platform is held in inertial space."""
+
+    bench: Bench
+
+    def __call__(self, state: State) -> None:
+        up = np.array([[0.0, self.bench.gravity_mps2, 0.0]])
+        if self.bench.reference == "inertial":
+            up = Rotation.from_rotvec(state.time_s[:, None] * self._earth_rate_radps).apply(up)
+        state.force_mps2 = state.attitude.inv().apply(up)
+
+    @property
+    def _earth_rate_radps(self) -> Floats:
+        """Turning rate of the Earth (3,) in the bench frame: North, Up, East turned until x has the azimuth."""
+        # a bench that says inertial states its latitude
+        latitude, azimuth = np.radians([self.bench.latitude_deg or 0.0, self.bench.azimuth_deg])
+        pole = Rotation.from_rotvec([0.0, 0.0, latitude]).apply([1.0, 0.0, 0.0])  # raised from North by the latitude
+        from_north = Rotation.from_rotvec([0.0, -azimuth, 0.0])  # East is z: toward it is a turn about Down
+        return 2.0 * np.pi / SIDEREAL_DAY_S * from_north.inv().apply(pole)
+
+
+@dataclass(frozen=True)
+class Response:
+    """Readings of the three accelerometers: K_i E_i . f + b_i."""
+
+    sensors: Sensors
+
+    def __call__(self, state: State) -> None:
+        rows = self.sensors.sensitivities
+        state.reading_mps2 = np.einsum("nj,ij->ni", state.force_mps2, rows) + self.sensors.biases_mps2
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """An offset of each accelerometer in each dwell, ``offset_mps2`` (m, 3)."""
+
+    offset_mps2: Floats
+
+    def __call__(self, state: State) -> None:
+        state.reading_mps2 = state.reading_mps2 + state.of_dwells(self.offset_mps2)
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """Noise added to the readings; ``when_moving``: only in slews."""
+
+    process: Process
+    when_moving: bool = False
+
+    def __call__(self, state: State) -> None:
+        if state.moving or not self.when_moving:
+            state.reading_mps2 = state.reading_mps2 + self.process(len(state.time_s))
