@@ -1,6 +1,6 @@
 """The main job: a source in, the twelve parameters with their covariance, the noise and the misfit out.
 
-One pass folds the recording into a factor a dwell (``information.Folder``); everything after it (noise model, filter
+One pass folds the recording into a factor a dwell (``folding.Folder``); everything after it (noise model, filter
 steps, leave-one-orientation-out) works on the factors. The estimate after each dwell is reported with the noise model
 of the whole run, so the curves of a replay do not jump when the noise becomes better known.
 """
@@ -18,7 +18,8 @@ from kf_calib import information, kalman, paper
 from kf_calib.bench import Bench
 from kf_calib.dwells import Segmenter, Stillness, Tally, dwell_blocks
 from kf_calib.errors import InputError, UnobservableError
-from kf_calib.information import DwellFactor, Folder, Step
+from kf_calib.folding import DwellFactor, Folder, informative
+from kf_calib.information import Step
 from kf_calib.model import PRIORS, STATE_COUNT, Prior, Rows, model_rows
 from kf_calib.noise import Noise, considered, mean_covariances, mean_design, with_dwell_parts, within_dwells
 from kf_calib.samples import Floats, Mask, Source
@@ -372,7 +373,7 @@ def _consistency(dwells: list[DwellFactor], noise: Noise, state: Floats) -> Cons
     rows = information.whitened(dwells, noise.judging, state).reshape(-1, STATE_COUNT + 1)
     step = information.update(information.start(Prior(), state, state), rows)
     factors = np.array([dwell.factor for dwell in dwells])
-    dof = 3 * int(information.informative(factors).sum()) - information.rank(step.factor)
+    dof = 3 * int(informative(factors).sum()) - information.rank(step.factor)
     dof -= int(not noise.setting_stated and noise.setting_rad > 0)
     if dof <= 0:
         return Consistency(step.nis, 0, None, None)

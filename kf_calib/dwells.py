@@ -143,11 +143,15 @@ class _Event(Enum):
 
 @dataclass
 class _Dwell:
-    """The open dwell: its number, the first stamp that may be used, and the first pose message that belongs to it."""
+    """The open dwell: its number, the first stamp that may be used, and the first pose message that belongs to it.
+
+    pose (1, k): where the platform stands, from the messages of the dwell's first block.
+    """
 
     number: int
     usable_ns: int
     first_pose_ns: int
+    pose: Floats | None = None
 
 
 @dataclass
@@ -398,9 +402,23 @@ class Segmenter:
         inside = poses[first:last]
         spread = np.ptp(inside, axis=0).max()
         if spread <= np.radians(self.stillness.tolerance_deg):
-            return mean_pose(inside)[None, :]
+            return self._standing_pose(inside)
         around = slice(max(first - 1, own), last + 1)
         return interpolate_pose(accel_ns, times[around], poses[around], not self.bench.axes)
+
+    def _standing_pose(self, inside: Floats) -> Floats:
+        """The dwell's pose (1, k); taken anew only where a block's mean has left it by more than the encoder's noise.
+
+        A platform that stands still has one pose: the columns of its dwell are then constant to the last bit.
+        """
+        assert self._dwell is not None
+        mean = mean_pose(inside)[None, :]
+        known = self._dwell.pose
+        allowed = 6.0 * inside.std(axis=0) / np.sqrt(len(inside)) + 1e-9
+        if known is None or (np.abs(mean - known) > allowed).any():
+            self._dwell.pose = mean
+            return mean
+        return known
 
     def _forget(self) -> None:
         """Drop poses and temperatures that no pending reading needs."""

@@ -1,155 +1,22 @@
-"""The block engine: a square-root information filter whose memory is one triangular factor a dwell.
+"""The block engine: a square-root information filter over dwell factors.
 
-Each dwell's rows [X | z] (regressors, three readings) are folded by QR into one upper-triangular factor of 7 x 7
-numbers, unwhitened. That factor is all there is of the dwell: whitening by the noise model, eliminating the dwell's
-nuisance states, the posterior, least squares and leave-one-orientation-out all work on the factors, with no second
-pass over the data. Factors of the same dwell from two places merge by stacking and one more QR.
+A dwell's factor is whitened by the noise model, its nuisance states (setting error, scatter) are eliminated, and the
+rows that remain update the running factor [R | z] by QR. The posterior, least squares and leave-one-orientation-out
+all come from such factors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from kf_calib.model import REGRESSORS, STATE_COUNT, Prior, Rows, dwell_map, state_map
+from kf_calib.folding import WIDTH, DwellFactor, informative
+from kf_calib.model import STATE_COUNT, Prior, dwell_map, state_map
 from kf_calib.noise import Noise
-from kf_calib.samples import Floats, Mask
+from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
-
-_WIDTH = len(REGRESSORS)
-_LAGS = 64
-_CORRELATED_SAMPLES = 8192  # readings of a dwell whose autocovariance is accumulated
-_FIRST_SNAPSHOT = 64
-
-
-@dataclass(frozen=True)
-class Autocovariance:
-    """Sums of lagged products of the innovations within blocks: products (L + 1, 3), pairs (L + 1,), blocks' n."""
-
-    products: Floats = field(default_factory=lambda: np.zeros((_LAGS + 1, 3)))
-    pairs: Floats = field(default_factory=lambda: np.zeros(_LAGS + 1))
-    count: int = 0
-    blocks: int = 0
-
-    def __add__(self, other: Autocovariance) -> Autocovariance:
-        return Autocovariance(
-            self.products + other.products,
-            self.pairs + other.pairs,
-            self.count + other.count,
-            self.blocks + other.blocks,
-        )
-
-    @classmethod
-    def of(cls, innovation: Floats) -> Autocovariance:
-        """Of innovations (3, n)."""
-        count = innovation.shape[1]
-        padded = 1 << (count + _LAGS).bit_length()
-        spectrum = np.fft.rfft(innovation, padded, axis=1)
-        products = np.zeros((_LAGS + 1, 3))
-        lags = min(_LAGS, count - 1) + 1
-        products[:lags] = np.fft.irfft(np.abs(spectrum) ** 2, padded, axis=1)[:, :lags].T
-        return cls(products, np.maximum(count - np.arange(_LAGS + 1), 0).astype(float), count, 1)
-
-
-@dataclass(frozen=True)
-class DwellFactor:
-    """One dwell, folded: factor (7, 7) upper triangular over [1 f_x f_y f_z | z1 z2 z3], count of readings."""
-
-    number: int
-    start_s: float
-    end_s: float
-    count: int
-    factor: Floats
-    pose: Floats  # (k,), mean
-    temperature_c: float
-    autocovariance: Autocovariance
-    snapshots: tuple[tuple[float, int, Floats], ...] = ()  # (end_s, count, factor) at doublings of the count
-
-    @property
-    def means(self) -> Floats:
-        """Means of the regressors and readings, (7,): 1, f (3), z (3)."""
-        return self.factor[0] / self.factor[0, 0]
-
-    def merged(self, other: DwellFactor) -> DwellFactor:
-        """The same dwell from two stretches of samples, this one the earlier."""
-        count = self.count + other.count
-        shared = (self.count * self.pose + other.count * other.pose) / count
-        return replace(
-            self,
-            end_s=max(self.end_s, other.end_s),
-            count=count,
-            factor=triangle(np.vstack([self.factor, other.factor])),
-            pose=shared,
-            temperature_c=(self.count * self.temperature_c + other.count * other.temperature_c) / count,
-            autocovariance=self.autocovariance + other.autocovariance,
-            snapshots=self.snapshots + other.snapshots,
-        )
-
-
-def fold(rows: Rows, correlated: bool = True) -> DwellFactor:
-    """One block as a factor of its own; ``correlated``: its autocovariance too."""
-    stacked = np.concatenate([rows.columns, rows.readings], axis=1)
-    return DwellFactor(
-        number=rows.dwell,
-        start_s=float(rows.elapsed_s[0]),
-        end_s=float(rows.elapsed_s[-1]),
-        count=len(stacked),
-        factor=_triangle(stacked),
-        pose=rows.pose,
-        temperature_c=rows.temperature_c,
-        autocovariance=Autocovariance.of(rows.innovation) if correlated else Autocovariance(),
-    )
-
-
-def _triangle(stacked: Floats) -> Floats:
-    """The (7, 7) triangle of rows (n, 7), padded with zeros where there are fewer rows than columns."""
-    width = stacked.shape[1]
-    if len(stacked) < width:
-        stacked = np.vstack([stacked, np.zeros((width - len(stacked), width))])
-    return triangle(stacked)
-
-
-class Folder:
-    """Folds rows into the list of dwell factors, dwell after dwell."""
-
-    def __init__(self) -> None:
-        self.dwells: list[DwellFactor] = []
-
-    def add(self, rows: Rows) -> None:
-        current = self.dwells[-1] if self.dwells else None
-        if current is None or current.number != rows.dwell:
-            self.dwells.append(replace(fold(rows), snapshots=_early_snapshots(rows)))
-            return
-        block = fold(rows, correlated=current.autocovariance.count < _CORRELATED_SAMPLES)
-        if block.count + current.count >= 2 * _last_count(current):
-            block = replace(block, snapshots=((current.end_s, current.count, current.factor),))
-        self.dwells[-1] = current.merged(block)
-
-
-def _last_count(dwell: DwellFactor) -> int:
-    return dwell.snapshots[-1][1] if dwell.snapshots else _FIRST_SNAPSHOT
-
-
-def _early_snapshots(rows: Rows) -> tuple[tuple[float, int, Floats], ...]:
-    """Factors of the first 64, 128, 256 ... readings of a dwell's first block, for curves within the dwell."""
-    stacked = np.concatenate([rows.columns, rows.readings], axis=1)
-    out, size, done, factor = list[tuple[float, int, Floats]](), _FIRST_SNAPSHOT, 0, np.empty((0, stacked.shape[1]))
-    while size < len(stacked):
-        factor = _triangle(np.vstack([factor, stacked[done:size]]))
-        out.append((float(rows.elapsed_s[size - 1]), size, factor))
-        done, size = size, 2 * size
-    return tuple(out)
-
-
-def informative(factors: Floats) -> Mask:
-    """Which of the first 4 rows of factors (D, 7, 7) carry model columns, (D, 4) bool.
-
-    A still platform has one: the mean. The others then hold columns of rounding size and are noise.
-    """
-    size = np.linalg.norm(factors[:, :_WIDTH, :_WIDTH], axis=2)
-    return size > 1e-9 * size[:, :1]
 
 
 def whitened(dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> Floats:
@@ -158,20 +25,20 @@ def whitened(dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> Floa
     Channel i's rows are divided by the sigma of a white reading that averages like the true one; the setting error
     (three rotations) and the scatter (three offsets) enter as states with their priors, linearised at ``state``.
     """
-    factors = np.array([dwell.factor for dwell in dwells]).reshape(-1, _WIDTH + 3, _WIDTH + 3)
-    columns = np.where(informative(factors)[:, :, None], factors[:, :_WIDTH, :], 0.0)
+    factors = np.array([dwell.factor for dwell in dwells]).reshape(-1, WIDTH + 3, WIDTH + 3)
+    columns = np.where(informative(factors)[:, :, None], factors[:, :WIDTH, :], 0.0)
     sigma = noise.effective_sigma_mps2
     maps, nuisances = state_map(), dwell_map(state)
     used = np.flatnonzero(noise.dwell_sigmas > 0)
     count = len(used)
-    out = np.zeros((len(dwells), 3 * _WIDTH + count, count + STATE_COUNT + 1))
+    out = np.zeros((len(dwells), 3 * WIDTH + count, count + STATE_COUNT + 1))
     for i in range(3):
-        rows = out[:, i * _WIDTH : (i + 1) * _WIDTH]
-        rows[:, :, :count] = columns[:, :, :_WIDTH] @ nuisances[i][:, used] / sigma[i]
-        rows[:, :, count:-1] = columns[:, :, :_WIDTH] @ maps[i] / sigma[i]
-        rows[:, :, -1] = columns[:, :, _WIDTH + i] / sigma[i]
+        rows = out[:, i * WIDTH : (i + 1) * WIDTH]
+        rows[:, :, :count] = columns[:, :, :WIDTH] @ nuisances[i][:, used] / sigma[i]
+        rows[:, :, count:-1] = columns[:, :, :WIDTH] @ maps[i] / sigma[i]
+        rows[:, :, -1] = columns[:, :, WIDTH + i] / sigma[i]
     if count:
-        out[:, 3 * _WIDTH :, :count] = np.diag(1.0 / noise.dwell_sigmas[used])
+        out[:, 3 * WIDTH :, :count] = np.diag(1.0 / noise.dwell_sigmas[used])
         out = triangle(out)[:, count:, count:]
     return out[:, : STATE_COUNT + 1]
 

@@ -26,13 +26,17 @@ DWELL_STATES = 6
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Model columns and readings of one block: columns (n, 4), readings (n, 3), innovation within the block (3, n)."""
+    """Model columns and readings of one block: columns (n, 4), readings (n, 3), innovation within the block (3, n).
+
+    static: the columns are the same in every row, and the innovation is the readings less their mean.
+    """
 
     dwell: int
     elapsed_s: Floats
     columns: Floats
     readings: Floats
     innovation: Floats
+    static: bool
     pose: Floats  # (k,), the block's mean
     temperature_c: float
 
@@ -61,10 +65,10 @@ def dwell_map(state: Floats) -> Floats:
 
 def regressors(elapsed_s: Floats, pose: Floats, bench: Bench) -> Floats:
     """X (n, 4) at ``elapsed_s`` (n,) and poses (n, k) or (1, k)."""
-    out = np.empty((len(elapsed_s), len(REGRESSORS)))
-    out[:, 0] = 1.0
-    out[:, 1:] = bench.specific_force(elapsed_s if bench.reference == "inertial" else elapsed_s[:1], pose)
-    return out
+    still = bench.reference == "base" and len(pose) == 1
+    force = bench.specific_force(elapsed_s[: 1 if still else None], pose)
+    out = np.concatenate([np.ones((len(force), 1)), force], axis=1)
+    return np.broadcast_to(out, (len(elapsed_s), out.shape[1]))
 
 
 def model_rows(blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0) -> Iterator[Rows]:
@@ -81,7 +85,7 @@ def model_rows(blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: 
                 elapsed_s, columns, readings = elapsed_s[keep], columns[keep], readings[keep]
                 innovation = gate.innovations(columns, readings, static)
         pose, warm = block.pose.mean(axis=0), float(block.temperature_c.mean())
-        yield Rows(block.dwell, elapsed_s, columns, readings, innovation, pose, warm)
+        yield Rows(block.dwell, elapsed_s, columns, readings, innovation, static, pose, warm)
 
 
 @dataclass(frozen=True)

@@ -10,15 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from kf_calib.folding import Autocovariance, DwellFactor, within_squares
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
-
-if TYPE_CHECKING:
-    from kf_calib.information import Autocovariance, DwellFactor
 
 FLOOR_MPS2 = 1e-9
 """Readings that are exactly constant get this sigma: the rounding of a double is 1e-15 m/s^2."""
@@ -72,15 +69,18 @@ class Noise:
 def within_dwells(dwells: Sequence[DwellFactor]) -> Noise:
     """sigma_w and kappa of each accelerometer, pooled over the dwells.
 
-    The residual sum of squares of a dwell has expectation sigma^2 (n - kappa - 3): the fitted mean takes kappa,
-    three further columns one each.
+    The residual sum of squares of a dwell has expectation sigma^2 (n - kappa - c + 1): the fitted mean takes kappa, the
+    other of the c columns that vary within the dwell one each.
     """
     total = dwells[0].autocovariance
     for dwell in dwells[1:]:
         total += dwell.autocovariance
     inflation = np.array([_inflation(total, i) for i in range(3)])
-    squares = np.sum([np.diag(d.factor[4:, 4:].T @ d.factor[4:, 4:]) for d in dwells], axis=0)
-    freedom = np.sum([np.maximum(d.count - 3 - np.minimum(inflation, d.count), 0) for d in dwells], axis=0)
+    squares, freedom = np.zeros(3), np.zeros(3)
+    for dwell in dwells:
+        own, columns = within_squares(dwell)
+        squares += own
+        freedom += np.maximum(dwell.count + 1 - columns - np.minimum(inflation, dwell.count), 0)
     return Noise(np.sqrt(squares / np.maximum(freedom, 1.0)), inflation)
 
 

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from synthetic import Run
 
 from kf_calib.calibration import calibrate
-from kf_calib.information import Autocovariance
+from kf_calib.folding import Autocovariance
 
 
 def test_autocovariance_is_the_sum_of_lagged_products() -> None:

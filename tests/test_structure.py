@@ -16,6 +16,7 @@ LEVELS = [
     ["bench"],
     ["triangle", "dwells", "paper", "gate"],
     ["model"],
+    ["folding"],
     ["noise"],
     ["information", "kalman", "batch"],
     ["calibration"],

@@ -97,7 +97,9 @@ def peak_mb(path: Path) -> float:
         "from kf_calib.sources.recording import Recording; calibrate(Recording(sys.argv[1])); "
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == 'darwin' else 1024))"
     )
-    return float(subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True).stdout)
+    return float(
+        subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True).stdout
+    )
 
 
 def import_s() -> float:

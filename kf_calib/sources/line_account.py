@@ -26,12 +26,13 @@ class Account:
 
     lines: int = 0
     malformed: int = 0
-    first_malformed: str = ""
+    first_malformed: tuple[int, str] | None = None
     unknown: Counter[str] = field(default_factory=Counter[str])
 
     def refuse(self, line: int, reason: str) -> None:
         self.malformed += 1
-        self.first_malformed = self.first_malformed or f"line {line}: {reason}"
+        if self.first_malformed is None or line < self.first_malformed[0]:
+            self.first_malformed = (line, reason)
 
     def leave_out(self, names: Iterable[str]) -> None:
         """Counts values under unknown names; of the names, the first few are kept."""
@@ -41,9 +42,10 @@ class Account:
 
     def sentences(self) -> list[str]:
         out = list[str]()
-        if self.malformed:
+        if self.first_malformed:
+            line, reason = self.first_malformed
             out.append(
-                f"{self.malformed} of {self.lines} lines were malformed and skipped (first {self.first_malformed})."
+                f"{self.malformed} of {self.lines} lines were malformed and skipped (first line {line}: {reason})."
             )
         if self.unknown:
             named = ", ".join(f"{name!r} ({count})" for name, count in self.unknown.items())
