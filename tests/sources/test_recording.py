@@ -619,7 +619,7 @@ def test_a_bit_flipped_in_an_unfinished_file(tmp_path: Path, small: bytes) -> No
 def test_memory_does_not_grow_with_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     peaks: list[int] = []
-    for count in (25_000, 100_000):
+    for count in (50_000, 200_000):
         path = record(tmp_path / f"{count}.mcap", made_batch(count), chunk_size=500_000)
         recording = Recording(path)
         tracemalloc.start()
@@ -627,4 +627,4 @@ def test_memory_does_not_grow_with_the_recording(tmp_path: Path, monkeypatch: py
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 1.6 * peaks[0], "four times the samples"
-    assert peaks[1] < 12_000_000, "the readings unpacked take 40 MB"
+    assert peaks[1] < 25_000_000, "the readings unpacked take 80 MB"
