@@ -273,6 +273,11 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
     """Raise InputError where there is nothing to calibrate from, or where the readings are not in m/s^2."""
     if not tally.read:
         raise InputError("the recording holds no accelerometer readings: check that the logger wrote any.")
+    if not tally.poses:
+        raise InputError(
+            "the recording holds no platform angles (or attitude), so the direction of gravity is not known: "
+            "record them on /platform/angles, at any rate."
+        )
     if not dwells:
         raise InputError(
             f"no dwell was found in {tally.read} readings ({tally.moving} moving, {tally.settling} settling, "
@@ -299,9 +304,11 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
 def refuse_unseen(result: Calibration) -> None:
     """Raise UnobservableError where the orientations determine none of the twelve parameters."""
     if result.estimate.unseen.all():
-        count = len(result.visits)
+        dwells = (
+            "1 dwell of this run shows" if len(result.visits) == 1 else f"{len(result.visits)} dwells of this run show"
+        )
         raise UnobservableError(
-            f"the {count} dwell{'s' * (count > 1)} of this run show too few different directions of gravity, so none "
+            f"the {dwells} too few different directions of gravity, so none "
             f"of the parameters can be seen ({', '.join(paper.SYMBOLS)}): visit at least four spread orientations, "
             "or state a --prior."
         )

@@ -65,26 +65,23 @@ class Tally:
     backward: int = 0
     leaping: int = 0
     without_pose: int = 0
+    poses: int = 0
     poses_dropped: int = 0
     gated: int = 0
     first_backward_s: float | None = None
 
     def sentences(self) -> list[str]:
+        backward_s = self.first_backward_s or 0.0
         said = {
-            "not_finite": "{} readings were not finite (NaN or infinite) and were dropped.",
-            "repeated": "{} readings repeated the stamp before them and were dropped.",
-            "leaping": "{} readings had a stamp far ahead of their neighbours and were dropped.",
-            "without_pose": "{} readings had no platform angle within 1 s of them and were dropped.",
-            "poses_dropped": "{} angle messages were not finite, not in order of time or no unit quaternion: dropped.",
-            "gated": "{} readings were outliers (innovation gate) and were rejected; --no-gate keeps them.",
+            "not_finite": "readings that were not finite (NaN or infinite), dropped: {}.",
+            "repeated": "readings that repeated the stamp before them, dropped: {}.",
+            "backward": f"readings whose stamps jumped back (first at {backward_s:.3f} s), dropped: {{}}.",
+            "leaping": "readings with a stamp far ahead of their neighbours, dropped: {}.",
+            "without_pose": "readings with no platform angle within 1 s of them, dropped: {}.",
+            "poses_dropped": "angle messages not finite, out of order of time or no unit quaternion, dropped: {}.",
+            "gated": "outlying readings (innovation gate), rejected: {}; --no-gate keeps them.",
         }
-        out = [text.format(getattr(self, key)) for key, text in said.items() if getattr(self, key)]
-        if self.backward:
-            out.append(
-                f"{self.backward} readings had stamps that jumped back (first at {self.first_backward_s:.3f} s) "
-                "and were dropped."
-            )
-        return out
+        return [text.format(getattr(self, key)) for key, text in said.items() if getattr(self, key)]
 
 
 class _Order:
@@ -201,6 +198,7 @@ class Segmenter:
         if len(pose):
             sound, counts = self._sound(pose.values), Tally()
             pose = self._orders[1](pose[sound], counts)
+            self.tally.poses += len(pose)
             self.tally.poses_dropped += int((~sound).sum()) + counts.repeated + counts.backward + counts.leaping
             previous = self._pose.values[-1:] if len(self._pose) else None
             self._pose += Stream(pose.time_ns, unwrap_pose(pose.values, not self.bench.axes, previous))
@@ -279,7 +277,8 @@ class Segmenter:
         window_ns = round(self.stillness.window_s * _SECOND_NS)
         in_dwell, events = self._dwell is not None, list[tuple[int, _Event, int]]()
         unresolved = ~still & (np.diff(times[: len(still) + 1]) > window_ns)
-        changes = np.flatnonzero(np.diff(still, prepend=in_dwell) | unresolved)
+        after_unresolved = np.concatenate([[False], unresolved[:-1]])
+        changes = np.flatnonzero(np.diff(still, prepend=in_dwell) | unresolved | after_unresolved)
         for j in changes:
             begin, end = int(times[j]), int(times[j + 1])
             if still[j] and not in_dwell:

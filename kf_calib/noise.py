@@ -28,9 +28,9 @@ _SIGNIFICANT = 5.41  # 1 % point of the likelihood ratio of a variance against z
 class Noise:
     """sigma_mps2, inflation, scatter_mps2: (3,) each; setting_rad; which of the dwell parts were stated.
 
-    checked: enough orientations to check that a setting error only turns the specific force. The estimate then leans
-    on the readings along it, which no rotation changes; otherwise dwells weigh by their scatter alone, and the
-    setting error is *considered* (Schmidt): it enlarges the covariance and moves no estimate.
+    checked: the scatter is stated, or the orientations are enough to check that a setting error only turns the specific
+    force. The estimate then leans on the readings along it, which no rotation changes; otherwise dwells weigh by their
+    scatter alone, and the setting error is *considered* (Schmidt): it enlarges the covariance and moves no estimate.
     """
 
     sigma_mps2: Floats
@@ -145,7 +145,7 @@ def with_dwell_parts(
         scatter_mps2=np.full(3, scatter_mps2 or 0.0),
         setting_stated=angle_sigma_deg is not None,
         scatter_stated=scatter_mps2 is not None,
-        checked=_setting_is_checked(means),
+        checked=scatter_mps2 is not None or _setting_is_checked(means),
     )
     freedom = 3 * len(dwells) - 12
     if freedom < 6 or (stated.setting_stated and stated.scatter_stated):

@@ -132,7 +132,7 @@ def test_bad_samples_are_dropped_and_counted() -> None:
     assert (tally.not_finite, tally.repeated, tally.backward, tally.leaping) == (2, 1, 1, 1)
     assert tally.used == 2000 - 5 and len(got) == 1
     said = " ".join(tally.sentences())
-    assert "NaN" in said and "jumped back" in said and "repeated" in said and "far ahead" in said
+    assert "NaN" in said and "jumped back" in said and "repeated the stamp" in said and "far ahead" in said
 
 
 def test_readings_outside_the_angles_are_counted() -> None:

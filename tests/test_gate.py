@@ -23,7 +23,7 @@ def test_outliers_are_rejected_counted_and_harmless(share: float) -> None:
     place = np.arange(len(hit)) % 300  # within the dwell: a second settles, the last angle message of a dwell ends it
     evaluated = ((place >= 20) | (np.arange(len(hit)) < 300)) & (place < 288)
     assert other.tally.gated == pytest.approx((hit & evaluated).sum(), rel=0.03, abs=1)
-    assert any("outliers" in warning for warning in other.warnings)
+    assert any("outlying readings" in warning for warning in other.warnings)
     shift = np.abs(other.estimate.parameters - one.estimate.parameters) / one.estimate.sigma
     assert shift.max() < 2.5
     spoiled = calibrate(dirty, Settings(gate_sigma=None))

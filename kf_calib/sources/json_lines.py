@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -20,12 +20,7 @@ _TEMPERATURE = "temperature_c"
 _KNOWN = frozenset([*TIME_DECIMALS, *_ACCEL, *_ANGLES, _ATTITUDE, _TEMPERATURE])
 
 
-def _refuse_constant(text: str) -> NoReturn:
-    raise LineError(f"{text} is not JSON")
-
-
-_decode = json.JSONDecoder(parse_constant=_refuse_constant).decode
-_decode_exactly = json.JSONDecoder(parse_constant=_refuse_constant, parse_float=Decimal).decode
+_decode_exactly = json.JSONDecoder(parse_float=Decimal).decode
 
 
 class JsonLines:
@@ -64,7 +59,7 @@ class JsonLines:
         return Batch(accel.stream(3), pose.stream(self.pose_width), temperature.stream(1))
 
     def _read_line(self, line: str, accel: _Rows, pose: _Rows, temperature: _Rows) -> None:
-        entry = _decode(line)
+        entry = json.loads(line)
         if not isinstance(entry, dict):
             raise LineError("it is not a JSON object")
         if self._columns:
@@ -155,7 +150,7 @@ class _Rows:
 
 
 def _numbers(values: Any, name: str) -> list[float]:
-    """Finite JSON numbers; true, "1" and 1e999 are none."""
+    """Finite numbers; true, "1", NaN and 1e999 are none."""
     if type(values) is not list:
         raise LineError(f"{name} is not a list of numbers")
     for value in values:

@@ -72,7 +72,10 @@ class Recorder:
             self._sync()
 
     def write(self, batch: Batch) -> None:
-        """Adds the samples of ``batch`` in the order of their stamps. Raises InputError where they do not fit."""
+        """Adds the samples of ``batch``, the streams merged by their stamps. Raises InputError where they do not fit.
+
+        Each stream keeps the order in which it came: a stamp that jumps back is evidence, and stays where it is.
+        """
         streams = (batch.accel, batch.pose, batch.temperature)
         messages: list[bytes] = []
         ids: list[int] = []
@@ -81,7 +84,8 @@ class Recorder:
                 messages += self._pack(channel, stream)
                 ids += [channel.register(self._writer)] * len(stream)
         stamps = np.concatenate([stream.time_ns for stream in streams])
-        order = np.argsort(stamps, kind="stable")
+        reached = np.concatenate([np.maximum.accumulate(stream.time_ns) for stream in streams])
+        order = np.argsort(reached, kind="stable")
         with self._storing():
             for i, stamp in zip(order.tolist(), stamps[order].tolist(), strict=True):
                 self._writer.add_message(ids[i], log_time=stamp, data=messages[i], publish_time=stamp)

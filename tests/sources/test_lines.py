@@ -22,7 +22,7 @@ from kf_calib.sources.lines import Lines
 BENCH = {"axes": "y z x", "gravity_mps2": "9.81"}
 HEADER = "time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c"
 ROW = "1.5,0.1,9.8,-0.2,10,20,30,25.5"
-OBJECT = {"time_ns": 1_500_000_000, "accel_mps2": [0.1, 9.8, -0.2], "angles_rad": [0.1, 0.2, 0.3], "temperature_c": 25.5}
+OBJECT = {"time_ns": 1_500_000_000, "accel_mps2": [0.1, 9.8, -0.2], "angles_rad": [0.1, 0.2, 0.3], "temperature_c": 25}
 START_NS = 1_750_000_000_123_456_789
 
 
@@ -267,7 +267,9 @@ def test_garbage_raises_nothing_but_input_errors(garbage, before):
         assert not before, error
 
 
-@pytest.mark.parametrize("text", [b"\x00" * (8 << 20), b"{" * (8 << 20), b"\xff\xfe\n" * 100_000, b"\n" * (1 << 20)])
+@pytest.mark.parametrize(
+    "text", [b"\x00" * (32 << 20), b"{" * (32 << 20), b"\xff\xfe\n" * 100_000, b"\n" * (1 << 20)]
+)
 def test_hostile_input_ends_soon_and_in_little_memory(text):
     tracemalloc.start()
     start = time.perf_counter()
@@ -276,7 +278,7 @@ def test_hostile_input_ends_soon_and_in_little_memory(text):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert time.perf_counter() - start < 10.0
-    assert peak < 40 << 20
+    assert peak < 24 << 20
 
 
 def test_memory_does_not_grow_with_the_lines():
@@ -307,7 +309,7 @@ def test_memory_does_not_grow_with_the_lines():
 
 def test_a_live_stream_is_read_as_it_arrives():
     reader, writer = os.pipe()
-    with open(reader, "rb") as stream, open(writer, "wb", buffering=0) as feed:
+    with os.fdopen(reader, "rb") as stream, os.fdopen(writer, "wb", buffering=0) as feed:
         feed.write(json_text({"bench": {"axes": "y z x", "gravity_mps2": 9.81}}, OBJECT).encode())
         source = Lines(stream)
         assert source.bench.gravity_mps2 == 9.81
@@ -354,12 +356,12 @@ def test_unusable_lines_say_what_is_missing_and_what_to_do(text, words):
 
 
 def test_a_bench_that_is_not_described_is_asked_for():
-    with pytest.raises(InputError, match="standard input.*axes"):
+    with pytest.raises(InputError, match=r"standard input.*axes"):
         _ = lines_of(f"{HEADER}\n{ROW}", {}).bench
     with pytest.raises(InputError, match="gravty"):
         _ = lines_of(json_text({"bench": {"gravty": 9.81}}, OBJECT)).bench
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(InputError, match="absent.csv: cannot be read"):
+    with pytest.raises(InputError, match=r"absent\.csv: cannot be read"):
         list(Lines(tmp_path / "absent.csv", BENCH))

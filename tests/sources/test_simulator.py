@@ -53,12 +53,13 @@ def dwell_means(simulation: Simulation, batch: Batch) -> np.ndarray:
 def test_six_faces_read_plus_and_minus_g_times_scale_plus_bias():
     sensors = replace(ORTHOGONAL, parameters={**ORTHOGONAL.parameters, "K1": 1.01, "b1": 0.1, "K2": 0.98, "b3": -0.2})
     simulation = Simulation(BENCH, sensors, QUIET, six_faces(dwell_s=2.0))
-    expected = np.kron(np.diag([1.01, 0.98, 1.0]), [[G], [-G]]) + [0.1, 0.0, -0.2]
+    expected = np.kron(np.diag([1.01, 0.98, 1.0]), [[G], [-G]]) + np.array([0.1, 0.0, -0.2])
     np.testing.assert_allclose(dwell_means(simulation, read(simulation)), expected, atol=1e-12)
 
 
 def test_sensitive_axes_are_the_papers():
-    sensors = Sensors({"theta1": 0.02, "phi1": 0.3, "K1": 1.1, "nu1": 0.04, "nu2": -0.05, "theta3": -0.01, "phi3": -1.5})
+    first, second, third = {"theta1": 0.02, "phi1": 0.3, "K1": 1.1}, {"nu1": 0.04, "nu2": -0.05}, {"theta3": -0.01}
+    sensors = Sensors(first | second | third | {"phi3": -1.5})
     expected = [
         [1.1 * math.cos(0.3) * math.cos(0.02), 1.1 * math.sin(0.02), -1.1 * math.sin(0.3) * math.cos(0.02)],
         [math.sin(0.04), math.sqrt(1 - math.sin(0.04) ** 2 - math.sin(0.05) ** 2), math.sin(0.05)],
@@ -242,9 +243,9 @@ def test_outliers_have_their_rate_and_size():
 
 
 def test_scatter_is_constant_in_a_dwell_and_independent_between_them():
-    simulation = Simulation(BENCH, ORTHOGONAL, Noise(scatter_mps2=1e-3), explicit_plan([(0, 0, 0), (0, 1, 0)] * 150, 1.0),
-                            slew_rate_degps=math.inf, seed=3)  # fmt: skip
-    quiet = Simulation(BENCH, ORTHOGONAL, QUIET, simulation.plan, slew_rate_degps=math.inf)
+    plan = explicit_plan([(0, 0, 0), (0, 1, 0)] * 150, dwell_s=1.0)
+    simulation = Simulation(BENCH, ORTHOGONAL, Noise(scatter_mps2=1e-3), plan, slew_rate_degps=math.inf, seed=3)
+    quiet = Simulation(BENCH, ORTHOGONAL, QUIET, plan, slew_rate_degps=math.inf)
     offsets = (read(simulation).accel.values - read(quiet).accel.values).reshape(300, 100, 3)
     assert np.ptp(offsets, axis=1).max() < 1e-14
     assert offsets[:, 0].std() == pytest.approx(1e-3, rel=0.08)
