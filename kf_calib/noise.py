@@ -131,8 +131,8 @@ def with_dwell_parts(
 ) -> Noise:
     """The noise with its dwell parts: as stated, else estimated by restricted maximum likelihood where significant.
 
-    Of the parts not stated, the combination with the best likelihood is taken, each part charged for by the 1 % point
-    of its ratio against zero. Fewer than 6 degrees of freedom between dwells: nothing is estimated. Too few
+    Of the parts not stated (the scatter one number for all accelerometers, or one each), the combination with the best
+    likelihood is taken, each number charged for by the 1 % point of its ratio against zero. Fewer than 6 degrees of freedom between dwells: nothing is estimated. Too few
     orientations to tell a setting error from the sensors' scatter: the whole misfit counts as scatter.
     """
     from scipy.special import chdtrc
@@ -153,13 +153,13 @@ def with_dwell_parts(
     if chdtrc(freedom, _misfit(stated.weights, means, counts, state)) > 0.1:  # nothing to explain: spares the search
         return stated
     if not stated.checked:
-        free = [()] if stated.scatter_stated else [("common",)]
+        free = {("common",)}
     else:
-        setting = () if stated.setting_stated else ("setting",)
-        scatter = () if stated.scatter_stated else ("scatter",)
-        free = [setting, scatter, setting + scatter]
+        settings = [()] if stated.setting_stated else [(), ("setting",)]
+        scatters = [()] if stated.scatter_stated else [(), ("common",), ("scatter",)]
+        free = {setting + scatter for setting in settings for scatter in scatters} - {()}
     best, best_score = stated, restricted_log_likelihood(stated.weights, means, counts, state)
-    for parts in {parts for parts in free if parts}:
+    for parts in sorted(free):
         found, score = _most_likely(stated, parts, means, counts, state)
         if score > best_score:
             best, best_score = found, score

@@ -43,14 +43,15 @@ def test_ar2_resonance_is_followed_too() -> None:
 
 
 def test_setting_error_and_scatter_are_told_apart_and_sized() -> None:
-    settings, scatters = [], []
+    settings, scatters, mistaken = [], [], 0
     for seed in range(12):
         setting = calibrate(Run(seed=seed, dwells=30, setting_deg=0.01, stated=False)).noise
-        assert not setting.scatter_mps2.any()
+        mistaken += bool(setting.scatter_mps2.any())
         settings.append(np.degrees(setting.setting_rad))
         scatter = calibrate(Run(seed=seed, dwells=30, scatter_mps2=5e-4)).noise
-        assert scatter.setting_rad == 0 or scatter.setting_stated
+        mistaken += scatter.setting_rad > 0 and not scatter.setting_stated
         scatters.append(scatter.scatter_mps2)
+    assert mistaken <= 2  # of 24, at the 1 % point each
     assert np.sqrt(np.mean(np.square(settings))) == pytest.approx(0.01, rel=0.1)
     assert np.sqrt(np.mean(np.square(scatters))) == pytest.approx(5e-4, rel=0.12)
 

@@ -5,17 +5,14 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
-from itertools import compress
-
-import numpy as np
-from numpy.typing import NDArray
+from operator import mul
 
 from kf_calib.errors import InputError
-from kf_calib.samples import Batch, Floats, Stream, Times
-from kf_calib.sources.line_account import ACCEL_UNITS, TIME_DECIMALS, Account, LineError, stamp_ns
+from kf_calib.samples import Batch
+from kf_calib.sources.line_parts import ACCEL_UNITS, TIME_DECIMALS, Account, LineError, Rows, stamp_ns
 
 _ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
 _USUAL_GIMBALS = ("outer", "middle", "inner")
@@ -29,6 +26,18 @@ class _Columns:
 
     at: tuple[int, ...]
     factors: tuple[float, ...]
+
+    def values(self, row: Sequence[str]) -> list[float] | None:
+        """The quantity, None where it is not measured. Raises ValueError where it cannot be used."""
+        cells = [row[at] for at in self.at]
+        if not all(cells):
+            if any(cells):
+                raise LineError("some components of a vector are missing")
+            return None
+        values = list(map(float, cells))
+        if not math.isfinite(sum(values)):
+            raise LineError("a number is not finite")
+        return list(map(mul, values, self.factors))
 
 
 class CsvLines:
@@ -63,47 +72,31 @@ class CsvLines:
 
     def read(self, lines: Sequence[str], first_line: int) -> Batch:
         """The batch of consecutive lines, the first of them of that number."""
-        rows, numbers = list[list[str]](), list[int]()
+        accel, pose, temperature = Rows(), Rows(), Rows()
         for number, line in enumerate(lines, start=first_line):
             if not line or line.isspace():
                 continue
-            plain = '"' not in line and " " not in line
-            row = line.split(self._delimiter) if plain else _cells(line, self._delimiter)
-            if len(row) == len(self._names):
-                rows.append(row)
-                numbers.append(number)
-            else:
-                self._account.refuse(number, f"it has {len(row)} cells, the header has {len(self._names)}")
-        try:
-            return self._batch(rows)
-        except (ValueError, ArithmeticError):
-            return self._batch(self._usable(rows, numbers))
+            try:
+                self._read_line(line, accel, pose, temperature)
+            except LineError as error:
+                self._account.refuse(number, str(error))
+            except (ValueError, ArithmeticError):
+                self._account.refuse(number, "a cell is not a number")
+        return Batch(accel.stream(3), pose.stream(self.pose_width), temperature.stream(1))
 
-    def _batch(self, rows: list[list[str]]) -> Batch:
-        """The batch of rows that are all well formed. Raises ValueError or ArithmeticError where one is not."""
-        if not rows:
-            return Batch(Stream.empty(3), Stream.empty(self.pose_width))
-        columns = list(zip(*rows, strict=True))
-        stamps = _stamps(columns[self._time], self._decimals)
-        accel, pose, temperature = (
-            _stream(stamps, columns, wanted) for wanted in (self._accel, self._pose, self._temperature)
-        )
-        if not self.has_angles and not pose.values.any(axis=1).all():
+    def _read_line(self, line: str, accel: Rows, pose: Rows, temperature: Rows) -> None:
+        is_plain = '"' not in line and " " not in line
+        row = line.split(self._delimiter) if is_plain else _cells(line, self._delimiter)
+        if len(row) != len(self._names):
+            raise LineError(f"it has {len(row)} cells, the header has {len(self._names)}")
+        time_ns = stamp_ns(Decimal(row[self._time]), self._decimals)
+        # everything on the line is understood before any of it is used
+        readings, angles, degrees = self._accel.values(row), self._pose.values(row), self._temperature.values(row)
+        if angles and not self.has_angles and not any(angles):
             raise LineError("the quaternion is zero")
-        return Batch(accel, pose, temperature if self._temperature.at else Stream.empty(1))
-
-    def _usable(self, rows: list[list[str]], numbers: list[int]) -> list[list[str]]:
-        """The rows without those that cannot be used, found by halving."""
-        try:
-            self._batch(rows)
-            return rows
-        except (ValueError, ArithmeticError) as error:
-            if len(rows) == 1:
-                reason = str(error) if isinstance(error, LineError) else "a cell is not a number"
-                self._account.refuse(numbers[0], reason)
-                return []
-        half = len(rows) // 2
-        return self._usable(rows[:half], numbers[:half]) + self._usable(rows[half:], numbers[half:])
+        accel.add(time_ns, readings)
+        pose.add(time_ns, angles)
+        temperature.add(time_ns, degrees)
 
     def _time_column(self) -> tuple[int, int]:
         for name, decimals in TIME_DECIMALS.items():
@@ -156,34 +149,3 @@ def _cells(line: str, delimiter: str) -> list[str]:
     except csv.Error:  # a cell beyond csv's own limit
         cells = line.split(delimiter)
     return [cell.strip() for cell in cells]
-
-
-def _stamps(cells: Iterable[str], decimals: int) -> Times:
-    return np.array([stamp_ns(Decimal(cell), decimals) for cell in cells], np.int64)
-
-
-def _stream(stamps: Times, columns: Sequence[tuple[str, ...]], wanted: _Columns) -> Stream:
-    """The stamped values of the ``wanted`` columns where they are measured: all of them or none, and finite."""
-    cells = [columns[at] for at in wanted.at]
-    if not all(all(column) for column in cells):
-        measured = _measured(cells)
-        stamps, cells = stamps[measured], [tuple(compress(column, measured)) for column in cells]
-    values = np.empty((len(stamps), len(cells)))
-    for i, column in enumerate(cells):
-        values[:, i] = list(map(float, column))
-    if not np.isfinite(values).all():
-        raise LineError("a number is not finite")
-    return Stream(stamps, _scaled(values, wanted.factors))
-
-
-def _measured(cells: Sequence[tuple[str, ...]]) -> NDArray[np.bool_]:
-    """Which rows (n,) have all the cells. Raises LineError where a row has some and not others."""
-    filled = np.array([[bool(cell) for cell in column] for column in cells])
-    complete = np.all(filled, axis=0)
-    if np.any(filled[:, ~complete]):
-        raise LineError("some components of a vector are missing")
-    return complete
-
-
-def _scaled(values: Floats, factors: Sequence[float]) -> Floats:
-    return values if set(factors) == {1.0} else values * np.array(factors)

@@ -8,10 +8,8 @@ from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from typing import Any
 
-import numpy as np
-
-from kf_calib.samples import Batch, Stream
-from kf_calib.sources.line_account import ACCEL_UNITS, TIME_DECIMALS, Account, LineError, stamp_ns
+from kf_calib.samples import Batch
+from kf_calib.sources.line_parts import ACCEL_UNITS, TIME_DECIMALS, Account, LineError, Rows, stamp_ns
 
 _ACCEL = {f"accel_{unit}": factor for unit, factor in ACCEL_UNITS.items()}
 _ANGLES = {"angles_rad": 1.0, "angles_deg": math.pi / 180.0}
@@ -44,7 +42,7 @@ class JsonLines:
 
     def read(self, lines: Sequence[str], first_line: int) -> Batch:
         """The batch of consecutive lines, the first of them of that number."""
-        accel, pose, temperature = _Rows(), _Rows(), _Rows()
+        accel, pose, temperature = Rows(), Rows(), Rows()
         for number, line in enumerate(lines, start=first_line):
             if not line or line.isspace():
                 continue
@@ -58,7 +56,7 @@ class JsonLines:
                 self._account.refuse(number, "it is nested too deeply")
         return Batch(accel.stream(3), pose.stream(self.pose_width), temperature.stream(1))
 
-    def _read_line(self, line: str, accel: _Rows, pose: _Rows, temperature: _Rows) -> None:
+    def _read_line(self, line: str, accel: Rows, pose: Rows, temperature: Rows) -> None:
         entry = json.loads(line)
         if not isinstance(entry, dict):
             raise LineError("it is not a JSON object")
@@ -73,9 +71,9 @@ class JsonLines:
         degrees = _numbers([entry[_TEMPERATURE]], _TEMPERATURE) if entry.get(_TEMPERATURE) is not None else None
         if attitude and not self.pose_width:
             self.pose_width, self.has_angles = len(attitude), has_angles
-        for rows, values in ((accel, readings), (pose, attitude), (temperature, degrees)):
-            if values:
-                rows.add(time_ns, values)
+        accel.add(time_ns, readings)
+        pose.add(time_ns, attitude)
+        temperature.add(time_ns, degrees)
         if not entry.keys() <= _KNOWN:
             self._account.leave_out(key for key in entry if key not in _KNOWN)
 
@@ -130,23 +128,6 @@ class JsonLines:
         if self.pose_width and (len(values), has_angles) != (self.pose_width, self.has_angles):
             raise LineError(f"{name} is not like the poses before it")
         return values
-
-
-class _Rows:
-    """Stamped rows on their way to a stream."""
-
-    def __init__(self) -> None:
-        self._stamps = list[int]()
-        self._values = list[list[float]]()
-
-    def add(self, time_ns: int, values: list[float]) -> None:
-        self._stamps.append(time_ns)
-        self._values.append(values)
-
-    def stream(self, width: int) -> Stream:
-        if not self._stamps:
-            return Stream.empty(width)
-        return Stream(np.array(self._stamps, np.int64), np.array(self._values, float))
 
 
 def _numbers(values: Any, name: str) -> list[float]:

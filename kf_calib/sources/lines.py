@@ -19,7 +19,7 @@ from kf_calib.errors import BenchError, InputError
 from kf_calib.samples import Batch
 from kf_calib.sources.csv_lines import CsvLines
 from kf_calib.sources.json_lines import JsonLines
-from kf_calib.sources.line_account import Account
+from kf_calib.sources.line_parts import Account
 
 _BLOCK_BYTES = 1 << 18
 _LONGEST_LINE_BYTES = 1 << 20

@@ -1,4 +1,4 @@
-"""What the line readers share: an account of what could not be used, and exact stamps."""
+"""What the readers of JSON and CSV lines share: units, exact stamps, rows, and an account of what was not used."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from decimal import Decimal
+
+import numpy as np
+
+from kf_calib.samples import Stream
 
 STANDARD_GRAVITY_MPS2 = 9.80665
 ACCEL_UNITS = {"mps2": 1.0, "g": STANDARD_GRAVITY_MPS2, "mg": STANDARD_GRAVITY_MPS2 / 1e3}
@@ -51,6 +55,25 @@ class Account:
             named = ", ".join(f"{name!r} ({count})" for name, count in self.unknown.items())
             out.append(f"names that are not known were left out, with the values under them: {named}.")
         return out
+
+
+class Rows:
+    """Stamped rows on their way to a stream."""
+
+    def __init__(self) -> None:
+        self._stamps = list[int]()
+        self._values = list[list[float]]()
+
+    def add(self, time_ns: int, values: list[float] | None) -> None:
+        """Adds a row, unless there is nothing to add."""
+        if values:
+            self._stamps.append(time_ns)
+            self._values.append(values)
+
+    def stream(self, width: int) -> Stream:
+        if not self._stamps:
+            return Stream.empty(width)
+        return Stream(np.array(self._stamps, np.int64), np.array(self._values, float))
 
 
 def stamp_ns(number: int | Decimal, decimals: int) -> int:
