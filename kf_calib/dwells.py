@@ -4,7 +4,7 @@ Stillness is judged on the platform angles: an interval between two pose message
 ``window_s`` over which the pose moves by no more than ``tolerance_deg``. Where angles are absent during a motion
 (two messages far apart in time and in angle) the readings decide where the one dwell ended and the next began.
 Samples of a slew stay in the recording and out of the static fit; so do ``settle_s`` after each arrival and
-``lead_s`` before each departure. What comes out does not depend on how the streams were chopped into batches.
+``lead_s`` before each departure (of short dwells no more than a third and a tenth). What comes out does not depend on how the streams were chopped into batches.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Stillness:
     """When the platform counts as still."""
 
     tolerance_deg: float = 0.05
-    window_s: float = 1.0
+    window_s: float = 0.5
     settle_s: float = 1.0
     lead_s: float = 0.25
 
@@ -140,14 +140,16 @@ class _Event(Enum):
 
 @dataclass
 class _Dwell:
-    """The open dwell: its number, the first stamp that may be used, and the first pose message that belongs to it.
+    """The open dwell: its number, its arrival, and the first pose message that belongs to it.
 
+    settling_ns: what is left out after the arrival; None while the dwell may still be too short for the whole margin.
     pose (1, k): where the platform stands, from the messages of the dwell's first block.
     """
 
     number: int
-    usable_ns: int
+    arrival_ns: int
     first_pose_ns: int
+    settling_ns: int | None
     pose: Floats | None = None
 
 
@@ -170,6 +172,7 @@ class Segmenter:
         self._cover_ns = -(1 << 62)  # a still window judged earlier reaches to here
         self._dwell: _Dwell | None = None
         self._begun = False
+        self._lead_ns = round(self.stillness.lead_s * _SECOND_NS)
 
     def push(self, batch: Batch) -> Iterator[Block]:
         """Blocks that are complete once this batch is known."""
@@ -214,13 +217,15 @@ class Segmenter:
         return finite & (np.abs(np.linalg.norm(poses, axis=1) - 1.0) < 0.01)
 
     def _advance(self, final: bool) -> Iterator[Block]:
-        for stamp, event, settle in self._judge(final):
+        for stamp, event, settles in self._judge(final):
             if event is _Event.ARRIVE:
                 self._discard(stamp)
                 self.dwell_count += 1
-                self._dwell = _Dwell(self.dwell_count - 1, stamp + settle, self._next_pose_ns(stamp))
+                number, settling_ns = self.dwell_count - 1, None if settles else 0
+                self._dwell = _Dwell(number, stamp, self._next_pose_ns(stamp), settling_ns)
             else:
-                yield from self._emit(stamp, closing=True)
+                lead_ns = min(self._lead_ns, (stamp - self._dwell.arrival_ns) // 10) if self._dwell else 0
+                yield from self._emit(stamp - lead_ns, closing=True)
                 self._dwell = None
         horizon = self._horizon(final)
         if horizon is None:
@@ -234,8 +239,8 @@ class Segmenter:
             self.tally.without_pose += len(self._accel)
             self._accel = Stream.empty(3)
 
-    def _judge(self, final: bool) -> list[tuple[int, _Event, int]]:
-        """Arrivals and departures in the pose intervals that can be judged by now: (stamp, event, settling in ns)."""
+    def _judge(self, final: bool) -> list[tuple[int, _Event, bool]]:
+        """Arrivals and departures in the pose intervals that can be judged by now: (stamp, event, has to settle)."""
         times, poses = self._pose.time_ns, self._pose.values
         start = 0 if self._decided_ns is None else int(np.searchsorted(times, self._decided_ns))
         times, poses = times[start:], poses[start:]
@@ -253,12 +258,12 @@ class Segmenter:
         self._decided_ns = int(times[count])
         return events
 
-    def _lone_pose(self, times: Times) -> list[tuple[int, _Event, int]]:
+    def _lone_pose(self, times: Times) -> list[tuple[int, _Event, bool]]:
         """A single pose message makes one dwell of all the readings around it."""
         if self._begun or not len(times) or not len(self._accel):
             return []
         self._begun, self._decided_ns = True, int(times[0])
-        return [(int(min(self._accel.time_ns[0], times[0])), _Event.ARRIVE, 0)]
+        return [(int(min(self._accel.time_ns[0], times[0])), _Event.ARRIVE, False)]
 
     def _still(self, times: Times, poses: Floats, ends: Times, known: Mask) -> Mask:
         """Which intervals between consecutive poses are still, (m - 1,) bool."""
@@ -271,11 +276,9 @@ class Segmenter:
         self._cover_ns = int(reach[-1])
         return (reach[:-1] > times[:-1]) & steps
 
-    def _events(self, times: Times, still: Mask) -> list[tuple[int, _Event, int]]:
-        settle_ns = round(self.stillness.settle_s * _SECOND_NS)
-        lead_ns = round(self.stillness.lead_s * _SECOND_NS)
+    def _events(self, times: Times, still: Mask) -> list[tuple[int, _Event, bool]]:
         window_ns = round(self.stillness.window_s * _SECOND_NS)
-        in_dwell, events = self._dwell is not None, list[tuple[int, _Event, int]]()
+        in_dwell, events = self._dwell is not None, list[tuple[int, _Event, bool]]()
         unresolved = ~still & (np.diff(times[: len(still) + 1]) > window_ns)
         after_unresolved = np.concatenate([[False], unresolved[:-1]])
         changes = np.flatnonzero(np.diff(still, prepend=in_dwell) | unresolved | after_unresolved)
@@ -283,19 +286,19 @@ class Segmenter:
             begin, end = int(times[j]), int(times[j + 1])
             if still[j] and not in_dwell:
                 first = not self._begun
-                events.append((begin - (_HOLD_NS if first else 0), _Event.ARRIVE, 0 if first else settle_ns))
+                events.append((begin - (_HOLD_NS if first else 0), _Event.ARRIVE, not first))
                 in_dwell = True
             elif unresolved[j]:
                 leave, arrive = self._resolve_by_readings(begin, end)
                 if not in_dwell and leave > begin:
-                    events.append((begin - (0 if self._begun else _HOLD_NS), _Event.ARRIVE, 0))
+                    events.append((begin - (0 if self._begun else _HOLD_NS), _Event.ARRIVE, False))
                     in_dwell = True
                 if in_dwell:
-                    events.append((self._departure_ns(leave) - lead_ns, _Event.LEAVE, 0))
-                events.append((arrive, _Event.ARRIVE, settle_ns))
+                    events.append((self._departure_ns(leave), _Event.LEAVE, False))
+                events.append((arrive, _Event.ARRIVE, True))
                 in_dwell = True
             elif not still[j] and in_dwell:
-                events.append((self._departure_ns(begin) - lead_ns, _Event.LEAVE, 0))
+                events.append((self._departure_ns(begin), _Event.LEAVE, False))
                 in_dwell = False
             self._begun = True
         return events
@@ -355,7 +358,7 @@ class Segmenter:
             return int(self._accel.time_ns[-1]) + 1 if len(self._accel) else None
         if final:
             return int(self._pose.time_ns[-1]) + _HOLD_NS if len(self._pose) > 1 else 1 << 62
-        return self._decided_ns - round((self.stillness.lead_s + self.stillness.window_s) * _SECOND_NS)
+        return self._decided_ns - self._lead_ns - round(self.stillness.window_s * _SECOND_NS)
 
     def _discard(self, until_ns: int) -> None:
         """Drop the readings before ``until_ns``: the platform was moving, or no angle was known."""
@@ -369,10 +372,15 @@ class Segmenter:
     def _emit(self, until_ns: int, closing: bool) -> Iterator[Block]:
         """Blocks of the open dwell from the readings before ``until_ns``; a last short one when it closes."""
         assert self._dwell is not None
+        dwell, settle_ns = self._dwell, round(self.stillness.settle_s * _SECOND_NS)
+        if dwell.settling_ns is None:
+            length_ns = until_ns - dwell.arrival_ns
+            if length_ns < 3 * settle_ns and not closing:
+                return
+            dwell.settling_ns = min(settle_ns, length_ns // 3)
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
-        skip = min(int(np.searchsorted(self._accel.time_ns, self._dwell.usable_ns)), count)
-        self.tally.settling += skip
-        first = skip
+        first = min(int(np.searchsorted(self._accel.time_ns, dwell.arrival_ns + dwell.settling_ns)), count)
+        self.tally.settling += first
         while count - first >= BLOCK_SAMPLES or (closing and count > first):
             size = min(BLOCK_SAMPLES, count - first)
             yield self._block(self._accel[first : first + size])

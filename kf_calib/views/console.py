@@ -95,7 +95,7 @@ def summary(result: Calibration) -> RenderableType:
     """What a replay prints."""
     tally, dwells = result.tally, [visit.dwell for visit in result.visits]
     head = (
-        f"{tally.used} of {tally.read} readings used, {len(dwells)} dwells in {len(orientations(dwells))} orientations "
+        f"{tally.used - tally.gated} of {tally.read} readings used, {len(dwells)} dwells in {len(orientations(dwells))} orientations "
         f"({tally.moving} readings moving, {tally.settling} settling)"
     )
     parts: list[RenderableType] = [

@@ -16,7 +16,7 @@ def replay_object(result: Calibration) -> dict[str, Any]:
     judged, noise, dwells = result.consistency, result.noise, [visit.dwell for visit in result.visits]
     return _clean(
         {
-            "samples": result.tally.used,
+            "samples": result.tally.read,
             "dwells": len(dwells),
             "orientations": len(orientations(dwells)),
             "engine": result.settings.engine,
