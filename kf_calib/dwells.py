@@ -4,7 +4,8 @@ Stillness is judged on the platform angles: an interval between two pose message
 ``window_s`` over which the pose moves by no more than ``tolerance_deg``. Where angles are absent during a motion
 (two messages far apart in time and in angle) the readings decide where the one dwell ended and the next began.
 Samples of a slew stay in the recording and out of the static fit; so do ``settle_s`` after each arrival and
-``lead_s`` before each departure (of short dwells no more than a third and a tenth). What comes out does not depend on how the streams were chopped into batches.
+``lead_s`` before each departure (of short dwells no more than a third and a tenth). What comes out does not depend on
+how the streams were chopped into batches.
 """
 
 from __future__ import annotations

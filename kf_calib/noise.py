@@ -132,8 +132,9 @@ def with_dwell_parts(
     """The noise with its dwell parts: as stated, else estimated by restricted maximum likelihood where significant.
 
     Of the parts not stated (the scatter one number for all accelerometers, or one each), the combination with the best
-    likelihood is taken, each number charged for by the 1 % point of its ratio against zero. Fewer than 6 degrees of freedom between dwells: nothing is estimated. Too few
-    orientations to tell a setting error from the sensors' scatter: the whole misfit counts as scatter.
+    likelihood is taken, each number charged for by the 1 % point of its ratio against zero. Fewer than 6 degrees of
+    freedom between dwells: nothing is estimated. Too few orientations to tell a setting error from the sensors'
+    scatter: the whole misfit counts as scatter.
     """
     from scipy.special import chdtrc
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from synthetic import Run
 
 from kf_calib.calibration import Calibration, calibrate
 from kf_calib.errors import KfCalibError
 from kf_calib.samples import Batch
 from kf_calib.sources.recorder import Recorder
 from kf_calib.sources.recording import Recording
-from synthetic import Run
 
 TRIALS = 200
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -54,7 +54,8 @@ class Lines:
         """The bench; a stream is read for it up to the first pose, which shows how the platform is described."""
         if self._bench is None:
             self._waiting = self._begin()
-            self._bench = self._describe_bench(self._waiting)
+            with self._waiting.closed_on_failure():
+                self._bench = self._describe_bench(self._waiting)
         return self._bench
 
     @property
@@ -82,7 +83,8 @@ class Lines:
         except OSError as error:
             raise InputError(f"{self.name}: cannot be read ({error.strerror}).") from None
         self._latest = _Passage(self.name, stream, size, self._columns)
-        self._latest.survey()
+        with self._latest.closed_on_failure():
+            self._latest.survey()
         return self._latest
 
     def _describe_bench(self, passage: _Passage) -> Bench:
@@ -107,11 +109,21 @@ class _Passage:
     def __init__(self, name: str, stream: BinaryIO, size: int | None, columns: Mapping[str, str]) -> None:
         self.account = Account()
         self.fraction = 0.0 if size else math.nan
-        self._name, self._columns, self._size = name, columns, size
+        self._name, self._columns, self._size, self._stream = name, columns, size, stream
         self._is_ours = size is not None  # a file opened here
         self._blocks = self._split(stream)
         self._ahead = list[Batch]()
         self._has_accel = self._has_pose = False
+
+    @contextmanager
+    def closed_on_failure(self) -> Iterator[None]:
+        """Closes a file opened here where what is done within fails."""
+        try:
+            yield
+        except BaseException:
+            if self._is_ours:
+                self._stream.close()
+            raise
 
     def survey(self) -> None:
         """Reads up to the first pose and keeps what it has read."""

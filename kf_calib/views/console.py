@@ -95,8 +95,8 @@ def summary(result: Calibration) -> RenderableType:
     """What a replay prints."""
     tally, dwells = result.tally, [visit.dwell for visit in result.visits]
     head = (
-        f"{tally.used - tally.gated} of {tally.read} readings used, {len(dwells)} dwells in {len(orientations(dwells))} orientations "
-        f"({tally.moving} readings moving, {tally.settling} settling)"
+        f"{tally.used - tally.gated} of {tally.read} readings used, {len(dwells)} dwells in "
+        f"{len(orientations(dwells))} orientations ({tally.moving} readings moving, {tally.settling} settling)"
     )
     parts: list[RenderableType] = [
         head, parameter_table(list(result.parameters.values())), noise_table(result),
