@@ -147,3 +147,22 @@ def test_temperature_is_the_last_one_measured() -> None:
     blocks = list(dwell_blocks(Given(Batch(readings(pose, 20), pose, warm)), Segmenter(BENCH)))
     values = np.concatenate([block.temperature_c for block in blocks])
     assert np.isnan(values[:400]).all() and (values[400:1000] == 20).all() and (values[1000:] == 30).all()
+
+
+def test_a_gentle_start_of_a_slew_is_not_in_the_dwell() -> None:
+    """A minimum-jerk slew stays within the tolerance for tenths of a second: none of it may reach the fit."""
+    from kf_calib.calibration import calibrate
+    from kf_calib.sources.plans import spread_plan
+    from kf_calib.sources.sensors import GRADES
+    from kf_calib.sources.simulator import Simulation
+
+    grade, bench = GRADES["navigation"], Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+    p_values = []
+    for seed in range(3):
+        run = Simulation(
+            bench, grade.sensors(seed), grade.noise, spread_plan(12, dwell_s=8.0), slew_rate_degps=20.0, seed=seed
+        )
+        result = calibrate(run)
+        assert result.tally.gated <= 2
+        p_values.append(result.consistency.p_value)
+    assert np.mean(p_values) > 0.1
