@@ -166,19 +166,18 @@ class Calibration:
         return plain_summary(self)
 
     def trace(self) -> Iterator[tuple[float, int, Estimate]]:
-        """(elapsed_s, dwell index, estimate) within and after every dwell: at doublings of its readings."""
+        """(elapsed_s, dwell index, estimate) within and after every dwell: after a second, two, four ...."""
         nominal_state = paper.state_of(paper.nominal(self.bench.nominal))
         walks = _walk_variances([visit.dwell for visit in self.visits], self.settings)
         factor = information.start(self.settings.prior, paper.nominal(self.bench.nominal), nominal_state)
         extra = np.zeros((STATE_COUNT, STATE_COUNT))
         for index, (visit, walk) in enumerate(zip(self.visits, walks, strict=True)):
             before, extra_before, dwell = information.predict(factor, walk), extra, visit.dwell
-            for end_s, count, part in (*dwell.snapshots, (dwell.end_s, dwell.count, dwell.factor)):
-                piece = [replace(dwell, factor=part, count=count)]
-                rows = information.whitened(piece, self.noise.weights, self.linearised_at)[0]
+            for part in dwell.prefixes():
+                rows = information.whitened([part], self.noise.weights, self.linearised_at)[0]
                 factor = information.update(before, rows).factor
-                extra = extra_before + considered(self.noise, *_means(piece), self.linearised_at)[0]
-                yield end_s, index, _estimate(factor, nominal_state, extra)
+                extra = extra_before + considered(self.noise, *_means([part]), self.linearised_at)[0]
+                yield part.end_s, index, _estimate(factor, nominal_state, extra)
 
 
 @dataclass

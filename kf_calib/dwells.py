@@ -40,13 +40,14 @@ class Stillness:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Up to 4096 consecutive readings of one dwell.
+    """Up to 4096 consecutive readings of one dwell, which began at ``arrival_s``.
 
     elapsed_s (n,) since the first sample of the recording; accel_mps2 (n, 3); pose (1, k): the mean of the angle
     messages while the platform stands still, or (n, k) where it creeps; temperature_c (n,), NaN where not measured.
     """
 
     dwell: int
+    arrival_s: float
     elapsed_s: Floats
     accel_mps2: Floats
     pose: Floats
@@ -396,7 +397,8 @@ class Segmenter:
             index = np.searchsorted(self._temperature.time_ns, accel.time_ns, side="right") - 1
             warm = np.where(index >= 0, self._temperature.values[np.maximum(index, 0), 0], np.nan)
         elapsed_s = (accel.time_ns - self.first_ns) / _SECOND_NS
-        return Block(self._dwell.number, elapsed_s, accel.values, self._block_pose(accel.time_ns), warm)
+        arrival_s = max((self._dwell.arrival_ns - self.first_ns) / _SECOND_NS, 0.0)
+        return Block(self._dwell.number, arrival_s, elapsed_s, accel.values, self._block_pose(accel.time_ns), warm)
 
     def _block_pose(self, accel_ns: Times) -> Floats:
         assert self._dwell is not None

@@ -1,24 +1,29 @@
-"""Dwells folded into triangular factors: all that is kept of the samples.
+"""Dwells folded into small triangles: all that is kept of the samples.
 
-Each dwell's rows [X | z] (regressors, three readings) are folded by QR into one upper-triangular factor of 7 x 7
-numbers, unwhitened, so that noise model, filter and diagnosis need no second pass over the data. Factors of the same
-dwell from two places merge by stacking and one more QR.
+A dwell is cut into pieces, short after the arrival and longer later (1, 1, 2, 4 ... 60 s). Over a piece every model
+column is smooth: it is taken as a parabola through its values at the piece's beginning, middle and end (its *nodes*).
+The readings are folded by QR against the parabola's basis, [1 u u^2 | z1 z2 z3] -> 6 x 6, unwhitened. Any column known
+at the nodes, of any model, then has its exact rows from the triangles: noise model, filter and diagnosis need no second
+pass over the data, and a column that changes (another tau, another E) is evaluated anew at a few hundred nodes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
-from kf_calib.model import REGRESSORS, Rows
+from kf_calib.model import Nodes, Rows, parabola
 from kf_calib.samples import Floats, Mask
 from kf_calib.triangle import triangle
 
-WIDTH = len(REGRESSORS)
+WIDTH = 4
+"""Regressors of the twelve parameters: 1, f_x, f_y, f_z."""
+
 _LAGS = 64
 _CORRELATED_SAMPLES = 8192  # readings of a dwell whose autocovariance is accumulated
-_FIRST_SNAPSHOT = 64
 
 
 @dataclass(frozen=True)
@@ -51,69 +56,87 @@ class Autocovariance:
 
 
 @dataclass(frozen=True)
+class Piece:
+    """A stretch of a dwell, folded: triangle (6, 6) over [1 u u^2 | z1 z2 z3], and its nodes (3)."""
+
+    triangle: Floats
+    nodes: Nodes
+    count: int
+
+
+@dataclass(frozen=True)
 class DwellFactor:
-    """One dwell, folded: factor (7, 7) upper triangular over [1 f_x f_y f_z | z1 z2 z3], count of readings."""
+    """One dwell: its pieces in order of time, and the autocovariance of its first readings."""
 
     number: int
-    start_s: float
-    end_s: float
-    count: int
-    factor: Floats
-    pose: Floats  # (k,), mean
-    temperature_c: float
+    pieces: tuple[Piece, ...]
     autocovariance: Autocovariance
-    snapshots: tuple[tuple[float, int, Floats], ...] = ()  # (end_s, count, factor) at doublings of the count
+
+    @property
+    def start_s(self) -> float:
+        return float(self.pieces[0].nodes.elapsed_s[0])
+
+    @property
+    def end_s(self) -> float:
+        return float(self.pieces[-1].nodes.elapsed_s[-1])
+
+    @cached_property
+    def count(self) -> int:
+        return sum(piece.count for piece in self.pieces)
+
+    @cached_property
+    def pose(self) -> Floats:
+        """Mean pose (k,)."""
+        weights = np.array([piece.count for piece in self.pieces]) / self.count
+        return weights @ np.array([piece.nodes.pose.mean(axis=0) for piece in self.pieces])
+
+    @cached_property
+    def factor(self) -> Floats:
+        """Triangle (7, 7) over [1 f_x f_y f_z | z1 z2 z3]."""
+        return _folded(self.rows([np.column_stack([np.ones(3), piece.nodes.force_mps2]) for piece in self.pieces]))
 
     @property
     def means(self) -> Floats:
         """Means of the regressors and readings, (7,): 1, f (3), z (3)."""
         return self.factor[0] / self.factor[0, 0]
 
+    def rows(self, columns: Sequence[Floats]) -> Floats:
+        """Rows [X | z1 z2 z3] of columns known at the nodes of each piece, (3, c): (6 pieces, c + 3)."""
+        width = columns[0].shape[1]
+        out = np.zeros((len(self.pieces), 6, width + 3))
+        triangles = np.array([piece.triangle for piece in self.pieces])
+        out[:, :3, :width] = triangles[:, :3, :3] @ parabola(np.array(columns))
+        out[:, :, width:] = triangles[:, :, 3:]
+        return out.reshape(-1, width + 3)
+
     def merged(self, other: DwellFactor) -> DwellFactor:
-        """The same dwell from two stretches of samples, this one the earlier."""
-        count = self.count + other.count
-        shared = (self.count * self.pose + other.count * other.pose) / count
-        return replace(
-            self,
-            end_s=max(self.end_s, other.end_s),
-            count=count,
-            factor=triangle(np.vstack([self.factor, other.factor])),
-            pose=shared,
-            temperature_c=(self.count * self.temperature_c + other.count * other.temperature_c) / count,
-            autocovariance=self.autocovariance + other.autocovariance,
-            snapshots=self.snapshots + other.snapshots,
-        )
+        """The same dwell from two stretches of samples."""
+        pieces = sorted((*self.pieces, *other.pieces), key=lambda piece: piece.nodes.elapsed_s[0])
+        return replace(self, pieces=tuple(pieces), autocovariance=self.autocovariance + other.autocovariance)
+
+    def prefixes(self) -> Iterator[DwellFactor]:
+        """The dwell as it stood after 1, 2, 4 ... of its pieces, and in the end."""
+        size = 1
+        while size < len(self.pieces):
+            yield replace(self, pieces=self.pieces[:size])
+            size = 2 * size if size > 7 else size + 1
+        yield self
 
 
-def fold(rows: Rows, correlated: bool = True) -> DwellFactor:
-    """One block as a factor of its own; ``correlated``: its autocovariance too."""
-    return DwellFactor(
-        number=rows.dwell,
-        start_s=float(rows.elapsed_s[0]),
-        end_s=float(rows.elapsed_s[-1]),
-        count=len(rows.readings),
-        factor=_static_triangle(rows) if rows.static else _triangle(np.hstack([rows.columns, rows.readings])),
-        pose=rows.pose,
-        temperature_c=rows.temperature_c,
-        autocovariance=Autocovariance.of(rows.innovation) if correlated else Autocovariance(),
+def fold(rows: Rows) -> tuple[Piece, ...]:
+    """The pieces of one block of rows."""
+    return tuple(
+        Piece(_folded(np.hstack([basis, rows.readings[part]])), nodes, len(basis))
+        for part, basis, nodes in rows.pieces
     )
 
 
-def _triangle(stacked: Floats) -> Floats:
-    """The (7, 7) triangle of rows (n, 7), padded with zeros where there are fewer rows than columns."""
+def _folded(stacked: Floats) -> Floats:
+    """The square triangle of rows (n, c), padded with zeros where there are fewer rows than columns."""
     width = stacked.shape[1]
     if len(stacked) < width:
         stacked = np.vstack([stacked, np.zeros((width - len(stacked), width))])
     return triangle(stacked)
-
-
-def _static_triangle(rows: Rows) -> Floats:
-    """The triangle of rows with constant columns: their mean times sqrt(n), and that of what is orthogonal to it."""
-    out, count = np.zeros((WIDTH + 3, WIDTH + 3)), len(rows.readings)
-    out[0] = np.sqrt(count) * np.concatenate([rows.columns[0], rows.readings.mean(axis=0)])
-    rest = triangle(rows.innovation.T)
-    out[WIDTH : WIDTH + len(rest), WIDTH:] = rest
-    return out
 
 
 class Folder:
@@ -123,29 +146,14 @@ class Folder:
         self.dwells: list[DwellFactor] = []
 
     def add(self, rows: Rows) -> None:
-        current = self.dwells[-1] if self.dwells else None
-        if current is None or current.number != rows.dwell:
-            self.dwells.append(replace(fold(rows), snapshots=_early_snapshots(rows)))
-            return
-        block = fold(rows, correlated=current.autocovariance.count < _CORRELATED_SAMPLES)
-        if block.count + current.count >= 2 * _last_count(current):
-            block = replace(block, snapshots=((current.end_s, current.count, current.factor),))
-        self.dwells[-1] = current.merged(block)
-
-
-def _last_count(dwell: DwellFactor) -> int:
-    return dwell.snapshots[-1][1] if dwell.snapshots else _FIRST_SNAPSHOT
-
-
-def _early_snapshots(rows: Rows) -> tuple[tuple[float, int, Floats], ...]:
-    """Factors of the first 64, 128, 256 ... readings of a dwell's first block, for curves within the dwell."""
-    stacked = np.hstack([rows.columns, rows.readings])
-    out, size, done, factor = list[tuple[float, int, Floats]](), _FIRST_SNAPSHOT, 0, np.empty((0, stacked.shape[1]))
-    while size < len(stacked):
-        factor = _triangle(np.vstack([factor, stacked[done:size]]))
-        out.append((float(rows.elapsed_s[size - 1]), size, factor))
-        done, size = size, 2 * size
-    return tuple(out)
+        current = self.dwells[-1] if self.dwells and self.dwells[-1].number == rows.dwell else None
+        fresh = current is None or current.autocovariance.count < _CORRELATED_SAMPLES
+        own = Autocovariance.of(rows.innovation) if fresh else Autocovariance()
+        block = DwellFactor(rows.dwell, fold(rows), own)
+        if current is None:
+            self.dwells.append(block)
+        else:
+            self.dwells[-1] = current.merged(block)
 
 
 def informative(factors: Floats) -> Mask:

@@ -8,8 +8,9 @@ same regressors once the s_i are known to first order.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,10 +26,34 @@ DWELL_STATES = 6
 
 
 @dataclass(frozen=True, slots=True)
+class Nodes:
+    """What the block feels at m instants: elapsed_s, since_arrival_s, temperature_c (m,), force_mps2 (m, 3), pose (m, k).
+
+    The three nodes of a piece are its beginning, middle and end. temperature_c is NaN where it is not measured.
+    """
+
+    elapsed_s: Floats
+    since_arrival_s: Floats
+    force_mps2: Floats
+    pose: Floats
+    temperature_c: Floats
+
+
+def parabola(values: Floats) -> Floats:
+    """Coefficients (..., 3, c) on 1, u, u^2 of the parabola with ``values`` (..., 3, c) at u = -1, 0, 1.
+
+    Equal values give exact zeros: a column that stands still has no rows but its mean's.
+    """
+    first, middle, last = np.moveaxis(values, -2, 0)
+    return np.stack([middle, 0.5 * (last - first), 0.5 * (first - middle) + 0.5 * (last - middle)], axis=-2)
+
+
+@dataclass(frozen=True, slots=True)
 class Rows:
     """Model columns and readings of one block: columns (n, 4), readings (n, 3), innovation within the block (3, n).
 
     static: the columns are the same in every row, and the innovation is the readings less their mean.
+    pieces: parts of the rows, the basis [1 u u^2] (n', 3) of each, and its nodes.
     """
 
     dwell: int
@@ -37,8 +62,7 @@ class Rows:
     readings: Floats
     innovation: Floats
     static: bool
-    pose: Floats  # (k,), the block's mean
-    temperature_c: float
+    pieces: tuple[tuple[slice, Floats, Nodes], ...]
 
 
 def state_map() -> Floats:
@@ -63,29 +87,71 @@ def dwell_map(state: Floats) -> Floats:
     return out
 
 
-def regressors(elapsed_s: Floats, pose: Floats, bench: Bench) -> Floats:
-    """X (n, 4) at ``elapsed_s`` (n,) and poses (n, k) or (1, k)."""
-    still = bench.reference == "base" and len(pose) == 1
-    force = bench.specific_force(elapsed_s[: 1 if still else None], pose)
-    out = np.concatenate([np.ones((len(force), 1)), force], axis=1)
-    return np.broadcast_to(out, (len(elapsed_s), out.shape[1]))
-
-
-def model_rows(blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0) -> Iterator[Rows]:
+def model_rows(
+    blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0
+) -> Iterator[Rows]:
     """Rows of every block, outliers gated out; the same rows feed both engines and batch least squares."""
     for block in blocks:
         elapsed_s, readings = block.elapsed_s, block.accel_mps2
-        columns = regressors(elapsed_s, block.pose, bench)
         static = len(block.pose) == 1 and bench.reference == "base"
+        pieces = _pieces(block, elapsed_s, bench)
+        columns = _columns(pieces, static, len(elapsed_s))
         innovation = gate.innovations(columns, readings, static)
         if gate_sigma is not None:
             keep = gate.inliers(columns, readings, innovation, static, gate_sigma)
             if keep is not None:
                 tally.gated += int((~keep).sum())
-                elapsed_s, columns, readings = elapsed_s[keep], columns[keep], readings[keep]
+                elapsed_s, readings = elapsed_s[keep], readings[keep]
+                block = replace(block, temperature_c=block.temperature_c[keep])
+                if len(block.pose) > 1:
+                    block = replace(block, pose=block.pose[keep])
+                pieces = _pieces(block, elapsed_s, bench)
+                columns = _columns(pieces, static, len(elapsed_s))
                 innovation = gate.innovations(columns, readings, static)
-        pose, warm = block.pose.mean(axis=0), float(block.temperature_c.mean())
-        yield Rows(block.dwell, elapsed_s, columns, readings, innovation, static, pose, warm)
+        yield Rows(block.dwell, elapsed_s, columns, readings, innovation, static, pieces)
+
+
+def _pieces(block: Block, elapsed_s: Floats, bench: Bench) -> tuple[tuple[slice, Floats, Nodes], ...]:
+    """The block cut where 1, 2, 4 ... s have passed since the arrival, and at every further minute."""
+    since_s = elapsed_s - block.arrival_s
+    edges = _EDGES_S[: int(np.searchsorted(_EDGES_S, since_s[-1]))]
+    cuts = np.unique(np.concatenate([[0], np.searchsorted(since_s, edges), [len(elapsed_s)]]))
+    return tuple(_piece(block, elapsed_s, slice(a, b), bench) for a, b in itertools.pairwise(cuts.tolist()))
+
+
+_EDGES_S = np.concatenate([2.0 ** np.arange(6), 60.0 * np.arange(1, 20_000)])
+
+
+def _piece(block: Block, elapsed_s: Floats, part: slice, bench: Bench) -> tuple[slice, Floats, Nodes]:
+    own = elapsed_s[part]
+    middle, half = 0.5 * (own[0] + own[-1]), max(0.5 * (own[-1] - own[0]), 1e-9)
+    u = (own - middle) / half
+    basis = np.stack([np.ones_like(u), u, u * u], axis=1)
+    at = np.array([own[0], middle, own[-1]])
+    if len(block.pose) == 1:
+        pose = np.repeat(block.pose, 3, axis=0)
+    else:
+        pose = _values_at_nodes(basis, block.pose[part])
+    still = len(block.pose) == 1 and bench.reference == "base"
+    force = bench.specific_force(at[:1] if still else at, pose[:1] if still else pose)
+    warm = block.temperature_c[part]
+    warm = np.full(3, np.nan) if np.isnan(warm).any() else _values_at_nodes(basis[:, :2], warm[:, None])[:, 0]
+    return part, basis, Nodes(at, at - block.arrival_s, np.broadcast_to(force, (3, 3)), pose, warm)
+
+
+def _values_at_nodes(basis: Floats, values: Floats) -> Floats:
+    """Values (3, k) at u = -1, 0, 1 of the line or parabola nearest to samples (n, k)."""
+    fitted = np.linalg.lstsq(basis, values, rcond=1e-9)[0]
+    return np.array([[1.0, -1.0, 1.0], [1.0, 0.0, 0.0], [1.0, 1.0, 1.0]])[:, : len(fitted)] @ fitted
+
+
+def _columns(pieces: Sequence[tuple[slice, Floats, Nodes]], static: bool, count: int) -> Floats:
+    """X = [1 f] (n, 4) of a block: the parabolas through the nodes."""
+    if static:
+        force = pieces[0][2].force_mps2[0]
+        return np.broadcast_to(np.concatenate([[1.0], force]), (count, len(REGRESSORS)))
+    parts = [basis @ parabola(np.column_stack([np.ones(3), nodes.force_mps2])) for _, basis, nodes in pieces]
+    return np.concatenate(parts)
 
 
 @dataclass(frozen=True)

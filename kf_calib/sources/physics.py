@@ -1,7 +1,8 @@
 """What is true of the simulated bench, and the steps that make it so.
 
 A ``State`` goes through steps in three groups: the platform (angles -> attitude -> specific force), the response of the
-accelerometers (specific force -> readings), and the recording (noise). They share no formula with the estimator.
+accelerometers (specific force -> input acceleration -> readings), and the recording (noise). They share no formula with
+the estimator. Hidden effects (``hidden``) are further steps between these.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from kf_calib.bench import Bench, Vector
@@ -37,6 +39,11 @@ class Ambient:
         swing = self.swing_c * np.sin(2.0 * np.pi * time_s / self.period_s)
         return self.constant_c + swing - self.warm_up_c * np.exp(-time_s / self.warm_up_s)
 
+    def rate(self, time_s: Floats) -> Floats:
+        """Its rate of change, K/s."""
+        swing = 2.0 * np.pi * self.swing_c / self.period_s * np.cos(2.0 * np.pi * time_s / self.period_s)
+        return swing + self.warm_up_c / self.warm_up_s * np.exp(-time_s / self.warm_up_s)
+
 
 @dataclass
 class State:
@@ -52,9 +59,11 @@ class State:
     moving: bool
     arrival_s: float
     share: Floats  # (n,) or (1,)
-    angles_rad: Floats  # (n, k) or (1, k); as the encoders see them, without their noise
+    axes: Sequence[Vector]  # of the gimbals, outer first
+    angles_rad: Floats  # (n, k) or (1, k); the encoders see them without the hidden effects, and with their noise
     attitude: Rotation = field(default_factory=Rotation.identity)  # platform -> bench
     force_mps2: Floats = field(default_factory=lambda: np.zeros((1, 3)))  # specific force, in the platform
+    input_mps2: Floats = field(default_factory=lambda: np.zeros((1, 3)))  # along each accelerometer's input axis
     reading_mps2: Floats = field(default_factory=lambda: np.zeros((1, 3)))
 
     @property
@@ -74,14 +83,9 @@ Step = Callable[[State], None]
 """One part of the bench: changes what is true in a ``State``. It may remember what went before."""
 
 
-@dataclass(frozen=True)
-class Gimbals:
-    """The chain of gimbals: encoder angles -> attitude."""
-
-    axes: Sequence[Vector]
-
-    def __call__(self, state: State) -> None:
-        state.attitude = attitude(self.axes, state.angles_rad)
+def gimbals(state: State) -> None:
+    """The chain of gimbals: angles -> attitude."""
+    state.attitude = attitude(state.axes, state.angles_rad)
 
 
 @dataclass(frozen=True)
@@ -104,28 +108,50 @@ class Gravity:
     def __call__(self, state: State) -> None:
         up = np.array([[0.0, self.bench.gravity_mps2, 0.0]])
         if self.bench.reference == "inertial":
-            up = Rotation.from_rotvec(state.time_s[:, None] * self._earth_rate_radps).apply(up)
+            # a bench that says inertial states its latitude
+            turning_radps = earth_rate_radps(self.bench.latitude_deg or 0.0, self.bench.azimuth_deg)
+            up = Rotation.from_rotvec(state.time_s[:, None] * turning_radps).apply(up)
         state.force_mps2 = state.attitude.inv().apply(up)
 
-    @property
-    def _earth_rate_radps(self) -> Floats:
-        """Turning rate of the Earth (3,) in the bench frame: North, Up, East turned until x has the azimuth."""
-        # a bench that says inertial states its latitude
-        latitude, azimuth = np.radians([self.bench.latitude_deg or 0.0, self.bench.azimuth_deg])
-        pole = Rotation.from_rotvec([0.0, 0.0, latitude]).apply([1.0, 0.0, 0.0])  # raised from North by the latitude
-        from_north = Rotation.from_rotvec([0.0, -azimuth, 0.0])  # East is z: toward it is a turn about Down
-        return 2.0 * np.pi / SIDEREAL_DAY_S * from_north.inv().apply(pole)
+
+def earth_rate_radps(latitude_deg: float, azimuth_deg: float) -> Floats:
+    """Turning rate of the Earth (3,) in the bench frame."""
+    pole = Rotation.from_rotvec([0.0, 0.0, np.radians(latitude_deg)]).apply([1.0, 0.0, 0.0])  # raised from North
+    return 2.0 * np.pi / SIDEREAL_DAY_S * to_bench(pole, azimuth_deg)
+
+
+def to_bench(north_up_east: ArrayLike, azimuth_deg: float) -> Floats:
+    """A vector (3,) given by its parts toward North, Up and East, in the bench frame, whose x has the azimuth."""
+    from_north = Rotation.from_rotvec([0.0, -np.radians(azimuth_deg), 0.0])  # East is z: toward it is a turn about Down
+    return from_north.inv().apply(north_up_east)
 
 
 @dataclass(frozen=True)
-class Response:
-    """Readings of the three accelerometers: K_i E_i . f + b_i."""
+class Inputs:
+    """Accelerations along the input axes of the three accelerometers: a_i = E_i . f."""
 
     sensors: Sensors
 
     def __call__(self, state: State) -> None:
-        rows = self.sensors.sensitivities
-        state.reading_mps2 = np.einsum("nj,ij->ni", state.force_mps2, rows) + self.sensors.biases_mps2
+        state.input_mps2 = along(state.force_mps2, self.sensors.input_axes)
+
+
+def along(vector: Floats, axes: Floats) -> Floats:
+    """Parts (n, 3) of a vector (n, 3) along three axes, the rows (3, 3).
+
+    Written out, because matrix products round differently with the number of samples.
+    """
+    return vector[:, 0:1] * axes[:, 0] + vector[:, 1:2] * axes[:, 1] + vector[:, 2:3] * axes[:, 2]
+
+
+@dataclass(frozen=True)
+class Response:
+    """Readings of the three accelerometers: K_i a_i + b_i."""
+
+    sensors: Sensors
+
+    def __call__(self, state: State) -> None:
+        state.reading_mps2 = self.sensors.scales * state.input_mps2 + self.sensors.biases_mps2
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,12 @@ class Sensors:
 
     @property
     def sensitivities(self) -> Floats:
-        """Rows K_i E_i (3, 3).
+        """Rows K_i E_i (3, 3)."""
+        return self.scales[:, None] * self.input_axes
+
+    @property
+    def input_axes(self) -> Floats:
+        """Rows E_i (3, 3).
 
         E_1 and E_3 are the platform's x axis raised by theta toward y (a turn about z), then turned by phi about y;
         E_2 is y leaning so that its parts along x and z are sin nu1 and -sin nu2.
@@ -48,8 +53,12 @@ class Sensors:
         p = self.parameters
         lean_x, lean_z = math.sin(p["nu1"]), -math.sin(p["nu2"])
         second = np.array([lean_x, math.sqrt(1.0 - lean_x**2 - lean_z**2), lean_z])
-        axes = [_raised_and_turned(p["theta1"], p["phi1"]), second, _raised_and_turned(p["theta3"], p["phi3"])]
-        return np.array([p[f"K{i}"] * axis for i, axis in enumerate(axes, start=1)])
+        first, third = _raised_and_turned(p["theta1"], p["phi1"]), _raised_and_turned(p["theta3"], p["phi3"])
+        return np.array([first, second, third])
+
+    @property
+    def scales(self) -> Floats:
+        return np.array([self.parameters[f"K{i}"] for i in (1, 2, 3)])
 
     @property
     def biases_mps2(self) -> Floats:

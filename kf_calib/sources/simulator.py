@@ -23,17 +23,19 @@ from kf_calib.bench import Bench
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.samples import Batch, Floats, Stream, Times
 from kf_calib.sources.gimbals import Motion, attitude
+from kf_calib.sources.hidden import Hidden, Rig, Stage, steps_of
 from kf_calib.sources.noise_sources import Noise, generator
 from kf_calib.sources.physics import (
     Ambient,
     Disturbance,
-    Gimbals,
     Gravity,
+    Inputs,
     Response,
     Scatter,
     SettingError,
     State,
     Step,
+    gimbals,
 )
 from kf_calib.sources.plans import YZX, Visit
 from kf_calib.sources.sensors import Sensors
@@ -50,7 +52,8 @@ class Simulation:
     bench: what the recording says of the bench; where it has no axes, the gimbals are y z x and the attitude quaternion
     is recorded in place of angles. sample_hz, angle_hz: rates of readings and of poses; temperature comes at 1 Hz.
     slew_rate_degps: greatest speed of the fastest axis (infinity: the platform jumps). batch_samples: readings a batch.
-    grade: name of the grade the sensors were drawn from, for the record.
+    grade: name of the grade the sensors were drawn from, for the record. hidden: further physical effects, which only
+    the truth tells.
     """
 
     def __init__(
@@ -67,9 +70,11 @@ class Simulation:
         seed: int = 0,
         batch_samples: int = 65536,
         grade: str = "",
+        hidden: Sequence[Hidden] = (),
     ) -> None:
         self.bench, self.sensors, self.noise, self.plan = bench, sensors, noise, tuple(plan)
         self.ambient, self.seed, self.grade = ambient or Ambient(), seed, grade
+        self.hidden = tuple(hidden)
         self.warnings = list[str]()
         self.fraction = 0.0
         self._axes = bench.axes or YZX
@@ -106,7 +111,7 @@ class Simulation:
             "parameters": dict(self.sensors.parameters),
             "noise": asdict(self.noise),
             "ambient": asdict(self.ambient),
-            "effects": [],
+            "effects": [effect.truth for effect in self.hidden],
         }
 
     def write_truth(self, recording: str | PathLike[str]) -> Path:
@@ -120,15 +125,23 @@ class Simulation:
 
     def _steps(self) -> list[Step]:
         """The chain, fresh from its start."""
-        return [*self._platform_steps(), Response(self.sensors), *self._recording_steps()]
+        hidden = self._hidden_steps()
+        platform: list[Step] = [*hidden["angles"], gimbals, *hidden["attitude"], *self._setting_steps()]
+        response: list[Step] = [Inputs(self.sensors), *hidden["input"], Response(self.sensors), *hidden["reading"]]
+        force: list[Step] = [Gravity(self.bench), *hidden["force"]]
+        return [*platform, *force, *response, *self._noise_steps(), *hidden["record"]]
 
-    def _platform_steps(self) -> list[Step]:
-        steps: list[Step] = [Gimbals(self._axes)]
-        if self.noise.setting_sigma_deg:
-            steps.append(SettingError(self._drawn_per_dwell("setting", math.radians(self.noise.setting_sigma_deg))))
-        return [*steps, Gravity(self.bench)]
+    def _hidden_steps(self) -> dict[Stage, list[Step]]:
+        period_s = self._accel.period_ns * 1e-9
+        rig = Rig(self.bench, self._axes, self.sensors, self.motion, period_s, len(self) * period_s, self.seed)
+        return steps_of(self.hidden, rig)
 
-    def _recording_steps(self) -> list[Step]:
+    def _setting_steps(self) -> list[Step]:
+        if not self.noise.setting_sigma_deg:
+            return []
+        return [SettingError(self._drawn_per_dwell("setting", math.radians(self.noise.setting_sigma_deg)))]
+
+    def _noise_steps(self) -> list[Step]:
         noise, period_s = self.noise, self._accel.period_ns * 1e-9
         processes = noise.processes(self.seed, period_s, len(self) * period_s)
         steps: list[Step] = [Disturbance(process) for process in processes]
@@ -165,6 +178,7 @@ class Simulation:
             moving=moving,
             arrival_s=float(self.motion.arrive_ns[dwell]) * 1e-9,
             share=self.motion.locate(posed_ns)[1],
+            axes=self._axes,
             angles_rad=self.motion.angles_at(posed_ns),
         )
 
