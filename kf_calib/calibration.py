@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from kf_calib import information, kalman, paper
 from kf_calib.bench import Bench
@@ -217,9 +218,10 @@ def calibrate(
     """
     settings = settings or Settings()
     passed = Pass(source, settings)
-    dwells = passed.fold(on_progress)
-    refuse_unusable(dwells, passed.tally, source.bench)
-    result = evaluate(dwells, source.bench, settings)
+    with threadpool_limits(1, user_api="blas"):  # small decompositions: with threads they take three times as long
+        dwells = passed.fold(on_progress)
+        refuse_unusable(dwells, passed.tally, source.bench)
+        result = evaluate(dwells, source.bench, settings)
     refuse_unseen(result)
     if settings.engine == "filterpy":
         result = replace(result, estimate=filterpy_estimate(source, result))

@@ -19,8 +19,8 @@ import numpy as np
 from kf_calib.bench import Bench, interpolate_pose, mean_pose, pose_distance, unwrap_pose
 from kf_calib.samples import Batch, Floats, Mask, Source, Stream, Times
 
-BLOCK_SAMPLES = 4096
-"""Samples of one block at the most: small enough for the cache, large enough to amortise a call."""
+BLOCK_SAMPLES = 4000
+"""Samples of one block at the most: few enough for the cache; no power of two, whose columns would evict each other."""
 
 _SECOND_NS = 1_000_000_000
 _HOLD_NS = _SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
@@ -40,7 +40,7 @@ class Stillness:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Up to 4096 consecutive readings of one dwell, which began at ``arrival_s``.
+    """Up to 4000 consecutive readings of one dwell, which began at ``arrival_s``.
 
     elapsed_s (n,) since the first sample of the recording; accel_mps2 (n, 3); pose (1, k): the mean of the angle
     messages while the platform stands still, or (n, k) where it creeps; temperature_c (n,), NaN where not measured.
@@ -392,10 +392,9 @@ class Segmenter:
     def _block(self, accel: Stream) -> Block:
         assert self._dwell is not None and self.first_ns is not None
         self.tally.used += len(accel)
-        warm = np.full(len(accel), np.nan)
-        if len(self._temperature):
-            index = np.searchsorted(self._temperature.time_ns, accel.time_ns, side="right") - 1
-            warm = np.where(index >= 0, self._temperature.values[np.maximum(index, 0), 0], np.nan)
+        since = np.searchsorted(accel.time_ns, self._temperature.time_ns)  # where each temperature begins to hold
+        lengths = np.diff(since, prepend=0, append=len(accel))
+        warm = np.repeat(np.append(np.nan, self._temperature.values[:, 0]), lengths)
         elapsed_s = (accel.time_ns - self.first_ns) / _SECOND_NS
         arrival_s = max((self._dwell.arrival_ns - self.first_ns) / _SECOND_NS, 0.0)
         return Block(self._dwell.number, arrival_s, elapsed_s, accel.values, self._block_pose(accel.time_ns), warm)

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from kf_calib.model import Nodes, Rows, parabola
+from kf_calib.model import Nodes, Rows, basis, parabola
 from kf_calib.samples import Floats, Mask
 from kf_calib.triangle import triangle
 
@@ -125,10 +125,16 @@ class DwellFactor:
 
 def fold(rows: Rows) -> tuple[Piece, ...]:
     """The pieces of one block of rows."""
-    return tuple(
-        Piece(_folded(np.hstack([basis, rows.readings[part]])), nodes, len(basis))
-        for part, basis, nodes in rows.pieces
-    )
+    channels = rows.innovation if rows.static else rows.readings.T
+    level = rows.readings[0] - channels[:, 0]  # what the innovation of a standing platform lacks of the readings
+    pieces = list[Piece]()
+    for part, u, nodes in rows.pieces:
+        stacked = np.empty((6, len(u)))  # rows along memory: what LAPACK wants, and faster to fill
+        stacked[:3], stacked[3:] = basis(u), channels[:, part]
+        folded = _folded(stacked.T)
+        folded[0, 3:] += folded[0, 0] * level
+        pieces.append(Piece(folded, nodes, len(u)))
+    return tuple(pieces)
 
 
 def _folded(stacked: Floats) -> Floats:

@@ -9,7 +9,8 @@ same regressors once the s_i are known to first order.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ import numpy as np
 from kf_calib import gate, paper
 from kf_calib.bench import Bench
 from kf_calib.dwells import Block, Tally
-from kf_calib.samples import Floats
+from kf_calib.samples import Floats, Mask
 
 STATE_COUNT = 12
 REGRESSORS = ("1", "f_x", "f_y", "f_z")
@@ -53,7 +54,7 @@ class Rows:
     """Model columns and readings of one block: columns (n, 4), readings (n, 3), innovation within the block (3, n).
 
     static: the columns are the same in every row, and the innovation is the readings less their mean.
-    pieces: parts of the rows, the basis [1 u u^2] (n', 3) of each, and its nodes.
+    pieces: parts of the rows, u (n',) from -1 to 1 over each, and its nodes.
     """
 
     dwell: int
@@ -91,67 +92,85 @@ def model_rows(
     blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0
 ) -> Iterator[Rows]:
     """Rows of every block, outliers gated out; the same rows feed both engines and batch least squares."""
+    standing: tuple[Floats, Floats] | None = None  # a pose and its force: the same for all blocks of a dwell
     for block in blocks:
-        elapsed_s, readings = block.elapsed_s, block.accel_mps2
         static = len(block.pose) == 1 and bench.reference == "base"
-        pieces = _pieces(block, elapsed_s, bench)
-        columns = _columns(pieces, static, len(elapsed_s))
-        innovation = gate.innovations(columns, readings, static)
+        if static and (standing is None or standing[0] is not block.pose):
+            standing = block.pose, bench.specific_force(np.zeros(1), block.pose)
+        force = standing[1] if static and standing else None
+        rows = _rows(block, bench, force)
         if gate_sigma is not None:
-            keep = gate.inliers(columns, readings, innovation, static, gate_sigma)
+            keep = gate.inliers(rows.columns, rows.readings, rows.innovation, static, gate_sigma)
             if keep is not None:
                 tally.gated += int((~keep).sum())
-                elapsed_s, readings = elapsed_s[keep], readings[keep]
-                block = replace(block, temperature_c=block.temperature_c[keep])
-                if len(block.pose) > 1:
-                    block = replace(block, pose=block.pose[keep])
-                pieces = _pieces(block, elapsed_s, bench)
-                columns = _columns(pieces, static, len(elapsed_s))
-                innovation = gate.innovations(columns, readings, static)
-        yield Rows(block.dwell, elapsed_s, columns, readings, innovation, static, pieces)
+                rows = _rows(_kept(block, keep), bench, force)
+        yield rows
 
 
-def _pieces(block: Block, elapsed_s: Floats, bench: Bench) -> tuple[tuple[slice, Floats, Nodes], ...]:
-    """The block cut where 1, 2, 4 ... s have passed since the arrival, and at every further minute."""
-    since_s = elapsed_s - block.arrival_s
+def _kept(block: Block, keep: Mask) -> Block:
+    pose = block.pose if len(block.pose) == 1 else block.pose[keep]
+    return replace(
+        block,
+        elapsed_s=block.elapsed_s[keep],
+        accel_mps2=block.accel_mps2[keep],
+        pose=pose,
+        temperature_c=block.temperature_c[keep],
+    )
+
+
+def _rows(block: Block, bench: Bench, force: Floats | None) -> Rows:
+    """The rows of a block; ``force`` (1, 3) where the platform stands and gravity with it, else None."""
+    since_s = block.elapsed_s - block.arrival_s
     edges = _EDGES_S[: int(np.searchsorted(_EDGES_S, since_s[-1]))]
-    cuts = np.unique(np.concatenate([[0], np.searchsorted(since_s, edges), [len(elapsed_s)]]))
-    return tuple(_piece(block, elapsed_s, slice(a, b), bench) for a, b in itertools.pairwise(cuts.tolist()))
+    cuts = np.unique(np.concatenate([[0], np.searchsorted(since_s, edges), [len(since_s)]]))
+    pieces = tuple(_piece(block, slice(a, b), bench, force) for a, b in itertools.pairwise(cuts.tolist()))
+    if force is not None:
+        columns = np.broadcast_to(np.append(1.0, force), (len(since_s), len(REGRESSORS)))
+    else:
+        columns = np.concatenate(
+            [basis(u).T @ parabola(np.column_stack([np.ones(3), nodes.force_mps2])) for _, u, nodes in pieces]
+        )
+    innovation = gate.innovations(columns, block.accel_mps2, force is not None)
+    return Rows(block.dwell, block.elapsed_s, columns, block.accel_mps2, innovation, force is not None, pieces)
 
 
 _EDGES_S = np.concatenate([2.0 ** np.arange(6), 60.0 * np.arange(1, 20_000)])
+"""A dwell is cut into pieces where 1, 2, 4 ... s have passed since the arrival, and at every further minute."""
 
 
-def _piece(block: Block, elapsed_s: Floats, part: slice, bench: Bench) -> tuple[slice, Floats, Nodes]:
-    own = elapsed_s[part]
+def _piece(block: Block, part: slice, bench: Bench, force: Floats | None) -> tuple[slice, Floats, Nodes]:
+    own, warm = block.elapsed_s[part], block.temperature_c[part]
     middle, half = 0.5 * (own[0] + own[-1]), max(0.5 * (own[-1] - own[0]), 1e-9)
-    u = (own - middle) / half
-    basis = np.stack([np.ones_like(u), u, u * u], axis=1)
-    at = np.array([own[0], middle, own[-1]])
-    if len(block.pose) == 1:
-        pose = np.repeat(block.pose, 3, axis=0)
-    else:
-        pose = _values_at_nodes(basis, block.pose[part])
-    still = len(block.pose) == 1 and bench.reference == "base"
-    force = bench.specific_force(at[:1] if still else at, pose[:1] if still else pose)
-    warm = block.temperature_c[part]
-    warm = np.full(3, np.nan) if np.isnan(warm).any() else _values_at_nodes(basis[:, :2], warm[:, None])[:, 0]
-    return part, basis, Nodes(at, at - block.arrival_s, np.broadcast_to(force, (3, 3)), pose, warm)
+    u, at = (own - middle) / half, np.array([own[0], middle, own[-1]])
+    pose = np.repeat(block.pose, 3, axis=0) if len(block.pose) == 1 else _values_at_nodes(u, block.pose[part])
+    if force is None:
+        force = bench.specific_force(at, pose)
+    nodes = Nodes(at, at - block.arrival_s, np.broadcast_to(force, (3, 3)), pose, _temperatures(u, warm))
+    return part, u, nodes
 
 
-def _values_at_nodes(basis: Floats, values: Floats) -> Floats:
-    """Values (3, k) at u = -1, 0, 1 of the line or parabola nearest to samples (n, k)."""
-    fitted = np.linalg.lstsq(basis, values, rcond=1e-9)[0]
-    return np.array([[1.0, -1.0, 1.0], [1.0, 0.0, 0.0], [1.0, 1.0, 1.0]])[:, : len(fitted)] @ fitted
+def _temperatures(u: Floats, measured: Floats) -> Floats:
+    """Temperature (3,) at u = -1, 0, 1: the line nearest to what was measured; NaN where any of it is missing."""
+    level = measured.mean()
+    if not math.isfinite(level) or measured[0] == measured[-1] == level:
+        return np.full(3, level)
+    away = u - u.mean()
+    slope = (away @ measured) / max(away @ away, 1e-300)
+    return level + slope * (np.array([-1.0, 0.0, 1.0]) - u.mean())
 
 
-def _columns(pieces: Sequence[tuple[slice, Floats, Nodes]], static: bool, count: int) -> Floats:
-    """X = [1 f] (n, 4) of a block: the parabolas through the nodes."""
-    if static:
-        force = pieces[0][2].force_mps2[0]
-        return np.broadcast_to(np.concatenate([[1.0], force]), (count, len(REGRESSORS)))
-    parts = [basis @ parabola(np.column_stack([np.ones(3), nodes.force_mps2])) for _, basis, nodes in pieces]
-    return np.concatenate(parts)
+def basis(u: Floats) -> Floats:
+    """1, u, u^2 as rows (3, n)."""
+    out = np.empty((3, len(u)))
+    out[0], out[1] = 1.0, u
+    np.multiply(u, u, out=out[2])
+    return out
+
+
+def _values_at_nodes(u: Floats, values: Floats) -> Floats:
+    """Values (3, k) at u = -1, 0, 1 of the parabola nearest to samples (n, k)."""
+    fitted = np.linalg.lstsq(basis(u).T, values, rcond=1e-9)[0]
+    return basis(np.array([-1.0, 0.0, 1.0])).T @ fitted
 
 
 @dataclass(frozen=True)
