@@ -10,21 +10,22 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from kf_calib.model import STATE_COUNT, Rows, dwell_map, state_map
+from kf_calib.folding import Samples
+from kf_calib.model import dwell_map
 from kf_calib.noise import Noise
 from kf_calib.samples import Floats
 
 
-def least_squares(rows: Iterable[Rows], noise: Noise, linearised_at: Floats) -> tuple[Floats, Floats]:
-    """Affine state (12,) and covariance (12, 12) of all rows; diffuse prior, no process noise.
+def least_squares(samples: Iterable[Samples], noise: Noise, linearised_at: Floats) -> tuple[Floats, Floats]:
+    """State (p,) and covariance (p, p) of all samples; diffuse prior, no process noise.
 
     Rows of a dwell have covariance V = I + B B^T after division by the white sigma, B the dwell's nuisance columns
     times their sigmas; V^(-1/2) = I - U (1 - (1 + s^2)^(-1/2)) U^T from the thin SVD of B.
     """
-    by_dwell: dict[int, list[Floats]] = {}
-    for block in rows:
-        by_dwell.setdefault(block.dwell, []).append(np.concatenate([block.columns, block.readings], axis=1))
-    stacked = np.concatenate([_whitened(np.concatenate(part), noise, linearised_at) for part in by_dwell.values()])
+    by_dwell: dict[int, list[Samples]] = {}
+    for piece in samples:
+        by_dwell.setdefault(piece.dwell, []).append(piece)
+    stacked = np.concatenate([_whitened(pieces, noise, linearised_at) for pieces in by_dwell.values()])
     design, readings = stacked[:, :-1], stacked[:, -1]
     scale = np.linalg.norm(design, axis=0)
     design = design / scale
@@ -32,19 +33,15 @@ def least_squares(rows: Iterable[Rows], noise: Noise, linearised_at: Floats) -> 
     return solution / scale, np.linalg.inv(design.T @ design) / np.outer(scale, scale)
 
 
-def _whitened(samples: Floats, noise: Noise, linearised_at: Floats) -> Floats:
-    """Whitened rows [H | z] (3 n, 13) of one dwell's samples (n, 7)."""
-    columns, count = samples[:, :4], len(samples)
+def _whitened(pieces: list[Samples], noise: Noise, linearised_at: Floats) -> Floats:
+    """Whitened rows [H | z] (3 n, p + 1) of one dwell's samples."""
     sigma, used = noise.effective_sigma_mps2, noise.dwell_sigmas > 0
-    maps, nuisances = state_map(), dwell_map(linearised_at)[:, :, used] * noise.dwell_sigmas[used]
-    out = np.empty((3, count, STATE_COUNT + 1))
-    shared = np.empty((3, count, int(used.sum())))
-    for i in range(3):
-        out[i, :, :-1] = columns @ maps[i] / sigma[i]
-        out[i, :, -1] = samples[:, 4 + i] / sigma[i]
-        shared[i] = columns @ nuisances[i] / sigma[i]
-    flat, common = out.reshape(3 * count, -1), shared.reshape(3 * count, -1)
-    if common.shape[1]:
-        left, singular, _ = np.linalg.svd(common, full_matrices=False)
+    nuisances = dwell_map(linearised_at)[:, :, used] * noise.dwell_sigmas[used]
+    rows = np.concatenate([np.concatenate([p.observation, p.readings[:, :, None]], axis=2) for p in pieces])
+    flat = (rows / sigma[:, None]).reshape(-1, rows.shape[2])
+    if used.any():
+        regressors = np.concatenate([p.regressors for p in pieces])
+        shared = (np.einsum("nc,icp->nip", regressors, nuisances) / sigma[:, None]).reshape(len(flat), -1)
+        left, singular, _ = np.linalg.svd(shared, full_matrices=False)
         flat = flat - left @ ((1 - 1 / np.sqrt(1 + singular**2))[:, None] * (left.T @ flat))
     return flat

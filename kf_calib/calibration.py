@@ -7,6 +7,7 @@ of the whole run, so the curves of a replay do not jump when the noise becomes b
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,44 +20,54 @@ from kf_calib import information, kalman, paper
 from kf_calib.bench import Bench
 from kf_calib.dwells import Segmenter, Stillness, Tally, dwell_blocks
 from kf_calib.errors import InputError, UnobservableError
-from kf_calib.folding import DwellFactor, Folder, informative
+from kf_calib.folding import Carried, DwellFactor, Folder, means_of, samples_of
 from kf_calib.information import Step
-from kf_calib.model import PRIORS, STATE_COUNT, Prior, Rows, model_rows
-from kf_calib.noise import Noise, considered, mean_covariances, mean_design, with_dwell_parts, within_dwells
+from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
+from kf_calib.noise import Noise, considered, mean_covariances, with_dwell_parts, within_dwells
 from kf_calib.samples import Floats, Mask, Source
 
 SAME_POSE_DEG = 1.0
 """Dwells whose gravity directions are closer than this are visits of one orientation."""
 
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # a larger sigma means: not seen by this run
+_SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
 Engine = Literal["block", "filterpy"]
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How a run is evaluated. ``walk_mps2_per_sqrt_s``: random walk of the biases (process noise), 0: none."""
+    """How a run is evaluated.
+
+    walk_mps2_per_sqrt_s: random walk of the biases (process noise), 0: none. effects: names of those in the model.
+    """
 
     engine: Engine = "block"
     prior: Prior = PRIORS["diffuse"]
     stillness: Stillness = field(default_factory=Stillness)
     gate_sigma: float | None = 6.0
     walk_mps2_per_sqrt_s: float = 0.0
+    effects: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """An estimate with its sigma and unit; value and sigma are None where the orientations cannot see it."""
+    """An estimate with its sigma in SI units; value and sigma are None where the orientations cannot see it.
+
+    Deviations times ``per_si`` are in ``shown_unit``, the unit of the field.
+    """
 
     symbol: str
     value: float | None
     sigma: float | None
     unit: str
     nominal: float
+    shown_unit: str
+    per_si: float
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The affine state, its covariance, and the basis (12, q) of the combinations that are not determined."""
+    """State (p,): the affine twelve, then effects; its covariance; basis (p, q) of the combinations not determined."""
 
     state: Floats
     covariance: Floats
@@ -65,28 +76,47 @@ class Estimate:
     @cached_property
     def parameters(self) -> Floats:
         """The paper's parameters (12,)."""
-        return paper.parameters_of(self.state)
+        return paper.parameters_of(self.state[:STATE_COUNT])
 
     @cached_property
     def parameter_covariance(self) -> Floats:
         """Their covariance (12, 12), carried over by the closed-form Jacobian."""
-        jacobian = paper.jacobian(self.state)
-        return jacobian @ self.covariance @ jacobian.T
+        jacobian = paper.jacobian(self.state[:STATE_COUNT])
+        return jacobian @ self.covariance[:STATE_COUNT, :STATE_COUNT] @ jacobian.T
 
     @cached_property
     def unseen(self) -> Mask:
-        """Which parameters the orientations do not determine, (12,) bool."""
+        """Which of the twelve the orientations do not determine, (12,) bool."""
         sigma = np.sqrt(np.diag(self.parameter_covariance))
         unseen = sigma > np.array([_HOPELESS[unit] for unit in paper.UNITS])
         if self.undetermined.size:
-            basis = self.undetermined / np.linalg.norm(self.undetermined, axis=0)
-            unseen |= np.linalg.norm(paper.jacobian(self.state) @ basis, axis=1) > 1e-6
+            jacobian = paper.jacobian(self.state[:STATE_COUNT])
+            unseen |= np.linalg.norm(jacobian @ self._lost[:STATE_COUNT], axis=1) > 1e-6
         return np.asarray(unseen)
 
     @cached_property
+    def _lost(self) -> Floats:
+        return self.undetermined / np.linalg.norm(self.undetermined, axis=0)
+
+    @cached_property
     def sigma(self) -> Floats:
-        """1 sigma of the parameters (12,); NaN where not determined."""
+        """1 sigma of the twelve (12,); NaN where not determined."""
         return np.where(self.unseen, np.nan, np.sqrt(np.diag(self.parameter_covariance)))
+
+    @cached_property
+    def effects(self) -> Floats:
+        """Coefficients of the effects (q,)."""
+        return self.state[STATE_COUNT:]
+
+    @cached_property
+    def effect_sigma(self) -> Floats:
+        """1 sigma of the coefficients (q,); NaN where not determined."""
+        sigma = np.sqrt(np.diag(self.covariance)[STATE_COUNT:])
+        if self.undetermined.size:
+            lost = np.abs(self.undetermined[STATE_COUNT:]).max(axis=1)
+            largest = np.abs(self.undetermined).max()
+            sigma = np.where(lost > 1e-9 * largest, np.nan, sigma)
+        return sigma
 
 
 @dataclass(frozen=True)
@@ -131,7 +161,7 @@ class Calibration:
     bench: Bench
     settings: Settings
     noise: Noise
-    linearised_at: Floats  # affine state (12,) at which the setting error was linearised
+    carried: Carried
     visits: tuple[Visit, ...]
     estimate: Estimate
     consistency: Consistency
@@ -142,23 +172,38 @@ class Calibration:
     warnings: tuple[str, ...]
 
     @property
+    def model(self) -> Model:
+        return self.carried.model
+
+    @property
     def parameters(self) -> dict[str, Parameter]:
-        """The twelve parameters by symbol."""
+        """The twelve parameters, then the effects' coefficients, by symbol."""
         estimate, nominal = self.estimate, paper.nominal(self.bench.nominal)
+        found = [
+            *zip(paper.SYMBOLS, estimate.parameters, estimate.sigma, nominal, paper.UNITS, strict=True),
+            *(
+                (coefficient.symbol, value, sigma, 0.0, coefficient.unit)
+                for coefficient, value, sigma in zip(
+                    self.model.coefficients, estimate.effects, estimate.effect_sigma, strict=True
+                )
+            ),
+        ]
+        shown = [*(_SHOWN[unit] for unit in paper.UNITS), *((c.shown_unit, c.per_si) for c in self.model.coefficients)]
         return {
             symbol: Parameter(
                 symbol,
-                None if estimate.unseen[k] else float(estimate.parameters[k]),
-                None if estimate.unseen[k] else float(estimate.sigma[k]),
-                paper.UNITS[k],
-                float(nominal[k]),
+                float(value) if np.isfinite(sigma) else None,
+                float(sigma) if np.isfinite(sigma) else None,
+                unit,
+                float(expected),
+                *own,
             )
-            for k, symbol in enumerate(paper.SYMBOLS)
+            for (symbol, value, sigma, expected, unit), own in zip(found, shown, strict=True)
         }
 
     def considering(self, state: Floats, covariance: Floats) -> Estimate:
         """Another engine's state and covariance, the latter enlarged by what is considered only."""
-        extra = considered(self.noise, *_means([visit.dwell for visit in self.visits]), self.linearised_at).sum(axis=0)
+        extra = considered(self.noise, self.carried.means, self.carried.state).sum(axis=0)
         return Estimate(state, covariance + covariance @ extra @ covariance, self.estimate.undetermined)
 
     def __str__(self) -> str:
@@ -167,18 +212,21 @@ class Calibration:
         return plain_summary(self)
 
     def trace(self) -> Iterator[tuple[float, int, Estimate]]:
-        """(elapsed_s, dwell index, estimate) within and after every dwell: after a second, two, four ...."""
-        nominal_state = paper.state_of(paper.nominal(self.bench.nominal))
-        walks = _walk_variances([visit.dwell for visit in self.visits], self.settings)
-        factor = information.start(self.settings.prior, paper.nominal(self.bench.nominal), nominal_state)
-        extra = np.zeros((STATE_COUNT, STATE_COUNT))
-        for index, (visit, walk) in enumerate(zip(self.visits, walks, strict=True)):
-            before, extra_before, dwell = information.predict(factor, walk), extra, visit.dwell
+        """(elapsed_s, dwell index, estimate) within and after every dwell: after a second, two, four ..."""
+        model, state, around = self.model, self.carried.state, self.model.nominal_state()
+        walks = _walk_variances(self.carried.dwells, self.settings)
+        factor = information.start(self.settings.prior, model)
+        extra = np.zeros((model.count, model.count))
+        for index, (dwell, columns, walk) in enumerate(
+            zip(self.carried.dwells, self.carried.columns, walks, strict=True)
+        ):
+            before, extra_before = information.predict(factor, walk), extra
             for part in dwell.prefixes():
-                rows = information.whitened([part], self.noise.weights, self.linearised_at)[0]
+                own = [columns[: len(part.pieces)]]
+                rows = information.whitened([part], own, self.noise.weights, state)[0]
                 factor = information.update(before, rows).factor
-                extra = extra_before + considered(self.noise, *_means([part]), self.linearised_at)[0]
-                yield part.end_s, index, _estimate(factor, nominal_state, extra)
+                extra = extra_before + considered(self.noise, means_of([part], own), state)[0]
+                yield part.end_s, index, _estimate(factor, around, extra)
 
 
 @dataclass
@@ -231,22 +279,19 @@ def calibrate(
 
 def evaluate(dwells: list[DwellFactor], bench: Bench, settings: Settings) -> Calibration:
     """The calibration from dwell factors alone; no pass over the data."""
-    nominal = paper.nominal(bench.nominal)
-    nominal_state = paper.state_of(nominal)
-    walks = _walk_variances(dwells, settings)
-    noise, state = _noise_and_state(dwells, bench, nominal_state)
-    rows = information.whitened(dwells, noise.weights, state)
-    steps = information.run(information.start(settings.prior, nominal, nominal_state), rows, walks)
-    extra = considered(noise, *_means(dwells), state)
-    final = _estimate(steps[-1].factor, nominal_state, extra.sum(axis=0))
-    means, _ = _means(dwells)
-    residuals = means[:, 4:] - _predicted(means, final.state)
-    visits = _visits(dwells, steps, residuals, noise, extra, nominal_state, settings, bench)
-    held_out, floor = _held_out(dwells, noise.judging, state, nominal_state)
-    judged = _consistency(dwells, noise, state)
+    model = Model.of(bench, settings.effects)
+    noise, carried = _noise_and_columns(dwells, model)
+    rows = information.whitened(dwells, carried.columns, noise.weights, carried.state)
+    steps = information.run(information.start(settings.prior, model), rows, _walk_variances(dwells, settings))
+    extra = considered(noise, carried.means, carried.state)
+    final = _estimate(steps[-1].factor, model.nominal_state(), extra.sum(axis=0))
+    residuals = carried.means.readings - carried.means.design @ final.state
+    visits = _visits(carried, steps, residuals, noise, extra, settings)
+    held_out, floor = _held_out(carried, noise.judging)
+    judged = _consistency(carried, noise)
     return Calibration(
-        bench, settings, noise, state, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), held_out, floor,
-        Tally(), tuple(_remarks(bench, noise, final, judged, residuals, dwells)),
+        bench, settings, noise, carried, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), held_out, floor,
+        Tally(), tuple(_remarks(model, noise, final, judged, residuals, dwells)),
     )  # fmt: skip
 
 
@@ -254,16 +299,18 @@ def filterpy_estimate(
     source: Source, result: Calibration, form: Literal["square-root", "plain"] = "square-root"
 ) -> Estimate:
     """The same posterior by filterpy's filter, sample by sample: a second pass over the source."""
-    nominal = paper.nominal(result.bench.nominal)
-    prior, q = result.settings.prior, result.settings.walk_mps2_per_sqrt_s
-    counted = {visit.dwell.number for visit in result.visits}
+    prior, q, model = result.settings.prior, result.settings.walk_mps2_per_sqrt_s, result.model
+    largest = np.abs(result.carried.means.design).max(axis=(0, 1))
+    scale = np.concatenate(
+        [np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), np.where(largest > 0, largest, 1.0)[STATE_COUNT:]]
+    )
     posterior = kalman.estimate(
-        (rows for rows in Pass(source, result.settings).rows() if rows.dwell in counted),
+        samples_of(Pass(source, result.settings).rows(), result.carried),
         result.noise.weights,
-        paper.state_of(nominal),
-        None if prior.diffuse else prior.covariance(nominal),
-        result.linearised_at,
-        result.bench.gravity_mps2,
+        model.nominal_state(),
+        None if prior.diffuse else information.prior_covariance(prior, model),
+        result.carried.state,
+        scale,
         (lambda elapsed_s: np.full(3, q**2 * elapsed_s)) if q else None,
         form,
     )
@@ -315,17 +362,16 @@ def refuse_unseen(result: Calibration) -> None:
         )
 
 
-def _noise_and_state(dwells: list[DwellFactor], bench: Bench, nominal_state: Floats) -> tuple[Noise, Floats]:
-    """The noise model, and the state at which it is linearised: estimated in turn, twice."""
-    within = within_dwells(dwells)
-    noise, state = within, nominal_state
+def _noise_and_columns(dwells: list[DwellFactor], model: Model) -> tuple[Noise, Carried]:
+    """The noise model, and the model's columns linearised at the estimate it leads to: in turn, three times."""
+    within, bench, around = within_dwells(dwells), model.bench, model.nominal_state()
+    noise, carried = within, Carried(dwells, model, around)
     for _ in range(3):
-        rows = information.whitened(dwells, noise.weights, state)
-        empty = information.start(Prior(), nominal_state, nominal_state)
-        factor = information.update(empty, rows.reshape(-1, STATE_COUNT + 1)).factor
-        state = information.solve(factor, nominal_state)[0]
-        noise = with_dwell_parts(within, dwells, state, bench.angle_sigma_deg, bench.scatter_sigma_mps2)
-    return noise, state
+        rows = information.whitened(dwells, carried.columns, noise.weights, carried.state)
+        factor = information.update(information.start(Prior(), model), np.concatenate(rows)).factor
+        carried = Carried(dwells, model, information.solve(factor, around)[0])
+        noise = with_dwell_parts(within, carried.means, carried.state, bench.angle_sigma_deg, bench.scatter_sigma_mps2)
+    return noise, carried
 
 
 def _walk_variances(dwells: list[DwellFactor], settings: Settings) -> Floats:
@@ -335,53 +381,40 @@ def _walk_variances(dwells: list[DwellFactor], settings: Settings) -> Floats:
     return np.repeat(settings.walk_mps2_per_sqrt_s**2 * gaps[:, None], 3, axis=1)
 
 
-def _means(dwells: list[DwellFactor]) -> tuple[Floats, Floats]:
-    """Mean regressors and readings (D, 7) of the dwells, and their counts (D,)."""
-    return np.array([dwell.means for dwell in dwells]), np.array([dwell.count for dwell in dwells], float)
-
-
 def _estimate(factor: Floats, nominal_state: Floats, extra: Floats) -> Estimate:
     """The estimate of a factor, its covariance P enlarged by what is considered: P + P B P, B = ``extra`` (12, 12)."""
     state, covariance, undetermined = information.solve(factor, nominal_state)
     return Estimate(state, covariance + covariance @ extra @ covariance, undetermined)
 
 
-def _predicted(means: Floats, state: Floats) -> Floats:
-    """Mean readings (..., 3) of dwells with mean regressors (..., 4+)."""
-    sensitivity = state.reshape(3, 4)
-    return means[..., 1:4] @ sensitivity[:, :3].T + sensitivity[:, 3]
-
-
 def _visits(
-    dwells: list[DwellFactor], steps: list[Step], residuals: Floats, noise: Noise,
-    extra: Floats, nominal_state: Floats, settings: Settings, bench: Bench,
-) -> tuple[Visit, ...]:  # fmt: skip
-    means, counts = _means(dwells)
-    own = mean_covariances(noise, means, counts, nominal_state)
-    extra = np.cumsum(extra, axis=0)
-    walks = _walk_variances(dwells, settings)
-    before = information.start(settings.prior, paper.nominal(bench.nominal), nominal_state)
+    carried: Carried, steps: list[Step], residuals: Floats, noise: Noise, extra: Floats, settings: Settings
+) -> tuple[Visit, ...]:
+    means, around = carried.means, carried.model.nominal_state()
+    own = mean_covariances(noise, means, carried.state)
+    walks = _walk_variances(carried.dwells, settings)
+    before, extra = information.start(settings.prior, carried.model), np.cumsum(extra, axis=0)
     visits = list[Visit]()
-    for k, (dwell, step) in enumerate(zip(dwells, steps, strict=True)):
-        known = _estimate(information.predict(before, walks[k]), nominal_state, extra[k - 1] if k else 0.0 * extra[0])
+    for k, (dwell, step) in enumerate(zip(carried.dwells, steps, strict=True)):
+        known = _estimate(information.predict(before, walks[k]), around, extra[k - 1] if k else 0.0 * extra[0])
         innovation, sigma = np.full(3, np.nan), np.full(3, np.nan)
         if not known.undetermined.size:
-            rows = mean_design(means[k])
-            innovation = means[k, 4:] - _predicted(means[k], known.state)
+            rows = means.design[k]
+            innovation = means.readings[k] - rows @ known.state
             sigma = np.sqrt(np.diag(rows @ known.covariance @ rows.T + own[k]))
-        estimate = _estimate(step.factor, nominal_state, extra[k])
+        estimate = _estimate(step.factor, around, extra[k])
         visits.append(Visit(dwell, estimate, step.nis, step.dof, innovation, sigma, residuals[k]))
         before = step.factor
     return tuple(visits)
 
 
-def _consistency(dwells: list[DwellFactor], noise: Noise, state: Floats) -> Consistency:
+def _consistency(carried: Carried, noise: Noise) -> Consistency:
     from scipy.special import fdtrc
 
-    rows = information.whitened(dwells, noise.judging, state).reshape(-1, STATE_COUNT + 1)
-    step = information.update(information.start(Prior(), state, state), rows)
-    factors = np.array([dwell.factor for dwell in dwells])
-    dof = 3 * int(informative(factors).sum()) - information.rank(step.factor)
+    dwells = carried.dwells
+    rows = information.whitened(dwells, carried.columns, noise.judging, carried.state)
+    step = information.update(information.start(Prior(), carried.model), np.concatenate(rows))
+    dof = sum(information.rank(own) for own in rows) - information.rank(step.factor)
     dof -= int(not noise.setting_stated and noise.setting_rad > 0)
     if dof <= 0:
         return Consistency(step.nis, 0, None, None)
@@ -397,7 +430,7 @@ def format_p(p_value: float | None) -> str:
 
 def orientations(dwells: list[DwellFactor]) -> list[list[int]]:
     """Dwells grouped by orientation: the same direction of gravity in the platform, and nearly the same pose."""
-    means, _ = _means(dwells)
+    means = np.array([dwell.means for dwell in dwells])
     direction = means[:, 1:4] / np.linalg.norm(means[:, 1:4], axis=1, keepdims=True)
     place = np.column_stack([direction, [dwell.pose for dwell in dwells]])
     groups, heads = list[list[int]](), np.empty((0, place.shape[1]))
@@ -411,19 +444,17 @@ def orientations(dwells: list[DwellFactor]) -> list[list[int]]:
     return groups
 
 
-def _held_out(
-    dwells: list[DwellFactor], noise: Noise, state: Floats, nominal_state: Floats
-) -> tuple[float | None, float | None]:
+def _held_out(carried: Carried, noise: Noise) -> tuple[float | None, float | None]:
     """Rms error of the dwell means of orientations left out of the fit, and the rms that ``noise`` alone would give.
 
     Factors of the orientations before and after the one left out are merged: no refit from the start. None where a
     fit without one of the orientations is undetermined.
     """
-    rows = information.whitened(dwells, noise.weights, state)
-    extra = considered(noise, *_means(dwells), state)
-    groups = orientations(dwells)
-    own = [information.update(information.start(Prior(), state, state), rows[g].reshape(-1, 13)).factor for g in groups]
-    heads, tails = [np.zeros((12, 13))], [np.zeros((12, 13))]
+    rows = information.whitened(carried.dwells, carried.columns, noise.weights, carried.state)
+    extra = considered(noise, carried.means, carried.state)
+    groups, empty = orientations(carried.dwells), information.start(Prior(), carried.model)
+    own = [information.update(empty, np.concatenate([rows[k] for k in group])).factor for group in groups]
+    heads, tails = [empty], [empty]
     for factor in own[:-1]:
         heads.append(information.update(heads[-1], factor).factor)
     for factor in own[:0:-1]:
@@ -431,22 +462,23 @@ def _held_out(
     errors, expected = list[Floats](), list[Floats]()
     for group, head, tail in zip(groups, heads, tails, strict=True):
         rest = extra.sum(axis=0) - extra[group].sum(axis=0)
-        left = _estimate(information.update(head, tail).factor, nominal_state, rest)
+        left = _estimate(information.update(head, tail).factor, carried.model.nominal_state(), rest)
         if left.undetermined.size:
             return None, None
-        means, counts = _means([dwells[k] for k in group])
-        design = mean_design(means)
-        spread = design @ left.covariance @ np.swapaxes(design, 1, 2) + mean_covariances(noise, means, counts, state)
-        errors.append(((means[:, 4:] - _predicted(means, left.state)) ** 2).ravel())
+        means = carried.means[group]
+        design = means.design
+        spread = design @ left.covariance @ np.swapaxes(design, 1, 2) + mean_covariances(noise, means, carried.state)
+        errors.append(((means.readings - design @ left.state) ** 2).ravel())
         expected.append(np.einsum("dii->di", spread).ravel())
     return float(np.sqrt(np.mean(np.concatenate(errors)))), float(np.sqrt(np.mean(np.concatenate(expected))))
 
 
 def _remarks(
-    bench: Bench, noise: Noise, estimate: Estimate, judged: Consistency, residuals: Floats, dwells: list[DwellFactor]
+    model: Model, noise: Noise, estimate: Estimate, judged: Consistency, residuals: Floats, dwells: list[DwellFactor]
 ) -> Iterator[str]:
     """What a reader of the numbers must know, one sentence each."""
     unseen = [symbol for symbol, hidden in zip(paper.SYMBOLS, estimate.unseen, strict=True) if hidden]
+    unseen += [c.symbol for c, s in zip(model.coefficients, estimate.effect_sigma, strict=True) if np.isnan(s)]
     if unseen:
         yield f"these orientations do not determine {', '.join(unseen)}: visit more, spread over the sphere."
     if judged.dof == 0:
@@ -455,7 +487,7 @@ def _remarks(
             "visit at least five spread orientations."
         )
     rms = float(np.sqrt(np.mean(residuals**2)))
-    if rms > 0.03 * bench.gravity_mps2:
+    if rms > 0.03 * model.bench.gravity_mps2:
         yield (
             f"the angles do not explain the readings (residual {rms:.2g} m/s^2 rms between dwells): check the order "
             "and sign of the axes, the unit of the angles, and which channel is which."

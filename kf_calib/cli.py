@@ -72,6 +72,8 @@ def filter_options(command: F) -> F:
     options = [
         click.option("--engine", type=click.Choice(["block", "filterpy"]), default="block", show_default=True,
                      help="Block square-root filter, or filterpy sample by sample."),
+        click.option("--with", "effects", multiple=True, metavar="EFFECT",
+                     help="An effect to put in the model, for example second-order; repeatable."),
         click.option("--prior", type=click.Choice(["diffuse", "navigation", "mems"]), default="diffuse",
                      show_default=True, help="What is believed of the sensors before the run."),
         click.option("--bias-walk", type=click.FloatRange(min=0), default=0.0,
@@ -137,6 +139,7 @@ def _settings(options: Mapping[str, Any]) -> Settings:
         stillness=Stillness(tolerance_deg=options["still_deg"], settle_s=options["settle_s"]),
         gate_sigma=options["gate_sigma"] if options["gate"] else None,
         walk_mps2_per_sqrt_s=options["bias_walk"],
+        effects=tuple(options["effects"]),
     )
 
 
@@ -266,6 +269,9 @@ def simulation_options(command: F) -> F:
         click.option("--encoder-step", "encoder_step_deg", type=float, help="Resolution of the encoders, deg."),
         click.option("--outlier-rate", type=float, help="Share of readings that are outliers."),
         click.option("--outlier-size", "outlier_mps2", type=float, help="Size of an outlier, m/s^2."),
+        click.option("--hide", "hidden", multiple=True, metavar="NAME=SIZE",
+                     help="Hide an effect in the truth, for example second-order=4ug/g^2, or random; repeatable."),
+        click.option("--temperature-swing", "swing_c", type=float, default=0.0, help="Swing of the temperature, K."),
         click.option("--unstated", is_flag=True, help="Do not state the setting error and scatter in the recording."),
         click.option("--seed", type=int, default=0, show_default=True, help="Seed of sensors, plan and noise."),
     ]  # fmt: skip
@@ -278,6 +284,8 @@ def _simulation(options: Mapping[str, Any]) -> Simulation:
     from dataclasses import fields, replace
 
     from kf_calib.bench import Bench, parse_axes
+    from kf_calib.sources.hidden import parse
+    from kf_calib.sources.physics import Ambient
     from kf_calib.sources.sensors import GRADES
     from kf_calib.sources.simulator import Simulation
 
@@ -290,11 +298,13 @@ def _simulation(options: Mapping[str, Any]) -> Simulation:
     if not options["unstated"]:
         keys.setdefault("angle_sigma_deg", repr(noise.setting_sigma_deg))
         keys.setdefault("scatter_sigma_mps2", repr(float((noise.scatter_mps2**2 + noise.flicker_mps2**2) ** 0.5)))
-    plan = _visits(options, parse_axes(keys["axes"]))
+    axes = parse_axes(keys["axes"])
     return Simulation(
-        Bench.from_metadata(keys), grade.sensors(options["seed"]), noise, plan,
+        Bench.from_metadata(keys), grade.sensors(options["seed"]), noise, _visits(options, axes),
         sample_hz=options["sample_hz"], angle_hz=options["angle_hz"], slew_rate_degps=options["slew_degps"],
+        ambient=Ambient(swing_c=options["swing_c"], period_s=3600.0),
         seed=options["seed"], grade=options["grade"],
+        hidden=parse(options["hidden"], axes, seed=options["seed"], grade=options["grade"]),
     )  # fmt: skip
 
 

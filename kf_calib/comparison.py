@@ -16,7 +16,8 @@ import numpy as np
 
 from kf_calib.batch import least_squares
 from kf_calib.calibration import Calibration, Estimate, Pass, Settings, calibrate, filterpy_estimate
-from kf_calib.samples import Mask, Source
+from kf_calib.folding import samples_of
+from kf_calib.samples import Source
 
 Extra = TypeVar("Extra")
 
@@ -52,17 +53,15 @@ def compare(source: Source, settings: Settings | None = None) -> Comparison:
     result, block = _measured(lambda: (done := calibrate(source, settings), done.estimate))
 
     def batch() -> tuple[None, Estimate]:
-        counted = {visit.dwell.number for visit in result.visits}
-        rows = (rows for rows in Pass(source, settings).rows() if rows.dwell in counted)
-        return None, result.considering(*least_squares(rows, result.noise.weights, result.linearised_at))
+        samples = samples_of(Pass(source, settings).rows(), result.carried)
+        return None, result.considering(*least_squares(samples, result.noise.weights, result.carried.state))
 
     ways = {
         "block": block,
         "filterpy": _measured(lambda: (None, filterpy_estimate(source, result)))[1],
         "batch": _measured(batch)[1],
     }
-    seen = ~result.estimate.unseen
-    ways = {name: _against(way, block.estimate, seen) for name, way in ways.items()}
+    ways = {name: _against(way, block.estimate) for name, way in ways.items()}
     return Comparison(result, ways, tuple(_remarks(settings, result)))
 
 
@@ -76,14 +75,17 @@ def _measured(run: Callable[[], tuple[Extra, Estimate]]) -> tuple[Extra, Way]:
     return extra, Way(estimate, wall_s, peak / 1e6)
 
 
-def _against(way: Way, reference: Estimate, seen: Mask) -> Way:
-    sigma = np.sqrt(np.diag(reference.parameter_covariance))
-    difference = np.abs(way.estimate.parameters - reference.parameters) / sigma
-    variance = np.abs(np.diag(way.estimate.covariance) / np.diag(reference.covariance) - 1)
+def _against(way: Way, reference: Estimate) -> Way:
+    """Distances over the twelve parameters and the effects, as far as they are determined."""
+    ones = np.concatenate([way.estimate.parameters, way.estimate.effects])
+    others = np.concatenate([reference.parameters, reference.effects])
+    sigma = np.concatenate([reference.sigma, reference.effect_sigma])
+    seen = np.isfinite(sigma)
+    variance = np.diag(way.estimate.covariance)[seen] / np.diag(reference.covariance)[seen]
     return replace(
         way,
-        max_difference_sigma=float(difference[seen].max(initial=0.0)),
-        max_relative_variance=float(variance[seen].max(initial=0.0)),
+        max_difference_sigma=float((np.abs(ones - others)[seen] / sigma[seen]).max(initial=0.0)),
+        max_relative_variance=float(np.abs(variance - 1).max(initial=0.0)),
     )
 
 

@@ -9,13 +9,15 @@ pass over the data, and a column that changes (another tau, another E) is evalua
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
-from kf_calib.model import Nodes, Rows, basis, parabola
+from kf_calib.bench import Bench
+from kf_calib.effects import Stimulus
+from kf_calib.model import Model, Nodes, Rows, basis, parabola
 from kf_calib.samples import Floats, Mask
 from kf_calib.triangle import triangle
 
@@ -143,6 +145,91 @@ def _folded(stacked: Floats) -> Floats:
     if len(stacked) < width:
         stacked = np.vstack([stacked, np.zeros((width - len(stacked), width))])
     return triangle(stacked)
+
+
+def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> Stimulus:
+    """The nodes of all pieces of all dwells, in order; rotations are linearised at the affine ``state``."""
+    nodes = [piece.nodes for dwell in dwells for piece in dwell.pieces]
+    forces = [dwell.means[1:4] for dwell in dwells]
+    before = [forces[max(d - 1, 0)] for d, dwell in enumerate(dwells) for _ in dwell.pieces]
+    return Stimulus(
+        bench=bench,
+        elapsed_s=np.concatenate([each.elapsed_s for each in nodes]),
+        since_arrival_s=np.concatenate([each.since_arrival_s for each in nodes]),
+        force_mps2=np.concatenate([each.force_mps2 for each in nodes]),
+        previous_force_mps2=np.repeat(before, 3, axis=0),
+        pose=np.concatenate([each.pose for each in nodes]),
+        temperature_c=np.concatenate([each.temperature_c for each in nodes]),
+        sensitivity=state[:12].reshape(3, 4)[:, :3],
+    )
+
+
+def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[Floats]:
+    """The model's columns at the nodes of each dwell, (pieces, 3 nodes, 3 channels, p)."""
+    columns = model.columns(stimulus_of(dwells, model.bench, state))
+    ends = np.cumsum([3 * len(dwell.pieces) for dwell in dwells])
+    return [part.reshape(-1, 3, *part.shape[1:]) for part in np.split(columns, ends[:-1])]
+
+
+@dataclass(frozen=True)
+class Means:
+    """Of D dwells: mean model columns (D, 3, p), readings (D, 3), specific force (D, 3); counts of readings (D,)."""
+
+    design: Floats
+    readings: Floats
+    force_mps2: Floats
+    counts: Floats
+
+    def __getitem__(self, part: int | list[int]) -> Means:
+        return Means(self.design[part], self.readings[part], self.force_mps2[part], self.counts[part])
+
+
+def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
+    design = []
+    for dwell, own in zip(dwells, columns, strict=True):
+        first = np.array([piece.triangle[0, :3] / piece.triangle[0, 0] for piece in dwell.pieces])  # means of 1, u, u^2
+        weights = np.array([piece.count for piece in dwell.pieces]) / dwell.count
+        coefficients = parabola(own.reshape(*own.shape[:2], -1))
+        design.append(np.einsum("b,bk,bkc->c", weights, first, coefficients).reshape(own.shape[2:]))
+    means = np.array([dwell.means for dwell in dwells])
+    counts = np.array([dwell.count for dwell in dwells], float)
+    return Means(np.array(design), means[:, 4:], means[:, 1:4], counts)
+
+
+class Carried:
+    """Dwells with the columns of a model: all that noise model, filter and diagnosis work on.
+
+    ``state`` (p,): where small rotations and input axes are linearised.
+    """
+
+    def __init__(self, dwells: Sequence[DwellFactor], model: Model, state: Floats) -> None:
+        self.dwells, self.model, self.state = list(dwells), model, state
+        self.columns = columns_of(self.dwells, model, state)
+        self.means = means_of(self.dwells, self.columns)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Rows of one piece, sample by sample: H (n, 3, p), regressors of the dwell states (n, 4), readings (n, 3)."""
+
+    dwell: int
+    start_s: float
+    observation: Floats
+    regressors: Floats
+    readings: Floats
+
+
+def samples_of(rows: Iterable[Rows], carried: Carried) -> Iterator[Samples]:
+    """A second pass over the rows with the columns of the first: what filterpy and batch least squares work on."""
+    known = {dwell.number: iter(own) for dwell, own in zip(carried.dwells, carried.columns, strict=True)}
+    starts = {dwell.number: dwell.start_s for dwell in carried.dwells}
+    for block in rows:
+        if block.dwell not in known:
+            continue
+        for part, u, _ in block.pieces:
+            own = next(known[block.dwell])
+            observation = (basis(u).T @ parabola(own.reshape(3, -1))).reshape(len(u), *own.shape[1:])
+            yield Samples(block.dwell, starts[block.dwell], observation, block.columns[part], block.readings[part])
 
 
 class Folder:

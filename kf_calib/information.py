@@ -12,35 +12,59 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kf_calib.folding import WIDTH, DwellFactor, informative
-from kf_calib.model import STATE_COUNT, Prior, dwell_map, state_map
+from kf_calib import paper
+from kf_calib.folding import DwellFactor
+from kf_calib.model import STATE_COUNT, Model, Prior, dwell_map, parabola
 from kf_calib.noise import Noise
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 
 
-def whitened(dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> Floats:
-    """Rows [H | z] of unit noise, (D, 12, 13), a dwell each, its nuisance states eliminated by QR.
+def whitened(dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats) -> list[Floats]:
+    """Rows [H | z] of unit noise (p, p + 1) of each dwell, its nuisance states eliminated by QR.
 
-    Channel i's rows are divided by the sigma of a white reading that averages like the true one; the setting error
-    (three rotations) and the scatter (three offsets) enter as states with their priors, linearised at ``state``.
+    ``columns``: the model's, at the nodes of each dwell. Channel i's rows are divided by the sigma of a white reading
+    that averages like the true one; the setting error (three rotations) and the scatter (three offsets) enter as states
+    with their priors, linearised at ``state``. What a dwell's rows leave over among themselves is not in the result.
     """
-    factors = np.array([dwell.factor for dwell in dwells]).reshape(-1, WIDTH + 3, WIDTH + 3)
-    columns = np.where(informative(factors)[:, :, None], factors[:, :WIDTH, :], 0.0)
-    sigma = noise.effective_sigma_mps2
-    maps, nuisances = state_map(), dwell_map(state)
-    used = np.flatnonzero(noise.dwell_sigmas > 0)
-    count = len(used)
-    out = np.zeros((len(dwells), 3 * WIDTH + count, count + STATE_COUNT + 1))
-    for i in range(3):
-        rows = out[:, i * WIDTH : (i + 1) * WIDTH]
-        rows[:, :, :count] = columns[:, :, :WIDTH] @ nuisances[i][:, used] / sigma[i]
-        rows[:, :, count:-1] = columns[:, :, :WIDTH] @ maps[i] / sigma[i]
-        rows[:, :, -1] = columns[:, :, WIDTH + i] / sigma[i]
-    if count:
-        out[:, 3 * WIDTH :, :count] = np.diag(1.0 / noise.dwell_sigmas[used])
-        out = triangle(out)[:, count:, count:]
-    return out[:, : STATE_COUNT + 1]
+    sigma, sigmas = noise.effective_sigma_mps2, noise.dwell_sigmas
+    used, units = np.flatnonzero(sigmas > 0), _units(columns)
+    nuisances, count = dwell_map(state)[:, :, used], len(used)
+    out = list[Floats]()
+    for dwell, own in zip(dwells, columns, strict=True):
+        triangles = np.array([piece.triangle for piece in dwell.pieces])
+        force = np.array([piece.nodes.force_mps2 for piece in dwell.pieces])
+        regressors = triangles[:, :3, :3] @ parabola(np.concatenate([np.ones((*force.shape[:2], 1)), force], axis=2))
+        size, width = 3 * len(triangles), own.shape[-1]
+        rows = np.zeros((3 * size + count, count + width + 1))
+        for i in range(3):
+            part = rows[i * size : (i + 1) * size]
+            part[:, :count] = (regressors @ nuisances[i]).reshape(size, count) / sigma[i]
+            part[:, count:-1] = (triangles[:, :3, :3] @ parabola(own[:, :, i])).reshape(size, width) / sigma[i]
+            part[:, -1] = triangles[:, :3, 3 + i].reshape(size) / sigma[i]
+        rows[3 * size :, :count] = np.diag(1.0 / sigmas[used])
+        folded = triangle(rows)
+        out.append(_informative(folded[count:, count:], units))
+    return out
+
+
+def _units(columns: Sequence[Floats]) -> Floats:
+    """The largest each column becomes in the run (p,); one figure for all sensitivities."""
+    largest = np.max([np.abs(own).max(axis=(0, 1, 2)) for own in columns], axis=0)
+    largest[:STATE_COUNT] = np.tile([*[largest[:STATE_COUNT].max()] * 3, 1.0], 3)
+    return np.where(largest > 0, largest, 1.0)
+
+
+def _informative(rows: Floats, units: Floats) -> Floats:
+    """As few rows [H | z] (p, p + 1, padded with zeros) as H has rank: what the rows leave over is split off.
+
+    A still dwell has rank 3. By SVD: QR would spread the residuals over rows that columns of rounding size lead.
+    """
+    left, singular, _ = np.linalg.svd(rows[:, :-1] / units, full_matrices=False)
+    rank = int((singular > 1e-9 * singular[0]).sum())
+    out = np.zeros((len(units), len(units) + 1))
+    out[:rank] = left[:, :rank].T @ rows
+    return out
 
 
 @dataclass(frozen=True)
@@ -52,12 +76,19 @@ class Step:
     dof: int
 
 
-def start(prior: Prior, parameters: Floats, state: Floats) -> Floats:
-    """The factor [R | z] (12, 13) of a prior about the nominal ``parameters``; zeros for a diffuse one."""
+def prior_covariance(prior: Prior, model: Model) -> Floats:
+    """Covariance (p, p) of a stated prior about the nominal parameters; effects have the scale of their kind."""
+    out = np.diag([0.0] * STATE_COUNT + [coefficient.scale**2 for coefficient in model.coefficients])
+    out[:STATE_COUNT, :STATE_COUNT] = prior.covariance(paper.nominal(model.bench.nominal))
+    return out
+
+
+def start(prior: Prior, model: Model) -> Floats:
+    """The factor [R | z] (p, p + 1) of a prior about the nominal parameters and no effect; zeros for a diffuse one."""
     if prior.diffuse:
-        return np.zeros((STATE_COUNT, STATE_COUNT + 1))
-    root = np.linalg.inv(np.linalg.cholesky(prior.covariance(parameters)))
-    return triangle(np.column_stack([root, root @ state]))[:STATE_COUNT]
+        return np.zeros((model.count, model.count + 1))
+    root = np.linalg.inv(np.linalg.cholesky(prior_covariance(prior, model)))
+    return triangle(np.column_stack([root, root @ model.nominal_state()]))[: model.count]
 
 
 def predict(factor: Floats, walk_variance: Floats) -> Floats:
@@ -67,20 +98,22 @@ def predict(factor: Floats, walk_variance: Floats) -> Floats:
     if not count:
         return factor
     biases = 4 * walking + 3
-    augmented = np.zeros((count + STATE_COUNT, count + STATE_COUNT + 1))
+    width = len(factor)
+    augmented = np.zeros((count + width, count + width + 1))
     augmented[:count, :count] = np.diag(1.0 / np.sqrt(walk_variance[walking]))
     augmented[count:, :count] = -factor[:, biases]
     augmented[count:, count:] = factor
-    return triangle(augmented)[count : count + STATE_COUNT, count:]
+    return triangle(augmented)[count : count + width, count:]
 
 
 def update(factor: Floats, rows: Floats) -> Step:
-    """Measurement update with one dwell's whitened rows (m, 13)."""
+    """Measurement update with whitened rows (m, p + 1)."""
+    width = len(factor)
     upper = triangle(np.vstack([factor, rows]))
-    after = upper[:STATE_COUNT]
+    after = upper[:width]
     gained = rank(after) - rank(factor)
     informative_rows = int(np.linalg.matrix_rank(rows[:, :-1], rtol=1e-9)) if len(rows) else 0
-    return Step(after, float(upper[STATE_COUNT, STATE_COUNT] ** 2), informative_rows - gained)
+    return Step(after, float(upper[width, width] ** 2), informative_rows - gained)
 
 
 def run(first: Floats, rows: Iterable[Floats], walk_variances: Iterable[Floats]) -> list[Step]:
@@ -93,13 +126,15 @@ def run(first: Floats, rows: Iterable[Floats], walk_variances: Iterable[Floats])
 
 
 def _scaled(factor: Floats) -> tuple[Floats, Floats]:
-    """R in units in which its columns are of the same order, and those units (12,).
+    """R in units in which its columns are of the same order, and those units (p,).
 
     One unit for all sensitivities and one for all biases: a column of rounding size must stay small.
     """
-    size = np.linalg.norm(factor[:, :-1], axis=0).reshape(3, 4)
-    largest = np.concatenate([np.full(3, size[:, :3].max()), size[:, 3:].max(axis=0)])
-    scale = np.tile(np.where(largest > 0, largest, 1.0), 3)
+    size = np.linalg.norm(factor[:, :-1], axis=0)
+    twelve = size[:STATE_COUNT].reshape(3, 4)
+    largest = np.tile([*[twelve[:, :3].max()] * 3, twelve[:, 3].max()], 3)
+    scale = np.concatenate([largest, size[STATE_COUNT:]])
+    scale = np.where(scale > 0, scale, 1.0)
     return factor[:, :-1] / scale, scale
 
 
@@ -110,13 +145,13 @@ def rank(factor: Floats, tolerance: float = 1e-9) -> int:
 
 
 def solve(factor: Floats, around: Floats, tolerance: float = 1e-9) -> tuple[Floats, Floats, Floats]:
-    """State (12,), covariance (12, 12) and a basis (12, q) of the combinations not determined.
+    """State (p,), covariance (p, p) and a basis (p, q) of the combinations not determined.
 
     Undetermined combinations keep their value ``around``; their variance is not in the covariance.
     """
     upper, scale = _scaled(factor)
     left, singular, right = np.linalg.svd(upper)
     seen = singular > tolerance
-    inverse = (right[seen].T / singular[seen]) / scale[:, None]  # (12, rank)
+    inverse = (right[seen].T / singular[seen]) / scale[:, None]  # (p, rank)
     state = around + inverse @ (left[:, seen].T @ (factor[:, -1] - factor[:, :-1] @ around))
     return state, inverse @ inverse.T, right[~seen].T / scale[:, None]

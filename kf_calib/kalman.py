@@ -1,6 +1,6 @@
 """The reference engine: filterpy's Kalman filter, sample by sample, as a textbook has it.
 
-The state is the affine one in units of m/s^2 (g s_i, b_i), followed by the nuisance states of the current dwell, which
+The state is in units of m/s^2 (g s_i, b_i, effects), followed by the nuisance states of the current dwell, which
 start again from their prior at each new dwell. filterpy's square-root form is used: its plain form loses digits of
 the covariance after tens of thousands of static samples with a wide prior (``form="plain"`` shows it).
 """
@@ -14,7 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.model import STATE_COUNT, Rows, dwell_map, state_map
+from kf_calib.folding import Samples
+from kf_calib.model import STATE_COUNT, dwell_map
 from kf_calib.noise import Noise
 from kf_calib.samples import Floats
 
@@ -24,7 +25,7 @@ _DIFFUSE = 1e5
 
 @dataclass(frozen=True)
 class Posterior:
-    """Affine state (12,), covariance (12, 12), sum of the samples' normalised innovations squared and their number."""
+    """State (p,), covariance (p, p), sum of the samples' normalised innovations squared and their number."""
 
     state: Floats
     covariance: Floats
@@ -33,39 +34,43 @@ class Posterior:
 
 
 def estimate(
-    rows: Iterable[Rows],
+    samples: Iterable[Samples],
     noise: Noise,
     nominal_state: Floats,
     prior_covariance: Floats | None,
     linearised_at: Floats,
-    gravity_mps2: float,
+    scale: Floats,
     walk_variance: Callable[[float], Floats] | None = None,
     form: Literal["square-root", "plain"] = "square-root",
 ) -> Posterior:
-    """Run the filter over all rows. ``prior_covariance`` None: diffuse. ``walk_variance(elapsed_s)``: the biases' Q."""
-    scale = np.where(np.arange(STATE_COUNT) % 4 == 3, 1.0, gravity_mps2)
-    used = np.flatnonzero(noise.dwell_sigmas > 0)
-    maps = np.concatenate([state_map() / scale, dwell_map(linearised_at)[:, :, used]], axis=2)
+    """Run the filter over all samples.
+
+    prior_covariance None: diffuse. scale (p,): m/s^2 that a unit of each state makes in a reading, about.
+    walk_variance(seconds): the variance of the biases' steps (process noise Q).
+    """
+    count, used = len(nominal_state), np.flatnonzero(noise.dwell_sigmas > 0)
+    nuisances = dwell_map(linearised_at)[:, :, used]
     if prior_covariance is None:
-        widest = max(noise.effective_sigma_mps2.max(), noise.scatter_mps2.max(), gravity_mps2 * noise.setting_rad)
-        root = _DIFFUSE * widest * np.eye(STATE_COUNT)
+        gravity = scale[0]
+        widest = max(noise.effective_sigma_mps2.max(), noise.scatter_mps2.max(), gravity * noise.setting_rad)
+        root = _DIFFUSE * widest * np.eye(count)
     else:
         root = np.linalg.cholesky(prior_covariance * np.outer(scale, scale))
     kf = _Filter(form, nominal_state * scale, root, noise.dwell_sigmas[used], noise.effective_sigma_mps2)
-    dwell, nis, samples, previous_s = -1, 0.0, 0, None
-    for block in rows:
-        if block.dwell != dwell:
-            begin = float(block.elapsed_s[0])
+    dwell, nis, done, previous_s = -1, 0.0, 0, None
+    for piece in samples:
+        if piece.dwell != dwell:
             if walk_variance is not None and previous_s is not None:
-                kf.walk(walk_variance(begin - previous_s))
+                kf.walk(walk_variance(piece.start_s - previous_s))
             kf.enter_dwell()
-            dwell, previous_s = block.dwell, begin
-        observations = np.einsum("nc,icp->nip", block.columns, maps)
-        for observation, reading in zip(observations, block.readings, strict=True):
+            dwell, previous_s = piece.dwell, piece.start_s
+        own = np.einsum("nc,icp->nip", piece.regressors, nuisances)
+        observations = np.concatenate([piece.observation / scale, own], axis=2)
+        for observation, reading in zip(observations, piece.readings, strict=True):
             nis += kf.update(observation, reading)
-        samples += len(block.readings)
+        done += len(piece.readings)
     state, covariance = kf.posterior()
-    return Posterior(state / scale, covariance / np.outer(scale, scale), nis, samples)
+    return Posterior(state / scale, covariance / np.outer(scale, scale), nis, done)
 
 
 class _Filter:
@@ -78,11 +83,12 @@ class _Filter:
 
         self.plain = form == "plain"
         self.dwell_sigmas = dwell_sigmas
-        size = STATE_COUNT + len(dwell_sigmas)
+        self.count = len(state)
+        size = self.count + len(dwell_sigmas)
         kf: Any = (KalmanFilter if self.plain else SquareRootKalmanFilter)(dim_x=size, dim_z=3)
         kf.x = np.concatenate([state, np.zeros(len(dwell_sigmas))])  # 1-D: a column would broadcast to (n, 3)
         full = np.zeros((size, size))
-        full[:STATE_COUNT, :STATE_COUNT] = root
+        full[: self.count, : self.count] = root
         if self.plain:
             kf.P, kf.R = full @ full.T, np.diag(sigma**2)
         else:
@@ -91,7 +97,7 @@ class _Filter:
 
     def enter_dwell(self) -> None:
         """The nuisance states start from their prior, independent of everything before."""
-        own = slice(STATE_COUNT, None)
+        own = slice(self.count, None)
         self.kf.x[own] = 0.0
         matrix, sigma = (self.kf.P, self.dwell_sigmas**2) if self.plain else (self.kf._P1_2, self.dwell_sigmas)
         matrix[own, :] = 0.0
@@ -115,5 +121,5 @@ class _Filter:
         return float(self.kf.y @ self.kf.SI @ self.kf.y)
 
     def posterior(self) -> tuple[Floats, Floats]:
-        part = slice(0, STATE_COUNT)
+        part = slice(0, self.count)
         return self.kf.x[part].copy(), self.kf.P[part, part].copy()

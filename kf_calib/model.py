@@ -1,7 +1,7 @@
-"""The model of the readings: columns that do not depend on the state, and the state's map onto them.
+"""The model of the readings: the exact affine one, and effects added to it.
 
-``reading_i(t) = X(t) . M_i x`` with regressors X = [1, f_x, f_y, f_z] and the state
-x = (s1, b1, s2, b2, s3, b3): exactly linear for any scale factor, bias and misalignment.
+``reading_i(t) = s_i . f(t) + b_i + sum of effects``, with the state x = (s1, b1, s2, b2, s3, b3, effects): linear
+for any scale factor, bias and misalignment. ``model + effect`` is a model with one effect more.
 A small rotation alpha of the platform (setting error) adds ``s_i . (alpha x f) = alpha . (f x s_i)``, linear in the
 same regressors once the s_i are known to first order.
 """
@@ -12,15 +12,19 @@ import itertools
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from kf_calib import gate, paper
 from kf_calib.bench import Bench
 from kf_calib.dwells import Block, Tally
+from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named
+from kf_calib.errors import InputError
 from kf_calib.samples import Floats, Mask
 
 STATE_COUNT = 12
+_ROUNDING_MPS2 = 1e-13
 REGRESSORS = ("1", "f_x", "f_y", "f_z")
 DWELL_STATES = 6
 """Nuisance states of a dwell: three small rotations (setting error), three offsets (sensor scatter)."""
@@ -28,9 +32,10 @@ DWELL_STATES = 6
 
 @dataclass(frozen=True, slots=True)
 class Nodes:
-    """What the block feels at m instants: elapsed_s, since_arrival_s, temperature_c (m,), force_mps2 (m, 3), pose (m, k).
+    """What the block feels at m instants.
 
-    The three nodes of a piece are its beginning, middle and end. temperature_c is NaN where it is not measured.
+    elapsed_s, since_arrival_s, temperature_c (m,); force_mps2 (m, 3); pose (m, k). The three nodes of a
+    piece are its beginning, middle and end. temperature_c is NaN where it is not measured.
     """
 
     elapsed_s: Floats
@@ -66,13 +71,63 @@ class Rows:
     pieces: tuple[tuple[slice, Floats, Nodes], ...]
 
 
-def state_map() -> Floats:
-    """M (3, 4, 12): which state multiplies which regressor in which channel."""
-    out = np.zeros((3, len(REGRESSORS), STATE_COUNT))
-    for i in range(3):
-        out[i, 0, 4 * i + 3] = 1.0
-        out[i, 1:, 4 * i : 4 * i + 3] = np.eye(3)
-    return out
+@dataclass(frozen=True)
+class Model:
+    """The twelve parameters and any effects; immutable, composed by + and -."""
+
+    bench: Bench
+    effects: tuple[Effect, ...] = ()
+
+    @classmethod
+    def of(cls, bench: Bench, names: Iterable[str] = ()) -> Model:
+        model = cls(bench)
+        for name in names:
+            model += effect_named(name, bench)
+        return model
+
+    def __add__(self, effect: Effect) -> Model:
+        taken = {c.symbol: each for each in self.effects for c in each.coefficients}
+        for coefficient in effect.coefficients:
+            if coefficient.symbol in taken:
+                raise InputError(
+                    f"{effect} cannot be added: {taken[coefficient.symbol]} in the model already has the coefficient "
+                    f"{coefficient.symbol}; take one of the two out."
+                )
+        return replace(self, effects=(*self.effects, effect))
+
+    def __sub__(self, effect: Effect) -> Model:
+        return replace(self, effects=tuple(each for each in self.effects if str(each) != str(effect)))
+
+    def __str__(self) -> str:
+        return " + ".join(["twelve parameters", *map(str, self.effects)])
+
+    @cached_property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """Of all effects, in the order of the state after the twelve."""
+        return tuple(coefficient for effect in self.effects for coefficient in effect.coefficients)
+
+    @property
+    def count(self) -> int:
+        return STATE_COUNT + len(self.coefficients)
+
+    def nominal_state(self) -> Floats:
+        """The state (p,) of nominal parameters and no effect."""
+        twelve = paper.state_of(paper.nominal(self.bench.nominal))
+        return np.concatenate([twelve, np.zeros(len(self.coefficients))])
+
+    def columns(self, stimulus: Stimulus) -> Floats:
+        """H (m, 3, p): what each accelerometer reads per unit of each state."""
+        affine = np.zeros((len(stimulus), 3, STATE_COUNT))
+        for i in range(3):
+            affine[:, i, 4 * i : 4 * i + 3] = stimulus.force_mps2
+            affine[:, i, 4 * i + 3] = 1.0
+        if not self.effects:
+            return affine
+        added = np.concatenate([effect.columns(stimulus) for effect in self.effects], axis=2)
+        scales = np.array([coefficient.scale for coefficient in self.coefficients])
+        # what a large coefficient would not lift above rounding is nothing: a vertical axis cannot tilt gravity
+        added[np.abs(added) * scales < _ROUNDING_MPS2] = 0.0
+        return np.concatenate([affine, added], axis=2)
 
 
 def dwell_map(state: Floats) -> Floats:
@@ -88,9 +143,7 @@ def dwell_map(state: Floats) -> Floats:
     return out
 
 
-def model_rows(
-    blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0
-) -> Iterator[Rows]:
+def model_rows(blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0) -> Iterator[Rows]:
     """Rows of every block, outliers gated out; the same rows feed both engines and batch least squares."""
     standing: tuple[Floats, Floats] | None = None  # a pose and its force: the same for all blocks of a dwell
     for block in blocks:

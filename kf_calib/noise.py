@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kf_calib.folding import Autocovariance, DwellFactor, within_squares
+from kf_calib.folding import Autocovariance, DwellFactor, Means, within_squares
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 
@@ -124,7 +124,7 @@ def _autoregressive_inflation(gamma: Floats, count: int) -> float:
 
 def with_dwell_parts(
     within: Noise,
-    dwells: Sequence[DwellFactor],
+    means: Means,
     state: Floats,
     angle_sigma_deg: float | None,
     scatter_mps2: float | None,
@@ -138,20 +138,18 @@ def with_dwell_parts(
     """
     from scipy.special import chdtrc
 
-    means = np.array([dwell.means for dwell in dwells])
-    counts = np.array([dwell.count for dwell in dwells], float)
     stated = replace(
         within,
         setting_rad=float(np.radians(angle_sigma_deg or 0.0)),
         scatter_mps2=np.full(3, scatter_mps2 or 0.0),
         setting_stated=angle_sigma_deg is not None,
         scatter_stated=scatter_mps2 is not None,
-        checked=scatter_mps2 is not None or _setting_is_checked(means),
+        checked=scatter_mps2 is not None or _setting_is_checked(means.force_mps2),
     )
-    freedom = 3 * len(dwells) - 12
+    freedom = means.readings.size - means.design.shape[2]
     if freedom < 6 or (stated.setting_stated and stated.scatter_stated):
         return stated
-    if chdtrc(freedom, _misfit(stated.weights, means, counts, state)) > 0.1:  # nothing to explain: spares the search
+    if chdtrc(freedom, _misfit(stated.weights, means, state)) > 0.1:  # nothing to explain: spares the search
         return stated
     if not stated.checked:
         free = {("common",)}
@@ -159,42 +157,41 @@ def with_dwell_parts(
         settings = [()] if stated.setting_stated else [(), ("setting",)]
         scatters = [()] if stated.scatter_stated else [(), ("common",), ("scatter",)]
         free = {setting + scatter for setting in settings for scatter in scatters} - {()}
-    best, best_score = stated, restricted_log_likelihood(stated.weights, means, counts, state)
+    best, best_score = stated, restricted_log_likelihood(stated.weights, means, state)
     for parts in sorted(free):
-        found, score = _most_likely(stated, parts, means, counts, state)
+        found, score = _most_likely(stated, parts, means, state)
         if score > best_score:
             best, best_score = found, score
     return best
 
 
-def _setting_is_checked(means: Floats) -> bool:
+def _setting_is_checked(force_mps2: Floats) -> bool:
     """Whether the readings along f overdetermine what they see by 3 or more: f^T S f + f^T b, 9 numbers at most."""
-    x, y, z = means[:, 1:4].T / np.linalg.norm(means[:, 1:4], axis=1).mean()
+    x, y, z = force_mps2.T / np.linalg.norm(force_mps2, axis=1).mean()
     design = np.column_stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z])
     directions = len(np.unique(np.round(design[:, 6:], 2), axis=0))
     return directions - int(np.linalg.matrix_rank(design, tol=0.02)) >= 3
 
 
-def _most_likely(
-    stated: Noise, parts: tuple[str, ...], means: Floats, counts: Floats, state: Floats
-) -> tuple[Noise, float]:
+def _most_likely(stated: Noise, parts: tuple[str, ...], means: Means, state: Floats) -> tuple[Noise, float]:
     """The noise with the most likely sizes of ``parts``, and its log-likelihood less the charge for them."""
     from scipy.optimize import minimize
 
     def cost(logs: Floats) -> float:
-        return -restricted_log_likelihood(_unpack(stated, logs, parts).weights, means, counts, state)
+        return -restricted_log_likelihood(_unpack(stated, logs, parts).weights, means, state)
 
     begin = _spread(means, parts)
     found = minimize(cost, begin, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4, "maxiter": 600})
     return _unpack(stated, found.x, parts), -float(found.fun) - 0.5 * _SIGNIFICANT * len(begin)
 
 
-def _spread(means: Floats, parts: tuple[str, ...]) -> Floats:
+def _spread(means: Means, parts: tuple[str, ...]) -> Floats:
     """A starting point of the search: log sigmas at the size of the misfit of the dwell means."""
-    columns, readings = means[:, :4], means[:, 4:]
-    residual = readings - columns @ np.linalg.lstsq(columns, readings, rcond=1e-9)[0]
-    size = np.sqrt(np.mean(residual**2, axis=0)) + FLOOR_MPS2
-    gravity = np.linalg.norm(columns[:, 1:], axis=1).mean()
+    design = means.design.reshape(-1, means.design.shape[2])
+    scale = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+    fitted = design / scale @ np.linalg.lstsq(design / scale, means.readings.ravel(), rcond=1e-9)[0]
+    size = np.sqrt(np.mean((means.readings - fitted.reshape(-1, 3)) ** 2, axis=0)) + FLOOR_MPS2
+    gravity = np.linalg.norm(means.force_mps2, axis=1).mean()
     logs = (
         ([np.log(size.mean() / gravity)] if "setting" in parts else [])
         + (list(np.log(size)) if "scatter" in parts else [])
@@ -213,60 +210,54 @@ def _unpack(noise: Noise, logs: Floats, parts: tuple[str, ...]) -> Noise:
     return noise
 
 
-def mean_covariances(noise: Noise, means: Floats, counts: Floats, state: Floats) -> Floats:
+def mean_covariances(noise: Noise, means: Means, state: Floats) -> Floats:
     """Covariance (D, 3, 3) of the dwells' mean readings about the model.
 
     diag(kappa sigma_w^2 / n + sigma_s^2) + sigma_alpha^2 S (|f|^2 I - f f^T) S^T, S the sensitivities (rows).
     """
-    own = noise.effective_sigma_mps2**2 / counts[:, None] + noise.scatter_mps2**2
+    own = noise.effective_sigma_mps2**2 / means.counts[:, None] + noise.scatter_mps2**2
     return own[:, :, None] * np.eye(3) + noise.setting_rad**2 * _turned(means, state)
 
 
-def _turned(means: Floats, state: Floats) -> Floats:
+def _turned(means: Means, state: Floats) -> Floats:
     """Covariance (D, 3, 3) of the mean readings per unit variance of a random small rotation."""
-    force, sensitivity = means[:, 1:4], state.reshape(3, 4)[:, :3]
+    force, sensitivity = means.force_mps2, state[:12].reshape(3, 4)[:, :3]
     across = np.einsum("di,di->d", force, force)[:, None, None] * np.eye(3) - force[:, :, None] * force[:, None, :]
     return sensitivity @ across @ sensitivity.T
 
 
-def considered(noise: Noise, means: Floats, counts: Floats, state: Floats) -> Floats:
-    """What each dwell's setting error adds to the information about the gain, (D, 12, 12); zeros where it is weighted.
+def considered(noise: Noise, means: Means, state: Floats) -> Floats:
+    """What each dwell's setting error adds to the information about the gain, (D, p, p); zeros where it is weighted.
 
     With weights W and design A, the covariance is P + P B P, B = sum A^T W dV W A, dV the setting error's part: the
     Schmidt-Kalman filter's covariance (Bierman, 1977, ch. VIII), in batch terms a sandwich.
     """
+    count = means.design.shape[2]
     if noise.checked or not noise.setting_rad:
-        return np.zeros((len(means), 12, 12))
-    weight = 1.0 / np.einsum("dii->di", mean_covariances(noise.weights, means, counts, state))
-    design = weight[:, :, None] * mean_design(means)
-    return noise.setting_rad**2 * np.swapaxes(design, 1, 2) @ _turned(means, state) @ design
+        return np.zeros((len(means.counts), count, count))
+    weight = 1.0 / np.einsum("dii->di", mean_covariances(noise.weights, means, state))
+    weighted = weight[:, :, None] * means.design
+    return noise.setting_rad**2 * np.swapaxes(weighted, 1, 2) @ _turned(means, state) @ weighted
 
 
-def mean_design(means: Floats) -> Floats:
-    """A (..., 3, 12): the mean readings of dwells with mean regressors (..., 4+) on the affine state."""
-    out = np.zeros((*means.shape[:-1], 3, 12))
-    for i in range(3):
-        out[..., i, 4 * i : 4 * i + 3] = means[..., 1:4]
-        out[..., i, 4 * i + 3] = 1.0
-    return out
-
-
-def _misfit(noise: Noise, means: Floats, counts: Floats, state: Floats) -> float:
+def _misfit(noise: Noise, means: Means, state: Floats) -> float:
     """Chi-squared of the dwell means about their generalised least-squares fit."""
-    return float(_between(noise, means, counts, state)[0][12, 12] ** 2)
+    return float(_between(noise, means, state)[0][-1, -1] ** 2)
 
 
-def restricted_log_likelihood(noise: Noise, means: Floats, counts: Floats, state: Floats) -> float:
-    """REML of the dwell means (D, 7): -1/2 (sum log|V_d| + log|sum A' V^-1 A| + r' V^-1 r), up to a constant."""
-    upper, log_roots = _between(noise, means, counts, state)
-    determinant = np.abs(np.diag(upper))
-    seen = determinant[:12] > 1e-9 * determinant[:12].max()
-    return float(-log_roots - np.log(determinant[:12][seen]).sum() - 0.5 * determinant[12] ** 2)
+def restricted_log_likelihood(noise: Noise, means: Means, state: Floats) -> float:
+    """REML of the dwell means: -1/2 (sum log|V_d| + log|sum A' V^-1 A| + r' V^-1 r), up to a constant."""
+    upper, log_roots = _between(noise, means, state)
+    size = np.abs(np.diag(upper))[:-1]
+    seen = size > 1e-9 * size.max()
+    return float(-log_roots - np.log(size[seen]).sum() - 0.5 * upper[-1, -1] ** 2)
 
 
-def _between(noise: Noise, means: Floats, counts: Floats, state: Floats) -> tuple[Floats, float]:
-    """Triangle (13, 13) of the whitened dwell means [A | z], and the sum of log|V_d|^(1/2)."""
-    root = np.linalg.cholesky(mean_covariances(noise, means, counts, state))
-    design = np.concatenate([mean_design(means), means[:, 4:, None]], axis=2)
-    upper = triangle(np.linalg.solve(root, design).reshape(-1, 13))
+def _between(noise: Noise, means: Means, state: Floats) -> tuple[Floats, float]:
+    """Triangle (p + 1, p + 1) of the whitened dwell means [A | z], A in units of its size; sum of log|V_d|^(1/2)."""
+    root = np.linalg.cholesky(mean_covariances(noise, means, state))
+    scale = np.linalg.norm(means.design, axis=(0, 1))
+    design = means.design / np.where(scale > 0, scale, 1.0)
+    stacked = np.concatenate([design, means.readings[:, :, None]], axis=2)
+    upper = triangle(np.linalg.solve(root, stacked).reshape(-1, stacked.shape[2]))
     return upper, float(np.log(np.einsum("dii->di", root)).sum())

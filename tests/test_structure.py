@@ -14,6 +14,7 @@ LEVELS = [
     ["errors"],
     ["samples"],
     ["bench"],
+    ["effects"],
     ["triangle", "dwells", "paper", "gate"],
     ["model"],
     ["folding"],

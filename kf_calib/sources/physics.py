@@ -106,12 +106,17 @@ class Gravity:
     bench: Bench
 
     def __call__(self, state: State) -> None:
-        up = np.array([[0.0, self.bench.gravity_mps2, 0.0]])
-        if self.bench.reference == "inertial":
-            # a bench that says inertial states its latitude
-            turning_radps = earth_rate_radps(self.bench.latitude_deg or 0.0, self.bench.azimuth_deg)
-            up = Rotation.from_rotvec(state.time_s[:, None] * turning_radps).apply(up)
-        state.force_mps2 = state.attitude.inv().apply(up)
+        up = carried_by_earth(self.bench, np.array([[0.0, self.bench.gravity_mps2, 0.0]]), state.time_s)
+        state.force_mps2 = turned(state.attitude.inv(), up)
+
+
+def carried_by_earth(bench: Bench, vector: Floats, time_s: Floats) -> Floats:
+    """A vector (1, 3) fixed to the Earth, in the frame that attitudes refer to: it turns where that one is inertial."""
+    if bench.reference == "base":
+        return vector
+    # a bench that says inertial states its latitude
+    rate_radps = earth_rate_radps(bench.latitude_deg or 0.0, bench.azimuth_deg)
+    return turned(Rotation.from_rotvec(time_s[:, None] * rate_radps), vector)
 
 
 def earth_rate_radps(latitude_deg: float, azimuth_deg: float) -> Floats:
@@ -136,12 +141,17 @@ class Inputs:
         state.input_mps2 = along(state.force_mps2, self.sensors.input_axes)
 
 
-def along(vector: Floats, axes: Floats) -> Floats:
-    """Parts (n, 3) of a vector (n, 3) along three axes, the rows (3, 3).
+def turned(rotation: Rotation, vector: Floats) -> Floats:
+    """A vector (n, 3) turned by rotations, n or 1 of them."""
+    return along(vector, rotation.as_matrix().reshape(-1, 3, 3))
 
-    Written out, because matrix products round differently with the number of samples.
+
+def along(vector: Floats, axes: Floats) -> Floats:
+    """Parts (n, 3) of a vector (n, 3) along three axes, the rows (3, 3) or (n, 3, 3).
+
+    Written out, because products of matrices round differently with the number of samples.
     """
-    return vector[:, 0:1] * axes[:, 0] + vector[:, 1:2] * axes[:, 1] + vector[:, 2:3] * axes[:, 2]
+    return vector[:, 0:1] * axes[..., 0] + vector[:, 1:2] * axes[..., 1] + vector[:, 2:3] * axes[..., 2]
 
 
 @dataclass(frozen=True)

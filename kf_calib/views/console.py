@@ -14,7 +14,6 @@ from rich.text import Text
 from kf_calib.calibration import Calibration, Parameter, format_p, orientations
 from kf_calib.comparison import Comparison
 
-_SHOWN = {"rad": ("arcsec", 180 * 3600 / math.pi), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
 
 
@@ -34,24 +33,43 @@ def rounded(value: float, sigma: float) -> tuple[str, str]:
 
 
 def _row(parameter: Parameter) -> tuple[str, str, str, str, str]:
+    """Symbol, value (angles in deg, the rest in the unit of the field), deviation from nominal, sigma, unit."""
     if parameter.value is None or parameter.sigma is None:
         return symbol(parameter.symbol), "not seen", "", "", ""
-    unit, factor = _SHOWN[parameter.unit]
+    factor = parameter.per_si
     deviation, sigma = rounded((parameter.value - parameter.nominal) * factor, parameter.sigma * factor)
-    whole, of = (np.degrees(parameter.value), np.degrees(parameter.sigma)) if parameter.unit == "rad" else (
-        parameter.value, parameter.sigma)  # fmt: skip
-    suffix = " deg" if parameter.unit == "rad" else ""
+    if parameter.unit == "rad":
+        value = f"{rounded(math.degrees(parameter.value), math.degrees(parameter.sigma))[0]} deg"
+    else:
+        value = rounded(parameter.value, parameter.sigma)[0]
     sign = "" if deviation.startswith("-") else "+"
-    return symbol(parameter.symbol), f"{rounded(whole, of)[0]}{suffix}", f"{sign}{deviation}", f"± {sigma}", unit
+    return symbol(parameter.symbol), value, f"{sign}{deviation}", f"± {sigma}", parameter.shown_unit
 
 
 def parameter_table(parameters: Sequence[Parameter]) -> Table:
-    """Value, deviation from nominal and sigma (1 sigma) of each parameter."""
+    """Value, deviation from nominal and sigma (1 sigma) of the twelve."""
     table = Table(title="Parameters (1σ)", title_justify="left")
     for heading in ("parameter", "value", "less nominal", "sigma", "unit"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for k, parameter in enumerate(parameters):
         table.add_row(*_row(parameter), end_section=k % 4 == 3)
+    return table
+
+
+def effect_table(result: Calibration) -> Table:
+    """Coefficients of the effects in the model, in units of the field, and how many sigma they are from zero."""
+    table = Table(title="Effects in the model (1σ)", title_justify="left")
+    for heading in ("effect", "coefficient", "value", "sigma", "unit", "value / sigma"):
+        table.add_column(heading, justify="left" if heading in ("effect", "coefficient", "unit") else "right")
+    for effect in result.model.effects:
+        for k, coefficient in enumerate(effect.coefficients):
+            parameter, name = result.parameters[coefficient.symbol], str(effect) if k == 0 else ""
+            if parameter.value is None or parameter.sigma is None:
+                table.add_row(name, symbol(parameter.symbol), "not seen")
+                continue
+            value, sigma = rounded(parameter.value * parameter.per_si, parameter.sigma * parameter.per_si)
+            ratio = f"{parameter.value / parameter.sigma:.1f}"
+            table.add_row(name, symbol(parameter.symbol), value, f"± {sigma}", parameter.shown_unit, ratio)
     return table
 
 
@@ -99,7 +117,8 @@ def summary(result: Calibration) -> RenderableType:
         f"{len(orientations(dwells))} orientations ({tally.moving} readings moving, {tally.settling} settling)"
     )
     parts: list[RenderableType] = [
-        head, parameter_table(list(result.parameters.values())), noise_table(result),
+        head, parameter_table(list(result.parameters.values())[:12]),
+        *([effect_table(result)] if result.model.effects else []), noise_table(result),
         Text(verdict(result), style="bold green" if result.consistency.consistent else "bold yellow"),
     ]  # fmt: skip
     parts += [Text(f"Note: {warning}", style="yellow") for warning in result.warnings]

@@ -20,7 +20,7 @@ def replay_object(result: Calibration) -> dict[str, Any]:
             "dwells": len(dwells),
             "orientations": len(orientations(dwells)),
             "engine": result.settings.engine,
-            "model": [],
+            "model": [str(effect) for effect in result.model.effects],
             "parameters": [
                 {"symbol": p.symbol, "value": p.value, "sigma": p.sigma, "unit": p.unit, "nominal": p.nominal}
                 for p in result.parameters.values()

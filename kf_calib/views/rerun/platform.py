@@ -43,7 +43,7 @@ def _ellipsoids(estimate: Estimate) -> list[tuple[int, Floats, Floats]]:
 
 def _axes(estimate: Estimate) -> Floats:
     """E_i (3, 3), an axis a row."""
-    sensitivity = estimate.state.reshape(3, 4)[:, :3]
+    sensitivity = estimate.state[:12].reshape(3, 4)[:, :3]
     return sensitivity / np.linalg.norm(sensitivity, axis=1, keepdims=True)
 
 

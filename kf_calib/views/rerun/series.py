@@ -65,9 +65,8 @@ class History:
 
 
 def _prior(result: Calibration) -> Estimate:
-    nominal = paper.nominal(result.bench.nominal)
-    state = paper.state_of(nominal)
-    return Estimate(*information.solve(information.start(result.settings.prior, nominal, state), state))
+    factor = information.start(result.settings.prior, result.model)
+    return Estimate(*information.solve(factor, result.model.nominal_state()))
 
 
 def times(elapsed_s: Floats, orientation: Counts | None = None) -> list[rr.TimeColumn]:

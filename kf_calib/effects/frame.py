@@ -1,0 +1,166 @@
+"""What bends the reference: tilt of the base, encoders, gimbal axes, drift of the platform, wrong gravity."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kf_calib.effects.effect import Coefficient, Effect, FrameEffect
+from kf_calib.effects.stimulus import Stimulus
+from kf_calib.errors import InputError
+from kf_calib.samples import Floats
+
+ARCSEC = ("arcsec", np.degrees(1.0) * 3600.0)
+_NORTH_EAST = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _level_axes(s: Stimulus) -> Floats:
+    """North and East in the bench frame (2, 3)."""
+    azimuth = np.radians(s.bench.azimuth_deg)
+    cos, sin = np.cos(azimuth), np.sin(azimuth)
+    return _NORTH_EAST @ np.array([[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]])
+
+
+class BaseTilt(FrameEffect):
+    """A base turned by (delta_N, delta_E): the specific force turns the other way in it."""
+
+    name, title, source = "base-tilt", "tilt of the base", "IEEE Std 836, base motion"
+    confused_with = "about the outer axis it is the outer encoder's zero"
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"delta{axis}", "rad", 1e-3, *ARCSEC) for axis in "NE")
+
+    def rotations(self, s: Stimulus) -> Floats:
+        return -np.stack([s.to_platform(axis) for axis in _level_axes(s)], axis=1)
+
+
+class BaseTiltDrift(BaseTilt):
+    """The same, growing with t."""
+
+    name, title = "base-tilt-drift", "tilt of the base that grows with time"
+    confused_with = "scale-drift"
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"deltaRate{axis}", "rad/s", 1e-8, "µrad/day", 86400e6) for axis in "NE")
+
+    def rotations(self, s: Stimulus) -> Floats:
+        return super().rotations(s) * s.elapsed_s[:, None, None]
+
+
+class PlatformDrift(FrameEffect):
+    """The platform turned by omega_d t, three rates in its own frame."""
+
+    name, title, source = "platform-drift", "drift of the platform", "IEEE Std 836"
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"omega{axis}", "rad/s", 1e-6, "deg/h", np.degrees(3600.0)) for axis in "XYZ")
+
+    def rotations(self, s: Stimulus) -> Floats:
+        return -s.elapsed_s[:, None, None] * np.eye(3)
+
+
+class _GimbalEffect(FrameEffect):
+    """An effect of one gimbal, named by its letter or number after the colon."""
+
+    def __init__(self, gimbal: int, variant: str) -> None:
+        self.gimbal, self.variant = gimbal, variant
+
+    def _about_axis(self, s: Stimulus) -> Floats:
+        """What a positive error of the gimbal's angle turns the specific force by, rad/rad, (m, 3)."""
+        return -s.inner(np.array(s.bench.axes[self.gimbal]), self.gimbal)
+
+    def _angle(self, s: Stimulus) -> Floats:
+        return s.pose[:, self.gimbal]
+
+
+class EncoderOffset(_GimbalEffect):
+    """q_k + epsilon_k."""
+
+    name, title, source = "encoder-offset", "zero of an encoder", "IEEE Std 836, positioning errors"
+    confused_with = "innermost: a misalignment; outermost: base-tilt"
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient(f"eps_{self.variant}", "rad", 1e-2, *ARCSEC),)
+
+    def rotations(self, s: Stimulus) -> Floats:
+        return self._about_axis(s)[:, None, :]
+
+
+class EncoderScale(_GimbalEffect):
+    """q_k (1 + epsilon_k)."""
+
+    name, title, source = "encoder-scale", "scale of an encoder", "IEEE Std 836, positioning errors"
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient(f"epsS_{self.variant}", "1", 1e-3, "ppm", 1e6),)
+
+    def rotations(self, s: Stimulus) -> Floats:
+        return (self._angle(s)[:, None] * self._about_axis(s))[:, None, :]
+
+
+class EncoderHarmonic1(_GimbalEffect):
+    """s sin q_k + c cos q_k on the angle."""
+
+    name, title, source = "encoder-harmonic-1", "eccentricity of an encoder", "IEEE Std 836, positioning errors"
+    order = 1
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"{part}{self.order}_{self.variant}", "rad", 1e-3, *ARCSEC) for part in "sc")
+
+    def rotations(self, s: Stimulus) -> Floats:
+        angle = self.order * self._angle(s)
+        return np.stack([np.sin(angle), np.cos(angle)], axis=1)[:, :, None] * self._about_axis(s)[:, None, :]
+
+
+class EncoderHarmonic2(EncoderHarmonic1):
+    """s sin 2 q_k + c cos 2 q_k on the angle."""
+
+    name, title = "encoder-harmonic-2", "second harmonic of an encoder"
+    confused_with = "second-order"
+    order = 2
+
+
+class AxisNonorthogonality(_GimbalEffect):
+    """Gimbal axis k tilted in its parent by tau: the child turns by tau - R^T tau, R the gimbal's own rotation."""
+
+    name, title, source = "axis-nonorthogonality", "tilt of a gimbal axis", "IEEE Std 836, positioning errors"
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"tau{part}_{self.variant}", "rad", 1e-3, *ARCSEC) for part in "AB")
+
+    def rotations(self, s: Stimulus) -> Floats:
+        from kf_calib.bench import turn
+
+        axis = np.array(s.bench.axes[self.gimbal])
+        tilts = np.linalg.svd(axis[None])[2][1:]  # two directions across the axis
+        return np.stack([s.inner(tilt - turn(tilt, axis, -self._angle(s)), self.gimbal) for tilt in tilts], axis=1)
+
+
+class GravityError(Effect):
+    """epsilon f in all channels: always a common scale factor, and so always invisible."""
+
+    name, title, source = "gravity-error", "wrong local gravity", "IEEE Std 836"
+    confused_with = "a common scale factor, always"
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("epsG", "1", 1e-3, "ppm", 1e6),)
+
+    def columns(self, s: Stimulus) -> Floats:
+        return (s.force_mps2 @ s.sensitivity.T)[:, :, None]
+
+
+def gimbal_number(variant: str, letters: str) -> int:
+    """The gimbal a variant names: by the letter of its axis where that is one gimbal's only, else by number from 1."""
+    if letters.count(variant) == 1:
+        return letters.index(variant)
+    if variant.isdigit() and 1 <= int(variant) <= len(letters):
+        return int(variant) - 1
+    known = ", ".join(letter if letters.count(letter) == 1 else str(k + 1) for k, letter in enumerate(letters))
+    raise InputError(f"{variant!r} names no gimbal of this bench: use one of {known or 'none: it has no axes'}.")

@@ -1,0 +1,108 @@
+"""Nonlinearities of the accelerometer itself (IEEE Std 1293: K0', K1', K2, K3, Koq, Kip, Kio, Kpo, Kpp)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kf_calib.effects.effect import G, SensorEffect
+from kf_calib.effects.stimulus import Stimulus
+from kf_calib.samples import Floats
+
+IEEE = "IEEE Std 1293, model equation"
+
+
+class BiasAsymmetry(SensorEffect):
+    """1/2 K0' sgn a_i."""
+
+    name, title, source = "bias-asymmetry", "bias that changes sign with the input", IEEE
+    confused_with = "odd-quadratic; invisible in six faces"
+    symbol, unit, scale, shown = "K0'", "m/s^2", 1e-3, ("µg", 1e6 / G)
+
+    def terms(self, s: Stimulus) -> Floats:
+        return 0.5 * np.sign(s.along)
+
+
+class ScaleAsymmetry(SensorEffect):
+    """1/2 K1' |a_i|."""
+
+    name, title, source = "scale-asymmetry", "scale factor that differs with the sign of the input", IEEE
+    confused_with = "second-order"
+    symbol, unit, scale, shown = "K1'", "1", 1e-3, ("ppm", 1e6)
+
+    def terms(self, s: Stimulus) -> Floats:
+        return 0.5 * np.abs(s.along)
+
+
+class SecondOrder(SensorEffect):
+    """K2 a_i^2."""
+
+    name, title, source = "second-order", "second-order nonlinearity", IEEE
+    confused_with = "scale-asymmetry"
+    symbol, unit, scale, shown = "K2_", "s^2/m", 1e-4, ("µg/g²", 1e6 * G)
+
+    def terms(self, s: Stimulus) -> Floats:
+        return s.along**2
+
+
+class ThirdOrder(SensorEffect):
+    """K3 a_i^3."""
+
+    name, title, source = "third-order", "third-order nonlinearity", IEEE
+    confused_with = "odd-quadratic; invisible in six faces"
+    symbol, unit, scale, shown = "K3_", "s^4/m^2", 1e-5, ("µg/g³", 1e6 * G**2)
+
+    def terms(self, s: Stimulus) -> Floats:
+        return s.along**3
+
+
+class OddQuadratic(SensorEffect):
+    """Koq a_i |a_i|."""
+
+    name, title, source = "odd-quadratic", "odd quadratic nonlinearity", IEEE
+    confused_with = "third-order; invisible in six faces"
+    symbol, unit, scale, shown = "Koq", "s^2/m", 1e-4, ("µg/g²", 1e6 * G)
+
+    def terms(self, s: Stimulus) -> Floats:
+        return s.along * np.abs(s.along)
+
+
+class _CrossCoupling(SensorEffect):
+    source, confused_with = IEEE, "seen in poses between the faces only"
+    unit, scale, shown = "s^2/m", 1e-4, ("µg/g²", 1e6 * G)
+
+
+class CrossCouplingIP(_CrossCoupling):
+    """Kip a_i a_p."""
+
+    name, title, symbol = "cross-coupling-ip", "input-pendulous cross-coupling", "Kip"
+
+    def terms(self, s: Stimulus) -> Floats:
+        return s.along * s.pendulous
+
+
+class CrossCouplingIO(_CrossCoupling):
+    """Kio a_i a_o."""
+
+    name, title, symbol = "cross-coupling-io", "input-output cross-coupling", "Kio"
+
+    def terms(self, s: Stimulus) -> Floats:
+        return s.along * s.output
+
+
+class CrossCouplingPO(_CrossCoupling):
+    """Kpo a_p a_o."""
+
+    name, title, symbol = "cross-coupling-po", "pendulous-output cross-coupling", "Kpo"
+
+    def terms(self, s: Stimulus) -> Floats:
+        return s.pendulous * s.output
+
+
+class CrossAxisSquare(_CrossCoupling):
+    """Kpp a_p^2; Koo a_o^2 is then redundant, because the squares sum to g^2."""
+
+    name, title, symbol = "cross-axis-square", "square of the pendulous acceleration", "Kpp"
+    confused_with = "second-order, bias"
+
+    def terms(self, s: Stimulus) -> Floats:
+        return s.pendulous**2

@@ -1,0 +1,86 @@
+"""What the accelerometer block feels, and what an effect may depend on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib.bench import Bench, turn
+from kf_calib.samples import Floats
+
+REFERENCE_TEMPERATURE_C = 25.0
+"""T of the catalogue is the temperature less this."""
+
+_RATE_WINDOW_S = 5.0  # a thermometer of 0.01 K noise then shows rates of 1e-3 K/s
+
+
+@dataclass(frozen=True)
+class Stimulus:
+    """The state of the bench at m instants of dwells.
+
+    elapsed_s, since_arrival_s, temperature_c: (m,); force_mps2: specific force in the platform frame, and that of the
+    dwell before, (m, 3); pose (m, k); sensitivity (3, 3): rows K_i E_i at which small rotations are linearised.
+    """
+
+    bench: Bench
+    elapsed_s: Floats
+    since_arrival_s: Floats
+    force_mps2: Floats
+    previous_force_mps2: Floats
+    pose: Floats
+    temperature_c: Floats
+    sensitivity: Floats
+
+    def __len__(self) -> int:
+        return len(self.elapsed_s)
+
+    @cached_property
+    def axes(self) -> Floats:
+        """Unit input axes E_i (3, 3), a row each."""
+        return self.sensitivity / np.linalg.norm(self.sensitivity, axis=1, keepdims=True)
+
+    @cached_property
+    def along(self) -> Floats:
+        """a_i (m, 3): specific force along the input axis of each accelerometer."""
+        return self.force_mps2 @ self.axes.T
+
+    @cached_property
+    def pendulous(self) -> Floats:
+        """a_p (m, 3): along the pendulous axes y, z, x of accelerometers 1, 2, 3."""
+        return self.force_mps2[:, [1, 2, 0]]
+
+    @cached_property
+    def output(self) -> Floats:
+        """a_o (m, 3): along the output axes z, x, y of accelerometers 1, 2, 3."""
+        return self.force_mps2[:, [2, 0, 1]]
+
+    @cached_property
+    def step(self) -> Floats:
+        """Delta a_i (m, 3): the last change of a_i from dwell to dwell; zero in the first."""
+        return (self.force_mps2 - self.previous_force_mps2) @ self.axes.T
+
+    @cached_property
+    def warmth(self) -> Floats:
+        """T (m,): temperature less the reference, K; zero where it is not measured."""
+        return np.nan_to_num(self.temperature_c - REFERENCE_TEMPERATURE_C)
+
+    @cached_property
+    def warming(self) -> Floats:
+        """dT/dt (m,), K/s: the change of temperature from 5 s before to 5 s after."""
+        times, first = np.unique(self.elapsed_s, return_index=True)
+        before = np.maximum(self.elapsed_s - _RATE_WINDOW_S, times[0])
+        after = np.minimum(self.elapsed_s + _RATE_WINDOW_S, times[-1])
+        change = np.interp(after, times, self.warmth[first]) - np.interp(before, times, self.warmth[first])
+        return change / np.maximum(after - before, 1e-9)
+
+    def to_platform(self, vector: Floats) -> Floats:
+        """A bench vector (3,) seen in the platform, (m, 3)."""
+        return np.broadcast_to(self.bench.to_platform(vector, self.pose), (len(self), 3))
+
+    def inner(self, vector: Floats, gimbal: int) -> Floats:
+        """A vector (3,) or (m, 3) of the frame carried by a gimbal, seen in the platform, (m, 3)."""
+        for k in range(gimbal + 1, len(self.bench.axes)):
+            vector = turn(vector, np.array(self.bench.axes[k]), -self.pose[:, k])
+        return np.broadcast_to(vector, (len(self), 3))

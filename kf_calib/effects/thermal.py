@@ -1,0 +1,73 @@
+"""What changes with temperature; T is the temperature less the reference (25 degC)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kf_calib.effects.effect import Coefficient, Effect, G, SensorEffect
+from kf_calib.effects.stimulus import Stimulus
+from kf_calib.samples import Floats
+
+IEEE = "IEEE Std 1293, environmental sensitivities"
+
+
+class ThermalBias(SensorEffect):
+    """alpha T."""
+
+    name, title, source = "thermal-bias", "bias that follows the temperature", IEEE
+    confused_with = "needs a temperature swing"
+    symbol, unit, scale, shown = "alpha", "m/s^2/K", 1e-3, ("µg/K", 1e6 / G)
+
+    def terms(self, s: Stimulus) -> Floats:
+        return np.repeat(s.warmth[:, None], 3, axis=1)
+
+
+class ThermalBias2(SensorEffect):
+    """alpha_2 T^2."""
+
+    name, title, source = "thermal-bias-2", "bias that follows the square of the temperature", IEEE
+    symbol, unit, scale, shown = "alpha2_", "m/s^2/K^2", 1e-4, ("µg/K²", 1e6 / G)
+
+    def terms(self, s: Stimulus) -> Floats:
+        return np.repeat(s.warmth[:, None] ** 2, 3, axis=1)
+
+
+class ThermalScale(SensorEffect):
+    """alpha_s T a_i."""
+
+    name, title, source = "thermal-scale", "scale factor that follows the temperature", IEEE
+    confused_with = "needs both signs of the input at two temperatures"
+    symbol, unit, scale, shown = "alphaS", "1/K", 1e-4, ("ppm/K", 1e6)
+
+    def terms(self, s: Stimulus) -> Floats:
+        return s.warmth[:, None] * s.along
+
+
+class ThermalRate(SensorEffect):
+    """kappa dT/dt."""
+
+    name, title, source = "thermal-rate", "bias that follows the rate of the temperature", IEEE
+    confused_with = "warm-up"
+    symbol, unit, scale, shown = "kappaT", "m s^-1/K", 1e-1, ("µg per K/min", 1e6 / G / 60)
+
+    def terms(self, s: Stimulus) -> Floats:
+        return np.repeat(s.warming[:, None], 3, axis=1)
+
+
+class ThermalMisalignment(Effect):
+    """gamma_p T a_p + gamma_o T a_o."""
+
+    name, title, source = "thermal-misalignment", "alignment that follows the temperature", IEEE
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(
+            Coefficient(f"gamma{axis}{i}", "rad/K", 1e-5, "µrad/K", 1e6) for i in (1, 2, 3) for axis in ("P", "O")
+        )
+
+    def columns(self, s: Stimulus) -> Floats:
+        out = np.zeros((len(s), 3, 6))
+        for i in range(3):
+            out[:, i, 2 * i] = s.warmth * s.pendulous[:, i]
+            out[:, i, 2 * i + 1] = s.warmth * s.output[:, i]
+        return out
