@@ -189,6 +189,26 @@ def test_views_are_saved(run, recording: Path, tmp_path: Path) -> None:
     assert code == 0 and "saved" in out and (tmp_path / "view.rrd").stat().st_size > 10_000
 
 
+def test_a_hidden_effect_fails_and_the_right_one_mends_it(run, tmp_path: Path) -> None:
+    """Compare the model with the measurements, see it fail, add the effect, watch the error fall; also in Rerun."""
+    path = tmp_path / "hidden.mcap"
+    assert run("simulate", path, *QUICK, "--hide", "second-order=40ug/g^2", "--seed", 8)[0] == 0
+    plain = json.loads(run("replay", path, "--json")[1])
+    mended = json.loads(run("replay", path, "--json", "--with", "second-order", "--rrd", tmp_path / "view.rrd")[1])
+    assert plain["consistency"]["consistent"] is False and mended["consistency"]["consistent"] is True
+    assert mended["model"] == ["second-order"]
+    assert mended["held_out_rms_mps2"] < 0.1 * plain["held_out_rms_mps2"]
+    truth = json.loads(path.with_suffix(".truth.json").read_text())["effects"][0]["sizes"]
+    found = {p["symbol"]: p for p in mended["parameters"]}
+    for i in "123":
+        coefficient = found[f"K2_{i}"]
+        assert abs(coefficient["value"] - truth[i]) < 4 * coefficient["sigma"]
+        assert coefficient["unit"] == "s^2/m"
+    assert b"second-order" not in path.read_bytes()
+    code, out, err = run("replay", path, "--with", "second-ordr")
+    assert (code, out) == (2, "") and "did you mean second-order" in err
+
+
 def test_demo_does_the_main_job(tmp_path: Path) -> None:
     """In a process of its own, as the README has it."""
     words = [sys.executable, "-m", "kf_calib.cli", "demo", str(tmp_path / "out"), "--json"]

@@ -107,7 +107,7 @@ def test_models_compose() -> None:
     assert str(larger) == "twelve parameters + second-order + bias-drift" and larger.count == 18
     assert str(larger - second) == "twelve parameters + bias-drift" and model.count == 12
     with pytest.raises(InputError, match="second-order in the model already has the coefficient K2_1"):
-        larger + second
+        _ = larger + second
 
 
 @pytest.mark.parametrize(

@@ -33,13 +33,19 @@ def _table(result: Calibration) -> str:
 
 
 def _row(parameter: Parameter) -> str:
-    label, group = LABELS[parameter.symbol], GROUP_OF[parameter.symbol]
+    label, group = LABELS.get(parameter.symbol, parameter.symbol), GROUP_OF.get(parameter.symbol)
     if parameter.value is None or parameter.sigma is None:
         return f"| {label} | not determined | | | |"
-    per, unit = (math.degrees(1.0), "°") if parameter.unit == "rad" else (1.0, "")
-    value = fixed(parameter.value * per, parameter.sigma * per) + unit
-    deviation = fixed((parameter.value - parameter.nominal) * group.per_si, parameter.sigma * group.per_si)
-    return f"| {label} | {value} | {deviation} | {_two(parameter.sigma * group.per_si)} | {group.unit} |"
+    per_si, unit = (parameter.per_si, parameter.shown_unit) if group is None else (group.per_si, group.unit)
+    deviation = fixed((parameter.value - parameter.nominal) * per_si, parameter.sigma * per_si)
+    value = "" if group is None else _absolute(parameter.value, parameter.sigma, parameter.unit)
+    return f"| {label} | {value} | {deviation} | {_two(parameter.sigma * per_si)} | {unit} |"
+
+
+def _absolute(value: float, sigma: float, unit: str) -> str:
+    if unit == "rad":
+        return fixed(math.degrees(value), math.degrees(sigma)) + "°"
+    return fixed(value, sigma)
 
 
 def fixed(value: float, sigma: float) -> str:
