@@ -24,6 +24,7 @@ BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scat
 PLAN = spread_plan(30, dwell_s=6.0, seed=4)
 NAMES = names(BENCH)
 INVISIBLE = {  # exactly: wrong g is a common scale, the innermost zero a misalignment; a vertical axis turns nothing
+    "cross-talk": {"theta1", "phi1", "nu1", "nu2", "theta3", "phi3", "X12", "X13", "X21", "X23", "X31", "X32"},
     "gravity-error": {"K1", "K2", "K3", "epsG"},
     "encoder-offset:x": {"eps_x"},
     "encoder-offset:y": {"eps_y"},
@@ -31,8 +32,10 @@ INVISIBLE = {  # exactly: wrong g is a common scale, the innermost zero a misali
     "encoder-harmonic-1:y": {"s1_y", "c1_y"},
     "encoder-harmonic-2:y": {"s2_y", "c2_y"},
 }
-SIZES = {"rad": 1e-5, "rad/s": 1e-8, "1": 1e-5, "m/s^2": 1e-4, "s^2/m": 1e-6, "s^4/m^2": 1e-7, "m/s^3": 1e-7,
-         "1/s": 1e-8, "m/s^2/K": 1e-5, "m/s^2/K^2": 1e-6, "1/K": 1e-6, "rad/K": 1e-6, "m s^-1/K": 1e-2}  # fmt: skip
+SIZES = {
+    "rad": 1e-5, "rad/s": 1e-8, "1": 1e-5, "m/s^2": 1e-4, "s^2/m": 1e-6, "s^4/m^2": 1e-7, "m/s^3": 1e-7, "1/s": 1e-8,
+    "m/s^2/K": 1e-5, "m/s^2/K^2": 1e-6, "1/K": 1e-6, "rad/K": 1e-6, "m s^-1/K": 1e-2, "rad s^2/m": 1e-6,
+}  # fmt: skip
 
 
 def run(hidden: list[str], white_mps2: float = 0.0, seed: int = 5) -> Simulation:

@@ -25,6 +25,7 @@ _PLAIN: dict[str, type[Effect]] = {
         thermal.ThermalBias, thermal.ThermalBias2, thermal.ThermalScale, thermal.ThermalRate,
         thermal.ThermalMisalignment,
         frame.BaseTilt, frame.BaseTiltDrift, frame.PlatformDrift, frame.GravityError,
+        frame.EarthRotation, frame.Flexure, frame.CrossTalk,
     )
 }  # fmt: skip
 _OF_A_GIMBAL = {
@@ -47,7 +48,8 @@ def names(bench: Bench) -> list[str]:
     """Every effect of the catalogue that this bench can have, axis-wise ones with their axis after a colon."""
     letters = _letters(bench)
     variants = [letter if letters.count(letter) == 1 else str(k + 1) for k, letter in enumerate(letters)]
-    return [*_PLAIN, *(f"{name}:{variant}" for name in _OF_A_GIMBAL for variant in variants)]
+    plain = [name for name in _PLAIN if name != frame.EarthRotation.name or bench.latitude_deg is not None]
+    return [*plain, *(f"{name}:{variant}" for name in _OF_A_GIMBAL for variant in variants)]
 
 
 def effect_named(text: str, bench: Bench) -> Effect:

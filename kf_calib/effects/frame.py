@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kf_calib.effects.effect import Coefficient, Effect, FrameEffect
+from kf_calib.effects.effect import Coefficient, Effect, FrameEffect, G
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 from kf_calib.samples import Floats
@@ -59,6 +59,55 @@ class PlatformDrift(FrameEffect):
 
     def rotations(self, s: Stimulus) -> Floats:
         return -s.elapsed_s[:, None, None] * np.eye(3)
+
+
+class EarthRotation(FrameEffect):
+    """Gravity turning with the Earth in a platform that is held inertially while its angles are taken as base-fixed.
+
+    The coefficient is the share of the Earth's rate, 1 where the platform is truly inertial.
+    """
+
+    name, title, source = "earth-rotation", "rotation of the Earth", "IEEE Std 836; WGS 84 rate"
+    confused_with = "platform-drift"
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("earth", "1", 1.0, "of Earth's rate", 1.0),)
+
+    def rotations(self, s: Stimulus) -> Floats:
+        return (s.elapsed_s[:, None] * s.to_platform(s.bench.earth_rate_radps))[:, None, :]
+
+
+class Flexure(FrameEffect):
+    """The platform turns by f x d under the torque of gravity, d the compliance times the offset of its mass."""
+
+    name, title, source = "flexure", "bending under the torque of gravity", "IEEE Std 836"
+    confused_with = "encoder-harmonic-1, cross-coupling"
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        per_si = np.degrees(1.0) * 3600.0 * G
+        return tuple(Coefficient(f"d{axis}", "rad s^2/m", 1e-4, "arcsec/g", per_si) for axis in "XYZ")
+
+    def rotations(self, s: Stimulus) -> Floats:
+        return -np.cross(s.force_mps2[:, None, :], np.eye(3))
+
+
+class CrossTalk(Effect):
+    """X_ij A_j: a share of another accelerometer's reading; at rest a misalignment, and so always invisible."""
+
+    name, title, source = "cross-talk", "a share of another channel's reading", "IEEE Std 1293"
+    confused_with = "misalignment, always at rest"
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"X{i}{j}", "1", 1e-3, "ppm", 1e6) for i in (1, 2, 3) for j in (1, 2, 3) if i != j)
+
+    def columns(self, s: Stimulus) -> Floats:
+        readings, out = s.force_mps2 @ s.sensitivity.T, np.zeros((len(s), 3, 6))
+        for k, (i, j) in enumerate((i, j) for i in range(3) for j in range(3) if i != j):
+            out[:, i, k] = readings[:, j]
+        return out
 
 
 class _GimbalEffect(FrameEffect):
