@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic import G, Run
+from scipy.spatial.transform import Rotation
+from synthetic import G, Run, sensitivities
 
 from kf_calib.bench import Bench, axes_of
 from kf_calib.calibration import Settings, calibrate, orientations
@@ -146,3 +147,21 @@ def test_nothing_at_all_is_refused() -> None:
 def test_the_result_prints_itself() -> None:
     text = str(calibrate(Run(seed=11)))
     assert "θ1" in text and "ppm" in text and "Model and measurements agree" in text and "\x1b" not in text
+
+
+@pytest.mark.parametrize("reference", ["base", "inertial"])
+def test_an_attitude_in_place_of_angles(reference: str) -> None:
+    """A quaternion stream, base-fixed and inertially held."""
+    run = Run(seed=12, dwells=12)
+    run.bench = Bench((), G, reference=reference, latitude_deg=50.0)  # type: ignore[arg-type]
+    elapsed_s = (run.accel.time_ns - run.accel.time_ns[0]) / 1e9
+    dwell = np.arange(len(elapsed_s)) // run.count
+    attitudes = Rotation.random(12, random_state=3).as_quat()[dwell]
+    rows, biases = sensitivities(run.truth)
+    noise = np.random.default_rng(1).normal(size=(len(elapsed_s), 3)) * 1e-4
+    force = run.bench.specific_force(elapsed_s, attitudes)
+    run.accel = replace(run.accel, values=force @ rows.T + biases + noise)
+    run.pose = Stream(run.accel.time_ns, attitudes)
+    result = calibrate(run)
+    assert len(result.visits) == 12 and result.consistency.consistent
+    assert np.abs((result.estimate.parameters - run.truth) / result.estimate.sigma).max() < 4
