@@ -14,7 +14,7 @@ Conventions, kept everywhere:
   All angles zero: y up, accelerometer 2 reads +g. Right-handed, angles in rad, quaternions x y z w (platform -> bench).
 - Time: stamps are integer nanoseconds (``time_ns``); ``elapsed_s`` counts from the first reading.
 - Units are in the names: ``accel_mps2``, ``angle_sigma_deg``, ``gimbal_deg``, ``sigma_mps2``.
-- Arrays have samples (n) or dwells (D) first: readings (n, 3), factors (D, 7, 7). sigma is always 1 sigma.
+- Arrays have samples (n) or dwells (D) first: readings (n, 3), mean columns (D, 3, p). sigma is always 1 sigma.
 - The affine state is (s1, b1, s2, b2, s3, b3), s_i = K_i E_i; the paper's theta, phi, nu, K, b follow in closed form.
 """
 

@@ -95,7 +95,7 @@ class DwellFactor:
     @cached_property
     def factor(self) -> Floats:
         """Triangle (7, 7) over [1 f_x f_y f_z | z1 z2 z3]."""
-        return _folded(self.rows([np.column_stack([np.ones(3), piece.nodes.force_mps2]) for piece in self.pieces]))
+        return _folded(self.rows([piece.nodes.regressors for piece in self.pieces]))
 
     @property
     def means(self) -> Floats:

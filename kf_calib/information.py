@@ -33,8 +33,7 @@ def whitened(dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: No
     out = list[Floats]()
     for dwell, own in zip(dwells, columns, strict=True):
         triangles = np.array([piece.triangle for piece in dwell.pieces])
-        force = np.array([piece.nodes.force_mps2 for piece in dwell.pieces])
-        regressors = triangles[:, :3, :3] @ parabola(np.concatenate([np.ones((*force.shape[:2], 1)), force], axis=2))
+        regressors = triangles[:, :3, :3] @ parabola(np.array([piece.nodes.regressors for piece in dwell.pieces]))
         size, width = 3 * len(triangles), own.shape[-1]
         rows = np.zeros((3 * size + count, count + width + 1))
         for i in range(3):
@@ -69,7 +68,7 @@ def _informative(rows: Floats, units: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Step:
-    """The filter after one dwell: factor [R | z] (12, 13), normalised innovation squared and its degrees of freedom."""
+    """The filter after one dwell: factor [R | z] (p, p + 1), normalised innovation squared, its degrees of freedom."""
 
     factor: Floats
     nis: float

@@ -44,6 +44,11 @@ class Nodes:
     pose: Floats
     temperature_c: Floats
 
+    @property
+    def regressors(self) -> Floats:
+        """1, f_x, f_y, f_z (m, 4)."""
+        return np.column_stack([np.ones(len(self.force_mps2)), self.force_mps2])
+
 
 def parabola(values: Floats) -> Floats:
     """Coefficients (..., 3, c) on 1, u, u^2 of the parabola with ``values`` (..., 3, c) at u = -1, 0, 1.
@@ -180,9 +185,7 @@ def _rows(block: Block, bench: Bench, force: Floats | None) -> Rows:
     if force is not None:
         columns = np.broadcast_to(np.append(1.0, force), (len(since_s), len(REGRESSORS)))
     else:
-        columns = np.concatenate(
-            [basis(u).T @ parabola(np.column_stack([np.ones(3), nodes.force_mps2])) for _, u, nodes in pieces]
-        )
+        columns = np.concatenate([basis(u).T @ parabola(nodes.regressors) for _, u, nodes in pieces])
     innovation = gate.innovations(columns, block.accel_mps2, force is not None)
     return Rows(block.dwell, block.elapsed_s, columns, block.accel_mps2, innovation, force is not None, pieces)
 
