@@ -20,10 +20,11 @@ from kf_calib import information, kalman, paper
 from kf_calib.bench import Bench
 from kf_calib.dwells import Segmenter, Stillness, Tally, dwell_blocks
 from kf_calib.errors import InputError, UnobservableError
+from kf_calib.fitting import WALK, Fit, fit
 from kf_calib.folding import Carried, DwellFactor, Folder, means_of, samples_of
 from kf_calib.information import Step
 from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
-from kf_calib.noise import Noise, considered, mean_covariances, with_dwell_parts, within_dwells
+from kf_calib.noise import Noise, considered, mean_covariances
 from kf_calib.samples import Floats, Mask, Source
 
 SAME_POSE_DEG = 1.0
@@ -160,8 +161,7 @@ class Calibration:
 
     bench: Bench
     settings: Settings
-    noise: Noise
-    carried: Carried
+    fit: Fit
     visits: tuple[Visit, ...]
     estimate: Estimate
     consistency: Consistency
@@ -172,6 +172,14 @@ class Calibration:
     warnings: tuple[str, ...]
 
     @property
+    def noise(self) -> Noise:
+        return self.fit.noise
+
+    @property
+    def carried(self) -> Carried:
+        return self.fit.carried
+
+    @property
     def model(self) -> Model:
         return self.carried.model
 
@@ -179,16 +187,17 @@ class Calibration:
     def parameters(self) -> dict[str, Parameter]:
         """The twelve parameters, then the effects' coefficients, by symbol."""
         estimate, nominal = self.estimate, paper.nominal(self.bench.nominal)
+        coefficients, (effects, gains) = self.model.coefficients, self.model.natural(self.estimate.state)
+        sigmas = estimate.effect_sigma * gains
+        sigmas = np.where((gains != 1.0) & (sigmas > effects), np.nan, sigmas)  # a constant not known within itself
         found = [
             *zip(paper.SYMBOLS, estimate.parameters, estimate.sigma, nominal, paper.UNITS, strict=True),
-            *(
-                (coefficient.symbol, value, sigma, 0.0, coefficient.unit)
-                for coefficient, value, sigma in zip(
-                    self.model.coefficients, estimate.effects, estimate.effect_sigma, strict=True
-                )
-            ),
+            *((c.symbol, *own, 0.0, c.unit) for c, *own in zip(coefficients, effects, sigmas, strict=True)),
         ]
-        shown = [*(_SHOWN[unit] for unit in paper.UNITS), *((c.shown_unit, c.per_si) for c in self.model.coefficients)]
+        shown = [*(_SHOWN[unit] for unit in paper.UNITS), *((c.shown_unit, c.per_si) for c in coefficients)]
+        if self.model.walks:
+            found.append((WALK.symbol, self.fit.walk.intensity, self.fit.walk.sigma or math.nan, 0.0, WALK.unit))
+            shown.append((WALK.shown_unit, WALK.per_si))
         return {
             symbol: Parameter(
                 symbol,
@@ -214,7 +223,7 @@ class Calibration:
     def trace(self) -> Iterator[tuple[float, int, Estimate]]:
         """(elapsed_s, dwell index, estimate) within and after every dwell: after a second, two, four ..."""
         model, state, around = self.model, self.carried.state, self.model.nominal_state()
-        walks = _walk_variances(self.carried.dwells, self.settings)
+        walks = self.fit.walk_variances
         factor = information.start(self.settings.prior, model)
         extra = np.zeros((model.count, model.count))
         for index, (dwell, columns, walk) in enumerate(
@@ -279,19 +288,22 @@ def calibrate(
 
 def evaluate(dwells: list[DwellFactor], bench: Bench, settings: Settings) -> Calibration:
     """The calibration from dwell factors alone; no pass over the data."""
-    model = Model.of(bench, settings.effects)
-    noise, carried = _noise_and_columns(dwells, model)
-    rows = information.whitened(dwells, carried.columns, noise.weights, carried.state)
-    steps = information.run(information.start(settings.prior, model), rows, _walk_variances(dwells, settings))
+    return evaluated(fit(dwells, Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s), settings)
+
+
+def evaluated(fitted: Fit, settings: Settings) -> Calibration:
+    """The filter run over a fit, its innovations, and the judgement of the misfit."""
+    carried, noise, model = fitted.carried, fitted.noise, fitted.carried.model
+    steps = information.run(information.start(settings.prior, model), fitted.rows(), fitted.walk_variances)
     extra = considered(noise, carried.means, carried.state)
     final = _estimate(steps[-1].factor, model.nominal_state(), extra.sum(axis=0))
     residuals = carried.means.readings - carried.means.design @ final.state
-    visits = _visits(carried, steps, residuals, noise, extra, settings)
+    visits = _visits(fitted, steps, residuals, extra, settings)
     held_out, floor = _held_out(carried, noise.judging)
-    judged = _consistency(carried, noise)
+    judged = consistency(fitted)
     return Calibration(
-        bench, settings, noise, carried, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), held_out, floor,
-        Tally(), tuple(_remarks(model, noise, final, judged, residuals, dwells)),
+        model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), held_out, floor,
+        Tally(), tuple(_remarks(model, noise, final, judged, residuals, carried.dwells)),
     )  # fmt: skip
 
 
@@ -299,7 +311,7 @@ def filterpy_estimate(
     source: Source, result: Calibration, form: Literal["square-root", "plain"] = "square-root"
 ) -> Estimate:
     """The same posterior by filterpy's filter, sample by sample: a second pass over the source."""
-    prior, q, model = result.settings.prior, result.settings.walk_mps2_per_sqrt_s, result.model
+    prior, q, model = result.settings.prior, result.fit.walk.intensity, result.model
     largest = np.abs(result.carried.means.design).max(axis=(0, 1))
     scale = np.concatenate(
         [np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), np.where(largest > 0, largest, 1.0)[STATE_COUNT:]]
@@ -362,37 +374,15 @@ def refuse_unseen(result: Calibration) -> None:
         )
 
 
-def _noise_and_columns(dwells: list[DwellFactor], model: Model) -> tuple[Noise, Carried]:
-    """The noise model, and the model's columns linearised at the estimate it leads to: in turn, three times."""
-    within, bench, around = within_dwells(dwells), model.bench, model.nominal_state()
-    noise, carried = within, Carried(dwells, model, around)
-    for _ in range(3):
-        rows = information.whitened(dwells, carried.columns, noise.weights, carried.state)
-        factor = information.update(information.start(Prior(), model), np.concatenate(rows)).factor
-        carried = Carried(dwells, model, information.solve(factor, around)[0])
-        noise = with_dwell_parts(within, carried.means, carried.state, bench.angle_sigma_deg, bench.scatter_sigma_mps2)
-    return noise, carried
-
-
-def _walk_variances(dwells: list[DwellFactor], settings: Settings) -> Floats:
-    """Variance (D, 3) of the biases' steps before each dwell: q^2 times the time between the dwells' starts."""
-    starts = np.array([dwell.start_s for dwell in dwells])
-    gaps = np.diff(starts, prepend=starts[:1])
-    return np.repeat(settings.walk_mps2_per_sqrt_s**2 * gaps[:, None], 3, axis=1)
-
-
 def _estimate(factor: Floats, nominal_state: Floats, extra: Floats) -> Estimate:
     """The estimate of a factor, its covariance P enlarged by what is considered: P + P B P, B = ``extra`` (12, 12)."""
     state, covariance, undetermined = information.solve(factor, nominal_state)
     return Estimate(state, covariance + covariance @ extra @ covariance, undetermined)
 
 
-def _visits(
-    carried: Carried, steps: list[Step], residuals: Floats, noise: Noise, extra: Floats, settings: Settings
-) -> tuple[Visit, ...]:
-    means, around = carried.means, carried.model.nominal_state()
-    own = mean_covariances(noise, means, carried.state)
-    walks = _walk_variances(carried.dwells, settings)
+def _visits(fitted: Fit, steps: list[Step], residuals: Floats, extra: Floats, settings: Settings) -> tuple[Visit, ...]:
+    carried, means, around = fitted.carried, fitted.carried.means, fitted.carried.model.nominal_state()
+    own, walks = mean_covariances(fitted.noise, means, carried.state), fitted.walk_variances
     before, extra = information.start(settings.prior, carried.model), np.cumsum(extra, axis=0)
     visits = list[Visit]()
     for k, (dwell, step) in enumerate(zip(carried.dwells, steps, strict=True)):
@@ -408,19 +398,21 @@ def _visits(
     return tuple(visits)
 
 
-def _consistency(carried: Carried, noise: Noise) -> Consistency:
+def consistency(fitted: Fit) -> Consistency:
+    """Whether the dwells agree with the fitted model within the noise it is judged by."""
     from scipy.special import fdtrc
 
-    dwells = carried.dwells
-    rows = information.whitened(dwells, carried.columns, noise.judging, carried.state)
-    step = information.update(information.start(Prior(), carried.model), np.concatenate(rows))
-    dof = sum(information.rank(own) for own in rows) - information.rank(step.factor)
+    noise, dwells = fitted.noise, fitted.dwells
+    rows = fitted.rows(noise.judging)
+    upper = information.accumulated(rows, fitted.walk_variances)
+    statistic = float(upper[-1, -1] ** 2)
+    dof = sum(information.row_rank(own) for own in rows) - information.rank(upper[:-1])
     dof -= int(not noise.setting_stated and noise.setting_rad > 0)
     if dof <= 0:
-        return Consistency(step.nis, 0, None, None)
+        return Consistency(statistic, 0, None, None)
     noise_dof = float(sum(max(dwell.count - 4, 1) for dwell in dwells) / noise.inflation.mean())
-    p_value = float(fdtrc(dof, max(noise_dof, 1.0), step.nis / dof))
-    return Consistency(step.nis, dof, p_value, p_value >= 0.01)
+    p_value = float(fdtrc(dof, max(noise_dof, 1.0), statistic / dof))
+    return Consistency(statistic, dof, p_value, p_value >= 0.01)
 
 
 def format_p(p_value: float | None) -> str:

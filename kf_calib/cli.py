@@ -19,6 +19,8 @@ import click
 from kf_calib.errors import InputError, KfCalibError
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from kf_calib.bench import Vector
     from kf_calib.calibration import Settings
     from kf_calib.samples import Source
@@ -67,13 +69,23 @@ def recording_options(command: F) -> F:
     return bench_options(command)
 
 
+effects_from_option = click.option(
+    "--effects-from", "effects_from", multiple=True, type=click.Path(path_type=Path), metavar="FILE.py",
+    help="A Python file with effect classes of your own, for --with to name; repeatable.",
+)  # fmt: skip
+
+
 def filter_options(command: F) -> F:
     """How a run is evaluated."""
     options = [
         click.option("--engine", type=click.Choice(["block", "filterpy"]), default="block", show_default=True,
                      help="Block square-root filter, or filterpy sample by sample."),
         click.option("--with", "effects", multiple=True, metavar="EFFECT",
-                     help="An effect to put in the model, for example second-order; repeatable."),
+                     help="An effect to put in the model, for example second-order, or a formula of your own, "
+                     "for example 'mine = fx*fy*T'; repeatable."),
+        effects_from_option,
+        click.option("--model", "model_file", type=click.Path(path_type=Path),
+                     help="A model file (replay --save-model); its effects come before those of --with."),
         click.option("--prior", type=click.Choice(["diffuse", "navigation", "mems"]), default="diffuse",
                      show_default=True, help="What is believed of the sensors before the run."),
         click.option("--bias-walk", type=click.FloatRange(min=0), default=0.0,
@@ -139,8 +151,23 @@ def _settings(options: Mapping[str, Any]) -> Settings:
         stillness=Stillness(tolerance_deg=options["still_deg"], settle_s=options["settle_s"]),
         gate_sigma=options["gate_sigma"] if options["gate"] else None,
         walk_mps2_per_sqrt_s=options["bias_walk"],
-        effects=tuple(options["effects"]),
+        effects=_effects(options),
     )
+
+
+def _effects(options: Mapping[str, Any]) -> tuple[str, ...]:
+    """Effects of the model file, then those of ``--with``; the user's files are read first."""
+    from kf_calib.effects import load_file, merged, refuse_unknown
+
+    for path in options["effects_from"]:
+        load_file(path)
+    for text in options["effects"]:
+        refuse_unknown(text)  # at once, not after a long recording was read
+    if options["model_file"] is None:
+        return tuple(options["effects"])
+    from kf_calib import model_file
+
+    return merged(model_file.read(options["model_file"]).effects, options["effects"])
 
 
 def _print_json(content: Mapping[str, Any]) -> None:
@@ -178,13 +205,21 @@ def cli() -> None:
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--rrd", type=click.Path(path_type=Path), help="Save the Rerun view here.")
 @click.option("--png", type=click.Path(path_type=Path), help="Save a picture of the Rerun view here.")
+@click.option("--save-model", type=click.Path(path_type=Path), help="Save the model here, for --model to read.")
 @recording_options
 @filter_options
 @strict_option
 @json_option
 @click.pass_context
 def replay(
-    ctx: click.Context, recording: Path, rrd: Path | None, png: Path | None, strict: bool, as_json: bool, **options: Any
+    ctx: click.Context,
+    recording: Path,
+    rrd: Path | None,
+    png: Path | None,
+    save_model: Path | None,
+    strict: bool,
+    as_json: bool,
+    **options: Any,
 ) -> None:
     """Run a recording through the filter: twelve parameters, their sigma, and whether the model fits."""
     from kf_calib.calibration import calibrate
@@ -193,6 +228,10 @@ def replay(
     with _progress(f"replaying {recording.name}", as_json) as tick:
         result = calibrate(source, _settings(options), tick)
     _save_views(result, rrd, png)
+    if save_model:
+        from kf_calib import model_file
+
+        model_file.write(save_model, result)
     if as_json:
         from kf_calib.views.json import replay_object
 
@@ -201,7 +240,7 @@ def replay(
         from kf_calib.views.console import summary
 
         _show(summary(result))
-        for path in filter(None, (rrd, png)):
+        for path in filter(None, (rrd, png, save_model)):
             click.echo(f"saved {path}")
     if strict and result.consistency.consistent is False:
         ctx.exit(1)
@@ -242,6 +281,71 @@ def compare(recording: Path, as_json: bool, **options: Any) -> None:
         _show(comparison_table(compared))
 
 
+@cli.command("effects")
+@click.argument("names", nargs=-1, metavar="[NAME]...")
+@click.option("--axes", default="y z x", show_default=True, help="Gimbal axes of the bench, outer to inner.")
+@click.option("--latitude", type=click.FloatRange(-90, 90), default=50.0, show_default=True, help="Latitude, deg.")
+@effects_from_option
+@json_option
+def list_effects(
+    names: tuple[str, ...], axes: str, latitude: float, effects_from: tuple[Path, ...], as_json: bool
+) -> None:
+    """The effects a model may have: all of the catalogue and your own, or those NAMEd (formulas too) in detail."""
+    from kf_calib.bench import Bench, normal_gravity, parse_axes
+    from kf_calib.effects import effect_named, load_file
+    from kf_calib.effects import names as known
+    from kf_calib.views import catalogue
+
+    for path in effects_from:
+        load_file(path)
+    bench = Bench(parse_axes(axes), normal_gravity(latitude), latitude_deg=latitude)
+    chosen = [effect_named(name, bench) for name in names or known(bench)]
+    if as_json:
+        _print_json(catalogue.effects_object(chosen))
+    else:
+        _show(catalogue.details(chosen) if names else catalogue.overview(chosen))
+
+
+def _list_hidden(ctx: click.Context, _: click.Parameter, texts: tuple[str, ...]) -> tuple[str, ...]:
+    """``--hide help`` prints what can be hidden, and ends."""
+    if "help" in texts:
+        _show(_hidden_table())
+        ctx.exit()
+    return texts
+
+
+def _hidden_table() -> RenderableType:
+    """Every kind of hidden effect, in two lines or more."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Group
+    from rich.table import Table
+
+    from kf_calib.sources.hidden import INNER, catalogue
+
+    kinds = catalogue().values()
+    table = Table(title=f"{len(kinds)} effects to hide", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("effect\nwhat it is", min_width=26)
+    for heading in ("in the\ncatalogue", "SI unit\ncoefficients", "constants", "navigation grade\nMEMS"):
+        table.add_column(heading, no_wrap=True)
+    for kind in kinds:
+        names = kind.coefficients if len(kind.coefficients) < 7 else (*kind.coefficients[:2], "...")
+        constants = [f"{name}={value:.4g} {INNER[name].unit}" for name, value in kind.inner.items()]
+        sizes = [" to ".join(dict.fromkeys(sizes)) for sizes in (kind.navigation, kind.mems)]
+        table.add_row(
+            f"{kind.name}{':AXIS' * kind.per_axis}\n{kind.title}", "yes" if kind.known else "no",
+            f"{kind.unit}\n{' '.join(names)}", "\n".join(constants), "\n".join(sizes),
+        )  # fmt: skip
+    return Group(table, _HOW_TO_HIDE)
+
+
+_HOW_TO_HIDE = """\
+--hide NAME=SIZE: one size for all coefficients, with signs drawn from the seed, or SIZE,SIZE,... one for each;
+constants after semicolons: 'warm-up=20ug;tau=600'. Without :AXIS an effect is on every gimbal axis.
+SIZE: a number in the SI unit, one with a unit (4ug/g^2), or 10sigma: 10 times what the noise of the run leaves
+uncertain, after what the twelve parameters absorb.
+--hide random, random-known (in the catalogue), random-unknown (not in it), also with =10sigma: drawn from the seed."""
+
+
 def simulation_options(command: F) -> F:
     """What the simulated bench is and does."""
     options = [
@@ -269,9 +373,19 @@ def simulation_options(command: F) -> F:
         click.option("--encoder-step", "encoder_step_deg", type=float, help="Resolution of the encoders, deg."),
         click.option("--outlier-rate", type=float, help="Share of readings that are outliers."),
         click.option("--outlier-size", "outlier_mps2", type=float, help="Size of an outlier, m/s^2."),
-        click.option("--hide", "hidden", multiple=True, metavar="NAME=SIZE",
-                     help="Hide an effect in the truth, for example second-order=4ug/g^2, or random; repeatable."),
-        click.option("--temperature-swing", "swing_c", type=float, default=0.0, help="Swing of the temperature, K."),
+        click.option("--hide", "hidden", multiple=True, metavar="NAME=SIZE", is_eager=True, callback=_list_hidden,
+                     help="Hide an effect in the truth, for example second-order=4ug/g^2, second-order=10sigma (10 "
+                     "times what noise leaves uncertain), random or random=10sigma; repeatable; help lists them all."),
+        click.option("--temperature", "constant_c", type=float, default=25.0, show_default=True,
+                     help="Temperature about which it swings, degC."),
+        click.option("--temperature-swing", "swing_c", type=float, default=0.0, show_default=True,
+                     help="Swing of the temperature to either side, K."),
+        click.option("--temperature-period-s", "period_s", type=float, default=3600.0, show_default=True,
+                     help="Period of that swing, s."),
+        click.option("--warm-up-c", "warm_up_c", type=float, default=0.0, show_default=True,
+                     help="How much colder the start is, K."),
+        click.option("--warm-up-s", "warm_up_s", type=float, default=1800.0, show_default=True,
+                     help="Time constant of the warming up, s."),
         click.option("--unstated", is_flag=True, help="Do not state the setting error and scatter in the recording."),
         click.option("--seed", type=int, default=0, show_default=True, help="Seed of sensors, plan and noise."),
     ]  # fmt: skip
@@ -282,9 +396,10 @@ def simulation_options(command: F) -> F:
 
 def _simulation(options: Mapping[str, Any]) -> Simulation:
     from dataclasses import fields, replace
+    from functools import partial
 
     from kf_calib.bench import Bench, parse_axes
-    from kf_calib.sources.hidden import parse
+    from kf_calib.sources.hidden import parse, sized
     from kf_calib.sources.physics import Ambient
     from kf_calib.sources.sensors import GRADES
     from kf_calib.sources.simulator import Simulation
@@ -299,13 +414,15 @@ def _simulation(options: Mapping[str, Any]) -> Simulation:
         keys.setdefault("angle_sigma_deg", repr(noise.setting_sigma_deg))
         keys.setdefault("scatter_sigma_mps2", repr(float((noise.scatter_mps2**2 + noise.flicker_mps2**2) ** 0.5)))
     axes = parse_axes(keys["axes"])
-    return Simulation(
+    ambient = Ambient(**{field.name: options[field.name] for field in fields(Ambient) if field.name in options})
+    run = Simulation(
         Bench.from_metadata(keys), grade.sensors(options["seed"]), noise, _visits(options, axes),
         sample_hz=options["sample_hz"], angle_hz=options["angle_hz"], slew_rate_degps=options["slew_degps"],
-        ambient=Ambient(swing_c=options["swing_c"], period_s=3600.0),
-        seed=options["seed"], grade=options["grade"],
-        hidden=parse(options["hidden"], axes, seed=options["seed"], grade=options["grade"]),
+        ambient=ambient, seed=options["seed"], grade=options["grade"],
     )  # fmt: skip
+    return run.hiding(
+        parse(options["hidden"], axes, seed=options["seed"], grade=options["grade"], sized=partial(sized, run))
+    )
 
 
 def _visits(options: Mapping[str, Any], axes: tuple[Vector, ...]) -> list[Visit]:

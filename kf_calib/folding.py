@@ -16,8 +16,8 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench import Bench
-from kf_calib.effects import Stimulus
-from kf_calib.model import Model, Nodes, Rows, basis, parabola
+from kf_calib.effects import Effect, Stimulus
+from kf_calib.model import Model, Nodes, Rows, basis, effect_columns, parabola
 from kf_calib.samples import Floats, Mask
 from kf_calib.triangle import triangle
 
@@ -30,7 +30,10 @@ _CORRELATED_SAMPLES = 8192  # readings of a dwell whose autocovariance is accumu
 
 @dataclass(frozen=True)
 class Autocovariance:
-    """Sums of lagged products of the innovations within blocks: products (L + 1, 3), pairs (L + 1,), blocks' n."""
+    """Sums of lagged products within blocks of readings less their parabola: products (L + 1, 3), pairs (L + 1,).
+
+    Without the parabola a drift would count as noise, and the test that should find it would be silenced.
+    """
 
     products: Floats = field(default_factory=lambda: np.zeros((_LAGS + 1, 3)))
     pairs: Floats = field(default_factory=lambda: np.zeros(_LAGS + 1))
@@ -49,6 +52,8 @@ class Autocovariance:
     def of(cls, innovation: Floats) -> Autocovariance:
         """Of innovations (3, n)."""
         count = innovation.shape[1]
+        curve = np.linalg.qr(basis(np.linspace(-1.0, 1.0, count)).T)[0]
+        innovation = innovation - (innovation @ curve) @ curve.T
         padded = 1 << (count + _LAGS).bit_length()
         spectrum = np.fft.rfft(innovation, padded, axis=1)
         products = np.zeros((_LAGS + 1, 3))
@@ -73,6 +78,23 @@ class DwellFactor:
     number: int
     pieces: tuple[Piece, ...]
     autocovariance: Autocovariance
+
+    @cached_property
+    def squares(self) -> Floats:
+        """Sums of squares of the readings about a parabola, (pieces, 3)."""
+        return np.array([(piece.triangle[3:, 3:] ** 2).sum(axis=0) for piece in self.pieces])
+
+    @cached_property
+    def counts(self) -> Floats:
+        """Readings of each piece, (pieces,)."""
+        return np.array([piece.count for piece in self.pieces], float)
+
+    @cached_property
+    def variances(self) -> Floats:
+        """Variance of the readings within each piece (pieces, 3), about a parabola; short pieces have their dwell's."""
+        squares, spare = self.squares, np.maximum(self.counts - 3.0, 0.0)[:, None]
+        pooled = squares.sum(axis=0) / max(spare.sum(), 1)
+        return np.where(spare >= 8, squares / np.maximum(spare, 1), pooled)
 
     @property
     def start_s(self) -> float:
@@ -161,12 +183,23 @@ def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> S
         pose=np.concatenate([each.pose for each in nodes]),
         temperature_c=np.concatenate([each.temperature_c for each in nodes]),
         sensitivity=state[:12].reshape(3, 4)[:, :3],
+        variance_mps2_2=np.repeat(np.concatenate([dwell.variances for dwell in dwells]), 3, axis=0),
     )
 
 
 def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[Floats]:
     """The model's columns at the nodes of each dwell, (pieces, 3 nodes, 3 channels, p)."""
-    columns = model.columns(stimulus_of(dwells, model.bench, state))
+    return _by_dwell(dwells, model.columns(stimulus_of(dwells, model.bench, state), state))
+
+
+def candidate_columns(
+    dwells: Sequence[DwellFactor], effects: Sequence[Effect], bench: Bench, state: Floats
+) -> list[Floats]:
+    """Columns of effects that are in no model yet, like ``columns_of``."""
+    return _by_dwell(dwells, effect_columns(effects, stimulus_of(dwells, bench, state)))
+
+
+def _by_dwell(dwells: Sequence[DwellFactor], columns: Floats) -> list[Floats]:
     ends = np.cumsum([3 * len(dwell.pieces) for dwell in dwells])
     return [part.reshape(-1, 3, *part.shape[1:]) for part in np.split(columns, ends[:-1])]
 
@@ -256,9 +289,3 @@ def informative(factors: Floats) -> Mask:
     """
     size = np.linalg.norm(factors[:, :WIDTH, :WIDTH], axis=2)
     return size > 1e-9 * size[:, :1]
-
-
-def within_squares(dwell: DwellFactor) -> tuple[Floats, int]:
-    """Residual sums of squares (3,) within a dwell, and how many model columns were fitted to get them."""
-    fitted = np.append(informative(dwell.factor[None])[0], [False] * 3)
-    return np.sum(dwell.factor[~fitted, WIDTH:] ** 2, axis=0), int(fitted.sum())

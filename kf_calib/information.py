@@ -92,17 +92,21 @@ def start(prior: Prior, model: Model) -> Floats:
 
 def predict(factor: Floats, walk_variance: Floats) -> Floats:
     """Time update: the three biases take a step of variance (3,), 0: none. SRIF form, valid for a singular factor."""
+    count = int((walk_variance > 0).sum())
+    return _walked(factor, walk_variance)[count:, count:] if count else factor
+
+
+def _walked(factor: Floats, walk_variance: Floats) -> Floats:
+    """Triangle [steps w | states | z] after a step of the biases: rows of w first, to be eliminated."""
     walking = np.flatnonzero(walk_variance > 0)
     count = len(walking)
-    if not count:
-        return factor
     biases = 4 * walking + 3
     width = len(factor)
     augmented = np.zeros((count + width, count + width + 1))
     augmented[:count, :count] = np.diag(1.0 / np.sqrt(walk_variance[walking]))
     augmented[count:, :count] = -factor[:, biases]
     augmented[count:, count:] = factor
-    return triangle(augmented)[count : count + width, count:]
+    return triangle(augmented)[: count + width]
 
 
 def update(factor: Floats, rows: Floats) -> Step:
@@ -111,8 +115,12 @@ def update(factor: Floats, rows: Floats) -> Step:
     upper = triangle(np.vstack([factor, rows]))
     after = upper[:width]
     gained = rank(after) - rank(factor)
-    informative_rows = int(np.linalg.matrix_rank(rows[:, :-1], rtol=1e-9)) if len(rows) else 0
-    return Step(after, float(upper[width, width] ** 2), informative_rows - gained)
+    return Step(after, float(upper[width, width] ** 2), row_rank(rows) - gained)
+
+
+def row_rank(rows: Floats) -> int:
+    """How many rows [H | z] of a dwell carry something of the model; the others are zeros."""
+    return int(rows[:, :-1].any(axis=1).sum())
 
 
 def run(first: Floats, rows: Iterable[Floats], walk_variances: Iterable[Floats]) -> list[Step]:
@@ -124,7 +132,44 @@ def run(first: Floats, rows: Iterable[Floats], walk_variances: Iterable[Floats])
     return steps
 
 
-def _scaled(factor: Floats) -> tuple[Floats, Floats]:
+def accumulated(rows: Sequence[Floats], walk_variances: Floats | None = None) -> Floats:
+    """The triangle [H | z] of all rows (a diffuse prior), the residual in its last row; the biases walk between dwells.
+
+    ``walk_variances`` (D, 3); without a walk all rows are folded at once.
+    """
+    if walk_variances is None or not walk_variances.any():
+        stacked = np.concatenate(rows)
+        return triangle(np.vstack([stacked, np.zeros((max(stacked.shape[1] - len(stacked), 0), stacked.shape[1]))]))
+    width = rows[0].shape[1]
+    factor, left = np.zeros((width - 1, width)), np.zeros((1, width))
+    for own, variance in zip(rows, walk_variances, strict=True):
+        upper = triangle(np.vstack([predict(factor, variance), own]))
+        factor, left[0, -1] = upper[:-1], np.hypot(left[0, -1], upper[-1, -1])
+    return np.vstack([factor, left])
+
+
+def log_likelihood(rows: Sequence[Floats], walk_variances: Floats) -> float:
+    """Restricted log-likelihood of the rows under a walk of the biases, up to a constant in the walk.
+
+    -1/2 (sum of squared residuals) - sum log(|R_ww| sigma_w) over the eliminated steps - log|R| of what is left.
+    """
+    width = rows[0].shape[1]
+    factor, total = np.zeros((width - 1, width)), 0.0
+    for own, variance in zip(rows, walk_variances, strict=True):
+        walking = variance > 0
+        count = int(walking.sum())
+        if count:
+            upper = _walked(factor, variance)
+            steps = np.abs(np.diag(upper)[:count]) * np.sqrt(variance[walking])
+            factor, total = upper[count:, count:], total - float(np.log(steps).sum())
+        upper = triangle(np.vstack([factor, own]))
+        factor, total = upper[:-1], total - 0.5 * float(upper[-1, -1] ** 2)
+    singular = np.linalg.svd(scaled(factor)[0], compute_uv=False)
+    sizes = np.log(scaled(factor)[1]).sum()
+    return total - float(np.log(singular[singular > 1e-9]).sum() + sizes)
+
+
+def scaled(factor: Floats) -> tuple[Floats, Floats]:
     """R in units in which its columns are of the same order, and those units (p,).
 
     One unit for all sensitivities and one for all biases: a column of rounding size must stay small.
@@ -139,7 +184,7 @@ def _scaled(factor: Floats) -> tuple[Floats, Floats]:
 
 def rank(factor: Floats, tolerance: float = 1e-9) -> int:
     """How many combinations of the states the factor determines."""
-    singular = np.linalg.svd(_scaled(factor)[0], compute_uv=False)
+    singular = np.linalg.svd(scaled(factor)[0], compute_uv=False)
     return int((singular > tolerance).sum())
 
 
@@ -148,7 +193,7 @@ def solve(factor: Floats, around: Floats, tolerance: float = 1e-9) -> tuple[Floa
 
     Undetermined combinations keep their value ``around``; their variance is not in the covariance.
     """
-    upper, scale = _scaled(factor)
+    upper, scale = scaled(factor)
     left, singular, right = np.linalg.svd(upper)
     seen = singular > tolerance
     inverse = (right[seen].T / singular[seen]) / scale[:, None]  # (p, rank)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -91,8 +91,10 @@ class Model:
         return model
 
     def __add__(self, effect: Effect) -> Model:
-        taken = {c.symbol: each for each in self.effects for c in each.coefficients}
-        for coefficient in effect.coefficients:
+        taken = {c.symbol: each for each in self.effects for c in _states_of(each)}
+        if any(str(each) == str(effect) for each in self.effects):
+            raise InputError(f"{effect} is in the model already: name it once, or take it out first.")
+        for coefficient in _states_of(effect):
             if coefficient.symbol in taken:
                 raise InputError(
                     f"{effect} cannot be added: {taken[coefficient.symbol]} in the model already has the coefficient "
@@ -108,8 +110,41 @@ class Model:
 
     @cached_property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        """Of all effects, in the order of the state after the twelve."""
-        return tuple(coefficient for effect in self.effects for coefficient in effect.coefficients)
+        """Of all effects, in the order of the state after the twelve; an effect's unknown comes after its own."""
+        return tuple(coefficient for effect in self.effects for coefficient in _states_of(effect))
+
+    @cached_property
+    def parts(self) -> dict[str, slice]:
+        """Where in the state each effect stands, by name."""
+        ends = np.cumsum([STATE_COUNT, *(len(_states_of(effect)) for effect in self.effects)]).tolist()
+        return {str(effect): slice(a, b) for effect, (a, b) in zip(self.effects, itertools.pairwise(ends), strict=True)}
+
+    @property
+    def walks(self) -> bool:
+        """Whether an effect lets the biases walk."""
+        return any(effect.walks for effect in self.effects)
+
+    @property
+    def unknowns(self) -> dict[int, Effect]:
+        """The effects with a constant to be found, by the place of its state."""
+        return {self.parts[str(each)].stop - 1: each for each in self.effects if each.unknown is not None}
+
+    def moved(self, state: Floats) -> Model:
+        """The model with its unknowns where ``state`` (p,) puts them: value times exp(state)."""
+        moved = {str(each): each.at(each.value * math.exp(state[k])) for k, each in self.unknowns.items()}
+        return replace(self, effects=tuple(moved.get(str(each), each) for each in self.effects))
+
+    def with_effect(self, effect: Effect) -> Model:
+        """The model with that effect in the place of the one of the same name."""
+        return replace(self, effects=tuple(effect if str(each) == str(effect) else each for each in self.effects))
+
+    def natural(self, state: Floats) -> tuple[Floats, Floats]:
+        """Values of the effects' coefficients (q,) at ``state`` (p,), and how much of each a unit of its state is."""
+        values, gains = state[STATE_COUNT:].copy(), np.ones(len(state) - STATE_COUNT)
+        for k, effect in self.unknowns.items():
+            values[k - STATE_COUNT] = effect.value * (1.0 + state[k])
+            gains[k - STATE_COUNT] = effect.value
+        return values, gains
 
     @property
     def count(self) -> int:
@@ -120,19 +155,35 @@ class Model:
         twelve = paper.state_of(paper.nominal(self.bench.nominal))
         return np.concatenate([twelve, np.zeros(len(self.coefficients))])
 
-    def columns(self, stimulus: Stimulus) -> Floats:
-        """H (m, 3, p): what each accelerometer reads per unit of each state."""
-        affine = np.zeros((len(stimulus), 3, STATE_COUNT))
+    def columns(self, stimulus: Stimulus, state: Floats) -> Floats:
+        """H (m, 3, p): what each accelerometer reads per unit of each state, linearised at ``state`` (p,)."""
+        out = np.zeros((len(stimulus), 3, self.count))
         for i in range(3):
-            affine[:, i, 4 * i : 4 * i + 3] = stimulus.force_mps2
-            affine[:, i, 4 * i + 3] = 1.0
-        if not self.effects:
-            return affine
-        added = np.concatenate([effect.columns(stimulus) for effect in self.effects], axis=2)
-        scales = np.array([coefficient.scale for coefficient in self.coefficients])
-        # what a large coefficient would not lift above rounding is nothing: a vertical axis cannot tilt gravity
-        added[np.abs(added) * scales < _ROUNDING_MPS2] = 0.0
-        return np.concatenate([affine, added], axis=2)
+            out[:, i, 4 * i : 4 * i + 3] = stimulus.force_mps2
+            out[:, i, 4 * i + 3] = 1.0
+        for effect in self.effects:
+            part = self.parts[str(effect)]
+            own = slice(part.start, part.start + len(effect.coefficients))
+            out[:, :, own] = effect_columns([effect], stimulus)
+            if effect.unknown is not None:
+                out[:, :, own.stop : part.stop] = effect.derivative(stimulus, state[own])
+        return out
+
+
+def effect_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
+    """What each accelerometer reads more per unit of each coefficient of the effects, (m, 3, q)."""
+    columns = np.concatenate([np.zeros((len(stimulus), 3, 0)), *(each.columns(stimulus) for each in effects)], axis=2)
+    scales = np.array([coefficient.scale for each in effects for coefficient in each.coefficients])
+    # what a large coefficient would not lift above rounding is nothing: a vertical axis cannot tilt gravity
+    columns[np.abs(columns) * scales < _ROUNDING_MPS2] = 0.0
+    return columns
+
+
+def _states_of(effect: Effect) -> tuple[Coefficient, ...]:
+    unknown = effect.unknown
+    if unknown is None:
+        return effect.coefficients
+    return *effect.coefficients, Coefficient(unknown.symbol, unknown.unit, 1.0, unknown.shown_unit, unknown.per_si)
 
 
 def dwell_map(state: Floats) -> Floats:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kf_calib.folding import Autocovariance, DwellFactor, Means, within_squares
+from kf_calib.folding import Autocovariance, DwellFactor, Means
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 
@@ -67,42 +67,41 @@ class Noise:
 
 
 def within_dwells(dwells: Sequence[DwellFactor]) -> Noise:
-    """sigma_w and kappa of each accelerometer, pooled over the dwells.
+    """sigma_w and kappa of each accelerometer, pooled over the pieces of the dwells.
 
-    The residual sum of squares of a dwell has expectation sigma^2 (n - kappa - c + 1): the fitted mean takes kappa, the
-    other of the c columns that vary within the dwell one each.
+    The sum of squares about a parabola has expectation sigma^2 (n - 3 kappa) over a piece of 40 kappa readings or more;
+    where there is none, sigma_w is that of the autocovariance.
     """
     total = dwells[0].autocovariance
     for dwell in dwells[1:]:
         total += dwell.autocovariance
-    inflation = np.array([_inflation(total, i) for i in range(3)])
-    squares, freedom = np.zeros(3), np.zeros(3)
-    for dwell in dwells:
-        own, columns = within_squares(dwell)
-        squares += own
-        freedom += np.maximum(dwell.count + 1 - columns - np.minimum(inflation, dwell.count), 0)
-    return Noise(np.sqrt(squares / np.maximum(freedom, 1.0)), inflation)
+    inflation, variance = np.array([_inflation(total, i) for i in range(3)]).T
+    squares, counts = (np.concatenate([getattr(each, key) for each in dwells]) for key in ("squares", "counts"))
+    long = counts[:, None] >= np.where(variance > 0, 40.0 * inflation, 0.0)
+    freedom = np.where(long, np.maximum(counts[:, None] - 3.0 * inflation, 0.0), 0.0).sum(axis=0)
+    pooled = np.where(long, squares, 0.0).sum(axis=0) / np.maximum(freedom, 1.0)
+    return Noise(np.sqrt(np.where(long.any(axis=0), pooled, variance)), inflation)
 
 
-def _inflation(total: Autocovariance, channel: int) -> float:
-    """kappa from an autoregression fitted to the autocovariance (Yule-Walker), its order chosen by BIC.
+def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
+    """kappa, and the variance, from an autoregression fitted to the autocovariance (Yule-Walker), its order by BIC.
 
     kappa = v / (gamma_0 (1 - sum a)^2), v the variance of the autoregression's innovations (Percival and Walden, 1993,
-    ch. 9). The autocovariance of readings less their block mean is low by kappa gamma_0 / n at every lag; that is
-    put back by iteration. Never below 1: a noise that averages faster than white is not relied on.
+    ch. 9). The autocovariance of readings less their block's parabola is low by 3 kappa gamma_0 / n at every lag, about;
+    that is put back by iteration. Never below 1: a noise that averages faster than white is not relied on.
     """
     if total.count < 64 or total.products[0, channel] <= 0:
-        return 1.0
+        return 1.0, 0.0
     mean_block = total.count / total.blocks
     lags = min(_MAX_ORDER, total.count // 16, int(mean_block) // 4)
     raw = total.products[: lags + 1, channel] / np.maximum(total.pairs[: lags + 1], 1.0)
-    kappa = 1.0
+    kappa, gamma = 1.0, raw
     for _ in range(10):
-        gamma = raw + kappa * raw[0] / max(mean_block - kappa, 1.0)
-        before, kappa = kappa, min(_autoregressive_inflation(gamma, total.count), mean_block / 4)
+        gamma = raw + 3.0 * kappa * raw[0] / max(mean_block - 3.0 * kappa, 1.0)
+        before, kappa = kappa, min(_autoregressive_inflation(gamma, total.count), mean_block / 12)
         if abs(kappa - before) < 1e-3 * kappa:
             break
-    return max(kappa, 1.0)
+    return max(kappa, 1.0), float(gamma[0])
 
 
 def _autoregressive_inflation(gamma: Floats, count: int) -> float:

@@ -20,8 +20,10 @@ LEVELS = [
     ["folding"],
     ["noise"],
     ["information", "kalman", "batch"],
+    ["scan"],
+    ["fitting"],
     ["calibration"],
-    ["comparison"],
+    ["comparison", "model_file"],
     ["views"],
     ["cli"],
 ]

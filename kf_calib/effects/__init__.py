@@ -1,29 +1,38 @@
 """The catalogue of physical effects: names, and how to make one.
 
 Nothing outside this package knows an effect's name. A class listed here is found by the command line, both engines,
-batch least squares, the views and the tests.
+batch least squares, the views and the tests; so is one that a user registers (``effects.user``), and a formula
+(``effects.formula``) wherever a name is asked for.
 """
 
 from __future__ import annotations
 
 import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 from kf_calib.bench import Bench
-from kf_calib.effects import drift, frame, sensor, thermal
-from kf_calib.effects.effect import Coefficient, Effect, FrameEffect, SensorEffect
+from kf_calib.effects import checks, drift, formula, frame, sensor, surroundings, thermal, user
+from kf_calib.effects.effect import Coefficient, Effect, FrameEffect, SensorEffect, Unknown
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 
-__all__ = ["Coefficient", "Effect", "FrameEffect", "SensorEffect", "Stimulus", "effect_named", "names"]
+__all__ = [
+    "Coefficient", "Effect", "FrameEffect", "SensorEffect", "Stimulus", "Unknown", "as_text", "effect_named",
+    "files_of", "load_file", "merged", "names", "refuse_unknown", "register", "remarks_of",
+]  # fmt: skip
 
 _PLAIN: dict[str, type[Effect]] = {
     kind.name: kind
     for kind in (
         sensor.BiasAsymmetry, sensor.ScaleAsymmetry, sensor.SecondOrder, sensor.ThirdOrder, sensor.OddQuadratic,
         sensor.CrossCouplingIP, sensor.CrossCouplingIO, sensor.CrossCouplingPO, sensor.CrossAxisSquare,
-        drift.BiasDrift, drift.ScaleDrift, drift.Hysteresis,
+        sensor.VibrationRectification, sensor.DeadZone,
+        drift.BiasDrift, drift.BiasWalk, drift.ScaleDrift, drift.WarmUp, drift.Settling, drift.Hysteresis,
         thermal.ThermalBias, thermal.ThermalBias2, thermal.ThermalScale, thermal.ThermalRate,
-        thermal.ThermalMisalignment,
+        thermal.ThermalMisalignment, thermal.ThermalLag, surroundings.Magnetic,
         frame.BaseTilt, frame.BaseTiltDrift, frame.PlatformDrift, frame.GravityError,
         frame.EarthRotation, frame.Flexure, frame.CrossTalk,
     )
@@ -37,28 +46,145 @@ _OF_A_GIMBAL = {
 }  # fmt: skip
 
 
-def _letters(bench: Bench) -> str:
-    """A letter for each gimbal: its axis, or ? where it is none of x, y, z."""
-    return "".join(
-        "xyz"[max(range(3), key=lambda k, a=axis: abs(a[k]))] if 1.0 in map(abs, axis) else "?" for axis in bench.axes
-    )
+@dataclass(frozen=True)
+class _Registered:
+    """A user's class; where it came from, in words and, if from a file, as a path; what its checks had to say."""
+
+    kind: type[Effect]
+    origin: str
+    file: Path | None
+    remarks: tuple[str, ...]
+
+
+_registered: dict[str, _Registered] = {}
 
 
 def names(bench: Bench) -> list[str]:
-    """Every effect of the catalogue that this bench can have, axis-wise ones with their axis after a colon."""
-    letters = _letters(bench)
+    """Every effect known that this bench can have: the catalogue's, axis-wise ones with their axis after a colon,
+    then registered ones."""
+    letters = formula.gimbal_letters(bench.axes)
     variants = [letter if letters.count(letter) == 1 else str(k + 1) for k, letter in enumerate(letters)]
     plain = [name for name in _PLAIN if name != frame.EarthRotation.name or bench.latitude_deg is not None]
-    return [*plain, *(f"{name}:{variant}" for name in _OF_A_GIMBAL for variant in variants)]
+    _register_installed()
+    return [*plain, *(f"{name}:{variant}" for name in _OF_A_GIMBAL for variant in variants), *_registered]
 
 
 def effect_named(text: str, bench: Bench) -> Effect:
-    """The effect of that name; raises InputError, with near names, where there is none."""
+    """The effect of that name, or that ``NAME = FORMULA``; raises InputError, with near names, where there is none."""
     name, _, variant = text.partition(":")
+    if "=" in text:
+        return _formula(text, bench)
     if name in _PLAIN and not variant:
         return _PLAIN[name]()
     if name in _OF_A_GIMBAL and variant:
-        return _OF_A_GIMBAL[name](frame.gimbal_number(variant, _letters(bench)), variant)
-    near = difflib.get_close_matches(text, names(bench), n=3, cutoff=0.4)
-    hint = f"did you mean {' or '.join(near)}?" if near else f"the catalogue has {', '.join(names(bench))}."
-    raise InputError(f"no effect is called {text!r}: {hint}")
+        letters = formula.gimbal_letters(bench.axes)
+        return _OF_A_GIMBAL[name](frame.gimbal_number(variant, letters), variant)
+    if text not in _registered:
+        _register_installed()
+    if text in _registered:
+        return _registered[text].kind()
+    raise _unknown(text, names(bench))
+
+
+def refuse_unknown(text: str) -> None:
+    """Raise InputError where no bench whatever could have an effect of that name."""
+    if "=" in text:
+        formula.split(text)
+        return
+    _register_installed()
+    known = [*_PLAIN, *_OF_A_GIMBAL, *_registered]
+    if text.partition(":")[0] not in known:
+        raise _unknown(text, known)
+
+
+def _unknown(text: str, known: list[str]) -> InputError:
+    near = difflib.get_close_matches(text, known, n=3, cutoff=0.4)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"the catalogue has {', '.join(known)}."
+    return InputError(f"no effect is called {text!r}: {hint}")
+
+
+def _formula(text: str, bench: Bench) -> Effect:
+    name, _ = formula.split(text)
+    origin = "the catalogue" if name in (*_PLAIN, *_OF_A_GIMBAL) else None
+    origin = _registered[name].origin if name in _registered else origin
+    if origin:
+        raise InputError(
+            f"{name} is the name of an effect of {origin}: call the formula otherwise, say my-{text.strip()}."
+        )
+    effect = formula.formula(text.strip(), bench.axes, bench.gravity_mps2)
+    user.refuse_symbols(effect, _catalogue_symbols())
+    return effect
+
+
+@cache
+def _catalogue_symbols() -> dict[str, str]:
+    """Symbols of all coefficients and unknowns of the catalogue, with the effect each belongs to."""
+    known = [kind() for kind in _PLAIN.values()]
+    known += [kind(0, axis) for kind in _OF_A_GIMBAL.values() for axis in ("x", "y", "z", "1", "2", "3")]
+    found = {coefficient.symbol: str(effect) for effect in known for coefficient in effect.coefficients}
+    return found | {effect.unknown.symbol: str(effect) for effect in known if effect.unknown is not None}
+
+
+def register(kind: type[Effect], origin: str = "this program", file: Path | None = None) -> type[Effect]:
+    """Let a user's class into the catalogue, completed and checked; a decorator of it, too.
+
+    Raises InputError, in one sentence, where its name or symbols are taken or a check fails.
+    """
+    kind = user.completed(kind, origin)
+    name, known = kind.name, _registered.get(kind.name)
+    if known is not None and known.kind is kind:
+        return kind
+    if name in _PLAIN or name in _OF_A_GIMBAL:
+        raise InputError(
+            f"{origin}: the catalogue already has an effect {name}: call this one otherwise, say my-{name}."
+        )
+    if known is not None:
+        both = f"{origin} defines" if known.origin == origin else f"{known.origin} and {origin} both define"
+        raise InputError(f"{both} an effect {name}: rename one of the two, or leave one out.")
+    effect = user.made(kind, origin)
+    said = checks.check(effect)
+    user.refuse_symbols(effect, _catalogue_symbols())
+    _registered[name] = _Registered(kind, origin, file, said)
+    return kind
+
+
+def load_file(path: Path) -> list[str]:
+    """Register the effect classes of a Python file; returns their names. A file loaded again replaces its classes."""
+    file = path.resolve()
+    for name in [name for name, known in _registered.items() if known.file == file]:
+        del _registered[name]
+    return [register(kind, str(path), file).name for kind in user.classes_in_file(path)]
+
+
+@cache
+def _register_installed() -> None:
+    for kind, origin in user.classes_installed():
+        register(kind, origin)
+
+
+def remarks_of(effect: Effect) -> tuple[str, ...]:
+    """What the checks of a user's class had to say of it, short of refusing it."""
+    known = _registered.get(str(effect))
+    return known.remarks if known is not None else ()
+
+
+def as_text(effect: Effect) -> str:
+    """What ``effect_named`` makes the same effect of."""
+    return effect.text if isinstance(effect, formula.Formula) else str(effect)
+
+
+def files_of(effects: Iterable[Effect]) -> list[Path]:
+    """The user's files that classes of these effects came from."""
+    known = (_registered.get(str(effect)) for effect in effects)
+    return list(dict.fromkeys(each.file for each in known if each is not None and each.file is not None))
+
+
+def merged(first: Iterable[str], second: Iterable[str]) -> tuple[str, ...]:
+    """Texts of effects, those of ``second`` left out that are in ``first``; spaces in formulas do not count."""
+    first = tuple(first)
+    there = {_bare(text) for text in first}
+    return (*first, *(text for text in second if _bare(text) not in there))
+
+
+def _bare(text: str) -> str:
+    return "".join(text.split())

@@ -1,10 +1,10 @@
-"""What changes with time: drift of bias and scale factor, history of the poses."""
+"""What changes with time: drift and walk of the bias, warm-up, settling after a step, oscillation."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from kf_calib.effects.effect import G, SensorEffect
+from kf_calib.effects.effect import Coefficient, Effect, G, SensorEffect, Unknown
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.samples import Floats
 
@@ -40,3 +40,50 @@ class Hysteresis(SensorEffect):
 
     def terms(self, s: Stimulus) -> Floats:
         return np.sign(np.where(np.abs(s.step) > 1e-6 * G, s.step, 0.0))
+
+
+class _Decay(SensorEffect):
+    """Something that dies away with a time constant, common to the three accelerometers."""
+
+    def __init__(self) -> None:
+        assert self.unknown is not None
+        self.value = float(np.sqrt(self.unknown.low * self.unknown.high))
+
+
+class WarmUp(_Decay):
+    """B exp(-t / tau), t since the first sample."""
+
+    name, title, source = "warm-up", "bias that settles after switching on", "IEEE Std 1293, turn-on transient"
+    confused_with = "bias-drift; needs an early long dwell"
+    symbol, unit, scale, shown = "B", "m/s^2", 1e-2, ("µg", 1e6 / G)
+    unknown = Unknown("tauWarm", "s", 30.0, 10800.0, "min", 1.0 / 60.0)
+
+    def terms(self, s: Stimulus) -> Floats:
+        return np.repeat(np.exp(-s.elapsed_s / self.value)[:, None], 3, axis=1)
+
+
+class Settling(_Decay):
+    """C Delta a_i exp(-tau / tau_0), tau since the arrival in the dwell, Delta a_i the last step of the input."""
+
+    name, title, source = "settling", "creep after a change of the input", "IEEE Std 1293, settling"
+    confused_with = "shows in early against late samples of a dwell"
+    symbol, unit, scale, shown = "C", "1", 1e-3, ("ppm", 1e6)
+    unknown = Unknown("tauSettle", "s", 3.0, 600.0, "s", 1.0)
+
+    def terms(self, s: Stimulus) -> Floats:
+        return s.step * np.exp(-s.since_arrival_s / self.value)[:, None]
+
+
+class BiasWalk(Effect):
+    """The integral of white noise in each bias: no column, but process noise of the filter."""
+
+    name, title, source = "bias-walk", "bias that walks at random", "IEEE Std 1293, annex on Allan variance"
+    confused_with = "bias-drift; scatter from dwell to dwell"
+    walks = True
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return ()
+
+    def columns(self, s: Stimulus) -> Floats:
+        return np.zeros((len(s), 3, 0))

@@ -7,9 +7,10 @@ common to the three accelerometers. A new effect is a class with a docstring and
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from kf_calib.effects.stimulus import Stimulus
 from kf_calib.samples import Floats
 
 G = 9.80665
+_STEP = 1e-4  # in ln(value)
 
 
 @dataclass(frozen=True)
@@ -30,18 +32,54 @@ class Coefficient:
     per_si: float
 
 
+@dataclass(frozen=True)
+class Unknown:
+    """A positive constant inside the columns (a time constant, a frequency), estimated with the coefficients.
+
+    low, high: the range it is looked for in. Its state is ln(value / current value), so that its sigma is a share of it.
+    """
+
+    symbol: str
+    unit: str
+    low: float
+    high: float
+    shown_unit: str
+    per_si: float
+
+    def grid(self, ratio: float = 1.5) -> Floats:
+        """Values from low to high in equal steps of the logarithm, each at most ``ratio`` times the one before."""
+        count = int(np.ceil(np.log(self.high / self.low) / np.log(ratio))) + 1
+        return np.geomspace(self.low, self.high, count)
+
+
 class Effect(ABC):
-    """A physical effect the readings may contain besides the twelve parameters."""
+    """A physical effect the readings may contain besides the twelve parameters.
+
+    unknown: a constant inside the columns; ``value`` is where it stands, and ``at(value)`` the effect with another.
+    walks: the biases take a random walk (process noise), its intensity is estimated by likelihood.
+    dynamic: it shows in slews only, so these are evaluated too.
+    """
 
     name: ClassVar[str]
     title: ClassVar[str]
     source: ClassVar[str]
     confused_with: ClassVar[str] = ""
+    unknown: ClassVar[Unknown | None] = None
+    walks: ClassVar[bool] = False
+    dynamic: ClassVar[bool] = False
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""
+    value: float = 0.0
 
     def __str__(self) -> str:
         return f"{self.name}:{self.variant}" if self.variant else self.name
+
+    def at(self, value: float) -> Self:
+        """The same effect with its unknown at ``value``, held within its range."""
+        other = copy.copy(self)
+        if self.unknown is not None:
+            other.value = float(np.clip(value, self.unknown.low, self.unknown.high))
+        return other
 
     @property
     @abstractmethod
@@ -50,6 +88,19 @@ class Effect(ABC):
     @abstractmethod
     def columns(self, s: Stimulus) -> Floats:
         """What each accelerometer reads more per unit of each coefficient: (m, 3, q), m/s^2."""
+
+    def derivative(self, s: Stimulus, coefficients: Floats) -> Floats:
+        """What each accelerometer reads more per unit of ln(value) with these ``coefficients`` (q,): (m, 3, 1).
+
+        Central differences: the step leaves 1e-8 of it, and the iteration it serves ends where it no longer matters.
+        """
+        more, less = (self._free(self.value * factor).columns(s) for factor in (np.exp(_STEP), np.exp(-_STEP)))
+        return ((more - less) @ coefficients / (2.0 * _STEP))[:, :, None]
+
+    def _free(self, value: float) -> Self:
+        other = copy.copy(self)
+        other.value = value
+        return other
 
 
 class SensorEffect(Effect):

@@ -10,14 +10,6 @@ from kf_calib.errors import InputError
 from kf_calib.samples import Floats
 
 ARCSEC = ("arcsec", np.degrees(1.0) * 3600.0)
-_NORTH_EAST = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _level_axes(s: Stimulus) -> Floats:
-    """North and East in the bench frame (2, 3)."""
-    azimuth = np.radians(s.bench.azimuth_deg)
-    cos, sin = np.cos(azimuth), np.sin(azimuth)
-    return _NORTH_EAST @ np.array([[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]])
 
 
 class BaseTilt(FrameEffect):
@@ -31,7 +23,7 @@ class BaseTilt(FrameEffect):
         return tuple(Coefficient(f"delta{axis}", "rad", 1e-3, *ARCSEC) for axis in "NE")
 
     def rotations(self, s: Stimulus) -> Floats:
-        return -np.stack([s.to_platform(axis) for axis in _level_axes(s)], axis=1)
+        return -np.stack([s.to_platform(axis) for axis in s.level_axes], axis=1)
 
 
 class BaseTiltDrift(BaseTilt):

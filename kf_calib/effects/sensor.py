@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kf_calib.effects.effect import G, SensorEffect
+from kf_calib.effects.effect import G, SensorEffect, Unknown
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.samples import Floats
 
@@ -106,3 +106,29 @@ class CrossAxisSquare(_CrossCoupling):
 
     def terms(self, s: Stimulus) -> Floats:
         return s.pendulous**2
+
+
+class VibrationRectification(SensorEffect):
+    """K2v <v^2>, <v^2> the variance of the readings within a piece of the dwell."""
+
+    name, title, source = "vibration-rectification", "shift of the bias under vibration", IEEE
+    confused_with = "needs vibration that varies"
+    symbol, unit, scale, shown = "K2v", "s^2/m", 1e-4, ("µg/g²", 1e6 * G)
+
+    def terms(self, s: Stimulus) -> Floats:
+        return np.broadcast_to(s.variance_mps2_2, (len(s), 3))
+
+
+class DeadZone(SensorEffect):
+    """-a_i where |a_i| < d: a share of 1 is a reading that stays where it is over the whole zone."""
+
+    name, title, source = "dead-zone", "no response to small inputs", IEEE
+    confused_with = "needs poses that sweep through zero"
+    symbol, unit, scale, shown = "Dz", "1", 1.0, ("of the input", 1.0)
+    unknown = Unknown("dZone", "m/s^2", 1e-6, 1e-2, "µg", 1e6 / G)
+
+    def __init__(self) -> None:
+        self.value = 1e-4
+
+    def terms(self, s: Stimulus) -> Floats:
+        return np.where(np.abs(s.along) < self.value, -s.along, 0.0)

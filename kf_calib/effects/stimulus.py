@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -21,7 +21,8 @@ class Stimulus:
     """The state of the bench at m instants of dwells.
 
     elapsed_s, since_arrival_s, temperature_c: (m,); force_mps2: specific force in the platform frame, and that of the
-    dwell before, (m, 3); pose (m, k); sensitivity (3, 3): rows K_i E_i at which small rotations are linearised.
+    dwell before, (m, 3); pose (m, k); sensitivity (3, 3): rows K_i E_i at which small rotations are linearised;
+    variance_mps2_2: variance of the readings about here, (m, 3).
     """
 
     bench: Bench
@@ -32,6 +33,7 @@ class Stimulus:
     pose: Floats
     temperature_c: Floats
     sensitivity: Floats
+    variance_mps2_2: Floats = field(default_factory=lambda: np.zeros((1, 3)))
 
     def __len__(self) -> int:
         return len(self.elapsed_s)
@@ -74,6 +76,31 @@ class Stimulus:
         after = np.minimum(self.elapsed_s + _RATE_WINDOW_S, times[-1])
         change = np.interp(after, times, self.warmth[first]) - np.interp(before, times, self.warmth[first])
         return change / np.maximum(after - before, 1e-9)
+
+    @property
+    def level_axes(self) -> Floats:
+        """North and East in the bench frame, (2, 3)."""
+        azimuth = np.radians(self.bench.azimuth_deg)
+        cos, sin = np.cos(azimuth), np.sin(azimuth)
+        return np.array([[cos, 0.0, -sin], [sin, 0.0, cos]])
+
+    def lagged_warmth(self, tau_s: float) -> Floats:
+        """L (m,), K: tau dL/dt = T - L, in balance at first; T passes smoothly through the middles of the pieces.
+
+        With equal steps h, r = h / tau: L_n = p L_(n-1) + (c - p) T_(n-1) + (1 - c) T_n, p = e^-r, c = (1 - p)/r.
+        """
+        from scipy.interpolate import Akima1DInterpolator
+        from scipy.signal import lfilter
+
+        times, first = np.unique(np.append(self.elapsed_s[1:-1:3], self.elapsed_s[[0, -1]]), return_index=True)
+        values = np.append(self.warmth[1:-1:3], self.warmth[[0, -1]])[first]
+        span = max(times[-1] - times[0], 1e-9)
+        grid = np.linspace(times[0], times[-1], int(np.clip(20.0 * span / tau_s, 1000, 20_000)))
+        ratio = (grid[1] - grid[0]) / tau_s
+        decay, mean = np.exp(-ratio), -np.expm1(-ratio) / ratio
+        warm = Akima1DInterpolator(times, values, method="makima")(grid)
+        lagged, _ = lfilter([1.0 - mean, mean - decay], [1.0, -decay], warm, zi=[mean * warm[0]])
+        return np.interp(self.elapsed_s, grid, lagged)
 
     def to_platform(self, vector: Floats) -> Floats:
         """A bench vector (3,) seen in the platform, (m, 3)."""

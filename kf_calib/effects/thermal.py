@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kf_calib.effects.effect import Coefficient, Effect, G, SensorEffect
+from kf_calib.effects.effect import Coefficient, Effect, G, SensorEffect, Unknown
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.samples import Floats
 
@@ -71,3 +71,18 @@ class ThermalMisalignment(Effect):
             out[:, i, 2 * i] = s.warmth * s.pendulous[:, i]
             out[:, i, 2 * i + 1] = s.warmth * s.output[:, i]
         return out
+
+
+class ThermalLag(SensorEffect):
+    """alpha L, tau dL/dt = T - L: the sensor follows the thermometer late, in balance at the first sample."""
+
+    name, title, source = "thermal-lag", "bias that follows the temperature late", IEEE
+    confused_with = "thermal-bias and thermal-rate together"
+    symbol, unit, scale, shown = "alphaL", "m/s^2/K", 1e-3, ("µg/K", 1e6 / G)
+    unknown = Unknown("tauLag", "s", 30.0, 7200.0, "min", 1.0 / 60.0)
+
+    def __init__(self) -> None:
+        self.value = 600.0
+
+    def terms(self, s: Stimulus) -> Floats:
+        return np.repeat(s.lagged_warmth(self.value)[:, None], 3, axis=1)

@@ -11,8 +11,7 @@ from decimal import Decimal
 from operator import mul
 
 from kf_calib.errors import InputError
-from kf_calib.samples import Batch
-from kf_calib.sources.line_parts import ACCEL_UNITS, TIME_DECIMALS, Account, LineError, Rows, stamp_ns
+from kf_calib.sources.line_parts import ACCEL_UNITS, TIME_DECIMALS, Account, LineError, LineReader, Rows, stamp_ns
 
 _ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
 _USUAL_GIMBALS = ("outer", "middle", "inner")
@@ -40,16 +39,17 @@ class _Columns:
         return list(map(mul, values, self.factors))
 
 
-class CsvLines:
+class CsvLines(LineReader):
     """Reads the rows under one header, block by block.
 
     ``columns`` renames foreign columns. Poses are gimbal angles (``has_angles``), or the quaternion qx qy qz qw.
     Raises InputError where the header does not say what is needed.
     """
 
+    _faults = ((ValueError, "a cell is not a number"), (ArithmeticError, "a cell is not a number"))
+
     def __init__(self, header: str, columns: Mapping[str, str], account: Account) -> None:
-        self.metadata: dict[str, str] = {}
-        self._account = account
+        super().__init__(account)
         self._delimiter = max(",;\t", key=header.count)
         self._names = [columns.get(name, name.lower()) for name in _cells(header, self._delimiter)]
         repeated = next((name for name in self._names if name and self._names.count(name) > 1), None)
@@ -69,20 +69,6 @@ class CsvLines:
     def advice(self) -> str:
         """How columns have to be named."""
         return f"a header such as {_EXAMPLE} is wanted"
-
-    def read(self, lines: Sequence[str], first_line: int) -> Batch:
-        """The batch of consecutive lines, the first of them of that number."""
-        accel, pose, temperature = Rows(), Rows(), Rows()
-        for number, line in enumerate(lines, start=first_line):
-            if not line or line.isspace():
-                continue
-            try:
-                self._read_line(line, accel, pose, temperature)
-            except LineError as error:
-                self._account.refuse(number, str(error))
-            except (ValueError, ArithmeticError):
-                self._account.refuse(number, "a cell is not a number")
-        return Batch(accel.stream(3), pose.stream(self.pose_width), temperature.stream(1))
 
     def _read_line(self, line: str, accel: Rows, pose: Rows, temperature: Rows) -> None:
         is_plain = '"' not in line and " " not in line

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from decimal import Decimal
 from typing import Any
 
-from kf_calib.samples import Batch
-from kf_calib.sources.line_parts import ACCEL_UNITS, TIME_DECIMALS, Account, LineError, Rows, stamp_ns
+from kf_calib.sources.line_parts import ACCEL_UNITS, TIME_DECIMALS, Account, LineError, LineReader, Rows, stamp_ns
 
 _ACCEL = {f"accel_{unit}": factor for unit, factor in ACCEL_UNITS.items()}
 _ANGLES = {"angles_rad": 1.0, "angles_deg": math.pi / 180.0}
@@ -21,40 +20,24 @@ _KNOWN = frozenset([*TIME_DECIMALS, *_ACCEL, *_ANGLES, _ATTITUDE, _TEMPERATURE])
 _decode_exactly = json.JSONDecoder(parse_float=Decimal).decode
 
 
-class JsonLines:
+class JsonLines(LineReader):
     """Reads JSON lines block by block.
 
     ``columns`` renames foreign keys. ``metadata`` is the first line's ``{"bench": ...}`` as strings. The first pose
     settles whether poses are angles (``has_angles``) and how many (``pose_width``, 0 until then).
     """
 
+    _faults = ((ValueError, "it is not JSON"), (RecursionError, "it is nested too deeply"))
+
     def __init__(self, columns: Mapping[str, str], account: Account) -> None:
-        self.metadata: dict[str, str] = {}
-        self.has_angles = True
-        self.pose_width = 0
-        self._columns, self._account = columns, account
+        super().__init__(account)
+        self._columns = columns
         self._is_first = True
 
     @property
     def advice(self) -> str:
         """How readings and poses have to be named."""
         return "name the readings accel_mps2 or accel_g, and the poses angles_rad, angles_deg or attitude_xyzw"
-
-    def read(self, lines: Sequence[str], first_line: int) -> Batch:
-        """The batch of consecutive lines, the first of them of that number."""
-        accel, pose, temperature = Rows(), Rows(), Rows()
-        for number, line in enumerate(lines, start=first_line):
-            if not line or line.isspace():
-                continue
-            try:
-                self._read_line(line, accel, pose, temperature)
-            except LineError as error:
-                self._account.refuse(number, str(error))
-            except ValueError:
-                self._account.refuse(number, "it is not JSON")
-            except RecursionError:
-                self._account.refuse(number, "it is nested too deeply")
-        return Batch(accel.stream(3), pose.stream(self.pose_width), temperature.stream(1))
 
     def _read_line(self, line: str, accel: Rows, pose: Rows, temperature: Rows) -> None:
         entry = json.loads(line)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
+from typing import ClassVar
 
 import numpy as np
 
-from kf_calib.samples import Stream
+from kf_calib.samples import Batch, Stream
 
 STANDARD_GRAVITY_MPS2 = 9.80665
 ACCEL_UNITS = {"mps2": 1.0, "g": STANDARD_GRAVITY_MPS2, "mg": STANDARD_GRAVITY_MPS2 / 1e3}
@@ -74,6 +76,47 @@ class Rows:
         if not self._stamps:
             return Stream.empty(width)
         return Stream(np.array(self._stamps, np.int64), np.array(self._values, float))
+
+
+class LineReader(ABC):
+    """Reads lines block by block; those that cannot be used are put down in the account.
+
+    ``metadata``: of the bench, as strings. ``has_angles``: poses are angles; ``pose_width``: numbers of one.
+    """
+
+    _faults: ClassVar[tuple[tuple[type[Exception], str], ...]]
+    """What reading a line may raise beside LineError, and the reason to give."""
+
+    def __init__(self, account: Account) -> None:
+        self.metadata: dict[str, str] = {}
+        self.has_angles = True
+        self.pose_width = 0
+        self._account = account
+
+    @property
+    @abstractmethod
+    def advice(self) -> str:
+        """How quantities have to be named."""
+
+    def read(self, lines: Sequence[str], first_line: int) -> Batch:
+        """The batch of consecutive lines, the first of them of that number."""
+        accel, pose, temperature = Rows(), Rows(), Rows()
+        faults = tuple(kind for kind, _ in self._faults)
+        for number, line in enumerate(lines, start=first_line):
+            if not line or line.isspace():
+                continue
+            try:
+                self._read_line(line, accel, pose, temperature)
+            except LineError as error:
+                self._account.refuse(number, str(error))
+            except faults as error:
+                reason = next(reason for kind, reason in self._faults if isinstance(error, kind))
+                self._account.refuse(number, reason)
+        return Batch(accel.stream(3), pose.stream(self.pose_width), temperature.stream(1))
+
+    @abstractmethod
+    def _read_line(self, line: str, accel: Rows, pose: Rows, temperature: Rows) -> None:
+        """Adds what one line holds, all of it or nothing; raises LineError or one of ``_faults``."""
 
 
 def stamp_ns(number: int | Decimal, decimals: int) -> int:

@@ -19,7 +19,7 @@ from kf_calib.errors import BenchError, InputError
 from kf_calib.samples import Batch
 from kf_calib.sources.csv_lines import CsvLines
 from kf_calib.sources.json_lines import JsonLines
-from kf_calib.sources.line_parts import Account
+from kf_calib.sources.line_parts import Account, LineReader
 
 _BLOCK_BYTES = 1 << 18
 _LONGEST_LINE_BYTES = 1 << 20
@@ -104,7 +104,7 @@ class Lines:
 class _Passage:
     """One reading of the lines, from the first to the last; iterated once."""
 
-    parser: JsonLines | CsvLines
+    parser: LineReader
 
     def __init__(self, name: str, stream: BinaryIO, size: int | None, columns: Mapping[str, str]) -> None:
         self.account = Account()

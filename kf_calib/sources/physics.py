@@ -7,14 +7,16 @@ the estimator. Hidden effects (``hidden``) are further steps between these.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from kf_calib.bench import Bench, Vector
+from kf_calib.errors import InputError
 from kf_calib.samples import Floats
 from kf_calib.sources.gimbals import attitude, between
 from kf_calib.sources.noise_sources import Process
@@ -34,6 +36,18 @@ class Ambient:
     warm_up_c: float = 0.0
     warm_up_s: float = 1800.0
     sigma_c: float = 0.01  # of the recorded values
+
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, astuple(self))):
+            raise InputError("a figure of the temperature is not a finite number: give one.")
+        for words, value_s in (("period of the temperature", self.period_s), ("warm-up time", self.warm_up_s)):
+            if not value_s > 0.0:
+                raise InputError(f"the {words} is {value_s:g} s: give a positive time.")
+        if self.sigma_c < 0.0:
+            raise InputError(f"the noise of the thermometer is {self.sigma_c:g} K: give zero or a positive number.")
+        coldest_c = self.constant_c - abs(self.swing_c) - max(self.warm_up_c, 0.0)
+        if coldest_c < -273.15:
+            raise InputError(f"the temperature falls to {coldest_c:g} degC, below absolute zero: give a warmer one.")
 
     def __call__(self, time_s: Floats) -> Floats:
         swing = self.swing_c * np.sin(2.0 * np.pi * time_s / self.period_s)

@@ -8,6 +8,7 @@ does not grow with the run.
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -23,7 +24,7 @@ from kf_calib.bench import Bench
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.samples import Batch, Floats, Stream, Times
 from kf_calib.sources.gimbals import Motion, attitude
-from kf_calib.sources.hidden import Hidden, Rig, Stage, steps_of
+from kf_calib.sources.hidden import Hidden, Rig, Stage, sizes_in_sigma, steps_of
 from kf_calib.sources.noise_sources import Noise, generator
 from kf_calib.sources.physics import (
     Ambient,
@@ -102,16 +103,27 @@ class Simulation:
             )
             self.fraction = last / len(self)
 
+    def hiding(self, hidden: Sequence[Hidden], noise: Noise | None = None) -> Simulation:
+        """The same run with these hidden effects in place of its own, and with other noise where some is given."""
+        other = copy.copy(self)
+        other.hidden, other.noise, other.fraction = tuple(hidden), noise or self.noise, 0.0
+        other.warnings = list[str]()
+        return other
+
     @property
     def truth(self) -> dict[str, Any]:
-        """What no estimator may see, for the side file: parameters by symbol (rad, 1, m/s^2), noise, seed, effects."""
+        """What no estimator may see, for the side file: parameters by symbol (rad, 1, m/s^2), noise, seed, effects.
+
+        ``size_sigma`` of an effect is worked out by further runs (``hidden.detectability``); None where it is not seen.
+        """
+        sizes = sizes_in_sigma(self, self.hidden)
         return {
             "grade": self.grade,
             "seed": self.seed,
             "parameters": dict(self.sensors.parameters),
             "noise": asdict(self.noise),
             "ambient": asdict(self.ambient),
-            "effects": [effect.truth for effect in self.hidden],
+            "effects": [effect.truth | {"size_sigma": n} for effect, n in zip(self.hidden, sizes, strict=True)],
         }
 
     def write_truth(self, recording: str | PathLike[str]) -> Path:

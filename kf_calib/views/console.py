@@ -11,8 +11,11 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from kf_calib import paper
 from kf_calib.calibration import Calibration, Parameter, format_p, orientations
 from kf_calib.comparison import Comparison
+from kf_calib.effects import Effect, as_text
+from kf_calib.model import Model
 
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
 
@@ -63,7 +66,7 @@ def effect_table(result: Calibration) -> Table:
         table.add_column(heading, justify="left" if heading in ("effect", "coefficient", "unit") else "right")
     for effect in result.model.effects:
         for k, coefficient in enumerate(effect.coefficients):
-            parameter, name = result.parameters[coefficient.symbol], str(effect) if k == 0 else ""
+            parameter, name = result.parameters[coefficient.symbol], as_text(effect) if k == 0 else ""
             if parameter.value is None or parameter.sigma is None:
                 table.add_row(name, symbol(parameter.symbol), "not seen")
                 continue
@@ -71,6 +74,36 @@ def effect_table(result: Calibration) -> Table:
             ratio = f"{parameter.value / parameter.sigma:.1f}"
             table.add_row(name, symbol(parameter.symbol), value, f"± {sigma}", parameter.shown_unit, ratio)
     return table
+
+
+def model_table(model: Model) -> Table:
+    """The twelve parameters and every effect of a model: symbols, unit, and the size a prior would call large."""
+    table = Table(title="Model", title_justify="left")
+    for heading in ("effect", "what it is", "coefficient", "unit", "prior scale"):
+        table.add_column(heading)
+    about = "misalignments, scale factors and biases", f"{symbol(paper.SYMBOLS[0])} ... {paper.SYMBOLS[-1]}"
+    table.add_row("twelve parameters", *about, "rad, 1, m/s^2", "as stated", end_section=True)
+    for effect in model.effects:
+        rows = effect_rows(effect) or [("", "", "")]
+        for k, row in enumerate(rows):
+            name = (str(effect), effect.title) if k == 0 else ("", "")
+            table.add_row(*name, *row, end_section=k == len(rows) - 1)
+    return table
+
+
+def effect_rows(effect: Effect) -> list[tuple[str, str, str]]:
+    """Symbol, SI unit and scale of each coefficient; a constant inside the columns with its range."""
+    rows = [
+        (
+            symbol(c.symbol),
+            c.unit,
+            f"{c.scale * c.per_si:.3g} {c.shown_unit}" if c.shown_unit != "1" else f"{c.scale:.3g}",
+        )
+        for c in effect.coefficients
+    ]
+    if (u := effect.unknown) is not None:
+        rows.append((symbol(u.symbol), u.unit, f"{u.low * u.per_si:.3g} to {u.high * u.per_si:.3g} {u.shown_unit}"))
+    return rows
 
 
 def noise_table(result: Calibration) -> Table:

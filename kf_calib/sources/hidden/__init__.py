@@ -15,6 +15,8 @@ Conventions, the same for every effect:
 * One number is the size of every coefficient of the effect, with signs drawn from the seed where signs matter; as many
   numbers as coefficients are taken as they stand. A gimbal axis stands after a colon (its letter, its number from the
   outer one, ``outer`` or ``inner``); without one the effect is on every axis. Other constants follow after semicolons.
+* A size may be given in sigma, ``second-order=10sigma``: n times what the noise of the run leaves uncertain, after what
+  the twelve parameters absorb (``detectability``); ``parse`` then needs ``sized``, which knows the run.
 * Size zero: the effect is absent, and the samples are bit for bit those of a run without it.
 
 One file a family: ``sensor``, ``thermal``, ``drift``, ``history``, ``gimbal``, ``surroundings``, ``electronics`` hold
@@ -28,10 +30,14 @@ from __future__ import annotations
 from kf_calib.sources.hidden import surroundings, gimbal, thermal, sensor, drift, history, outside, electronics
 
 # isort: on
-from kf_calib.sources.hidden.kinds import Hidden, Kind, Rig, Stage, catalogue, steps_of
+from kf_calib.sources.hidden.detectability import NoSizeError, sized, sizes_in_sigma
+from kf_calib.sources.hidden.kinds import INNER, Hidden, Kind, Rig, Stage, catalogue, steps_of
 from kf_calib.sources.hidden.text import parse
 from kf_calib.sources.hidden.units import si
 
 FAMILIES = (surroundings, gimbal, sensor, thermal, drift, history, outside, electronics)
 
-__all__ = ["FAMILIES", "Hidden", "Kind", "Rig", "Stage", "catalogue", "parse", "si", "steps_of"]
+__all__ = [
+    "FAMILIES", "INNER", "Hidden", "Kind", "NoSizeError", "Rig", "Stage", "catalogue", "parse", "si", "sized",
+    "sizes_in_sigma", "steps_of",
+]  # fmt: skip

@@ -44,7 +44,7 @@ def bias_walk(q: Floats, rig: Rig) -> Step:
     return Disturbance(lambda count: q * walk(count))
 
 
-@made("vibration-rectification", "1/(m/s^2)", ("10ug/g^2", "50ug/g^2"), ("0.1mg/g^2", "3mg/g^2"))
+@made("vibration-rectification", "1/(m/s^2)", ("10ug/g^2", "50ug/g^2"), ("0.1mg/g^2", "3mg/g^2"), accompanied=True)
 def vibration_rectification(
     k: Floats, rig: Rig, *, rms: float = 3.0, frequency: float = 33.7, period: float = 170.0
 ) -> Step:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -76,7 +76,8 @@ class Kind:
 
     unit: of a coefficient. coefficients: their names, one for each size. navigation, mems: typical sizes, from ... to,
     in units of data sheets. make: (coefficients, rig, gimbal axis where ``per_axis``, inner constants) -> step.
-    signed: false where a coefficient cannot be negative. known: it is in the catalogue of the diagnosis.
+    signed: false where a coefficient cannot be negative. known: it is in the catalogue of the diagnosis. accompanied:
+    something comes with the effect whatever its size, and does not count to its size in sigma.
     """
 
     name: str
@@ -92,6 +93,7 @@ class Kind:
     signed: bool = True
     per_axis: bool = False
     known: bool = True
+    accompanied: bool = False
 
     def typical(self, grade: str) -> tuple[float, float]:
         """Typical sizes, least and greatest, in SI; the paper's sensors are of navigation grade."""
@@ -127,6 +129,10 @@ class Hidden:
             "inner": {name: {"value": value, "unit": INNER[name].unit} for name, value in self._inner.items()},
             "physics": self.kind.physics,
         }
+
+    def scaled(self, factor: float) -> Hidden:
+        """The same with every coefficient times a number."""
+        return replace(self, sizes=tuple(factor * size for size in self.sizes))
 
     def step(self, rig: Rig) -> Step:
         """The step in the chain, fresh from its start."""
@@ -167,6 +173,7 @@ def made(
     signed: bool = True,
     per_axis: bool = False,
     known: bool = True,
+    accompanied: bool = False,
 ) -> Callable[[Callable[..., Step]], Callable[..., Step]]:
     """Registers a maker of steps. Its docstring is "Title: physics (source)."; its keyword-only arguments are the inner
     constants with their usual values."""
@@ -178,8 +185,8 @@ def made(
         inner = {item.name: float(item.default) for item in parameters if item.kind is item.KEYWORD_ONLY}
         typical = navigation, mems or navigation
         _KINDS[name] = Kind(
-            name, unit, stage, coefficients, *typical, make, inner, title, physics, signed, per_axis, known
-        )
+            name, unit, stage, coefficients, *typical, make, inner, title, physics, signed, per_axis, known, accompanied
+        )  # fmt: skip
         return make
 
     return register

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
-from collections.abc import Iterable, Mapping, Sequence
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from kf_calib.bench import Vector
 from kf_calib.errors import InputError
+from kf_calib.sources.hidden.detectability import NoSizeError
 from kf_calib.sources.hidden.kinds import INNER, Hidden, Kind, catalogue
 from kf_calib.sources.hidden.units import si
 from kf_calib.sources.noise_sources import generator
@@ -16,21 +20,39 @@ from kf_calib.sources.noise_sources import generator
 RANDOM = {"random": (True, False), "random-known": (True,), "random-unknown": (False,)}
 """What may be drawn: effects that are in the catalogue of the diagnosis (True), and those that are not."""
 
+Sizer = Callable[[Hidden, float], Hidden]
+"""Makes an effect so many sigma large, all coefficients times one number; raises NoSizeError where none does."""
 
-def parse(texts: Iterable[str], axes: Sequence[Vector], *, seed: int = 0, grade: str = "navigation") -> list[Hidden]:
-    """Effects from texts ``NAME[:AXIS]=SIZE[,SIZE...][;CONSTANT=VALUE...]``, or ``random``.
+_DRAWS = 100
+
+
+def parse(
+    texts: Iterable[str],
+    axes: Sequence[Vector],
+    *,
+    seed: int = 0,
+    grade: str = "navigation",
+    sized: Sizer | None = None,
+) -> list[Hidden]:
+    """Effects from texts ``NAME[:AXIS]=SIZE[,SIZE...][;CONSTANT=VALUE...]``, or ``random[=SIZE]``.
 
     axes: of the gimbals. seed: of the signs where one size is given, and of what ``random`` draws, an effect with
     sizes typical of the grade: ``random-known`` one of the catalogue of the diagnosis, ``random-unknown`` another.
-    Examples: ``second-order=4e-5``, ``second-order=4ug/g^2,0,0``, ``encoder-harmonic-2:z=2e-5``,
-    ``warm-up=1e-4;tau=600``.
+    sized: takes sizes in sigma, which need to know the run; ``random`` with one draws until an effect can have it.
+    Examples: ``second-order=4e-5``, ``second-order=4ug/g^2,0,0``, ``second-order=10sigma``, ``random=10sigma``,
+    ``encoder-harmonic-2:z=2e-5``, ``warm-up=1e-4;tau=600``.
     """
     effects = list[Hidden]()
     for number, text in enumerate(texts):
-        if text.strip() in RANDOM:
-            effects.append(_drawn(RANDOM[text.strip()], axes, seed, number, grade, {effect.name for effect in effects}))
+        pool, equals, size = (part.strip() for part in text.partition("="))
+        if pool in RANDOM:
+            resized = _resizing(_sigmas(size), sized)
+            if equals and resized is None:
+                raise InputError(f"{pool} takes a size in sigma or none, not {size!r}: write {pool}=10sigma or {pool}.")
+            taken = {effect.name for effect in effects}
+            effects.append(_drawn(RANDOM[pool], axes, seed, number, grade, taken, resized))
         else:
-            effects += _read(text, axes, seed)
+            effects += _read(text, axes, seed, grade, sized)
     names = [effect.name for effect in effects]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
@@ -47,7 +69,30 @@ def axis_names(axes: Sequence[Vector]) -> list[str]:
     ]
 
 
-def _read(text: str, axes: Sequence[Vector], seed: int) -> list[Hidden]:
+def _sigmas(text: str) -> float | None:
+    """n of ``n sigma``; None of a text that is no such size."""
+    number, word, _ = text.partition("sigma")
+    if not word:
+        return None
+    try:
+        sigmas = float(number) if text.strip().endswith(word) else math.nan
+    except ValueError:
+        sigmas = math.nan
+    if not 0.0 < sigmas < math.inf:
+        raise InputError(f"{text.strip()!r} is no size in sigma: give one positive number, for example 10sigma.")
+    return sigmas
+
+
+def _resizing(sigmas: float | None, sized: Sizer | None) -> Callable[[Hidden], Hidden] | None:
+    """What makes an effect ``sigmas`` large; None where no size in sigma is given."""
+    if sigmas is None:
+        return None
+    if sized is None:
+        raise InputError(f"a size of {sigmas:g} sigma needs a run to be worked out on: give a size with a unit.")
+    return lambda effect: sized(effect, sigmas)
+
+
+def _read(text: str, axes: Sequence[Vector], seed: int, grade: str, sized: Sizer | None) -> list[Hidden]:
     head, *constants = text.split(";")
     label, equals, numbers = head.partition("=")
     name, colon, axis = (part.strip() for part in label.partition(":"))
@@ -56,12 +101,15 @@ def _read(text: str, axes: Sequence[Vector], seed: int) -> list[Hidden]:
     kind = _kind(name)
     if colon and not kind.per_axis:
         raise InputError(f"{name} belongs to no gimbal axis: leave out {':' + axis!r}.")
-    given = [si(number) for number in numbers.split(",")]
+    resized = _resizing(_sigmas(numbers), sized)
+    given = [math.sqrt(math.prod(kind.typical(grade)))] if resized else [si(number) for number in numbers.split(",")]
     inner = _inner(kind, constants)
-    if not kind.per_axis:
-        return [Hidden(kind, _sizes(kind, given, seed, name), inner)]
-    chosen, names = _axes_meant(axis, axes), axis_names(axes)
-    return [Hidden(kind, _sizes(kind, given, seed, f"{name} {k}"), inner, k, names[k]) for k in chosen]
+    if kind.per_axis:
+        chosen, names = _axes_meant(axis, axes), axis_names(axes)
+        effects = [Hidden(kind, _sizes(kind, given, seed, f"{name} {k}"), inner, k, names[k]) for k in chosen]
+    else:
+        effects = [Hidden(kind, _sizes(kind, given, seed, name), inner)]
+    return [resized(effect) for effect in effects] if resized else effects
 
 
 def _kind(name: str) -> Kind:
@@ -116,9 +164,25 @@ def _axes_meant(word: str, axes: Sequence[Vector]) -> list[int]:
 
 
 def _drawn(
-    known: Sequence[bool], axes: Sequence[Vector], seed: int, number: int, grade: str, taken: set[str]
+    known: Sequence[bool],
+    axes: Sequence[Vector],
+    seed: int,
+    number: int,
+    grade: str,
+    taken: set[str],
+    resized: Callable[[Hidden], Hidden] | None,
 ) -> Hidden:
-    """An effect that is not ``taken``: kind and axis evenly, sizes and constants evenly in their logarithm."""
+    """An effect that is not ``taken`` and, where a size in sigma is asked for, can have it."""
+    for effect in itertools.islice(_draws(known, axes, seed, number, grade), _DRAWS):
+        if effect.name in taken:
+            continue
+        with contextlib.suppress(NoSizeError):
+            return resized(effect) if resized else effect
+    raise InputError("no effect that was drawn can be seen with these orientations: give one by name, with a unit.")
+
+
+def _draws(known: Sequence[bool], axes: Sequence[Vector], seed: int, number: int, grade: str) -> Iterator[Hidden]:
+    """Effects without end: kind and axis evenly, sizes and constants evenly in their logarithm."""
     rng = generator(seed, f"hidden random {number}")
     kinds = [kind for kind in catalogue().values() if kind.known in known]
     while True:
@@ -131,6 +195,4 @@ def _drawn(
             for name, value in kind.inner.items()
         }
         axis_name = axis_names(axes)[axis] if kind.per_axis else ""
-        effect = Hidden(kind, tuple((size * signs).tolist()), inner, axis, axis_name)
-        if effect.name not in taken:
-            return effect
+        yield Hidden(kind, tuple((size * signs).tolist()), inner, axis, axis_name)

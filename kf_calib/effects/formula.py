@@ -1,0 +1,166 @@
+"""A user's own effect as a formula over what the bench does: ``mine = fx*fy*T``.
+
+One coefficient for each accelerometer, ``mine1 mine2 mine3``; reading i is ``mine_i`` times the formula larger. The
+quantities (f and a without accelerometer errors, all in SI units):
+
+=================  =======  ============================================================================
+name               unit     what it is
+=================  =======  ============================================================================
+fx fy fz           m/s^2    specific force in the platform frame
+a p o              m/s^2    the same along the input, pendulous and output axis of the accelerometer
+da                 m/s^2    last step of a from dwell to dwell; 0 in the first
+T                  K        temperature less 25 degC; 0 where it is not measured
+dT                 K/s      rate of the temperature
+t                  s        time since the first sample
+tau                s        time since the arrival in the dwell
+q1 q2 q3 ...       rad      gimbal angles, outer first; also outer, inner, and q_x q_y q_z where one is
+g                  m/s^2    local gravity
+s m K rad deg pi            units and the number, to make a formula's units agree: exp(-tau/(60*s))
+=================  =======  ============================================================================
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from kf_calib.bench import Bench, Vector
+from kf_calib.effects import checks
+from kf_calib.effects.effect import SensorEffect
+from kf_calib.effects.expression import Expression
+from kf_calib.effects.stimulus import Stimulus
+from kf_calib.errors import InputError
+from kf_calib.samples import Floats
+
+NAME_RULE = "letters, digits, - and _, a letter first, at most 40 of them"
+_LARGE_MPS2 = 1e-3  # what a prior lets a coefficient add to a typical reading
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A name in formulas: its SI unit, its meaning, and its values (m, 1), (m, 3) or a number."""
+
+    unit: str
+    meaning: str
+    of: Callable[[Stimulus], Floats | float]
+
+
+QUANTITIES: dict[str, Quantity] = {
+    "fx": Quantity("m/s^2", "specific force along x of the platform", lambda s: s.force_mps2[:, 0:1]),
+    "fy": Quantity("m/s^2", "specific force along y of the platform", lambda s: s.force_mps2[:, 1:2]),
+    "fz": Quantity("m/s^2", "specific force along z of the platform", lambda s: s.force_mps2[:, 2:3]),
+    "a": Quantity("m/s^2", "specific force along the input axis", lambda s: s.along),
+    "p": Quantity("m/s^2", "specific force along the pendulous axis", lambda s: s.pendulous),
+    "o": Quantity("m/s^2", "specific force along the output axis", lambda s: s.output),
+    "da": Quantity("m/s^2", "last step of a from dwell to dwell", lambda s: s.step),
+    "T": Quantity("K", "temperature less 25 degC", lambda s: s.warmth[:, None]),
+    "dT": Quantity("K/s", "rate of the temperature", lambda s: s.warming[:, None]),
+    "t": Quantity("s", "time since the first sample", lambda s: s.elapsed_s[:, None]),
+    "tau": Quantity("s", "time since the arrival in the dwell", lambda s: s.since_arrival_s[:, None]),
+    "g": Quantity("m/s^2", "local gravity", lambda s: s.bench.gravity_mps2),
+    "s": Quantity("s", "one second", lambda s: 1.0),
+    "m": Quantity("m", "one metre", lambda s: 1.0),
+    "K": Quantity("K", "one kelvin", lambda s: 1.0),
+    "rad": Quantity("rad", "one radian", lambda s: 1.0),
+    "deg": Quantity("rad", "one degree", lambda s: math.pi / 180.0),
+    "pi": Quantity("", "3.14159...", lambda s: math.pi),
+}
+
+
+class _Angle:
+    """The angle of a gimbal, (m, 1) rad."""
+
+    def __init__(self, gimbal: int) -> None:
+        self.gimbal = gimbal
+
+    def __call__(self, s: Stimulus) -> Floats:
+        return s.pose[:, self.gimbal : self.gimbal + 1]
+
+
+def gimbal_letters(axes: tuple[Vector, ...]) -> str:
+    """A letter for each gimbal: its axis, or ? where it is none of x, y, z."""
+    return "".join(
+        "xyz"[max(range(3), key=lambda k, a=axis: abs(a[k]))] if 1.0 in map(abs, axis) else "?" for axis in axes
+    )
+
+
+@lru_cache(maxsize=32)
+def quantities(axes: tuple[Vector, ...]) -> dict[str, Quantity]:
+    """Everything a formula may name on a bench with these gimbal axes."""
+    letters, found = gimbal_letters(axes), dict(QUANTITIES)
+    for k, letter in enumerate(letters):
+        angle = Quantity("rad", f"angle of gimbal {k + 1}", _Angle(k))
+        names = [f"q{k + 1}", *([f"q_{letter}"] if letter != "?" and letters.count(letter) == 1 else [])]
+        names += ["outer"] * (k == 0) + ["inner"] * (k == len(letters) - 1)
+        found |= dict.fromkeys(names, angle)
+    return found
+
+
+def split(text: str) -> tuple[str, str]:
+    """Name and expression of ``NAME = FORMULA``; raises InputError where the name is none."""
+    name, _, expression = (part.strip() for part in text.partition("="))
+    if not is_name(name):
+        raise InputError(f"{name[:60]!r} cannot name an effect: write NAME = FORMULA, the name of {NAME_RULE}.")
+    return name, expression
+
+
+def is_name(text: str) -> bool:
+    return re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]{0,39}", text) is not None
+
+
+def symbol_stem(name: str) -> str:
+    """What the number of the accelerometer is put after."""
+    return f"{name}_" if name[-1].isdigit() else name
+
+
+class Formula(SensorEffect):
+    """An effect ``name = expression``; raises InputError, with the formula in it, where it cannot be used.
+
+    text: what gives the same effect again. The unit of the coefficients follows from that of the expression, their
+    scale from what they add on a trial run: about 1e-3 m/s^2.
+    """
+
+    source, confused_with = "user's formula", ""
+
+    def __init__(self, text: str, bench: Bench) -> None:
+        from kf_calib.effects.formula_units import coefficient_units, unit_of
+
+        name, expression = split(text)
+        known = quantities(bench.axes)
+        try:
+            self._expression = Expression(expression, {key: quantity.meaning for key, quantity in known.items()})
+            unit, shown = coefficient_units(unit_of(self._expression, {key: q.unit for key, q in known.items()}))
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from None
+        # of the class in the catalogue; here each formula has its own
+        vars(self).update(name=name, title=expression, symbol=symbol_stem(name), unit=unit, shown=shown, scale=1.0)
+        self.text = f"{name} = {expression}"
+        stimulus = checks.trial(bench)
+        checks.check(self, stimulus)
+        vars(self).update(scale=_LARGE_MPS2 / self._typical(stimulus))
+
+    def _typical(self, stimulus: Stimulus) -> float:
+        """Rms of the terms on a trial run, to a power of ten."""
+        size = np.abs(self.terms(stimulus))
+        largest = float(size.max())
+        if not 1e-60 < largest < 1e60:
+            raise InputError(f"{self} has values up to {largest:.1e}: multiply the formula by a constant.")
+        return 10.0 ** round(math.log10(largest * np.sqrt(np.mean((size / largest) ** 2))))
+
+    def terms(self, s: Stimulus) -> Floats:
+        known = quantities(s.bench.axes)
+        values = self._expression({name: known[name].of(s) for name in self._expression.names})
+        terms = np.array(np.broadcast_to(values, (len(s), 3)), dtype=float)
+        checks.refuse_not_finite(self, terms, s)
+        return terms
+
+
+@lru_cache(maxsize=128)
+def formula(text: str, axes: tuple[Vector, ...], gravity_mps2: float) -> Formula:
+    """The formula's effect, made once for each bench: a run asks for it many times."""
+    return Formula(text, Bench(axes, gravity_mps2))

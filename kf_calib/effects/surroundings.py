@@ -1,0 +1,30 @@
+"""What the surroundings do to the sensors."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kf_calib.effects.effect import Coefficient, Effect, G
+from kf_calib.effects.stimulus import Stimulus
+from kf_calib.samples import Floats
+
+
+class Magnetic(Effect):
+    """m_i B . E_i, B the local field: (m_i B_N) N . E_i + (m_i B_E) E . E_i, the products are fitted.
+
+    The vertical part is along gravity, and so a scale factor.
+    """
+
+    name, title, source = "magnetic", "response to the local magnetic field", "IEEE Std 1293, magnetic sensitivity"
+    confused_with = "needs turns about the vertical"
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"mB{part}{i}", "m/s^2", 1e-3, "µg", 1e6 / G) for i in (1, 2, 3) for part in "NE")
+
+    def columns(self, s: Stimulus) -> Floats:
+        out = np.zeros((len(s), 3, 6))
+        along = np.stack([s.to_platform(axis) for axis in s.level_axes], axis=2)  # (m, 3, 2)
+        for i in range(3):
+            out[:, i, 2 * i : 2 * i + 2] = np.einsum("x,mxk->mk", s.axes[i], along)
+        return out

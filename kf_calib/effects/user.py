@@ -1,0 +1,152 @@
+"""Effects from outside: classes in a Python file of the user's, or in a package that announces them.
+
+A file needs no more than this (ten lines at most)::
+
+    from kf_calib.effects import SensorEffect
+
+    class Mine(SensorEffect):
+        unit = "s^2/m/K"
+
+        def terms(self, s):
+            return s.along**2 * s.warmth[:, None]
+
+What a class leaves out is filled in: name ``mine``, title, source ``user``, symbols ``mine1 mine2 mine3``, scale 1, and
+the unit itself as the unit shown. A package announces a class, or a module of classes, as an entry point of the group
+``kf_calib.effects``. Reading such a file runs it, as Python runs any module.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import inspect
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+from kf_calib.effects import checks
+from kf_calib.effects.effect import Effect, SensorEffect
+from kf_calib.effects.formula import NAME_RULE, is_name, symbol_stem
+from kf_calib.errors import InputError
+
+GROUP = "kf_calib.effects"
+TWELVE = frozenset(f"{stem}{i}" for stem in ("theta", "phi", "nu", "K", "b") for i in (1, 2, 3))
+"""Symbols of the paper's parameters, one or two of them never used: no effect may have them."""
+
+
+def classes_in_file(path: Path) -> list[type[Effect]]:
+    """The effect classes a Python file defines, in its order; raises InputError where it cannot be run or has none."""
+    try:
+        source = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}): give a Python file of effect classes.") from None
+    # run from its text: nothing is written beside the user's file, and an old compiled copy is never taken for it
+    module = ModuleType(f"kf_calib_user_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]}")
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module
+    try:
+        with contextlib.redirect_stdout(sys.stderr):  # stdout may be one JSON object
+            exec(compile(source, str(path), "exec", dont_inherit=True), vars(module))
+    except (Exception, SystemExit) as error:
+        del sys.modules[module.__name__]
+        raise InputError(
+            f"{path}{_line(error, path)}: cannot be run ({checks.words_of(error)}): mend it there."
+        ) from None
+    found = effect_classes(module)
+    if not found:
+        raise InputError(
+            f"{path}: defines no effect: write a class that derives from SensorEffect, FrameEffect or Effect "
+            "(from kf_calib.effects import SensorEffect)."
+        )
+    return found
+
+
+def _line(error: BaseException, path: Path) -> str:
+    """The last line of the file that an error passed through, as ``, line N``."""
+    if isinstance(error, SyntaxError) and error.filename == str(path):
+        return f", line {error.lineno}"
+    trace, line = error.__traceback__, None
+    while trace is not None:
+        line = trace.tb_lineno if trace.tb_frame.f_code.co_filename == str(path) else line
+        trace = trace.tb_next
+    return f", line {line}" if line else ""
+
+
+def effect_classes(module: ModuleType) -> list[type[Effect]]:
+    """Classes of effects defined in a module, but for those whose name begins with an underscore."""
+    return [
+        kind
+        for name, kind in vars(module).items()
+        if inspect.isclass(kind)
+        and issubclass(kind, Effect)
+        and kind.__module__ == module.__name__
+        and not name.startswith("_")
+    ]
+
+
+def classes_installed() -> list[tuple[type[Effect], str]]:
+    """Effect classes that installed packages announce, each with who announces it."""
+    import importlib.metadata  # as dear as the rest of this package together
+
+    found = list[tuple[type[Effect], str]]()
+    for point in importlib.metadata.entry_points(group=GROUP):
+        origin = f"entry point {point.name} = {point.value}"
+        try:
+            loaded = point.load()
+        except Exception as error:
+            raise InputError(
+                f"{origin} of {GROUP}: cannot be loaded ({checks.words_of(error)}): mend or uninstall its package."
+            ) from None
+        kinds = effect_classes(loaded) if isinstance(loaded, ModuleType) else [loaded]
+        for kind in kinds:
+            if not (inspect.isclass(kind) and issubclass(kind, Effect)):
+                raise InputError(
+                    f"{origin} of {GROUP}: is no effect class: it must derive from kf_calib.effects.Effect."
+                )
+            found.append((kind, origin))
+    return found
+
+
+def completed(kind: type[Effect], origin: str) -> type[Effect]:
+    """The class with what it left out; raises InputError where that cannot be filled in."""
+    who = f"class {kind.__name__} of {origin}"
+    missing = sorted(getattr(kind, "__abstractmethods__", ()))
+    if missing:
+        raise InputError(f"{who} lacks {' and '.join(missing)}: define {'it' if len(missing) == 1 else 'them'}.")
+    given = getattr(kind, "name", None)
+    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", kind.__name__).lower() if given is None else given
+    if not (isinstance(name, str) and is_name(name)):
+        raise InputError(f"{who} is called {name!r}: a name is made of {NAME_RULE}.")
+    defaults: dict[str, object] = {"name": name, "title": name, "source": "user"}
+    if issubclass(kind, SensorEffect):
+        unit = getattr(kind, "unit", "SI")
+        defaults |= {"symbol": symbol_stem(name), "unit": unit, "scale": 1.0, "shown": (unit, 1.0)}
+    for key, value in defaults.items():
+        if not hasattr(kind, key):
+            setattr(kind, key, value)
+    checks.guard(kind)
+    return kind
+
+
+def made(kind: type[Effect], origin: str) -> Effect:
+    """An effect of the class; raises InputError where it cannot be made without arguments."""
+    try:
+        return kind()
+    except Exception as error:
+        raise InputError(
+            f"class {kind.__name__} of {origin} cannot be made without arguments"
+            f"{checks.line_of(error, kind)} ({checks.words_of(error)}): give those of __init__ default values."
+        ) from None
+
+
+def refuse_symbols(effect: Effect, taken: dict[str, str]) -> None:
+    """Raise InputError where a symbol of the effect is one of the twelve parameters' or ``taken`` by another effect."""
+    symbols = [coefficient.symbol for coefficient in effect.coefficients]
+    symbols += [effect.unknown.symbol] if effect.unknown is not None else []
+    for symbol in symbols:
+        owner = "the twelve parameters" if symbol in TWELVE else taken.get(symbol)
+        if owner:
+            raise InputError(
+                f"{effect} would have a coefficient {symbol}, which is one of {owner}: give it another name."
+            )

@@ -1,0 +1,139 @@
+"""The model and the noise model fitted to the dwells, in turn: what the filter then runs on.
+
+Small rotations and input axes are linearised at the estimate; constants inside an effect's columns (time constants,
+frequencies) are looked for on a grid and refined by Gauss-Newton, their derivative being one more column; the dwell
+parts of the noise and a walk of the biases are found by likelihood.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kf_calib import information
+from kf_calib.effects import Coefficient, Effect
+from kf_calib.folding import Carried, DwellFactor
+from kf_calib.model import Model
+from kf_calib.noise import Noise, with_dwell_parts, within_dwells
+from kf_calib.samples import Floats
+from kf_calib.scan import scan
+
+WALK = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5, "µg/√s", 1e6 / 9.80665)
+"""The intensity of a walk of the biases as a parameter."""
+
+_PASSES = 3
+_PASSES_WITH_UNKNOWNS = 10
+_STEP_LIMIT = 0.4  # of ln(value) in one step: the width of the grid
+
+
+@dataclass(frozen=True)
+class Walk:
+    """The biases' random walk, m/s^2 per sqrt(s), and 1 sigma of it (None: it was stated, or is zero)."""
+
+    intensity: float = 0.0
+    sigma: float | None = None
+
+    def variances(self, dwells: Sequence[DwellFactor]) -> Floats:
+        """Variance (D, 3) of the biases' steps before each dwell: q^2 times the time between the dwells' starts."""
+        return np.repeat(self.intensity**2 * _gaps_s(dwells)[:, None], 3, axis=1)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Dwells with the fitted model's columns, and the noise they are weighted by."""
+
+    carried: Carried
+    noise: Noise
+    walk: Walk
+
+    @property
+    def dwells(self) -> list[DwellFactor]:
+        return self.carried.dwells
+
+    @property
+    def walk_variances(self) -> Floats:
+        return self.walk.variances(self.dwells)
+
+    def rows(self, noise: Noise | None = None) -> list[Floats]:
+        """Whitened rows [H | z] of each dwell, by the weights of the fit or by another noise."""
+        return information.whitened(self.dwells, self.carried.columns, noise or self.noise.weights, self.carried.state)
+
+
+def fit(dwells: list[DwellFactor], model: Model, walk_mps2_per_sqrt_s: float = 0.0) -> Fit:
+    """Noise, linearisation and the model's unknowns, each given the others, until they stand still."""
+    within, bench = within_dwells(dwells), model.bench
+    fitted = Fit(Carried(dwells, model, model.nominal_state()), within, Walk(walk_mps2_per_sqrt_s))
+    searching = False
+    for number in range(_PASSES_WITH_UNKNOWNS if model.unknowns else _PASSES):
+        if number == 1 and model.unknowns:
+            model, searching = _placed(fitted), True
+            fitted = replace(fitted, carried=Carried(dwells, model, fitted.carried.state))
+        state, moved = _solved(fitted)
+        if searching:
+            model = model.moved(np.clip(moved, -_STEP_LIMIT, _STEP_LIMIT))
+        carried = Carried(dwells, model, state)
+        noise = with_dwell_parts(within, carried.means, state, bench.angle_sigma_deg, bench.scatter_sigma_mps2)
+        walk = _likely_walk(replace(fitted, carried=carried, noise=noise)) if model.walks else fitted.walk
+        fitted = Fit(carried, noise, walk)
+        if number >= _PASSES - 1 and np.abs(moved).max(initial=0.0) < 1e-4:
+            break
+    return fitted
+
+
+def _solved(fitted: Fit) -> tuple[Floats, Floats]:
+    """The estimate (p,) with unknowns at zero, and how far these would move (p,), zeros elsewhere."""
+    factor = information.accumulated(fitted.rows(), fitted.walk_variances)[:-1]
+    state = information.solve(factor, fitted.carried.model.nominal_state())[0]
+    moved = np.zeros_like(state)
+    places = list(fitted.carried.model.unknowns)
+    moved[places], state[places] = state[places], 0.0
+    return state, moved
+
+
+def _placed(fitted: Fit) -> Model:
+    """The model with each unknown at that value of its grid at which its effect explains most."""
+    model = fitted.carried.model
+    for effect in model.unknowns.values():
+        assert effect.unknown is not None
+        grid = [effect.at(value) for value in effect.unknown.grid()]
+        model = model.with_effect(grid[_best(fitted, model - effect, grid)])
+    return model
+
+
+def _best(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> int:
+    """Which of the same effect at several values explains most beside the ``rest`` of the model."""
+    state = np.concatenate([fitted.carried.state[:12], np.zeros(rest.count - 12)])
+    found = scan(Carried(fitted.dwells, rest, state), fitted.noise.weights, grid, fitted.walk_variances)
+    return int(np.argmax(found.statistics))
+
+
+def _gaps_s(dwells: Sequence[DwellFactor]) -> Floats:
+    starts = np.array([dwell.start_s for dwell in dwells])
+    return np.diff(starts, prepend=starts[:1])
+
+
+def _likely_walk(fitted: Fit) -> Walk:
+    """The walk's most likely intensity and its sigma, from the likelihood's curvature in its logarithm.
+
+    The scatter from dwell to dwell is kept as it was found or stated; where it was found, the walk explains it first.
+    """
+    from scipy.optimize import minimize_scalar
+
+    noise = fitted.noise if fitted.noise.scatter_stated else replace(fitted.noise, scatter_mps2=np.zeros(3))
+    rows = fitted.rows(noise.weights)
+    gaps = _gaps_s(fitted.dwells)
+    level = math.log(float(np.mean(noise.effective_sigma_mps2)) / math.sqrt(max(float(gaps.mean()), 1e-9)))
+
+    def cost(log_intensity: float) -> float:
+        variances = np.repeat(math.exp(2.0 * log_intensity) * gaps[:, None], 3, axis=1)
+        return -information.log_likelihood(rows, variances)
+
+    found = minimize_scalar(cost, bounds=(level - 12.0, level + 6.0), method="bounded", options={"xatol": 1e-3})
+    best, step = float(found.x), 0.05
+    curvature = (cost(best + step) - 2.0 * float(found.fun) + cost(best - step)) / step**2
+    if -information.log_likelihood(rows, np.zeros((len(gaps), 3))) - float(found.fun) < 0.5 or curvature <= 0:
+        return Walk()
+    return Walk(math.exp(best), math.exp(best) / math.sqrt(curvature))

@@ -1,0 +1,107 @@
+"""Candidates against a model: what each would explain, what it cannot be told from, how small it may be.
+
+The whitened rows [H | G | z] of a run (H the model's columns, G the candidates', z the readings) are folded into one
+triangle, and G and z are projected off H. Everything asked of a candidate is then read from a few small matrices:
+its score test, its coefficients, its overlap with any other, and the size at which it would be found.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib import information
+from kf_calib.effects import Effect
+from kf_calib.folding import Carried, candidate_columns
+from kf_calib.noise import Noise
+from kf_calib.samples import Floats, Mask
+
+_SEEN = 1e-6
+"""A candidate of which the model leaves less than this share is invisible."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect (its unknown at one value) as far as the model does not explain it.
+
+    basis (d, k): orthonormal, of what is left of its columns; inverse (q, k): coefficients = inverse @ basis^T r;
+    hidden (q,): which coefficients are not determined; visibility: the largest share of a column that is left.
+    """
+
+    effect: Effect
+    basis: Floats
+    inverse: Floats
+    hidden: Mask
+    visibility: float
+
+    @property
+    def dof(self) -> int:
+        return self.basis.shape[1]
+
+    @cached_property
+    def sigma(self) -> Floats:
+        """Of the coefficients (q,), were it the only effect added; infinite where not determined."""
+        return np.where(self.hidden, np.inf, np.linalg.norm(self.inverse, axis=1))
+
+    def overlap(self, other: Candidate) -> float:
+        """Cosine of the smallest principal angle: 1 where some combination of the one mimics one of the other."""
+        if not (self.dof and other.dof):
+            return 0.0
+        return float(np.linalg.svd(self.basis.T @ other.basis, compute_uv=False)[0])
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Candidates in a common orthonormal frame of d dimensions, and the residual (d,) there, of unit noise."""
+
+    candidates: tuple[Candidate, ...]
+    residual: Floats
+
+    @cached_property
+    def statistics(self) -> Floats:
+        """By how much adding each candidate would lower chi-squared; chi-squared of its dof if nothing is missing."""
+        return np.array([np.sum((each.basis.T @ self.residual) ** 2) for each in self.candidates])
+
+    def coefficients(self, candidate: Candidate) -> Floats:
+        """Coefficients (q,) of a candidate, were it the only effect added."""
+        return candidate.inverse @ (candidate.basis.T @ self.residual)
+
+
+def scan(carried: Carried, noise: Noise, effects: Sequence[Effect], walk_variances: Floats | None = None) -> Scan:
+    """Project ``effects`` off the model carried; ``walk_variances`` (D, 3): of the biases' steps before each dwell."""
+    added = candidate_columns(carried.dwells, effects, carried.model.bench, carried.state)
+    columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
+    rows = information.whitened(carried.dwells, columns, noise, carried.state)
+    counts = [len(effect.coefficients) for effect in effects]
+    return projected(information.accumulated(rows, walk_variances), carried.model.count, effects, counts)
+
+
+def projected(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
+    """The scan of a triangle [H | G | z] whose first ``width`` columns are the model's, then ``counts`` an effect."""
+    rest, sizes = upper[:, width:], np.linalg.norm(upper[:, width:-1], axis=0)
+    left, singular, _ = np.linalg.svd(information.scaled(upper[:, : width + 1])[0], full_matrices=False)
+    explained = left[:, singular > 1e-9]
+    for _ in range(2):  # twice, or the rounding of what is large stays in what is left
+        rest = rest - explained @ (explained.T @ rest)
+    units = np.where(sizes > 0, sizes, 1.0)
+    frame, singular, turned = np.linalg.svd(rest[:, :-1] / units, full_matrices=False)
+    inside = singular > 0.1 * _SEEN
+    columns, residual = singular[inside, None] * turned[inside], frame[:, inside].T @ rest[:, -1]
+    ends = np.cumsum([0, *counts]).tolist()
+    parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
+    found = [_candidate(each, columns[:, part], units[part]) for each, part in zip(effects, parts, strict=True)]
+    return Scan(tuple(found), residual)
+
+
+def _candidate(effect: Effect, columns: Floats, units: Floats) -> Candidate:
+    """``columns`` (d, q) in the frame, each divided by what it was before the projection, ``units`` (q,)."""
+    left, singular, right = np.linalg.svd(columns, full_matrices=False)
+    seen = singular > _SEEN
+    lost = np.eye(len(units)) - right[seen].T @ right[seen]
+    inverse = (right[seen].T / singular[seen]) / units[:, None]
+    hidden = np.asarray(np.diag(lost) > 1e-6)
+    return Candidate(effect, left[:, seen], inverse, hidden, float(singular.max(initial=0.0)))

@@ -1,0 +1,97 @@
+"""The catalogue of effects: as a table, in detail, and as a JSON object."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from kf_calib.effects import Effect, as_text, remarks_of
+from kf_calib.views.console import effect_rows, symbol
+
+
+def overview(effects: Sequence[Effect]) -> RenderableType:
+    """Every effect in a line: name, what it is, its coefficients with their unit, what it is confused with."""
+    table = Table(title=f"{len(effects)} effects", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    for heading in ("effect", "what it is", "coefficients", "unit", "confused with"):
+        table.add_column(heading, no_wrap=heading in ("effect", "coefficients", "unit"))
+    for effect in effects:
+        table.add_row(
+            str(effect), effect.title, _symbols(effect), ", ".join(dict.fromkeys(c.unit for c in effect.coefficients)),
+            effect.confused_with,
+        )  # fmt: skip
+    return Group(
+        table, Text("kf-calib effects NAME shows one in detail; kf-calib replay RECORDING --with NAME adds it.")
+    )
+
+
+def _symbols(effect: Effect) -> str:
+    found = [symbol(coefficient.symbol) for coefficient in effect.coefficients]
+    stem = found[0][:-1] if found else ""
+    if found == [f"{stem}{i}" for i in (1, 2, 3)]:
+        found = [f"{found[0]}..3"]
+    found = found if len(found) <= 3 else [found[0], "...", found[-1]]
+    return " ".join([*found, *([symbol(effect.unknown.symbol)] if effect.unknown is not None else [])])
+
+
+def details(effects: Sequence[Effect]) -> RenderableType:
+    """Each effect with its formula, coefficients, scale for a prior, source, and what its checks had to say."""
+    return Group(*(part for effect in effects for part in _detail(effect)))
+
+
+def _detail(effect: Effect) -> list[RenderableType]:
+    table = Table(box=None, pad_edge=False, header_style="")
+    for heading in ("coefficient", "unit", "prior scale"):
+        table.add_column(heading)
+    for row in effect_rows(effect):
+        table.add_row(*row)
+    lines = [f"reading i is larger by: {formula_of(effect)}", f"source: {effect.source}"]
+    if effect.confused_with:
+        lines.append(f"confused with: {effect.confused_with}")
+    lines += [f"note: {remark}" for remark in remarks_of(effect)]
+    head = Text(f"{effect}: {effect.title}", style="bold")
+    return [head, *map(Text, lines), *([table] if table.rows else []), Text()]
+
+
+def formula_of(effect: Effect) -> str:
+    """What an effect adds to a reading, in the words of its class, or the user's formula."""
+    text = as_text(effect)
+    if "=" in text:
+        return f"{effect.coefficients[0].symbol[:-1]}i * ({text.partition('=')[2].strip()})"
+    own = inspect.cleandoc(type(effect).__doc__ or "not said")
+    return " ".join(own.split("\n\n")[0].split()).rstrip(".")
+
+
+def effects_object(effects: Sequence[Effect]) -> dict[str, Any]:
+    """What ``effects --json`` prints."""
+    return {"effects": [_object(effect) for effect in effects]}
+
+
+def _object(effect: Effect) -> dict[str, Any]:
+    unknown = effect.unknown
+    return {
+        "effect": str(effect),
+        "title": effect.title,
+        "formula": formula_of(effect),
+        "coefficients": [
+            {
+                "symbol": c.symbol,
+                "unit": c.unit,
+                "scale": c.scale,
+                "shown_unit": c.shown_unit,
+                "per_si": float(c.per_si),
+            }
+            for c in effect.coefficients
+        ],
+        "unknown": None
+        if unknown is None
+        else {"symbol": unknown.symbol, "unit": unknown.unit, "low": unknown.low, "high": unknown.high},
+        "confused_with": effect.confused_with,
+        "source": effect.source,
+        "remarks": list(remarks_of(effect)),
+    }
