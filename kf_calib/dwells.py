@@ -392,12 +392,16 @@ class Segmenter:
     def _block(self, accel: Stream) -> Block:
         assert self._dwell is not None and self.first_ns is not None
         self.tally.used += len(accel)
-        since = np.searchsorted(accel.time_ns, self._temperature.time_ns)  # where each temperature begins to hold
-        lengths = np.diff(since, prepend=0, append=len(accel))
-        warm = np.repeat(np.append(np.nan, self._temperature.values[:, 0]), lengths)
         elapsed_s = (accel.time_ns - self.first_ns) / _SECOND_NS
         arrival_s = max((self._dwell.arrival_ns - self.first_ns) / _SECOND_NS, 0.0)
-        return Block(self._dwell.number, arrival_s, elapsed_s, accel.values, self._block_pose(accel.time_ns), warm)
+        return Block(
+            self._dwell.number,
+            arrival_s,
+            elapsed_s,
+            accel.values,
+            self._block_pose(accel.time_ns),
+            _carried_on(self._temperature, accel.time_ns),
+        )
 
     def _block_pose(self, accel_ns: Times) -> Floats:
         assert self._dwell is not None
@@ -434,7 +438,22 @@ class Segmenter:
         oldest = int(self._accel.time_ns[0]) if len(self._accel) else (self._decided_ns or 0)
         oldest = min(oldest, (self._decided_ns or oldest) - round(4 * self.stillness.window_s * _SECOND_NS))
         self._pose = self._pose[max(int(np.searchsorted(self._pose.time_ns, oldest)) - 2, 0) :]
-        self._temperature = self._temperature[max(int(np.searchsorted(self._temperature.time_ns, oldest)) - 1, 0) :]
+        self._temperature = self._temperature[max(int(np.searchsorted(self._temperature.time_ns, oldest)) - 2, 0) :]
+
+
+def _carried_on(slow: Stream, at_ns: Times) -> Floats:
+    """A slow quantity at ``at_ns`` (n,): the line through its last two samples, for as long as they lie apart.
+
+    Nothing waits for the next sample, and holding the last would be late by half their distance. NaN before the first.
+    """
+    if not len(slow):
+        return np.full(len(at_ns), np.nan)
+    since = np.searchsorted(at_ns, slow.time_ns)  # where each sample begins to count
+    own = np.repeat(np.arange(-1, len(slow)), np.diff(since, prepend=0, append=len(at_ns)))
+    steps_ns = np.diff(slow.time_ns, prepend=slow.time_ns[:1])
+    rises = np.diff(slow.values[:, 0], prepend=slow.values[:1, 0])
+    share = np.minimum((at_ns - slow.time_ns[own]) / np.maximum(steps_ns[own], 1), 1.0)
+    return np.where(own < 0, np.nan, slow.values[own, 0] + np.where(steps_ns[own] > 0, share * rises[own], 0.0))
 
 
 def dwell_blocks(source: Source, segmenter: Segmenter) -> Iterator[Block]:

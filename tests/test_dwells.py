@@ -141,12 +141,16 @@ def test_readings_outside_the_angles_are_counted() -> None:
     assert spans.tally.without_pose == pytest.approx(400 + 900, abs=20)
 
 
-def test_temperature_is_the_last_one_measured() -> None:
+def test_temperature_goes_on_as_it_went_last() -> None:
+    """Before the first: none; after one: that; then the line through the last two, for as long as they lie apart."""
     pose = path((0, 0), (20, 0), rate_hz=10)
-    warm = Stream(np.array([4, 10]) * S, np.array([[20.0], [30.0]]))
+    warm = Stream(np.array([4, 6, 8]) * S, np.array([[20.0], [30.0], [32.0]]))
     blocks = list(dwell_blocks(Given(Batch(readings(pose, 20), pose, warm)), Segmenter(BENCH)))
-    values = np.concatenate([block.temperature_c for block in blocks])
-    assert np.isnan(values[:400]).all() and (values[400:1000] == 20).all() and (values[1000:] == 30).all()
+    times, values = (np.concatenate([getattr(b, key) for b in blocks]) for key in ("elapsed_s", "temperature_c"))
+    assert np.isnan(values[times < 4]).all() and (values[(times >= 4) & (times < 6)] == 20).all()
+    rising = (times >= 6) & (times < 8)
+    np.testing.assert_allclose(values[rising], 30 + 5 * (times[rising] - 6))
+    np.testing.assert_allclose(values[times >= 8], 32 + np.minimum(times[times >= 8] - 8, 2.0))
 
 
 def test_a_gentle_start_of_a_slew_is_not_in_the_dwell() -> None:
