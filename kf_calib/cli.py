@@ -346,6 +346,29 @@ uncertain, after what the twelve parameters absorb.
 --hide random, random-known (in the catalogue), random-unknown (not in it), also with =10sigma: drawn from the seed."""
 
 
+@cli.command()
+@click.argument("recording", type=click.Path(path_type=Path))
+@recording_options
+@filter_options
+@strict_option
+@json_option
+@click.pass_context
+def diagnose(ctx: click.Context, recording: Path, strict: bool, as_json: bool, **options: Any) -> None:
+    """Which physical effect is missing in the model: verdict, suspects, what this run cannot see, where to go next."""
+    from kf_calib.calibration import calibrate
+    from kf_calib.diagnosis import diagnose as run
+    from kf_calib.views import diagnosis as views
+
+    with _progress(f"diagnosing {recording.name}", as_json) as tick:
+        found = run(calibrate(_recording(recording, options), _settings(options), tick))
+    if as_json:
+        _print_json(views.diagnosis_object(found))
+    else:
+        _show(views.diagnosis_report(found))
+    if strict and found.test.consistent is False:
+        ctx.exit(1)
+
+
 def simulation_options(command: F) -> F:
     """What the simulated bench is and does."""
     options = [

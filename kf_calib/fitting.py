@@ -76,7 +76,7 @@ def fit(dwells: list[DwellFactor], model: Model, walk_mps2_per_sqrt_s: float = 0
             model = model.moved(np.clip(moved, -_STEP_LIMIT, _STEP_LIMIT))
         carried = Carried(dwells, model, state)
         noise = with_dwell_parts(within, carried.means, state, bench.angle_sigma_deg, bench.scatter_sigma_mps2)
-        walk = _likely_walk(replace(fitted, carried=carried, noise=noise)) if model.walks else fitted.walk
+        walk = likely_walk(replace(fitted, carried=carried, noise=noise))[0] if model.walks else fitted.walk
         fitted = Fit(carried, noise, walk)
         if number >= _PASSES - 1 and np.abs(moved).max(initial=0.0) < 1e-4:
             break
@@ -115,8 +115,8 @@ def _gaps_s(dwells: Sequence[DwellFactor]) -> Floats:
     return np.diff(starts, prepend=starts[:1])
 
 
-def _likely_walk(fitted: Fit) -> Walk:
-    """The walk's most likely intensity and its sigma, from the likelihood's curvature in its logarithm.
+def likely_walk(fitted: Fit) -> tuple[Walk, float]:
+    """The walk's most likely intensity, its sigma from the likelihood's curvature, and the gain in log-likelihood.
 
     The scatter from dwell to dwell is kept as it was found or stated; where it was found, the walk explains it first.
     """
@@ -134,6 +134,7 @@ def _likely_walk(fitted: Fit) -> Walk:
     found = minimize_scalar(cost, bounds=(level - 12.0, level + 6.0), method="bounded", options={"xatol": 1e-3})
     best, step = float(found.x), 0.05
     curvature = (cost(best + step) - 2.0 * float(found.fun) + cost(best - step)) / step**2
-    if -information.log_likelihood(rows, np.zeros((len(gaps), 3))) - float(found.fun) < 0.5 or curvature <= 0:
-        return Walk()
-    return Walk(math.exp(best), math.exp(best) / math.sqrt(curvature))
+    gain = -float(found.fun) - information.log_likelihood(rows, np.zeros((len(gaps), 3)))
+    if gain < 0.5 or curvature <= 0:
+        return Walk(), 0.0
+    return Walk(math.exp(best), math.exp(best) / math.sqrt(curvature)), gain

@@ -24,6 +24,7 @@ from kf_calib.triangle import triangle
 WIDTH = 4
 """Regressors of the twelve parameters: 1, f_x, f_y, f_z."""
 
+_VIBRATING = 25.0  # mean squared deviation of the variances in their own sigma; autocorrelation alone makes up to 10
 _LAGS = 64
 _CORRELATED_SAMPLES = 8192  # readings of a dwell whose autocovariance is accumulated
 
@@ -181,10 +182,35 @@ def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> S
         force_mps2=np.concatenate([each.force_mps2 for each in nodes]),
         previous_force_mps2=np.repeat(before, 3, axis=0),
         pose=np.concatenate([each.pose for each in nodes]),
-        temperature_c=np.concatenate([each.temperature_c for each in nodes]),
+        temperature_c=_signal_only(dwells, np.concatenate([each.temperature_c for each in nodes])),
         sensitivity=state[:12].reshape(3, 4)[:, :3],
-        variance_mps2_2=np.repeat(np.concatenate([dwell.variances for dwell in dwells]), 3, axis=0),
+        variance_mps2_2=np.repeat(_varying(dwells), 3, axis=0),
     )
+
+
+def _signal_only(dwells: Sequence[DwellFactor], temperature_c: Floats) -> Floats:
+    """Temperatures (m,) at the nodes; their mean where they only scatter, as a thermometer does in a steady room.
+
+    Means of dwells that follow each other differ as much as any two (von Neumann's ratio near 1), and by no more than
+    temperatures within a dwell.
+    """
+    by_dwell = np.split(temperature_c, np.cumsum([3 * len(dwell.pieces) for dwell in dwells])[:-1])
+    means = np.array([own.mean() for own in by_dwell])
+    if len(means) < 4 or not np.isfinite(means).all():
+        return temperature_c
+    between, within = means.var(), float(np.mean([own.var() for own in by_dwell]))
+    alike = np.mean(np.diff(means) ** 2) > between  # 2 var on average where one says nothing of the next
+    if alike and between < 2.0 * within:
+        return np.full(len(temperature_c), means.mean())
+    return temperature_c
+
+
+def _varying(dwells: Sequence[DwellFactor]) -> Floats:
+    """Variances of the readings (pieces, 3) where they vary beyond what their estimates scatter by, else their mean."""
+    variances, counts = (np.concatenate([getattr(each, key) for each in dwells]) for key in ("variances", "counts"))
+    mean = np.average(variances, axis=0, weights=counts)
+    excess = np.mean(0.5 * counts[:, None] * (variances / np.where(mean > 0, mean, 1.0) - 1.0) ** 2, axis=0)
+    return np.where(excess > _VIBRATING, variances, mean)
 
 
 def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[Floats]:

@@ -87,7 +87,7 @@ def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
     """kappa, and the variance, from an autoregression fitted to the autocovariance (Yule-Walker), its order by BIC.
 
     kappa = v / (gamma_0 (1 - sum a)^2), v the variance of the autoregression's innovations (Percival and Walden, 1993,
-    ch. 9). The autocovariance of readings less their block's parabola is low by 3 kappa gamma_0 / n at every lag, about;
+    ch. 9). The autocovariance of readings less their block's parabola is low by about 3 kappa gamma_0 / n at every lag;
     that is put back by iteration. Never below 1: a noise that averages faster than white is not relied on.
     """
     if total.count < 64 or total.products[0, channel] <= 0:
@@ -182,6 +182,19 @@ def _most_likely(stated: Noise, parts: tuple[str, ...], means: Means, state: Flo
     begin = _spread(means, parts)
     found = minimize(cost, begin, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4, "maxiter": 600})
     return _unpack(stated, found.x, parts), -float(found.fun) - 0.5 * _SIGNIFICANT * len(begin)
+
+
+def scatter_gain(noise: Noise, means: Means, state: Floats) -> float:
+    """What a further scatter from dwell to dwell, as likely as can be, gains in log-likelihood."""
+    from scipy.optimize import minimize_scalar
+
+    def cost(log_sigma: float) -> float:
+        scatter = np.hypot(noise.scatter_mps2, np.exp(log_sigma))
+        return -restricted_log_likelihood(replace(noise, scatter_mps2=scatter), means, state)
+
+    begin = float(_spread(means, ("common",))[0])
+    found = minimize_scalar(cost, bounds=(begin - 5.0, begin + 2.0), method="bounded", options={"xatol": 1e-2})
+    return max(-float(found.fun) - restricted_log_likelihood(noise, means, state), 0.0)
 
 
 def _spread(means: Means, parts: tuple[str, ...]) -> Floats:

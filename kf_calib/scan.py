@@ -29,10 +29,12 @@ class Candidate:
     """One effect (its unknown at one value) as far as the model does not explain it.
 
     basis (d, k): orthonormal, of what is left of its columns; inverse (q, k): coefficients = inverse @ basis^T r;
-    hidden (q,): which coefficients are not determined; visibility: the largest share of a column that is left.
+    columns (d, q): what is left of the columns, per unit of the coefficients; hidden (q,): which of these are not
+    determined; visibility: the largest share of a column that is left.
     """
 
     effect: Effect
+    columns: Floats
     basis: Floats
     inverse: Floats
     hidden: Mask
@@ -104,4 +106,4 @@ def _candidate(effect: Effect, columns: Floats, units: Floats) -> Candidate:
     lost = np.eye(len(units)) - right[seen].T @ right[seen]
     inverse = (right[seen].T / singular[seen]) / units[:, None]
     hidden = np.asarray(np.diag(lost) > 1e-6)
-    return Candidate(effect, left[:, seen], inverse, hidden, float(singular.max(initial=0.0)))
+    return Candidate(effect, columns * units, left[:, seen], inverse, hidden, float(singular.max(initial=0.0)))

@@ -22,8 +22,10 @@ LEVELS = [
     ["information", "kalman", "batch"],
     ["scan"],
     ["fitting"],
+    ["advice", "drivers"],
     ["calibration"],
     ["comparison", "model_file"],
+    ["diagnosis"],
     ["views"],
     ["cli"],
 ]

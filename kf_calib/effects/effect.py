@@ -36,7 +36,7 @@ class Coefficient:
 class Unknown:
     """A positive constant inside the columns (a time constant, a frequency), estimated with the coefficients.
 
-    low, high: the range it is looked for in. Its state is ln(value / current value), so that its sigma is a share of it.
+    low, high: the range it is looked for in. Its state is ln(value / current value), so its sigma is a share of it.
     """
 
     symbol: str

@@ -14,7 +14,7 @@ from kf_calib.comparison import Comparison
 def replay_object(result: Calibration) -> dict[str, Any]:
     """What ``replay --json`` prints."""
     judged, noise, dwells = result.consistency, result.noise, [visit.dwell for visit in result.visits]
-    return _clean(
+    return clean(
         {
             "samples": result.tally.read,
             "dwells": len(dwells),
@@ -50,7 +50,7 @@ def replay_object(result: Calibration) -> dict[str, Any]:
 
 def compare_object(compared: Comparison) -> dict[str, Any]:
     """What ``compare --json`` prints: parameters of each way beside its time, memory and distance."""
-    return _clean(
+    return clean(
         {
             "max_difference_sigma": compared.max_difference_sigma,
             "engines": {
@@ -71,11 +71,12 @@ def compare_object(compared: Comparison) -> dict[str, Any]:
     )
 
 
-def _clean(value: Any) -> Any:
+def clean(value: Any) -> Any:
+    """As JSON can hold it: lists and plain numbers, null for what is not finite."""
     if isinstance(value, dict):
-        return {key: _clean(item) for key, item in value.items()}
+        return {key: clean(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):
-        return [_clean(item) for item in value]
+        return [clean(item) for item in value]
     if isinstance(value, np.bool_ | bool):
         return bool(value)
     if isinstance(value, np.integer | int):

@@ -1,0 +1,113 @@
+"""Where to go next: the orientation that tells two suspects apart, or shows what none has shown yet."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib.effects import Effect, Stimulus
+from kf_calib.fitting import Fit
+from kf_calib.folding import Means, candidate_columns
+from kf_calib.information import accumulated, whitened
+from kf_calib.model import effect_columns
+from kf_calib.noise import mean_covariances
+from kf_calib.samples import Floats
+from kf_calib.triangle import triangle
+
+_POSES = 160
+_STEP_DEG = 5.0
+_LATER_S = 60.0  # when the next dwell would be, and how far into it
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Gimbal angles of the next orientation, deg; separation: in sigma, before and after a dwell there."""
+
+    gimbal_deg: tuple[float, ...]
+    before: float
+    after: float
+
+
+def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequence[Effect]) -> Advice | None:
+    """The orientation after which the effect ``one`` of this size differs most from each of the ``others``.
+
+    Separation: what is left of its signal, in sigma, when the model and the other have explained all they can; the
+    smallest over the others (no others: over the model alone).
+    """
+    poses = _poses(fitted)
+    if poses is None:
+        return None
+    before, after = math.inf, np.full(len(poses), np.inf)
+    for rival in [[other] for other in others] or [[]]:
+        factor, rows = _with_next(fitted, [*rival, one], poses)
+        count = factor.shape[1] - len(coefficients)
+        mix = np.zeros((factor.shape[1], count + 1))
+        mix[:count, :count], mix[count:, count] = np.eye(count), coefficients
+        before = min(before, abs(float(triangle(factor @ mix)[-1, -1])))
+        after = np.minimum(after, [abs(float(triangle(np.vstack([factor @ mix, own @ mix]))[-1, -1])) for own in rows])
+    best = int(np.argmax(after))
+    return Advice(tuple(np.degrees(poses[best]).round(1).tolist()), before, float(after[best]))
+
+
+def to_show(fitted: Fit, hidden: Sequence[Effect]) -> tuple[Advice, int] | None:
+    """The orientation that shows most of what is ``hidden`` so far, each at the scale of its kind; and how many."""
+    poses = _poses(fitted)
+    if poses is None or not hidden:
+        return None
+    factor, rows = _with_next(fitted, hidden, poses)
+    width, shown = fitted.carried.model.count, np.zeros(len(poses))
+    ends = np.cumsum([width, *(len(effect.coefficients) for effect in hidden)]).tolist()
+    scales = np.array([coefficient.scale for effect in hidden for coefficient in effect.coefficients])
+    for k, own in enumerate(rows):
+        for start, end in itertools.pairwise(ends):
+            kept = np.r_[0:width, start:end]
+            left = np.abs(triangle(np.vstack([factor[:, kept], own[:, kept]]))[width:, width:])
+            shown[k] += bool((left * scales[start - width : end - width]).max() > 5.0)
+    best = int(np.argmax(shown))
+    return Advice(tuple(np.degrees(poses[best]).round(1).tolist()), 0.0, float(shown[best])), int(shown[best])
+
+
+def _poses(fitted: Fit) -> Floats | None:
+    """Gimbal angles (m, k) to choose from, rad: multiples of 45 deg and a spread of others; None without gimbals."""
+    count = len(fitted.carried.model.bench.axes)
+    if not count:
+        return None
+    rng = np.random.default_rng(0)
+    coarse = rng.integers(-4, 4, (_POSES // 2, count)) * 45.0
+    fine = np.round(rng.uniform(-180.0, 180.0, (_POSES // 2, count)) / _STEP_DEG) * _STEP_DEG
+    return np.radians(np.concatenate([coarse, fine]))
+
+
+def _with_next(fitted: Fit, effects: Sequence[Effect], poses: Floats) -> tuple[Floats, Floats]:
+    """Triangle of the run so far over [H | G], and whitened rows (m, 3, p + q) of a dwell's mean at each pose."""
+    carried, noise = fitted.carried, fitted.noise.judging
+    model, state = carried.model, carried.state
+    added = candidate_columns(carried.dwells, effects, model.bench, state)
+    columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
+    upper = accumulated(whitened(carried.dwells, columns, noise, state), fitted.walk_variances)
+    stimulus = _next_stimulus(fitted, poses)
+    design = np.concatenate([model.columns(stimulus, state), effect_columns(effects, stimulus)], axis=2)
+    counts = np.full(len(poses), np.median(carried.means.counts))
+    means = Means(design, np.zeros((len(poses), 3)), stimulus.force_mps2, counts)
+    root = np.linalg.cholesky(mean_covariances(noise, means, state))
+    return upper[:-1, :-1], np.linalg.solve(root, design)
+
+
+def _next_stimulus(fitted: Fit, poses: Floats) -> Stimulus:
+    last, bench, count = fitted.dwells[-1], fitted.carried.model.bench, len(poses)
+    at = np.linspace(last.end_s + _LATER_S, last.end_s + _LATER_S + 0.1, count)
+    return Stimulus(
+        bench=bench,
+        elapsed_s=at,
+        since_arrival_s=np.full(count, 15.0),
+        force_mps2=bench.specific_force(at, poses),
+        previous_force_mps2=np.repeat(last.means[None, 1:4], count, axis=0),
+        pose=poses,
+        temperature_c=np.full(count, last.pieces[-1].nodes.temperature_c[-1]),
+        sensitivity=fitted.carried.state[:12].reshape(3, 4)[:, :3],
+        variance_mps2_2=np.repeat(last.variances[-1:], count, axis=0),
+    )

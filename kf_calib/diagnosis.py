@@ -1,0 +1,386 @@
+"""Which physical effect is missing: what the misfit says, and what it cannot say.
+
+The candidates of the catalogue are projected off the model (``scan``) and tested together: the p-value of a suspect
+is that of the run, the chance that any of them would look as good with nothing missing. A suspect is named only where
+the model with it fits; where several fit equally well they are all named; where none does the answer is *unknown*.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from kf_calib import advice as advise
+from kf_calib.advice import Advice
+from kf_calib.calibration import Calibration, Parameter, Settings, consistency, evaluated, format_p
+from kf_calib.effects import Effect, effect_named, names
+from kf_calib.fitting import Fit, Walk, fit, likely_walk
+from kf_calib.model import Model
+from kf_calib.noise import mean_covariances, scatter_gain
+from kf_calib.samples import Floats
+from kf_calib.scan import Candidate, Scan, scan
+
+LEVEL = 0.01
+"""Chance of a false alarm a run."""
+
+_DRAWS = 4000
+_EQUAL = 6.63  # suspects whose chi-squared is this close to the best cannot be told from it (1 %, 1 dof)
+_PAIRED = 14  # suspects that are tried in pairs
+_SHOWN = 6  # suspects that are refitted and shown
+_POWER = 0.9
+
+
+@dataclass(frozen=True)
+class Test:
+    """All candidates against one fit: a candidate an effect, the best of the values where it has an unknown.
+
+    scores: chi-squared falls less the threshold of their degrees of freedom: above zero is beyond chance.
+    p_values: of the run. misfit_p: of the sum of squares as a whole (None: nothing left over to judge by).
+    """
+
+    scan: Scan
+    best: dict[str, int]
+    scores: dict[str, float]
+    p_values: dict[str, float]
+    misfit_p: float | None
+    walk: Walk | None
+    effective_tests: float
+
+    @property
+    def p_value(self) -> float | None:
+        """Of the run: the smaller of the misfit's and the best suspect's, doubled for being two."""
+        found = [*self.p_values.values(), *([self.misfit_p] if self.misfit_p is not None else [])]
+        return min(1.0, 2.0 * min(found)) if found else None
+
+    @property
+    def consistent(self) -> bool | None:
+        return None if self.p_value is None else self.p_value >= LEVEL
+
+    @property
+    def ranked(self) -> list[str]:
+        """Names, the likeliest first."""
+        return sorted(self.scores, key=lambda name: -self.scores[name])
+
+    @cached_property
+    def invisible(self) -> list[str]:
+        """Effects of which these orientations show nothing."""
+        return [name for name, k in self.best.items() if not self.scan.candidates[k].dof]
+
+    def candidate(self, name: str) -> Candidate:
+        return self.scan.candidates[self.best[name]]
+
+
+def candidates(model: Model) -> list[Effect]:
+    """The effects of the catalogue that are not in the model; one with an unknown at every value of a coarse grid."""
+    inside, out = {str(effect) for effect in model.effects}, list[Effect]()
+    for name in names(model.bench):
+        effect = effect_named(name, model.bench)
+        if name in inside or effect.dynamic or effect.walks:
+            continue
+        out += [effect] if effect.unknown is None else [effect.at(value) for value in effect.unknown.grid(2.0)]
+    return out
+
+
+def tested(fitted: Fit, seed: int = 0) -> Test:
+    """Score tests of all candidates, calibrated on their own columns by drawing residuals as noise alone makes them."""
+    from scipy.special import chdtrc, chdtri
+
+    found = scan(fitted.carried, fitted.noise.judging, candidates(fitted.carried.model), fitted.walk_variances)
+    dofs, statistics = np.array([each.dof for each in found.candidates]), found.statistics
+    seen = np.flatnonzero(dofs)
+    own = np.where(dofs > 0, chdtrc(np.maximum(dofs, 1), statistics), 1.0)
+    smallest = _smallest_p(found, seen, seed)
+    tests = LEVEL / max(float(np.quantile(smallest, LEVEL)), 1e-12) if len(seen) else 1.0
+    threshold = {dof: float(chdtri(dof, LEVEL / tests)) for dof in set(dofs[seen].tolist()) | {1}}
+    best, scores, p_values = dict[str, int](), dict[str, float](), dict[str, float]()
+    for k, candidate in enumerate(found.candidates):
+        name = str(candidate.effect)
+        score = float(statistics[k] - threshold[candidate.dof]) if candidate.dof else -np.inf
+        if name not in best or score > scores.get(name, -np.inf):
+            best[name] = k
+            if candidate.dof:
+                scores[name], p_values[name] = score, run_level(float(own[k]), tests)
+    walk = _walk_test(fitted)
+    if walk is not None:
+        name, ratio = walk[0], walk[2]
+        scores[name], p_values[name] = ratio - threshold[1], run_level(0.5 * float(chdtrc(1, ratio)), tests)
+    return Test(found, best, scores, p_values, consistency(fitted).p_value, walk and walk[1], tests)
+
+
+def run_level(p_value: float, tests: float) -> float:
+    """The chance that any of ``tests`` independent tests shows a p-value as small: 1 - (1 - p)^n."""
+    return float(-np.expm1(tests * np.log1p(-min(p_value, 1.0 - 1e-16))))
+
+
+def _smallest_p(found: Scan, seen: NDArray[np.intp], seed: int) -> Floats:
+    """The smallest p-value among all candidates in each of many runs in which nothing is missing."""
+    from scipy.special import chdtrc
+
+    if not len(seen):
+        return np.ones(1)
+    draws = np.random.default_rng(seed).standard_normal((_DRAWS, len(found.residual)))
+    bases = [found.candidates[k].basis for k in seen]
+    starts = np.cumsum([0, *(basis.shape[1] for basis in bases[:-1])])
+    squares = np.add.reduceat((draws @ np.concatenate(bases, axis=1)) ** 2, starts, axis=1)
+    return chdtrc(np.array([basis.shape[1] for basis in bases], float), squares).min(axis=1)
+
+
+def _walk_test(fitted: Fit) -> tuple[str, Walk, float] | None:
+    """The effect that lets the biases walk, its likeliest intensity, and twice its gain in log-likelihood.
+
+    The gain over a mere scatter from dwell to dwell, which any unexplained misfit looks like.
+    """
+    model = fitted.carried.model
+    kinds = [effect_named(name, model.bench) for name in names(model.bench) if ":" not in name]
+    walking = [effect for effect in kinds if effect.walks]
+    if model.walks or not walking or len(fitted.dwells) < 8 or fitted.walk.intensity:
+        return None
+    noise = fitted.noise.judging
+    walk, gain = likely_walk(replace(fitted, noise=replace(noise, scatter_stated=True)))
+    return str(walking[0]), walk, 2.0 * (gain - scatter_gain(noise, fitted.carried.means, fitted.carried.state))
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """An effect that would explain something: p-value of the run, whether the model fits with it, its refit.
+
+    known: symbols of the effects that were in the model already.
+    """
+
+    name: str
+    statistic: float
+    dof: int
+    p_value: float
+    fits: bool
+    refit: Calibration
+    known: tuple[str, ...]
+
+    @property
+    def coefficients(self) -> list[Parameter]:
+        """Of this effect in its refit."""
+        return [p for p in list(self.refit.parameters.values())[12:] if p.symbol not in self.known]
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """missing: the names that make the model fit (empty: nothing is missing, or none of the known ones does).
+
+    ambiguity: every single effect that fits as well as the first; overlaps: of each with it.
+    """
+
+    before: Calibration
+    test: Test
+    suspects: tuple[Suspect, ...]
+    missing: tuple[str, ...]
+    unknown: bool
+    ambiguity: tuple[str, ...]
+    overlaps: dict[str, float]
+    after: Calibration | None
+    verdict: str
+
+    @property
+    def residual_ratios(self) -> Floats:
+        """Residuals of the dwells (D, 3) over the sigma of their means."""
+        carried = self.before.carried
+        spread = mean_covariances(self.before.noise.judging, carried.means, carried.state)
+        residuals = np.array([visit.residual_mps2 for visit in self.before.visits])
+        return residuals / np.sqrt(np.einsum("dii->di", spread))
+
+
+def diagnose(before: Calibration) -> Diagnosis:
+    """What is missing in the model of a calibration, from its dwell factors alone."""
+    with threadpool_limits(1, user_api="blas"):  # small decompositions
+        return _diagnosed(before)
+
+
+def _diagnosed(before: Calibration) -> Diagnosis:
+    test = tested(before.fit)
+    nothing = Diagnosis(before, test, (), (), False, (), {}, None, "")
+    if test.consistent is not False:
+        return replace(nothing, verdict=_verdict(nothing))
+    suspects = _suspects(before, test)
+    explaining = [each for each in suspects if each.fits]
+    scatter = before.noise.scatter_mps2.any() and not before.noise.scatter_stated
+    if explaining:
+        first = explaining[0]
+        close = [name for name in test.ranked if test.scores[name] > test.scores[first.name] - _EQUAL]
+        overlaps = {name: _overlap(test, first.name, name) for name in close if name != first.name}
+        equal = [first.name, *(name for name in close if name != first.name and overlaps[name] > 0.5)]
+        found = replace(nothing, suspects=suspects, missing=(first.name,), ambiguity=tuple(equal), overlaps=overlaps,
+                        after=first.refit)  # fmt: skip
+    else:
+        pair = _pair(before, test)
+        if pair is not None:
+            found = replace(nothing, suspects=suspects, missing=pair[0], ambiguity=pair[0], after=pair[1])
+        else:
+            found = replace(nothing, suspects=suspects, unknown=not scatter)
+    return replace(found, verdict=_verdict(found))
+
+
+def _suspects(before: Calibration, test: Test) -> tuple[Suspect, ...]:
+    """The likeliest candidates, each refitted and judged anew."""
+    out = list[Suspect]()
+    for name in [name for name in test.ranked if test.scores[name] > 0][:_SHOWN]:
+        refit = with_effects(before, (name,))
+        dof = 1 if name not in test.best else test.candidate(name).dof
+        statistic = test.scores[name] if name not in test.best else float(test.scan.statistics[test.best[name]])
+        fits = tested(refit.fit).consistent is not False and not _leaps(refit)
+        known = tuple(before.parameters)[12:]
+        out.append(Suspect(name, statistic, dof, test.p_values[name], fits, refit, known))
+    return tuple(out)
+
+
+def _leaps(refit: Calibration) -> bool:
+    """Whether walking biases take a step no walk would: one jump is not a walk."""
+    from scipy.special import ndtr
+
+    if not refit.fit.walk.intensity:
+        return False
+    steps = np.array([visit.innovation_mps2 / visit.innovation_sigma_mps2 for visit in refit.visits])
+    steps = np.abs(steps[np.isfinite(steps)])
+    return bool(steps.size and run_level(2.0 * float(ndtr(-steps.max())), steps.size) < LEVEL)
+
+
+def with_effects(before: Calibration, added: Sequence[str]) -> Calibration:
+    """The same dwells with further effects in the model."""
+    settings: Settings = replace(before.settings, effects=(*before.settings.effects, *added))
+    model = Model.of(before.bench, settings.effects)
+    return evaluated(fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s), settings)
+
+
+def _pair(before: Calibration, test: Test) -> tuple[tuple[str, str], Calibration] | None:
+    """Two effects that fit together where no single one does: they may mask each other. The best few are refitted."""
+    visible = [name for name in test.best if test.candidate(name).dof]
+    visible = sorted(visible, key=lambda name: -test.scores[name])[:_PAIRED]
+    falls = {pair: _fall(test, pair) for pair in itertools.combinations(visible, 2)}
+    for pair in sorted(falls, key=lambda pair: -falls[pair])[:3]:
+        refit = with_effects(before, pair)
+        if tested(refit.fit).consistent is not False:
+            return pair, refit
+    return None
+
+
+def _fall(test: Test, pair: tuple[str, str]) -> float:
+    """By how much a pair of effects would lower chi-squared, less its number of coefficients times their price."""
+    basis = np.concatenate([test.candidate(name).basis for name in pair], axis=1)
+    left, singular, _ = np.linalg.svd(basis, full_matrices=False)
+    seen = left[:, singular > 1e-6]
+    return float(np.sum((seen.T @ test.scan.residual) ** 2) - _EQUAL * seen.shape[1] / 2.0)
+
+
+def _overlap(test: Test, one: str, other: str) -> float:
+    if one not in test.best or other not in test.best:
+        return 1.0  # process noise has no column to compare
+    return test.candidate(one).overlap(test.candidate(other))
+
+
+@dataclass(frozen=True)
+class Detectable:
+    """The size of one coefficient at which an effect is found in 90 of 100 runs, the largest over its coefficients."""
+
+    name: str
+    minimum: float
+    unit: str
+    shown_minimum: float
+    shown_unit: str
+
+
+def detectable(test: Test) -> list[Detectable]:
+    """Of every visible effect, from the columns alone."""
+    from scipy.special import chdtri, chndtrinc
+
+    out = list[Detectable]()
+    for name, k in test.best.items():
+        candidate = test.scan.candidates[k]
+        if not candidate.dof or name in test.invisible:
+            continue
+        threshold = float(chdtri(candidate.dof, 0.5 * LEVEL / test.effective_tests))
+        needed = float(np.sqrt(chndtrinc(threshold, candidate.dof, 1.0 - _POWER)))
+        sizes = np.linalg.norm(candidate.columns, axis=0)
+        seen = ~candidate.hidden & (sizes > 0)
+        if not seen.any():
+            continue
+        worst = int(np.argmax(np.where(seen, needed / np.where(seen, sizes, 1.0), 0.0)))
+        minimum, own = needed / float(sizes[worst]), candidate.effect.coefficients[worst]
+        out.append(Detectable(name, minimum, own.unit, minimum * own.per_si, own.shown_unit))
+    return out
+
+
+def next_orientation(found: Diagnosis) -> tuple[Advice, str] | None:
+    """Where to go next, and why: to tell equal suspects apart, to size the one there is, or to show what is hidden."""
+    fitted, test = found.before.fit, found.test
+    named = [name for name in found.ambiguity if name in test.best]
+    if named and not found.unknown:
+        first = test.candidate(named[0])
+        rivals = [test.candidate(name).effect for name in named[1:5]] if len(found.missing) == 1 else []
+        advice = advise.to_tell_apart(fitted, first.effect, test.scan.coefficients(first), rivals)
+        if advice is None:
+            return None
+        words = f"tells {named[0]} from {', '.join(named[1:5])}" if rivals else f"shows {named[0]} best"
+        return advice, f"{words}: separation {advice.before:.1f} -> {advice.after:.1f} sigma"
+    hidden = [effect_named(name, found.before.bench) for name in test.invisible]
+    shown = advise.to_show(fitted, hidden)
+    if shown is None or not shown[1]:
+        return None
+    return shown[0], f"would show {shown[1]} of {len(hidden)} effects that these orientations cannot"
+
+
+def _verdict(found: Diagnosis) -> str:
+    """One sentence on top."""
+    test = found.test
+    if test.consistent is None:
+        return "Nothing is left over to judge the model by: visit more orientations."
+    if test.consistent:
+        blind = f" It cannot see {len(test.invisible)} of {len(test.best)} effects." if test.invisible else ""
+        agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
+        return f"{agreed}: no effect is missing that this run could show.{blind}"
+    start = f"Residuals fail (p {format_p(test.p_value)})."
+    if found.missing and found.after is not None:
+        first = found.missing[0]
+        if len(found.missing) > 1:
+            named = f"{' and '.join(found.missing)} together explain it; no single known effect does"
+        else:
+            named = f"Missing: {first}{_size(found)}"
+            others = [name for name in found.ambiguity if name != first]
+            if others:
+                told = ", ".join(f"{name} (overlap {found.overlaps[name]:.2f})" for name in others)
+                named = f"Best: {first}{_size(found)}. Cannot yet be told from {told}"
+        return f"{start} {named}.{_held_out(found)}"
+    if found.unknown:
+        return f"{start} No known effect explains it, alone or in pairs: unknown."
+    return (
+        f"{start} Either the sensors scatter from dwell to dwell (which was not stated) or an effect is missing that "
+        "is none of the known ones: state scatter_sigma_mps2, or visit an orientation again to tell."
+    )
+
+
+def _size(found: Diagnosis) -> str:
+    """The largest coefficient of the first name, in sigma, with its unit."""
+    assert found.after is not None
+    first = next(each for each in found.after.model.effects if str(each) == found.missing[0])
+    sized = [found.after.parameters[c.symbol] for c in first.coefficients]
+    seen = [p for p in sized if p.value is not None and p.sigma]
+    if not seen:
+        return ""
+    top = max(seen, key=lambda p: abs(p.value or 0.0) / (p.sigma or 1.0))
+    return (
+        f", {top.symbol} = {(top.value or 0) * top.per_si:.3g} ± {(top.sigma or 0) * top.per_si:.2g} {top.shown_unit}"
+    )
+
+
+def _held_out(found: Diagnosis) -> str:
+    before, after = found.before, found.after
+    assert after is not None
+    if before.held_out_rms_mps2 is None or after.held_out_rms_mps2 is None or not after.held_out_floor_mps2:
+        return ""
+    floor = after.held_out_floor_mps2
+    return (
+        f" Adding it changes the held-out rms from {before.held_out_rms_mps2 / floor:.2f} to "
+        f"{after.held_out_rms_mps2 / floor:.2f} of the noise floor."
+    )

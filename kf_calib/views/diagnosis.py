@@ -1,0 +1,139 @@
+"""A diagnosis for people and for programs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from kf_calib.calibration import format_p
+from kf_calib.diagnosis import Detectable, Diagnosis, Suspect, detectable, next_orientation
+from kf_calib.drivers import Description, described
+from kf_calib.views.console import rounded, symbol
+from kf_calib.views.json import clean
+
+_LISTED = 12
+
+
+def description(found: Diagnosis) -> Description | None:
+    """What an unknown misfit looks like; None where the misfit is known, or there is none."""
+    if not found.unknown:
+        return None
+    return described(found.before.fit, np.array([visit.residual_mps2 for visit in found.before.visits]))
+
+
+def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
+    """What ``diagnose --json`` prints; p-values are those of the run."""
+    unknown, going = description(found), next_orientation(found)
+    missing = "unknown" if found.unknown else found.missing[0] if found.missing else None
+    return clean(
+        {
+            "consistent": found.test.consistent,
+            "p_value": found.test.p_value,
+            "verdict": found.verdict,
+            "model": [str(effect) for effect in found.before.model.effects],
+            "missing": missing,
+            "all_missing": list(found.missing),
+            "suspects": [_suspect_object(each) for each in found.suspects],
+            "ambiguity_set": list(found.ambiguity),
+            "overlaps": found.overlaps,
+            "invisible": found.test.invisible,
+            "detectable": [
+                {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in detectable(found.test)
+            ],
+            "unknown": None if unknown is None else vars(unknown),
+            "next_orientation": None if going is None else {"gimbal_deg": list(going[0].gimbal_deg), "why": going[1]},
+            "held_out_rms_mps2": found.before.held_out_rms_mps2,
+            "held_out_floor_mps2": found.before.held_out_floor_mps2,
+            "warnings": list(found.before.warnings),
+        }
+    )
+
+
+def _suspect_object(suspect: Suspect) -> dict[str, Any]:
+    return {
+        "effect": suspect.name,
+        "statistic": suspect.statistic,
+        "dof": suspect.dof,
+        "p_value": suspect.p_value,
+        "fits": suspect.fits,
+        "coefficients": [
+            {"symbol": p.symbol, "value": p.value, "sigma": p.sigma, "unit": p.unit} for p in suspect.coefficients
+        ],
+        "held_out_rms_mps2": suspect.refit.held_out_rms_mps2,
+        "held_out_floor_mps2": suspect.refit.held_out_floor_mps2,
+    }
+
+
+def diagnosis_report(found: Diagnosis) -> RenderableType:
+    """What ``diagnose`` prints: the verdict, then what it rests on."""
+    style = {True: "bold green", False: "bold yellow", None: "bold"}[found.test.consistent]
+    parts: list[RenderableType] = [Text(found.verdict, style=style)]
+    if found.suspects:
+        parts.append(_suspect_table(found))
+    if found.test.consistent is False:
+        parts.append(_dwell_table(found))
+    unknown, going = description(found), next_orientation(found)
+    if unknown is not None:
+        parts.append(
+            Text(
+                f"It goes with {unknown.driver} (accelerometer {unknown.channel}; explains {unknown.share:.0%} of it). "
+                f"To try: --with '{unknown.formula}'"
+            )
+        )
+    if going is not None:
+        angles = ", ".join(f"{angle:g}" for angle in going[0].gimbal_deg)
+        parts.append(Text(f"Next orientation: gimbals at {angles} deg: {going[1]}."))
+    if found.test.invisible:
+        parts.append(Text(f"Not to be seen with this run: {', '.join(found.test.invisible)}."))
+    parts.append(_detectable_table(detectable(found.test)))
+    parts += [Text(f"Note: {warning}", style="yellow") for warning in found.before.warnings]
+    return Group(*parts)
+
+
+def _suspect_table(found: Diagnosis) -> Table:
+    table = Table(title="Suspects (1σ; p of the whole run)", title_justify="left")
+    for heading in ("effect", "p", "fall of χ²", "fits", "coefficient", "value", "sigma", "unit", "held out / floor"):
+        table.add_column(heading, justify="left" if heading in ("effect", "fits", "coefficient", "unit") else "right")
+    for suspect in found.suspects:
+        rms, floor = suspect.refit.held_out_rms_mps2, suspect.refit.held_out_floor_mps2
+        ratio = f"{rms / floor:.2f}" if rms is not None and floor else ""
+        head = [suspect.name, format_p(suspect.p_value).removeprefix("= "), f"{suspect.statistic:.1f} / {suspect.dof}",
+                "yes" if suspect.fits else "no"]  # fmt: skip
+        for k, p in enumerate(suspect.coefficients):
+            own = head if k == 0 else [""] * 4
+            if p.value is None or p.sigma is None:
+                table.add_row(*own, symbol(p.symbol), "not seen", "", "", ratio if k == 0 else "")
+                continue
+            value, sigma = rounded(p.value * p.per_si, p.sigma * p.per_si)
+            table.add_row(*own, symbol(p.symbol), value, f"± {sigma}", p.shown_unit, ratio if k == 0 else "")
+        table.add_section()
+    return table
+
+
+def _dwell_table(found: Diagnosis) -> Table:
+    """The dwells that disagree most: residual over the sigma of the dwell's mean."""
+    table = Table(title="Where it fails: residual / σ of the dwell's mean", title_justify="left")
+    for heading in ("dwell", "at s", "gimbals, deg", "1", "2", "3"):
+        table.add_column(heading, justify="right")
+    ratios = found.residual_ratios
+    for k in np.argsort(-np.abs(ratios).max(axis=1))[:5].tolist():
+        dwell = found.before.visits[k].dwell
+        angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(dwell.pose))
+        table.add_row(str(k + 1), f"{dwell.start_s:.0f}", angles, *(f"{ratio:+.1f}" for ratio in ratios[k]))
+    return table
+
+
+def _detectable_table(sizes: list[Detectable]) -> Table:
+    table = Table(title="Smallest coefficient that would be found in 9 of 10 such runs", title_justify="left")
+    for heading in ("effect", "size", "unit", "effect", "size", "unit"):
+        table.add_column(heading, justify="right" if heading == "size" else "left")
+    half = (len(sizes) + 1) // 2
+    cells = [(each.name, f"{each.shown_minimum:.3g}", each.shown_unit) for each in sizes]
+    cells += [("", "", "")] * (2 * half - len(cells))
+    for left, right in zip(cells[:half], cells[half:], strict=True):
+        table.add_row(*left, *right)
+    return table
