@@ -1,11 +1,12 @@
 """Speed and memory of a replay, as ratios against named peers in one run.
 
-usage: .venv/bin/python tools/bench.py [--samples 1000000] [--large] [--json]
+usage: .venv/bin/python tools/bench.py [--samples 1000000] [--scan-memory] [--large] [--json]
 
 Peers: decoding alone (this package's reader, nothing done with the samples), and the textbook way: the official mcap
 reader with mcap-ros2-support's decoder and one update of filterpy's KalmanFilter a sample (timed on the first
 ``--peer-samples`` and scaled: it is linear). Each figure is the median of several runs, the ways taken in turn.
-``--large`` adds the peak memory of a ten times longer recording.
+``--large`` adds the peak memory of a ten times longer recording. The scan: decoding, folding, fitting the twelve, and
+projecting 70 further columns off them, those of all visible effects of the catalogue and of formulas.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -56,6 +58,47 @@ def replay(path: Path) -> int:
     return calibrate(Recording(path)).tally.read
 
 
+def candidates(dwells: list[Any], bench: Any, columns: int = 70) -> list[Any]:
+    """Effects of the catalogue that have a column the twelve do not explain, and formulas up to so many columns."""
+    from kf_calib.effects import effect_named, names
+
+    effects = [effect_named(name, bench) for name in names(bench)]
+    effects = [effect for effect in effects if effect.coefficients and scanned(dwells, bench, [effect])[0].dof]
+    letters = [f"f{a}*f{b}*{more}" for more in ("T", "t", "fx", "fy") for a in "xyz" for b in "xyz" if a <= b]
+    formulas = (effect_named(f"f{k:02} = {text}", bench) for k, text in enumerate(letters))
+    while sum(len(effect.coefficients) for effect in effects) < columns:
+        effects.append(next(formulas))
+    return effects
+
+
+def scanned(dwells: list[Any], bench: Any, effects: list[Any]) -> Sequence[Any]:
+    from kf_calib.fitting import fit
+    from kf_calib.model import Model
+    from kf_calib.scan import scan
+
+    fitted = fit(dwells, Model(bench))
+    return scan(fitted.carried, fitted.noise, effects).candidates
+
+
+def fold_and_scan(path: Path) -> tuple[int, int]:
+    """Readings, and columns beside the twelve."""
+    from threadpoolctl import threadpool_limits
+
+    from kf_calib.calibration import Pass, Settings
+    from kf_calib.sources.recording import Recording
+
+    passed = Pass(Recording(path), Settings())
+    with threadpool_limits(1, user_api="blas"):
+        dwells = passed.fold()
+        if path not in _candidates:
+            _candidates[path] = candidates(dwells, passed.source.bench)
+        scanned(dwells, passed.source.bench, _candidates[path])
+    return passed.tally.read, sum(len(effect.coefficients) for effect in _candidates[path])
+
+
+_candidates: dict[Path, list[Any]] = {}
+
+
 def textbook(path: Path, samples: int) -> int:
     """Official reader and decoder, filterpy's update with the affine model; angles are taken as last decoded."""
     from filterpy.kalman import KalmanFilter
@@ -90,11 +133,11 @@ def seconds(run: Callable[[], int]) -> tuple[float, int]:
     return time.perf_counter() - begin, count
 
 
-def peak_mb(path: Path) -> float:
-    """Largest resident memory of a process of its own that replays the recording, MB."""
+def peak_mb(path: Path, way: str = "replay") -> float:
+    """Largest resident memory of a process of its own that goes ``way`` (a function of this file), MB."""
     code = (
-        "import resource, sys; from kf_calib.calibration import calibrate; "
-        "from kf_calib.sources.recording import Recording; calibrate(Recording(sys.argv[1])); "
+        f"import pathlib, resource, sys; sys.path.insert(0, {str(Path(__file__).resolve().parent)!r}); import bench; "
+        f"bench.{way}(pathlib.Path(sys.argv[1])); "
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == 'darwin' else 1024))"
     )
     return float(
@@ -118,6 +161,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=1_000_000)
     parser.add_argument("--peer-samples", type=int, default=30_000)
     parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--scan-memory", action="store_true", help="peak memory of a scan of three times the readings")
     parser.add_argument("--large", action="store_true")
     parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
@@ -125,11 +169,13 @@ def main() -> None:
         path = Path(folder) / "run.mcap"
         making_s, _ = seconds(lambda: make_recording(path, chosen.samples) or 0)
         replay(path)  # imports and the disk cache are not what is compared
-        times: dict[str, list[float]] = {"decode": [], "replay": [], "textbook": []}
+        _, columns = fold_and_scan(path)
+        times: dict[str, list[float]] = {"decode": [], "replay": [], "scan": [], "textbook": []}
         for _ in range(chosen.runs):
             times["decode"].append(seconds(lambda: decode(path))[0])
             wall_s, samples = seconds(lambda: replay(path))
             times["replay"].append(wall_s)
+            times["scan"].append(seconds(lambda: fold_and_scan(path)[0])[0])
             wall_s, done = seconds(lambda: textbook(path, chosen.peer_samples))
             times["textbook"].append(wall_s * samples / done)
         median = {name: statistics.median(values) for name, values in times.items()}
@@ -142,9 +188,17 @@ def main() -> None:
             "textbook_s_scaled": median["textbook"],
             "replay_over_decode": statistics.median(np.divide(times["replay"], times["decode"]).tolist()),
             "textbook_over_replay": statistics.median(np.divide(times["textbook"], times["replay"]).tolist()),
+            "scan_columns": 12 + columns,
+            "scan_s": median["scan"],
+            "scan_over_replay": statistics.median(np.divide(times["scan"], times["replay"]).tolist()),
             "import_s": import_s(),
             "replay_peak_mb": peak_mb(path),
+            "scan_peak_mb": peak_mb(path, "fold_and_scan"),
         }
+        if chosen.scan_memory:
+            longer = Path(folder) / "longer.mcap"
+            make_recording(longer, 3 * chosen.samples)
+            figures["scan_peak_mb_of_three_times"] = peak_mb(longer, "fold_and_scan")
         if chosen.large:
             long = Path(folder) / "long.mcap"
             make_recording(long, 10 * chosen.samples)
