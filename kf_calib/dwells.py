@@ -395,8 +395,8 @@ class Segmenter:
         return self.slews and self.dwell_count > 0 and len(self._accel) <= _PENDING_SAMPLES
 
     def _slew(self, arrival_ns: int) -> Iterator[Block]:
-        """Blocks of the readings between the last dwell and an arrival, if angles came all the way and half a second
-        to either side."""
+        """Blocks of the readings between the last dwell and an arrival, if angles came all the way, no farther
+        apart than half a second and a quarter of the way."""
         count = int(np.searchsorted(self._accel.time_ns, arrival_ns))
         if not self._slewing() or count < _SLEW_READINGS or self.first_ns is None:
             return
@@ -405,6 +405,8 @@ class Segmenter:
         around = slice(*np.searchsorted(self._pose.time_ns, (begin_ns - window_ns, arrival_ns + window_ns + 1)))
         times, poses = self._pose.time_ns[around], self._pose.values[around]
         if len(times) < 4 or times[0] > begin_ns or times[-1] < end_ns or np.diff(times).max() > window_ns:
+            return
+        if np.abs(np.diff(poses, axis=0)).max() > np.ptp(poses, axis=0).max() / 4.0:  # too fast for its messages
             return
         curve = Curve.through(self.bench, (times - self.first_ns) / _SECOND_NS, poses)
         warm, elapsed_s = _carried_on(self._temperature, accel.time_ns), (accel.time_ns - self.first_ns) / _SECOND_NS
