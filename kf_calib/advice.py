@@ -94,7 +94,7 @@ def _with_next(fitted: Fit, effects: Sequence[Effect], poses: Floats) -> tuple[F
     counts = np.full(len(poses), np.median(carried.means.counts))
     means = Means(design, np.zeros((len(poses), 3)), stimulus.force_mps2, counts)
     root = np.linalg.cholesky(mean_covariances(noise, means, state))
-    return upper[:-1, :-1], np.linalg.solve(root, design)
+    return upper[:-1, :-1], np.asarray(np.linalg.solve(root, design), float)
 
 
 def _next_stimulus(fitted: Fit, poses: Floats) -> Stimulus:

@@ -22,10 +22,11 @@ def least_squares(samples: Iterable[Samples], noise: Noise, linearised_at: Float
     Rows of a dwell have covariance V = I + B B^T after division by the white sigma, B the dwell's nuisance columns
     times their sigmas; V^(-1/2) = I - U (1 - (1 + s^2)^(-1/2)) U^T from the thin SVD of B.
     """
-    by_dwell: dict[int, list[Samples]] = {}
+    by_dwell: dict[tuple[int, bool], list[Samples]] = {}
     for piece in samples:
-        by_dwell.setdefault(piece.dwell, []).append(piece)
-    stacked = np.concatenate([_whitened(pieces, noise, linearised_at) for pieces in by_dwell.values()])
+        by_dwell.setdefault((piece.dwell, piece.moving), []).append(piece)
+    whitened = (_whitened(pieces, noise.of(pieces[0].moving), linearised_at) for pieces in by_dwell.values())
+    stacked = np.concatenate(list(whitened))
     design, readings = stacked[:, :-1], stacked[:, -1]
     scale = np.linalg.norm(design, axis=0)
     design = design / scale

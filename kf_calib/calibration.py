@@ -8,7 +8,7 @@ of the whole run, so the curves of a replay do not jump when the noise becomes b
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -236,6 +236,8 @@ class Calibration:
                 factor = information.update(before, rows).factor
                 extra = extra_before + considered(self.noise, means_of([part], own), state)[0]
                 yield part.end_s, index, _estimate(factor, around, extra)
+            if len(self.fit.following[index]):
+                factor = information.update(factor, self.fit.following[index]).factor
 
 
 @dataclass
@@ -248,7 +250,8 @@ class Pass:
     folder: Folder = field(default_factory=Folder)
 
     def rows(self) -> Iterator[Rows]:
-        segmenter = Segmenter(self.source.bench, self.settings.stillness, self.tally)
+        slews = bool(Model.of(self.source.bench, self.settings.effects).dynamic)
+        segmenter = Segmenter(self.source.bench, self.settings.stillness, self.tally, slews)
         blocks = dwell_blocks(self.source, segmenter)
         return model_rows(blocks, self.source.bench, self.tally, self.settings.gate_sigma)
 
@@ -278,7 +281,7 @@ def calibrate(
     with threadpool_limits(1, user_api="blas"):  # small decompositions: with threads they take three times as long
         dwells = passed.fold(on_progress)
         refuse_unusable(dwells, passed.tally, source.bench)
-        result = evaluate(dwells, source.bench, settings)
+        result = evaluate(dwells, source.bench, settings, passed.folder.slews)
     refuse_unseen(result)
     if settings.engine == "filterpy":
         result = replace(result, estimate=filterpy_estimate(source, result))
@@ -286,24 +289,27 @@ def calibrate(
     return replace(result, tally=passed.tally, warnings=tuple(said))
 
 
-def evaluate(dwells: list[DwellFactor], bench: Bench, settings: Settings) -> Calibration:
-    """The calibration from dwell factors alone; no pass over the data."""
-    return evaluated(fit(dwells, Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s), settings)
+def evaluate(
+    dwells: list[DwellFactor], bench: Bench, settings: Settings, slews: Sequence[DwellFactor] = ()
+) -> Calibration:
+    """The calibration from dwell factors alone, and those of slews if effects show in them; no pass over the data."""
+    return evaluated(fit(dwells, Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s, slews), settings)
 
 
 def evaluated(fitted: Fit, settings: Settings) -> Calibration:
     """The filter run over a fit, its innovations, and the judgement of the misfit."""
     carried, noise, model = fitted.carried, fitted.noise, fitted.carried.model
-    steps = information.run(information.start(settings.prior, model), fitted.rows(), fitted.walk_variances)
+    first = information.start(settings.prior, model)
+    steps = information.run(first, fitted.rows(), fitted.walk_variances, fitted.following)
     extra = considered(noise, carried.means, carried.state)
     final = _estimate(steps[-1].factor, model.nominal_state(), extra.sum(axis=0))
     residuals = carried.means.readings - carried.means.design @ final.state
     visits = _visits(fitted, steps, residuals, extra, settings)
-    held_out, floor = _held_out(carried, noise.judging)
+    held_out, floor = _held_out(fitted)
     judged = consistency(fitted)
     return Calibration(
         model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), held_out, floor,
-        Tally(), tuple(_remarks(model, noise, final, judged, residuals, carried.dwells)),
+        Tally(), tuple(_remarks(carried, noise, final, judged, residuals)),
     )  # fmt: skip
 
 
@@ -313,6 +319,8 @@ def filterpy_estimate(
     """The same posterior by filterpy's filter, sample by sample: a second pass over the source."""
     prior, q, model = result.settings.prior, result.fit.walk.intensity, result.model
     largest = np.abs(result.carried.means.design).max(axis=(0, 1))
+    for columns in result.carried.slew_columns:
+        largest = np.maximum(largest, np.abs(columns).max(axis=(0, 1, 2)))
     scale = np.concatenate(
         [np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), np.where(largest > 0, largest, 1.0)[STATE_COUNT:]]
     )
@@ -436,17 +444,19 @@ def orientations(dwells: list[DwellFactor]) -> list[list[int]]:
     return groups
 
 
-def _held_out(carried: Carried, noise: Noise) -> tuple[float | None, float | None]:
-    """Rms error of the dwell means of orientations left out of the fit, and the rms that ``noise`` alone would give.
+def _held_out(fitted: Fit) -> tuple[float | None, float | None]:
+    """Rms error of the dwell means of orientations left out of the fit, and the rms that the noise alone would give.
 
     Factors of the orientations before and after the one left out are merged: no refit from the start. None where a
-    fit without one of the orientations is undetermined.
+    fit without one of the orientations is undetermined. Slews are left out of no fit.
     """
+    carried, noise = fitted.carried, fitted.noise.judging
     rows = information.whitened(carried.dwells, carried.columns, noise.weights, carried.state)
     extra = considered(noise, carried.means, carried.state)
     groups, empty = orientations(carried.dwells), information.start(Prior(), carried.model)
+    slews = information.update(empty, np.concatenate(fitted.following)).factor if carried.slews else empty
     own = [information.update(empty, np.concatenate([rows[k] for k in group])).factor for group in groups]
-    heads, tails = [empty], [empty]
+    heads, tails = [slews], [empty]
     for factor in own[:-1]:
         heads.append(information.update(heads[-1], factor).factor)
     for factor in own[:0:-1]:
@@ -466,9 +476,15 @@ def _held_out(carried: Carried, noise: Noise) -> tuple[float | None, float | Non
 
 
 def _remarks(
-    model: Model, noise: Noise, estimate: Estimate, judged: Consistency, residuals: Floats, dwells: list[DwellFactor]
+    carried: Carried, noise: Noise, estimate: Estimate, judged: Consistency, residuals: Floats
 ) -> Iterator[str]:
     """What a reader of the numbers must know, one sentence each."""
+    model, dwells = carried.model, carried.dwells
+    if model.dynamic and not carried.slews:
+        yield (
+            f"{' and '.join(map(str, model.dynamic))} cannot be seen in this recording: it needs slew samples, "
+            "readings and angles recorded all through the motions, angles at least every half second."
+        )
     unseen = [symbol for symbol, hidden in zip(paper.SYMBOLS, estimate.unseen, strict=True) if hidden]
     unseen += [c.symbol for c, s in zip(model.coefficients, estimate.effect_sigma, strict=True) if np.isnan(s)]
     if unseen:

@@ -51,6 +51,7 @@ class Test:
     misfit_p: float | None
     walk: Walk | None
     effective_tests: float
+    in_slews_only: tuple[str, ...]
 
     @property
     def p_value(self) -> float | None:
@@ -63,14 +64,20 @@ class Test:
         return None if self.p_value is None else self.p_value >= LEVEL
 
     @property
+    def count(self) -> int:
+        """How many effects were looked for or could not be."""
+        return len(self.best) + len(self.in_slews_only) + (self.walk is not None)
+
+    @property
     def ranked(self) -> list[str]:
         """Names, the likeliest first."""
         return sorted(self.scores, key=lambda name: -self.scores[name])
 
     @cached_property
     def invisible(self) -> list[str]:
-        """Effects of which these orientations show nothing."""
-        return [name for name, k in self.best.items() if not self.scan.candidates[k].dof]
+        """Effects of which these orientations show nothing, and those that only slews could show."""
+        unseen = [name for name, k in self.best.items() if not self.scan.candidates[k].dof]
+        return [*unseen, *self.in_slews_only]
 
     def candidate(self, name: str) -> Candidate:
         return self.scan.candidates[self.best[name]]
@@ -87,7 +94,7 @@ def candidates(model: Model) -> list[Effect]:
     return out
 
 
-def tested(fitted: Fit, seed: int = 0) -> Test:
+def assessed(fitted: Fit, seed: int = 0) -> Test:
     """Score tests of all candidates, calibrated on their own columns by drawing residuals as noise alone makes them."""
     from scipy.special import chdtrc, chdtri
 
@@ -110,7 +117,9 @@ def tested(fitted: Fit, seed: int = 0) -> Test:
     if walk is not None:
         name, ratio = walk[0], walk[2]
         scores[name], p_values[name] = ratio - threshold[1], run_level(0.5 * float(chdtrc(1, ratio)), tests)
-    return Test(found, best, scores, p_values, consistency(fitted).p_value, walk and walk[1], tests)
+    model, misfit_p = fitted.carried.model, consistency(fitted).p_value
+    slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
+    return Test(found, best, scores, p_values, misfit_p, walk and walk[1], tests, slewing)
 
 
 def run_level(p_value: float, tests: float) -> float:
@@ -200,7 +209,7 @@ def diagnose(before: Calibration) -> Diagnosis:
 
 
 def _diagnosed(before: Calibration) -> Diagnosis:
-    test = tested(before.fit)
+    test = assessed(before.fit)
     nothing = Diagnosis(before, test, (), (), False, (), {}, None, "")
     if test.consistent is not False:
         return replace(nothing, verdict=_verdict(nothing))
@@ -230,7 +239,7 @@ def _suspects(before: Calibration, test: Test) -> tuple[Suspect, ...]:
         refit = with_effects(before, (name,))
         dof = 1 if name not in test.best else test.candidate(name).dof
         statistic = test.scores[name] if name not in test.best else float(test.scan.statistics[test.best[name]])
-        fits = tested(refit.fit).consistent is not False and not _leaps(refit)
+        fits = assessed(refit.fit).consistent is not False and not _leaps(refit)
         known = tuple(before.parameters)[12:]
         out.append(Suspect(name, statistic, dof, test.p_values[name], fits, refit, known))
     return tuple(out)
@@ -251,7 +260,7 @@ def with_effects(before: Calibration, added: Sequence[str]) -> Calibration:
     """The same dwells with further effects in the model."""
     settings: Settings = replace(before.settings, effects=(*before.settings.effects, *added))
     model = Model.of(before.bench, settings.effects)
-    return evaluated(fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s), settings)
+    return evaluated(fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews), settings)
 
 
 def _pair(before: Calibration, test: Test) -> tuple[tuple[str, str], Calibration] | None:
@@ -261,7 +270,7 @@ def _pair(before: Calibration, test: Test) -> tuple[tuple[str, str], Calibration
     falls = {pair: _fall(test, pair) for pair in itertools.combinations(visible, 2)}
     for pair in sorted(falls, key=lambda pair: -falls[pair])[:3]:
         refit = with_effects(before, pair)
-        if tested(refit.fit).consistent is not False:
+        if assessed(refit.fit).consistent is not False:
             return pair, refit
     return None
 
@@ -324,7 +333,7 @@ def next_orientation(found: Diagnosis) -> tuple[Advice, str] | None:
             return None
         words = f"tells {named[0]} from {', '.join(named[1:5])}" if rivals else f"shows {named[0]} best"
         return advice, f"{words}: separation {advice.before:.1f} -> {advice.after:.1f} sigma"
-    hidden = [effect_named(name, found.before.bench) for name in test.invisible]
+    hidden = [test.candidate(name).effect for name in test.invisible if name in test.best]
     shown = advise.to_show(fitted, hidden)
     if shown is None or not shown[1]:
         return None
@@ -337,7 +346,7 @@ def _verdict(found: Diagnosis) -> str:
     if test.consistent is None:
         return "Nothing is left over to judge the model by: visit more orientations."
     if test.consistent:
-        blind = f" It cannot see {len(test.invisible)} of {len(test.best)} effects." if test.invisible else ""
+        blind = f" It cannot see {len(test.invisible)} of {test.count} effects." if test.invisible else ""
         agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
         return f"{agreed}: no effect is missing that this run could show.{blind}"
     start = f"Residuals fail (p {format_p(test.p_value)})."

@@ -17,7 +17,9 @@ from enum import Enum
 import numpy as np
 
 from kf_calib.bench import Bench, interpolate_pose, mean_pose, pose_distance, unwrap_pose
+from kf_calib.errors import InputError
 from kf_calib.samples import Batch, Floats, Mask, Source, Stream, Times
+from kf_calib.slews import Curve
 
 BLOCK_SAMPLES = 4000
 """Samples of one block at the most: few enough for the cache; no power of two, whose columns would evict each other."""
@@ -25,6 +27,7 @@ BLOCK_SAMPLES = 4000
 _SECOND_NS = 1_000_000_000
 _HOLD_NS = _SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
 _LEAP_NS = 10 * _SECOND_NS  # a stamp this far ahead, with the next one behind it, is a damaged stamp
+_SLEW_READINGS = 8  # of a slew, at least
 _PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
 
 
@@ -40,7 +43,7 @@ class Stillness:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Up to 4000 consecutive readings of one dwell, which began at ``arrival_s``.
+    """Up to 4000 consecutive readings of one dwell, which began at ``arrival_s``, or of the slew that ended it.
 
     elapsed_s (n,) since the first sample of the recording; accel_mps2 (n, 3); pose (1, k): the mean of the angle
     messages while the platform stands still, or (n, k) where it creeps; temperature_c (n,), NaN where not measured.
@@ -52,14 +55,20 @@ class Block:
     accel_mps2: Floats
     pose: Floats
     temperature_c: Floats
+    curve: Curve | None = None
+    """How the angles went, in a slew; None in a dwell."""
 
 
 @dataclass
 class Tally:
-    """What became of every sample that was read; ``sentences`` says what a user should know of it."""
+    """What became of every sample that was read; ``sentences`` says what a user should know of it.
+
+    slewing: used though the platform moved; moving: not used because it did.
+    """
 
     read: int = 0
     used: int = 0
+    slewing: int = 0
     moving: int = 0
     settling: int = 0
     not_finite: int = 0
@@ -157,13 +166,22 @@ class _Dwell:
 
 @dataclass
 class Segmenter:
-    """Cuts batches into blocks of dwells; ``push`` what has arrived, then ``finish``."""
+    """Cuts batches into blocks of dwells; ``push`` what has arrived, then ``finish``.
+
+    slews: blocks of the motions from dwell to dwell, too, as far as angles were recorded in them.
+    """
 
     bench: Bench
     stillness: Stillness = field(default_factory=Stillness)
     tally: Tally = field(default_factory=Tally)
+    slews: bool = False
 
     def __post_init__(self) -> None:
+        if self.slews and not self.bench.axes:
+            raise InputError(
+                "slews are evaluated from gimbal angles, and this recording has attitude quaternions: record "
+                "/platform/angles, or leave out the effects that show in slews only."
+            )
         self.first_ns: int | None = None
         self.dwell_count = 0
         self._accel = Stream.empty(3)
@@ -221,6 +239,7 @@ class Segmenter:
     def _advance(self, final: bool) -> Iterator[Block]:
         for stamp, event, settles in self._judge(final):
             if event is _Event.ARRIVE:
+                yield from self._slew(stamp)
                 self._discard(stamp)
                 self.dwell_count += 1
                 number, settling_ns = self.dwell_count - 1, None if settles else 0
@@ -234,7 +253,7 @@ class Segmenter:
             return
         if self._dwell is not None:
             yield from self._emit(horizon, closing=final)
-        else:
+        elif final or not self._slewing():
             self._discard(horizon)
         self._forget()
         if final:
@@ -371,6 +390,34 @@ class Segmenter:
         self.tally.moving += count - early
         self._accel = self._accel[count:]
 
+    def _slewing(self) -> bool:
+        """Whether readings wait for the end of a slew, to be used."""
+        return self.slews and self.dwell_count > 0 and len(self._accel) <= _PENDING_SAMPLES
+
+    def _slew(self, arrival_ns: int) -> Iterator[Block]:
+        """Blocks of the readings between the last dwell and an arrival, if angles came all the way, no farther
+        apart than half a second and a quarter of the way."""
+        count = int(np.searchsorted(self._accel.time_ns, arrival_ns))
+        if not self._slewing() or count < _SLEW_READINGS or self.first_ns is None:
+            return
+        accel, window_ns = self._accel[:count], round(self.stillness.window_s * _SECOND_NS)
+        begin_ns, end_ns = int(accel.time_ns[0]), int(accel.time_ns[-1])
+        around = slice(*np.searchsorted(self._pose.time_ns, (begin_ns - window_ns, arrival_ns + window_ns + 1)))
+        times, poses = self._pose.time_ns[around], self._pose.values[around]
+        if len(times) < 4 or times[0] > begin_ns or times[-1] < end_ns or np.diff(times).max() > window_ns:
+            return
+        if np.abs(np.diff(poses, axis=0)).max() > np.ptp(poses, axis=0).max() / 4.0:  # too fast for its messages
+            return
+        curve = Curve.through(self.bench, (times - self.first_ns) / _SECOND_NS, poses)
+        warm, elapsed_s = _carried_on(self._temperature, accel.time_ns), (accel.time_ns - self.first_ns) / _SECOND_NS
+        for part in np.array_split(np.arange(count), -(-count // BLOCK_SAMPLES)):
+            own = elapsed_s[part]
+            yield Block(
+                self.dwell_count - 1, float(elapsed_s[0]), own, accel.values[part], curve.angles(own), warm[part], curve
+            )
+        self.tally.slewing += count
+        self._accel = self._accel[count:]
+
     def _emit(self, until_ns: int, closing: bool) -> Iterator[Block]:
         """Blocks of the open dwell from the readings before ``until_ns``; a last short one when it closes."""
         assert self._dwell is not None
@@ -437,6 +484,8 @@ class Segmenter:
         """Drop poses and temperatures that no pending reading needs."""
         oldest = int(self._accel.time_ns[0]) if len(self._accel) else (self._decided_ns or 0)
         oldest = min(oldest, (self._decided_ns or oldest) - round(4 * self.stillness.window_s * _SECOND_NS))
+        if self.slews:  # a slew's curve begins a window before it
+            oldest -= round(self.stillness.window_s * _SECOND_NS) + self._lead_ns
         self._pose = self._pose[max(int(np.searchsorted(self._pose.time_ns, oldest)) - 2, 0) :]
         self._temperature = self._temperature[max(int(np.searchsorted(self._temperature.time_ns, oldest)) - 2, 0) :]
 

@@ -7,17 +7,19 @@ parts of the noise and a walk of the biases are found by likelihood.
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from kf_calib import information
 from kf_calib.effects import Coefficient, Effect
 from kf_calib.folding import Carried, DwellFactor
-from kf_calib.model import Model
-from kf_calib.noise import Noise, with_dwell_parts, within_dwells
+from kf_calib.model import Model, parabola
+from kf_calib.noise import FLOOR_MPS2, Noise, with_dwell_parts, within_dwells
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
 
@@ -57,25 +59,46 @@ class Fit:
     def walk_variances(self) -> Floats:
         return self.walk.variances(self.dwells)
 
+    @cached_property
+    def following(self) -> list[Floats]:
+        """Whitened rows [H | z] of what slew follows each dwell; (0, p + 1) where none does."""
+        carried, noise = self.carried, self.noise.weights.of(moving=True)
+        out = [np.zeros((0, carried.model.count + 1))] * len(self.dwells)
+        if carried.slews:
+            rows = information.whitened(carried.slews, carried.slew_columns, noise, carried.state)
+            numbers = [dwell.number for dwell in self.dwells]
+            for slew, own in zip(carried.slews, rows, strict=True):
+                place = bisect.bisect_right(numbers, slew.number) - 1
+                out[place] = np.vstack([out[place], own])
+        return out
+
+    def all_rows(self) -> list[Floats]:
+        """Whitened rows of each dwell and the slew after it."""
+        return [np.vstack(both) if len(both[1]) else both[0] for both in zip(self.rows(), self.following, strict=True)]
+
     def rows(self, noise: Noise | None = None) -> list[Floats]:
         """Whitened rows [H | z] of each dwell, by the weights of the fit or by another noise."""
         return information.whitened(self.dwells, self.carried.columns, noise or self.noise.weights, self.carried.state)
 
 
-def fit(dwells: list[DwellFactor], model: Model, walk_mps2_per_sqrt_s: float = 0.0) -> Fit:
+def fit(
+    dwells: list[DwellFactor], model: Model, walk_mps2_per_sqrt_s: float = 0.0, slews: Sequence[DwellFactor] = ()
+) -> Fit:
     """Noise, linearisation and the model's unknowns, each given the others, until they stand still."""
     within, bench = within_dwells(dwells), model.bench
-    fitted = Fit(Carried(dwells, model, model.nominal_state()), within, Walk(walk_mps2_per_sqrt_s))
+    slews = [slew for slew in slews if slew.number >= dwells[0].number] if model.dynamic else []
+    fitted = Fit(Carried(dwells, model, model.nominal_state(), slews), within, Walk(walk_mps2_per_sqrt_s))
     searching = False
     for number in range(_PASSES_WITH_UNKNOWNS if model.unknowns else _PASSES):
         if number == 1 and model.unknowns:
             model, searching = _placed(fitted), True
-            fitted = replace(fitted, carried=Carried(dwells, model, fitted.carried.state))
+            fitted = replace(fitted, carried=Carried(dwells, model, fitted.carried.state, slews))
         state, moved = _solved(fitted)
         if searching:
             model = model.moved(np.clip(moved, -_STEP_LIMIT, _STEP_LIMIT))
-        carried = Carried(dwells, model, state)
+        carried = Carried(dwells, model, state, slews)
         noise = with_dwell_parts(within, carried.means, state, bench.angle_sigma_deg, bench.scatter_sigma_mps2)
+        noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
         walk = likely_walk(replace(fitted, carried=carried, noise=noise))[0] if model.walks else fitted.walk
         fitted = Fit(carried, noise, walk)
         if number >= _PASSES - 1 and np.abs(moved).max(initial=0.0) < 1e-4:
@@ -85,12 +108,35 @@ def fit(dwells: list[DwellFactor], model: Model, walk_mps2_per_sqrt_s: float = 0
 
 def _solved(fitted: Fit) -> tuple[Floats, Floats]:
     """The estimate (p,) with unknowns at zero, and how far these would move (p,), zeros elsewhere."""
-    factor = information.accumulated(fitted.rows(), fitted.walk_variances)[:-1]
+    factor = information.accumulated(fitted.all_rows(), fitted.walk_variances)[:-1]
     state = information.solve(factor, fitted.carried.model.nominal_state())[0]
     moved = np.zeros_like(state)
     places = list(fitted.carried.model.unknowns)
     moved[places], state[places] = state[places], 0.0
     return state, moved
+
+
+def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
+    """Sigma (3,) of white readings that would leave the slews' rows as far from ``state`` as they are.
+
+    The channels' ratio is that of their residuals; the level makes the mean square of the whitened rows' residuals one.
+    These rows are weighted sums over whole slews, so that what is correlated along a slew (angles, vibration) counts.
+    """
+    carried, rows = fitted.carried, np.concatenate(fitted.following)
+    squares, counts = np.zeros(3), 0
+    for slew, columns in zip(carried.slews, carried.slew_columns, strict=True):
+        model = np.moveaxis(columns @ state, 2, 1)  # (pieces, channels, nodes)
+        triangles = np.array([piece.triangle for piece in slew.pieces])
+        own = triangles[:, :, 3:].copy()
+        own[:, :3] -= triangles[:, :3, :3] @ parabola(np.moveaxis(model, 1, 2))
+        squares, counts = squares + (own**2).sum(axis=(0, 1)), counts + slew.count
+    sizes = np.sqrt(squares / counts) + FLOOR_MPS2
+    factor = information.accumulated(fitted.all_rows(), fitted.walk_variances)[:-1]
+    covariance = information.solve(factor, state)[1]
+    freedom = information.row_rank(rows) - float(np.einsum("rp,pq,rq->", rows[:, :-1], covariance, rows[:, :-1]))
+    level = np.linalg.norm(rows[:, -1] - rows[:, :-1] @ state) / np.sqrt(max(freedom, 1.0))
+    before = fitted.noise.of(moving=True).effective_sigma_mps2
+    return np.maximum(level * sizes * np.exp(np.mean(np.log(before / sizes))), FLOOR_MPS2)
 
 
 def _placed(fitted: Fit) -> Model:

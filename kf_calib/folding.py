@@ -74,11 +74,15 @@ class Piece:
 
 @dataclass(frozen=True)
 class DwellFactor:
-    """One dwell: its pieces in order of time, and the autocovariance of its first readings."""
+    """One dwell: its pieces in order of time, and the autocovariance of its first readings.
+
+    moving: it is the slew after the dwell of that number, folded like a dwell.
+    """
 
     number: int
     pieces: tuple[Piece, ...]
     autocovariance: Autocovariance
+    moving: bool = False
 
     @cached_property
     def squares(self) -> Floats:
@@ -171,10 +175,9 @@ def _folded(stacked: Floats) -> Floats:
 
 
 def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> Stimulus:
-    """The nodes of all pieces of all dwells, in order; rotations are linearised at the affine ``state``."""
+    """The nodes of all pieces of all dwells and slews, in order; rotations are linearised at the affine ``state``."""
     nodes = [piece.nodes for dwell in dwells for piece in dwell.pieces]
-    forces = [dwell.means[1:4] for dwell in dwells]
-    before = [forces[max(d - 1, 0)] for d, dwell in enumerate(dwells) for _ in dwell.pieces]
+    before = [force for dwell, force in zip(dwells, _forces_before(dwells), strict=True) for _ in dwell.pieces]
     return Stimulus(
         bench=bench,
         elapsed_s=np.concatenate([each.elapsed_s for each in nodes]),
@@ -185,7 +188,23 @@ def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> S
         temperature_c=_signal_only(dwells, np.concatenate([each.temperature_c for each in nodes])),
         sensitivity=state[:12].reshape(3, 4)[:, :3],
         variance_mps2_2=np.repeat(_varying(dwells), 3, axis=0),
+        rate_radps=np.concatenate([_still if each.rate_radps is None else each.rate_radps for each in nodes]),
+        rate_change_radps2=np.concatenate(
+            [_still if each.rate_change_radps2 is None else each.rate_change_radps2 for each in nodes]
+        ),
     )
+
+
+_still = np.zeros((3, 3))
+
+
+def _forces_before(dwells: Sequence[DwellFactor]) -> list[Floats]:
+    """Specific force (3,) in the dwell before each dwell, its own in the first; before a slew, of the dwell it left."""
+    out, last = list[Floats](), dwells[0].means[1:4]
+    for dwell in dwells:
+        out.append(last)
+        last = last if dwell.moving else dwell.means[1:4]
+    return out
 
 
 def _signal_only(dwells: Sequence[DwellFactor], temperature_c: Floats) -> Floats:
@@ -258,54 +277,69 @@ def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
 class Carried:
     """Dwells with the columns of a model: all that noise model, filter and diagnosis work on.
 
-    ``state`` (p,): where small rotations and input axes are linearised.
+    ``state`` (p,): where small rotations and input axes are linearised. slews, slew_columns: of the motions, where an
+    effect in the model shows in them; everything else is of dwells only.
     """
 
-    def __init__(self, dwells: Sequence[DwellFactor], model: Model, state: Floats) -> None:
-        self.dwells, self.model, self.state = list(dwells), model, state
-        self.columns = columns_of(self.dwells, model, state)
+    def __init__(
+        self, dwells: Sequence[DwellFactor], model: Model, state: Floats, slews: Sequence[DwellFactor] = ()
+    ) -> None:
+        self.dwells, self.slews, self.model, self.state = list(dwells), list(slews), model, state
+        every = sorted((*dwells, *slews), key=lambda each: (each.number, each.moving)) if slews else self.dwells
+        columns = columns_of(every, model, state)
+        self.columns = [own for each, own in zip(every, columns, strict=True) if not each.moving]
+        self.slew_columns = [own for each, own in zip(every, columns, strict=True) if each.moving]
         self.means = means_of(self.dwells, self.columns)
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Rows of one piece, sample by sample: H (n, 3, p), regressors of the dwell states (n, 4), readings (n, 3)."""
+    """Rows of one piece, sample by sample: H (n, 3, p), regressors of the dwell states (n, 4), readings (n, 3).
+
+    moving: of the slew after the dwell.
+    """
 
     dwell: int
     start_s: float
     observation: Floats
     regressors: Floats
     readings: Floats
+    moving: bool = False
 
 
 def samples_of(rows: Iterable[Rows], carried: Carried) -> Iterator[Samples]:
     """A second pass over the rows with the columns of the first: what filterpy and batch least squares work on."""
-    known = {dwell.number: iter(own) for dwell, own in zip(carried.dwells, carried.columns, strict=True)}
-    starts = {dwell.number: dwell.start_s for dwell in carried.dwells}
+    every, columns = [*carried.dwells, *carried.slews], [*carried.columns, *carried.slew_columns]
+    known = {(each.number, each.moving): iter(own) for each, own in zip(every, columns, strict=True)}
+    starts = {(each.number, each.moving): each.start_s for each in every}
     for block in rows:
-        if block.dwell not in known:
+        key = block.dwell, block.moving
+        if key not in known:
             continue
         for part, u, _ in block.pieces:
-            own = next(known[block.dwell])
+            own = next(known[key])
             observation = (basis(u).T @ parabola(own.reshape(3, -1))).reshape(len(u), *own.shape[1:])
-            yield Samples(block.dwell, starts[block.dwell], observation, block.columns[part], block.readings[part])
+            regressors, readings = block.columns[part], block.readings[part]
+            yield Samples(block.dwell, starts[key], observation, regressors, readings, block.moving)
 
 
 class Folder:
-    """Folds rows into the list of dwell factors, dwell after dwell."""
+    """Folds rows into the lists of dwell factors and of slews, one after another."""
 
     def __init__(self) -> None:
         self.dwells: list[DwellFactor] = []
+        self.slews: list[DwellFactor] = []
 
     def add(self, rows: Rows) -> None:
-        current = self.dwells[-1] if self.dwells and self.dwells[-1].number == rows.dwell else None
-        fresh = current is None or current.autocovariance.count < _CORRELATED_SAMPLES
+        folded = self.slews if rows.moving else self.dwells
+        current = folded[-1] if folded and folded[-1].number == rows.dwell else None
+        fresh = not rows.moving and (current is None or current.autocovariance.count < _CORRELATED_SAMPLES)
         own = Autocovariance.of(rows.innovation) if fresh else Autocovariance()
-        block = DwellFactor(rows.dwell, fold(rows), own)
+        block = DwellFactor(rows.dwell, fold(rows), own, rows.moving)
         if current is None:
-            self.dwells.append(block)
+            folded.append(block)
         else:
-            self.dwells[-1] = current.merged(block)
+            folded[-1] = current.merged(block)
 
 
 def informative(factors: Floats) -> Mask:

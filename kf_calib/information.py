@@ -8,7 +8,7 @@ all come from such factors.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -68,7 +68,8 @@ def _informative(rows: Floats, units: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Step:
-    """The filter after one dwell: factor [R | z] (p, p + 1), normalised innovation squared, its degrees of freedom."""
+    """The filter after one dwell and its slew: factor [R | z] (p, p + 1); the dwell's normalised innovation squared and
+    its degrees of freedom."""
 
     factor: Floats
     nis: float
@@ -123,11 +124,17 @@ def row_rank(rows: Floats) -> int:
     return int(rows[:, :-1].any(axis=1).sum())
 
 
-def run(first: Floats, rows: Iterable[Floats], walk_variances: Iterable[Floats]) -> list[Step]:
-    """The recursion over dwells; one step of the biases' walk before each."""
+def run(
+    first: Floats, rows: Iterable[Floats], walk_variances: Iterable[Floats], following: Iterable[Floats]
+) -> list[Step]:
+    """The recursion over dwells; one step of the biases' walk before each, the rows ``following`` of its slew after it.
+
+    A step's factor is that after the slew, its innovation that of the dwell.
+    """
     steps, factor = list[Step](), first
-    for dwell_rows, variance in zip(rows, walk_variances, strict=True):
-        steps.append(update(predict(factor, variance), dwell_rows))
+    for dwell_rows, variance, more in zip(rows, walk_variances, following, strict=True):
+        step = update(predict(factor, variance), dwell_rows)
+        steps.append(replace(step, factor=update(step.factor, more).factor) if len(more) else step)
         factor = steps[-1].factor
     return steps
 

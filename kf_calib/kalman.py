@@ -56,14 +56,14 @@ def estimate(
         root = _DIFFUSE * widest * np.eye(count)
     else:
         root = np.linalg.cholesky(prior_covariance * np.outer(scale, scale))
-    kf = _Filter(form, nominal_state * scale, root, noise.dwell_sigmas[used], noise.effective_sigma_mps2)
-    dwell, nis, done, previous_s = -1, 0.0, 0, None
+    kf = _Filter(form, nominal_state * scale, root, noise.dwell_sigmas[used])
+    place, nis, done, previous_s = (-1, False), 0.0, 0, None
     for piece in samples:
-        if piece.dwell != dwell:
-            if walk_variance is not None and previous_s is not None:
+        if (piece.dwell, piece.moving) != place:
+            if walk_variance is not None and previous_s is not None and not piece.moving:
                 kf.walk(walk_variance(piece.start_s - previous_s))
-            kf.enter_dwell()
-            dwell, previous_s = piece.dwell, piece.start_s
+            kf.enter_dwell(noise.of(piece.moving).effective_sigma_mps2)
+            place, previous_s = (piece.dwell, piece.moving), previous_s if piece.moving else piece.start_s
         own = np.einsum("nc,icp->nip", piece.regressors, nuisances)
         observations = np.concatenate([piece.observation / scale, own], axis=2)
         for observation, reading in zip(observations, piece.readings, strict=True):
@@ -76,9 +76,7 @@ def estimate(
 class _Filter:
     """One of filterpy's two filters behind the few calls needed here."""
 
-    def __init__(
-        self, form: str, state: Floats, root: NDArray[np.floating[Any]], dwell_sigmas: Floats, sigma: Floats
-    ) -> None:
+    def __init__(self, form: str, state: Floats, root: NDArray[np.floating[Any]], dwell_sigmas: Floats) -> None:
         from filterpy.kalman import KalmanFilter, SquareRootKalmanFilter
 
         self.plain = form == "plain"
@@ -90,13 +88,17 @@ class _Filter:
         full = np.zeros((size, size))
         full[: self.count, : self.count] = root
         if self.plain:
-            kf.P, kf.R = full @ full.T, np.diag(sigma**2)
+            kf.P = full @ full.T
         else:
-            kf._P1_2, kf._R1_2 = full, np.diag(sigma)  # its setters would square the roots and lose half the digits
+            kf._P1_2 = full  # its setter would square the root and lose half the digits
         self.kf = kf
 
-    def enter_dwell(self) -> None:
-        """The nuisance states start from their prior, independent of everything before."""
+    def enter_dwell(self, sigma_mps2: Floats) -> None:
+        """The nuisance states start from their prior, independent of everything before; readings have this sigma."""
+        if self.plain:
+            self.kf.R = np.diag(sigma_mps2**2)
+        else:
+            self.kf._R1_2 = np.diag(sigma_mps2)  # its setter would square the root and lose half the digits
         own = slice(self.count, None)
         self.kf.x[own] = 0.0
         matrix, sigma = (self.kf.P, self.dwell_sigmas**2) if self.plain else (self.kf._P1_2, self.dwell_sigmas)

@@ -22,6 +22,7 @@ from kf_calib.dwells import Block, Tally
 from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named
 from kf_calib.errors import InputError
 from kf_calib.samples import Floats, Mask
+from kf_calib.slews import Curve
 
 STATE_COUNT = 12
 _ROUNDING_MPS2 = 1e-13
@@ -35,7 +36,8 @@ class Nodes:
     """What the block feels at m instants.
 
     elapsed_s, since_arrival_s, temperature_c (m,); force_mps2 (m, 3); pose (m, k). The three nodes of a
-    piece are its beginning, middle and end. temperature_c is NaN where it is not measured.
+    piece are its beginning, middle and end. temperature_c is NaN where it is not measured. rate_radps,
+    rate_change_radps2 (m, 3): the platform's omega in its own frame, and its derivative; None where it stands.
     """
 
     elapsed_s: Floats
@@ -43,6 +45,8 @@ class Nodes:
     force_mps2: Floats
     pose: Floats
     temperature_c: Floats
+    rate_radps: Floats | None = None
+    rate_change_radps2: Floats | None = None
 
     @property
     def regressors(self) -> Floats:
@@ -64,7 +68,7 @@ class Rows:
     """Model columns and readings of one block: columns (n, 4), readings (n, 3), innovation within the block (3, n).
 
     static: the columns are the same in every row, and the innovation is the readings less their mean.
-    pieces: parts of the rows, u (n',) from -1 to 1 over each, and its nodes.
+    pieces: parts of the rows, u (n',) from -1 to 1 over each, and its nodes. moving: of the slew after the dwell.
     """
 
     dwell: int
@@ -74,6 +78,7 @@ class Rows:
     innovation: Floats
     static: bool
     pieces: tuple[tuple[slice, Floats, Nodes], ...]
+    moving: bool = False
 
 
 @dataclass(frozen=True)
@@ -123,6 +128,11 @@ class Model:
     def walks(self) -> bool:
         """Whether an effect lets the biases walk."""
         return any(effect.walks for effect in self.effects)
+
+    @property
+    def dynamic(self) -> tuple[Effect, ...]:
+        """The effects that show in slews only."""
+        return tuple(effect for effect in self.effects if effect.dynamic)
 
     @property
     def unknowns(self) -> dict[int, Effect]:
@@ -203,6 +213,9 @@ def model_rows(blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: 
     """Rows of every block, outliers gated out; the same rows feed both engines and batch least squares."""
     standing: tuple[Floats, Floats] | None = None  # a pose and its force: the same for all blocks of a dwell
     for block in blocks:
+        if block.curve is not None:  # not gated: what an effect in a slew adds is no outlier
+            yield _slew_rows(block, bench, block.curve)
+            continue
         static = len(block.pose) == 1 and bench.reference == "base"
         if static and (standing is None or standing[0] is not block.pose):
             standing = block.pose, bench.specific_force(np.zeros(1), block.pose)
@@ -241,14 +254,39 @@ def _rows(block: Block, bench: Bench, force: Floats | None) -> Rows:
     return Rows(block.dwell, block.elapsed_s, columns, block.accel_mps2, innovation, force is not None, pieces)
 
 
+def _slew_rows(block: Block, bench: Bench, curve: Curve) -> Rows:
+    """The rows of a slew, in pieces of 2 deg."""
+    pieces = tuple(
+        _slew_piece(block, slice(a, b), bench, curve) for a, b in itertools.pairwise(curve.cuts(block.elapsed_s))
+    )
+    columns = np.concatenate([basis(u).T @ parabola(nodes.regressors) for _, u, nodes in pieces])
+    return Rows(block.dwell, block.elapsed_s, columns, block.accel_mps2, block.accel_mps2.T, False, pieces, moving=True)
+
+
+def _slew_piece(block: Block, part: slice, bench: Bench, curve: Curve) -> tuple[slice, Floats, Nodes]:
+    own = block.elapsed_s[part]
+    u, at = _spread(own)
+    pose = curve.angles(at)
+    nodes = Nodes(
+        at, at - block.arrival_s, bench.specific_force(at, pose), pose, _temperatures(u, block.temperature_c[part]),
+        curve.rate(at), curve.rate_change(at),
+    )  # fmt: skip
+    return part, u, nodes
+
+
+def _spread(elapsed_s: Floats) -> tuple[Floats, Floats]:
+    """u (n,) from -1 to 1 over readings, and the times of the nodes (3,)."""
+    middle, half = 0.5 * (elapsed_s[0] + elapsed_s[-1]), max(0.5 * (elapsed_s[-1] - elapsed_s[0]), 1e-9)
+    return (elapsed_s - middle) / half, np.array([elapsed_s[0], middle, elapsed_s[-1]])
+
+
 _EDGES_S = np.concatenate([2.0 ** np.arange(6), 60.0 * np.arange(1, 20_000)])
 """A dwell is cut into pieces where 1, 2, 4 ... s have passed since the arrival, and at every further minute."""
 
 
 def _piece(block: Block, part: slice, bench: Bench, force: Floats | None) -> tuple[slice, Floats, Nodes]:
     own, warm = block.elapsed_s[part], block.temperature_c[part]
-    middle, half = 0.5 * (own[0] + own[-1]), max(0.5 * (own[-1] - own[0]), 1e-9)
-    u, at = (own - middle) / half, np.array([own[0], middle, own[-1]])
+    u, at = _spread(own)
     pose = np.repeat(block.pose, 3, axis=0) if len(block.pose) == 1 else _values_at_nodes(u, block.pose[part])
     if force is None:
         force = bench.specific_force(at, pose)

@@ -31,6 +31,7 @@ class Noise:
     checked: the scatter is stated, or the orientations are enough to check that a setting error only turns the specific
     force. The estimate then leans on the readings along it, which no rotation changes; otherwise dwells weigh by their
     scatter alone, and the setting error is *considered* (Schmidt): it enlarges the covariance and moves no estimate.
+    slew_sigma_mps2 (3,): what stands for sigma and inflation in slews; None where none are used.
     """
 
     sigma_mps2: Floats
@@ -40,6 +41,7 @@ class Noise:
     setting_stated: bool = False
     scatter_stated: bool = False
     checked: bool = True
+    slew_sigma_mps2: Floats | None = None
 
     def __post_init__(self) -> None:
         if self.scatter_mps2 is None:  # pyright: ignore[reportUnnecessaryComparison]
@@ -59,6 +61,12 @@ class Noise:
     def judging(self) -> Noise:
         """The noise by which a misfit is judged: scatter that was estimated from the same misfit is left out."""
         return self if self.scatter_stated else replace(self, scatter_mps2=np.zeros(3))
+
+    def of(self, moving: bool) -> Noise:
+        """The noise in dwells, or that in slews."""
+        if not moving or self.slew_sigma_mps2 is None:
+            return self
+        return replace(self, sigma_mps2=self.slew_sigma_mps2, inflation=np.ones(3))
 
     @property
     def dwell_sigmas(self) -> Floats:

@@ -14,7 +14,7 @@ LEVELS = [
     ["errors"],
     ["samples"],
     ["bench"],
-    ["effects"],
+    ["effects", "slews"],
     ["triangle", "dwells", "paper", "gate"],
     ["model"],
     ["folding"],

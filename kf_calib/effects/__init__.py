@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 
 from kf_calib.bench import Bench
-from kf_calib.effects import checks, drift, formula, frame, sensor, surroundings, thermal, user
+from kf_calib.effects import checks, drift, dynamic, formula, frame, sensor, surroundings, thermal, user
 from kf_calib.effects.effect import Coefficient, Effect, FrameEffect, SensorEffect, Unknown
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
@@ -34,7 +34,7 @@ _PLAIN: dict[str, type[Effect]] = {
         thermal.ThermalBias, thermal.ThermalBias2, thermal.ThermalScale, thermal.ThermalRate,
         thermal.ThermalMisalignment, thermal.ThermalLag, surroundings.Magnetic,
         frame.BaseTilt, frame.BaseTiltDrift, frame.PlatformDrift, frame.GravityError,
-        frame.EarthRotation, frame.Flexure, frame.CrossTalk,
+        frame.EarthRotation, frame.Flexure, frame.CrossTalk, dynamic.Latency, dynamic.LeverArm,
     )
 }  # fmt: skip
 _OF_A_GIMBAL = {

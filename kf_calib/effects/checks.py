@@ -24,6 +24,7 @@ EXAMPLE = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0)
 _DWELLS, _NODES = 60, 5
 _LARGEST_TURN_RAD = 1e-3  # of the finite rotation: central differences leave its square / 6
 _DERIVATIVE_LIMIT = 1e-6
+_RATE_RADPS = 0.3  # the trial turns, too, or effects of slews would add nothing
 
 
 def trial(bench: Bench) -> Stimulus:
@@ -46,6 +47,8 @@ def trial(bench: Bench) -> Stimulus:
         temperature_c=REFERENCE_TEMPERATURE_C + 0.3 + np.sin(elapsed_s / 300.0),
         sensitivity=np.eye(3),
         variance_mps2_2=noise.copy(),
+        rate_radps=_RATE_RADPS * np.sin(elapsed_s[:, None] * np.array([1.0, 1.3, 1.7])),
+        rate_change_radps2=_RATE_RADPS * np.cos(elapsed_s[:, None] * np.array([1.9, 0.7, 1.1])),
     )
 
 
@@ -80,7 +83,7 @@ def check(effect: Effect, s: Stimulus | None = None) -> tuple[str, ...]:
     for name, values in _arrays(s).items():
         if not np.array_equal(values, before[name], equal_nan=True):
             raise InputError(f"{effect} writes into {name} of the stimulus: work on a copy, other effects read it too.")
-    if count and not effect.dynamic and not columns.any():
+    if count and not columns.any():
         raise InputError(f"{effect} adds nothing to any reading in {len(s)} spread instants: check its terms.")
     if isinstance(effect, FrameEffect):
         _refuse_wrong_derivative(effect, columns, s)

@@ -22,7 +22,8 @@ class Stimulus:
 
     elapsed_s, since_arrival_s, temperature_c: (m,); force_mps2: specific force in the platform frame, and that of the
     dwell before, (m, 3); pose (m, k); sensitivity (3, 3): rows K_i E_i at which small rotations are linearised;
-    variance_mps2_2: variance of the readings about here, (m, 3).
+    variance_mps2_2: variance of the readings about here, (m, 3). rate_radps, rate_change_radps2: omega of the platform
+    in its own frame and its derivative there, (m, 3), zero where it stands.
     """
 
     bench: Bench
@@ -34,6 +35,8 @@ class Stimulus:
     temperature_c: Floats
     sensitivity: Floats
     variance_mps2_2: Floats = field(default_factory=lambda: np.zeros((1, 3)))
+    rate_radps: Floats = field(default_factory=lambda: np.zeros((1, 3)))
+    rate_change_radps2: Floats = field(default_factory=lambda: np.zeros((1, 3)))
 
     def __len__(self) -> int:
         return len(self.elapsed_s)
@@ -62,6 +65,11 @@ class Stimulus:
     def step(self) -> Floats:
         """Delta a_i (m, 3): the last change of a_i from dwell to dwell; zero in the first."""
         return (self.force_mps2 - self.previous_force_mps2) @ self.axes.T
+
+    @cached_property
+    def force_rate_mps3(self) -> Floats:
+        """df/dt (m, 3) in the platform frame: f x omega."""
+        return np.cross(self.force_mps2, self.rate_radps)
 
     @cached_property
     def warmth(self) -> Floats:

@@ -1,0 +1,129 @@
+"""Diagnosis: a hidden effect is named, an unknown one is not, and what cannot be seen is said."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from synthetic import Run
+
+from kf_calib.bench import Bench, axes_of
+from kf_calib.calibration import Calibration, calibrate
+from kf_calib.cli import cli
+from kf_calib.diagnosis import assessed, detectable, diagnose, next_orientation
+from kf_calib.effects import effect_named
+from kf_calib.scan import scan
+from kf_calib.sources.hidden import parse
+from kf_calib.sources.hidden.detectability import sized
+from kf_calib.sources.noise_sources import Noise
+from kf_calib.sources.physics import Ambient
+from kf_calib.sources.plans import six_faces, spread_plan
+from kf_calib.sources.sensors import GRADES
+from kf_calib.sources.simulator import Simulation
+
+BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+HAND = Path(__file__).resolve().parents[2] / "shared" / "recordings" / "ferraris_hand.mcap"
+
+
+def run(*hidden: str, seed: int = 5, plan: list | None = None) -> Calibration:
+    """A calibration without the hidden effects in its model."""
+    base = Simulation(
+        BENCH, GRADES["navigation"].sensors(seed), Noise(white_mps2=5e-5),
+        plan or spread_plan(24, dwell_s=8.0, seed=seed),
+        sample_hz=50.0, angle_hz=20.0, slew_rate_degps=90.0, seed=seed,
+        ambient=Ambient(swing_c=5.0, period_s=300.0, sigma_c=0.0),
+    )  # fmt: skip
+    return calibrate(base.hiding(parse(hidden, BENCH.axes, seed=seed, sized=partial(sized, base))))
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["second-order", "hysteresis", "encoder-harmonic-1:z", "thermal-scale", "axis-nonorthogonality:z", "settling",
+     "cross-coupling-ip", "scale-drift"],
+)  # fmt: skip
+def test_a_hidden_effect_is_named(name: str) -> None:
+    """Made by the nonlinear truth at 15 sigma: first name, and the error falls to its floor on what was held out."""
+    found = diagnose(run(f"{name}=15sigma"))
+    assert found.missing == (name,) and name == found.ambiguity[0] and not found.unknown
+    assert found.after is not None and found.after.held_out_floor_mps2 is not None
+    assert found.after.held_out_rms_mps2 <= 1.3 * found.after.held_out_floor_mps2
+    assert found.before.held_out_rms_mps2 > 1.5 * found.before.held_out_floor_mps2
+    assert name in found.verdict and "held-out" in found.verdict
+
+
+@pytest.mark.parametrize("case", [{}, {"phi": 0.9, "count": 500}, {"setting_deg": 0.01}])
+def test_nothing_is_found_in_noise(case: dict) -> None:
+    """Of 15 runs at a level of 1 %, two or more alarms have a chance of 1 %."""
+    tests = [assessed(calibrate(Run(seed=4000 + k, **{"dwells": 24, "count": 200, **case})).fit) for k in range(15)]
+    assert sum(not each.consistent for each in tests) <= 1
+    assert np.median([min(each.p_values.values()) for each in tests]) > 0.2
+
+
+@pytest.mark.parametrize("name, driver", [("encoder-harmonic-3:z", "angle"), ("triple-product", "specific force")])
+def test_what_is_in_no_catalogue_is_unknown(name: str, driver: str) -> None:
+    from kf_calib.views.diagnosis import description, diagnosis_object
+
+    found = diagnose(run(f"{name}=20sigma"))
+    assert found.unknown and not found.missing
+    shape = description(found)
+    assert shape is not None and driver in shape.driver and shape.formula.startswith("mine = ")
+    assert diagnosis_object(found)["missing"] == "unknown"
+
+
+def test_two_effects_at_once_are_both_found() -> None:
+    found = diagnose(run("hysteresis=15sigma", "thermal-scale=15sigma"))
+    assert set(found.missing) == {"hysteresis", "thermal-scale"}
+
+
+def test_six_faces_say_what_they_cannot_see_and_where_to_go() -> None:
+    found = diagnose(run(plan=six_faces(dwell_s=8)))
+    assert {"gravity-error", "cross-talk"} <= set(found.test.invisible)
+    assert not found.missing
+    advice = next_orientation(found)
+    assert advice is not None and "would show" in advice[1]
+
+
+def test_scores_are_falls_of_chi_squared() -> None:
+    """The score test against the refit it predicts."""
+    before = run("second-order=6sigma")
+    found = scan(before.carried, before.noise.judging, [effect_named("second-order", BENCH)])
+    after = diagnose(before).suspects[0].refit
+    assert found.statistics[0] == pytest.approx(before.consistency.statistic - after.consistency.statistic, rel=0.02)
+    np.testing.assert_allclose(found.coefficients(found.candidates[0]), after.estimate.effects, rtol=1e-3)
+    np.testing.assert_allclose(found.candidates[0].sigma, after.estimate.effect_sigma, rtol=1e-3)
+
+
+def test_smallest_sizes_are_met() -> None:
+    """Power at the stated size, one coefficient hidden: about 0.9 of 20 runs."""
+    sizes = {each.name: each.minimum for each in detectable(assessed(run().fit))}
+    seen = 0
+    for seed in range(20):
+        test = assessed(run(f"second-order={sizes['second-order']},0,0", seed=seed).fit)
+        seen += test.consistent is False
+    assert seen >= 14
+
+
+def test_command_line(tmp_path: Path) -> None:
+    out = tmp_path / "run.mcap"
+    made = ["simulate", str(out), "--hide", "second-order=20sigma", "--dwell-s", "6", "--slew-degps", "90"]
+    assert CliRunner().invoke(cli, made).exit_code == 0
+    printed = CliRunner().invoke(cli, ["diagnose", str(out), "--json"])
+    content = json.loads(printed.stdout)
+    assert content["missing"] == "second-order" and content["ambiguity_set"][0] == "second-order"
+    keys = {"consistent", "p_value", "verdict", "suspects", "invisible", "detectable", "unknown", "next_orientation"}
+    assert keys <= set(content)
+    assert CliRunner().invoke(cli, ["diagnose", str(out), "--strict"]).exit_code == 1
+    cured = json.loads(CliRunner().invoke(cli, ["diagnose", str(out), "--with", "second-order", "--json"]).stdout)
+    assert cured["consistent"] and cured["missing"] is None
+
+
+@pytest.mark.skipif(not HAND.exists(), reason=f"{HAND} is not here")
+def test_a_hand_placed_run_claims_nothing() -> None:
+    from kf_calib.sources.recording import Recording
+
+    found = diagnose(calibrate(Recording(HAND)))
+    assert not found.missing and not found.unknown and "third-order" in found.test.invisible
