@@ -214,7 +214,9 @@ def _diagnosed(before: Calibration) -> Diagnosis:
     if test.consistent is not False:
         return replace(nothing, verdict=_verdict(nothing))
     suspects = _suspects(before, test)
-    explaining = [each for each in suspects if each.fits]
+    # what explains all of it explains most: one that fits far behind the first has only made the noise large enough
+    least = test.scores[test.ranked[0]] - 2.0 * _EQUAL
+    explaining = [each for each in suspects if each.fits and test.scores[each.name] > least]
     scatter = before.noise.scatter_mps2.any() and not before.noise.scatter_stated
     if explaining:
         first = explaining[0]
@@ -239,10 +241,21 @@ def _suspects(before: Calibration, test: Test) -> tuple[Suspect, ...]:
         refit = with_effects(before, (name,))
         dof = 1 if name not in test.best else test.candidate(name).dof
         statistic = test.scores[name] if name not in test.best else float(test.scan.statistics[test.best[name]])
-        fits = assessed(refit.fit).consistent is not False and not _leaps(refit)
+        fits = _fits(refit)
         known = tuple(before.parameters)[12:]
         out.append(Suspect(name, statistic, dof, test.p_values[name], fits, refit, known))
     return tuple(out)
+
+
+def _fits(refit: Calibration) -> bool:
+    """Whether nothing is left that noise would not leave, by means an effect of that kind has."""
+    return assessed(refit.fit).consistent is not False and not _leaps(refit) and not _at_an_end(refit)
+
+
+def _at_an_end(refit: Calibration) -> bool:
+    """Whether a constant was looked for and ran to an end of its range: another, simpler effect is meant then."""
+    ranges = [(effect.value, effect.unknown) for effect in refit.model.effects if effect.unknown is not None]
+    return any(not unknown.low * 1.01 < value < unknown.high * 0.99 for value, unknown in ranges)
 
 
 def _leaps(refit: Calibration) -> bool:
@@ -270,7 +283,7 @@ def _pair(before: Calibration, test: Test) -> tuple[tuple[str, str], Calibration
     falls = {pair: _fall(test, pair) for pair in itertools.combinations(visible, 2)}
     for pair in sorted(falls, key=lambda pair: -falls[pair])[:3]:
         refit = with_effects(before, pair)
-        if assessed(refit.fit).consistent is not False:
+        if _fits(refit):
             return pair, refit
     return None
 

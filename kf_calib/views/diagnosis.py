@@ -95,9 +95,10 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
 
 
 def _suspect_table(found: Diagnosis) -> Table:
-    table = Table(title="Suspects (1σ; p of the whole run)", title_justify="left")
-    for heading in ("effect", "p", "fall of χ²", "fits", "coefficient", "value", "sigma", "unit", "held out / floor"):
-        table.add_column(heading, justify="left" if heading in ("effect", "fits", "coefficient", "unit") else "right")
+    table = Table(title="Suspects (1σ; p of the whole run; held-out rms over its floor)", title_justify="left")
+    for heading in ("effect", "p", "χ² / dof", "fits", "symbol", "value", "sigma", "unit", "held out"):
+        left = heading in ("effect", "fits", "symbol", "unit")
+        table.add_column(heading, justify="left" if left else "right", no_wrap=heading == "effect")
     for suspect in found.suspects:
         rms, floor = suspect.refit.held_out_rms_mps2, suspect.refit.held_out_floor_mps2
         ratio = f"{rms / floor:.2f}" if rms is not None and floor else ""
