@@ -55,7 +55,7 @@ def test_lever_arms_are_found() -> None:
 
 def test_both_at_once_and_with_other_effects() -> None:
     source = run(["latency=2ms", ARMS, "second-order=1e-5,-1e-5,2e-5"], dwells=16)
-    value, sigma = values(calibrate(source, Settings(effects=("latency", "lever-arm", "second-order", "thermal-bias"))))
+    value, sigma = values(calibrate(source, Settings(effects=("latency", "lever-arm", "second-order", "bias-drift"))))
     truth = [2e-3, *ARMS_M, 1e-5, -1e-5, 2e-5, 0.0, 0.0, 0.0]
     assert (np.abs(value - truth) < 4.0 * sigma).all()
 
