@@ -5,6 +5,7 @@
     run = kf_calib.calibrate(kf_calib.open_recording("run.mcap"))
     print(run)                                  # parameters, noise, verdict
     run.parameters["K1"].value, run.parameters["K1"].sigma
+    print(kf_calib.diagnose(run).verdict)       # which physical effect is missing
     kf_calib.save_view(run, "run.rrd")          # opens in Rerun
 
 Conventions, kept everywhere:
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from kf_calib.bench import Bench
     from kf_calib.calibration import Calibration, Parameter, Settings, calibrate
     from kf_calib.comparison import compare
+    from kf_calib.diagnosis import Diagnosis, diagnose
     from kf_calib.errors import InputError, KfCalibError, UnobservableError
     from kf_calib.sources.recorder import Recorder
     from kf_calib.sources.recording import Recording as open_recording
@@ -38,6 +40,8 @@ _HOMES = {
     "Settings": ("calibration", "Settings"),
     "calibrate": ("calibration", "calibrate"),
     "compare": ("comparison", "compare"),
+    "Diagnosis": ("diagnosis", "Diagnosis"),
+    "diagnose": ("diagnosis", "diagnose"),
     "InputError": ("errors", "InputError"),
     "KfCalibError": ("errors", "KfCalibError"),
     "UnobservableError": ("errors", "UnobservableError"),
@@ -47,8 +51,8 @@ _HOMES = {
 }
 
 __all__ = [
-    "Bench", "Calibration", "InputError", "KfCalibError", "Parameter", "Recorder", "Settings", "UnobservableError",
-    "calibrate", "compare", "open_recording", "save_view",
+    "Bench", "Calibration", "Diagnosis", "InputError", "KfCalibError", "Parameter", "Recorder", "Settings",
+    "UnobservableError", "calibrate", "compare", "diagnose", "open_recording", "save_view",
 ]  # fmt: skip
 
 

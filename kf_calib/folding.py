@@ -18,11 +18,8 @@ import numpy as np
 from kf_calib.bench import Bench
 from kf_calib.effects import Effect, Stimulus
 from kf_calib.model import Model, Nodes, Rows, basis, effect_columns, parabola
-from kf_calib.samples import Floats, Mask
+from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
-
-WIDTH = 4
-"""Regressors of the twelve parameters: 1, f_x, f_y, f_z."""
 
 _VIBRATING = 25.0  # mean squared deviation of the variances in their own sigma; autocorrelation alone makes up to 10
 _LAGS = 64
@@ -340,12 +337,3 @@ class Folder:
             folded.append(block)
         else:
             folded[-1] = current.merged(block)
-
-
-def informative(factors: Floats) -> Mask:
-    """Which of the first 4 rows of factors (D, 7, 7) carry model columns, (D, 4) bool.
-
-    A still platform has one: the mean. The others then hold columns of rounding size and are noise.
-    """
-    size = np.linalg.norm(factors[:, :WIDTH, :WIDTH], axis=2)
-    return size > 1e-9 * size[:, :1]
