@@ -7,6 +7,7 @@ the model with it fits; where several fit equally well they are all named; where
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -31,7 +32,8 @@ LEVEL = 0.01
 
 _DRAWS = 4000
 _EQUAL = 6.63  # suspects whose chi-squared is this close to the best cannot be told from it (1 %, 1 dof)
-_PAIRED = 14  # suspects that are tried in pairs
+_ALIKE = 0.5  # overlap above which two suspects may be taken for each other
+_PAIRS = 3  # pairs that are refitted
 _SHOWN = 6  # suspects that are refitted and shown
 _POWER = 0.9
 
@@ -94,21 +96,22 @@ def candidates(model: Model) -> list[Effect]:
     return out
 
 
-def assessed(fitted: Fit, seed: int = 0) -> Test:
-    """Score tests of all candidates, calibrated on their own columns by drawing residuals as noise alone makes them."""
-    from scipy.special import chdtrc, chdtri
+def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
+    """Score tests of all candidates, calibrated on their own columns by drawing residuals as noise alone makes them.
+
+    tests: as how many independent ones they count, where that is known from nearly the same columns.
+    """
+    from scipy.special import chdtrc
 
     found = scan(fitted.carried, fitted.noise.judging, candidates(fitted.carried.model), fitted.walk_variances)
     dofs, statistics = np.array([each.dof for each in found.candidates]), found.statistics
     seen = np.flatnonzero(dofs)
     own = np.where(dofs > 0, chdtrc(np.maximum(dofs, 1), statistics), 1.0)
-    smallest = _smallest_p(found, seen, seed)
-    tests = LEVEL / max(float(np.quantile(smallest, LEVEL)), 1e-12) if len(seen) else 1.0
-    threshold = {dof: float(chdtri(dof, LEVEL / tests)) for dof in set(dofs[seen].tolist()) | {1}}
+    tests = tests or _independent_tests(found, seen, seed)
     best, scores, p_values = dict[str, int](), dict[str, float](), dict[str, float]()
     for k, candidate in enumerate(found.candidates):
         name = str(candidate.effect)
-        score = float(statistics[k] - threshold[candidate.dof]) if candidate.dof else -np.inf
+        score = float(statistics[k]) - price(candidate, tests) if candidate.dof else -np.inf
         if name not in best or score > scores.get(name, -np.inf):
             best[name] = k
             if candidate.dof:
@@ -116,10 +119,30 @@ def assessed(fitted: Fit, seed: int = 0) -> Test:
     walk = _walk_test(fitted)
     if walk is not None:
         name, ratio = walk[0], walk[2]
-        scores[name], p_values[name] = ratio - threshold[1], run_level(0.5 * float(chdtrc(1, ratio)), tests)
+        scores[name] = ratio - _threshold(1, tests)
+        p_values[name] = run_level(0.5 * float(chdtrc(1, ratio)), tests)
     model, misfit_p = fitted.carried.model, consistency(fitted).p_value
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
     return Test(found, best, scores, p_values, misfit_p, walk and walk[1], tests, slewing)
+
+
+def price(candidate: Candidate, tests: float) -> float:
+    """The fall of chi-squared that chance gives one of so many candidates; a constant looked for counts as one more."""
+    return _threshold(candidate.dof + (candidate.effect.unknown is not None), tests)
+
+
+@functools.cache
+def _threshold(dof: int, tests: float) -> float:
+    from scipy.special import chdtri
+
+    return float(chdtri(dof, LEVEL / tests))
+
+
+def _independent_tests(found: Scan, seen: NDArray[np.intp], seed: int) -> float:
+    """As many independent tests would reach the smallest p-value that one run in 100 reaches."""
+    if not len(seen):
+        return 1.0
+    return LEVEL / max(float(np.quantile(_smallest_p(found, seen, seed), LEVEL)), 1e-12)
 
 
 def run_level(p_value: float, tests: float) -> float:
@@ -131,8 +154,6 @@ def _smallest_p(found: Scan, seen: NDArray[np.intp], seed: int) -> Floats:
     """The smallest p-value among all candidates in each of many runs in which nothing is missing."""
     from scipy.special import chdtrc
 
-    if not len(seen):
-        return np.ones(1)
     draws = np.random.default_rng(seed).standard_normal((_DRAWS, len(found.residual)))
     bases = [found.candidates[k].basis for k in seen]
     starts = np.cumsum([0, *(basis.shape[1] for basis in bases[:-1])])
@@ -215,23 +236,60 @@ def _diagnosed(before: Calibration) -> Diagnosis:
         return replace(nothing, verdict=_verdict(nothing))
     suspects = _suspects(before, test)
     # what explains all of it explains most: one that fits far behind the first has only made the noise large enough
-    least = test.scores[test.ranked[0]] - 2.0 * _EQUAL
+    least = test.scores[test.ranked[0]] - 2.0 * _EQUAL if test.ranked else 0.0
     explaining = [each for each in suspects if each.fits and test.scores[each.name] > least]
-    scatter = before.noise.scatter_mps2.any() and not before.noise.scatter_stated
     if explaining:
-        first = explaining[0]
-        close = [name for name in test.ranked if test.scores[name] > test.scores[first.name] - _EQUAL]
-        overlaps = {name: _overlap(test, first.name, name) for name in close if name != first.name}
-        equal = [first.name, *(name for name in close if name != first.name and overlaps[name] > 0.5)]
-        found = replace(nothing, suspects=suspects, missing=(first.name,), ambiguity=tuple(equal), overlaps=overlaps,
-                        after=first.refit)  # fmt: skip
+        found = _one(replace(nothing, suspects=suspects), explaining[0])
     else:
-        pair = _pair(before, test)
-        if pair is not None:
-            found = replace(nothing, suspects=suspects, missing=pair[0], ambiguity=pair[0], after=pair[1])
-        else:
-            found = replace(nothing, suspects=suspects, unknown=not scatter)
+        scatter = before.noise.scatter_mps2.any() and not before.noise.scatter_stated
+        found = _two(replace(nothing, suspects=suspects)) or replace(nothing, suspects=suspects, unknown=not scatter)
     return replace(found, verdict=_verdict(found))
+
+
+def _one(found: Diagnosis, first: Suspect) -> Diagnosis:
+    """One effect explains the misfit; with it, all that explain it as well and look like it."""
+    test = found.test
+    close = [name for name in test.ranked if test.scores[name] > test.scores[first.name] - _EQUAL]
+    overlaps = {name: _overlap(test, first.name, name) for name in close if name != first.name}
+    overlaps = {name: overlap for name, overlap in overlaps.items() if overlap > _ALIKE}
+    names = (first.name, *overlaps)
+    return replace(found, missing=(first.name,), ambiguity=names, overlaps=overlaps, after=first.refit)
+
+
+def _two(found: Diagnosis) -> Diagnosis | None:
+    """Two effects explain the misfit where no single one does: they may mask each other. The best few are refitted."""
+    candidates, pairs = found.test.scan.candidates, _pairs(found.test)
+    for pair in sorted(pairs, key=lambda pair: -pairs[pair])[:_PAIRS]:
+        names = (str(candidates[pair[0]].effect), str(candidates[pair[1]].effect))
+        refit = with_effects(found.before, names)
+        if not _fits(refit, found.test):
+            continue
+        overlaps = dict[str, float]()
+        for other, score in pairs.items():
+            shared = set(pair) & set(other)
+            if score > pairs[pair] - _EQUAL and len(shared) == 1:
+                (lost,), (new,) = set(pair) - shared, set(other) - shared
+                name, alike = str(candidates[new].effect), candidates[lost].overlap(candidates[new])
+                if alike > max(_ALIKE, overlaps.get(name, 0.0)) and name not in names:
+                    overlaps[name] = alike
+        return replace(found, missing=names, ambiguity=(*names, *overlaps), overlaps=overlaps, after=refit)
+    return None
+
+
+def _pairs(test: Test) -> dict[tuple[int, int], float]:
+    """Pairs of which each is beyond chance beside the other: the fall of chi-squared less the prices of both."""
+    candidates, falls = test.scan.candidates, test.scan.statistics
+    prices = [price(each, test.effective_tests) if each.dof else 0.0 for each in candidates]
+    out = dict[tuple[int, int], float]()
+    for j, k in itertools.combinations([k for k, each in enumerate(candidates) if each.dof], 2):
+        one, two = candidates[j], candidates[k]
+        if str(one.effect) == str(two.effect):
+            continue
+        left, singular, _ = np.linalg.svd(two.basis - one.basis @ (one.basis.T @ two.basis), full_matrices=False)
+        fall = falls[j] + np.sum((left[:, singular > 1e-6].T @ test.scan.residual) ** 2)
+        if fall - falls[j] > prices[k] and fall - falls[k] > prices[j]:
+            out[j, k] = float(fall - prices[j] - prices[k])
+    return out
 
 
 def _suspects(before: Calibration, test: Test) -> tuple[Suspect, ...]:
@@ -241,15 +299,17 @@ def _suspects(before: Calibration, test: Test) -> tuple[Suspect, ...]:
         refit = with_effects(before, (name,))
         dof = 1 if name not in test.best else test.candidate(name).dof
         statistic = test.scores[name] if name not in test.best else float(test.scan.statistics[test.best[name]])
-        fits = _fits(refit)
         known = tuple(before.parameters)[12:]
-        out.append(Suspect(name, statistic, dof, test.p_values[name], fits, refit, known))
+        out.append(Suspect(name, statistic, dof, test.p_values[name], _fits(refit, test), refit, known))
     return tuple(out)
 
 
-def _fits(refit: Calibration) -> bool:
+def _fits(refit: Calibration, before: Test) -> bool:
     """Whether nothing is left that noise would not leave, by means an effect of that kind has."""
-    return assessed(refit.fit).consistent is not False and not _leaps(refit) and not _at_an_end(refit)
+    misfit = refit.consistency.p_value
+    if (misfit is not None and misfit < 0.5 * LEVEL) or _leaps(refit) or _at_an_end(refit):
+        return False
+    return assessed(refit.fit, before.effective_tests).consistent is not False
 
 
 def _at_an_end(refit: Calibration) -> bool:
@@ -274,26 +334,6 @@ def with_effects(before: Calibration, added: Sequence[str]) -> Calibration:
     settings: Settings = replace(before.settings, effects=(*before.settings.effects, *added))
     model = Model.of(before.bench, settings.effects)
     return evaluated(fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews), settings)
-
-
-def _pair(before: Calibration, test: Test) -> tuple[tuple[str, str], Calibration] | None:
-    """Two effects that fit together where no single one does: they may mask each other. The best few are refitted."""
-    visible = [name for name in test.best if test.candidate(name).dof]
-    visible = sorted(visible, key=lambda name: -test.scores[name])[:_PAIRED]
-    falls = {pair: _fall(test, pair) for pair in itertools.combinations(visible, 2)}
-    for pair in sorted(falls, key=lambda pair: -falls[pair])[:3]:
-        refit = with_effects(before, pair)
-        if _fits(refit):
-            return pair, refit
-    return None
-
-
-def _fall(test: Test, pair: tuple[str, str]) -> float:
-    """By how much a pair of effects would lower chi-squared, less its number of coefficients times their price."""
-    basis = np.concatenate([test.candidate(name).basis for name in pair], axis=1)
-    left, singular, _ = np.linalg.svd(basis, full_matrices=False)
-    seen = left[:, singular > 1e-6]
-    return float(np.sum((seen.T @ test.scan.residual) ** 2) - _EQUAL * seen.shape[1] / 2.0)
 
 
 def _overlap(test: Test, one: str, other: str) -> float:
