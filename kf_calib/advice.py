@@ -107,6 +107,7 @@ def _next_stimulus(fitted: Fit, poses: Floats) -> Stimulus:
         force_mps2=bench.specific_force(at, poses),
         previous_force_mps2=np.repeat(last.means[None, 1:4], count, axis=0),
         pose=poses,
+        previous_pose=np.repeat(last.pose[None], count, axis=0),
         temperature_c=np.full(count, last.pieces[-1].nodes.temperature_c[-1]),
         sensitivity=fitted.carried.state[:12].reshape(3, 4)[:, :3],
         variance_mps2_2=np.repeat(last.variances[-1:], count, axis=0),

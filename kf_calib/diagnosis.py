@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 from kf_calib import advice as advise
 from kf_calib.advice import Advice
 from kf_calib.calibration import Calibration, Parameter, Settings, consistency, evaluated, format_p
+from kf_calib.drivers import families
 from kf_calib.effects import Effect, effect_named, names
 from kf_calib.fitting import Fit, Walk, fit, likely_walk
 from kf_calib.model import Model
@@ -247,13 +248,30 @@ def _diagnosed(before: Calibration) -> Diagnosis:
 
 
 def _one(found: Diagnosis, first: Suspect) -> Diagnosis:
-    """One effect explains the misfit; with it, all that explain it as well and look like it."""
+    """One effect explains the misfit; with it, all that explain it as well and look like it.
+
+    Unless a formula that is no known effect explains it better: then the effect is not the one that is missing.
+    """
     test = found.test
+    if first.name in test.best and _outdone(found, first.refit, (first.name,)):
+        return replace(found, unknown=True)
     close = [name for name in test.ranked if test.scores[name] > test.scores[first.name] - _EQUAL]
     overlaps = {name: _overlap(test, first.name, name) for name in close if name != first.name}
     overlaps = {name: overlap for name, overlap in overlaps.items() if overlap > _ALIKE}
     names = (first.name, *overlaps)
     return replace(found, missing=(first.name,), ambiguity=names, overlaps=overlaps, after=first.refit)
+
+
+def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool:
+    """Whether some formula explains the misfit better than the effects at the constants that were found for them."""
+    fitted, tests = found.before.fit, found.test.effective_tests
+    effects = [effect for effect in refit.model.effects if str(effect) in names]
+    scanned = scan(fitted.carried, fitted.noise.judging, effects, fitted.walk_variances)
+    basis = np.concatenate([each.basis for each in scanned.candidates], axis=1)
+    left, singular, _ = np.linalg.svd(basis, full_matrices=False)
+    own = float(np.sum((left[:, singular > 1e-6].T @ scanned.residual) ** 2))
+    own -= sum(price(each, tests) for each in scanned.candidates)
+    return any(each.dof and each.fall - _threshold(each.dof, tests) > own + _EQUAL for each in families(fitted)[0])
 
 
 def _two(found: Diagnosis) -> Diagnosis | None:
@@ -264,6 +282,8 @@ def _two(found: Diagnosis) -> Diagnosis | None:
         refit = with_effects(found.before, names)
         if not _fits(refit, found.test):
             continue
+        if _outdone(found, refit, names):
+            return None
         overlaps = dict[str, float]()
         for other, score in pairs.items():
             shared = set(pair) & set(other)
@@ -415,6 +435,9 @@ def _verdict(found: Diagnosis) -> str:
                 named = f"Best: {first}{_size(found)}. Cannot yet be told from {told}"
         return f"{start} {named}.{_held_out(found)}"
     if found.unknown:
+        nearest = next((each.name for each in found.suspects if each.fits), None)
+        if nearest:
+            return f"{start} {nearest} would fit, but what no known effect is explains it better: unknown."
         return f"{start} No known effect explains it, alone or in pairs: unknown."
     return (
         f"{start} Either the sensors scatter from dwell to dwell (which was not stated) or an effect is missing that "

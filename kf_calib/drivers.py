@@ -13,40 +13,81 @@ from kf_calib.fitting import Fit
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
 
-_PRICE = 6.63  # of a coefficient, in chi-squared
+_CHANCE = 1e-4  # of a family to fall as much where nothing is missing: there are about a hundred
 _DECAYS_S = (10, 30, 100, 300)
 
 
 @dataclass(frozen=True)
 class Description:
-    """channel: x, y, z or all; driver: in words; share: of the misfit it explains; formula: to add as it stands."""
+    """channel: x, y, z or all; driver: in words; share: of the misfit it explains; formulas: to add as they stand."""
 
     channel: str
     driver: str
     share: float
-    formula: str
+    formulas: tuple[str, ...]
+
+    @property
+    def formula(self) -> str:
+        return self.formulas[0]
+
+
+@dataclass(frozen=True)
+class Family:
+    """Formulas with one driver, as a candidate of its own; fall: of chi-squared, with all of them; dof: what they see.
+
+    falls: with each of them alone.
+    """
+
+    driver: str
+    texts: tuple[str, ...]
+    fall: float
+    dof: int
+    falls: tuple[float, ...]
+
+    @property
+    def score(self) -> float:
+        """The fall less what chance gives so many columns."""
+        from scipy.special import chdtri
+
+        return self.fall - float(chdtri(self.dof, _CHANCE)) if self.dof else 0.0
 
 
 def described(fitted: Fit, residuals: Floats) -> Description | None:
-    """The family of formulas that explains most of what the model leaves for the number of its coefficients."""
+    """The family of formulas that explains most of what the model leaves, if any explains more than chance would.
+
+    residuals: of the dwells, (D, 3).
+    """
+    found, misfit = families(fitted)
+    best = max(found, key=lambda family: family.score)
+    if best.score <= 0.0:
+        return None
+    order = np.argsort(best.falls)[::-1]
+    enough = 1 if best.falls[order[0]] > 0.7 * best.fall else len(order)
+    formulas = tuple(_named(best.texts[k], number) for number, k in enumerate(order[:enough]))
+    return Description(_channel(residuals), best.driver, best.fall / max(misfit, 1e-300), formulas)
+
+
+def families(fitted: Fit) -> tuple[list[Family], float]:
+    """All families tried on what the model leaves, and the sum of squares there."""
     bench = fitted.carried.model.bench
-    families = list(_families(bench, fitted.dwells[-1].end_s))
-    effects = [effect_named(f"mine = {text}", bench) for _, texts in families for text in texts]
-    found = scan(fitted.carried, fitted.noise.judging, effects, fitted.walk_variances)
-    best, best_score, place = None, 0.0, 0
-    for driver, texts in families:
-        own = range(place, place + len(texts))
-        place += len(texts)
-        basis = np.concatenate([found.candidates[k].basis for k in own], axis=1)
+    listed = list(_families(bench, fitted.dwells[-1].end_s))
+    effects = [effect_named(_named(text), bench) for _, texts in listed for text in texts]
+    scanned = scan(fitted.carried, fitted.noise.judging, effects, fitted.walk_variances)
+    out, place = list[Family](), 0
+    for driver, texts in listed:
+        own, place = slice(place, place + len(texts)), place + len(texts)
+        basis = np.concatenate([each.basis for each in scanned.candidates[own]], axis=1)
         left, singular, _ = np.linalg.svd(basis, full_matrices=False)
         left = left[:, singular > 1e-6]
-        fall = float(np.sum((left.T @ found.residual) ** 2))
-        if fall - _PRICE * left.shape[1] > best_score:
-            best_score = fall - _PRICE * left.shape[1]
-            strongest = texts[int(np.argmax(found.statistics[list(own)]))]
-            share = fall / max(float(found.residual @ found.residual), 1e-300)
-            best = Description(_channel(residuals), driver, share, f"mine = {strongest}")
-    return best
+        fall = float(np.sum((left.T @ scanned.residual) ** 2))
+        out.append(Family(driver, tuple(texts), fall, left.shape[1], tuple(scanned.statistics[own].tolist())))
+    return out, float(scanned.residual @ scanned.residual)
+
+
+def _named(text: str, number: int = 0) -> str:
+    """``:z = sin(q1)`` or ``sin(q1)`` as a formula with a name."""
+    name = f"mine{number + 1}" if number else "mine"
+    return f"{name}{text}" if text.startswith(":") else f"{name} = {text}"
 
 
 def _channel(residuals: Floats) -> str:
@@ -56,17 +97,36 @@ def _channel(residuals: Floats) -> str:
 
 
 def _families(bench: Bench, duration_s: float) -> Iterator[tuple[str, list[str]]]:
-    """What may drive a misfit, in words, and formulas of it."""
+    """What may drive a misfit, in words, and formulas of it; ``:place = ...`` turns a gimbal or the base."""
+    yield from _of_force()
+    yield from _of_gimbals(len(bench.axes))
+    yield from _of_time(duration_s)
+    yield from _of_surroundings(bench)
+
+
+def _of_force() -> Iterator[tuple[str, list[str]]]:
     yield "specific force, degree 2", ["a*a", "a*p", "a*o", "p*o", "p*p"]
-    yield "specific force, degree 3", ["a**3", "a*a*p", "a*a*o", "a*p*o", "p**3", "o**3"]
-    yield "specific force, degree 4", ["a**4", "p**4", "a**2*p**2"]
-    yield "specific force, degree 5", ["a**5", "p**5"]
-    for k in range(len(bench.axes)):
+    for terms in (["a**3"], ["a*a*p"], ["a*a*o"], ["a*p*o"], ["p**3"], ["o**3"], ["a**3", "a*p*p", "p**3", "a*a*p"]):
+        yield "specific force, degree 3", terms
+    for terms in (["a**4"], ["a**4", "a*a"], ["p**4", "p*p"], ["a**2*p**2"]):
+        yield "specific force, degree 4", terms
+    for terms in (["a**5"], ["a**5", "a**3"], ["p**5", "p**3"]):
+        yield "specific force, degree 5", terms
+
+
+def _of_gimbals(count: int) -> Iterator[tuple[str, list[str]]]:
+    for k in range(1, count + 1):
         for n in (1, 2, 3, 4, 6):
-            yield f"angle of gimbal {k + 1}, {n} a turn", [f"sin({n}*q{k + 1})", f"cos({n}*q{k + 1})"]
-        for n in (3, 4):
-            turned = [f"{wave}({n}*q{k + 1})*{axis}" for wave in ("sin", "cos") for axis in ("p", "o")]
-            yield f"angle of gimbal {k + 1}, {n} a turn", turned
+            both = [f"{wave}({n}*q{k})" for wave in ("sin", "cos")]
+            yield f"angle of gimbal {k}, {n} a turn", both
+            if n > 2:
+                yield f"angle of gimbal {k}, {n} a turn", [f":{k} = {text}" for text in both]
+                yield f"angle of gimbal {k}, {n} a turn", [f"{text}*{axis}" for text in both for axis in ("p", "o")]
+        yield f"angle of gimbal {k} in the dwell before", [f"sin(q{k}_before)", f"cos(q{k}_before)"]
+
+
+def _of_time(duration_s: float) -> Iterator[tuple[str, list[str]]]:
+    yield "time", ["t"]
     yield "time", ["t", "t*t"]
     for share in np.linspace(0.05, 0.95, 19):
         yield "time (a jump)", [f"t > {share * duration_s:.0f}*s"]
@@ -74,9 +134,18 @@ def _families(bench: Bench, duration_s: float) -> Iterator[tuple[str, list[str]]
         yield "time (a decay)", [f"exp(-t/({10 * decay_s}*s))"]
         yield "time since arrival", [f"exp(-tau/({decay_s}*s))"]
         yield "time since arrival", [f"{axis}*exp(-tau/({decay_s}*s))" for axis in ("fx", "fy", "fz")]
-    yield "temperature", ["T", "T*T", "T**3"]
-    yield "temperature", ["a*T", "a*T*T"]
-    yield "temperature", ["p*T", "o*T"]
+    for turns in (0.5, 1, 1.5, 2, 3, 4, 6, 8):
+        waves = [f"{wave}({turns}*2*pi*t/({duration_s:.0f}*s))" for wave in ("sin", "cos")]
+        yield "time (periodic)", waves
+
+
+def _of_surroundings(bench: Bench) -> Iterator[tuple[str, list[str]]]:
+    for terms in (["T"], ["T*T"], ["T", "T*T", "T**3"], ["a*T"], ["a*T*T"], ["a*T", "a*T*T"], ["p*T", "o*T"]):
+        yield "temperature", terms
+    if bench.axes:
+        yield "temperature", [":base = T"]
+        yield "time", [":base = t"]
     yield "rate of temperature", ["dT"]
-    yield "previous orientation", ["da", "da*abs(da)"]
-    yield "previous orientation", ["sign(da)"]
+    yield "rate of temperature", ["a*dT"]
+    for terms in (["da"], ["da*abs(da)"], ["sign(da)"], ["a-da"], ["(a-da)**2"]):
+        yield "previous orientation", terms

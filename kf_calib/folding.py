@@ -174,14 +174,15 @@ def _folded(stacked: Floats) -> Floats:
 def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> Stimulus:
     """The nodes of all pieces of all dwells and slews, in order; rotations are linearised at the affine ``state``."""
     nodes = [piece.nodes for dwell in dwells for piece in dwell.pieces]
-    before = [force for dwell, force in zip(dwells, _forces_before(dwells), strict=True) for _ in dwell.pieces]
+    before = [last for dwell, last in zip(dwells, _before(dwells), strict=True) for _ in dwell.pieces]
     return Stimulus(
         bench=bench,
         elapsed_s=np.concatenate([each.elapsed_s for each in nodes]),
         since_arrival_s=np.concatenate([each.since_arrival_s for each in nodes]),
         force_mps2=np.concatenate([each.force_mps2 for each in nodes]),
-        previous_force_mps2=np.repeat(before, 3, axis=0),
+        previous_force_mps2=np.repeat([each.means[1:4] for each in before], 3, axis=0),
         pose=np.concatenate([each.pose for each in nodes]),
+        previous_pose=np.repeat([each.pose for each in before], 3, axis=0),
         temperature_c=_signal_only(dwells, np.concatenate([each.temperature_c for each in nodes])),
         sensitivity=state[:12].reshape(3, 4)[:, :3],
         variance_mps2_2=np.repeat(_varying(dwells), 3, axis=0),
@@ -195,12 +196,12 @@ def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> S
 _still = np.zeros((3, 3))
 
 
-def _forces_before(dwells: Sequence[DwellFactor]) -> list[Floats]:
-    """Specific force (3,) in the dwell before each dwell, its own in the first; before a slew, of the dwell it left."""
-    out, last = list[Floats](), dwells[0].means[1:4]
+def _before(dwells: Sequence[DwellFactor]) -> list[DwellFactor]:
+    """The dwell before each dwell, itself in the first; before a slew, the dwell it left."""
+    out, last = list[DwellFactor](), dwells[0]
     for dwell in dwells:
         out.append(last)
-        last = last if dwell.moving else dwell.means[1:4]
+        last = last if dwell.moving else dwell
     return out
 
 

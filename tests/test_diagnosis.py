@@ -14,7 +14,7 @@ from synthetic import Run
 from kf_calib.bench import Bench, axes_of
 from kf_calib.calibration import Calibration, calibrate
 from kf_calib.cli import cli
-from kf_calib.diagnosis import assessed, detectable, diagnose, next_orientation
+from kf_calib.diagnosis import assessed, detectable, diagnose, next_orientation, with_effects
 from kf_calib.effects import effect_named
 from kf_calib.scan import scan
 from kf_calib.sources.hidden import parse
@@ -70,8 +70,19 @@ def test_what_is_in_no_catalogue_is_unknown(name: str, driver: str) -> None:
     found = diagnose(run(f"{name}=20sigma"))
     assert found.unknown and not found.missing
     shape = description(found)
-    assert shape is not None and driver in shape.driver and shape.formula.startswith("mine = ")
-    assert diagnosis_object(found)["missing"] == "unknown"
+    assert shape is not None and driver in shape.driver
+    shown = diagnosis_object(found)
+    assert shown["missing"] == "unknown" and shown["unknown"]["formula"] == shape.formulas[0]
+    assert assessed(with_effects(found.before, shape.formulas).fit).consistent
+
+
+def test_a_formula_that_explains_more_than_a_known_effect_speaks_against_it() -> None:
+    """A fifth power looks like a third power to 0.96: named third-order, it would be a wrong name."""
+    from kf_calib.views.diagnosis import description
+
+    found = diagnose(run("fifth-order=20sigma"))
+    shape = description(found)
+    assert found.unknown and shape is not None and shape.formula == "mine = a**5"
 
 
 def test_two_effects_at_once_are_both_found() -> None:

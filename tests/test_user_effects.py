@@ -19,7 +19,18 @@ from kf_calib import effects, model_file
 from kf_calib.bench import Bench, axes_of
 from kf_calib.calibration import Settings, calibrate
 from kf_calib.cli import main
-from kf_calib.effects import FrameEffect, SensorEffect, checks, effect_named, load_file, names, register, remarks_of
+from kf_calib.effects import (
+    FrameEffect,
+    SensorEffect,
+    as_text,
+    checks,
+    effect_named,
+    load_file,
+    names,
+    register,
+    remarks_of,
+)
+from kf_calib.effects.checks import EXAMPLE, trial
 from kf_calib.effects.expression import LENGTH_LIMIT
 from kf_calib.effects.formula import Formula, quantities
 from kf_calib.errors import InputError
@@ -476,3 +487,33 @@ def test_a_model_prints_itself() -> None:
     model = Model.of(BENCH, ["second-order", "mine = fx*fy*T", "bias-walk"])
     text = plain(model_table(model))
     assert "twelve parameters" in text and "K2_3" in text and "981 µg/g²/K" in text and "bias-walk" in text
+
+
+@pytest.mark.parametrize(
+    "text, same_as",
+    [("mine:z = 1*rad", "encoder-offset:z"), ("mine:x = q_x", "encoder-scale:x"), ("mine:base = 1*rad", "base-tilt"),
+     ("mine:base = t*rad/(1*s)", "base-tilt-drift")],
+)  # fmt: skip
+def test_a_formula_of_a_place_turns_it(text: str, same_as: str) -> None:
+    """An error of a gimbal's angle or a tilt of the base, through the same chain as the catalogue's."""
+    effect, known = effect_named(text, EXAMPLE), effect_named(same_as, EXAMPLE)
+    stimulus = trial(EXAMPLE)
+    np.testing.assert_allclose(effect.columns(stimulus), known.columns(stimulus), rtol=1e-12, atol=1e-12)
+    assert as_text(effect) == text
+    assert len(effect.coefficients) == len(known.coefficients)
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [("mine:z = a*a", "one for the whole block"), ("mine:w = q1", "names no gimbal"), (":z = q1", "cannot name")],
+)
+def test_a_formula_of_a_place_that_cannot_be_used(text: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        effect_named(text, EXAMPLE)
+
+
+def test_the_angle_in_the_dwell_before() -> None:
+    stimulus = trial(EXAMPLE)
+    before = effect_named("mine = q2_before", EXAMPLE).columns(stimulus)[:, 0, 0]
+    own = effect_named("mine = q2", EXAMPLE).columns(stimulus)[:, 0, 0]
+    np.testing.assert_allclose(before[5:], own[:-5])

@@ -104,7 +104,7 @@ def _unknown(text: str, known: list[str]) -> InputError:
 
 
 def _formula(text: str, bench: Bench) -> Effect:
-    name, _ = formula.split(text)
+    name = formula.split(text)[0].partition(":")[0]
     origin = "the catalogue" if name in (*_PLAIN, *_OF_A_GIMBAL) else None
     origin = _registered[name].origin if name in _registered else origin
     if origin:
@@ -170,7 +170,7 @@ def remarks_of(effect: Effect) -> tuple[str, ...]:
 
 def as_text(effect: Effect) -> str:
     """What ``effect_named`` makes the same effect of."""
-    return effect.text if isinstance(effect, formula.Formula) else str(effect)
+    return effect.text if isinstance(effect, formula.Formula | formula.FrameFormula) else str(effect)
 
 
 def files_of(effects: Iterable[Effect]) -> list[Path]:

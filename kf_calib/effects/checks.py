@@ -44,6 +44,7 @@ def trial(bench: Bench) -> Stimulus:
         force_mps2=np.repeat(force, _NODES, axis=0),
         previous_force_mps2=np.repeat(before, _NODES, axis=0),
         pose=np.repeat(pose, _NODES, axis=0),
+        previous_pose=np.repeat(np.vstack([pose[:1], pose[:-1]]), _NODES, axis=0),
         temperature_c=REFERENCE_TEMPERATURE_C + 0.3 + np.sin(elapsed_s / 300.0),
         sensitivity=np.eye(3),
         variance_mps2_2=noise.copy(),

@@ -1,7 +1,9 @@
 """A user's own effect as a formula over what the bench does: ``mine = fx*fy*T``.
 
-One coefficient for each accelerometer, ``mine1 mine2 mine3``; reading i is ``mine_i`` times the formula larger. The
-quantities (f and a without accelerometer errors, all in SI units):
+One coefficient for each accelerometer, ``mine1 mine2 mine3``; reading i is ``mine_i`` times the formula larger. With
+a gimbal after its name, ``mine:z = sin(3*q_z)``, the formula is an error of that gimbal's angle, and as in
+``mine:base = T`` a tilt of the base about North and East. The quantities (f and a without accelerometer errors, all in
+SI units):
 
 =================  =======  ============================================================================
 name               unit     what it is
@@ -14,6 +16,7 @@ dT                 K/s      rate of the temperature
 t                  s        time since the first sample
 tau                s        time since the arrival in the dwell
 q1 q2 q3 ...       rad      gimbal angles, outer first; also outer, inner, and q_x q_y q_z where one is
+q1_before ...      rad      the same in the dwell before
 g                  m/s^2    local gravity
 s m K rad deg pi            units and the number, to make a formula's units agree: exp(-tau/(60*s))
 =================  =======  ============================================================================
@@ -24,20 +27,25 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
 from kf_calib.bench import Bench, Vector
 from kf_calib.effects import checks
-from kf_calib.effects.effect import SensorEffect
+from kf_calib.effects.effect import Coefficient, FrameEffect, SensorEffect
 from kf_calib.effects.expression import Expression
+from kf_calib.effects.frame import about_axis, gimbal_number
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 from kf_calib.samples import Floats
 
 NAME_RULE = "letters, digits, - and _, a letter first, at most 40 of them"
+BASE = "base"
+"""After a formula's name: it tilts the base."""
+
+_LARGE_RAD = 1e-3
 _LARGE_MPS2 = 1e-3  # what a prior lets a coefficient add to a typical reading
 
 
@@ -73,13 +81,13 @@ QUANTITIES: dict[str, Quantity] = {
 
 
 class _Angle:
-    """The angle of a gimbal, (m, 1) rad."""
+    """The angle of a gimbal, now or in the dwell before, (m, 1) rad."""
 
-    def __init__(self, gimbal: int) -> None:
-        self.gimbal = gimbal
+    def __init__(self, gimbal: int, before: bool = False) -> None:
+        self.gimbal, self.before = gimbal, before
 
     def __call__(self, s: Stimulus) -> Floats:
-        return s.pose[:, self.gimbal : self.gimbal + 1]
+        return (s.previous_pose if self.before else s.pose)[:, self.gimbal : self.gimbal + 1]
 
 
 def gimbal_letters(axes: tuple[Vector, ...]) -> str:
@@ -98,13 +106,14 @@ def quantities(axes: tuple[Vector, ...]) -> dict[str, Quantity]:
         names = [f"q{k + 1}", *([f"q_{letter}"] if letter != "?" and letters.count(letter) == 1 else [])]
         names += ["outer"] * (k == 0) + ["inner"] * (k == len(letters) - 1)
         found |= dict.fromkeys(names, angle)
+        found[f"q{k + 1}_before"] = Quantity("rad", f"angle of gimbal {k + 1} in the dwell before", _Angle(k, True))
     return found
 
 
 def split(text: str) -> tuple[str, str]:
     """Name and expression of ``NAME = FORMULA``; raises InputError where the name is none."""
     name, _, expression = (part.strip() for part in text.partition("="))
-    if not is_name(name):
+    if not is_name(name.partition(":")[0]):
         raise InputError(f"{name[:60]!r} cannot name an effect: write NAME = FORMULA, the name of {NAME_RULE}.")
     return name, expression
 
@@ -118,6 +127,34 @@ def symbol_stem(name: str) -> str:
     return f"{name}_" if name[-1].isdigit() else name
 
 
+class _Reading:
+    """A formula read: its expression over the quantities of the bench, and its unit."""
+
+    def __init__(self, name: str, expression: str, bench: Bench) -> None:
+        from kf_calib.effects.formula_units import unit_of
+
+        self._name, known = name, quantities(bench.axes)
+        try:
+            self._expression = Expression(expression, {key: quantity.meaning for key, quantity in known.items()})
+            self.unit = unit_of(self._expression, {key: quantity.unit for key, quantity in known.items()})
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from None
+
+    def __call__(self, s: Stimulus) -> Floats:
+        """Values (m, 1) or (m, 3)."""
+        known = quantities(s.bench.axes)
+        values = self._expression({name: known[name].of(s) for name in self._expression.names})
+        return np.array(np.broadcast_to(values, (len(s), np.shape(values)[-1] if np.ndim(values) else 1)), dtype=float)
+
+    def typical(self, stimulus: Stimulus) -> float:
+        """Rms on a trial run, to a power of ten."""
+        size = np.abs(self(stimulus))
+        largest = float(size.max())
+        if not 1e-60 < largest < 1e60:
+            raise InputError(f"{self._name} has values up to {largest:.1e}: multiply the formula by a constant.")
+        return 10.0 ** round(math.log10(largest * np.sqrt(np.mean((size / largest) ** 2))))
+
+
 class Formula(SensorEffect):
     """An effect ``name = expression``; raises InputError, with the formula in it, where it cannot be used.
 
@@ -127,14 +164,12 @@ class Formula(SensorEffect):
 
     source, confused_with = "user's formula", ""
 
-    def __init__(self, text: str, bench: Bench) -> None:
-        from kf_calib.effects.formula_units import coefficient_units, unit_of
+    def __init__(self, name: str, expression: str, bench: Bench) -> None:
+        from kf_calib.effects.formula_units import coefficient_units
 
-        name, expression = split(text)
-        known = quantities(bench.axes)
+        self._values = _Reading(name, expression, bench)
         try:
-            self._expression = Expression(expression, {key: quantity.meaning for key, quantity in known.items()})
-            unit, shown = coefficient_units(unit_of(self._expression, {key: q.unit for key, q in known.items()}))
+            unit, shown = coefficient_units(self._values.unit)
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
         # of the class in the catalogue; here each formula has its own
@@ -142,25 +177,53 @@ class Formula(SensorEffect):
         self.text = f"{name} = {expression}"
         stimulus = checks.trial(bench)
         checks.check(self, stimulus)
-        vars(self).update(scale=_LARGE_MPS2 / self._typical(stimulus))
-
-    def _typical(self, stimulus: Stimulus) -> float:
-        """Rms of the terms on a trial run, to a power of ten."""
-        size = np.abs(self.terms(stimulus))
-        largest = float(size.max())
-        if not 1e-60 < largest < 1e60:
-            raise InputError(f"{self} has values up to {largest:.1e}: multiply the formula by a constant.")
-        return 10.0 ** round(math.log10(largest * np.sqrt(np.mean((size / largest) ** 2))))
+        vars(self).update(scale=_LARGE_MPS2 / self._values.typical(stimulus))
 
     def terms(self, s: Stimulus) -> Floats:
-        known = quantities(s.bench.axes)
-        values = self._expression({name: known[name].of(s) for name in self._expression.names})
-        terms = np.array(np.broadcast_to(values, (len(s), 3)), dtype=float)
+        terms = np.array(np.broadcast_to(self._values(s), (len(s), 3)), dtype=float)
         checks.refuse_not_finite(self, terms, s)
         return terms
 
 
-@lru_cache(maxsize=128)
-def formula(text: str, axes: tuple[Vector, ...], gravity_mps2: float) -> Formula:
+class FrameFormula(FrameEffect):
+    """An effect ``name:place = expression``: an error of a gimbal's angle, or a tilt of the base about North and East.
+
+    Raises InputError like ``Formula``, and where the expression is not one value for the whole block.
+    """
+
+    source, confused_with = "user's formula", ""
+
+    def __init__(self, name: str, place: str, expression: str, bench: Bench) -> None:
+        from kf_calib.effects.formula_units import turning_units
+
+        self._values, self._unit = _Reading(name, expression, bench), ""
+        self._gimbal = None if place == BASE else gimbal_number(place, gimbal_letters(bench.axes))
+        unit, shown = turning_units(self._values.unit)
+        vars(self).update(name=name, variant=place, title=expression)
+        self.text = f"{name}:{place} = {expression}"
+        stimulus = checks.trial(bench)
+        if self._values(stimulus).shape[1] != 1:
+            raise InputError(f"{name}: an angle is one for the whole block: use fx, fy, fz in place of a, p, o and da.")
+        symbols = [f"{symbol_stem(name)}{axis}" for axis in ("NE" if place == BASE else [f"_{place}"])]
+        self._coefficients = tuple(Coefficient(symbol, unit, 1.0, *shown) for symbol in symbols)
+        checks.check(self, stimulus)
+        scale = _LARGE_RAD / self._values.typical(stimulus)
+        self._coefficients = tuple(replace(each, scale=scale) for each in self._coefficients)
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return self._coefficients
+
+    def rotations(self, s: Stimulus) -> Floats:
+        values = self._values(s)
+        checks.refuse_not_finite(self, values, s)
+        axes = [about_axis(s, self._gimbal)] if self._gimbal is not None else [-s.to_platform(n) for n in s.level_axes]
+        return values[:, :, None] * np.stack(axes, axis=1)
+
+
+@lru_cache(maxsize=256)
+def formula(text: str, axes: tuple[Vector, ...], gravity_mps2: float) -> Formula | FrameFormula:
     """The formula's effect, made once for each bench: a run asks for it many times."""
-    return Formula(text, Bench(axes, gravity_mps2))
+    (full, expression), bench = split(text), Bench(axes, gravity_mps2)
+    name, _, place = full.partition(":")
+    return FrameFormula(name, place, expression, bench) if place else Formula(name, expression, bench)

@@ -5,6 +5,7 @@ A plain number stays a number, so that it can be an exponent; a plain 0 goes wit
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any
@@ -50,6 +51,12 @@ def coefficient_units(unit: Unit) -> tuple[str, tuple[str, float]]:
         return own, (own, 1.0)
     head = {0.0: "µg", 1.0: "ppm"}.get(power, f"µg/g{f'{power:g}'.translate(_RAISED)}")
     return own, (text(acceleration**power / unit, head, raised=True), 1e6 * G ** (power - 1.0))
+
+
+def turning_units(unit: Unit) -> tuple[str, tuple[str, float]]:
+    """The same of the coefficient of an expression that is an angle per unit of the coefficient; told in arcsec."""
+    own = _registry().Unit("rad") / unit
+    return text(own), (text(1 / unit, "arcsec"), math.degrees(3600.0))
 
 
 def text(unit: Unit, head: str = "", raised: bool = False) -> str:

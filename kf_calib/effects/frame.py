@@ -102,6 +102,11 @@ class CrossTalk(Effect):
         return out
 
 
+def about_axis(s: Stimulus, gimbal: int) -> Floats:
+    """What a positive error of a gimbal's angle turns the specific force by, rad/rad, (m, 3)."""
+    return -s.inner(np.array(s.bench.axes[gimbal]), gimbal)
+
+
 class _GimbalEffect(FrameEffect):
     """An effect of one gimbal, named by its letter or number after the colon."""
 
@@ -109,8 +114,7 @@ class _GimbalEffect(FrameEffect):
         self.gimbal, self.variant = gimbal, variant
 
     def _about_axis(self, s: Stimulus) -> Floats:
-        """What a positive error of the gimbal's angle turns the specific force by, rad/rad, (m, 3)."""
-        return -s.inner(np.array(s.bench.axes[self.gimbal]), self.gimbal)
+        return about_axis(s, self.gimbal)
 
     def _angle(self, s: Stimulus) -> Floats:
         return s.pose[:, self.gimbal]

@@ -20,8 +20,8 @@ _RATE_WINDOW_S = 5.0  # a thermometer of 0.01 K noise then shows rates of 1e-3 K
 class Stimulus:
     """The state of the bench at m instants of dwells.
 
-    elapsed_s, since_arrival_s, temperature_c: (m,); force_mps2: specific force in the platform frame, and that of the
-    dwell before, (m, 3); pose (m, k); sensitivity (3, 3): rows K_i E_i at which small rotations are linearised;
+    elapsed_s, since_arrival_s, temperature_c: (m,); force_mps2: specific force in the platform frame, (m, 3), and pose,
+    (m, k), each of the dwell before, too; sensitivity (3, 3): rows K_i E_i at which small rotations are linearised;
     variance_mps2_2: variance of the readings about here, (m, 3). rate_radps, rate_change_radps2: omega of the platform
     in its own frame and its derivative there, (m, 3), zero where it stands.
     """
@@ -32,6 +32,7 @@ class Stimulus:
     force_mps2: Floats
     previous_force_mps2: Floats
     pose: Floats
+    previous_pose: Floats
     temperature_c: Floats
     sensitivity: Floats
     variance_mps2_2: Floats = field(default_factory=lambda: np.zeros((1, 3)))

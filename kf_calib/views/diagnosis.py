@@ -44,7 +44,7 @@ def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
             "detectable": [
                 {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in detectable(found.test)
             ],
-            "unknown": None if unknown is None else vars(unknown),
+            "unknown": None if unknown is None else {**vars(unknown), "formula": unknown.formula},
             "next_orientation": None if going is None else {"gimbal_deg": list(going[0].gimbal_deg), "why": going[1]},
             "held_out_rms_mps2": found.before.held_out_rms_mps2,
             "held_out_floor_mps2": found.before.held_out_floor_mps2,
@@ -81,7 +81,7 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
         parts.append(
             Text(
                 f"It goes with {unknown.driver} (accelerometer {unknown.channel}; explains {unknown.share:.0%} of it). "
-                f"To try: --with '{unknown.formula}'"
+                f"To try: {' '.join(f"--with '{formula}'" for formula in unknown.formulas)}"
             )
         )
     if going is not None:
