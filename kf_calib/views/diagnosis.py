@@ -78,10 +78,11 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
         parts.append(_dwell_table(found))
     unknown, going = description(found), next_orientation(found)
     if unknown is not None:
+        to_try = " ".join(f"--with '{formula}'" for formula in unknown.formulas)
         parts.append(
             Text(
                 f"It goes with {unknown.driver} (accelerometer {unknown.channel}; explains {unknown.share:.0%} of it). "
-                f"To try: {' '.join(f"--with '{formula}'" for formula in unknown.formulas)}"
+                f"To try: {to_try}"
             )
         )
     if going is not None:
