@@ -3,8 +3,9 @@
 All of it works on the dwell factors of one pass over the data. A model is refitted from nothing but these factors and
 its list of effects, so that a journal of the steps, or the list alone, gives the same numbers bit for bit.
 
-Unattended, an effect is added only where the diagnosis names it alone (or names several that are all needed): where
-two explain the misfit equally well the twelve parameters depend on which is taken, and that is a person's choice.
+Unattended, an effect is added only where nothing else would do as well: where two explain the misfit equally well the
+twelve parameters depend on which is taken, and that is a person's choice. Of several that are needed together, one is
+added at a time, first one that is the only choice beside the others; the next diagnosis may then know better.
 After every addition each effect of the model is tested for being taken out again; what the user put in stays.
 """
 
@@ -79,12 +80,12 @@ class Step:
         out = list[str]()
         for each in own:
             size = float(np.sqrt(max(each.statistic, 0.0)))
-            if self.by == "diagnosis" and size < _NEAR_THRESHOLD:
+            if each.needed and size < _NEAR_THRESHOLD:
                 out.append(
                     f"{each.name} is {size:.1f} sigma in size, near where it could just be found: such sizes come out "
                     "high on average; measure it on a run of its own before relying on it."
                 )
-            if self.by == "user" and not each.needed:
+            if not each.needed:
                 out.append(f"{each.name} explains no more than chance would (p {format_p(each.p_value)}).")
         return tuple(out)
 
@@ -173,6 +174,8 @@ class Improvement:
             far = max(self.spreads, key=lambda spread: spread.sigmas, default=None)
             differ = f"; the twelve differ by up to {far.sigmas:.1f} sigma ({far.parameter.symbol})" if far else ""
             return f"{names} explain what is left equally well, so none was added{differ}. {verdict}"
+        if self.found.missing and self.because == "ambiguous":
+            return f"{verdict} Other pairs explain it equally well, so none was added."
         return verdict
 
     @cached_property
@@ -207,8 +210,8 @@ def improve(
     accept_first: of effects that explain the misfit equally well, take the first instead of stopping.
     """
     state = begun(start)
-    while names := chosen(state.found, accept_first):
-        state = extended(state, names, "diagnosis")
+    while (name := next_effect(state.found, accept_first)) is not None:
+        state = stepped(state, name, None, "diagnosis")
         if on_step is not None:
             on_step(state)
     return state
@@ -218,11 +221,26 @@ def begun(start: Calibration) -> Improvement:
     return Improvement(diagnose(start))
 
 
-def chosen(found: Diagnosis, accept_first: bool = False) -> tuple[str, ...]:
-    """The effects to add next; none where nothing is missing, or where a person must choose."""
-    if found.test.consistent is not False or (_rivals(found) and not accept_first):
-        return ()
-    return found.missing
+def next_effect(found: Diagnosis, accept_first: bool = False) -> str | None:
+    """The effect to add next; None where nothing is missing, or where a person must choose."""
+    if found.test.consistent is not False or not found.missing:
+        return None
+    if accept_first:
+        return found.missing[0]
+    if _rivals(found):
+        return None
+    return found.missing[0] if len(found.missing) == 1 else _only_choice(found)
+
+
+def _only_choice(found: Diagnosis) -> str | None:
+    """Of effects that explain the misfit together, the first that nothing can stand for beside the others."""
+    before = found.before
+    for name in found.missing:
+        rest = [other for other in found.missing if other != name]
+        beside = diagnose(refitted(before, (*before.settings.effects, *rest)))
+        if beside.missing == (name,) and not _rivals(beside):
+            return name
+    return None
 
 
 def _rivals(found: Diagnosis) -> list[str]:
@@ -244,14 +262,12 @@ def stepped(state: Improvement, added: str | None, dropped: Sequence[str] | None
     """
     if added is not None:
         _refuse(state.result, added)
-    with threadpool_limits(1, user_api="blas"):  # small decompositions, and the same bits every time
-        result = state.result if added is None else refitted(state.result, (*state.effects, added))
-        out = list[Removal]()
-        kept = state.kept | ({_name(added, result)} if added is not None and by == "user" else set[str]())
-        while (weak := _next_out(result, kept, dropped, len(out))) is not None:
-            result = refitted(result, _less(result, weak.name))
-            out.append(weak)
-            kept.add(weak.name)
+    result = state.result if added is None else refitted(state.result, (*state.effects, added))
+    kept = state.kept | ({_name(added, result)} if added is not None else set[str]())
+    out = list[Removal]()
+    while (weak := _next_out(result, kept, dropped, len(out))) is not None:
+        result = refitted(result, _less(result, weak.name))
+        out.append(weak)
     return replace(state, history=(*state.history, Step(added, tuple(out), by, diagnose(result))))
 
 
@@ -269,8 +285,9 @@ def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
     """The same dwells with these effects in the model, whatever was in it before."""
     settings = replace(before.settings, effects=tuple(effects))
     model = Model.of(before.bench, settings.effects)
-    fitted = fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews)
-    return replace(evaluated(fitted, settings), tally=before.tally)
+    with threadpool_limits(1, user_api="blas"):  # small decompositions, and the same bits every time
+        fitted = fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews)
+        return replace(evaluated(fitted, settings), tally=before.tally)
 
 
 def removals(fitted: Fit) -> tuple[Removal, ...]:

@@ -32,10 +32,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from kf_calib.calibration import Calibration
 from kf_calib.diagnosis import Diagnosis
 from kf_calib.errors import InputError
 from kf_calib.improvement import By, Improvement, Step, begun, stepped
-from kf_calib.calibration import Calibration
 from kf_calib.model_file import table_of, write_whole
 
 
@@ -77,7 +77,7 @@ class Journal:
     choices: tuple[Choice, ...]
     asked: bool
 
-    def refuse_other(self, origin: Origin, path: Path) -> None:
+    def refuse_other(self, origin: Origin, path: Path | None) -> None:
         """Raise InputError where the recording is not the one the journal was made from."""
         if origin.sha256 != self.origin.sha256:
             raise InputError(
@@ -132,16 +132,23 @@ def read(path: Path) -> Journal:
         return Journal(
             Origin(str(recording["name"]), str(recording["sha256"]), dict(table["options"])),
             str(table["version"]),
-            dict(table["start"]),
-            tuple(
-                Choice(step.get("added"), tuple(each["name"] for each in step["dropped"]), step["by"], step["figures"])
-                for step in steps
-            ),
+            _numbers(table["start"]),
+            tuple(_choice(step) for step in steps),
             table["stopped_because"] == "asked",
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(f"{path}: is no journal of improve ({what}): write one with --journal.") from None
+
+
+def _choice(step: Mapping[str, Any]) -> Choice:
+    by: By = "user" if step["by"] == "user" else "diagnosis"
+    added = None if "added" not in step else str(step["added"])
+    return Choice(added, tuple(str(each["name"]) for each in step["dropped"]), by, _numbers(step["figures"]))
+
+
+def _numbers(table: Mapping[str, Any]) -> dict[str, float]:
+    return {key: float(value) for key, value in table.items()}
 
 
 def replayed(
