@@ -173,9 +173,10 @@ class Improvement:
             names = " and ".join(each.name for each in self.alternatives)
             far = max(self.spreads, key=lambda spread: spread.sigmas, default=None)
             differ = f"; the twelve differ by up to {far.sigmas:.1f} sigma ({far.parameter.symbol})" if far else ""
-            return f"{names} explain what is left equally well, so none was added{differ}. {verdict}"
+            taken = "none was added (--accept-first takes the first)"
+            return f"{names} explain what is left equally well: {taken}{differ}. {verdict}"
         if self.found.missing and self.because == "ambiguous":
-            return f"{verdict} Other pairs explain it equally well, so none was added."
+            return f"{verdict} Others would do as well: none was added (--accept-first takes the first)."
         return verdict
 
     @cached_property

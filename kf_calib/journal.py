@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -162,7 +162,7 @@ def replayed(
         differences.append(_difference(choice.figures, figures(state.found)))
         if on_step is not None:
             on_step(state)
-    return Improvement(state.start, state.history, journal.asked), max(differences)
+    return replace(state, asked=journal.asked), max(differences)
 
 
 def _difference(one: Mapping[str, float], other: Mapping[str, float]) -> float:

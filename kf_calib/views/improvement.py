@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -124,10 +125,11 @@ def improvement_report(
     parts: list[RenderableType] = [
         progress(state), Text(f"Stopped, {state.because}: {state.reason}", style=style),
     ]  # fmt: skip
+    parts += [Text(line) for line in _settling(state)]
     if state.spreads:
         parts.append(_spread_table(state))
-    parts += [Text(line) for line in _settling(state)]
-    parts.append(parameter_table(list(state.result.parameters.values())[:12]))
+    else:
+        parts.append(parameter_table(list(state.result.parameters.values())[:12]))
     if state.result.model.effects:
         parts.append(effect_table(state.result))
     if honest is not None:
@@ -193,21 +195,23 @@ def _test(each: Removal) -> str:
 
 
 def _spread_table(state: Improvement) -> Table:
-    """The parameters that depend most on which of the equal explanations is taken."""
-    table = Table(title="Twelve parameters, lowest and highest over these effects", title_justify="left")
+    """The twelve by each of the equal explanations: without any of them they would be wrong by more."""
+    names = ", ".join(each.name for each in state.alternatives)
+    table = Table(title=f"Parameters less nominal, with either of {names}", title_justify="left")
     for heading in ("parameter", "lowest", "highest", "sigma", "unit", "differ by, σ"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    for each in sorted(state.spreads, key=lambda spread: -spread.sigmas)[:6]:
-        table.add_row(*_spread_row(each))
+    for k, each in enumerate(state.spreads):
+        table.add_row(*_spread_row(each), end_section=k % 4 == 3)
     return table
 
 
 def _spread_row(each: Spread) -> tuple[str, ...]:
     own = each.parameter
-    values = [rounded((value - own.nominal) * own.per_si, (own.sigma or 0.0) * own.per_si)
-              for value in (each.lowest, each.highest)]  # fmt: skip
-    shown = [f"{value:>}" for value, _ in values]
-    return f"{symbol(own.symbol)} less nominal", *shown, f"± {values[0][1]}", own.shown_unit, f"{each.sigmas:.1f}"
+    low, high = (
+        rounded((value - own.nominal) * own.per_si, (own.sigma or 0.0) * own.per_si)
+        for value in (each.lowest, each.highest)
+    )
+    return symbol(own.symbol), low[0], high[0], f"± {low[1]}", own.shown_unit, f"{each.sigmas:.1f}"
 
 
 def _settling(state: Improvement) -> list[str]:
@@ -245,19 +249,21 @@ def session(
     on_step: Callable[[Improvement], None],
 ) -> Improvement:
     """Ask what to do next until it is enough; ``ask`` takes a question and what an empty answer means."""
+    shown: Improvement | None = None
     while True:
         options = _options(state.found)
-        show(Group(progress(state), Text(state.found.verdict, style="bold"), *_numbered(state.found, options)))
+        if shown is not state:
+            show(Group(progress(state), Text(state.found.verdict, style="bold"), *_numbered(state.found, options)))
+            shown = state
         usual = "q" if not options else "1" if state.found.missing else ""
         answer = ask(HOW, usual).strip()
         if answer == "q":
-            return Improvement(state.start, state.history, asked=True)
+            return replace(state, asked=True)
         try:
             state = answered(state, answer, options)
+            on_step(state)
         except InputError as error:
             show(Text(f"{error}", style="red"))
-            continue
-        on_step(state)
 
 
 def answered(state: Improvement, answer: str, options: list[tuple[str, ...]]) -> Improvement:
