@@ -433,7 +433,7 @@ def improve(
     if interactive:
         state = views.session(state, lambda text, usual: click.prompt(text, default=usual or None), _show, keep)
     with _progress("holding out orientations", as_json or not honest) as tick:
-        checked = improvement.honest(start, accept_first=accept_first, on_fold=tick) if honest else None
+        checked = improvement.honest(start, on_fold=tick) if honest else None
     keep(state)
     if save_model:
         model_file.write(save_model, state.result)

@@ -361,11 +361,10 @@ class Honest:
     chosen: dict[str, int]
 
 
-def honest(
-    start: Calibration, folds: int = 6, accept_first: bool = False, on_fold: Callable[[float], None] | None = None
-) -> Honest:
+def honest(start: Calibration, folds: int = 6, on_fold: Callable[[float], None] | None = None) -> Honest:
     """Leave out every ``folds``-th orientation, improve on the others, predict it; each is left out once.
 
+    Of equal explanations the first is taken: they predict alike, and a fold that stopped to ask would predict nothing.
     Raises UnobservableError where the orientations of some fold do not determine the model it chose.
     """
     groups = orientations(start.fit.dwells)
@@ -375,7 +374,7 @@ def honest(
         left = sorted(k for group in groups[number::folds] for k in group)
         with threadpool_limits(1, user_api="blas"):
             kept = evaluate(without(start.fit.dwells, left), start.bench, start.settings, start.carried.slews)
-        result = improve(kept, accept_first).result
+        result = improve(kept, accept_first=True).result
         squares, variances = _predicted(start, result, left)
         errors.append(squares)
         expected.append(variances)
