@@ -6,6 +6,7 @@
     print(run)                                  # parameters, noise, verdict
     run.parameters["K1"].value, run.parameters["K1"].sigma
     print(kf_calib.diagnose(run).verdict)       # which physical effect is missing
+    print(kf_calib.improve(run).reason)         # added, refitted, tested, until there is a reason to stop
     kf_calib.save_view(run, "run.rrd")          # opens in Rerun
 
 Conventions, kept everywhere:
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from kf_calib.comparison import compare
     from kf_calib.diagnosis import Diagnosis, diagnose
     from kf_calib.errors import InputError, KfCalibError, UnobservableError
+    from kf_calib.improvement import Improvement, improve
     from kf_calib.sources.recorder import Recorder
     from kf_calib.sources.recording import Recording as open_recording
     from kf_calib.views.rerun import save as save_view
@@ -42,6 +44,8 @@ _HOMES = {
     "compare": ("comparison", "compare"),
     "Diagnosis": ("diagnosis", "Diagnosis"),
     "diagnose": ("diagnosis", "diagnose"),
+    "Improvement": ("improvement", "Improvement"),
+    "improve": ("improvement", "improve"),
     "InputError": ("errors", "InputError"),
     "KfCalibError": ("errors", "KfCalibError"),
     "UnobservableError": ("errors", "UnobservableError"),
@@ -51,8 +55,8 @@ _HOMES = {
 }
 
 __all__ = [
-    "Bench", "Calibration", "Diagnosis", "InputError", "KfCalibError", "Parameter", "Recorder", "Settings",
-    "UnobservableError", "calibrate", "compare", "diagnose", "open_recording", "save_view",
+    "Bench", "Calibration", "Diagnosis", "Improvement", "InputError", "KfCalibError", "Parameter", "Recorder",
+    "Settings", "UnobservableError", "calibrate", "compare", "diagnose", "improve", "open_recording", "save_view",
 ]  # fmt: skip
 
 

@@ -369,6 +369,121 @@ def diagnose(ctx: click.Context, recording: Path, strict: bool, as_json: bool, *
         ctx.exit(1)
 
 
+@cli.command()
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option("--interactive/--unattended", default=None, help="Ask at every step, or never; on a terminal it asks.")
+@click.option("--accept-first", is_flag=True, help="Of effects that explain it equally well, take the first.")
+@click.option(
+    "--honest",
+    is_flag=True,
+    help="Held-out error with the choice of effects repeated without what is held out, in 6 folds.",
+)
+@click.option("--save-model", "--out-model", type=click.Path(path_type=Path), help="Save the last model here.")
+@click.option("--journal", "journal_file", type=click.Path(path_type=Path), help="Keep a journal of the steps here.")
+@click.option("--from-journal", type=click.Path(path_type=Path), help="First take the steps of this journal again.")
+@recording_options
+@filter_options
+@strict_option
+@json_option
+@click.pass_context
+def improve(
+    ctx: click.Context,
+    recording: Path,
+    interactive: bool | None,
+    accept_first: bool,
+    honest: bool,
+    save_model: Path | None,
+    journal_file: Path | None,
+    from_journal: Path | None,
+    strict: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:  # fmt: skip
+    """Add the effects that are missing, one after another, and see the error fall, until there is a reason to stop."""
+    from kf_calib import improvement, journal, model_file
+    from kf_calib.calibration import calibrate
+    from kf_calib.views import improvement as views
+
+    if interactive is None:
+        interactive = not as_json and sys.stdin.isatty() and sys.stdout.isatty()
+    if interactive and as_json:
+        raise click.UsageError("--interactive asks questions, --json prints one object and nothing else: choose one.")
+    earlier = journal.read(from_journal) if from_journal else None
+    if earlier is not None:
+        options |= _of_journal(ctx, options, earlier.origin.options)
+    _refuse_engine(options)
+    settings = _settings(options)
+    origin = journal.Origin.of(recording, _for_journal(options, settings.effects))
+    if earlier is not None:
+        earlier.refuse_other(origin, from_journal)
+
+    def keep(state: improvement.Improvement) -> None:
+        if journal_file:
+            journal.write(journal_file, state, origin)
+
+    difference = None
+    with _progress(f"improving on {recording.name}", as_json) as tick:
+        start = calibrate(_recording(recording, options), settings, tick)
+        if earlier is not None:
+            state, difference = journal.replayed(earlier, start)
+        elif interactive:
+            state = improvement.begun(start)
+        else:
+            state = improvement.improve(start, accept_first, keep)
+    if interactive:
+        state = views.session(state, lambda text, usual: click.prompt(text, default=usual or None), _show, keep)
+    with _progress("holding out orientations", as_json or not honest) as tick:
+        checked = improvement.honest(start, on_fold=tick) if honest else None
+    keep(state)
+    if save_model:
+        model_file.write(save_model, state.result)
+    files = {"saved_model": save_model, "journal": journal_file}
+    if as_json:
+        _print_json(views.improvement_object(state, checked, difference, files))
+    else:
+        _show(views.improvement_report(state, checked, difference, files))
+    if strict and state.found.test.consistent is False:
+        ctx.exit(1)
+
+
+_BY_CONTENT = ("bench_file", "model_file", *_BENCH_OPTIONS)
+
+
+def _refuse_engine(options: Mapping[str, Any]) -> None:
+    if options["engine"] != "block":
+        raise click.UsageError(
+            "improve refits from folded dwells, as the block engine does: leave out --engine, and check what it finds "
+            "with replay --model FILE --engine filterpy."
+        )
+
+
+def _for_journal(options: Mapping[str, Any], effects: tuple[str, ...]) -> dict[str, Any]:
+    """All options that numbers depend on; files of bench keys and of models by what they say."""
+    from kf_calib import model_file
+
+    files = [*options["effects_from"]]
+    if options["model_file"] is not None:
+        files += model_file.read(options["model_file"]).effects_from
+    kept = {key: value for key, value in options.items() if value is not None and key not in _BY_CONTENT}
+    plain = {"effects": list(effects), "effects_from": [str(path.resolve()) for path in files]}
+    return kept | _overrides(options) | plain
+
+
+def _of_journal(ctx: click.Context, options: Mapping[str, Any], kept: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of a journal, as if they had been given; raises UsageError where some are given as well."""
+    from click.core import ParameterSource
+
+    own = [param for param in ctx.command.params if param.name in options]
+    given = [
+        param.opts[0] for param in own if ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE
+    ]
+    if given:
+        raise click.UsageError(f"--from-journal has its options from the journal: leave out {', '.join(given)}.")
+    return {param.name or "": param.type_cast_value(ctx, kept[param.name]) for param in own if param.name in kept} | {
+        key: None for key in _BY_CONTENT if key not in kept
+    }
+
+
 def simulation_options(command: F) -> F:
     """What the simulated bench is and does."""
     options = [

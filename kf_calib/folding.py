@@ -9,7 +9,7 @@ pass over the data, and a column that changes (another tau, another E) is evalua
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -73,13 +73,15 @@ class Piece:
 class DwellFactor:
     """One dwell: its pieces in order of time, and the autocovariance of its first readings.
 
-    moving: it is the slew after the dwell of that number, folded like a dwell.
+    moving: it is the slew after the dwell of that number, folded like a dwell. came_from: the dwell before it, where
+    that one is left out (None: it is there, or there was none).
     """
 
     number: int
     pieces: tuple[Piece, ...]
     autocovariance: Autocovariance
     moving: bool = False
+    came_from: DwellFactor | None = None
 
     @cached_property
     def squares(self) -> Floats:
@@ -200,9 +202,15 @@ def _before(dwells: Sequence[DwellFactor]) -> list[DwellFactor]:
     """The dwell before each dwell, itself in the first; before a slew, the dwell it left."""
     out, last = list[DwellFactor](), dwells[0]
     for dwell in dwells:
-        out.append(last)
+        out.append(dwell.came_from or last)
         last = last if dwell.moving else dwell
     return out
+
+
+def without(dwells: Sequence[DwellFactor], left_out: Collection[int]) -> list[DwellFactor]:
+    """The dwells but those at the places ``left_out``; each still knows the step by which it was reached."""
+    told = [replace(dwell, came_from=last) for dwell, last in zip(dwells, _before(dwells), strict=True)]
+    return [dwell for k, dwell in enumerate(told) if k not in left_out]
 
 
 def _signal_only(dwells: Sequence[DwellFactor], temperature_c: Floats) -> Floats:

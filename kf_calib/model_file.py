@@ -42,7 +42,7 @@ def read(path: Path) -> ModelFile:
 
     Raises InputError, with the path, where the file cannot be read or used.
     """
-    table = _table(path)
+    table = table_of(path)
     for key in table:
         if key not in _KEYS:
             near = difflib.get_close_matches(key, _KEYS, n=1, cutoff=0.4)
@@ -63,7 +63,8 @@ def read(path: Path) -> ModelFile:
     return found
 
 
-def _table(path: Path) -> dict[str, Any]:
+def table_of(path: Path) -> dict[str, Any]:
+    """The content of a TOML file; raises InputError, with the path, where it cannot be read."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
@@ -90,7 +91,7 @@ def write(path: Path, result: Calibration) -> None:
         table["effects_from"] = [_relative(file, path) for file in files]
     if found := list(_coefficients(result)):
         table["coefficients"] = found
-    _replace(path, _toml(table))
+    write_whole(path, _toml(table), "the model", "--save-model")
 
 
 def _toml(table: dict[str, Any]) -> bytes:
@@ -114,14 +115,15 @@ def _relative(file: Path, path: Path) -> str:
         return file.as_posix()
 
 
-def _replace(path: Path, content: bytes) -> None:
-    """Write beside the file and rename: whoever looks sees the old one or the new one."""
+def write_whole(path: Path, content: bytes, what: str, option: str) -> None:
+    """Write beside the file and rename: whoever looks sees the old one or the new one.
+
+    Raises InputError, naming the ``option`` to give another path by, where ``what`` cannot be written.
+    """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         part.write_bytes(content)
         part.replace(path)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise InputError(
-            f"{path}: the model cannot be written ({error.strerror}): give another --save-model."
-        ) from None
+        raise InputError(f"{path}: {what} cannot be written ({error.strerror}): give another {option}.") from None

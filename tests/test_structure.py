@@ -26,6 +26,8 @@ LEVELS = [
     ["calibration"],
     ["comparison", "model_file"],
     ["diagnosis"],
+    ["improvement"],
+    ["journal"],
     ["views"],
     ["cli"],
 ]

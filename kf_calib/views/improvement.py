@@ -1,0 +1,309 @@
+"""An improvement for people and for programs: errors falling step by step, and the questions of a session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from kf_calib.calibration import Calibration, evaluated, format_p
+from kf_calib.diagnosis import Diagnosis, next_orientation
+from kf_calib.errors import InputError
+from kf_calib.improvement import Honest, Improvement, Removal, Spread, Step, extended, stepped, undone
+from kf_calib.views.console import effect_table, parameter_table, rounded, symbol
+from kf_calib.views.diagnosis import description
+from kf_calib.views.json import clean
+
+_WIDTH = 30  # characters of the longest bar
+_EIGHTHS = " ▏▎▍▌▋▊▉"
+
+
+def improvement_object(
+    state: Improvement, honest: Honest | None, replay_difference: float | None, files: Mapping[str, Path | None]
+) -> dict[str, Any]:
+    """What ``improve --json`` prints. A step's figures are those after it; p-values are those of the run.
+
+    replay_difference: largest relative difference from the figures of the journal that was replayed.
+    """
+    unknown, going = description(state.found), next_orientation(state.found)
+    return clean(
+        {
+            "start": _figures(state.start),
+            "steps": [_step_object(step) for step in state.steps],
+            "model": [str(effect) for effect in state.result.model.effects],
+            "stopped_because": state.because,
+            "reason": state.reason,
+            "verdict": state.found.verdict,
+            **_figures(state.found),
+            "parameters": _parameters(state.result),
+            "tests": [_removal_object(each) for each in state.removals],
+            "ambiguity_set": [each.name for each in state.alternatives],
+            "alternatives": [
+                {
+                    "effect": each.name,
+                    "residual_rms_mps2": each.result.residual_rms_mps2,
+                    "held_out_rms_mps2": each.result.held_out_rms_mps2,
+                    "held_out_floor_mps2": each.result.held_out_floor_mps2,
+                    "parameters": _parameters(each.result),
+                }
+                for each in state.alternatives
+            ],
+            "spread": [
+                {
+                    "symbol": each.parameter.symbol,
+                    "lowest": each.lowest,
+                    "highest": each.highest,
+                    "sigma": each.parameter.sigma,
+                    "unit": each.parameter.unit,
+                    "sigmas": each.sigmas,
+                }
+                for each in state.spreads
+            ],
+            "unknown": None if unknown is None else vars(unknown),
+            "next_orientation": None if going is None else {"gimbal_deg": list(going[0].gimbal_deg), "why": going[1]},
+            "honest": None if honest is None else vars(honest),
+            "replay_difference": replay_difference,
+            **{key: None if path is None else str(path) for key, path in files.items()},
+            "warnings": notes(state),
+        }
+    )
+
+
+def _figures(found: Diagnosis) -> dict[str, Any]:
+    result = found.before
+    return {
+        "p_value": found.test.p_value,
+        "consistent": found.test.consistent,
+        "residual_rms_mps2": result.residual_rms_mps2,
+        "held_out_rms_mps2": result.held_out_rms_mps2,
+        "held_out_floor_mps2": result.held_out_floor_mps2,
+    }
+
+
+def _step_object(step: Step) -> dict[str, Any]:
+    return {
+        "added": step.added,
+        "by": step.by,
+        **_figures(step.found),
+        "dropped": [_removal_object(each) for each in step.dropped],
+        "model": [str(effect) for effect in step.result.model.effects],
+        "coefficients": _parameters(step.result)[12:],
+        "remarks": list(step.remarks),
+    }
+
+
+def _removal_object(each: Removal) -> dict[str, Any]:
+    return {
+        "effect": each.name, "statistic": each.statistic, "dof": each.dof, "p_value": each.p_value,
+        "needed": each.needed,
+    }  # fmt: skip
+
+
+def _parameters(result: Calibration) -> list[dict[str, Any]]:
+    keys = ("symbol", "value", "sigma", "unit")
+    return [{key: getattr(parameter, key) for key in keys} for parameter in result.parameters.values()]
+
+
+def notes(state: Improvement) -> list[str]:
+    """What was said of the recording, and of the last model."""
+    first = state.start.before
+    of_models = evaluated(first.fit, first.settings).warnings
+    said = [sentence for sentence in first.warnings if sentence not in of_models]
+    return [*said, *state.result.warnings]
+
+
+def improvement_report(
+    state: Improvement, honest: Honest | None, replay_difference: float | None, files: Mapping[str, Path | None]
+) -> RenderableType:
+    """What ``improve`` prints: the errors falling, why it stopped, what would settle it, the parameters."""
+    style = "bold green" if state.because == "consistent" else "bold yellow"
+    parts: list[RenderableType] = [
+        progress(state), Text(f"Stopped, {state.because}: {state.reason}", style=style),
+    ]  # fmt: skip
+    parts += [Text(line) for line in _settling(state)]
+    if state.spreads:
+        parts.append(_spread_table(state))
+    else:
+        parts.append(parameter_table(list(state.result.parameters.values())[:12]))
+    if state.result.model.effects:
+        parts.append(effect_table(state.result))
+    if honest is not None:
+        parts.append(Text(honest_sentence(honest)))
+    if replay_difference is not None:
+        same = "to the last bit" if replay_difference == 0 else f"but for {replay_difference:.1g} of a figure at most"
+        parts.append(Text(f"The steps of the journal gave its figures again, {same}."))
+    parts += [Text(f"Note: {sentence}", style="yellow") for sentence in notes(state)]
+    parts += [Text(f"saved {path}") for path in files.values() if path]
+    return Group(*parts)
+
+
+def progress(state: Improvement) -> RenderableType:
+    """A line a step: held-out and in-sample rms as bars over the noise floor; below, what else is to be said of it."""
+    floor = state.result.held_out_floor_mps2
+    rows = [("start", state.start.before, state.start.test.p_value)]
+    rows += [(_label(step), step.result, step.found.test.p_value) for step in state.steps]
+    rows += [(f"(+ {each.name})", each.result, None) for each in state.alternatives]
+    errors = [_errors(result, floor) for _, result, _ in rows]
+    longest = max(error for both in errors for error in both if error is not None)
+    head = "over the noise floor" if floor else "m/s^2 (without any one orientation the model is not determined)"
+    table = Table(title=f"Rms error, {head}", title_justify="left", box=None, pad_edge=False)
+    for heading in ("step", "p of the run", "", "", ""):
+        table.add_column(heading, no_wrap=True)
+    for (label, _, p_value), (held_out, fitted) in zip(rows, errors, strict=True):
+        p_text = "" if p_value is None else format_p(p_value).removeprefix("= ")
+        if held_out is not None:
+            table.add_row(label, p_text, "held out", f"{held_out:.2f}", Text(bar(held_out, longest), style="cyan"))
+            label = p_text = ""
+        number = f"{fitted:.2f}" if floor else f"{fitted:.2g}"
+        table.add_row(label, p_text, "fitted", number, Text(bar(fitted, longest), style="dim"))
+    said = [Text(line) for step in state.steps for line in (*map(_out, step.dropped), *step.remarks)]
+    tests = [Text(f"Tested: {_test(each)}.") for each in state.removals]
+    return Group(table, *said, *tests)
+
+
+def _errors(result: Calibration, floor: float | None) -> tuple[float | None, float]:
+    """Held-out and in-sample rms over the floor; without one, the latter alone in m/s^2."""
+    if not floor:
+        return None, result.residual_rms_mps2
+    held_out = result.held_out_rms_mps2
+    return None if held_out is None else held_out / floor, result.residual_rms_mps2 / floor
+
+
+def bar(value: float, longest: float) -> str:
+    """A bar of eighths of a character, the longest 30 characters."""
+    eighths = max(1, round(8 * _WIDTH * value / longest)) if longest > 0 else 1
+    return "█" * (eighths // 8) + _EIGHTHS[eighths % 8].strip()
+
+
+def _label(step: Step) -> str:
+    said = [f"+ {step.added}"] if step.added else []
+    return ", ".join([*said, *(f"- {each.name}" for each in step.dropped)])
+
+
+def _out(each: Removal) -> str:
+    return f"{each.name} was taken out: {_test(each)}."
+
+
+def _test(each: Removal) -> str:
+    word = "needed" if each.needed else "not needed"
+    return f"without {each.name} χ² rises by {each.statistic:.1f}, {each.dof} dof (p {format_p(each.p_value)}): {word}"
+
+
+def _spread_table(state: Improvement) -> Table:
+    """The twelve by each of the equal explanations: without any of them they would be wrong by more."""
+    names = ", ".join(each.name for each in state.alternatives)
+    table = Table(title=f"Parameters less nominal, with either of {names}", title_justify="left")
+    for heading in ("parameter", "lowest", "highest", "sigma", "unit", "differ by, σ"):
+        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
+    for k, each in enumerate(state.spreads):
+        table.add_row(*_spread_row(each), end_section=k % 4 == 3)
+    return table
+
+
+def _spread_row(each: Spread) -> tuple[str, ...]:
+    own = each.parameter
+    low, high = (
+        rounded((value - own.nominal) * own.per_si, (own.sigma or 0.0) * own.per_si)
+        for value in (each.lowest, each.highest)
+    )
+    return symbol(own.symbol), low[0], high[0], f"± {low[1]}", own.shown_unit, f"{each.sigmas:.1f}"
+
+
+def _settling(state: Improvement) -> list[str]:
+    """What would settle what is left: a formula to try, an orientation to visit."""
+    if state.found.test.consistent is not False:
+        return []
+    unknown, going, out = description(state.found), next_orientation(state.found), list[str]()
+    if unknown is not None:
+        out.append(
+            f"It goes with {unknown.driver} (accelerometer {unknown.channel}; explains {unknown.share:.0%} of it). "
+            f"To try: --with '{unknown.formula}'"
+        )
+    if going is not None:
+        angles = ", ".join(f"{angle:g}" for angle in going[0].gimbal_deg)
+        out.append(f"Next orientation: gimbals at {angles} deg: {going[1]}.")
+    return out
+
+
+def honest_sentence(honest: Honest) -> str:
+    times = ", ".join(f"{name} in {count}" for name, count in honest.chosen.items()) or "no effect in any"
+    return (
+        f"With the choice of effects repeated without what is held out ({honest.folds} folds): "
+        f"{honest.rms_mps2:.3g} m/s^2 rms, {honest.rms_mps2 / honest.expected_mps2:.2f} of what noise gives; "
+        f"chosen: {times}."
+    )
+
+
+HOW = "number: add it; a NAME, f FORMULA: add that; d NAME: drop; u: undo; q: finish"
+
+
+def session(
+    state: Improvement,
+    ask: Callable[[str, str], str],
+    show: Callable[[RenderableType], None],
+    on_step: Callable[[Improvement], None],
+) -> Improvement:
+    """Ask what to do next until it is enough; ``ask`` takes a question and what an empty answer means."""
+    shown: Improvement | None = None
+    while True:
+        options = _options(state.found)
+        if shown is not state:
+            show(Group(progress(state), Text(state.found.verdict, style="bold"), *_numbered(state.found, options)))
+            shown = state
+        usual = "q" if not options else "1" if state.found.missing else ""
+        answer = ask(HOW, usual).strip()
+        if answer == "q":
+            return replace(state, asked=True)
+        try:
+            state = answered(state, answer, options)
+            on_step(state)
+        except InputError as error:
+            show(Text(f"{error}", style="red"))
+
+
+def answered(state: Improvement, answer: str, options: list[tuple[str, ...]]) -> Improvement:
+    """The improvement after an answer; raises InputError, in one sentence, where it means nothing."""
+    word, _, rest = answer.partition(" ")
+    rest = rest.strip()
+    if answer == "u":
+        return undone(state)
+    if word == "d" and rest:
+        return stepped(state, None, (rest,), "user")
+    if word == "f" and rest:
+        return extended(state, (rest if "=" in rest else f"mine = {rest}",), "user")
+    if word == "a" and rest:
+        return extended(state, (rest,), "user")
+    if answer.isdigit() and 1 <= int(answer) <= len(options):
+        return extended(state, options[int(answer) - 1], "user")
+    raise InputError(f"{answer!r} is no answer: {HOW}.")
+
+
+def _options(found: Diagnosis) -> list[tuple[str, ...]]:
+    """What there is to choose from by number: what is missing, then single suspects."""
+    out = [found.missing] if found.missing else []
+    out += [(suspect.name,) for suspect in found.suspects if (suspect.name,) != found.missing]
+    return out
+
+
+def _numbered(found: Diagnosis, options: list[tuple[str, ...]]) -> list[RenderableType]:
+    if not options:
+        return []
+    refits = {suspect.name: suspect for suspect in found.suspects}
+    table = Table(box=None, pad_edge=False)
+    for heading in ("", "suspect", "p of the run", "fits", "held out"):
+        table.add_column(heading, justify="right" if heading in ("", "held out") else "left")
+    for number, names in enumerate(options, start=1):
+        suspect = refits.get(names[0]) if len(names) == 1 else None
+        result = suspect.refit if suspect is not None else found.after
+        p_value = "" if suspect is None else format_p(suspect.p_value).removeprefix("= ")
+        ratio = "" if result is None or result.held_out_rms_mps2 is None or not result.held_out_floor_mps2 else (
+            f"{result.held_out_rms_mps2 / result.held_out_floor_mps2:.2f}"
+        )  # fmt: skip
+        fits = "yes" if suspect is None or suspect.fits else "no"
+        table.add_row(str(number), " + ".join(names), p_value, fits, ratio)
+    return [table]
