@@ -68,6 +68,11 @@ class Step:
     def result(self) -> Calibration:
         return self.found.before
 
+    @property
+    def name(self) -> str | None:
+        """Of the effect that was added."""
+        return None if self.added is None else _name(self.added, self.result)
+
     @cached_property
     def removals(self) -> tuple[Removal, ...]:
         """The test of every effect that is in the model now."""
@@ -76,7 +81,7 @@ class Step:
     @cached_property
     def remarks(self) -> tuple[str, ...]:
         """What must be known of an addition before its size is relied on."""
-        own = [each for each in self.removals if self.added is not None and each.name == _name(self.added, self.result)]
+        own = [each for each in self.removals if each.name == self.name]
         out = list[str]()
         for each in own:
             size = float(np.sqrt(max(each.statistic, 0.0)))
@@ -141,7 +146,7 @@ class Improvement:
     @property
     def kept(self) -> set[str]:
         """Effects that are never taken out unasked: the user's, and those that were out once and came back."""
-        users = {_name(step.added, step.result) for step in self.steps if step.added and step.by == "user"}
+        users = {step.name for step in self.steps if step.name and step.by == "user"}
         gone = {each.name for step in self.steps for each in step.dropped}
         return {str(effect) for effect in self.start.before.model.effects} | users | gone
 

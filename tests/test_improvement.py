@@ -211,7 +211,7 @@ def test_the_command_prints_the_agreed_keys(recording: Path, tmp_path: Path) -> 
     assert done.exit_code == 0 and done.stdout.count("\n") == 1
     assert content["model"] == ["second-order"] and content["stopped_because"] == "consistent"
     step = content["steps"][0]
-    assert step["added"] == "second-order" and step["p_value"] > 0.01
+    assert step["added"] == "second-order" and step["p_value"] < 1e-3 and step["p_value_after"] > 0.01
     assert step["held_out_rms_mps2"] < 0.5 * content["start"]["held_out_rms_mps2"]
     assert step["residual_rms_mps2"] < 0.5 * content["start"]["residual_rms_mps2"]
     table = tomllib.loads(kept.read_text())

@@ -44,13 +44,17 @@ def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
             "detectable": [
                 {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in detectable(found.test)
             ],
-            "unknown": None if unknown is None else {**vars(unknown), "formula": unknown.formula},
+            "unknown": description_object(unknown),
             "next_orientation": None if going is None else {"gimbal_deg": list(going[0].gimbal_deg), "why": going[1]},
             "held_out_rms_mps2": found.before.held_out_rms_mps2,
             "held_out_floor_mps2": found.before.held_out_floor_mps2,
             "warnings": list(found.before.warnings),
         }
     )
+
+
+def description_object(unknown: Description | None) -> dict[str, Any] | None:
+    return None if unknown is None else {**vars(unknown), "formula": unknown.formula}
 
 
 def _suspect_object(suspect: Suspect) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from kf_calib.diagnosis import Diagnosis, next_orientation
 from kf_calib.errors import InputError
 from kf_calib.improvement import Honest, Improvement, Removal, Spread, Step, extended, stepped, undone
 from kf_calib.views.console import effect_table, parameter_table, rounded, symbol
-from kf_calib.views.diagnosis import description
+from kf_calib.views.diagnosis import description, description_object
 from kf_calib.views.json import clean
 
 _WIDTH = 30  # characters of the longest bar
@@ -26,7 +26,7 @@ _EIGHTHS = " ▏▎▍▌▋▊▉"
 def improvement_object(
     state: Improvement, honest: Honest | None, replay_difference: float | None, files: Mapping[str, Path | None]
 ) -> dict[str, Any]:
-    """What ``improve --json`` prints. A step's figures are those after it; p-values are those of the run.
+    """What ``improve --json`` prints. A step's errors are those after it; p-values are those of the run.
 
     replay_difference: largest relative difference from the figures of the journal that was replayed.
     """
@@ -34,7 +34,10 @@ def improvement_object(
     return clean(
         {
             "start": _figures(state.start),
-            "steps": [_step_object(step) for step in state.steps],
+            "steps": [
+                _step_object(step, before)
+                for step, before in zip(state.steps, [state.start, *(step.found for step in state.steps)], strict=False)
+            ],
             "model": [str(effect) for effect in state.result.model.effects],
             "stopped_because": state.because,
             "reason": state.reason,
@@ -64,7 +67,7 @@ def improvement_object(
                 }
                 for each in state.spreads
             ],
-            "unknown": None if unknown is None else vars(unknown),
+            "unknown": description_object(unknown),
             "next_orientation": None if going is None else {"gimbal_deg": list(going[0].gimbal_deg), "why": going[1]},
             "honest": None if honest is None else vars(honest),
             "replay_difference": replay_difference,
@@ -85,11 +88,14 @@ def _figures(found: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _step_object(step: Step) -> dict[str, Any]:
+def _step_object(step: Step, before: Diagnosis) -> dict[str, Any]:
+    """p_value: of what was added, by the diagnosis before it; p_value_after: of the model then."""
     return {
         "added": step.added,
         "by": step.by,
         **_figures(step.found),
+        "p_value": None if step.name is None else before.test.p_values.get(step.name),
+        "p_value_after": step.found.test.p_value,
         "dropped": [_removal_object(each) for each in step.dropped],
         "model": [str(effect) for effect in step.result.model.effects],
         "coefficients": _parameters(step.result)[12:],
