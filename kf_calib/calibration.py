@@ -32,6 +32,8 @@ SAME_POSE_DEG = 1.0
 
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # a larger sigma means: not seen by this run
 _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
+_CARRIERS = 3  # passes at most in search of one
+_NEAR = 0.06  # cycles between oscillation and carrier in a piece: a parabola then leaves 1e-3 of its amplitude
 Engine = Literal["block", "filterpy"]
 
 
@@ -278,12 +280,41 @@ def calibrate(
     with threadpool_limits(1, user_api="blas"):  # small decompositions: with threads they take three times as long
         dwells = passed.fold(on_progress)
         refuse_unusable(dwells, passed.tally, source.bench)
+        if Model.of(source.bench, settings.effects).oscillates:
+            passed, dwells = _on_carrier(passed, dwells, on_progress)
         result = evaluate(dwells, source.bench, settings)
     refuse_unseen(result)
     if settings.engine == "filterpy":
         result = replace(result, estimate=filterpy_estimate(source, result))
     said = [*source.warnings, *passed.tally.sentences(), *result.warnings]
     return replace(result, tally=passed.tally, warnings=tuple(said))
+
+
+def _on_carrier(
+    passed: Pass, dwells: list[DwellFactor], on_progress: Callable[[float], None] | None
+) -> tuple[Pass, list[DwellFactor]]:
+    """The source folded again on a carrier at the frequency of the model's oscillation, until it is near enough.
+
+    The first carrier is the line in the spectrum; without one, the oscillation is slow, and found on the plain dwells.
+    """
+    source, settings = passed.source, passed.settings
+    line = passed.folder.spectrum.line()
+    carrier_hz = line.frequency_hz if line is not None and line.p_value < 0.01 else _oscillation_hz(dwells, passed)
+    for _ in range(_CARRIERS):
+        passed = Pass(source, settings, folder=Folder(carrier_hz))
+        dwells = passed.fold(on_progress)
+        found_hz = _oscillation_hz(dwells, passed)
+        longest_s = max(float(np.ptp(piece.nodes.elapsed_s)) for dwell in dwells for piece in dwell.pieces)
+        if abs(found_hz - carrier_hz) * longest_s < _NEAR:
+            break
+        carrier_hz = found_hz
+    return passed, dwells
+
+
+def _oscillation_hz(dwells: list[DwellFactor], passed: Pass) -> float:
+    model = Model.of(passed.source.bench, passed.settings.effects)
+    found = fit(dwells, model, passed.settings.walk_mps2_per_sqrt_s).carried.model
+    return next(effect.value for effect in found.effects if effect.oscillates)
 
 
 def evaluate(dwells: list[DwellFactor], bench: Bench, settings: Settings) -> Calibration:
@@ -312,10 +343,7 @@ def filterpy_estimate(
 ) -> Estimate:
     """The same posterior by filterpy's filter, sample by sample: a second pass over the source."""
     prior, q, model = result.settings.prior, result.fit.walk.intensity, result.model
-    largest = np.abs(result.carried.means.design).max(axis=(0, 1))
-    scale = np.concatenate(
-        [np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), np.where(largest > 0, largest, 1.0)[STATE_COUNT:]]
-    )
+    scale = np.concatenate([np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), result.carried.sizes[STATE_COUNT:]])
     posterior = kalman.estimate(
         samples_of(Pass(source, result.settings).rows(), result.carried),
         result.noise.weights,

@@ -15,7 +15,7 @@ import numpy as np
 
 from kf_calib import information
 from kf_calib.effects import Coefficient, Effect
-from kf_calib.folding import Carried, DwellFactor
+from kf_calib.folding import Carried, DwellFactor, stimulus_of
 from kf_calib.model import Model
 from kf_calib.noise import Noise, with_dwell_parts, within_dwells
 from kf_calib.samples import Floats
@@ -26,7 +26,8 @@ WALK = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5, "µg/√s", 1e6 / 9.80665)
 
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
-_STEP_LIMIT = 0.4  # of ln(value) in one step: the width of the grid
+_STILL = 2.5e-4  # a step of ln(value), in reaches, that ends the search
+_TOGETHER = 40  # values of a grid in one scan
 
 
 @dataclass(frozen=True)
@@ -72,13 +73,14 @@ def fit(dwells: list[DwellFactor], model: Model, walk_mps2_per_sqrt_s: float = 0
             model, searching = _placed(fitted), True
             fitted = replace(fitted, carried=Carried(dwells, model, fitted.carried.state))
         state, moved = _solved(fitted)
+        reach = _reach(fitted)
         if searching:
-            model = model.moved(np.clip(moved, -_STEP_LIMIT, _STEP_LIMIT))
+            model = model.moved(np.clip(moved, -reach, reach))
         carried = Carried(dwells, model, state)
         noise = with_dwell_parts(within, carried.means, state, bench.angle_sigma_deg, bench.scatter_sigma_mps2)
         walk = _likely_walk(replace(fitted, carried=carried, noise=noise)) if model.walks else fitted.walk
         fitted = Fit(carried, noise, walk)
-        if number >= _PASSES - 1 and np.abs(moved).max(initial=0.0) < 1e-4:
+        if number >= _PASSES - 1 and (np.abs(moved) <= _STILL * reach).all():
             break
     return fitted
 
@@ -93,12 +95,22 @@ def _solved(fitted: Fit) -> tuple[Floats, Floats]:
     return state, moved
 
 
+def _reach(fitted: Fit) -> Floats:
+    """How far each state may move in one step (p,): unknowns by their kind, the others are not moved."""
+    model, reach = fitted.carried.model, np.ones(fitted.carried.model.count)
+    if model.unknowns:
+        stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
+        for k, effect in model.unknowns.items():
+            reach[k] = effect.reach(stimulus)
+    return reach
+
+
 def _placed(fitted: Fit) -> Model:
     """The model with each unknown at that value of its grid at which its effect explains most."""
     model = fitted.carried.model
+    stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
     for effect in model.unknowns.values():
-        assert effect.unknown is not None
-        grid = [effect.at(value) for value in effect.unknown.grid()]
+        grid = [effect.at(value) for value in effect.grid(stimulus)]
         model = model.with_effect(grid[_best(fitted, model - effect, grid)])
     return model
 
@@ -106,8 +118,11 @@ def _placed(fitted: Fit) -> Model:
 def _best(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> int:
     """Which of the same effect at several values explains most beside the ``rest`` of the model."""
     state = np.concatenate([fitted.carried.state[:12], np.zeros(rest.count - 12)])
-    found = scan(Carried(fitted.dwells, rest, state), fitted.noise.weights, grid, fitted.walk_variances)
-    return int(np.argmax(found.statistics))
+    carried, statistics = Carried(fitted.dwells, rest, state), list[Floats]()
+    for first in range(0, len(grid), _TOGETHER):
+        part = grid[first : first + _TOGETHER]
+        statistics.append(scan(carried, fitted.noise.weights, part, fitted.walk_variances).statistics)
+    return int(np.argmax(np.concatenate(statistics)))
 
 
 def _gaps_s(dwells: Sequence[DwellFactor]) -> Floats:

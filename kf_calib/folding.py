@@ -5,11 +5,15 @@ column is smooth: it is taken as a parabola through its values at the piece's be
 The readings are folded by QR against the parabola's basis, [1 u u^2 | z1 z2 z3] -> 6 x 6, unwhitened. Any column known
 at the nodes, of any model, then has its exact rows from the triangles: noise model, filter and diagnosis need no second
 pass over the data, and a column that changes (another tau, another E) is evaluated anew at a few hundred nodes.
+
+A column that oscillates within a piece is no parabola. For it the dwells are folded on a *carrier* f0 near its
+frequency: the basis is 1, u, u^2 and these times cos 2 pi f0 t and sin 2 pi f0 t, the triangle 12 x 12, and a column is known by
+nine nodes, three of its plain part and three of each envelope. K is 3 below, or 9 on a carrier.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -17,8 +21,9 @@ import numpy as np
 
 from kf_calib.bench import Bench
 from kf_calib.effects import Effect, Stimulus
-from kf_calib.model import Model, Nodes, Rows, basis, effect_columns, parabola
+from kf_calib.model import Model, Nodes, Rows, basis, effect_columns, on_basis, parabola
 from kf_calib.samples import Floats, Mask
+from kf_calib.spectrum import Spectrum
 from kf_calib.triangle import triangle
 
 WIDTH = 4
@@ -49,10 +54,10 @@ class Autocovariance:
         )
 
     @classmethod
-    def of(cls, innovation: Floats) -> Autocovariance:
-        """Of innovations (3, n)."""
+    def of(cls, innovation: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -> Autocovariance:
+        """Of innovations (3, n); what goes with a carrier is no noise either."""
         count = innovation.shape[1]
-        curve = np.linalg.qr(basis(np.linspace(-1.0, 1.0, count)).T)[0]
+        curve = np.linalg.qr(basis(np.linspace(-1.0, 1.0, count), elapsed_s, carrier_hz).T)[0]
         innovation = innovation - (innovation @ curve) @ curve.T
         padded = 1 << (count + _LAGS).bit_length()
         spectrum = np.fft.rfft(innovation, padded, axis=1)
@@ -64,11 +69,12 @@ class Autocovariance:
 
 @dataclass(frozen=True)
 class Piece:
-    """A stretch of a dwell, folded: triangle (6, 6) over [1 u u^2 | z1 z2 z3], and its nodes (3)."""
+    """A stretch of a dwell, folded: triangle (K + 3, K + 3) over [1 u u^2 ... | z1 z2 z3], and its nodes (3)."""
 
     triangle: Floats
     nodes: Nodes
     count: int
+    carrier_hz: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -79,10 +85,20 @@ class DwellFactor:
     pieces: tuple[Piece, ...]
     autocovariance: Autocovariance
 
+    @property
+    def carrier_hz(self) -> float:
+        """What it was folded on; 0: no carrier."""
+        return self.pieces[0].carrier_hz
+
+    @property
+    def width(self) -> int:
+        """K, functions in the basis of a piece."""
+        return self.pieces[0].triangle.shape[1] - 3
+
     @cached_property
     def squares(self) -> Floats:
-        """Sums of squares of the readings about a parabola, (pieces, 3)."""
-        return np.array([(piece.triangle[3:, 3:] ** 2).sum(axis=0) for piece in self.pieces])
+        """Sums of squares of the readings about the functions of the basis, (pieces, 3)."""
+        return np.array([(piece.triangle[self.width :, self.width :] ** 2).sum(axis=0) for piece in self.pieces])
 
     @cached_property
     def counts(self) -> Floats:
@@ -92,7 +108,7 @@ class DwellFactor:
     @cached_property
     def variances(self) -> Floats:
         """Variance of the readings within each piece (pieces, 3), about a parabola; short pieces have their dwell's."""
-        squares, spare = self.squares, np.maximum(self.counts - 3.0, 0.0)[:, None]
+        squares, spare = self.squares, np.maximum(self.counts - float(self.width), 0.0)[:, None]
         pooled = squares.sum(axis=0) / max(spare.sum(), 1)
         return np.where(spare >= 8, squares / np.maximum(spare, 1), pooled)
 
@@ -125,12 +141,12 @@ class DwellFactor:
         return self.factor[0] / self.factor[0, 0]
 
     def rows(self, columns: Sequence[Floats]) -> Floats:
-        """Rows [X | z1 z2 z3] of columns known at the nodes of each piece, (3, c): (6 pieces, c + 3)."""
+        """Rows [X | z1 z2 z3] of plain columns known at the nodes of each piece, (3, c): ((K + 3) pieces, c + 3)."""
         width = columns[0].shape[1]
-        out = np.zeros((len(self.pieces), 6, width + 3))
+        out = np.zeros((len(self.pieces), self.width + 3, width + 3))
         triangles = np.array([piece.triangle for piece in self.pieces])
         out[:, :3, :width] = triangles[:, :3, :3] @ parabola(np.array(columns))
-        out[:, :, width:] = triangles[:, :, 3:]
+        out[:, :, width:] = triangles[:, :, self.width :]
         return out.reshape(-1, width + 3)
 
     def merged(self, other: DwellFactor) -> DwellFactor:
@@ -147,17 +163,18 @@ class DwellFactor:
         yield self
 
 
-def fold(rows: Rows) -> tuple[Piece, ...]:
+def fold(rows: Rows, carrier_hz: float = 0.0) -> tuple[Piece, ...]:
     """The pieces of one block of rows."""
+    width = 9 if carrier_hz else 3
     channels = rows.innovation if rows.static else rows.readings.T
     level = rows.readings[0] - channels[:, 0]  # what the innovation of a standing platform lacks of the readings
     pieces = list[Piece]()
     for part, u, nodes in rows.pieces:
-        stacked = np.empty((6, len(u)))  # rows along memory: what LAPACK wants, and faster to fill
-        stacked[:3], stacked[3:] = basis(u), channels[:, part]
+        stacked = np.empty((width + 3, len(u)))  # rows along memory: what LAPACK wants, and faster to fill
+        stacked[:width], stacked[width:] = basis(u, rows.elapsed_s[part], carrier_hz), channels[:, part]
         folded = _folded(stacked.T)
-        folded[0, 3:] += folded[0, 0] * level
-        pieces.append(Piece(folded, nodes, len(u)))
+        folded[0, width:] += folded[0, 0] * level
+        pieces.append(Piece(folded, nodes, len(u), carrier_hz))
     return tuple(pieces)
 
 
@@ -184,24 +201,29 @@ def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> S
         temperature_c=np.concatenate([each.temperature_c for each in nodes]),
         sensitivity=state[:12].reshape(3, 4)[:, :3],
         variance_mps2_2=np.repeat(np.concatenate([dwell.variances for dwell in dwells]), 3, axis=0),
+        carrier_hz=dwells[0].carrier_hz,
     )
 
 
 def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[Floats]:
-    """The model's columns at the nodes of each dwell, (pieces, 3 nodes, 3 channels, p)."""
-    return _by_dwell(dwells, model.columns(stimulus_of(dwells, model.bench, state), state))
+    """The model's columns at the nodes of each dwell, (pieces, K nodes, 3 channels, p)."""
+    return _by_dwell(dwells, lambda s: model.columns(s, state), stimulus_of(dwells, model.bench, state))
 
 
 def candidate_columns(
     dwells: Sequence[DwellFactor], effects: Sequence[Effect], bench: Bench, state: Floats
 ) -> list[Floats]:
     """Columns of effects that are in no model yet, like ``columns_of``."""
-    return _by_dwell(dwells, effect_columns(effects, stimulus_of(dwells, bench, state)))
+    return _by_dwell(dwells, lambda s: effect_columns(effects, s), stimulus_of(dwells, bench, state))
 
 
-def _by_dwell(dwells: Sequence[DwellFactor], columns: Floats) -> list[Floats]:
-    ends = np.cumsum([3 * len(dwell.pieces) for dwell in dwells])
-    return [part.reshape(-1, 3, *part.shape[1:]) for part in np.split(columns, ends[:-1])]
+def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> list[Floats]:
+    """Columns of a stimulus (m, 3, p) by dwell; on a carrier the plain part's nodes, then those of the envelopes."""
+    parts = [columns(stimulus)]
+    if stimulus.carrier_hz:
+        parts += [columns(replace(stimulus, part=part)) for part in (1, 2)]
+    shaped = np.concatenate([part.reshape(-1, 3, *part.shape[1:]) for part in parts], axis=1)
+    return np.split(shaped, np.cumsum([len(dwell.pieces) for dwell in dwells])[:-1])
 
 
 @dataclass(frozen=True)
@@ -220,9 +242,10 @@ class Means:
 def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
     design = []
     for dwell, own in zip(dwells, columns, strict=True):
-        first = np.array([piece.triangle[0, :3] / piece.triangle[0, 0] for piece in dwell.pieces])  # means of 1, u, u^2
+        width = dwell.width
+        first = np.array([piece.triangle[0, :width] / piece.triangle[0, 0] for piece in dwell.pieces])  # means of basis
         weights = np.array([piece.count for piece in dwell.pieces]) / dwell.count
-        coefficients = parabola(own.reshape(*own.shape[:2], -1))
+        coefficients = on_basis(own.reshape(*own.shape[:2], -1))
         design.append(np.einsum("b,bk,bkc->c", weights, first, coefficients).reshape(own.shape[2:]))
     means = np.array([dwell.means for dwell in dwells])
     counts = np.array([dwell.count for dwell in dwells], float)
@@ -239,6 +262,19 @@ class Carried:
         self.dwells, self.model, self.state = list(dwells), model, state
         self.columns = columns_of(self.dwells, model, state)
         self.means = means_of(self.dwells, self.columns)
+
+    @property
+    def carrier_hz(self) -> float:
+        """What the dwells were folded on; 0: no carrier."""
+        return self.dwells[0].carrier_hz
+
+    @property
+    def sizes(self) -> Floats:
+        """What a unit of each state makes in a reading, about, (p,); 1 where nothing."""
+        largest = np.abs(self.means.design).max(axis=(0, 1))
+        for own in self.columns if self.carrier_hz else ():
+            largest = np.maximum(largest, np.abs(own[:, 3:]).max(axis=(0, 1, 2)))
+        return np.where(largest > 0, largest, 1.0)
 
 
 @dataclass(frozen=True)
@@ -261,21 +297,26 @@ def samples_of(rows: Iterable[Rows], carried: Carried) -> Iterator[Samples]:
             continue
         for part, u, _ in block.pieces:
             own = next(known[block.dwell])
-            observation = (basis(u).T @ parabola(own.reshape(3, -1))).reshape(len(u), *own.shape[1:])
+            functions = basis(u, block.elapsed_s[part], carried.carrier_hz)
+            observation = (functions.T @ on_basis(own.reshape(len(own), -1))).reshape(len(u), *own.shape[1:])
             yield Samples(block.dwell, starts[block.dwell], observation, block.columns[part], block.readings[part])
 
 
 class Folder:
-    """Folds rows into the list of dwell factors, dwell after dwell."""
+    """Folds rows into the list of dwell factors, dwell after dwell, on a carrier where one is given."""
 
-    def __init__(self) -> None:
+    def __init__(self, carrier_hz: float = 0.0) -> None:
         self.dwells: list[DwellFactor] = []
+        self.carrier_hz = carrier_hz
+        self.spectrum = Spectrum()
 
     def add(self, rows: Rows) -> None:
         current = self.dwells[-1] if self.dwells and self.dwells[-1].number == rows.dwell else None
         fresh = current is None or current.autocovariance.count < _CORRELATED_SAMPLES
-        own = Autocovariance.of(rows.innovation) if fresh else Autocovariance()
-        block = DwellFactor(rows.dwell, fold(rows), own)
+        own = Autocovariance.of(rows.innovation, rows.elapsed_s, self.carrier_hz) if fresh else Autocovariance()
+        block = DwellFactor(rows.dwell, fold(rows, self.carrier_hz), own)
+        if fresh:
+            self.spectrum.add(rows.innovation, rows.elapsed_s)
         if current is None:
             self.dwells.append(block)
         else:
