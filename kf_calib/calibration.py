@@ -33,6 +33,7 @@ SAME_POSE_DEG = 1.0
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # a larger sigma means: not seen by this run
 _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
 _CARRIERS = 3  # passes at most in search of one
+_CYCLES = 10.0  # a dwell, of a line that may be what is left of a slow oscillation
 _NEAR = 0.06  # cycles between oscillation and carrier in a piece: a parabola then leaves 1e-3 of its amplitude
 Engine = Literal["block", "filterpy"]
 
@@ -296,25 +297,41 @@ def _on_carrier(
     """The source folded again on a carrier at the frequency of the model's oscillation, until it is near enough.
 
     The first carrier is the line in the spectrum; without one, the oscillation is slow, and found on the plain dwells.
+    What a parabola leaves of a slow one makes a line of a few cycles a dwell: there the less noise decides.
     """
-    source, settings = passed.source, passed.settings
     line = passed.folder.spectrum.line()
-    carrier_hz = line.frequency_hz if line is not None and line.p_value < 0.01 else _oscillation_hz(dwells, passed)
-    for _ in range(_CARRIERS):
-        passed = Pass(source, settings, folder=Folder(carrier_hz))
+    if line is None or line.p_value >= 0.01:
+        return _nearer(passed, _fitted(passed, dwells), on_progress)[:2]
+    shortest_s = min(dwell.end_s - dwell.start_s for dwell in dwells if dwell.count > dwells[0].count // 2)
+    found = [_nearer(passed, line.frequency_hz, on_progress)]
+    if line.frequency_hz * shortest_s < _CYCLES:
+        found.append(_nearer(passed, _fitted(passed, dwells), on_progress))
+    return min(found, key=lambda each: float(np.log(each[2].noise.effective_sigma_mps2).sum()))[:2]
+
+
+def _nearer(
+    passed: Pass, carrier: float | Fit, on_progress: Callable[[float], None] | None
+) -> tuple[Pass, list[DwellFactor], Fit]:
+    """The source folded on a carrier, in Hz or where a fit has the oscillation, and the fit there."""
+    carrier_hz = _oscillation_hz(carrier) if isinstance(carrier, Fit) else carrier
+    for left in reversed(range(_CARRIERS)):
+        passed = Pass(passed.source, passed.settings, folder=Folder(carrier_hz))
         dwells = passed.fold(on_progress)
-        found_hz = _oscillation_hz(dwells, passed)
+        fitted = _fitted(passed, dwells)
         longest_s = max(float(np.ptp(piece.nodes.elapsed_s)) for dwell in dwells for piece in dwell.pieces)
-        if abs(found_hz - carrier_hz) * longest_s < _NEAR:
-            break
-        carrier_hz = found_hz
-    return passed, dwells
+        if not left or abs(_oscillation_hz(fitted) - carrier_hz) * longest_s < _NEAR:
+            return passed, dwells, fitted
+        carrier_hz = _oscillation_hz(fitted)
+    raise AssertionError("unreachable: the last of the carriers is taken as it is")
 
 
-def _oscillation_hz(dwells: list[DwellFactor], passed: Pass) -> float:
-    model = Model.of(passed.source.bench, passed.settings.effects)
-    found = fit(dwells, model, passed.settings.walk_mps2_per_sqrt_s).carried.model
-    return next(effect.value for effect in found.effects if effect.oscillates)
+def _fitted(passed: Pass, dwells: list[DwellFactor]) -> Fit:
+    settings = passed.settings
+    return fit(dwells, Model.of(passed.source.bench, settings.effects), settings.walk_mps2_per_sqrt_s)
+
+
+def _oscillation_hz(fitted: Fit) -> float:
+    return next(effect.value for effect in fitted.carried.model.effects if effect.oscillates)
 
 
 def evaluate(dwells: list[DwellFactor], bench: Bench, settings: Settings) -> Calibration:

@@ -7,8 +7,8 @@ at the nodes, of any model, then has its exact rows from the triangles: noise mo
 pass over the data, and a column that changes (another tau, another E) is evaluated anew at a few hundred nodes.
 
 A column that oscillates within a piece is no parabola. For it the dwells are folded on a *carrier* f0 near its
-frequency: the basis is 1, u, u^2 and these times cos 2 pi f0 t and sin 2 pi f0 t, the triangle 12 x 12, and a column is known by
-nine nodes, three of its plain part and three of each envelope. K is 3 below, or 9 on a carrier.
+frequency: the basis is 1, u, u^2 and these times cos 2 pi f0 t and sin 2 pi f0 t, the triangle 12 x 12, and a column is
+known by nine nodes, three of its plain part and three of each envelope. K is 3 below, or 9 on a carrier.
 """
 
 from __future__ import annotations

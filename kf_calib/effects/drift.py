@@ -114,9 +114,9 @@ class Sinusoid(Effect):
         step, longest = 0.25 / s.span_s, s.longest_piece_s
         if s.carrier_hz:
             count = int(np.ceil(max(0.15 / longest, 2.0 / s.span_s) / step))
-            found = s.carrier_hz + step * np.arange(-count, count + 1)
+            found = s.carrier_hz + step * np.arange(-count, count + 1, dtype=float)
             return found[found > 0]
-        return step * np.arange(2, int(np.clip(0.8 / longest / step, 8, 4000)))
+        return step * np.arange(2, int(np.clip(0.8 / longest / step, 8, 4000)), dtype=float)
 
     def reach(self, s: Stimulus) -> float:
         return 0.25 / s.span_s / self.value
