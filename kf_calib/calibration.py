@@ -33,7 +33,7 @@ SAME_POSE_DEG = 1.0
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # a larger sigma means: not seen by this run
 _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
 _CARRIERS = 3  # passes at most in search of one
-_CYCLES = 10.0  # a dwell, of a line that may be what is left of a slow oscillation
+_CYCLES = 50.0  # a dwell, of a line that may be what is left of a slow oscillation
 _NEAR = 0.06  # cycles between oscillation and carrier in a piece: a parabola then leaves 1e-3 of its amplitude
 Engine = Literal["block", "filterpy"]
 
