@@ -32,7 +32,9 @@ from kf_calib.sources.simulator import Simulation
 BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
 PLAN = spread_plan(30, dwell_s=6.0, seed=4)
 NAMES = [name for name in names(BENCH) if not effect_named(name, BENCH).dynamic]  # tests/test_slews.py has these
-OWN_TEST = {"vibration-rectification", "dead-zone", "bias-walk", "magnetic", "warm-up", "settling", "thermal-lag"}
+OWN_TEST = {
+    "vibration-rectification", "dead-zone", "bias-walk", "magnetic", "warm-up", "settling", "thermal-lag", "sinusoid",
+}  # fmt: skip
 INVISIBLE = {  # exactly: wrong g is a common scale, the innermost zero a misalignment; a vertical axis turns nothing
     "cross-talk": {"theta1", "phi1", "nu1", "nu2", "theta3", "phi3", "X12", "X13", "X21", "X23", "X31", "X32"},
     "gravity-error": {"K1", "K2", "K3", "epsG"},
