@@ -120,7 +120,7 @@ class _Search:
                 break
             line, place = self._line(k, p_value)
             found.append(line)
-            open_ &= self.height[k] * _leakage(np.arange(len(open_)) - place) < _LEAK
+            open_ &= self.height[k] * _leakage(np.arange(len(open_), dtype=float) - place) < _LEAK
         return tuple(found)
 
     def _peaks(self) -> Mask:
