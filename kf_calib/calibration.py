@@ -26,12 +26,16 @@ from kf_calib.information import Step
 from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
 from kf_calib.noise import Noise, considered, mean_covariances
 from kf_calib.samples import Floats, Mask, Source
+from kf_calib.spectrum import lines
 
 SAME_POSE_DEG = 1.0
 """Dwells whose gravity directions are closer than this are visits of one orientation."""
 
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # a larger sigma means: not seen by this run
 _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
+_CARRIERS = 3  # passes at most in search of one
+_CYCLES = 50.0  # a dwell, of a line that may be what is left of a slow oscillation
+_NEAR = 0.06  # cycles between oscillation and carrier in a piece: a parabola then leaves 1e-3 of its amplitude
 Engine = Literal["block", "filterpy"]
 
 
@@ -281,12 +285,58 @@ def calibrate(
     with threadpool_limits(1, user_api="blas"):  # small decompositions: with threads they take three times as long
         dwells = passed.fold(on_progress)
         refuse_unusable(dwells, passed.tally, source.bench)
+        if Model.of(source.bench, settings.effects).oscillates:
+            passed, dwells = _on_carrier(passed, dwells, on_progress)
         result = evaluate(dwells, source.bench, settings, passed.folder.slews)
     refuse_unseen(result)
     if settings.engine == "filterpy":
         result = replace(result, estimate=filterpy_estimate(source, result))
     said = [*source.warnings, *passed.tally.sentences(), *result.warnings]
     return replace(result, tally=passed.tally, warnings=tuple(said))
+
+
+def _on_carrier(
+    passed: Pass, dwells: list[DwellFactor], on_progress: Callable[[float], None] | None
+) -> tuple[Pass, list[DwellFactor]]:
+    """The source folded again on a carrier at the frequency of the model's oscillation, until it is near enough.
+
+    The first carrier is the line in the spectrum; without one, the oscillation is slow, and found on the plain dwells.
+    What a parabola leaves of a slow one makes a line of a few cycles a dwell: there the less noise decides.
+    """
+    seen = lines(dwell.spectrum for dwell in dwells)
+    if not seen:
+        return _nearer(passed, _fitted(passed, dwells), on_progress)[:2]
+    shortest_s = min(dwell.end_s - dwell.start_s for dwell in dwells if dwell.count > dwells[0].count // 2)
+    found = [_nearer(passed, seen[0].frequency_hz, on_progress)]
+    if seen[0].frequency_hz * shortest_s < _CYCLES:
+        found.append(_nearer(passed, _fitted(passed, dwells), on_progress))
+    return min(found, key=lambda each: float(np.log(each[2].noise.effective_sigma_mps2).sum()))[:2]
+
+
+def _nearer(
+    passed: Pass, carrier: float | Fit, on_progress: Callable[[float], None] | None
+) -> tuple[Pass, list[DwellFactor], Fit]:
+    """The source folded on a carrier, in Hz or where a fit has the oscillation, and the fit there."""
+    carrier_hz = _oscillation_hz(carrier) if isinstance(carrier, Fit) else carrier
+    for left in reversed(range(_CARRIERS)):
+        passed = Pass(passed.source, passed.settings, folder=Folder(carrier_hz))
+        dwells = passed.fold(on_progress)
+        fitted = _fitted(passed, dwells)
+        longest_s = max(float(np.ptp(piece.nodes.elapsed_s)) for dwell in dwells for piece in dwell.pieces)
+        if not left or abs(_oscillation_hz(fitted) - carrier_hz) * longest_s < _NEAR:
+            return passed, dwells, fitted
+        carrier_hz = _oscillation_hz(fitted)
+    raise AssertionError("unreachable: the last of the carriers is taken as it is")
+
+
+def _fitted(passed: Pass, dwells: list[DwellFactor]) -> Fit:
+    settings = passed.settings
+    model = Model.of(passed.source.bench, settings.effects)
+    return fit(dwells, model, settings.walk_mps2_per_sqrt_s, passed.folder.slews)
+
+
+def _oscillation_hz(fitted: Fit) -> float:
+    return next(effect.value for effect in fitted.carried.model.effects if effect.oscillates)
 
 
 def evaluate(
@@ -318,12 +368,7 @@ def filterpy_estimate(
 ) -> Estimate:
     """The same posterior by filterpy's filter, sample by sample: a second pass over the source."""
     prior, q, model = result.settings.prior, result.fit.walk.intensity, result.model
-    largest = np.abs(result.carried.means.design).max(axis=(0, 1))
-    for columns in result.carried.slew_columns:
-        largest = np.maximum(largest, np.abs(columns).max(axis=(0, 1, 2)))
-    scale = np.concatenate(
-        [np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), np.where(largest > 0, largest, 1.0)[STATE_COUNT:]]
-    )
+    scale = np.concatenate([np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), result.carried.sizes[STATE_COUNT:]])
     posterior = kalman.estimate(
         samples_of(Pass(source, result.settings).rows(), result.carried),
         result.noise.weights,

@@ -91,7 +91,7 @@ def candidates(model: Model) -> list[Effect]:
     inside, out = {str(effect) for effect in model.effects}, list[Effect]()
     for name in names(model.bench):
         effect = effect_named(name, model.bench)
-        if name in inside or effect.dynamic or effect.walks:
+        if name in inside or effect.dynamic or effect.walks or effect.oscillates:
             continue
         out += [effect] if effect.unknown is None else [effect.at(value) for value in effect.unknown.grid(2.0)]
     return out

@@ -17,8 +17,8 @@ import numpy as np
 
 from kf_calib import information
 from kf_calib.effects import Coefficient, Effect
-from kf_calib.folding import Carried, DwellFactor
-from kf_calib.model import Model, parabola
+from kf_calib.folding import Carried, DwellFactor, stimulus_of
+from kf_calib.model import Model, on_basis
 from kf_calib.noise import FLOOR_MPS2, Noise, with_dwell_parts, within_dwells
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
@@ -28,7 +28,8 @@ WALK = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5, "µg/√s", 1e6 / 9.80665)
 
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
-_STEP_LIMIT = 0.4  # of ln(value) in one step: the width of the grid
+_STILL = 2.5e-4  # a step of ln(value), in reaches, that ends the search
+_TOGETHER = 40  # values of a grid in one scan
 
 
 @dataclass(frozen=True)
@@ -94,14 +95,15 @@ def fit(
             model, searching = _placed(fitted), True
             fitted = replace(fitted, carried=Carried(dwells, model, fitted.carried.state, slews))
         state, moved = _solved(fitted)
+        reach = _reach(fitted)
         if searching:
-            model = model.moved(np.clip(moved, -_STEP_LIMIT, _STEP_LIMIT))
+            model = model.moved(np.clip(moved, -reach, reach))
         carried = Carried(dwells, model, state, slews)
         noise = with_dwell_parts(within, carried.means, state, bench.angle_sigma_deg, bench.scatter_sigma_mps2)
         noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
         walk = likely_walk(replace(fitted, carried=carried, noise=noise))[0] if model.walks else fitted.walk
         fitted = Fit(carried, noise, walk)
-        if number >= _PASSES - 1 and np.abs(moved).max(initial=0.0) < 1e-4:
+        if number >= _PASSES - 1 and (np.abs(moved) <= _STILL * reach).all():
             break
     return fitted
 
@@ -116,6 +118,16 @@ def _solved(fitted: Fit) -> tuple[Floats, Floats]:
     return state, moved
 
 
+def _reach(fitted: Fit) -> Floats:
+    """How far each state may move in one step (p,): unknowns by their kind, the others are not moved."""
+    model, reach = fitted.carried.model, np.ones(fitted.carried.model.count)
+    if model.unknowns:
+        stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
+        for k, effect in model.unknowns.items():
+            reach[k] = effect.reach(stimulus)
+    return reach
+
+
 def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
     """Sigma (3,) of white readings that would leave the slews' rows as far from ``state`` as they are.
 
@@ -127,8 +139,8 @@ def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
     for slew, columns in zip(carried.slews, carried.slew_columns, strict=True):
         model = np.moveaxis(columns @ state, 2, 1)  # (pieces, channels, nodes)
         triangles = np.array([piece.triangle for piece in slew.pieces])
-        own = triangles[:, :, 3:].copy()
-        own[:, :3] -= triangles[:, :3, :3] @ parabola(np.moveaxis(model, 1, 2))
+        own = triangles[:, :, slew.width :].copy()
+        own[:, : slew.width] -= triangles[:, : slew.width, : slew.width] @ on_basis(np.moveaxis(model, 1, 2))
         squares, counts = squares + (own**2).sum(axis=(0, 1)), counts + slew.count
     sizes = np.sqrt(squares / counts) + FLOOR_MPS2
     factor = information.accumulated(fitted.all_rows(), fitted.walk_variances)[:-1]
@@ -142,9 +154,9 @@ def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
 def _placed(fitted: Fit) -> Model:
     """The model with each unknown at that value of its grid at which its effect explains most."""
     model = fitted.carried.model
+    stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
     for effect in model.unknowns.values():
-        assert effect.unknown is not None
-        grid = [effect.at(value) for value in effect.unknown.grid()]
+        grid = [effect.at(value) for value in effect.grid(stimulus)]
         model = model.with_effect(grid[_best(fitted, model - effect, grid)])
     return model
 
@@ -152,8 +164,11 @@ def _placed(fitted: Fit) -> Model:
 def _best(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> int:
     """Which of the same effect at several values explains most beside the ``rest`` of the model."""
     state = np.concatenate([fitted.carried.state[:12], np.zeros(rest.count - 12)])
-    found = scan(Carried(fitted.dwells, rest, state), fitted.noise.weights, grid, fitted.walk_variances)
-    return int(np.argmax(found.statistics))
+    carried, statistics = Carried(fitted.dwells, rest, state), list[Floats]()
+    for first in range(0, len(grid), _TOGETHER):
+        part = grid[first : first + _TOGETHER]
+        statistics.append(scan(carried, fitted.noise.weights, part, fitted.walk_variances).statistics)
+    return int(np.argmax(np.concatenate(statistics)))
 
 
 def _gaps_s(dwells: Sequence[DwellFactor]) -> Floats:

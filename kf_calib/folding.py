@@ -5,20 +5,25 @@ column is smooth: it is taken as a parabola through its values at the piece's be
 The readings are folded by QR against the parabola's basis, [1 u u^2 | z1 z2 z3] -> 6 x 6, unwhitened. Any column known
 at the nodes, of any model, then has its exact rows from the triangles: noise model, filter and diagnosis need no second
 pass over the data, and a column that changes (another tau, another E) is evaluated anew at a few hundred nodes.
+
+A column that oscillates within a piece is no parabola. For it the dwells are folded on a *carrier* f0 near its
+frequency: the basis is 1, u, u^2 and these times cos 2 pi f0 t and sin 2 pi f0 t, the triangle 12 x 12, and a column is
+known by nine nodes, three of its plain part and three of each envelope. K is 3 below, or 9 on a carrier.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from kf_calib.bench import Bench
 from kf_calib.effects import Effect, Stimulus
-from kf_calib.model import Model, Nodes, Rows, basis, effect_columns, parabola
+from kf_calib.model import Model, Nodes, Rows, basis, effect_columns, on_basis, parabola
 from kf_calib.samples import Floats
+from kf_calib.spectrum import Spectrum
 from kf_calib.triangle import triangle
 
 _VIBRATING = 25.0  # mean squared deviation of the variances in their own sigma; autocorrelation alone makes up to 10
@@ -47,13 +52,11 @@ class Autocovariance:
         )
 
     @classmethod
-    def of(cls, innovation: Floats) -> Autocovariance:
-        """Of innovations (3, n)."""
-        count = innovation.shape[1]
-        curve = np.linalg.qr(basis(np.linspace(-1.0, 1.0, count)).T)[0]
-        innovation = innovation - (innovation @ curve) @ curve.T
+    def of(cls, left: Floats) -> Autocovariance:
+        """Of innovations (3, n) less their parabola."""
+        count = left.shape[1]
         padded = 1 << (count + _LAGS).bit_length()
-        spectrum = np.fft.rfft(innovation, padded, axis=1)
+        spectrum = np.fft.rfft(left, padded, axis=1)
         products = np.zeros((_LAGS + 1, 3))
         lags = min(_LAGS, count - 1) + 1
         products[:lags] = np.fft.irfft(np.abs(spectrum) ** 2, padded, axis=1)[:, :lags].T
@@ -62,16 +65,17 @@ class Autocovariance:
 
 @dataclass(frozen=True)
 class Piece:
-    """A stretch of a dwell, folded: triangle (6, 6) over [1 u u^2 | z1 z2 z3], and its nodes (3)."""
+    """A stretch of a dwell, folded: triangle (K + 3, K + 3) over [1 u u^2 ... | z1 z2 z3], and its nodes (3)."""
 
     triangle: Floats
     nodes: Nodes
     count: int
+    carrier_hz: float = 0.0
 
 
 @dataclass(frozen=True)
 class DwellFactor:
-    """One dwell: its pieces in order of time, and the autocovariance of its first readings.
+    """One dwell: its pieces in order of time, and the autocovariance and the spectrum of its first readings.
 
     moving: it is the slew after the dwell of that number, folded like a dwell. came_from: the dwell before it, where
     that one is left out (None: it is there, or there was none).
@@ -79,14 +83,25 @@ class DwellFactor:
 
     number: int
     pieces: tuple[Piece, ...]
-    autocovariance: Autocovariance
+    autocovariance: Autocovariance = field(default_factory=Autocovariance)
+    spectrum: Spectrum = field(default_factory=Spectrum)
     moving: bool = False
     came_from: DwellFactor | None = None
 
+    @property
+    def carrier_hz(self) -> float:
+        """What it was folded on; 0: no carrier."""
+        return self.pieces[0].carrier_hz
+
+    @property
+    def width(self) -> int:
+        """K, functions in the basis of a piece."""
+        return self.pieces[0].triangle.shape[1] - 3
+
     @cached_property
     def squares(self) -> Floats:
-        """Sums of squares of the readings about a parabola, (pieces, 3)."""
-        return np.array([(piece.triangle[3:, 3:] ** 2).sum(axis=0) for piece in self.pieces])
+        """Sums of squares of the readings about the functions of the basis, (pieces, 3)."""
+        return np.array([(piece.triangle[self.width :, self.width :] ** 2).sum(axis=0) for piece in self.pieces])
 
     @cached_property
     def counts(self) -> Floats:
@@ -96,7 +111,7 @@ class DwellFactor:
     @cached_property
     def variances(self) -> Floats:
         """Variance of the readings within each piece (pieces, 3), about a parabola; short pieces have their dwell's."""
-        squares, spare = self.squares, np.maximum(self.counts - 3.0, 0.0)[:, None]
+        squares, spare = self.squares, np.maximum(self.counts - float(self.width), 0.0)[:, None]
         pooled = squares.sum(axis=0) / max(spare.sum(), 1)
         return np.where(spare >= 8, squares / np.maximum(spare, 1), pooled)
 
@@ -129,18 +144,23 @@ class DwellFactor:
         return self.factor[0] / self.factor[0, 0]
 
     def rows(self, columns: Sequence[Floats]) -> Floats:
-        """Rows [X | z1 z2 z3] of columns known at the nodes of each piece, (3, c): (6 pieces, c + 3)."""
+        """Rows [X | z1 z2 z3] of plain columns known at the nodes of each piece, (3, c): ((K + 3) pieces, c + 3)."""
         width = columns[0].shape[1]
-        out = np.zeros((len(self.pieces), 6, width + 3))
+        out = np.zeros((len(self.pieces), self.width + 3, width + 3))
         triangles = np.array([piece.triangle for piece in self.pieces])
         out[:, :3, :width] = triangles[:, :3, :3] @ parabola(np.array(columns))
-        out[:, :, width:] = triangles[:, :, 3:]
+        out[:, :, width:] = triangles[:, :, self.width :]
         return out.reshape(-1, width + 3)
 
     def merged(self, other: DwellFactor) -> DwellFactor:
         """The same dwell from two stretches of samples."""
         pieces = sorted((*self.pieces, *other.pieces), key=lambda piece: piece.nodes.elapsed_s[0])
-        return replace(self, pieces=tuple(pieces), autocovariance=self.autocovariance + other.autocovariance)
+        return replace(
+            self,
+            pieces=tuple(pieces),
+            autocovariance=self.autocovariance + other.autocovariance,
+            spectrum=self.spectrum + other.spectrum,
+        )
 
     def prefixes(self) -> Iterator[DwellFactor]:
         """The dwell as it stood after 1, 2, 4 ... of its pieces, and in the end."""
@@ -151,18 +171,34 @@ class DwellFactor:
         yield self
 
 
-def fold(rows: Rows) -> tuple[Piece, ...]:
+def fold(rows: Rows, carrier_hz: float = 0.0) -> tuple[Piece, ...]:
     """The pieces of one block of rows."""
+    width = 9 if carrier_hz else 3
     channels = rows.innovation if rows.static else rows.readings.T
     level = rows.readings[0] - channels[:, 0]  # what the innovation of a standing platform lacks of the readings
     pieces = list[Piece]()
     for part, u, nodes in rows.pieces:
-        stacked = np.empty((6, len(u)))  # rows along memory: what LAPACK wants, and faster to fill
-        stacked[:3], stacked[3:] = basis(u), channels[:, part]
+        stacked = np.empty((width + 3, len(u)))  # rows along memory: what LAPACK wants, and faster to fill
+        stacked[:width], stacked[width:] = basis(u, rows.elapsed_s[part], carrier_hz), channels[:, part]
         folded = _folded(stacked.T)
-        folded[0, 3:] += folded[0, 0] * level
-        pieces.append(Piece(folded, nodes, len(u)))
+        folded[0, width:] += folded[0, 0] * level
+        pieces.append(Piece(folded, nodes, len(u), carrier_hz))
     return tuple(pieces)
+
+
+def less_curve(innovation: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -> Floats:
+    """Innovations (3, n) less their parabola; what goes with a carrier is no noise either."""
+    count = innovation.shape[1]
+    curve = _parabola(count)
+    if carrier_hz:
+        curve = np.linalg.qr(basis(np.linspace(-1.0, 1.0, count), elapsed_s, carrier_hz).T)[0]
+    return innovation - (innovation @ curve) @ curve.T
+
+
+@lru_cache(maxsize=4)
+def _parabola(count: int) -> Floats:
+    """1, u, u^2 made orthonormal, (n, 3)."""
+    return np.linalg.qr(basis(np.linspace(-1.0, 1.0, count)).T)[0]
 
 
 def _folded(stacked: Floats) -> Floats:
@@ -192,6 +228,7 @@ def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> S
         rate_change_radps2=np.concatenate(
             [_still if each.rate_change_radps2 is None else each.rate_change_radps2 for each in nodes]
         ),
+        carrier_hz=dwells[0].carrier_hz,
     )
 
 
@@ -239,20 +276,24 @@ def _varying(dwells: Sequence[DwellFactor]) -> Floats:
 
 
 def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[Floats]:
-    """The model's columns at the nodes of each dwell, (pieces, 3 nodes, 3 channels, p)."""
-    return _by_dwell(dwells, model.columns(stimulus_of(dwells, model.bench, state), state))
+    """The model's columns at the nodes of each dwell, (pieces, K nodes, 3 channels, p)."""
+    return _by_dwell(dwells, lambda s: model.columns(s, state), stimulus_of(dwells, model.bench, state))
 
 
 def candidate_columns(
     dwells: Sequence[DwellFactor], effects: Sequence[Effect], bench: Bench, state: Floats
 ) -> list[Floats]:
     """Columns of effects that are in no model yet, like ``columns_of``."""
-    return _by_dwell(dwells, effect_columns(effects, stimulus_of(dwells, bench, state)))
+    return _by_dwell(dwells, lambda s: effect_columns(effects, s), stimulus_of(dwells, bench, state))
 
 
-def _by_dwell(dwells: Sequence[DwellFactor], columns: Floats) -> list[Floats]:
-    ends = np.cumsum([3 * len(dwell.pieces) for dwell in dwells])
-    return [part.reshape(-1, 3, *part.shape[1:]) for part in np.split(columns, ends[:-1])]
+def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> list[Floats]:
+    """Columns of a stimulus (m, 3, p) by dwell; on a carrier the plain part's nodes, then those of the envelopes."""
+    parts = [columns(stimulus)]
+    if stimulus.carrier_hz:
+        parts += [columns(replace(stimulus, part=part)) for part in (1, 2)]
+    shaped = np.concatenate([part.reshape(-1, 3, *part.shape[1:]) for part in parts], axis=1)
+    return np.split(shaped, np.cumsum([len(dwell.pieces) for dwell in dwells])[:-1])
 
 
 @dataclass(frozen=True)
@@ -271,9 +312,10 @@ class Means:
 def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
     design = []
     for dwell, own in zip(dwells, columns, strict=True):
-        first = np.array([piece.triangle[0, :3] / piece.triangle[0, 0] for piece in dwell.pieces])  # means of 1, u, u^2
+        width = dwell.width
+        first = np.array([piece.triangle[0, :width] / piece.triangle[0, 0] for piece in dwell.pieces])  # means of basis
         weights = np.array([piece.count for piece in dwell.pieces]) / dwell.count
-        coefficients = parabola(own.reshape(*own.shape[:2], -1))
+        coefficients = on_basis(own.reshape(*own.shape[:2], -1))
         design.append(np.einsum("b,bk,bkc->c", weights, first, coefficients).reshape(own.shape[2:]))
     means = np.array([dwell.means for dwell in dwells])
     counts = np.array([dwell.count for dwell in dwells], float)
@@ -296,6 +338,20 @@ class Carried:
         self.columns = [own for each, own in zip(every, columns, strict=True) if not each.moving]
         self.slew_columns = [own for each, own in zip(every, columns, strict=True) if each.moving]
         self.means = means_of(self.dwells, self.columns)
+
+    @property
+    def carrier_hz(self) -> float:
+        """What the dwells were folded on; 0: no carrier."""
+        return self.dwells[0].carrier_hz
+
+    @property
+    def sizes(self) -> Floats:
+        """What a unit of each state makes in a reading, about, (p,); 1 where nothing."""
+        largest = np.abs(self.means.design).max(axis=(0, 1))
+        seen_within = [own[:, 3:] for own in self.columns if self.carrier_hz]  # envelopes leave little in a mean
+        for own in (*seen_within, *self.slew_columns):
+            largest = np.maximum(largest, np.abs(own).max(axis=(0, 1, 2)))
+        return np.where(largest > 0, largest, 1.0)
 
 
 @dataclass(frozen=True)
@@ -324,24 +380,29 @@ def samples_of(rows: Iterable[Rows], carried: Carried) -> Iterator[Samples]:
             continue
         for part, u, _ in block.pieces:
             own = next(known[key])
-            observation = (basis(u).T @ parabola(own.reshape(3, -1))).reshape(len(u), *own.shape[1:])
+            functions = basis(u, block.elapsed_s[part], carried.carrier_hz)
+            observation = (functions.T @ on_basis(own.reshape(len(own), -1))).reshape(len(u), *own.shape[1:])
             regressors, readings = block.columns[part], block.readings[part]
             yield Samples(block.dwell, starts[key], observation, regressors, readings, block.moving)
 
 
 class Folder:
-    """Folds rows into the lists of dwell factors and of slews, one after another."""
+    """Folds rows into the lists of dwell factors and of slews, one after another, on a carrier where one is given."""
 
-    def __init__(self) -> None:
+    def __init__(self, carrier_hz: float = 0.0) -> None:
         self.dwells: list[DwellFactor] = []
         self.slews: list[DwellFactor] = []
+        self.carrier_hz = carrier_hz
 
     def add(self, rows: Rows) -> None:
         folded = self.slews if rows.moving else self.dwells
         current = folded[-1] if folded and folded[-1].number == rows.dwell else None
         fresh = not rows.moving and (current is None or current.autocovariance.count < _CORRELATED_SAMPLES)
-        own = Autocovariance.of(rows.innovation) if fresh else Autocovariance()
-        block = DwellFactor(rows.dwell, fold(rows), own, rows.moving)
+        block = DwellFactor(rows.dwell, fold(rows, self.carrier_hz), moving=rows.moving)
+        if fresh:
+            left = less_curve(rows.innovation, rows.elapsed_s, self.carrier_hz)
+            own, spectrum = Autocovariance.of(left), Spectrum.of(left, rows.elapsed_s)
+            block = replace(block, autocovariance=own, spectrum=spectrum)
         if current is None:
             folded.append(block)
         else:

@@ -14,7 +14,7 @@ import numpy as np
 
 from kf_calib import paper
 from kf_calib.folding import DwellFactor
-from kf_calib.model import STATE_COUNT, Model, Prior, dwell_map, parabola
+from kf_calib.model import STATE_COUNT, Model, Prior, dwell_map, on_basis, parabola
 from kf_calib.noise import Noise
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
@@ -33,14 +33,16 @@ def whitened(dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: No
     out = list[Floats]()
     for dwell, own in zip(dwells, columns, strict=True):
         triangles = np.array([piece.triangle for piece in dwell.pieces])
-        regressors = triangles[:, :3, :3] @ parabola(np.array([piece.nodes.regressors for piece in dwell.pieces]))
-        size, width = 3 * len(triangles), own.shape[-1]
+        regressors = triangles[:, : dwell.width, :3] @ parabola(
+            np.array([piece.nodes.regressors for piece in dwell.pieces])
+        )
+        carried, size, width = triangles[:, : dwell.width, : dwell.width], dwell.width * len(triangles), own.shape[-1]
         rows = np.zeros((3 * size + count, count + width + 1))
         for i in range(3):
             part = rows[i * size : (i + 1) * size]
             part[:, :count] = (regressors @ nuisances[i]).reshape(size, count) / sigma[i]
-            part[:, count:-1] = (triangles[:, :3, :3] @ parabola(own[:, :, i])).reshape(size, width) / sigma[i]
-            part[:, -1] = triangles[:, :3, 3 + i].reshape(size) / sigma[i]
+            part[:, count:-1] = (carried @ on_basis(own[:, :, i])).reshape(size, width) / sigma[i]
+            part[:, -1] = triangles[:, : dwell.width, dwell.width + i].reshape(size) / sigma[i]
         rows[3 * size :, :count] = np.diag(1.0 / sigmas[used])
         folded = triangle(rows)
         out.append(_informative(folded[count:, count:], units))

@@ -63,6 +63,13 @@ def parabola(values: Floats) -> Floats:
     return np.stack([middle, 0.5 * (last - first), 0.5 * (first - middle) + 0.5 * (last - middle)], axis=-2)
 
 
+def on_basis(values: Floats) -> Floats:
+    """Coefficients (..., K, c) on ``basis`` of columns known at their nodes (..., K, c), K = 3, or 9 on a carrier."""
+    if values.shape[-2] == 3:
+        return parabola(values)
+    return np.concatenate([parabola(part) for part in np.split(values, values.shape[-2] // 3, axis=-2)], axis=-2)
+
+
 @dataclass(frozen=True, slots=True)
 class Rows:
     """Model columns and readings of one block: columns (n, 4), readings (n, 3), innovation within the block (3, n).
@@ -135,6 +142,11 @@ class Model:
         return tuple(effect for effect in self.effects if effect.dynamic)
 
     @property
+    def oscillates(self) -> bool:
+        """Whether an effect may be faster than a piece of a dwell, so that the dwells are folded on a carrier."""
+        return any(effect.oscillates for effect in self.effects)
+
+    @property
     def unknowns(self) -> dict[int, Effect]:
         """The effects with a constant to be found, by the place of its state."""
         return {self.parts[str(each)].stop - 1: each for each in self.effects if each.unknown is not None}
@@ -168,10 +180,12 @@ class Model:
     def columns(self, stimulus: Stimulus, state: Floats) -> Floats:
         """H (m, 3, p): what each accelerometer reads per unit of each state, linearised at ``state`` (p,)."""
         out = np.zeros((len(stimulus), 3, self.count))
-        for i in range(3):
+        for i in range(3) if not stimulus.part else ():
             out[:, i, 4 * i : 4 * i + 3] = stimulus.force_mps2
             out[:, i, 4 * i + 3] = 1.0
         for effect in self.effects:
+            if stimulus.part and not effect.oscillates:
+                continue
             part = self.parts[str(effect)]
             own = slice(part.start, part.start + len(effect.coefficients))
             out[:, :, own] = effect_columns([effect], stimulus)
@@ -182,7 +196,13 @@ class Model:
 
 def effect_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
     """What each accelerometer reads more per unit of each coefficient of the effects, (m, 3, q)."""
-    columns = np.concatenate([np.zeros((len(stimulus), 3, 0)), *(each.columns(stimulus) for each in effects)], axis=2)
+    own = [
+        np.zeros((len(stimulus), 3, len(each.coefficients)))
+        if stimulus.part and not each.oscillates
+        else each.columns(stimulus)
+        for each in effects
+    ]
+    columns = np.concatenate([np.zeros((len(stimulus), 3, 0)), *own], axis=2)
     scales = np.array([coefficient.scale for each in effects for coefficient in each.coefficients])
     # what a large coefficient would not lift above rounding is nothing: a vertical axis cannot tilt gravity
     columns[np.abs(columns) * scales < _ROUNDING_MPS2] = 0.0
@@ -304,8 +324,11 @@ def _temperatures(u: Floats, measured: Floats) -> Floats:
     return level + slope * (np.array([-1.0, 0.0, 1.0]) - u.mean())
 
 
-def basis(u: Floats) -> Floats:
-    """1, u, u^2 as rows (3, n)."""
+def basis(u: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -> Floats:
+    """1, u, u^2 as rows (3, n); on a carrier these, and these times its cosine and times its sine, (9, n)."""
+    if elapsed_s is not None and carrier_hz:
+        plain, phase = basis(u), 2.0 * np.pi * carrier_hz * elapsed_s
+        return np.concatenate([plain, plain * np.cos(phase), plain * np.sin(phase)])
     out = np.empty((3, len(u)))
     out[0], out[1] = 1.0, u
     np.multiply(u, u, out=out[2])

@@ -85,8 +85,9 @@ def within_dwells(dwells: Sequence[DwellFactor]) -> Noise:
         total += dwell.autocovariance
     inflation, variance = np.array([_inflation(total, i) for i in range(3)]).T
     squares, counts = (np.concatenate([getattr(each, key) for each in dwells]) for key in ("squares", "counts"))
+    on_carrier = dwells[0].width - 3
     long = counts[:, None] >= np.where(variance > 0, 40.0 * inflation, 0.0)
-    freedom = np.where(long, np.maximum(counts[:, None] - 3.0 * inflation, 0.0), 0.0).sum(axis=0)
+    freedom = np.where(long, np.maximum(counts[:, None] - 3.0 * inflation - on_carrier, 0.0), 0.0).sum(axis=0)
     pooled = np.where(long, squares, 0.0).sum(axis=0) / np.maximum(freedom, 1.0)
     return Noise(np.sqrt(np.where(long.any(axis=0), pooled, variance)), inflation)
 

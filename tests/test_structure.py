@@ -15,7 +15,7 @@ LEVELS = [
     ["samples"],
     ["bench"],
     ["effects", "slews"],
-    ["triangle", "dwells", "paper", "gate"],
+    ["triangle", "dwells", "paper", "gate", "spectrum"],
     ["model"],
     ["folding"],
     ["noise"],

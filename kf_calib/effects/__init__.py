@@ -31,6 +31,7 @@ _PLAIN: dict[str, type[Effect]] = {
         sensor.CrossCouplingIP, sensor.CrossCouplingIO, sensor.CrossCouplingPO, sensor.CrossAxisSquare,
         sensor.VibrationRectification, sensor.DeadZone,
         drift.BiasDrift, drift.BiasWalk, drift.ScaleDrift, drift.WarmUp, drift.Settling, drift.Hysteresis,
+        drift.Sinusoid,
         thermal.ThermalBias, thermal.ThermalBias2, thermal.ThermalScale, thermal.ThermalRate,
         thermal.ThermalMisalignment, thermal.ThermalLag, surroundings.Magnetic,
         frame.BaseTilt, frame.BaseTiltDrift, frame.PlatformDrift, frame.GravityError,

@@ -74,6 +74,54 @@ class Settling(_Decay):
         return s.step * np.exp(-s.since_arrival_s / self.value)[:, None]
 
 
+class Sinusoid(Effect):
+    """A_i sin 2 pi f t + B_i cos 2 pi f t, t since the first sample; f is common to the three accelerometers.
+
+    On a carrier f0, with d = 2 pi (f - f0) t: sin 2 pi f t = sin d cos 2 pi f0 t + cos d sin 2 pi f0 t, and the cosine
+    likewise: the envelopes are slow where f is near f0, however fast the carrier.
+    """
+
+    name, title, source = "sinusoid", "oscillation of one frequency", "Peterson, USGS OFR 93-322 (microseism); mains"
+    confused_with = "slower than a dwell: bias-drift, thermal effects"
+    unknown = Unknown("fSin", "Hz", 1e-6, 1e5, "Hz", 1.0)
+    oscillates = True
+    step = 1e-7  # the phase is thousands of rad
+    value = 0.15
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        kinds = [f"{kind}{i}" for i in (1, 2, 3) for kind in ("As", "Ac")]
+        return tuple(Coefficient(symbol, "m/s^2", 1e-3, "µg", 1e6 / G) for symbol in kinds)
+
+    def columns(self, s: Stimulus) -> Floats:
+        phase = 2.0 * np.pi * (self.value - s.carrier_hz) * s.elapsed_s
+        sin, cos = np.sin(phase), np.cos(phase)
+        if s.carrier_hz:
+            none = np.zeros_like(phase)
+            sin, cos = ((none, none), (sin, cos), (cos, -sin))[s.part]
+        out = np.zeros((len(s), 3, 6))
+        for i in range(3):
+            out[:, i, 2 * i], out[:, i, 2 * i + 1] = sin, cos
+        return out
+
+    def derivative(self, s: Stimulus, coefficients: Floats) -> Floats:
+        """2 pi f t (A_i cos 2 pi f t - B_i sin 2 pi f t)."""
+        turned = coefficients.reshape(3, 2)[:, ::-1] * [-1.0, 1.0]
+        return (2.0 * np.pi * self.value * s.elapsed_s)[:, None, None] * (self.columns(s) @ turned.ravel())[:, :, None]
+
+    def grid(self, s: Stimulus) -> Floats:
+        """In quarters of 1/run, about the carrier; without one, as far as parabolas over the pieces can follow."""
+        step, longest = 0.25 / s.span_s, s.longest_piece_s
+        if s.carrier_hz:
+            count = int(np.ceil(max(0.15 / longest, 2.0 / s.span_s) / step))
+            found = s.carrier_hz + step * np.arange(-count, count + 1, dtype=float)
+            return found[found > 0]
+        return step * np.arange(2, int(np.clip(0.8 / longest / step, 8, 4000)), dtype=float)
+
+    def reach(self, s: Stimulus) -> float:
+        return 0.25 / s.span_s / self.value
+
+
 class BiasWalk(Effect):
     """The integral of white noise in each bias: no column, but process noise of the filter."""
 

@@ -18,7 +18,6 @@ from kf_calib.effects.stimulus import Stimulus
 from kf_calib.samples import Floats
 
 G = 9.80665
-_STEP = 1e-4  # in ln(value)
 
 
 @dataclass(frozen=True)
@@ -58,6 +57,9 @@ class Effect(ABC):
     unknown: a constant inside the columns; ``value`` is where it stands, and ``at(value)`` the effect with another.
     walks: the biases take a random walk (process noise), its intensity is estimated by likelihood.
     dynamic: it shows in slews only, so these are evaluated too.
+    oscillates: its columns may be faster than a piece of a dwell, so the dwells are folded on a carrier, and
+    ``columns`` gives the part that the stimulus asks for (``Stimulus.part``).
+    step: of ln(value) in the differences of ``derivative``.
     """
 
     name: ClassVar[str]
@@ -67,6 +69,8 @@ class Effect(ABC):
     unknown: ClassVar[Unknown | None] = None
     walks: ClassVar[bool] = False
     dynamic: ClassVar[bool] = False
+    oscillates: ClassVar[bool] = False
+    step: ClassVar[float] = 1e-4
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""
     value: float = 0.0
@@ -89,13 +93,22 @@ class Effect(ABC):
     def columns(self, s: Stimulus) -> Floats:
         """What each accelerometer reads more per unit of each coefficient: (m, 3, q), m/s^2."""
 
+    def grid(self, s: Stimulus) -> Floats:
+        """Values of the unknown among which it is looked for first."""
+        assert self.unknown is not None
+        return self.unknown.grid()
+
+    def reach(self, s: Stimulus) -> float:
+        """How far from the truth ln(value) may be for its derivative to lead there: the width of the grid."""
+        return 0.4
+
     def derivative(self, s: Stimulus, coefficients: Floats) -> Floats:
         """What each accelerometer reads more per unit of ln(value) with these ``coefficients`` (q,): (m, 3, 1).
 
         Central differences: the step leaves 1e-8 of it, and the iteration it serves ends where it no longer matters.
         """
-        more, less = (self._free(self.value * factor).columns(s) for factor in (np.exp(_STEP), np.exp(-_STEP)))
-        return ((more - less) @ coefficients / (2.0 * _STEP))[:, :, None]
+        more, less = (self._free(self.value * factor).columns(s) for factor in (np.exp(self.step), np.exp(-self.step)))
+        return ((more - less) @ coefficients / (2.0 * self.step))[:, :, None]
 
     def _free(self, value: float) -> Self:
         other = copy.copy(self)

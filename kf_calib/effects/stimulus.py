@@ -23,7 +23,8 @@ class Stimulus:
     elapsed_s, since_arrival_s, temperature_c: (m,); force_mps2: specific force in the platform frame, (m, 3), and pose,
     (m, k), each of the dwell before, too; sensitivity (3, 3): rows K_i E_i at which small rotations are linearised;
     variance_mps2_2: variance of the readings about here, (m, 3). rate_radps, rate_change_radps2: omega of the platform
-    in its own frame and its derivative there, (m, 3), zero where it stands.
+    in its own frame and its derivative there, (m, 3), zero where it stands. carrier_hz: of dwells folded on a carrier,
+    0: none; part: of a column, that without the carrier (0) or the envelope of its cosine (1), sine (2).
     """
 
     bench: Bench
@@ -38,9 +39,21 @@ class Stimulus:
     variance_mps2_2: Floats = field(default_factory=lambda: np.zeros((1, 3)))
     rate_radps: Floats = field(default_factory=lambda: np.zeros((1, 3)))
     rate_change_radps2: Floats = field(default_factory=lambda: np.zeros((1, 3)))
+    carrier_hz: float = 0.0
+    part: int = 0
 
     def __len__(self) -> int:
         return len(self.elapsed_s)
+
+    @property
+    def span_s(self) -> float:
+        """From the first instant to the last."""
+        return float(max(np.ptp(self.elapsed_s), 1e-9))
+
+    @property
+    def longest_piece_s(self) -> float:
+        """Of the pieces of dwells, whose nodes are three instants each."""
+        return float(max((self.elapsed_s[2::3] - self.elapsed_s[:-2:3]).max(), 1e-9))
 
     @cached_property
     def axes(self) -> Floats:

@@ -1,0 +1,127 @@
+"""An oscillation of unknown frequency in the readings, slow or faster than a piece of a dwell; the test for a line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import binom
+from test_effects import BENCH
+
+from kf_calib.calibration import Calibration, Settings, calibrate
+from kf_calib.comparison import compare
+from kf_calib.effects import checks, effect_named
+from kf_calib.folding import less_curve
+from kf_calib.samples import Floats
+from kf_calib.sources.hidden import parse
+from kf_calib.sources.noise_sources import Noise
+from kf_calib.sources.plans import spread_plan
+from kf_calib.sources.sensors import GRADES
+from kf_calib.sources.simulator import Simulation
+from kf_calib.spectrum import Line, Spectrum, lines
+
+SIGMA = 5e-5
+SHARES = (1.0, -0.6, 0.8)
+WITH = Settings(effects=("sinusoid",))
+
+
+def run(frequency_hz: float, size_sigma: float, dwell_s: float = 6.0, seed: int = 5, dwells: int = 30) -> Simulation:
+    sizes = ",".join(str(size_sigma * SIGMA * share) for share in SHARES)
+    return Simulation(
+        BENCH, GRADES["navigation"].sensors(seed), Noise(white_mps2=SIGMA),
+        spread_plan(dwells, dwell_s=dwell_s, seed=4), sample_hz=100.0, slew_rate_degps=90.0, seed=seed,
+        hidden=parse([f"sinusoid={sizes};frequency={frequency_hz}"], BENCH.axes, seed=seed),
+    )  # fmt: skip
+
+
+def errors(result: Calibration, frequency_hz: float, size_sigma: float) -> list[float]:
+    """Of the frequency and the six amplitudes, in their sigmas; the simulator's phase is 0.7 rad."""
+    turned = np.concatenate([share * np.array([np.cos(0.7), np.sin(0.7)]) for share in SHARES]) * size_sigma * SIGMA
+    expected = [*turned, frequency_hz]
+    symbols = [*(c.symbol for c in effect_named("sinusoid", BENCH).coefficients), "fSin"]
+    found = [result.parameters[symbol] for symbol in symbols]
+    return [(p.value - truth) / p.sigma for p, truth in zip(found, expected, strict=True)]
+
+
+@pytest.mark.parametrize("size_sigma", [1.0, 5.0])
+@pytest.mark.parametrize(
+    "frequency_hz, dwell_s", [(0.15, 6.0), (0.15, 40.0), (1.3, 6.0), (33.0, 6.0), (33.0, 40.0), (0.02, 40.0)]
+)
+def test_frequency_and_amplitudes_are_found(frequency_hz: float, dwell_s: float, size_sigma: float) -> None:
+    result = calibrate(run(frequency_hz, size_sigma, dwell_s), WITH)
+    assert np.abs(errors(result, frequency_hz, size_sigma)).max() < 4.0
+    np.testing.assert_allclose(result.noise.effective_sigma_mps2, SIGMA, rtol=0.05)
+
+
+def test_intervals_cover() -> None:
+    ratios = [errors(calibrate(run(33.0, 1.0, seed=50 + k), WITH), 33.0, 1.0) for k in range(20)]
+    assert 0.88 <= np.mean(np.abs(ratios) < 1.96) <= 1.0
+    assert np.std(ratios) == pytest.approx(1.0, abs=0.2)
+
+
+def test_engines_and_batch_agree() -> None:
+    compared = compare(run(1.3, 2.0, dwells=16), WITH)
+    assert compared.max_difference_sigma <= 1e-6
+
+
+def test_columns_pass_the_checks() -> None:
+    assert checks.check(effect_named("sinusoid", BENCH)) == ()
+
+
+def seen_in(rng: np.random.Generator, kind: str, sizes: dict[float, float], count: int = 600) -> tuple[Line, ...]:
+    """Lines in 20 dwells of ``count`` readings at 100 Hz with oscillations {frequency: amplitude} in all channels."""
+    spectra, time_s = [], np.arange(count) / 100.0
+    for _ in range(20):
+        phases = rng.uniform(0.0, 2.0 * np.pi, len(sizes))
+        waves = sum(a * np.sin(2 * np.pi * f * time_s + p) for (f, a), p in zip(sizes.items(), phases, strict=True))
+        spectra.append(Spectrum.of(less_curve(noise_of(rng, kind, count) + waves), time_s))
+    return lines(spectra)
+
+
+def noise_of(rng: np.random.Generator, kind: str, count: int) -> Floats:
+    """White, or common to the channels, of unit variance; AR(1) of phi 0.9; density 1/f."""
+    if kind == "common":
+        return np.sqrt(0.9) * rng.normal(size=count) + np.sqrt(0.1) * rng.normal(size=(3, count))
+    white = rng.normal(size=(3, 4 * count))
+    if kind == "flicker":
+        density = 1.0 / np.maximum(np.fft.rfftfreq(4 * count), 0.25 / count)
+        white = np.fft.irfft(np.fft.rfft(white, axis=1) * np.sqrt(density), axis=1)
+    return lfilter([1.0], [1.0, -0.9 if kind == "coloured" else 0.0], white, axis=1)[:, -count:]
+
+
+@pytest.mark.parametrize("kind, count, runs", [
+    ("white", 600, 200), ("common", 600, 200), ("coloured", 600, 200), ("flicker", 600, 600),
+    ("white", 200, 100), ("coloured", 4000, 40), ("flicker", 4000, 40),
+])  # fmt: skip
+def test_noise_alone_has_no_line(kind: str, count: int, runs: int) -> None:
+    """At 1 %; the bound is passed once in 200 times."""
+    rng = np.random.default_rng(0)
+    assert sum(bool(seen_in(rng, kind, {}, count)) for _ in range(runs)) <= binom.ppf(0.995, runs, 0.01)
+
+
+@pytest.mark.parametrize("size, near", [(0.5, 0.3), (2.0, 0.1)])
+def test_a_line_is_found_with_its_size(size: float, near: float) -> None:
+    """The power of 20 segments of a line 7 times above the noise scatters by 12 %."""
+    (line,) = seen_in(np.random.default_rng(1), "coloured", {7.7: size})
+    assert line.p_value < 1e-6 and line.frequency_hz == pytest.approx(7.7, abs=0.03)
+    np.testing.assert_allclose(line.amplitude_mps2, size, rtol=near)
+
+
+def test_lines_are_told_apart() -> None:
+    """A strong one does not hide a weak one, nor has it others beside it."""
+    found = seen_in(np.random.default_rng(2), "white", {5.0: 300.0, 12.3: 0.4, 44.0: 10.0})
+    assert sorted(line.frequency_hz for line in found) == pytest.approx([5.0, 12.3, 44.0], abs=0.05)
+
+
+def test_spectra_add_up() -> None:
+    """Of one channel that stands still and two dwells, together or one after the other."""
+    rng, time_s = np.random.default_rng(3), np.arange(1500) / 100.0
+    wave = np.array([[0.0], [0.3], [1.0]]) * np.sin(2 * np.pi * 20.0 * time_s)
+    made = [np.diag([0.0, 1.0, 1.0]) @ rng.normal(size=(3, 1500)) + wave for _ in range(8)]
+    parts = slice(700), slice(700, None)
+    apart = [Spectrum.of(less_curve(each[:, part]), time_s[part]) for each in made for part in parts]
+    (line,) = lines(apart)
+    (same,) = lines([sum(apart[1:], apart[0])])
+    assert line.frequency_hz == same.frequency_hz and line.p_value == same.p_value
+    assert line.channel == 2 and line.frequency_hz == pytest.approx(20.0, abs=0.05)
+    np.testing.assert_allclose(line.amplitude_mps2, [0.0, 0.3, 1.0], atol=0.15)
