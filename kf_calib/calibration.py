@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -174,6 +174,8 @@ class Calibration:
     held_out_floor_mps2: float | None
     tally: Tally
     warnings: tuple[str, ...]
+    reread: Callable[[Settings], Calibration] | None = field(default=None, repr=False, compare=False)
+    """The same source evaluated anew: for models that need its readings folded otherwise."""
 
     @property
     def noise(self) -> Noise:
@@ -292,7 +294,22 @@ def calibrate(
     if settings.engine == "filterpy":
         result = replace(result, estimate=filterpy_estimate(source, result))
     said = [*source.warnings, *passed.tally.sentences(), *result.warnings]
-    return replace(result, tally=passed.tally, warnings=tuple(said))
+    return replace(result, tally=passed.tally, warnings=tuple(said), reread=partial(calibrate, source))
+
+
+def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
+    """The same run with these effects in the model, whatever was in it before: from the dwell factors alone.
+
+    Only effects that need other factors (an oscillation its carrier, some the slews) cost another pass over the source.
+    """
+    settings = replace(before.settings, effects=tuple(effects))
+    model = Model.of(before.bench, settings.effects)
+    other = model.oscillates and not any(dwell.carrier_hz for dwell in before.fit.dwells)
+    if before.reread is not None and (other or (model.dynamic and not before.carried.slews)):
+        return before.reread(settings)
+    with threadpool_limits(1, user_api="blas"):  # small decompositions, and the same bits every time
+        fitted = fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews)
+        return replace(evaluated(fitted, settings), tally=before.tally, reread=before.reread)
 
 
 def _on_carrier(

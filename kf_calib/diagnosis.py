@@ -19,19 +19,22 @@ from threadpoolctl import threadpool_limits
 
 from kf_calib import advice as advise
 from kf_calib.advice import Advice
-from kf_calib.calibration import Calibration, Parameter, Settings, consistency, evaluated, format_p
+from kf_calib.calibration import Calibration, Parameter, consistency, format_p, refitted
 from kf_calib.drivers import families
 from kf_calib.effects import Effect, effect_named, names
-from kf_calib.fitting import Fit, Walk, fit, likely_walk
+from kf_calib.fitting import Fit, Walk, likely_walk
 from kf_calib.model import Model
 from kf_calib.noise import mean_covariances, scatter_gain
 from kf_calib.samples import Floats
 from kf_calib.scan import Candidate, Scan, scan
+from kf_calib.spectrum import Line, lines
 
 LEVEL = 0.01
 """Chance of a false alarm a run."""
 
 _DRAWS = 4000
+_SHARE = 0.4  # of the chance of a false alarm: the misfit's and the scan's; lines have the rest
+_LINES = 1.0 - 2.0 * _SHARE
 _EQUAL = 6.63  # suspects whose chi-squared is this close to the best cannot be told from it (1 %, 1 dof)
 _ALIKE = 0.5  # overlap above which two suspects may be taken for each other
 _PAIRS = 3  # pairs that are refitted
@@ -45,6 +48,7 @@ class Test:
 
     scores: chi-squared falls less the threshold of their degrees of freedom: above zero is beyond chance.
     p_values: of the run. misfit_p: of the sum of squares as a whole (None: nothing left over to judge by).
+    lines: in the spectrum of the readings within dwells.
     """
 
     scan: Scan
@@ -55,12 +59,13 @@ class Test:
     walk: Walk | None
     effective_tests: float
     in_slews_only: tuple[str, ...]
+    lines: tuple[Line, ...]
 
     @property
     def p_value(self) -> float | None:
-        """Of the run: the smaller of the misfit's and the best suspect's, doubled for being two."""
+        """Of the run: the smallest of the misfit's, the best suspect's and the best line's, each at its share."""
         found = [*self.p_values.values(), *([self.misfit_p] if self.misfit_p is not None else [])]
-        return min(1.0, 2.0 * min(found)) if found else None
+        return min(1.0, min(found) / _SHARE) if found else None
 
     @property
     def consistent(self) -> bool | None:
@@ -102,7 +107,7 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
 
     tests: as how many independent ones they count, where that is known from nearly the same columns.
     """
-    from scipy.special import chdtrc
+    from scipy.special import chdtrc, chdtri
 
     found = scan(fitted.carried, fitted.noise.judging, candidates(fitted.carried.model), fitted.walk_variances)
     dofs, statistics = np.array([each.dof for each in found.candidates]), found.statistics
@@ -123,8 +128,13 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
         scores[name] = ratio - _threshold(1, tests)
         p_values[name] = run_level(0.5 * float(chdtrc(1, ratio)), tests)
     model, misfit_p = fitted.carried.model, consistency(fitted).p_value
+    seen_lines = () if model.oscillates else lines((dwell.spectrum for dwell in fitted.dwells), LEVEL * _LINES)
+    for name in names(model.bench):
+        if seen_lines and effect_named(name, model.bench).oscillates:
+            p_values[name] = seen_lines[0].p_value * _SHARE / _LINES
+            scores[name] = float(chdtri(1, seen_lines[0].p_value)) - _threshold(1, 1.0)
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
-    return Test(found, best, scores, p_values, misfit_p, walk and walk[1], tests, slewing)
+    return Test(found, best, scores, p_values, misfit_p, walk and walk[1], tests, slewing, seen_lines)
 
 
 def price(candidate: Candidate, tests: float) -> float:
@@ -350,10 +360,8 @@ def _leaps(refit: Calibration) -> bool:
 
 
 def with_effects(before: Calibration, added: Sequence[str]) -> Calibration:
-    """The same dwells with further effects in the model."""
-    settings: Settings = replace(before.settings, effects=(*before.settings.effects, *added))
-    model = Model.of(before.bench, settings.effects)
-    return evaluated(fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews), settings)
+    """The same run with further effects in the model."""
+    return refitted(before, (*before.settings.effects, *added))
 
 
 def _overlap(test: Test, one: str, other: str) -> float:
@@ -382,7 +390,7 @@ def detectable(test: Test) -> list[Detectable]:
         candidate = test.scan.candidates[k]
         if not candidate.dof or name in test.invisible:
             continue
-        threshold = float(chdtri(candidate.dof, 0.5 * LEVEL / test.effective_tests))
+        threshold = float(chdtri(candidate.dof, _SHARE * LEVEL / test.effective_tests))
         needed = float(np.sqrt(chndtrinc(threshold, candidate.dof, 1.0 - _POWER)))
         sizes = np.linalg.norm(candidate.columns, axis=0)
         seen = ~candidate.hidden & (sizes > 0)

@@ -20,13 +20,12 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from kf_calib import information, paper
-from kf_calib.calibration import Calibration, Parameter, evaluate, evaluated, format_p, orientations
+from kf_calib.calibration import Calibration, Parameter, evaluate, format_p, orientations, refitted
 from kf_calib.diagnosis import Diagnosis, diagnose
 from kf_calib.effects import as_text, effect_named, merged, refuse_unknown
 from kf_calib.errors import InputError, UnobservableError
-from kf_calib.fitting import Fit, fit, likely_walk
+from kf_calib.fitting import Fit, likely_walk
 from kf_calib.folding import Carried, without
-from kf_calib.model import Model
 from kf_calib.noise import mean_covariances
 from kf_calib.samples import Floats
 
@@ -285,15 +284,6 @@ def undone(state: Improvement) -> Improvement:
     history = list(state.history)
     history[last] = replace(history[last], undone=True)
     return replace(state, history=tuple(history))
-
-
-def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
-    """The same dwells with these effects in the model, whatever was in it before."""
-    settings = replace(before.settings, effects=tuple(effects))
-    model = Model.of(before.bench, settings.effects)
-    with threadpool_limits(1, user_api="blas"):  # small decompositions, and the same bits every time
-        fitted = fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews)
-        return replace(evaluated(fitted, settings), tally=before.tally)
 
 
 def removals(fitted: Fit) -> tuple[Removal, ...]:
