@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from kf_calib.comparison import compare
     from kf_calib.diagnosis import Diagnosis, diagnose
     from kf_calib.errors import InputError, KfCalibError, UnobservableError
+    from kf_calib.running import Running
     from kf_calib.sources.recorder import Recorder
     from kf_calib.sources.recording import Recording as open_recording
     from kf_calib.views.rerun import save as save_view
@@ -45,14 +46,15 @@ _HOMES = {
     "InputError": ("errors", "InputError"),
     "KfCalibError": ("errors", "KfCalibError"),
     "UnobservableError": ("errors", "UnobservableError"),
+    "Running": ("running", "Running"),
     "Recorder": ("sources.recorder", "Recorder"),
     "open_recording": ("sources.recording", "Recording"),
     "save_view": ("views.rerun", "save"),
 }
 
 __all__ = [
-    "Bench", "Calibration", "Diagnosis", "InputError", "KfCalibError", "Parameter", "Recorder", "Settings",
-    "UnobservableError", "calibrate", "compare", "diagnose", "open_recording", "save_view",
+    "Bench", "Calibration", "Diagnosis", "InputError", "KfCalibError", "Parameter", "Recorder", "Running",
+    "Settings", "UnobservableError", "calibrate", "compare", "diagnose", "open_recording", "save_view",
 ]  # fmt: skip
 
 
