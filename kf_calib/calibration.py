@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 from kf_calib import information, kalman, paper
 from kf_calib.bench import Bench
 from kf_calib.dwells import Segmenter, Stillness, Tally, dwell_blocks
+from kf_calib.effects import of_the_users, remarks_of
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.fitting import WALK, Fit, fit
 from kf_calib.folding import Carried, DwellFactor, Folder, means_of, samples_of
@@ -26,6 +27,7 @@ from kf_calib.information import Step
 from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
 from kf_calib.noise import Noise, considered, mean_covariances
 from kf_calib.samples import Floats, Mask, Source
+from kf_calib.visibility import sights
 
 SAME_POSE_DEG = 1.0
 """Dwells whose gravity directions are closer than this are visits of one orientation."""
@@ -283,9 +285,11 @@ def calibrate(
         refuse_unusable(dwells, passed.tally, source.bench)
         result = evaluate(dwells, source.bench, settings, passed.folder.slews)
     refuse_unseen(result)
+    own = [effect for effect in result.model.effects if of_the_users(effect)]
+    notes = [f"{sight}." for sight in sights(result.fit, own)]
     if settings.engine == "filterpy":
         result = replace(result, estimate=filterpy_estimate(source, result))
-    said = [*source.warnings, *passed.tally.sentences(), *result.warnings]
+    said = [*source.warnings, *passed.tally.sentences(), *result.warnings, *notes]
     return replace(result, tally=passed.tally, warnings=tuple(said))
 
 
@@ -485,10 +489,15 @@ def _remarks(
             f"{' and '.join(map(str, model.dynamic))} cannot be seen in this recording: it needs slew samples, "
             "readings and angles recorded all through the motions, angles at least every half second."
         )
+    yield from (remark for effect in model.effects for remark in remarks_of(effect))
     unseen = [symbol for symbol, hidden in zip(paper.SYMBOLS, estimate.unseen, strict=True) if hidden]
     unseen += [c.symbol for c, s in zip(model.coefficients, estimate.effect_sigma, strict=True) if np.isnan(s)]
     if unseen:
         yield f"these orientations do not determine {', '.join(unseen)}: visit more, spread over the sphere."
+    for effect in model.effects:
+        exact = effect.degeneracy(model.bench)
+        if exact and any(coefficient.symbol in unseen for coefficient in effect.coefficients):
+            yield f"{exact}."
     if judged.dof == 0:
         yield (
             f"{len(dwells)} dwell{'s' * (len(dwells) > 1)} leave nothing over to judge the model by: "

@@ -14,6 +14,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from kf_calib.bench import Bench
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.samples import Floats
 
@@ -88,6 +89,10 @@ class Effect(ABC):
     @abstractmethod
     def columns(self, s: Stimulus) -> Floats:
         """What each accelerometer reads more per unit of each coefficient: (m, 3, q), m/s^2."""
+
+    def degeneracy(self, bench: Bench) -> str:
+        """What the effect is exactly the same as on that bench, in words; empty where no such thing is known."""
+        return ""
 
     def derivative(self, s: Stimulus, coefficients: Floats) -> Floats:
         """What each accelerometer reads more per unit of ln(value) with these ``coefficients`` (q,): (m, 3, 1).

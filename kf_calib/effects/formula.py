@@ -121,8 +121,8 @@ def symbol_stem(name: str) -> str:
 class Formula(SensorEffect):
     """An effect ``name = expression``; raises InputError, with the formula in it, where it cannot be used.
 
-    text: what gives the same effect again. The unit of the coefficients follows from that of the expression, their
-    scale from what they add on a trial run: about 1e-3 m/s^2.
+    text: what gives the same effect again; remarks: what its checks had to say. The unit of the coefficients follows
+    from that of the expression, their scale from what they add on a trial run: about 1e-3 m/s^2.
     """
 
     source, confused_with = "user's formula", ""
@@ -141,7 +141,7 @@ class Formula(SensorEffect):
         vars(self).update(name=name, title=expression, symbol=symbol_stem(name), unit=unit, shown=shown, scale=1.0)
         self.text = f"{name} = {expression}"
         stimulus = checks.trial(bench)
-        checks.check(self, stimulus)
+        self.remarks = checks.check(self, stimulus)
         vars(self).update(scale=_LARGE_MPS2 / self._typical(stimulus))
 
     def _typical(self, stimulus: Stimulus) -> float:
