@@ -200,6 +200,12 @@ class Calibration:
         if self.model.walks:
             found.append((WALK.symbol, self.fit.walk.intensity, self.fit.walk.sigma or math.nan, 0.0, WALK.unit))
             shown.append((WALK.shown_unit, WALK.per_si))
+        for effect in self.model.stepped:
+            assert effect.unknown is not None
+            constant, spread = effect.unknown, self.fit.spreads[str(effect)]
+            sigma = effect.value * spread if spread < 1.0 else math.nan  # not known within itself
+            found.append((constant.symbol, effect.value, sigma, 0.0, constant.unit))
+            shown.append((constant.shown_unit, constant.per_si))
         return {
             symbol: Parameter(
                 symbol,
@@ -214,7 +220,7 @@ class Calibration:
 
     def considering(self, state: Floats, covariance: Floats) -> Estimate:
         """Another engine's state and covariance, the latter enlarged by what is considered only."""
-        extra = considered(self.noise, self.carried.means, self.carried.state).sum(axis=0)
+        extra = considered(self.noise, self.carried.means, self.carried.state).sum(axis=0) + self.fit.considered
         return Estimate(state, covariance + covariance @ extra @ covariance, self.estimate.undetermined)
 
     def __str__(self) -> str:
@@ -306,7 +312,7 @@ def evaluated(fitted: Fit, settings: Settings) -> Calibration:
     first = information.start(settings.prior, model)
     steps = information.run(first, fitted.rows(), fitted.walk_variances, fitted.following)
     extra = considered(noise, carried.means, carried.state)
-    final = _estimate(steps[-1].factor, model.nominal_state(), extra.sum(axis=0))
+    final = _estimate(steps[-1].factor, model.nominal_state(), extra.sum(axis=0) + fitted.considered)
     residuals = carried.means.readings - carried.means.design @ final.state
     visits = _visits(fitted, steps, residuals, extra, settings)
     held_out, floor = _held_out(fitted)

@@ -154,8 +154,11 @@ def test_vibration_rectification_is_found_from_readings_that_resolve_it() -> Non
 
 
 def sweep_plan(source: Simulation, step_rad: float = 2e-4) -> list[Visit]:
-    """Orientations spread over the sphere, and 16 about the zero of each accelerometer."""
-    rows = [visit.gimbal_deg for visit in spread_plan(24, seed=4)]
+    """Orientations spread over the sphere, and 16 about the zero of each accelerometer.
+
+    The three in turn: a pose and the next about the same zero would pass for one, standing still.
+    """
+    zeros = []
     for i, (gimbal, start) in enumerate([(1, 0.0), (1, np.pi / 2), (2, 0.0)]):
 
         def along(angle: float, i: int = i, gimbal: int = gimbal) -> float:
@@ -163,8 +166,10 @@ def sweep_plan(source: Simulation, step_rad: float = 2e-4) -> list[Visit]:
             pose[0, gimbal] = angle
             return float(source.sensors.input_axes[i] @ BENCH.specific_force(np.zeros(1), pose)[0])
 
-        zero = brentq(along, start - 0.2, start + 0.2)
-        for k in range(16):
+        zeros.append((gimbal, brentq(along, start - 0.2, start + 0.2)))
+    rows = [visit.gimbal_deg for visit in spread_plan(24, seed=4)]
+    for k in range(16):
+        for gimbal, zero in zeros:
             pose = [20.0, 0.0, 0.0]
             pose[gimbal] = float(np.degrees(zero + step_rad * (k - 7.5)))
             rows.append(tuple(pose))

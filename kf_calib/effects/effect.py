@@ -57,6 +57,7 @@ class Effect(ABC):
     """A physical effect the readings may contain besides the twelve parameters.
 
     unknown: a constant inside the columns; ``value`` is where it stands, and ``at(value)`` the effect with another.
+    smooth: the columns change smoothly with it; where not it is no state, and is averaged over its likelihood.
     walks: the biases take a random walk (process noise), its intensity is estimated by likelihood.
     dynamic: it shows in slews only, so these are evaluated too.
     """
@@ -66,6 +67,7 @@ class Effect(ABC):
     source: ClassVar[str]
     confused_with: ClassVar[str] = ""
     unknown: ClassVar[Unknown | None] = None
+    smooth: ClassVar[bool] = True
     walks: ClassVar[bool] = False
     dynamic: ClassVar[bool] = False
     variant: str = ""

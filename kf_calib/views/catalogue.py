@@ -78,9 +78,7 @@ def sight_report(sights: Sequence[Sight], about: str) -> RenderableType:
         table.add_row(*_sight_cells(sight))
     notes = [f"{sight.effect}: {words}." for sight in sights for words in (sight.why, sight.degeneracy) if words]
     notes += [f"{sight.effect}: not determined: {' '.join(sight.unseen)}." for sight in sights if sight.unseen]
-    explained = (
-        "Smallest sizes would be found in 9 of 10 such runs. An overlap of 1: this run cannot tell the two apart."
-    )
+    explained = "Smallest sizes would be found in 9 of 10 such runs. Overlap 1: this run cannot tell the two apart."
     return Group(table, Text(explained), *map(Text, notes))
 
 
