@@ -169,23 +169,34 @@ def sweep_plan(source: Simulation, step_rad: float = 2e-4) -> list[Visit]:
         zeros.append((gimbal, brentq(along, start - 0.2, start + 0.2)))
     rows = [visit.gimbal_deg for visit in spread_plan(24, seed=4)]
     for k in range(16):
-        for gimbal, zero in zeros:
-            pose = [20.0, 0.0, 0.0]
+        for i, (gimbal, zero) in enumerate(zeros):
+            pose = [20.0 + 40.0 * i, 0.0, 0.0]
             pose[gimbal] = float(np.degrees(zero + step_rad * (k - 7.5)))
             rows.append(tuple(pose))
     return explicit_plan(rows, 6.0)
 
 
 def test_a_dead_zone_is_found_from_poses_that_sweep_through_it() -> None:
-    """A share of one of the input is not felt; the width of the zone has no derivative, and so is not given a sigma."""
-    hidden = ["dead-zone=5e-3"]
-    source = run(hidden, 5e-5, plan=sweep_plan(run([])))
-    result = with_effect("dead-zone", source)
-    for i in (1, 2, 3):
-        found = result.parameters[f"Dz{i}"]
-        assert abs(found.value - 1.0) < 4.0 * found.sigma < 0.4
-    assert 5e-3 / 1.6 < result.model.effects[0].value < 5e-3 * 1.6  # a grid of steps of half
-    assert result.consistency.consistent and calibrate(source).consistency.p_value < 1e-9
+    """A share of one of the input is not felt; the width of the zone lies between two poses, and its sigma says so."""
+    inside = []
+    for seed, width in enumerate((4.3e-3, 5.0e-3, 5.7e-3, 6.6e-3)):
+        source = run([f"dead-zone={width}"], 5e-5, seed, plan=sweep_plan(run([], seed=seed)))
+        result = with_effect("dead-zone", source)
+        found = values(result)
+        assert list(found) == ["Dz1", "Dz2", "Dz3", "dZone"] and not result.warnings
+        for symbol in ("Dz1", "Dz2", "Dz3"):
+            value, sigma = found[symbol]
+            assert abs(value - 1.0) < 4.0 * sigma < 0.4
+        value, sigma = found["dZone"]
+        assert 0.0 < sigma < 0.2 * width
+        inside.append(abs(value - width) / sigma)
+        assert result.consistency.consistent and calibrate(source).consistency.p_value < 1e-9
+    assert max(inside) < 2.5 and float(np.median(inside)) < 1.5  # uniform between two poses: 1.7 at most
+
+
+def test_a_dead_zone_that_is_not_there_has_no_width() -> None:
+    found = values(with_effect("dead-zone", run([], 5e-5, plan=sweep_plan(run([])))))
+    assert found["dZone"] == (None, None)
 
 
 @pytest.mark.parametrize("name", INVISIBLE)
