@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from kf_calib.diagnosis import Diagnosis, diagnose
     from kf_calib.errors import InputError, KfCalibError, UnobservableError
     from kf_calib.improvement import Improvement, improve
+    from kf_calib.running import Running
     from kf_calib.sources.recorder import Recorder
     from kf_calib.sources.recording import Recording as open_recording
     from kf_calib.views.rerun import save as save_view
@@ -49,6 +50,7 @@ _HOMES = {
     "InputError": ("errors", "InputError"),
     "KfCalibError": ("errors", "KfCalibError"),
     "UnobservableError": ("errors", "UnobservableError"),
+    "Running": ("running", "Running"),
     "Recorder": ("sources.recorder", "Recorder"),
     "open_recording": ("sources.recording", "Recording"),
     "save_view": ("views.rerun", "save"),
@@ -56,7 +58,8 @@ _HOMES = {
 
 __all__ = [
     "Bench", "Calibration", "Diagnosis", "Improvement", "InputError", "KfCalibError", "Parameter", "Recorder",
-    "Settings", "UnobservableError", "calibrate", "compare", "diagnose", "improve", "open_recording", "save_view",
+    "Running", "Settings", "UnobservableError", "calibrate", "compare", "diagnose", "improve", "open_recording",
+    "save_view",
 ]  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 from kf_calib import information, kalman, paper
 from kf_calib.bench import Bench
 from kf_calib.dwells import Segmenter, Stillness, Tally, dwell_blocks
+from kf_calib.effects import of_the_users, remarks_of
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.fitting import WALK, Fit, fit
 from kf_calib.folding import Carried, DwellFactor, Folder, means_of, samples_of
@@ -27,6 +28,7 @@ from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
 from kf_calib.noise import Noise, considered, mean_covariances
 from kf_calib.samples import Floats, Mask, Source
 from kf_calib.spectrum import lines
+from kf_calib.visibility import sights
 
 SAME_POSE_DEG = 1.0
 """Dwells whose gravity directions are closer than this are visits of one orientation."""
@@ -204,6 +206,12 @@ class Calibration:
         if self.model.walks:
             found.append((WALK.symbol, self.fit.walk.intensity, self.fit.walk.sigma or math.nan, 0.0, WALK.unit))
             shown.append((WALK.shown_unit, WALK.per_si))
+        for effect in self.model.stepped:
+            assert effect.unknown is not None
+            constant, spread = effect.unknown, self.fit.spreads[str(effect)]
+            sigma = effect.value * spread if spread < 1.0 else math.nan  # not known within itself
+            found.append((constant.symbol, effect.value, sigma, 0.0, constant.unit))
+            shown.append((constant.shown_unit, constant.per_si))
         return {
             symbol: Parameter(
                 symbol,
@@ -218,7 +226,7 @@ class Calibration:
 
     def considering(self, state: Floats, covariance: Floats) -> Estimate:
         """Another engine's state and covariance, the latter enlarged by what is considered only."""
-        extra = considered(self.noise, self.carried.means, self.carried.state).sum(axis=0)
+        extra = considered(self.noise, self.carried.means, self.carried.state).sum(axis=0) + self.fit.considered
         return Estimate(state, covariance + covariance @ extra @ covariance, self.estimate.undetermined)
 
     def __str__(self) -> str:
@@ -291,9 +299,11 @@ def calibrate(
             passed, dwells = _on_carrier(passed, dwells, on_progress)
         result = evaluate(dwells, source.bench, settings, passed.folder.slews)
     refuse_unseen(result)
+    own = [effect for effect in result.model.effects if of_the_users(effect)]
+    notes = [f"{sight}." for sight in sights(result.fit, own)]
     if settings.engine == "filterpy":
         result = replace(result, estimate=filterpy_estimate(source, result))
-    said = [*source.warnings, *passed.tally.sentences(), *result.warnings]
+    said = [*source.warnings, *passed.tally.sentences(), *result.warnings, *notes]
     return replace(result, tally=passed.tally, warnings=tuple(said), reread=partial(calibrate, source))
 
 
@@ -369,7 +379,7 @@ def evaluated(fitted: Fit, settings: Settings) -> Calibration:
     first = information.start(settings.prior, model)
     steps = information.run(first, fitted.rows(), fitted.walk_variances, fitted.following)
     extra = considered(noise, carried.means, carried.state)
-    final = _estimate(steps[-1].factor, model.nominal_state(), extra.sum(axis=0))
+    final = _estimate(steps[-1].factor, model.nominal_state(), extra.sum(axis=0) + fitted.considered)
     residuals = carried.means.readings - carried.means.design @ final.state
     visits = _visits(fitted, steps, residuals, extra, settings)
     held_out, floor = _held_out(fitted)
@@ -547,10 +557,15 @@ def _remarks(
             f"{' and '.join(map(str, model.dynamic))} cannot be seen in this recording: it needs slew samples, "
             "readings and angles recorded all through the motions, angles at least every half second."
         )
+    yield from (remark for effect in model.effects for remark in remarks_of(effect))
     unseen = [symbol for symbol, hidden in zip(paper.SYMBOLS, estimate.unseen, strict=True) if hidden]
     unseen += [c.symbol for c, s in zip(model.coefficients, estimate.effect_sigma, strict=True) if np.isnan(s)]
     if unseen:
         yield f"these orientations do not determine {', '.join(unseen)}: visit more, spread over the sphere."
+    for effect in model.effects:
+        exact = effect.degeneracy(model.bench)
+        if exact and any(coefficient.symbol in unseen for coefficient in effect.coefficients):
+            yield f"{exact}."
     if judged.dof == 0:
         yield (
             f"{len(dwells)} dwell{'s' * (len(dwells) > 1)} leave nothing over to judge the model by: "

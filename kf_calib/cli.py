@@ -155,6 +155,16 @@ def _settings(options: Mapping[str, Any]) -> Settings:
     )
 
 
+def _opened(path: Path, options: Mapping[str, Any]) -> tuple[Recording, Settings]:
+    """A recording and how to evaluate it; a model that cannot be made is refused before any reading is read."""
+    from kf_calib.model import Model
+
+    settings = _settings(options)
+    source = _recording(path, options)
+    Model.of(source.bench, settings.effects)
+    return source, settings
+
+
 def _effects(options: Mapping[str, Any]) -> tuple[str, ...]:
     """Effects of the model file, then those of ``--with``; the user's files are read first."""
     from kf_calib.effects import load_file, merged, refuse_unknown
@@ -224,9 +234,9 @@ def replay(
     """Run a recording through the filter: twelve parameters, their sigma, and whether the model fits."""
     from kf_calib.calibration import calibrate
 
-    source: Source = _recording(recording, options)
+    source, settings = _opened(recording, options)
     with _progress(f"replaying {recording.name}", as_json) as tick:
-        result = calibrate(source, _settings(options), tick)
+        result = calibrate(source, settings, tick)
     _save_views(result, rrd, png)
     if save_model:
         from kf_calib import model_file
@@ -269,8 +279,9 @@ def compare(recording: Path, as_json: bool, **options: Any) -> None:
     """Block engine, filterpy and batch least squares on the same recording: differences, time, memory."""
     from kf_calib.comparison import compare as run
 
+    source, settings = _opened(recording, options)
     with _progress(f"comparing on {recording.name}", as_json):
-        compared = run(_recording(recording, options), _settings(options))
+        compared = run(source, settings)
     if as_json:
         from kf_calib.views.json import compare_object
 
@@ -283,27 +294,57 @@ def compare(recording: Path, as_json: bool, **options: Any) -> None:
 
 @cli.command("effects")
 @click.argument("names", nargs=-1, metavar="[NAME]...")
-@click.option("--axes", default="y z x", show_default=True, help="Gimbal axes of the bench, outer to inner.")
-@click.option("--latitude", type=click.FloatRange(-90, 90), default=50.0, show_default=True, help="Latitude, deg.")
-@effects_from_option
+@click.option(
+    "--recording",
+    type=click.Path(path_type=Path),
+    metavar="REC",
+    help="Say of each effect what this recording shows of it: visible, smallest size, confused with what.",
+)
+@recording_options
+@filter_options
 @json_option
-def list_effects(
-    names: tuple[str, ...], axes: str, latitude: float, effects_from: tuple[Path, ...], as_json: bool
-) -> None:
-    """The effects a model may have: all of the catalogue and your own, or those NAMEd (formulas too) in detail."""
-    from kf_calib.bench import Bench, normal_gravity, parse_axes
-    from kf_calib.effects import effect_named, load_file
+def list_effects(names: tuple[str, ...], recording: Path | None, as_json: bool, **options: Any) -> None:
+    """The effects a model may have: all of the catalogue and your own, or those NAMEd (formulas too) in detail.
+
+    Without --recording they are those of a bench with --axes "y z x" at --latitude 50, or as stated.
+    """  # fmt: skip
+    from kf_calib.bench import Bench
+    from kf_calib.effects import effect_named, refuse_unknown
     from kf_calib.effects import names as known
     from kf_calib.views import catalogue
 
-    for path in effects_from:
-        load_file(path)
-    bench = Bench(parse_axes(axes), normal_gravity(latitude), latitude_deg=latitude)
+    _effects(options)
+    for name in names:
+        refuse_unknown(name)
+    if recording is not None:
+        _list_visible(recording, names, as_json, options)
+        return
+    bench = Bench.from_metadata({"axes": "y z x", "latitude_deg": "50"} | _overrides(options))
     chosen = [effect_named(name, bench) for name in names or known(bench)]
     if as_json:
         _print_json(catalogue.effects_object(chosen))
     else:
         _show(catalogue.details(chosen) if names else catalogue.overview(chosen))
+
+
+def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, options: Mapping[str, Any]) -> None:
+    """What a recording shows of effects, beside the model of the options."""
+    from kf_calib.calibration import calibrate
+    from kf_calib.effects import effect_named
+    from kf_calib.effects import names as known
+    from kf_calib.views import catalogue
+    from kf_calib.views.json import clean
+    from kf_calib.visibility import sights
+
+    source, settings = _opened(recording, options)
+    chosen = [effect_named(name, source.bench) for name in names or known(source.bench)]
+    with _progress(f"reading {recording.name}", as_json) as tick:
+        result = calibrate(source, settings, tick)
+    seen = sights(result.fit, chosen)
+    if as_json:
+        _print_json(clean(catalogue.sights_object(seen, [str(effect) for effect in result.model.effects])))
+    else:
+        _show(catalogue.sight_report(seen, f"What {recording.name} shows of {len(seen)} effects beside {result.model}"))
 
 
 def _list_hidden(ctx: click.Context, _: click.Parameter, texts: tuple[str, ...]) -> tuple[str, ...]:
@@ -359,8 +400,9 @@ def diagnose(ctx: click.Context, recording: Path, strict: bool, as_json: bool, *
     from kf_calib.diagnosis import diagnose as run
     from kf_calib.views import diagnosis as views
 
+    source, settings = _opened(recording, options)
     with _progress(f"diagnosing {recording.name}", as_json) as tick:
-        found = run(calibrate(_recording(recording, options), _settings(options), tick))
+        found = run(calibrate(source, settings, tick))
     if as_json:
         _print_json(views.diagnosis_object(found))
     else:

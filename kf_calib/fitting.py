@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from kf_calib import information
 from kf_calib.effects import Coefficient, Effect
-from kf_calib.folding import Carried, DwellFactor, stimulus_of
+from kf_calib.folding import Carried, DwellFactor, candidate_columns, stimulus_of
 from kf_calib.model import Model, on_basis
 from kf_calib.noise import FLOOR_MPS2, Noise, with_dwell_parts, within_dwells
 from kf_calib.samples import Floats
@@ -30,6 +30,7 @@ _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
 _STILL = 2.5e-4  # a step of ln(value), in reaches, that ends the search
 _TOGETHER = 40  # values of a grid in one scan
+_CLOSER = ((0.45, 41), (0.0225, 17), (0.0028, 9))  # half width in ln(value) and points of ever finer grids
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,15 @@ class Walk:
 
 @dataclass(frozen=True)
 class Fit:
-    """Dwells with the fitted model's columns, and the noise they are weighted by."""
+    """Dwells with the fitted model's columns, and the noise they are weighted by.
+
+    spreads: 1 sigma of ln(value) of each constant without derivative, by its effect.
+    """
 
     carried: Carried
     noise: Noise
     walk: Walk
+    spreads: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @property
     def dwells(self) -> list[DwellFactor]:
@@ -77,6 +82,26 @@ class Fit:
         """Whitened rows of each dwell and the slew after it."""
         return [np.vstack(both) if len(both[1]) else both[0] for both in zip(self.rows(), self.following, strict=True)]
 
+    @cached_property
+    def considered(self) -> Floats:
+        """What the constants without derivative add to the information about the gain, (p, p).
+
+        b b^T times the variance, b = A^T W g, g the change of the readings from 1 sigma below to 1 sigma above: with it
+        the covariance is P + P b b^T P, as a Schmidt-Kalman filter's that knows of a parameter it does not estimate.
+        """
+        carried, out = self.carried, np.zeros((self.carried.model.count,) * 2)
+        for effect in carried.model.stepped:
+            spread, part = self.spreads.get(str(effect), 0.0), carried.model.parts[str(effect)]
+            ends = [effect.at(effect.value * math.exp(step)) for step in (spread, -spread)]
+            more, less = (candidate_columns(carried.dwells, [end], carried.model.bench, carried.state) for end in ends)
+            changes = [0.5 * (a - b) @ carried.state[part, None] for a, b in zip(more, less, strict=True)]
+            columns = [np.concatenate(both, axis=3) for both in zip(carried.columns, changes, strict=True)]
+            rows = information.whitened(carried.dwells, columns, self.noise.weights, carried.state)
+            upper = information.accumulated(rows, self.walk_variances)
+            gain = upper[: len(out), : len(out)].T @ upper[: len(out), len(out)]
+            out += np.outer(gain, gain)
+        return out
+
     def rows(self, noise: Noise | None = None) -> list[Floats]:
         """Whitened rows [H | z] of each dwell, by the weights of the fit or by another noise."""
         return information.whitened(self.dwells, self.carried.columns, noise or self.noise.weights, self.carried.state)
@@ -90,10 +115,13 @@ def fit(
     slews = [slew for slew in slews if slew.number >= dwells[0].number] if model.dynamic else []
     fitted = Fit(Carried(dwells, model, model.nominal_state(), slews), within, Walk(walk_mps2_per_sqrt_s))
     searching = False
-    for number in range(_PASSES_WITH_UNKNOWNS if model.unknowns else _PASSES):
+    for number in range(_PASSES_WITH_UNKNOWNS if model.unknowns or model.stepped else _PASSES):
         if number == 1 and model.unknowns:
             model, searching = _placed(fitted), True
             fitted = replace(fitted, carried=Carried(dwells, model, fitted.carried.state, slews))
+        if number and model.stepped:
+            model, spreads = _averaged(fitted)
+            fitted = replace(fitted, carried=Carried(dwells, model, fitted.carried.state, slews), spreads=spreads)
         state, moved = _solved(fitted)
         reach = _reach(fitted)
         if searching:
@@ -102,8 +130,9 @@ def fit(
         noise = with_dwell_parts(within, carried.means, state, bench.angle_sigma_deg, bench.scatter_sigma_mps2)
         noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
         walk = likely_walk(replace(fitted, carried=carried, noise=noise))[0] if model.walks else fitted.walk
-        fitted = Fit(carried, noise, walk)
-        if number >= _PASSES - 1 and (np.abs(moved) <= _STILL * reach).all():
+        fitted = replace(fitted, carried=carried, noise=noise, walk=walk)
+        # where columns step, they hold the input axes to where they are taken to be: that gives way slowly
+        if number >= _PASSES - 1 and (np.abs(moved) <= _STILL * reach).all() and not model.stepped:
             break
     return fitted
 
@@ -161,14 +190,49 @@ def _placed(fitted: Fit) -> Model:
     return model
 
 
+def _averaged(fitted: Fit) -> tuple[Model, dict[str, float]]:
+    """The model with each constant without derivative at its mean by likelihood, and 1 sigma of its logarithm.
+
+    Likelihood exp(fall of chi^2 / 2), the prior flat in ln(value): between two poses no value is likelier than another.
+    """
+    model, spreads = fitted.carried.model, dict[str, float]()
+    for effect in model.stepped:
+        assert effect.unknown is not None
+        rest, values = model - effect, effect.unknown.grid()
+        falls = _falls(fitted, rest, [effect.at(value) for value in values])
+        for half, count in _CLOSER:
+            near = values[np.argmax(falls)] * np.exp(np.linspace(-half, half, count))
+            near = np.clip(near, effect.unknown.low, effect.unknown.high)
+            values = np.append(values, near)
+            falls = np.append(falls, _falls(fitted, rest, [effect.at(value) for value in near]))
+        order = np.argsort(values)
+        logs, falls = np.log(values[order]), falls[order]
+        weights = np.exp(0.5 * (falls - falls.max())) * _cells(logs)
+        mean = float(np.average(logs, weights=weights))
+        spreads[str(effect)] = float(np.sqrt(np.average((logs - mean) ** 2, weights=weights)))
+        model = model.with_effect(effect.at(math.exp(mean)))
+    return model, spreads
+
+
+def _cells(points: Floats) -> Floats:
+    """The length (n,) that each of sorted points stands for: half the way to the points beside it."""
+    steps = np.diff(points)
+    return 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
+
+
 def _best(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> int:
     """Which of the same effect at several values explains most beside the ``rest`` of the model."""
+    return int(np.argmax(_falls(fitted, rest, grid)))
+
+
+def _falls(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> Floats:
+    """By how much the same effect at several values would lower chi-squared beside the ``rest`` of the model."""
     state = np.concatenate([fitted.carried.state[:12], np.zeros(rest.count - 12)])
     carried, statistics = Carried(fitted.dwells, rest, state), list[Floats]()
     for first in range(0, len(grid), _TOGETHER):
         part = grid[first : first + _TOGETHER]
         statistics.append(scan(carried, fitted.noise.weights, part, fitted.walk_variances).statistics)
-    return int(np.argmax(np.concatenate(statistics)))
+    return np.concatenate(statistics)
 
 
 def _gaps_s(dwells: Sequence[DwellFactor]) -> Floats:

@@ -20,12 +20,20 @@ from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 
 
-def whitened(dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats) -> list[Floats]:
+def whitened(
+    dwells: Sequence[DwellFactor],
+    columns: Sequence[Floats],
+    noise: Noise,
+    state: Floats,
+    about: Floats | None = None,
+) -> list[Floats]:
     """Rows [H | z] of unit noise (p, p + 1) of each dwell, its nuisance states eliminated by QR.
 
     ``columns``: the model's, at the nodes of each dwell. Channel i's rows are divided by the sigma of a white reading
     that averages like the true one; the setting error (three rotations) and the scatter (three offsets) enter as states
     with their priors, linearised at ``state``. What a dwell's rows leave over among themselves is not in the result.
+    ``about`` (p,): z is the readings less what the model reads there, and states solved for count from it. A reading of
+    size g is 1e6 sigma and more: its rounding is then no longer the largest error of whatever follows.
     """
     sigma, sigmas = noise.effective_sigma_mps2, noise.dwell_sigmas
     used, units = np.flatnonzero(sigmas > 0), _units(columns)
@@ -42,7 +50,10 @@ def whitened(dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: No
             part = rows[i * size : (i + 1) * size]
             part[:, :count] = (regressors @ nuisances[i]).reshape(size, count) / sigma[i]
             part[:, count:-1] = (carried @ on_basis(own[:, :, i])).reshape(size, width) / sigma[i]
-            part[:, -1] = triangles[:, : dwell.width, dwell.width + i].reshape(size) / sigma[i]
+            readings = triangles[:, : dwell.width, dwell.width + i]
+            if about is not None:
+                readings = readings - (carried @ on_basis((own[:, :, i] @ about)[:, :, None]))[:, :, 0]
+            part[:, -1] = readings.reshape(size) / sigma[i]
         rows[3 * size :, :count] = np.diag(1.0 / sigmas[used])
         folded = triangle(rows)
         out.append(_informative(folded[count:, count:], units))
@@ -119,6 +130,14 @@ def update(factor: Floats, rows: Floats) -> Step:
     after = upper[:width]
     gained = rank(after) - rank(factor)
     return Step(after, float(upper[width, width] ** 2), row_rank(rows) - gained)
+
+
+def restricted(factor: Floats, kept: Sequence[int]) -> Floats:
+    """The factor [R | z] (k, k + 1) of the states ``kept``, in that order, the others held at zero: one small QR.
+
+    What a filter carries of effects that are not in its model is conditioned away, and is there when they are added.
+    """
+    return triangle(factor[:, [*kept, -1]])[: len(kept)]
 
 
 def row_rank(rows: Floats) -> int:

@@ -148,8 +148,13 @@ class Model:
 
     @property
     def unknowns(self) -> dict[int, Effect]:
-        """The effects with a constant to be found, by the place of its state."""
-        return {self.parts[str(each)].stop - 1: each for each in self.effects if each.unknown is not None}
+        """The effects with a constant among the states, by the place of its state."""
+        return {self.parts[str(each)].stop - 1: each for each in self.effects if each.unknown and each.smooth}
+
+    @property
+    def stepped(self) -> tuple[Effect, ...]:
+        """The effects with a constant that has no derivative: it is no state."""
+        return tuple(each for each in self.effects if each.unknown and not each.smooth)
 
     def moved(self, state: Floats) -> Model:
         """The model with its unknowns where ``state`` (p,) puts them: value times exp(state)."""
@@ -189,7 +194,7 @@ class Model:
             part = self.parts[str(effect)]
             own = slice(part.start, part.start + len(effect.coefficients))
             out[:, :, own] = effect_columns([effect], stimulus)
-            if effect.unknown is not None:
+            if own.stop < part.stop:
                 out[:, :, own.stop : part.stop] = effect.derivative(stimulus, state[own])
         return out
 
@@ -211,7 +216,7 @@ def effect_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
 
 def _states_of(effect: Effect) -> tuple[Coefficient, ...]:
     unknown = effect.unknown
-    if unknown is None:
+    if unknown is None or not effect.smooth:
         return effect.coefficients
     return *effect.coefficients, Coefficient(unknown.symbol, unknown.unit, 1.0, unknown.shown_unit, unknown.per_si)
 

@@ -17,10 +17,12 @@ from kf_calib.calibration import Calibration, Estimate, Pass, Settings, calibrat
 from kf_calib.comparison import compare
 from kf_calib.effects import SensorEffect, Stimulus, effect_named, names
 from kf_calib.errors import InputError
-from kf_calib.fitting import WALK, Fit, fit
+from kf_calib.fitting import WALK, Fit, Walk, fit
 from kf_calib.folding import Carried, DwellFactor
-from kf_calib.model import Model
+from kf_calib.model import PRIORS, Model
+from kf_calib.noise import Noise as NoiseModel
 from kf_calib.noise import within_dwells
+from kf_calib.running import Running
 from kf_calib.samples import Floats
 from kf_calib.sources.hidden import parse, sized
 from kf_calib.sources.noise_sources import Noise
@@ -154,8 +156,11 @@ def test_vibration_rectification_is_found_from_readings_that_resolve_it() -> Non
 
 
 def sweep_plan(source: Simulation, step_rad: float = 2e-4) -> list[Visit]:
-    """Orientations spread over the sphere, and 16 about the zero of each accelerometer."""
-    rows = [visit.gimbal_deg for visit in spread_plan(24, seed=4)]
+    """Orientations spread over the sphere, and 16 about the zero of each accelerometer.
+
+    The three in turn: a pose and the next about the same zero would pass for one, standing still.
+    """
+    zeros = []
     for i, (gimbal, start) in enumerate([(1, 0.0), (1, np.pi / 2), (2, 0.0)]):
 
         def along(angle: float, i: int = i, gimbal: int = gimbal) -> float:
@@ -163,24 +168,37 @@ def sweep_plan(source: Simulation, step_rad: float = 2e-4) -> list[Visit]:
             pose[0, gimbal] = angle
             return float(source.sensors.input_axes[i] @ BENCH.specific_force(np.zeros(1), pose)[0])
 
-        zero = brentq(along, start - 0.2, start + 0.2)
-        for k in range(16):
-            pose = [20.0, 0.0, 0.0]
+        zeros.append((gimbal, brentq(along, start - 0.2, start + 0.2)))
+    rows = [visit.gimbal_deg for visit in spread_plan(24, seed=4)]
+    for k in range(16):
+        for i, (gimbal, zero) in enumerate(zeros):
+            pose = [20.0 + 40.0 * i, 0.0, 0.0]
             pose[gimbal] = float(np.degrees(zero + step_rad * (k - 7.5)))
             rows.append(tuple(pose))
     return explicit_plan(rows, 6.0)
 
 
 def test_a_dead_zone_is_found_from_poses_that_sweep_through_it() -> None:
-    """A share of one of the input is not felt; the width of the zone has no derivative, and so is not given a sigma."""
-    hidden = ["dead-zone=5e-3"]
-    source = run(hidden, 5e-5, plan=sweep_plan(run([])))
-    result = with_effect("dead-zone", source)
-    for i in (1, 2, 3):
-        found = result.parameters[f"Dz{i}"]
-        assert abs(found.value - 1.0) < 4.0 * found.sigma < 0.4
-    assert 5e-3 / 1.6 < result.model.effects[0].value < 5e-3 * 1.6  # a grid of steps of half
-    assert result.consistency.consistent and calibrate(source).consistency.p_value < 1e-9
+    """A share of one of the input is not felt; the width of the zone lies between two poses, and its sigma says so."""
+    inside = []
+    for seed, width in enumerate((4.3e-3, 5.0e-3, 5.7e-3, 6.6e-3)):
+        source = run([f"dead-zone={width}"], 5e-5, seed, plan=sweep_plan(run([], seed=seed)))
+        result = with_effect("dead-zone", source)
+        found = values(result)
+        assert list(found) == ["Dz1", "Dz2", "Dz3", "dZone"] and not result.warnings
+        for symbol in ("Dz1", "Dz2", "Dz3"):
+            value, sigma = found[symbol]
+            assert abs(value - 1.0) < 4.0 * sigma < 0.4
+        value, sigma = found["dZone"]
+        assert 0.0 < sigma < 0.2 * width
+        inside.append(abs(value - width) / sigma)
+        assert result.consistency.consistent and calibrate(source).consistency.p_value < 1e-9
+    assert max(inside) < 2.5 and float(np.median(inside)) < 1.5  # uniform between two poses: 1.7 at most
+
+
+def test_a_dead_zone_that_is_not_there_has_no_width() -> None:
+    found = values(with_effect("dead-zone", run([], 5e-5, plan=sweep_plan(run([])))))
+    assert found["dZone"] == (None, None)
 
 
 @pytest.mark.parametrize("name", INVISIBLE)
@@ -301,49 +319,74 @@ def test_intervals_of_each_coefficient_cover_over_300_runs() -> None:
     assert not {key: share for key, share in coverage.items() if not 0.92 <= share <= 0.98}
 
 
+@pytest.fixture(scope="module")
+def navigation() -> tuple[list[DwellFactor], NoiseModel, Floats]:
+    """Dwells at navigation grade, their noise, and the state at which rotations are linearised."""
+    dwells = Pass(run(["second-order=4e-6"], 5e-5), Settings()).fold()
+    return dwells, within_dwells(dwells), fit(dwells, Model.of(BENCH, ("thermal-bias",))).carried.state[:12]
+
+
 @pytest.mark.parametrize("name", ["second-order", "bias-drift", "settling", "hysteresis", "encoder-harmonic-2:z"])
-def test_an_effect_is_added_to_and_taken_out_of_a_running_filter(name: str) -> None:
-    """The filter carries the columns of all candidates; any choice of them at any dwell is a refit from the start.
-
-    To rounding, which is a share of the readings: 1e-8 sigma at navigation grade, less at the noise taken here.
-    """
-    dwells = Pass(run(["second-order=4e-6"], 5e-3), Settings()).fold()
-    small, k = Model.of(BENCH, ("thermal-bias",)), 11
+def test_a_factor_restricted_equals_that_of_fewer_columns(navigation, name: str) -> None:
+    """1e-12 sigma at navigation grade; 4e-9 where readings of size g are not counted from a prediction first."""
+    dwells, noise, state = navigation
+    small = Model.of(BENCH, ("thermal-bias",))
     large = small + effect_named(name, BENCH)
-    noise, state = within_dwells(dwells), fit(dwells, small).carried.state[:12]
 
-    def rows_of(model: Model) -> list[Floats]:
+    def factor_of(model: Model) -> Floats:
         at = np.concatenate([state, np.zeros(model.count - 12)])
-        return information.whitened(dwells, Carried(dwells, model, at).columns, noise, at)
+        rows = information.whitened(dwells, Carried(dwells, model, at).columns, noise, at, at)
+        return information.accumulated(rows)[:-1]
 
-    few, all_ = rows_of(small), rows_of(large)
-    carried = information.accumulated(all_[:k])[:-1]
-    running = chosen(carried, list(range(small.count)))  # the small model so far, from the triangle of all columns
-    same(running, information.accumulated(few[:k])[:-1], small)
-    added = carried
-    for own in all_[k:20]:
-        added = information.update(added, own).factor
-    same(added, information.accumulated(all_[:20])[:-1], large)
-    taken = chosen(added, list(range(small.count)))
-    for own in all_[20:]:
-        taken = information.update(taken, own[:, [*range(small.count), -1]]).factor
-    same(taken, information.accumulated(few)[:-1], small)
-
-
-def chosen(factor: Floats, kept: list[int]) -> Floats:
-    """The factor [R | z] of some of the states, the others held at zero."""
-    upper = np.linalg.qr(factor[:, [*kept, -1]], mode="r")
-    return upper[: len(kept)]
-
-
-def same(factor: Floats, expected: Floats, model: Model) -> None:
-    """Two factors give the same estimate to 1e-9 sigma, and the same covariance."""
-    around = model.nominal_state()
-    (one, covariance, _), (other, reference, _) = (information.solve(each, around) for each in (factor, expected))
+    few, chosen = factor_of(small), information.restricted(factor_of(large), list(range(small.count)))
+    (one, covariance, _), (other, reference, _) = (information.solve(f, np.zeros(small.count)) for f in (chosen, few))
     sigma = np.sqrt(np.diag(reference))
-    seen = sigma > 0
-    assert seen[:12].all() and np.abs((one - other)[seen] / sigma[seen]).max() < 1e-9
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance))[seen], sigma[seen], rtol=1e-9)
+    assert sigma[:12].all() and np.abs(one - other).max() > 0  # made in two ways
+    np.testing.assert_allclose(one / sigma, other / sigma, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(covariance, reference, rtol=1e-9, atol=1e-9 * sigma.min() ** 2)
+
+
+@pytest.mark.parametrize("walk", [0.0, 1e-6])
+@pytest.mark.parametrize("prior", ["diffuse", "navigation"])
+def test_effects_go_in_and_out_of_a_running_filter(navigation, walk: float, prior: str) -> None:
+    """Any choice of effects at any dwell is a refit from the start; the formula was not even carried."""
+    dwells, noise, state = navigation
+    small = Model.of(BENCH, ("thermal-bias",))
+    others = [effect_named(name, BENCH) for name in NAMES if name != "thermal-bias"]
+
+    def refit(count: int, model: Model) -> Running:
+        return Running.over(dwells[:count], model, noise, state, (), PRIORS[prior], Walk(walk))
+
+    running = Running.over(dwells[:11], small, noise, state, others, PRIORS[prior], Walk(walk))
+    same(running, refit(11, small))
+    for dwell in dwells[11:20]:
+        running = running.after(dwell)
+    for name in ("second-order", "settling", "hysteresis", "encoder-harmonic-2:z", "mine = a*a*T"):
+        more = running.with_effect(name)
+        large = small + effect_named(name, BENCH)
+        same(more, refit(20, large))
+        for dwell in dwells[20:23]:
+            more = more.after(dwell)
+        same(more, refit(23, large))
+        same(more.without(str(large.effects[-1])), refit(23, small))
+
+
+def same(running: Running, expected: Running) -> None:
+    """The same model, its estimate to 1e-9 sigma (and the last bit of a scale factor of 1), the same covariance."""
+    (one, covariance, _), (other, reference, _) = running.solved(), expected.solved()
+    sigma = np.sqrt(np.diag(reference))
+    assert str(running.model) == str(expected.model) and (sigma[:12] > 0).all()
+    assert (np.abs(one - other) <= 1e-9 * sigma + np.spacing(1.0)).all()
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), sigma, rtol=1e-9)
+
+
+def test_a_running_filter_refuses_what_it_cannot_do(navigation) -> None:
+    dwells, noise, state = navigation
+    running = Running.over(dwells[:8], Model.of(BENCH, ("bias-drift",)), noise, state)
+    with pytest.raises(InputError, match="bias-drift is in the model already"):
+        running.with_effect("bias-drift")
+    with pytest.raises(InputError, match="hysteresis is not in the model: it has bias-drift"):
+        running.without("hysteresis")
 
 
 class Twin(SensorEffect):

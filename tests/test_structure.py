@@ -22,7 +22,7 @@ LEVELS = [
     ["information", "kalman", "batch"],
     ["scan"],
     ["fitting"],
-    ["advice", "drivers"],
+    ["advice", "drivers", "running", "visibility"],
     ["calibration"],
     ["comparison", "model_file"],
     ["diagnosis"],

@@ -517,3 +517,46 @@ def test_the_angle_in_the_dwell_before() -> None:
     before = effect_named("mine = q2_before", EXAMPLE).columns(stimulus)[:, 0, 0]
     own = effect_named("mine = q2", EXAMPLE).columns(stimulus)[:, 0, 0]
     np.testing.assert_allclose(before[5:], own[:-5])
+
+
+def test_what_a_recording_shows_of_an_effect(run, recording: Path) -> None:
+    """A formula that spells out an effect of the catalogue cannot be told from it; wrong gravity is a scale factor."""
+    words = ["effects", "mine = a*a", "second-order", "gravity-error", "latency", "--recording", recording]
+    code, out, _ = run(*words, "--json")
+    seen = {each["effect"]: each for each in json.loads(out)["effects"]}
+    assert code == 0 and list(seen) == ["mine", "second-order", "gravity-error", "latency"]
+    mine, theirs = seen["mine"], seen["second-order"]
+    assert mine["visible"] and 0.0 < mine["share_left"] <= 1.0
+    assert mine["overlaps"]["second-order"] == pytest.approx(1.0, abs=1e-6)
+    assert mine["smallest"]["size"] == pytest.approx(theirs["smallest"]["size"], rel=1e-6)
+    assert seen["gravity-error"]["visible"] is False and "scale factor" in seen["gravity-error"]["degeneracy"]
+    assert seen["latency"]["visible"] is None and "slews" in seen["latency"]["why"]
+    code, out, _ = run(*words)
+    assert code == 0 and "second-order (1.00)" in out and "no orientation tells the two apart" in out
+
+
+def test_a_users_own_effect_is_reported_on_at_once(run, recording: Path) -> None:
+    warnings = json.loads(run("replay", recording, "--json", "--with", "mine = a*a")[1])["warnings"]
+    note = next(each for each in warnings if each.startswith("mine: visible"))
+    assert "smallest size" in note and "cannot be told from second-order (1.00)" in note
+    warnings = json.loads(run("replay", recording, "--json", "--with", "second-order")[1])["warnings"]
+    assert not any("visible" in each for each in warnings)
+
+
+@pytest.mark.parametrize("command", ["replay", "compare", "diagnose", "effects"])
+@pytest.mark.parametrize(
+    "effect, says", [("mine = a + T", "m/s^2 and K"), ("second-ordr", "did you mean second-order")]
+)
+def test_a_bad_effect_is_refused_before_a_reading_is_read(
+    run, recording: Path, monkeypatch: pytest.MonkeyPatch, command: str, effect: str, says: str
+) -> None:
+    from kf_calib.sources.recording import Recording
+
+    monkeypatch.setattr(Recording, "__iter__", lambda self: pytest.fail("the recording was read"))
+    place = ["--recording", recording] if command == "effects" else [recording]
+    code, out, err = run(command, *place, "--with", effect)
+    assert (code, out) == (2, "") and says in err and err.count("\n") == 1
+
+
+def test_the_rate_of_temperature_needs_no_remark() -> None:
+    assert remarks_of(made("dT")) == ()

@@ -21,7 +21,7 @@ from kf_calib.errors import InputError
 
 __all__ = [
     "Coefficient", "Effect", "FrameEffect", "SensorEffect", "Stimulus", "Unknown", "as_text", "effect_named",
-    "files_of", "load_file", "merged", "names", "refuse_unknown", "register", "remarks_of",
+    "files_of", "load_file", "merged", "names", "of_the_users", "refuse_unknown", "register", "remarks_of",
 ]  # fmt: skip
 
 _PLAIN: dict[str, type[Effect]] = {
@@ -164,9 +164,16 @@ def _register_installed() -> None:
 
 
 def remarks_of(effect: Effect) -> tuple[str, ...]:
-    """What the checks of a user's class had to say of it, short of refusing it."""
+    """What the checks of a user's class or formula had to say of it, short of refusing it."""
+    if isinstance(effect, formula.Formula):
+        return effect.remarks
     known = _registered.get(str(effect))
     return known.remarks if known is not None else ()
+
+
+def of_the_users(effect: Effect) -> bool:
+    """Whether an effect is a formula or a class from outside, not one of the catalogue."""
+    return isinstance(effect, formula.Formula) or str(effect) in _registered
 
 
 def as_text(effect: Effect) -> str:

@@ -229,7 +229,9 @@ def _remarks(effect: Effect, columns: Floats, s: Stimulus) -> tuple[str, ...]:
         for field in dataclasses.fields(s)
         if isinstance(value := getattr(s, field.name), np.ndarray) and len(value) == len(s)
     }
-    fewer = np.asarray(_called(effect, "columns", effect.columns, dataclasses.replace(s, **own)))
+    some = dataclasses.replace(s, **own)
+    vars(some)["warming"] = s.warming[keep]  # a rate is of an instant, though it is made of the readings about it
+    fewer = np.asarray(_called(effect, "columns", effect.columns, some))
     if fewer.shape == columns[keep].shape and np.allclose(
         fewer, columns[keep], rtol=1e-9, atol=1e-12 * np.abs(columns).max(initial=0.0)
     ):

@@ -14,6 +14,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from kf_calib.bench import Bench
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.samples import Floats
 
@@ -55,6 +56,7 @@ class Effect(ABC):
     """A physical effect the readings may contain besides the twelve parameters.
 
     unknown: a constant inside the columns; ``value`` is where it stands, and ``at(value)`` the effect with another.
+    smooth: the columns change smoothly with it; where not it is no state, and is averaged over its likelihood.
     walks: the biases take a random walk (process noise), its intensity is estimated by likelihood.
     dynamic: it shows in slews only, so these are evaluated too.
     oscillates: its columns may be faster than a piece of a dwell, so the dwells are folded on a carrier, and
@@ -67,6 +69,7 @@ class Effect(ABC):
     source: ClassVar[str]
     confused_with: ClassVar[str] = ""
     unknown: ClassVar[Unknown | None] = None
+    smooth: ClassVar[bool] = True
     walks: ClassVar[bool] = False
     dynamic: ClassVar[bool] = False
     oscillates: ClassVar[bool] = False
@@ -101,6 +104,10 @@ class Effect(ABC):
     def reach(self, s: Stimulus) -> float:
         """How far from the truth ln(value) may be for its derivative to lead there: the width of the grid."""
         return 0.4
+
+    def degeneracy(self, bench: Bench) -> str:
+        """What the effect is exactly the same as on that bench, in words; empty where no such thing is known."""
+        return ""
 
     def derivative(self, s: Stimulus, coefficients: Floats) -> Floats:
         """What each accelerometer reads more per unit of ln(value) with these ``coefficients`` (q,): (m, 3, 1).

@@ -158,8 +158,8 @@ class _Reading:
 class Formula(SensorEffect):
     """An effect ``name = expression``; raises InputError, with the formula in it, where it cannot be used.
 
-    text: what gives the same effect again. The unit of the coefficients follows from that of the expression, their
-    scale from what they add on a trial run: about 1e-3 m/s^2.
+    text: what gives the same effect again; remarks: what its checks had to say. The unit of the coefficients follows
+    from that of the expression, their scale from what they add on a trial run: about 1e-3 m/s^2.
     """
 
     source, confused_with = "user's formula", ""
@@ -176,7 +176,7 @@ class Formula(SensorEffect):
         vars(self).update(name=name, title=expression, symbol=symbol_stem(name), unit=unit, shown=shown, scale=1.0)
         self.text = f"{name} = {expression}"
         stimulus = checks.trial(bench)
-        checks.check(self, stimulus)
+        self.remarks = checks.check(self, stimulus)
         vars(self).update(scale=_LARGE_MPS2 / self._values.typical(stimulus))
 
     def terms(self, s: Stimulus) -> Floats:
@@ -206,7 +206,7 @@ class FrameFormula(FrameEffect):
             raise InputError(f"{name}: an angle is one for the whole block: use fx, fy, fz in place of a, p, o and da.")
         symbols = [f"{symbol_stem(name)}{axis}" for axis in ("NE" if place == BASE else [f"_{place}"])]
         self._coefficients = tuple(Coefficient(symbol, unit, 1.0, *shown) for symbol in symbols)
-        checks.check(self, stimulus)
+        self.remarks = checks.check(self, stimulus)
         scale = _LARGE_RAD / self._values.typical(stimulus)
         self._coefficients = tuple(replace(each, scale=scale) for each in self._coefficients)
 

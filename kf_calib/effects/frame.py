@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from kf_calib.bench import Bench
 from kf_calib.effects.effect import Coefficient, Effect, FrameEffect, G
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
@@ -25,6 +26,9 @@ class BaseTilt(FrameEffect):
     def rotations(self, s: Stimulus) -> Floats:
         return -np.stack([s.to_platform(axis) for axis in s.level_axes], axis=1)
 
+    def degeneracy(self, bench: Bench) -> str:
+        return "about the outer gimbal axis, a tilt of the base is exactly the zero of the outer encoder"
+
 
 class BaseTiltDrift(BaseTilt):
     """The same, growing with t."""
@@ -38,6 +42,9 @@ class BaseTiltDrift(BaseTilt):
 
     def rotations(self, s: Stimulus) -> Floats:
         return super().rotations(s) * s.elapsed_s[:, None, None]
+
+    def degeneracy(self, bench: Bench) -> str:
+        return ""
 
 
 class PlatformDrift(FrameEffect):
@@ -101,6 +108,9 @@ class CrossTalk(Effect):
             out[:, i, k] = readings[:, j]
         return out
 
+    def degeneracy(self, bench: Bench) -> str:
+        return "at rest, cross-talk is exactly a misalignment: no orientation tells the two apart"
+
 
 def about_axis(s: Stimulus, gimbal: int) -> Floats:
     """What a positive error of a gimbal's angle turns the specific force by, rad/rad, (m, 3)."""
@@ -132,6 +142,11 @@ class EncoderOffset(_GimbalEffect):
 
     def rotations(self, s: Stimulus) -> Floats:
         return self._about_axis(s)[:, None, :]
+
+    def degeneracy(self, bench: Bench) -> str:
+        if self.gimbal == len(bench.axes) - 1:
+            return "the zero of the innermost encoder is exactly a misalignment: no orientation tells the two apart"
+        return "the zero of the outer encoder is exactly a tilt of the base about its axis" if self.gimbal == 0 else ""
 
 
 class EncoderScale(_GimbalEffect):
@@ -199,6 +214,9 @@ class GravityError(Effect):
 
     def columns(self, s: Stimulus) -> Floats:
         return (s.force_mps2 @ s.sensitivity.T)[:, :, None]
+
+    def degeneracy(self, bench: Bench) -> str:
+        return "a wrong gravity is exactly a scale factor common to all channels: no orientation tells the two apart"
 
 
 def gimbal_number(variant: str, letters: str) -> int:

@@ -126,6 +126,7 @@ class DeadZone(SensorEffect):
     confused_with = "needs poses that sweep through zero"
     symbol, unit, scale, shown = "Dz", "1", 1.0, ("of the input", 1.0)
     unknown = Unknown("dZone", "m/s^2", 1e-6, 1e-2, "µg", 1e6 / G)
+    smooth = False
 
     def __init__(self) -> None:
         self.value = 1e-4

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from kf_calib.effects import Effect, as_text, remarks_of
 from kf_calib.views.console import effect_rows, symbol
+from kf_calib.visibility import Sight
 
 
 def overview(effects: Sequence[Effect]) -> RenderableType:
@@ -65,6 +66,52 @@ def formula_of(effect: Effect) -> str:
         return f"{effect.coefficients[0].symbol[:-1]}i * ({text.partition('=')[2].strip()})"
     own = inspect.cleandoc(type(effect).__doc__ or "not said")
     return " ".join(own.split("\n\n")[0].split()).rstrip(".")
+
+
+def sight_report(sights: Sequence[Sight], about: str) -> RenderableType:
+    """What ``effects --recording`` prints: each effect in a line, then what cannot be put into a cell."""
+    table = Table(title=about, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    for heading in ("effect", "visible", "left of it", "smallest size", "confused with (overlap)"):
+        right = heading == "left of it"
+        table.add_column(heading, justify="right" if right else "left", no_wrap=heading == "effect" or right)
+    for sight in sights:
+        table.add_row(*_sight_cells(sight))
+    notes = [f"{sight.effect}: {words}." for sight in sights for words in (sight.why, sight.degeneracy) if words]
+    notes += [f"{sight.effect}: not determined: {' '.join(sight.unseen)}." for sight in sights if sight.unseen]
+    explained = "Smallest sizes would be found in 9 of 10 such runs. Overlap 1: this run cannot tell the two apart."
+    return Group(table, Text(explained), *map(Text, notes))
+
+
+def _sight_cells(sight: Sight) -> list[str]:
+    visible = {True: "yes", False: "no", None: "-"}[sight.visible]
+    cells = [str(sight.effect), visible, "" if sight.share is None else f"{sight.share:.2g}"]
+    if sight.smallest is None:
+        cells.append("")
+    else:
+        own, size = sight.smallest
+        cells.append(f"{size * own.per_si:.3g} {own.shown_unit}{sight.at}")
+    return [*cells, ", ".join(f"{name} ({overlap:.2f})" for name, overlap in sight.rivals)]
+
+
+def sights_object(sights: Sequence[Sight], model: Sequence[str]) -> dict[str, Any]:
+    """What ``effects --recording --json`` prints: beside what is known of each effect, how this run shows it."""
+    return {"model": list(model), "effects": [{**_object(each.effect), **_seen_object(each)} for each in sights]}
+
+
+def _seen_object(sight: Sight) -> dict[str, Any]:
+    smallest = None
+    if sight.smallest is not None:
+        own, size = sight.smallest
+        smallest = {"symbol": own.symbol, "size": size, "unit": own.unit, "at": sight.at_value}
+    return {
+        "visible": sight.visible,
+        "share_left": sight.share,
+        "not_determined": list(sight.unseen),
+        "smallest": smallest,
+        "overlaps": dict(sight.rivals),
+        "degeneracy": sight.degeneracy,
+        "why": sight.why,
+    }
 
 
 def effects_object(effects: Sequence[Effect]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from kf_calib import paper
 from kf_calib.calibration import Calibration, Parameter, format_p, orientations
 from kf_calib.comparison import Comparison
 from kf_calib.effects import Effect, as_text
+from kf_calib.fitting import WALK
 from kf_calib.model import Model
 
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
@@ -65,8 +66,10 @@ def effect_table(result: Calibration) -> Table:
     for heading in ("effect", "coefficient", "value", "sigma", "unit", "value / sigma"):
         table.add_column(heading, justify="left" if heading in ("effect", "coefficient", "unit") else "right")
     for effect in result.model.effects:
-        for k, coefficient in enumerate(effect.coefficients):
-            parameter, name = result.parameters[coefficient.symbol], as_text(effect) if k == 0 else ""
+        symbols = [each.symbol for each in (*effect.coefficients, effect.unknown) if each is not None]
+        symbols += [WALK.symbol] if effect.walks else []
+        for k, own in enumerate(symbols):
+            parameter, name = result.parameters[own], as_text(effect) if k == 0 else ""
             if parameter.value is None or parameter.sigma is None:
                 table.add_row(name, symbol(parameter.symbol), "not seen")
                 continue

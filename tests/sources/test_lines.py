@@ -267,9 +267,7 @@ def test_garbage_raises_nothing_but_input_errors(garbage, before):
         assert not before, error
 
 
-@pytest.mark.parametrize(
-    "text", [b"\x00" * (32 << 20), b"{" * (32 << 20), b"\xff\xfe\n" * 100_000, b"\n" * (1 << 20)]
-)
+@pytest.mark.parametrize("text", [b"\x00" * (32 << 20), b"{" * (32 << 20), b"\xff\xfe\n" * 100_000, b"\n" * (1 << 20)])
 def test_hostile_input_ends_soon_and_in_little_memory(text):
     tracemalloc.start()
     start = time.perf_counter()

@@ -1,0 +1,130 @@
+"""A filter in the course of a run that takes effects in and out without a restart.
+
+Its factor [R | z] carries the columns of more effects than its model has. The estimate of any choice of them is one
+small QR (``information.restricted``), and equals that of a filter that had run with this choice from the start. A dwell
+that closes is one update of the factor; effects whose columns were not carried are folded in from the dwell factors.
+
+    running = Running.over(dwells, model, noise, state, candidates)
+    running = running.after(dwell)               # as each dwell closes
+    running = running.with_effect("mine = a*T")  # in or out, at any time
+    state, covariance, undetermined = running.solved()
+
+Noise and linearisation are those given; a constant inside an effect's columns stays at its value, and what shows in
+slews only is not here. ``calibrate`` iterates all of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib import information
+from kf_calib.effects import Effect, effect_named
+from kf_calib.errors import InputError
+from kf_calib.fitting import Walk
+from kf_calib.folding import Carried, DwellFactor
+from kf_calib.model import STATE_COUNT, Model, Prior
+from kf_calib.noise import Noise
+from kf_calib.samples import Floats
+
+
+@dataclass(frozen=True)
+class Running:
+    """carried: the dwells so far, with the columns of the model and of all candidates; inside: names of those effects
+    that are in the model; factor (P, P + 1): of all columns, its states counted from ``about``."""
+
+    carried: Carried
+    inside: tuple[str, ...]
+    noise: Noise
+    prior: Prior
+    walk: Walk
+    factor: Floats
+
+    @classmethod
+    def over(
+        cls,
+        dwells: Sequence[DwellFactor],
+        model: Model,
+        noise: Noise,
+        state: Floats,
+        candidates: Iterable[Effect] = (),
+        prior: Prior | None = None,
+        walk: Walk | None = None,
+    ) -> Running:
+        """The filter after ``dwells`` (one or more), linearised at the affine ``state`` (12,)."""
+        every = model
+        for effect in candidates:
+            every += effect
+        at = np.concatenate([state[:STATE_COUNT], np.zeros(every.count - STATE_COUNT)])
+        inside = tuple(str(effect) for effect in model.effects)
+        empty = np.zeros((every.count, every.count + 1))
+        return cls(Carried(dwells, every, at), inside, noise, prior or Prior(), walk or Walk(), empty)._folded()
+
+    @property
+    def dwells(self) -> list[DwellFactor]:
+        return self.carried.dwells
+
+    @property
+    def about(self) -> Floats:
+        """The state (P,) that the factor's states are counted from."""
+        return self.carried.state
+
+    @cached_property
+    def model(self) -> Model:
+        """The model as it stands: the twelve parameters and the effects inside, in the order they came."""
+        known = {str(effect): effect for effect in self.carried.model.effects}
+        return Model(self.carried.model.bench, tuple(known[name] for name in self.inside))
+
+    def after(self, dwell: DwellFactor) -> Running:
+        """The filter after one more dwell: one update, unless it changes what earlier dwells are known to have felt."""
+        carried = Carried([*self.dwells, dwell], self.carried.model, self.about)
+        more = replace(self, carried=carried)
+        if not all(map(np.array_equal, self.carried.columns, carried.columns[:-1])):
+            return more._folded()
+        known = information.predict(self.factor, self.walk.variances(carried.dwells)[-1])
+        return replace(more, factor=information.update(known, more._rows([-1])[0]).factor)
+
+    def with_effect(self, text: str) -> Running:
+        """With that effect (a name or a formula) in the model; raises InputError where it cannot be added."""
+        effect = effect_named(text, self.carried.model.bench)
+        _ = self.model + effect  # refuses what the model has
+        inside = (*self.inside, str(effect))
+        if str(effect) in self.carried.model.parts:
+            return replace(self, inside=inside)
+        every = self.carried.model + effect
+        at = np.concatenate([self.about, np.zeros(every.count - len(self.about))])
+        return replace(self, inside=inside, carried=Carried(self.dwells, every, at))._folded()
+
+    def without(self, name: str) -> Running:
+        """With that effect out of the model; its columns are still carried."""
+        if name not in self.inside:
+            raise InputError(f"{name} is not in the model: it has {', '.join(self.inside) or 'no effects'}.")
+        return replace(self, inside=tuple(each for each in self.inside if each != name))
+
+    def solved(self) -> tuple[Floats, Floats, Floats]:
+        """State (p,) of the model, covariance (p, p), and a basis (p, q) of the combinations not determined."""
+        parts = self.carried.model.parts
+        kept = [*range(STATE_COUNT), *(k for name in self.inside for k in range(*parts[name].indices(len(self.about))))]
+        around = self.model.nominal_state() - self.about[kept]
+        moved, covariance, undetermined = information.solve(information.restricted(self.factor, kept), around)
+        return self.about[kept] + moved, covariance, undetermined
+
+    def _folded(self) -> Running:
+        """The same with its factor made anew from the dwells."""
+        factor = information.start(self.prior, self.carried.model)
+        factor[:, -1] -= factor[:, :-1] @ self.about
+        variances = self.walk.variances(self.dwells)
+        if not variances.any():
+            return replace(self, factor=information.update(factor, np.concatenate(self._rows())).factor)
+        for own, variance in zip(self._rows(), variances, strict=True):
+            factor = information.update(information.predict(factor, variance), own).factor
+        return replace(self, factor=factor)
+
+    def _rows(self, chosen: Sequence[int] | None = None) -> list[Floats]:
+        """Whitened rows of all dwells, or of those chosen."""
+        chosen = range(len(self.dwells)) if chosen is None else chosen
+        dwells, columns = [self.dwells[k] for k in chosen], [self.carried.columns[k] for k in chosen]
+        return information.whitened(dwells, columns, self.noise.weights, self.about, self.about)
