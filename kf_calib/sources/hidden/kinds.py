@@ -77,7 +77,8 @@ class Kind:
     unit: of a coefficient. coefficients: their names, one for each size. navigation, mems: typical sizes, from ... to,
     in units of data sheets. make: (coefficients, rig, gimbal axis where ``per_axis``, inner constants) -> step.
     signed: false where a coefficient cannot be negative. known: it is in the catalogue of the diagnosis. accompanied:
-    something comes with the effect whatever its size, and does not count to its size in sigma.
+    something comes with the effect whatever its size, and does not count to its size in sigma. driver: of an effect
+    outside the catalogue, the quantity it goes with.
     """
 
     name: str
@@ -94,6 +95,7 @@ class Kind:
     per_axis: bool = False
     known: bool = True
     accompanied: bool = False
+    driver: str = ""
 
     def typical(self, grade: str) -> tuple[float, float]:
         """Typical sizes, least and greatest, in SI; the paper's sensors are of navigation grade."""
@@ -124,6 +126,7 @@ class Hidden:
         return {
             "name": self.name,
             "in_catalogue": self.kind.known,
+            "driver": self.kind.driver,
             "unit": self.kind.unit,
             "sizes": dict(zip(self.kind.coefficients, self.sizes, strict=True)),
             "inner": {name: {"value": value, "unit": INNER[name].unit} for name, value in self._inner.items()},
@@ -174,6 +177,7 @@ def made(
     per_axis: bool = False,
     known: bool = True,
     accompanied: bool = False,
+    driver: str = "",
 ) -> Callable[[Callable[..., Step]], Callable[..., Step]]:
     """Registers a maker of steps. Its docstring is "Title: physics (source)."; its keyword-only arguments are the inner
     constants with their usual values."""
@@ -185,7 +189,8 @@ def made(
         inner = {item.name: float(item.default) for item in parameters if item.kind is item.KEYWORD_ONLY}
         typical = navigation, mems or navigation
         _KINDS[name] = Kind(
-            name, unit, stage, coefficients, *typical, make, inner, title, physics, signed, per_axis, known, accompanied
+            name, unit, stage, coefficients, *typical, make, inner, title, physics, signed, per_axis, known,
+            accompanied, driver,
         )  # fmt: skip
         return make
 
@@ -193,7 +198,13 @@ def made(
 
 
 def added(
-    name: str, unit: str, navigation: tuple[str, str], mems: tuple[str, str] | None = None, *, known: bool = True
+    name: str,
+    unit: str,
+    navigation: tuple[str, str],
+    mems: tuple[str, str] | None = None,
+    *,
+    known: bool = True,
+    driver: str = "",
 ) -> Callable[[Callable[..., Floats]], Callable[..., Floats]]:
     """Registers what adds to each reading, a function of three coefficients, the state and inner constants."""
 
@@ -203,7 +214,7 @@ def added(
 
         make.__doc__ = contribution.__doc__
         make.__signature__ = inspect.signature(contribution)  # shows the inner constants
-        made(name, unit, navigation, mems, known=known)(make)
+        made(name, unit, navigation, mems, known=known, driver=driver)(make)
         return contribution
 
     return register
