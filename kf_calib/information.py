@@ -27,7 +27,7 @@ def whitened(
     state: Floats,
     about: Floats | None = None,
 ) -> list[Floats]:
-    """Rows [H | z] of unit noise (p, p + 1) of each dwell, its nuisance states eliminated by QR.
+    """Rows [H | z] of unit noise (r, p + 1) of each dwell, its nuisance states eliminated by QR.
 
     ``columns``: the model's, at the nodes of each dwell. Channel i's rows are divided by the sigma of a white reading
     that averages like the true one; the setting error (three rotations) and the scatter (three offsets) enter as states
@@ -68,15 +68,13 @@ def _units(columns: Sequence[Floats]) -> Floats:
 
 
 def _informative(rows: Floats, units: Floats) -> Floats:
-    """As few rows [H | z] (p, p + 1, padded with zeros) as H has rank: what the rows leave over is split off.
+    """As few rows [H | z] as H has rank: what the rows leave over is split off.
 
     A still dwell has rank 3. By SVD: QR would spread the residuals over rows that columns of rounding size lead.
     """
     left, singular, _ = np.linalg.svd(rows[:, :-1] / units, full_matrices=False)
     rank = int((singular > 1e-9 * singular[0]).sum())
-    out = np.zeros((len(units), len(units) + 1))
-    out[:rank] = left[:, :rank].T @ rows
-    return out
+    return left[:, :rank].T @ rows
 
 
 @dataclass(frozen=True)
@@ -141,7 +139,7 @@ def restricted(factor: Floats, kept: Sequence[int]) -> Floats:
 
 
 def row_rank(rows: Floats) -> int:
-    """How many rows [H | z] of a dwell carry something of the model; the others are zeros."""
+    """How many rows [H | z] of a dwell carry something of the model."""
     return int(rows[:, :-1].any(axis=1).sum())
 
 
