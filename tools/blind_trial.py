@@ -37,7 +37,7 @@ import numpy as np
 
 from kf_calib.errors import KfCalibError
 from kf_calib.scan import Candidate
-from kf_calib.sources.hidden import Kind, catalogue
+from kf_calib.sources.hidden import Kind, NoSizeError, catalogue
 
 # Few readings, and time enough for drifts and time constants to show: half an hour in about a second of computing.
 BENCH = (
@@ -181,8 +181,10 @@ def played(task: Task) -> Outcome:
             with contextlib.chdir(folder):
                 _make_plan(task)
                 return PLAYS[task.play](task)
-        except KfCalibError as error:
+        except NoSizeError as error:
             return Outcome(task, error=str(error))
+        except KfCalibError as error:  # a recording that the program refuses to judge is a failure of it
+            return Outcome(task, error=str(error), extra={"refused": True})
 
 
 def _make_plan(task: Task) -> None:
@@ -660,7 +662,7 @@ def failed(each: Outcome) -> bool:
     """Not what was hoped for: to be looked at."""
     family, close = each.task.family, each.extra.get("overlap", 0.0) >= _APART
     if each.error:
-        return False
+        return "refused" in each.extra
     if family in ("noise", "plans") and not each.truth:
         return each.consistent is False
     return {
@@ -753,7 +755,7 @@ def save_failures(outcomes: Sequence[Outcome], path: Path) -> None:
         lines += [
             f"[{each.task.figure}] hidden {' + '.join(each.truth) or 'nothing'}; first {each.first}; "
             f"all {list(each.names)}; set {list(each.ambiguity)}; p {each.p_value}; wrong {each.wrong}; {told}",
-            f"    {each.extra.get('verdict', '')}",
+            f"    {each.error or each.extra.get('verdict', '')}",
             f"    {each.task.command}",
         ]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
