@@ -482,9 +482,8 @@ def consistency(fitted: Fit) -> Consistency:
     """Whether the dwells agree with the fitted model within the noise it is judged by."""
     from scipy.special import fdtrc
 
-    noise, dwells = fitted.noise, fitted.dwells
-    rows = fitted.rows(noise.judging)
-    upper = information.accumulated(rows, fitted.walk_variances)
+    noise, dwells, (rows, walk_variances) = fitted.noise, fitted.dwells, fitted.judged
+    upper = information.accumulated(rows, walk_variances)
     statistic = float(upper[-1, -1] ** 2)
     dof = sum(information.row_rank(own) for own in rows) - information.rank(upper[:-1])
     dof -= int(not noise.setting_stated and noise.setting_rad > 0)

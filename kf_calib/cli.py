@@ -590,13 +590,14 @@ def _simulation(options: Mapping[str, Any]) -> Simulation:
     grade = GRADES[options["grade"]]
     names = {field.name for field in fields(grade.noise)}
     noise = replace(grade.noise, **{key: options[key] for key in names if options.get(key) is not None})
+    axes = parse_axes(keys["axes"])
+    visits = _visits(options, axes)
     if not options["unstated"]:
         keys.setdefault("angle_sigma_deg", repr(noise.setting_sigma_deg))
-        keys.setdefault("scatter_sigma_mps2", repr(float((noise.scatter_mps2**2 + noise.flicker_mps2**2) ** 0.5)))
-    axes = parse_axes(keys["axes"])
+        keys.setdefault("scatter_sigma_mps2", repr(noise.dwell_sigma_mps2(len(visits))))
     ambient = Ambient(**{field.name: options[field.name] for field in fields(Ambient) if field.name in options})
     run = Simulation(
-        Bench.from_metadata(keys), grade.sensors(options["seed"]), noise, _visits(options, axes),
+        Bench.from_metadata(keys), grade.sensors(options["seed"]), noise, visits,
         sample_hz=options["sample_hz"], angle_hz=options["angle_hz"], slew_rate_degps=options["slew_degps"],
         ambient=ambient, seed=options["seed"], grade=options["grade"],
     )  # fmt: skip

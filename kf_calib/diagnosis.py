@@ -123,9 +123,9 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
                 scores[name], p_values[name] = score, run_level(float(own[k]), tests)
     walk = _walk_test(fitted)
     if walk is not None:
-        name, ratio = walk[0], walk[2]
-        scores[name] = ratio - _threshold(1, tests)
-        p_values[name] = run_level(0.5 * float(chdtrc(1, ratio)), tests)
+        name, _, fall, ratio = walk
+        p_values[name] = run_level(0.5 * float(chdtrc(1, max(ratio, 0.0))), tests)
+        scores[name] = (fall if ratio > _threshold(1, tests) else ratio) - _threshold(1, tests)
     model, misfit_p = fitted.carried.model, consistency(fitted).p_value
     seen_lines = () if model.oscillates else lines((dwell.spectrum for dwell in fitted.dwells), LEVEL * _LINES)
     for name in names(model.bench):
@@ -172,19 +172,17 @@ def _smallest_p(found: Scan, seen: NDArray[np.intp], seed: int) -> Floats:
     return chdtrc(np.array([basis.shape[1] for basis in bases], float), squares).min(axis=1)
 
 
-def _walk_test(fitted: Fit) -> tuple[str, Walk, float] | None:
-    """The effect that lets the biases walk, its likeliest intensity, and twice its gain in log-likelihood.
-
-    The gain over a mere scatter from dwell to dwell, which any unexplained misfit looks like.
-    """
+def _walk_test(fitted: Fit) -> tuple[str, Walk, float, float] | None:
+    """The effect that lets the biases walk, its likeliest intensity, twice its gain in log-likelihood, and how much of
+    that a mere scatter from dwell to dwell has not, which any unexplained misfit looks like."""
     model = fitted.carried.model
     kinds = [effect_named(name, model.bench) for name in names(model.bench) if ":" not in name]
     walking = [effect for effect in kinds if effect.walks]
     if model.walks or not walking or len(fitted.dwells) < 8 or fitted.walk.intensity:
         return None
-    noise = fitted.noise.judging
-    walk, gain = likely_walk(replace(fitted, noise=replace(noise, scatter_stated=True)))
-    return str(walking[0]), walk, 2.0 * (gain - scatter_gain(noise, fitted.carried.means, fitted.carried.state))
+    walk, gain = likely_walk(fitted)
+    over_scatter = gain - scatter_gain(fitted.noise.judging, fitted.carried.means, fitted.carried.state)
+    return str(walking[0]), walk, 2.0 * gain, 2.0 * over_scatter
 
 
 @dataclass(frozen=True)

@@ -66,6 +66,15 @@ class Fit:
         return self.walk.variances(self.dwells)
 
     @cached_property
+    def judged(self) -> tuple[list[Floats], Floats]:
+        """Rows [H | W | z] by which the misfit is judged, and the variances of the biases' steps before each block."""
+        carried = self.carried
+        rows, _ = information.judged(
+            self.dwells, carried.columns, self.noise.judging, carried.state, carried.model.count
+        )
+        return rows, np.vstack([np.zeros((len(rows) - len(self.dwells), 3)), self.walk_variances])
+
+    @cached_property
     def following(self) -> list[Floats]:
         """Whitened rows [H | z] of what slew follows each dwell; (0, p + 1) where none does."""
         carried, noise = self.carried, self.noise.weights.of(moving=True)
@@ -247,9 +256,8 @@ def likely_walk(fitted: Fit) -> tuple[Walk, float]:
     """
     from scipy.optimize import minimize_scalar
 
-    noise = fitted.noise if fitted.noise.scatter_stated else replace(fitted.noise, scatter_mps2=np.zeros(3))
-    rows = fitted.rows(noise.weights)
-    gaps = _gaps_s(fitted.dwells)
+    noise, (rows, _) = fitted.noise.judging, fitted.judged
+    gaps = np.append(np.zeros(len(rows) - len(fitted.dwells)), _gaps_s(fitted.dwells))
     level = math.log(float(np.mean(noise.effective_sigma_mps2)) / math.sqrt(max(float(gaps.mean()), 1e-9)))
 
     def cost(log_intensity: float) -> float:

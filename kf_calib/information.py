@@ -15,9 +15,11 @@ import numpy as np
 from kf_calib import paper
 from kf_calib.folding import DwellFactor
 from kf_calib.model import STATE_COUNT, Model, Prior, dwell_map, on_basis, parabola
-from kf_calib.noise import Noise
+from kf_calib.noise import FLOOR_MPS2, Noise, flicker_sigma, wander
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
+
+_SLOW = np.arange(1, 5)
 
 
 def whitened(
@@ -26,6 +28,7 @@ def whitened(
     noise: Noise,
     state: Floats,
     about: Floats | None = None,
+    flicker_mps2: Floats | None = None,
 ) -> list[Floats]:
     """Rows [H | z] of unit noise (r, p + 1) of each dwell, its nuisance states eliminated by QR.
 
@@ -34,10 +37,15 @@ def whitened(
     with their priors, linearised at ``state``. What a dwell's rows leave over among themselves is not in the result.
     ``about`` (p,): z is the readings less what the model reads there, and states solved for count from it. A reading of
     size g is 1e6 sigma and more: its rounding is then no longer the largest error of whatever follows.
+    ``flicker_mps2`` (3,): sqrt(h) of 1/f noise of density h / f, whose slow parts within a dwell are states, too.
     """
     sigma, sigmas = noise.effective_sigma_mps2, noise.dwell_sigmas
     used, units = np.flatnonzero(sigmas > 0), _units(columns)
-    nuisances, count = dwell_map(state)[:, :, used], len(used)
+    nuisances, slow = dwell_map(state)[:, :, used], 0 if flicker_mps2 is None else len(_SLOW)
+    offsets, priors = len(used), sigmas[used]
+    if flicker_mps2 is not None:
+        priors = np.append(priors, np.outer(np.maximum(flicker_mps2, FLOOR_MPS2), 1.0 / np.sqrt(_SLOW)))
+    count = len(priors)
     out = list[Floats]()
     for dwell, own in zip(dwells, columns, strict=True):
         triangles = np.array([piece.triangle for piece in dwell.pieces])
@@ -48,16 +56,44 @@ def whitened(
         rows = np.zeros((3 * size + count, count + width + 1))
         for i in range(3):
             part = rows[i * size : (i + 1) * size]
-            part[:, :count] = (regressors @ nuisances[i]).reshape(size, count) / sigma[i]
+            part[:, :offsets] = (regressors @ nuisances[i]).reshape(size, offsets) / sigma[i]
+            if slow:
+                first = offsets + slow * i
+                part[:, first : first + slow] = (carried @ on_basis(_waves(dwell))).reshape(size, slow) / sigma[i]
             part[:, count:-1] = (carried @ on_basis(own[:, :, i])).reshape(size, width) / sigma[i]
             readings = triangles[:, : dwell.width, dwell.width + i]
             if about is not None:
                 readings = readings - (carried @ on_basis((own[:, :, i] @ about)[:, :, None]))[:, :, 0]
             part[:, -1] = readings.reshape(size) / sigma[i]
-        rows[3 * size :, :count] = np.diag(1.0 / sigmas[used])
+        rows[3 * size :, :count] = np.diag(1.0 / priors)
         folded = triangle(rows)
         out.append(_informative(folded[count:, count:], units))
     return out
+
+
+def judged(
+    dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats, width: int
+) -> tuple[list[Floats], int]:
+    """Rows [H | W | G | z] by which a misfit is judged, and how many columns come before G (of the first ``width``: H).
+
+    W: what a stated scatter may have in common in dwells that follow each other (``noise.wander``); its coefficients
+    have a prior, the rows of which come first. Within dwells it may go on as 1/f noise does.
+    """
+    slow, sigma = wander(dwells, noise)
+    if not sigma.size:
+        return whitened(dwells, columns, noise, state), width
+    flicker = flicker_sigma(noise, len(dwells))
+    count, places = columns[0].shape[3] + len(sigma) + 1, width + np.arange(len(sigma))
+    prior = np.zeros((len(sigma), count))
+    prior[np.arange(len(sigma)), places] = 1.0 / sigma
+    both = [np.insert(own, [width] * len(sigma), more, axis=3) for own, more in zip(columns, slow, strict=True)]
+    return [prior, *whitened(dwells, both, noise, state, flicker_mps2=flicker)], width + len(sigma)
+
+
+def _waves(dwell: DwellFactor) -> Floats:
+    """sqrt(2) cos(pi k t / T) over a dwell of length T, (pieces, nodes, k)."""
+    at = np.array([piece.nodes.elapsed_s for piece in dwell.pieces]) - dwell.start_s
+    return np.sqrt(2.0) * np.cos(np.pi * _SLOW * (at / max(dwell.end_s - dwell.start_s, 1e-9))[..., None])
 
 
 def _units(columns: Sequence[Floats]) -> Floats:

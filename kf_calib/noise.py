@@ -21,6 +21,7 @@ FLOOR_MPS2 = 1e-9
 """Readings that are exactly constant get this sigma: the rounding of a double is 1e-15 m/s^2."""
 
 _MAX_ORDER = 20
+_WANDER = 6
 _SIGNIFICANT = 5.41  # 1 % point of the likelihood ratio of a variance against zero: half of chi2 with 1 dof
 
 
@@ -191,6 +192,33 @@ def _most_likely(stated: Noise, parts: tuple[str, ...], means: Means, state: Flo
     begin = _spread(means, parts)
     found = minimize(cost, begin, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4, "maxiter": 600})
     return _unpack(stated, found.x, parts), -float(found.fun) - 0.5 * _SIGNIFICANT * len(begin)
+
+
+def wander(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floats], Floats]:
+    """The slow part of a stated scatter: columns at the nodes of each dwell (pieces, nodes, 3, q), constant in it, and
+    the sigma (q,) of their coefficients.
+
+    What a bench states as scatter from dwell to dwell may be flicker: as large, but alike in dwells that follow each
+    other, which looks like a drift. Of 1/f noise of density h / f, dwell means vary by s^2 = h ln D about the mean of D
+    dwells, and its part sqrt(2) cos(pi k t / T) of a run of length T has the variance h / k.
+    """
+    channels = np.flatnonzero(noise.scatter_mps2 > 0)
+    if len(dwells) < 4 or not channels.size:
+        return [np.zeros((len(dwell.pieces), 3, 3, 0)) for dwell in dwells], np.zeros(0)
+    start, span = dwells[0].start_s, dwells[-1].end_s - dwells[0].start_s
+    orders, out = np.arange(1, _WANDER + 1), list[Floats]()
+    for dwell in dwells:
+        own = np.zeros((len(dwell.pieces), 3, 3, len(channels), _WANDER))
+        at = (0.5 * (dwell.start_s + dwell.end_s) - start) / span
+        own[:, :, channels, np.arange(len(channels))] = np.sqrt(2.0) * np.cos(np.pi * orders * at)
+        out.append(own.reshape(len(dwell.pieces), 3, 3, -1))
+    sigma = flicker_sigma(noise, len(dwells))[channels, None] / np.sqrt(orders)
+    return out, sigma.ravel()
+
+
+def flicker_sigma(noise: Noise, dwells: int) -> Floats:
+    """sqrt(h) (3,) of a scatter stated for so many dwells, were it flicker."""
+    return noise.scatter_mps2 / np.sqrt(np.log(max(dwells, 2)))
 
 
 def scatter_gain(noise: Noise, means: Means, state: Floats) -> float:

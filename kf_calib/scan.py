@@ -77,9 +77,11 @@ def scan(carried: Carried, noise: Noise, effects: Sequence[Effect], walk_varianc
     """Project ``effects`` off the model carried; ``walk_variances`` (D, 3): of the biases' steps before each dwell."""
     added = candidate_columns(carried.dwells, effects, carried.model.bench, carried.state)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
-    rows = information.whitened(carried.dwells, columns, noise, carried.state)
+    rows, width = information.judged(carried.dwells, columns, noise, carried.state, carried.model.count)
+    if walk_variances is not None and len(rows) > len(walk_variances):
+        walk_variances = np.vstack([np.zeros((1, 3)), walk_variances])
     counts = [len(effect.coefficients) for effect in effects]
-    return projected(information.accumulated(rows, walk_variances), carried.model.count, effects, counts)
+    return projected(information.accumulated(rows, walk_variances), width, effects, counts)
 
 
 def projected(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:

@@ -58,6 +58,11 @@ class Noise:
         if self.ar1_phi >= 1.0 or self.outlier_rate > 1.0:
             raise InputError("ar1_phi must be below 1 and outlier_rate at most 1: give them so.")
 
+    def dwell_sigma_mps2(self, dwells: int) -> float:
+        """By how much the means of so many dwells scatter, however long they are: of flicker, by h ln(dwells)."""
+        flicker = self.flicker_mps2**2 * max(math.log(dwells) / (2.0 * math.log(2.0)), 1.0)
+        return math.sqrt(self.scatter_mps2**2 + flicker)
+
     def processes(self, seed: int, period_s: float, duration_s: float) -> list[Process]:
         """The processes to be added to readings every ``period_s`` over ``duration_s``, fresh from their start."""
         found = list[Process]()

@@ -11,7 +11,7 @@ Every reading counts that an evaluation uses: not the first second after an arri
 the last quarter before a departure (at most a tenth). V = kappa sigma^2 1 + (1 1^T) x D within a dwell of N readings:
 white noise, for AR(1) times kappa = (1 + phi) / (1 - phi), and offsets of the whole dwell,
 
-    D = (scatter^2 + flicker^2) 1 + setting^2 S (g^2 1 - f f^T) S^T,
+    D = (scatter^2 + flicker^2 ln(dwells) / (2 ln 2)) 1 + setting^2 S (g^2 1 - f f^T) S^T,
 
 S the rows of sensitivities, f the specific force. So the mean of a dwell, of covariance D + kappa sigma^2 / N, and what
 departs from it, of covariance kappa sigma^2, are independent: sums over each dwell suffice, and memory stays flat.
@@ -178,7 +178,7 @@ def _departures(dwell: _Moments, sigma: float) -> tuple[Floats, Floats]:
 def _mean(dwell: _Moments, sigma: float, simulation: Simulation) -> tuple[Floats, Floats]:
     """Rows of the mean of a dwell, (3, 12) and (3, k)."""
     noise, sensors = simulation.noise, simulation.sensors
-    offset = noise.scatter_mps2**2 + noise.flicker_mps2**2
+    offset = noise.dwell_sigma_mps2(len(simulation.plan)) ** 2
     felt = dwell.mean[:3] - sensors.biases_mps2  # S f
     turning = simulation.bench.gravity_mps2**2 * sensors.sensitivities @ sensors.sensitivities.T - np.outer(felt, felt)
     setting = math.radians(noise.setting_sigma_deg) ** 2
