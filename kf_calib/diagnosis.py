@@ -48,7 +48,8 @@ class Test:
 
     scores: chi-squared falls less the threshold of their degrees of freedom: above zero is beyond chance.
     p_values: of the run. misfit_p: of the sum of squares as a whole (None: nothing left over to judge by).
-    lines: in the spectrum of the readings within dwells.
+    lines: in the spectrum of the readings within dwells, and the name of the effect they speak for. vibration: those
+    that are no oscillation of one amplitude, and count as noise.
     """
 
     scan: Scan
@@ -60,6 +61,8 @@ class Test:
     effective_tests: float
     in_slews_only: tuple[str, ...]
     lines: tuple[Line, ...]
+    oscillating: str = ""
+    vibration: tuple[Line, ...] = ()
 
     @property
     def p_value(self) -> float | None:
@@ -86,6 +89,13 @@ class Test:
         """Effects of which these orientations show nothing, and those that only slews could show."""
         unseen = [name for name, k in self.best.items() if not self.scan.candidates[k].dof]
         return [*unseen, *self.in_slews_only]
+
+    def without_lines(self) -> Test:
+        """The test with its lines taken as vibration."""
+        scores, p_values = (
+            {k: v for k, v in own.items() if k != self.oscillating} for own in (self.scores, self.p_values)
+        )
+        return replace(self, scores=scores, p_values=p_values, lines=(), vibration=self.lines)
 
     def candidate(self, name: str) -> Candidate:
         return self.scan.candidates[self.best[name]]
@@ -128,12 +138,12 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
         scores[name] = (fall if ratio > _threshold(1, tests) else ratio) - _threshold(1, tests)
     model, misfit_p = fitted.carried.model, consistency(fitted).p_value
     seen_lines = () if model.oscillates else lines((dwell.spectrum for dwell in fitted.dwells), LEVEL * _LINES)
-    for name in names(model.bench):
-        if seen_lines and effect_named(name, model.bench).oscillates:
-            p_values[name] = seen_lines[0].p_value * _SHARE / _LINES
-            scores[name] = float(chdtri(1, seen_lines[0].p_value)) - _threshold(1, 1.0)
+    swinging = next((name for name in names(model.bench) if effect_named(name, model.bench).oscillates), "")
+    if seen_lines and swinging:
+        p_values[swinging] = seen_lines[0].p_value * _SHARE / _LINES
+        scores[swinging] = float(chdtri(1, max(seen_lines[0].p_value, 1e-300))) - _threshold(1, 1.0)
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
-    return Test(found, best, scores, p_values, misfit_p, walk and walk[1], tests, slewing, seen_lines)
+    return Test(found, best, scores, p_values, misfit_p, walk and walk[1], tests, slewing, seen_lines, swinging)
 
 
 def price(candidate: Candidate, tests: float) -> float:
@@ -239,20 +249,39 @@ def diagnose(before: Calibration) -> Diagnosis:
 
 
 def _diagnosed(before: Calibration) -> Diagnosis:
-    test = assessed(before.fit)
+    test = _without_vibration(before, assessed(before.fit))
+    found = _explained(before, test)
+    if found.unknown and test.lines:  # of one phase all along and not of one amplitude
+        found = _explained(before, test.without_lines())
+    return replace(found, verdict=_verdict(found))
+
+
+def _explained(before: Calibration, test: Test) -> Diagnosis:
+    """What explains the misfit, one effect or two; or nothing does."""
     nothing = Diagnosis(before, test, (), (), False, (), {}, None, "")
     if test.consistent is not False:
-        return replace(nothing, verdict=_verdict(nothing))
+        return nothing
     suspects = _suspects(before, test)
     # what explains all of it explains most: one that fits far behind the first has only made the noise large enough
     least = test.scores[test.ranked[0]] - 2.0 * _EQUAL if test.ranked else 0.0
     explaining = [each for each in suspects if each.fits and test.scores[each.name] > least]
+    found = replace(nothing, suspects=suspects)
     if explaining:
-        found = _one(replace(nothing, suspects=suspects), explaining[0])
-    else:
-        scatter = before.noise.scatter_mps2.any() and not before.noise.scatter_stated
-        found = _two(replace(nothing, suspects=suspects)) or replace(nothing, suspects=suspects, unknown=not scatter)
-    return replace(found, verdict=_verdict(found))
+        return _one(found, explaining[0])
+    scatter = before.noise.scatter_mps2.any() and not before.noise.scatter_stated
+    return _two(found) or replace(found, unknown=not scatter)
+
+
+def _without_vibration(before: Calibration, test: Test) -> Test:
+    """The test as it is where an oscillation of one amplitude explains its lines; else they are vibration."""
+    if not (test.lines and test.oscillating):
+        return test
+    refit = with_effects(before, (test.oscillating,))
+    # what the coherent fit over the whole run finds of the amplitude that each stretch of readings shows
+    share = np.linalg.norm(refit.estimate.state[refit.model.parts[test.oscillating]]) / np.linalg.norm(
+        test.lines[0].amplitude_mps2
+    )
+    return test if share > 0.5 else test.without_lines()
 
 
 def _one(found: Diagnosis, first: Suspect) -> Diagnosis:

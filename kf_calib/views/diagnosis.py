@@ -41,6 +41,7 @@ def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
             "ambiguity_set": list(found.ambiguity),
             "overlaps": found.overlaps,
             "invisible": found.test.invisible,
+            "vibration_hz": [line.frequency_hz for line in found.test.vibration],
             "detectable": [
                 {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in detectable(found.test)
             ],
@@ -89,6 +90,9 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
                 f"To try: {to_try}"
             )
         )
+    if found.test.vibration:
+        seen = ", ".join(f"{line.frequency_hz:.4g}" for line in found.test.vibration)
+        parts.append(Text(f"Vibration at {seen} Hz: not of one amplitude all along, so it counts as noise."))
     if going is not None:
         angles = ", ".join(f"{angle:g}" for angle in going[0].gimbal_deg)
         parts.append(Text(f"Next orientation: gimbals at {angles} deg: {going[1]}."))
