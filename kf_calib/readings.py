@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -69,10 +69,10 @@ class Saturation:
     dwells: tuple[int, ...]
 
     def __str__(self) -> str:
-        where = f"in {len(self.dwells)} dwell{'s' * (len(self.dwells) > 1)} ({_listed(self.dwells)})"
         return (
-            f"readings of accelerometer {self.channel} are cut off at {self.level_mps2:.4g} m/s^2 {where}, "
-            f"{self.share:.2%} of its readings: its scale factor and bias are wrong by it; widen its range, or avoid these orientations."
+            f"readings of accelerometer {self.channel} are cut off at {self.level_mps2:.4g} m/s^2 in "
+            f"{_dwells(self.dwells)}, {self.share:.2%} of its readings: its scale factor and bias are wrong by it; "
+            "widen its range, or avoid these orientations."
         )
 
 
@@ -81,7 +81,7 @@ class Outliers:
     """Readings rejected by the gate; by_channel counts one twice where it lies out in two channels.
 
     clustered_p: run-level probability of so many in any stretch of dwells (which are ``dwells``, counted from 1) were
-    they spread at random; None where there are none, or one dwell only.
+    they spread at random; None where there are none, or one dwell only, or where coarse steps or flat tops make some.
     """
 
     count: int = 0
@@ -98,9 +98,8 @@ class Outliers:
         told = f"{self.count} outlying readings were rejected ({self.share:.2%}; accelerometers {self.by_channel})"
         if not self.clustered:
             return f"{told}, spread over the run as chance would."
-        where = f"dwell{'s' * (len(self.dwells) > 1)} {_listed(self.dwells)}"
         return (
-            f"{told}, crowded in {where} (p = {self.clustered_p:.2g}): something disturbed the run there; look at "
+            f"{told}, crowded in {_dwells(self.dwells)} (p = {self.clustered_p:.2g}): something disturbed the run there; look at "
             "these readings, or visit these orientations again."
         )
 
@@ -127,10 +126,10 @@ class Readings:
     def findings(self) -> list[str]:
         """All that was found, harmless or not, in a few words each."""
         out = self.outliers
-        crowded = f", crowded in dwells {_listed(out.dwells)}" if out.clustered else ", spread over the run"
+        crowded = f", crowded in {_dwells(out.dwells)}" if out.clustered else ""
         return [
             *(
-                f"saturation of accelerometer {each.channel} at {each.level_mps2:.4g} m/s^2 in {len(each.dwells)} dwells"
+                f"saturation of accelerometer {each.channel} at {each.level_mps2:.4g} m/s^2 in {_dwells(each.dwells)}"
                 for each in self.saturation
             ),
             *(
@@ -189,12 +188,13 @@ class Watch:
         """What it means for a run of these dwells and this noise."""
         seen = [self._dwells[dwell.number] for dwell in dwells]
         steps = [_step(seen, channel) for channel in range(3)]
-        coarse = [_quantisation(i, q, noise, seen) for i, q in enumerate(steps) if q is not None]
-        return Readings(
-            tuple(each for each in coarse if each.matters or each.step_mps2 > 8.0 * _storage(seen, each.channel - 1)),
-            tuple(_saturations(seen, steps, np.array([_spread(dwell) for dwell in dwells]), noise)),
-            _outliers(seen),
-        )
+        grids = [_quantisation(i, q, noise, seen) for i, q in enumerate(steps) if q is not None]
+        grids = [each for each in grids if each.matters or each.step_mps2 > 8.0 * _storage(seen, each.channel - 1)]
+        flat = tuple(_saturations(seen, steps, np.array([_spread(dwell) for dwell in dwells]), noise))
+        outliers = _outliers(seen)
+        if flat or any(each.matters for each in grids):  # the gate takes what is off a flat top, or off by a step
+            outliers = replace(outliers, clustered_p=None, dwells=())
+        return Readings(tuple(grids), flat, outliers)
 
 
 def _ends(rows: Rows) -> tuple[Floats, Floats]:
@@ -235,26 +235,42 @@ def _step(seen: Sequence[_Seen], channel: int) -> float | None:
 def common_step(values: Floats, tolerance: float) -> float | None:
     """The step q of a grid v0 + k q that holds ``values`` (n,), each to within ``tolerance``; None: there is no such.
 
-    Euclid's algorithm on the differences of neighbours; it needs four values, and a step of eight tolerances.
+    Euclid's algorithm on the differences of neighbours, three of them or more; q is at least eight tolerances.
+    Differences of so many steps that rounding hides their number say nothing.
     """
     steps = np.diff(np.sort(values))
-    steps = left = steps[steps > 2.0 * tolerance]
+    steps = steps[steps > 2.0 * tolerance]
     if len(steps) < 3:
         return None
-    while True:
-        step = float(left.min())
-        if step < 8.0 * tolerance:
-            return None
-        step = float(left.sum() / np.rint(left / step).sum())
-        over = np.abs(left - step * np.rint(left / step))
-        over = over[over > np.maximum(4.0 * tolerance, 1e-3 * step)]
+    step = float(steps.min())
+    while step >= 8.0 * tolerance:
+        step, error = _refined(steps, step, tolerance)
+        certain = steps[_certain(steps, step, error)]
+        multiples = np.rint(certain / step)
+        over = np.abs(certain - step * multiples)
+        over = over[over > 2.0 * tolerance + error * multiples]
         if not over.size:
+            return step if len(certain) >= 3 else None
+        step = float(over.min())
+    return None
+
+
+def _refined(steps: Floats, step: float, tolerance: float) -> tuple[float, float]:
+    """A step, and its error, from all the differences it counts with certainty: the better known, the more."""
+    error = 4.0 * tolerance
+    for _ in range(6):
+        certain = steps[_certain(steps, step, error)]
+        multiples = np.rint(certain / step)
+        if multiples.sum() == 0.0:
             break
-        left = np.append(over, step)
-    multiples = np.rint(steps / step)
-    step = float(steps.sum() / multiples.sum())
-    off = np.abs(steps - step * multiples).max()
-    return step if off <= max(4.0 * tolerance, 0.01 * step) else None
+        step = float(certain.sum() / multiples.sum())
+        error = 2.0 * tolerance * math.sqrt(len(certain)) / float(multiples.sum())
+    return step, error
+
+
+def _certain(steps: Floats, step: float, error: float) -> Mask:
+    """Which differences are small enough for the number of steps in them to be known."""
+    return steps <= max(1.5 * step, 0.1 * step**2 / error)
 
 
 def _quantisation(index: int, step: float, noise: Noise, seen: Sequence[_Seen]) -> Quantisation:
@@ -336,6 +352,8 @@ def clustering(hits: Floats, counts: Floats) -> tuple[float | None, tuple[int, .
     return min(1.0, best * tried), tuple(range(stretch[0] + 1, stretch[1] + 1))
 
 
-def _listed(numbers: Sequence[int]) -> str:
-    """``2, 5, 9``, no more than six."""
-    return ", ".join(map(str, numbers[:6])) + " ..." * (len(numbers) > 6)
+def _dwells(numbers: Sequence[int]) -> str:
+    """``dwell 2``, ``3 dwells (2, 5, 9)``; no more than six of them."""
+    if len(numbers) == 1:
+        return f"dwell {numbers[0]}"
+    return f"{len(numbers)} dwells ({', '.join(map(str, numbers[:6]))}{' ...' * (len(numbers) > 6)})"

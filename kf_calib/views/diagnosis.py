@@ -79,13 +79,19 @@ def verdict(found: Diagnosis) -> str:
     return " ".join([*(sentence[0].upper() + sentence[1:] for sentence in first), found.verdict])
 
 
+def _notes(found: Diagnosis) -> list[str]:
+    """Warnings that the verdict does not begin with."""
+    said = found.before.readings.biasing if found.test.consistent is False else []
+    return [warning for warning in found.before.warnings if warning not in said]
+
+
 def diagnosis_report(found: Diagnosis) -> RenderableType:
     """What ``diagnose`` prints: the verdict, then what it rests on."""
     style = {True: "bold green", False: "bold yellow", None: "bold"}[found.test.consistent]
     parts: list[RenderableType] = [Text(verdict(found), style=style)]
     readings = found.before.readings
     if readings.findings:
-        parts.append(Text(f"Readings: {' '.join(readings.findings)}"))
+        parts.append(Text(f"In the readings: {'; '.join(readings.findings)}."))
     if found.suspects:
         parts.append(_suspect_table(found))
     if found.test.consistent is False:
@@ -105,11 +111,7 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
     if found.test.invisible:
         parts.append(Text(f"Not to be seen with this run: {', '.join(found.test.invisible)}."))
     parts.append(_detectable_table(detectable(found.test)))
-    parts += [
-        Text(f"Note: {warning}", style="yellow")
-        for warning in found.before.warnings
-        if warning not in readings.warnings
-    ]
+    parts += [Text(f"Note: {warning}", style="yellow") for warning in _notes(found)]
     return Group(*parts)
 
 
