@@ -99,8 +99,8 @@ class Outliers:
         if not self.clustered:
             return f"{told}, spread over the run as chance would."
         return (
-            f"{told}, crowded in {_dwells(self.dwells)} (p = {self.clustered_p:.2g}): something disturbed the run there; look at "
-            "these readings, or visit these orientations again."
+            f"{told}, crowded in {_dwells(self.dwells)} (p = {self.clustered_p:.2g}): something disturbed the run "
+            "there; look at these readings, or visit these orientations again."
         )
 
 
@@ -279,7 +279,8 @@ def _quantisation(index: int, step: float, noise: Noise, seen: Sequence[_Seen]) 
     error = 0.5 * step * math.exp(-2.0 * math.pi**2 * dither / step**2)
     count = float(np.median([each.count for each in seen]))
     seen_from = 0.5 * math.sqrt(variance * float(noise.inflation[index]) / count)
-    return Quantisation(index + 1, step, math.sqrt(variance), error, error > seen_from)
+    sigma = math.sqrt(variance) if variance > _ROUNDING[1] * step**2 else 0.0
+    return Quantisation(index + 1, step, sigma, error, error > seen_from)
 
 
 def _saturations(
