@@ -242,35 +242,20 @@ def common_step(values: Floats, tolerance: float) -> float | None:
     steps = steps[steps > 2.0 * tolerance]
     if len(steps) < 3:
         return None
-    step = float(steps.min())
+    step, error, known = float(steps.min()), 4.0 * tolerance, 0
     while step >= 8.0 * tolerance:
-        step, error = _refined(steps, step, tolerance)
-        certain = steps[_certain(steps, step, error)]
+        certain = steps[steps <= max(1.5 * step, 0.1 * step**2 / error)]  # those whose number of steps is known
         multiples = np.rint(certain / step)
-        over = np.abs(certain - step * multiples)
-        over = over[over > 2.0 * tolerance + error * multiples]
-        if not over.size:
-            return step if len(certain) >= 3 else None
-        step = float(over.min())
+        over, allowed = np.abs(certain - step * multiples), 2.0 * tolerance + error * multiples
+        if (over > allowed).any():
+            first = int(np.where(over > allowed, over, np.inf).argmin())
+            step, error, known = float(over[first]), float(allowed[first]), 0
+        elif len(certain) > known:  # the better the step is known, the larger differences count
+            known, error = len(certain), 2.0 * tolerance * math.sqrt(len(certain)) / float(multiples.sum())
+            step = float(certain.sum() / multiples.sum())
+        else:
+            return step if known >= 3 else None
     return None
-
-
-def _refined(steps: Floats, step: float, tolerance: float) -> tuple[float, float]:
-    """A step, and its error, from all the differences it counts with certainty: the better known, the more."""
-    error = 4.0 * tolerance
-    for _ in range(6):
-        certain = steps[_certain(steps, step, error)]
-        multiples = np.rint(certain / step)
-        if multiples.sum() == 0.0:
-            break
-        step = float(certain.sum() / multiples.sum())
-        error = 2.0 * tolerance * math.sqrt(len(certain)) / float(multiples.sum())
-    return step, error
-
-
-def _certain(steps: Floats, step: float, error: float) -> Mask:
-    """Which differences are small enough for the number of steps in them to be known."""
-    return steps <= max(1.5 * step, 0.1 * step**2 / error)
 
 
 def _quantisation(index: int, step: float, noise: Noise, seen: Sequence[_Seen]) -> Quantisation:
@@ -334,7 +319,7 @@ def clustering(hits: Floats, counts: Floats) -> tuple[float | None, tuple[int, .
     Given their sum, hits in a stretch are binomial; stretches of 1, 2, 4 ... dwells are looked at, and the least tail
     probability is multiplied by their number: at most the size it states, however few the hits.
     """
-    from scipy.special import bdtrc
+    from scipy.special import betainc
 
     size = -(-len(hits) // _COUNTABLE)
     starts = np.arange(0, len(hits), size)
@@ -343,7 +328,8 @@ def clustering(hits: Floats, counts: Floats) -> tuple[float | None, tuple[int, .
     length = 1
     while 2 * length <= len(starts):
         inside, share = (each[length:] - each[:-length] for each in sums)
-        tails = np.where(inside > 0, bdtrc(inside - 1.0, sums[0][-1], share / sums[1][-1]), 1.0)
+        least = np.maximum(inside, 1.0)  # the chance of so many is an incomplete beta function
+        tails = np.where(inside > 0, betainc(least, sums[0][-1] - least + 1.0, share / sums[1][-1]), 1.0)
         first, tried = int(tails.argmin()), tried + len(tails)
         if tails[first] < best:
             best, stretch = float(tails[first]), (first * size, min((first + length) * size, len(hits)))
