@@ -168,17 +168,10 @@ class Watch:
     def add(self, rows: Rows) -> None:
         if rows.moving:
             return
-        ends, stuck = _ends(rows)
         seen = self._dwells.get(rows.dwell)
         if seen is None:
-            sample = np.sort(rows.readings[:: -(-len(rows.readings) // _SAMPLE)].T)
-            values = [own[np.diff(own, prepend=-np.inf) > 0] for own in sample]
-            distinct, kept = np.array([float(len(own)) for own in values]), [own[:_VALUES] for own in values]
-            seen = _Seen(ends, stuck, 0, distinct, sample.shape[1], kept)
-            self._dwells[rows.dwell] = seen
-        else:
-            seen.stuck = np.where(ends > seen.ends, stuck, seen.stuck + np.where(ends == seen.ends, stuck, 0.0))
-            seen.ends = np.maximum(ends, seen.ends)
+            seen = self._dwells[rows.dwell] = _first_seen(rows.readings)
+        _reach(seen, rows)
         seen.count += len(rows.readings)
         if rows.gated is not None:
             seen.rejected += rows.gated.shape[1]
@@ -197,13 +190,29 @@ class Watch:
         return Readings(tuple(grids), flat, outliers)
 
 
-def _ends(rows: Rows) -> tuple[Floats, Floats]:
-    """The largest and the least negated readings of a block (6,), and how many there are of each (6,)."""
+def _first_seen(readings: Floats) -> _Seen:
+    """A dwell with what the values of its first block say of steps."""
+    sample = np.sort(readings[:: -(-len(readings) // _SAMPLE)].T)
+    new = sample[:, 1:] != sample[:, :-1]
+    distinct, size = 1.0 + new.sum(axis=1), sample.shape[1]
+    values = [
+        np.append(own[:1], own[1:][up])[:_VALUES] if few else own[:0]
+        for own, up, few in zip(sample, new, distinct <= size / 2, strict=True)
+    ]
+    return _Seen(np.full(6, -np.inf), np.zeros(6), 0, distinct, size, values)
+
+
+def _reach(seen: _Seen, rows: Rows) -> None:
+    """Takes in the ends of a block; readings there are counted only where the dwell has none farther out."""
     channels = rows.innovation if rows.static else np.ascontiguousarray(rows.readings.T)
-    places = np.concatenate([channels.argmax(axis=1), channels.argmin(axis=1)])
-    each = np.arange(6) % 3
-    stuck = [np.count_nonzero(channels[i] == channels[i, place]) for i, place in zip(each, places, strict=True)]
-    return rows.readings[places, each] * np.repeat([1.0, -1.0], 3), np.array(stuck, float)
+    places = channels.argmax(axis=1).tolist() + channels.argmin(axis=1).tolist()
+    for side, place in enumerate(places):
+        i = side % 3
+        end = rows.readings[place, i] if side < 3 else -rows.readings[place, i]
+        if end >= seen.ends[side]:
+            stuck = np.count_nonzero(channels[i] == channels[i, place])
+            seen.stuck[side] = stuck + (seen.stuck[side] if end == seen.ends[side] else 0.0)
+            seen.ends[side] = end
 
 
 def _spread(dwell: DwellFactor) -> Floats:
