@@ -26,6 +26,7 @@ from kf_calib.folding import Carried, DwellFactor, Folder, means_of, samples_of
 from kf_calib.information import Step
 from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
 from kf_calib.noise import Noise, considered, mean_covariances
+from kf_calib.readings import Readings, Watch
 from kf_calib.samples import Floats, Mask, Source
 from kf_calib.spectrum import lines
 from kf_calib.visibility import sights
@@ -178,6 +179,8 @@ class Calibration:
     warnings: tuple[str, ...]
     reread: Callable[[Settings], Calibration] | None = field(default=None, repr=False, compare=False)
     """The same source evaluated anew: for models that need its readings folded otherwise."""
+    readings: Readings = field(default_factory=Readings)
+    """What the readings themselves show, whatever the model."""
 
     @property
     def noise(self) -> Noise:
@@ -256,12 +259,13 @@ class Calibration:
 
 @dataclass
 class Pass:
-    """One pass over a source: the rows as they come, what was counted, and the dwells folded so far."""
+    """One pass over a source: the rows as they come, what was counted and seen, and the dwells folded so far."""
 
     source: Source
     settings: Settings
     tally: Tally = field(default_factory=Tally)
     folder: Folder = field(default_factory=Folder)
+    watch: Watch = field(default_factory=Watch)
 
     def rows(self) -> Iterator[Rows]:
         slews = bool(Model.of(self.source.bench, self.settings.effects).dynamic)
@@ -273,6 +277,7 @@ class Pass:
         """All dwells of the source that hold enough readings to be used."""
         for rows in self.rows():
             self.folder.add(rows)
+            self.watch.add(rows)
             if on_progress is not None:
                 on_progress(self.source.fraction)
         return usable(self.folder.dwells)
@@ -303,8 +308,10 @@ def calibrate(
     notes = [f"{sight}." for sight in sights(result.fit, own)]
     if settings.engine == "filterpy":
         result = replace(result, estimate=filterpy_estimate(source, result))
-    said = [*source.warnings, *passed.tally.sentences(), *result.warnings, *notes]
-    return replace(result, tally=passed.tally, warnings=tuple(said), reread=partial(calibrate, source))
+    readings = passed.watch.judged(dwells, result.noise)
+    said = [*source.warnings, *passed.tally.sentences(), *readings.warnings, *result.warnings, *notes]
+    again = partial(calibrate, source)
+    return replace(result, tally=passed.tally, readings=readings, warnings=tuple(said), reread=again)
 
 
 def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
@@ -319,7 +326,8 @@ def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
         return before.reread(settings)
     with threadpool_limits(1, user_api="blas"):  # small decompositions, and the same bits every time
         fitted = fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews)
-        return replace(evaluated(fitted, settings), tally=before.tally, reread=before.reread)
+        again = evaluated(fitted, settings)
+        return replace(again, tally=before.tally, readings=before.readings, reread=before.reread)
 
 
 def _on_carrier(

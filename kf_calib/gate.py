@@ -53,6 +53,15 @@ def inliers(columns: Floats, readings: Floats, innovation: Floats, static: bool,
     return None if keep.all() or keep.sum() < 4 else keep
 
 
+def channels(rejected: Floats, kept: Floats, threshold: float) -> Mask:
+    """In which channels rejected readings lie out, (3, m) bool, from innovations (3, m) and those kept (3, n).
+
+    One at least: the channel that is farthest out in its own sigma.
+    """
+    score = np.abs(rejected) / np.maximum(kept.std(axis=1, keepdims=True), 1e-12)
+    return score >= np.minimum(threshold, score.max(axis=0))
+
+
 def _plainly_clean(innovation: Floats, threshold: float) -> bool:
     """Whether the medians can be spared: no reading stands out, and the rms is that of the bulk (of a sample of it)."""
     rms = np.sqrt(np.einsum("ij,ij->i", innovation, innovation) / innovation.shape[1])

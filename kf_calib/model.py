@@ -76,6 +76,7 @@ class Rows:
 
     static: the columns are the same in every row, and the innovation is the readings less their mean.
     pieces: parts of the rows, u (n',) from -1 to 1 over each, and its nodes. moving: of the slew after the dwell.
+    gated: in which channels each reading lay out that is not among them, (3, m) bool; None: there were none.
     """
 
     dwell: int
@@ -86,6 +87,7 @@ class Rows:
     static: bool
     pieces: tuple[tuple[slice, Floats, Nodes], ...]
     moving: bool = False
+    gated: Mask | None = None
 
 
 @dataclass(frozen=True)
@@ -250,7 +252,9 @@ def model_rows(blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: 
             keep = gate.inliers(rows.columns, rows.readings, rows.innovation, static, gate_sigma)
             if keep is not None:
                 tally.gated += int((~keep).sum())
+                out = rows.innovation[:, ~keep]
                 rows = _rows(_kept(block, keep), bench, force)
+                rows = replace(rows, gated=gate.channels(out, rows.innovation, gate_sigma))
         yield rows
 
 

@@ -19,7 +19,7 @@ LEVELS = [
     ["model"],
     ["folding"],
     ["noise"],
-    ["information", "kalman", "batch"],
+    ["information", "kalman", "batch", "readings"],
     ["scan"],
     ["fitting"],
     ["advice", "drivers", "running", "visibility"],

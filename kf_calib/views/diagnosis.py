@@ -13,7 +13,7 @@ from kf_calib.calibration import format_p
 from kf_calib.diagnosis import Detectable, Diagnosis, Suspect, detectable, next_orientation
 from kf_calib.drivers import Description, described
 from kf_calib.views.console import rounded, symbol
-from kf_calib.views.json import clean
+from kf_calib.views.json import clean, readings_object
 
 _LISTED = 12
 
@@ -33,7 +33,7 @@ def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
         {
             "consistent": found.test.consistent,
             "p_value": found.test.p_value,
-            "verdict": found.verdict,
+            "verdict": verdict(found),
             "model": [str(effect) for effect in found.before.model.effects],
             "missing": missing,
             "all_missing": list(found.missing),
@@ -49,6 +49,7 @@ def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
             "next_orientation": None if going is None else {"gimbal_deg": list(going[0].gimbal_deg), "why": going[1]},
             "held_out_rms_mps2": found.before.held_out_rms_mps2,
             "held_out_floor_mps2": found.before.held_out_floor_mps2,
+            "readings": readings_object(found.before.readings),
             "warnings": list(found.before.warnings),
         }
     )
@@ -73,10 +74,25 @@ def _suspect_object(suspect: Suspect) -> dict[str, Any]:
     }
 
 
+def verdict(found: Diagnosis) -> str:
+    """The diagnosis in a sentence or two; where the run is inconsistent, after what is wrong with its readings."""
+    first = found.before.readings.biasing if found.test.consistent is False else []
+    return " ".join([*(sentence[0].upper() + sentence[1:] for sentence in first), found.verdict])
+
+
+def _notes(found: Diagnosis) -> list[str]:
+    """Warnings that the verdict does not begin with."""
+    said = found.before.readings.biasing if found.test.consistent is False else []
+    return [warning for warning in found.before.warnings if warning not in said]
+
+
 def diagnosis_report(found: Diagnosis) -> RenderableType:
     """What ``diagnose`` prints: the verdict, then what it rests on."""
     style = {True: "bold green", False: "bold yellow", None: "bold"}[found.test.consistent]
-    parts: list[RenderableType] = [Text(found.verdict, style=style)]
+    parts: list[RenderableType] = [Text(verdict(found), style=style)]
+    readings = found.before.readings
+    if readings.findings:
+        parts.append(Text(f"In the readings: {'; '.join(readings.findings)}."))
     if found.suspects:
         parts.append(_suspect_table(found))
     if found.test.consistent is False:
@@ -99,7 +115,7 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
     if found.test.invisible:
         parts.append(Text(f"Not to be seen with this run: {', '.join(found.test.invisible)}."))
     parts.append(_detectable_table(detectable(found.test)))
-    parts += [Text(f"Note: {warning}", style="yellow") for warning in found.before.warnings]
+    parts += [Text(f"Note: {warning}", style="yellow") for warning in _notes(found)]
     return Group(*parts)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from kf_calib.calibration import Calibration, orientations
 from kf_calib.comparison import Comparison
+from kf_calib.readings import Readings
 
 
 def replay_object(result: Calibration) -> dict[str, Any]:
@@ -43,9 +44,19 @@ def replay_object(result: Calibration) -> dict[str, Any]:
             "held_out_rms_mps2": result.held_out_rms_mps2,
             "held_out_floor_mps2": result.held_out_floor_mps2,
             "counts": {key: value for key, value in vars(result.tally).items() if isinstance(value, int)},
+            "readings": readings_object(result.readings),
             "warnings": list(result.warnings),
         }
     )
+
+
+def readings_object(found: Readings) -> dict[str, Any]:
+    """Step, flat tops and outliers of the readings."""
+    return {
+        "quantisation": [{**vars(each), "rms_mps2": each.rms_mps2} for each in found.quantisation],
+        "saturation": [vars(each) for each in found.saturation],
+        "outliers": vars(found.outliers),
+    }
 
 
 def compare_object(compared: Comparison) -> dict[str, Any]:
