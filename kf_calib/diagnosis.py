@@ -111,9 +111,8 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
 
     found = scan(fitted.carried, fitted.noise.judging, candidates(fitted.carried.model), fitted.walk_variances)
     dofs, statistics = np.array([each.dof for each in found.candidates]), found.statistics
-    seen = np.flatnonzero(dofs)
     own = np.where(dofs > 0, chdtrc(np.maximum(dofs, 1), statistics), 1.0)
-    tests = tests or _independent_tests(found, seen, seed)
+    tests = tests or independent_tests(found, seed)
     best, scores, p_values = dict[str, int](), dict[str, float](), dict[str, float]()
     for k, candidate in enumerate(found.candidates):
         name = str(candidate.effect)
@@ -149,8 +148,9 @@ def _threshold(dof: int, tests: float) -> float:
     return float(chdtri(dof, LEVEL / tests))
 
 
-def _independent_tests(found: Scan, seen: NDArray[np.intp], seed: int) -> float:
+def independent_tests(found: Scan, seed: int = 0) -> float:
     """As many independent tests would reach the smallest p-value that one run in 100 reaches."""
+    seen = np.flatnonzero([each.dof for each in found.candidates])
     if not len(seen):
         return 1.0
     return LEVEL / max(float(np.quantile(_smallest_p(found, seen, seed), LEVEL)), 1e-12)

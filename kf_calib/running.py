@@ -15,6 +15,7 @@ slews only is not here. ``calibrate`` iterates all of these.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,12 +30,16 @@ from kf_calib.folding import Carried, DwellFactor
 from kf_calib.model import STATE_COUNT, Model, Prior
 from kf_calib.noise import Noise
 from kf_calib.samples import Floats
+from kf_calib.scan import Scan, projected
+from kf_calib.triangle import triangle
 
 
 @dataclass(frozen=True)
 class Running:
     """carried: the dwells so far, with the columns of the model and of all candidates; inside: names of those effects
-    that are in the model; factor (P, P + 1): of all columns, its states counted from ``about``."""
+    that are in the model; factor (P, P + 1): of all columns, its states counted from ``about``. left, rows: the sum of
+    squares that all columns together leave of so many whitened rows.
+    """
 
     carried: Carried
     inside: tuple[str, ...]
@@ -42,6 +47,8 @@ class Running:
     prior: Prior
     walk: Walk
     factor: Floats
+    left: float = 0.0
+    rows: int = 0
 
     @classmethod
     def over(
@@ -85,7 +92,7 @@ class Running:
         if not all(map(np.array_equal, self.carried.columns, carried.columns[:-1])):
             return more._folded()
         known = information.predict(self.factor, self.walk.variances(carried.dwells)[-1])
-        return replace(more, factor=information.update(known, more._rows([-1])[0]).factor)
+        return replace(more, factor=known)._updated(more._rows([-1])[0])
 
     def with_effect(self, text: str) -> Running:
         """With that effect (a name or a formula) in the model; raises InputError where it cannot be added."""
@@ -106,22 +113,49 @@ class Running:
 
     def solved(self) -> tuple[Floats, Floats, Floats]:
         """State (p,) of the model, covariance (p, p), and a basis (p, q) of the combinations not determined."""
-        parts = self.carried.model.parts
-        kept = [*range(STATE_COUNT), *(k for name in self.inside for k in range(*parts[name].indices(len(self.about))))]
+        kept = self._kept
         around = self.model.nominal_state() - self.about[kept]
         moved, covariance, undetermined = information.solve(information.restricted(self.factor, kept), around)
         return self.about[kept] + moved, covariance, undetermined
+
+    @cached_property
+    def scan(self) -> Scan:
+        """What each effect that is carried and not in the model would explain."""
+        kept, parts = self._kept, self.carried.model.parts
+        outside = [effect for effect in self.carried.model.effects if str(effect) not in self.inside]
+        theirs = [range(*parts[str(effect)].indices(len(self.about))) for effect in outside]
+        order = [*kept, *itertools.chain(*theirs), len(self.about)]
+        upper = np.vstack([triangle(self.factor[:, order]), np.zeros((1, len(order)))])
+        return projected(upper, len(kept), outside, [len(own) for own in theirs])
+
+    @property
+    def misfit(self) -> tuple[float, int]:
+        """What the model as it stands leaves: sum of squares, chi-squared of so many degrees of freedom."""
+        restricted = information.restricted(self.factor, self._kept)
+        squares = self.left + float(np.sum(self.factor[:, -1] ** 2) - np.sum(restricted[:, -1] ** 2))
+        return squares, self.rows - information.rank(restricted)
+
+    @cached_property
+    def _kept(self) -> list[int]:
+        """Places of the model's columns among all."""
+        parts, count = self.carried.model.parts, len(self.about)
+        return [*range(STATE_COUNT), *(k for name in self.inside for k in range(*parts[name].indices(count)))]
+
+    def _updated(self, rows: Floats) -> Running:
+        step = information.update(self.factor, rows)
+        return replace(self, factor=step.factor, left=self.left + step.nis, rows=self.rows + len(rows))
 
     def _folded(self) -> Running:
         """The same with its factor made anew from the dwells."""
         factor = information.start(self.prior, self.carried.model)
         factor[:, -1] -= factor[:, :-1] @ self.about
         variances = self.walk.variances(self.dwells)
+        out = replace(self, factor=factor, left=0.0, rows=0)
         if not variances.any():
-            return replace(self, factor=information.update(factor, np.concatenate(self._rows())).factor)
+            return out._updated(np.concatenate(self._rows()))
         for own, variance in zip(self._rows(), variances, strict=True):
-            factor = information.update(information.predict(factor, variance), own).factor
-        return replace(self, factor=factor)
+            out = replace(out, factor=information.predict(out.factor, variance))._updated(own)
+        return out
 
     def _rows(self, chosen: Sequence[int] | None = None) -> list[Floats]:
         """Whitened rows of all dwells, or of those chosen."""

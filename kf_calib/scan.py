@@ -90,9 +90,7 @@ def projected(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequ
     for _ in range(2):  # twice, or the rounding of what is large stays in what is left
         rest = rest - explained @ (explained.T @ rest)
     units = np.where(sizes > 0, sizes, 1.0)
-    frame, singular, turned = np.linalg.svd(rest[:, :-1] / units, full_matrices=False)
-    inside = singular > 0.1 * _SEEN
-    columns, residual = singular[inside, None] * turned[inside], frame[:, inside].T @ rest[:, -1]
+    columns, residual = rest[:-1, :-1] / units, rest[:-1, -1]
     ends = np.cumsum([0, *counts]).tolist()
     parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
     found = [_candidate(each, columns[:, part], units[part]) for each, part in zip(effects, parts, strict=True)]

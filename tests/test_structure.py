@@ -26,7 +26,7 @@ LEVELS = [
     ["calibration"],
     ["comparison", "model_file"],
     ["diagnosis"],
-    ["improvement"],
+    ["improvement", "watch"],
     ["journal"],
     ["views"],
     ["cli"],

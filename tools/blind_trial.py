@@ -37,19 +37,20 @@ import numpy as np
 
 from kf_calib.errors import KfCalibError
 from kf_calib.scan import Candidate
-from kf_calib.sources.hidden import Kind, catalogue
+from kf_calib.sources.hidden import Kind, NoSizeError, catalogue
 
+# Few readings, and time enough for drifts and time constants to show: half an hour in about a second of computing.
 BENCH = (
-    "--dwell-s", "8", "--sample-hz", "50", "--angle-hz", "20", "--slew-degps", "90",
-    "--temperature-swing", "5", "--temperature-period-s", "300", "--gravity", "9.81", "--latitude", "50",
+    "--dwell-s", "60", "--sample-hz", "6", "--angle-hz", "4", "--slew-degps", "20", "--gravity", "9.81",
+    "--latitude", "50", "--temperature-swing", "5", "--temperature-period-s", "700", "--warm-up-c", "4",
+    "--warm-up-s", "500",
 )  # fmt: skip
-SETTING = ("--setting", "0.002")
-NOISES = {
-    "white": SETTING,
-    "AR(1) 0.9": (*SETTING, "--ar1", "0.9"),
-    "1/f": (*SETTING, "--flicker", "1e-5"),
-    "scatter": (*SETTING, "--scatter", "5e-5"),
-    "unstated": (*SETTING, "--unstated"),
+NOISES: dict[str, tuple[str, ...]] = {
+    "white": (),
+    "AR(1) 0.9": ("--ar1", "0.9"),
+    "1/f": ("--flicker", "1e-5"),
+    "scatter": ("--scatter", "5e-5"),
+    "unstated": ("--unstated",),
 }
 PLANS = {
     "six faces": ("--plan", "faces"),
@@ -64,13 +65,18 @@ _ENOUGH = 20  # trials; fewer are shown and not judged
 
 @dataclass(frozen=True)
 class Task:
-    """One trial. figure: family, then what sets it apart, as ``name@10``; play: a key of ``PLAYS``."""
+    """One trial.
+
+    figure: family, then what sets it apart, as ``name@10``. play: a key of ``PLAYS``. setting: error of setting an
+    orientation, deg; the recording states it unless the options say otherwise.
+    """
 
     figure: str
     play: str
     seed: int
     hidden: tuple[str, ...] = ()
-    options: tuple[str, ...] = SETTING
+    options: tuple[str, ...] = ()
+    setting: str = "0.0002"
 
     @property
     def family(self) -> str:
@@ -79,7 +85,19 @@ class Task:
     def simulate(self, path: Path | str, *more: str) -> list[str]:
         """Words of the command line that makes the recording."""
         hidden = [word for text in self.hidden for word in ("--hide", text)]
-        return ["simulate", str(path), *BENCH, *self.options, "--seed", str(self.seed), *hidden, *more, "--json"]
+        return [
+            "simulate",
+            str(path),
+            *BENCH,
+            "--setting",
+            self.setting,
+            *self.options,
+            "--seed",
+            str(self.seed),
+            *hidden,
+            *more,
+            "--json",
+        ]
 
     @property
     def command(self) -> str:
@@ -163,8 +181,10 @@ def played(task: Task) -> Outcome:
             with contextlib.chdir(folder):
                 _make_plan(task)
                 return PLAYS[task.play](task)
-        except KfCalibError as error:
+        except NoSizeError as error:
             return Outcome(task, error=str(error))
+        except KfCalibError as error:  # a recording that the program refuses to judge is a failure of it
+            return Outcome(task, error=str(error), extra={"refused": True})
 
 
 def _make_plan(task: Task) -> None:
@@ -275,9 +295,8 @@ def pair(task: Task) -> Outcome:
     """Two effects at once; overlap: cosine of the smallest angle between what each can do."""
     outcome = diagnosed(task)
     spaces = candidates(Path("trial.mcap"), outcome.truth)
-    if len(spaces) == 2:
-        one, other = spaces.values()
-        outcome.extra["overlap"] = max(a.overlap(b) for a, b in itertools.product(one, other))
+    one, other = (spaces.get(name, []) for name in outcome.truth)  # none of what has no columns, as a random walk
+    outcome.extra["overlap"] = max((a.overlap(b) for a, b in itertools.product(one, other)), default=0.0)
     return outcome
 
 
@@ -408,12 +427,19 @@ PLAYS: dict[str, Callable[[Task], Outcome]] = {
 
 def visible_effects(options: Sequence[str] = ()) -> list[str]:
     """Names that this kind of run shows and that can be hidden: the stated ones that are not called invisible."""
+    clean = Task("", "", 1, (), tuple(options))
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        run(*Task("", "", 1, (), (*SETTING, *options)).simulate("clean.mcap"))
+        run(*clean.simulate("clean.mcap"))
         unseen = set(run("diagnose", "clean.mcap", "--json")["invisible"])
-    hideable = {kind.name: kind.accompanied for kind in known_kinds()}
+    hideable = {kind.name: kind for kind in known_kinds()}
     names = [each["effect"] for each in run("effects", "--json")["effects"]]
-    return [n for n in names if n.split(":")[0] in hideable and (n not in unseen or hideable[n.split(":")[0]])]
+    kinds = {name: hideable[name.split(":")[0]] for name in names if name.split(":")[0] in hideable}
+    return [n for n, kind in kinds.items() if n not in unseen or (kind.accompanied and _has_size(clean, n))]
+
+
+def _has_size(task: Task, name: str) -> bool:
+    """What comes with the effect makes it visible."""
+    return not played(dataclasses.replace(task, play="diagnose", hidden=(f"{name}=10sigma",))).error
 
 
 def outside_effects() -> list[str]:
@@ -423,14 +449,16 @@ def outside_effects() -> list[str]:
     ]
 
 
-def tasks(families: Sequence[str], runs: int, seed: int, effects: Sequence[str] = ()) -> list[Task]:
+def tasks(
+    families: Sequence[str], runs: int, seed: int, effects: Sequence[str] = (), setting: str = Task.setting
+) -> list[Task]:
     """All trials, each with a seed of its own; ``effects``: only these are hidden."""
     visible = list(effects) or visible_effects()
     drawn, start = np.random.default_rng(seed), 10_000_000 * seed
     made, stepping = list[Task](), itertools.count(start)
 
-    def add(figure: str, play: str, hidden: Sequence[str] = (), options: Sequence[str] = SETTING) -> None:
-        made.append(Task(figure, play, next(stepping), tuple(hidden), tuple(options)))
+    def add(figure: str, play: str, hidden: Sequence[str] = (), options: Sequence[str] = ()) -> None:
+        made.append(Task(figure, play, next(stepping), tuple(hidden), tuple(options), setting))
 
     for family in families:
         stepping = itertools.count(start + 100_000 * FIGURES.index(family))  # the same seeds whatever else is asked for
@@ -438,15 +466,16 @@ def tasks(families: Sequence[str], runs: int, seed: int, effects: Sequence[str] 
             for name, _ in itertools.product(NOISES, range(40 * runs)):
                 add(f"noise@{name}", "diagnose", options=NOISES[name])
         elif family in ("name", "unstated"):
-            sizes, options = ((8, 10, 15), SETTING) if family == "name" else ((10,), NOISES["unstated"])
+            sizes, options = ((8, 10, 15), ()) if family == "name" else ((10,), NOISES["unstated"])
             for size, name, _ in itertools.product(sizes, visible, range(runs)):
                 add(f"{family}@{size}", "diagnose", [f"{name}={size}sigma"], options)
         elif family == "power":
             for round_, name in itertools.product(range(8 * runs), visible):
-                made.append(Task("power@stated", "power", start + 100_000 * FIGURES.index(family) + round_, (name,)))
+                first = start + 100_000 * FIGURES.index(family)
+                made.append(Task("power@stated", "power", first + round_, (name,), (), setting))
         elif family == "invisible":
             for _, options in itertools.product(range(max(1, runs // 5)), [(), *PLANS.values()]):
-                add(f"invisible@{options[-1] if options else 'spread'}", "invisible", options=(*SETTING, *options))
+                add(f"invisible@{options[-1] if options else 'spread'}", "invisible", options=options)
         elif family == "outside":
             for name, _ in itertools.product(outside_effects(), range(2 * runs)):
                 add("outside@15", "outside", [f"{name}=15sigma"])
@@ -456,10 +485,10 @@ def tasks(families: Sequence[str], runs: int, seed: int, effects: Sequence[str] 
         elif family == "plans":
             for name, plan in PLANS.items():
                 for _ in range(8 * runs):
-                    add(f"plans@{name}, nothing hidden", "diagnose", options=(*SETTING, *plan))
+                    add(f"plans@{name}, nothing hidden", "diagnose", options=plan)
                 shown = list(effects) or visible_effects(() if "monotone" in plan else plan)
                 for effect, _ in itertools.product(shown, range(runs)):
-                    add(f"plans@{name}, one hidden", "diagnose", [f"{effect}=10sigma"], (*SETTING, *plan))
+                    add(f"plans@{name}, one hidden", "diagnose", [f"{effect}=10sigma"], plan)
         elif family == "improve":
             for name, _ in itertools.product(visible, range(runs)):
                 add("improve@15", "improve", [f"{name}=15sigma"])
@@ -578,7 +607,7 @@ def _family(driver: str | None) -> str:
 
 
 def _pair(which: str, every: list[Outcome]) -> Iterator[Figure]:
-    own = [each for each in every if each.extra.get("overlap", 1.0) < _APART]
+    own = [each for each in every if each.extra["overlap"] < _APART]
     yield rate(f"two at once, n = {which} each: both found", [each.found for each in own], 0.85)
     yield rate("two at once: nothing else", [each.nothing_else for each in own], 0.95)
     yield rate("two at once: one of them found", [any(map(each.means_truth, each.names)) for each in own])
@@ -633,7 +662,7 @@ def failed(each: Outcome) -> bool:
     """Not what was hoped for: to be looked at."""
     family, close = each.task.family, each.extra.get("overlap", 0.0) >= _APART
     if each.error:
-        return False
+        return "refused" in each.extra
     if family in ("noise", "plans") and not each.truth:
         return each.consistent is False
     return {
@@ -726,7 +755,7 @@ def save_failures(outcomes: Sequence[Outcome], path: Path) -> None:
         lines += [
             f"[{each.task.figure}] hidden {' + '.join(each.truth) or 'nothing'}; first {each.first}; "
             f"all {list(each.names)}; set {list(each.ambiguity)}; p {each.p_value}; wrong {each.wrong}; {told}",
-            f"    {each.extra.get('verdict', '')}",
+            f"    {each.error or each.extra.get('verdict', '')}",
             f"    {each.task.command}",
         ]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -749,17 +778,35 @@ def keep(task: Task, folder: Path) -> None:
 @click.option("--jobs", type=click.IntRange(min=1), default=2, show_default=True, help="Processes.")
 @click.option("--only", multiple=True, type=click.Choice(FIGURES), help="Only this family of figures; repeatable.")
 @click.option("--effect", "effects", multiple=True, help="Hide only this one of the catalogue; repeatable.")
+@click.option(
+    "--setting",
+    type=click.FloatRange(min=0),
+    default=float(Task.setting),
+    show_default=True,
+    help="Error of setting an orientation, deg.",
+)
 @click.option("--limit", type=click.IntRange(min=1), help="At most so many trials of each figure, spread evenly.")
 @click.option("--out", type=click.Path(path_type=Path), help="All outcomes and figures, JSON.")
 @click.option("--picture", type=click.Path(path_type=Path), help="The confusion matrix, PNG or SVG.")
 @click.option("--failures", type=click.Path(path_type=Path), help="What went wrong, with commands to see it again.")
 @click.option("--keep", "kept", type=click.Path(path_type=Path), help="Folder for recordings of what went wrong.")
-def main(runs: int, seed: int, jobs: int, only: tuple[str, ...], effects: tuple[str, ...], limit: int | None,
-         out: Path | None, picture: Path | None, failures: Path | None, kept: Path | None) -> None:  # fmt: skip
+def main(
+    runs: int,
+    seed: int,
+    jobs: int,
+    only: tuple[str, ...],
+    effects: tuple[str, ...],
+    setting: float,
+    limit: int | None,
+    out: Path | None,
+    picture: Path | None,
+    failures: Path | None,
+    kept: Path | None,
+) -> None:
     """Blind trial of the diagnosis."""
     from rich.console import Console
 
-    todo = thinned(tasks(only or FIGURES, runs, seed, effects), limit)
+    todo = thinned(tasks(only or FIGURES, runs, seed, effects, f"{setting:g}"), limit)
     outcomes = list(_all(todo, jobs))
     Console(width=None if sys.stdout.isatty() else 140).print(report(outcomes))
     if out:
@@ -772,8 +819,9 @@ def main(runs: int, seed: int, jobs: int, only: tuple[str, ...], effects: tuple[
         save_picture(outcomes, picture)
     if failures:
         save_failures(outcomes, failures)
-    for each in filter(failed, outcomes) if kept else ():
-        keep(each.task, kept.absolute())
+    if kept:
+        for each in filter(failed, outcomes):
+            keep(each.task, kept.absolute())
 
 
 def thinned(every: list[Task], limit: int | None) -> list[Task]:

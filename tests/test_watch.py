@@ -1,0 +1,54 @@
+"""A run judged dwell by dwell: as a scan from the start would, and with one chance of a false alarm for all looks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic import Run
+from test_diagnosis import run
+
+from kf_calib.calibration import Calibration, calibrate
+from kf_calib.diagnosis import candidates
+from kf_calib.running import Running
+from kf_calib.scan import scan
+from kf_calib.watch import Watch
+
+
+def quiet(seed: int, **kwargs: float) -> Calibration:
+    return calibrate(Run(seed=seed, dwells=16, count=100, **kwargs))
+
+
+def watched(result: Calibration) -> Watch:
+    dwells = result.fit.dwells
+    watch = Watch.over(dwells[:6], result.bench)
+    for dwell in dwells[6:]:
+        watch = watch.after(dwell)
+    return watch
+
+
+def test_a_running_scan_is_that_from_the_start() -> None:
+    result = quiet(1)
+    effects = [each for each in candidates(result.model) if each.unknown is None]
+    dwells, noise = result.fit.dwells, result.noise.judging
+    running = Running.over(dwells[:8], result.model, noise, result.carried.state, effects)
+    for dwell in dwells[8:]:
+        running = running.after(dwell)
+    expected = scan(result.carried, noise, effects)
+    np.testing.assert_allclose(running.scan.statistics, expected.statistics, rtol=1e-6, atol=1e-7)
+    statistic, dof = running.misfit
+    assert dof == result.consistency.dof or dof > result.consistency.dof  # columns within dwells add rows
+    own = [sum(c.dof for c in each.candidates) for each in (running.scan, expected)]
+    assert own[0] == own[1] and statistic == pytest.approx(float(dof), abs=6.0 * np.sqrt(2.0 * dof))
+
+
+def test_noise_raises_no_alarm_however_often_it_is_looked_at() -> None:
+    """11 looks at each of 12 runs: at 1 % a run two alarms have a chance of 0.6 %."""
+    found = [watched(quiet(900 + k)) for k in range(12)]
+    assert all(each.looks == 11 for each in found)
+    assert sum(each.alarmed is not None for each in found) <= 1
+
+
+def test_a_missing_effect_raises_the_alarm_before_the_end() -> None:
+    watch = watched(run("second-order=20sigma"))
+    assert watch.alarmed is not None and watch.alarmed < 24
+    assert watch.suspects[0] in {"second-order", "scale-asymmetry"}
