@@ -1,14 +1,23 @@
-"""What the README prints is what its commands give."""
+"""What the README and the pages of docs print is what their commands give."""
 
 from __future__ import annotations
 
+import json
+import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+import kf_calib
+
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+GAP = "\n...\n"
 
 
 def block_after(marker: str, kind: str) -> str:
@@ -35,6 +44,83 @@ def test_the_demo_prints_the_tables_that_are_shown(tmp_path: Path) -> None:
     shown, printed = block_after("tools/demo", "text"), done.stdout
     table = slice(3, 27)  # parameters, and the heading of the noise
     assert printed.splitlines()[table] == shown.splitlines()[table]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_commands_of_a_page_print_what_is_shown(page: Path, tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "recordings", tmp_path / "recordings")
+    for command, shown in consoles(page.read_text()):
+        printed = _said(command, tmp_path)
+        place = 0
+        for part in map(_words, f"\n{shown}\n".split(GAP)):
+            found = printed.find(part, place)
+            assert found >= 0, f"{page.name}: {command!r} does not print, in this place:\n{part}\nbut:\n{printed}"
+            place = found + len(part)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_page_is_narrow_and_its_pictures_and_links_are_there(page: Path) -> None:
+    text = page.read_text()
+    blocks = re.findall(r"^```\w*\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    assert max(len(line) for block in blocks for line in block.splitlines()) <= 100
+    links = [link.partition("#")[0] for link in re.findall(r"\]\(([^)]+)\)", text) if "://" not in link]
+    for link in filter(None, links):
+        assert (page.parent / link).is_file(), link
+    for picture in (page.parent / link for link in links if link.endswith(".png")):
+        assert picture.stat().st_size < 150_000
+
+
+def test_the_effect_that_was_hidden_spoils_the_scale_factors_until_it_is_in_the_model() -> None:
+    """What the tutorial says of the side file: 4 to 7 sigma before, within 1 after."""
+    recordings = ROOT / "recordings"
+    truth = json.loads((recordings / "hidden.truth.json").read_text())
+    (effect,) = truth["effects"]
+    before = kf_calib.calibrate(kf_calib.open_recording(recordings / "hidden.mcap"))
+    after = kf_calib.calibrate(
+        kf_calib.open_recording(recordings / "hidden.mcap"), kf_calib.Settings(effects=(effect["name"],))
+    )
+    for symbol in ("K1", "K2", "K3"):
+        wrong, right = (_error_in_sigma(run, symbol, truth["parameters"]) for run in (before, after))
+        assert 4 < wrong < 7
+        assert right < 1
+    for given, size in zip(list(after.parameters.values())[12:], effect["sizes"].values(), strict=True):
+        assert given.value is not None and given.sigma is not None
+        assert abs(given.value - size) < 1.5 * given.sigma
+
+
+def consoles(text: str) -> list[tuple[str, str]]:
+    """Every command of the console blocks, with what is shown below it; a backslash goes on in the next line."""
+    blocks = re.findall(r"^```console\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    parts = [part for block in blocks for part in re.split(r"^\$ ", block.replace("\\\n", " "), flags=re.MULTILINE)[1:]]
+    return [(command, shown) for command, _, shown in (part.partition("\n") for part in parts)]
+
+
+def _said(command: str, folder: Path) -> str:
+    """What a command line of a page prints, in a folder of its own that has the recordings."""
+    ours = re.sub(r"^kf-calib\b", lambda _: f'"{sys.executable}" -m kf_calib.cli', command)
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    done = subprocess.run(
+        ours,
+        shell=True,
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, f"{command}: {done.stderr}"
+    return _words(done.stdout)
+
+
+def _words(text: str) -> str:
+    """Pages break long lines where they like."""
+    return " ".join(text.split())
+
+
+def _error_in_sigma(run: kf_calib.Calibration, symbol: str, truth: dict[str, float]) -> float:
+    given = run.parameters[symbol]
+    assert given.value is not None and given.sigma is not None
+    return abs(given.value - truth[symbol]) / given.sigma
 
 
 def _without_last_digits(text: str) -> str:
