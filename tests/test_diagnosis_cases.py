@@ -1,0 +1,117 @@
+"""The diagnosis where it is hard: noise of other kinds, outliers, poor plans, effects that look like others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+from test_diagnosis import BENCH
+
+from kf_calib.calibration import Calibration, calibrate
+from kf_calib.diagnosis import Diagnosis, assessed, diagnose
+from kf_calib.sources.hidden import parse
+from kf_calib.sources.hidden.detectability import sized
+from kf_calib.sources.noise_sources import Noise
+from kf_calib.sources.physics import Ambient
+from kf_calib.sources.plans import Visit, six_faces, spread_plan
+from kf_calib.sources.sensors import GRADES
+from kf_calib.sources.simulator import Simulation
+
+WHITE = 5e-5
+
+
+def run(*hidden: str, seed: int = 5, plan: list[Visit] | None = None, **noise: float) -> Calibration:
+    """A calibration without the hidden effects in its model, on a bench that states its noise."""
+    made = Noise(**{"white_mps2": WHITE, **noise})
+    visits = plan or spread_plan(24, dwell_s=8.0, seed=seed)
+    scatter = made.dwell_sigma_mps2(len(visits))
+    bench = replace(BENCH, angle_sigma_deg=made.setting_sigma_deg, scatter_sigma_mps2=scatter)
+    base = Simulation(
+        bench, GRADES["navigation"].sensors(seed), made, visits, sample_hz=50.0, angle_hz=20.0, slew_rate_degps=90.0,
+        seed=seed, ambient=Ambient(swing_c=5.0, period_s=300.0, sigma_c=0.0),
+    )  # fmt: skip
+    return calibrate(base.hiding(parse(hidden, bench.axes, seed=seed, sized=partial(sized, base))))
+
+
+def not_wrong(found: Diagnosis, *truth: str) -> None:
+    """Nothing is named, or what is named may be the truth."""
+    assert not found.missing or set(truth) & set(found.ambiguity), found.verdict
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [
+        {"ar1_phi": 0.9},
+        {"scatter_mps2": 1e-5},
+        {"setting_sigma_deg": 2e-4},
+        {"outlier_rate": 1e-3, "outlier_mps2": 0.05},
+        {"flicker_mps2": 2e-6},
+    ],
+    ids=lambda noise: "+".join(noise),
+)
+def test_an_effect_is_named_in_noise_of_other_kinds(noise: dict[str, float]) -> None:
+    found = diagnose(run("hysteresis=15sigma", **noise))
+    assert found.missing == ("hysteresis",), found.verdict
+
+
+@pytest.mark.parametrize("noise", [{"flicker_mps2": 1e-5}, {"scatter_mps2": 5e-5}], ids=lambda noise: "+".join(noise))
+def test_stated_scatter_and_flicker_name_nothing(noise: dict[str, float]) -> None:
+    tests = [assessed(run(seed=70 + k, **noise).fit) for k in range(8)]
+    assert sum(not each.consistent for each in tests) == 0
+
+
+def test_two_accelerometers_with_different_effects() -> None:
+    found = diagnose(run("second-order=1.2e-7,0,0", "hysteresis=0,0,3e-5"))
+    assert set(found.missing) == {"second-order", "hysteresis"}
+    assert found.after is not None
+    sigmas = {p.symbol: abs(p.value or 0.0) / (p.sigma or 1.0) for p in list(found.after.parameters.values())[12:]}
+    assert all((sigmas[symbol] > 8.0) == (symbol in {"K2_1", "h3"}) for symbol in sigmas), sigmas
+
+
+def test_a_walk_is_not_taken_for_a_drift() -> None:
+    """Straight lines and exponentials follow a random walk well; a wrong name is worse than several."""
+    for seed in (1, 2, 3, 4):
+        not_wrong(diagnose(run("bias-walk=15sigma", seed=seed)), "bias-walk")
+
+
+def test_a_line_is_named_with_its_frequency() -> None:
+    found = diagnose(run("sinusoid=6ug;frequency=7.3"))
+    assert found.missing == ("sinusoid",) and found.after is not None
+    frequency = found.after.parameters["fSin"]
+    assert frequency.value is not None and frequency.sigma is not None
+    assert abs(frequency.value - 7.3) < 5.0 * frequency.sigma < 0.01
+
+
+def test_vibration_is_no_oscillation_of_one_amplitude() -> None:
+    found = diagnose(run("vibration-rectification=15sigma"))
+    assert "sinusoid" not in found.missing and found.test.vibration
+
+
+@pytest.mark.parametrize("name", ["second-order", "hysteresis", "thermal-bias", "encoder-harmonic-2:x", "bias-drift"])
+def test_poor_plans_give_no_wrong_name(name: str) -> None:
+    """Six faces, six dwells, and poses in the order of their angle: mostly it cannot be told, and that is said."""
+    short = spread_plan(6, dwell_s=8.0, seed=3)
+    ordered = sorted(spread_plan(18, dwell_s=8.0, seed=4), key=lambda visit: tuple(visit.gimbal_deg))
+    for plan in (six_faces(dwell_s=8.0), short, ordered):
+        found = diagnose(run(_large(name), plan=plan))
+        not_wrong(found, name)
+        assert name not in found.test.invisible or name not in found.missing
+        assert found.test.consistent is not True or found.verdict.count("cannot see") or not found.test.invisible
+
+
+def _large(name: str) -> str:
+    """A size that any plan that sees the effect would show."""
+    sizes = {"second-order": "20ug/g^2", "hysteresis": "20ug", "thermal-bias": "20ug/K", "bias-drift": "5e-8"}
+    return f"{name}={sizes.get(name, '1e-4')}"
+
+
+def test_scatter_that_is_not_stated_gets_no_name() -> None:
+    """It looks like an unknown effect, and is named neither."""
+    unstated = replace(BENCH, scatter_sigma_mps2=None)
+    visits = spread_plan(24, dwell_s=8.0, seed=9)
+    noise = Noise(white_mps2=WHITE, scatter_mps2=5e-5)
+    source = Simulation(unstated, GRADES["navigation"].sensors(9), noise, visits, sample_hz=50.0, angle_hz=20.0,
+                        slew_rate_degps=90.0, seed=9)  # fmt: skip
+    found = diagnose(calibrate(source))
+    assert not found.missing, found.verdict
