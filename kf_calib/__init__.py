@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from kf_calib.sources.recorder import Recorder
     from kf_calib.sources.recording import Recording as open_recording
     from kf_calib.views.rerun import save as save_view
+    from kf_calib.watch import Watch
 
 _HOMES = {
     "Bench": ("bench", "Bench"),
@@ -54,12 +55,13 @@ _HOMES = {
     "Recorder": ("sources.recorder", "Recorder"),
     "open_recording": ("sources.recording", "Recording"),
     "save_view": ("views.rerun", "save"),
+    "Watch": ("watch", "Watch"),
 }
 
 __all__ = [
     "Bench", "Calibration", "Diagnosis", "Improvement", "InputError", "KfCalibError", "Parameter", "Recorder",
-    "Running", "Settings", "UnobservableError", "calibrate", "compare", "diagnose", "improve", "open_recording",
-    "save_view",
+    "Running", "Settings", "UnobservableError", "Watch", "calibrate", "compare", "diagnose", "improve",
+    "open_recording", "save_view",
 ]  # fmt: skip
 
 

@@ -85,11 +85,14 @@ class Running:
         known = {str(effect): effect for effect in self.carried.model.effects}
         return Model(self.carried.model.bench, tuple(known[name] for name in self.inside))
 
-    def after(self, dwell: DwellFactor) -> Running:
-        """The filter after one more dwell: one update, unless it changes what earlier dwells are known to have felt."""
+    def after(self, dwell: DwellFactor, exact: bool = True) -> Running:
+        """The filter after one more dwell: one update, unless it changes what earlier dwells are known to have felt.
+
+        Not ``exact``: earlier dwells stay as they were known when they closed.
+        """
         carried = Carried([*self.dwells, dwell], self.carried.model, self.about)
         more = replace(self, carried=carried)
-        if not all(map(np.array_equal, self.carried.columns, carried.columns[:-1])):
+        if exact and not all(map(np.array_equal, self.carried.columns, carried.columns[:-1])):
             return more._folded()
         known = information.predict(self.factor, self.walk.variances(carried.dwells)[-1])
         return replace(more, factor=known)._updated(more._rows([-1])[0])

@@ -58,7 +58,7 @@ class Watch:
     def after(self, dwell: DwellFactor) -> Watch:
         """The watch after one more dwell."""
         with threadpool_limits(1, user_api="blas"):
-            running = self.running.after(dwell)
+            running = self.running.after(dwell, exact=False)  # made anew when it has grown by a quarter
             if len(running.dwells) < _GROWN * self.fitted_at:
                 return replace(self, running=running)._looked()
             running, fitted_at, tests = _begun(running.dwells, self.bench, self.settings)

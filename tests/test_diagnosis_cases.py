@@ -62,7 +62,7 @@ def test_stated_scatter_and_flicker_name_nothing(noise: dict[str, float]) -> Non
 
 
 def test_two_accelerometers_with_different_effects() -> None:
-    found = diagnose(run("second-order=1.2e-7,0,0", "hysteresis=0,0,3e-5"))
+    found = diagnose(run("second-order=3e-7,0,0", "hysteresis=0,0,3e-5"))
     assert set(found.missing) == {"second-order", "hysteresis"}
     assert found.after is not None
     sigmas = {p.symbol: abs(p.value or 0.0) / (p.sigma or 1.0) for p in list(found.after.parameters.values())[12:]}
