@@ -344,7 +344,8 @@ def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, option
     if as_json:
         _print_json(clean(catalogue.sights_object(seen, [str(effect) for effect in result.model.effects])))
     else:
-        _show(catalogue.sight_report(seen, f"What {recording.name} shows of {len(seen)} effects beside {result.model}"))
+        title = f"What {recording.name} shows of {len(seen)} effects beside {result.model.sum}"
+        _show(catalogue.sight_report(seen, title))
 
 
 def _list_hidden(ctx: click.Context, _: click.Parameter, texts: tuple[str, ...]) -> tuple[str, ...]:

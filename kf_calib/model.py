@@ -120,6 +120,14 @@ class Model:
         return replace(self, effects=tuple(each for each in self.effects if str(each) != str(effect)))
 
     def __str__(self) -> str:
+        """A table: symbols, units, and the size a prior would call large."""
+        from kf_calib.views.console import model_table, plain
+
+        return plain(model_table(self))
+
+    @property
+    def sum(self) -> str:
+        """The model as a sum of its parts, in a line."""
         return " + ".join(["twelve parameters", *map(str, self.effects)])
 
     @cached_property

@@ -485,7 +485,8 @@ def test_effects_in_detail(run, tmp_path: Path) -> None:
 
 def test_a_model_prints_itself() -> None:
     model = Model.of(BENCH, ["second-order", "mine = fx*fy*T", "bias-walk"])
-    text = plain(model_table(model))
+    text = str(model)
+    assert text == plain(model_table(model)) and model.sum == "twelve parameters + second-order + mine + bias-walk"
     assert "twelve parameters" in text and "K2_3" in text and "981 µg/g²/K" in text and "bias-walk" in text
 
 
