@@ -89,7 +89,8 @@ ADDED = {
 def covariance(noise: Noise, force: np.ndarray, dwell: np.ndarray, sensors: Sensors = SENSORS) -> np.ndarray:
     """V (3 n, 3 n), sample after sample."""
     together = dwell[:, None] == dwell
-    offset = noise.scatter_mps2**2 + noise.flicker_mps2**2
+    flicker = noise.flicker_mps2**2 * max(np.log(COUNT) / (2 * np.log(2)), 1)  # means of dwells about their mean
+    offset = noise.scatter_mps2**2 + flicker
     white = noise.white_mps2**2 * (1 + noise.ar1_phi) / (1 - noise.ar1_phi)
     v = np.kron(white * np.eye(len(dwell)) + offset * together, np.eye(3))
     for axis in np.eye(3):  # a turn about each axis of the platform
