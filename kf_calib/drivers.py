@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from kf_calib.bench import Bench
-from kf_calib.effects import effect_named
+from kf_calib.effects import Effect, effect_named
+from kf_calib.errors import InputError
 from kf_calib.fitting import Fit
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
@@ -69,9 +71,11 @@ def described(fitted: Fit, residuals: Floats) -> Description | None:
 
 def families(fitted: Fit) -> tuple[list[Family], float]:
     """All families tried on what the model leaves, and the sum of squares there."""
-    bench = fitted.carried.model.bench
-    listed = list(_families(bench, fitted.dwells[-1].end_s))
-    effects = [effect_named(_named(text), bench) for _, texts in listed for text in texts]
+    bench, listed, effects = fitted.carried.model.bench, list[tuple[str, list[str]]](), list[Effect]()
+    for driver, texts in _families(bench, fitted.dwells[-1].end_s):
+        with contextlib.suppress(InputError):  # a jump so late, a decay so fast that the trial of a formula misses it
+            effects += [effect_named(_named(text), bench) for text in texts]
+            listed.append((driver, texts))
     scanned = scan(fitted.carried, fitted.noise.judging, effects, fitted.walk_variances)
     out, place = list[Family](), 0
     for driver, texts in listed:
