@@ -94,7 +94,7 @@ def noise_of(rng: np.random.Generator, kind: str, count: int) -> Floats:
     ("white", 200, 100), ("coloured", 4000, 40), ("flicker", 4000, 40),
 ])  # fmt: skip
 def test_noise_alone_has_no_line(kind: str, count: int, runs: int) -> None:
-    """At 1 %, and 1.5 % on flicker, whose rise the baseline follows less well; the bound is passed once in 200 times."""
+    """At 1 %, and 1.5 % on flicker, whose rise is followed less well; the bound is passed once in 200 times."""
     rng, chance = np.random.default_rng(0), 0.015 if kind == "flicker" else 0.01
     assert sum(bool(seen_in(rng, kind, {}, count)) for _ in range(runs)) <= binom.ppf(0.995, runs, chance)
 
