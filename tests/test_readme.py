@@ -62,7 +62,7 @@ def test_the_commands_of_a_page_print_what_is_shown(page: Path, tmp_path: Path) 
 def test_a_page_is_narrow_and_its_pictures_and_links_are_there(page: Path) -> None:
     text = page.read_text()
     blocks = re.findall(r"^```\w*\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
-    assert max(len(line) for block in blocks for line in block.splitlines()) <= 100
+    assert all(len(line) <= 100 for block in blocks for line in block.splitlines())
     links = [link.partition("#")[0] for link in re.findall(r"\]\(([^)]+)\)", text) if "://" not in link]
     for link in filter(None, links):
         assert (page.parent / link).is_file(), link
