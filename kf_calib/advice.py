@@ -14,7 +14,7 @@ from kf_calib.fitting import Fit
 from kf_calib.folding import Means, candidate_columns
 from kf_calib.information import accumulated, whitened
 from kf_calib.model import effect_columns
-from kf_calib.noise import mean_covariances
+from kf_calib.noise import mean_covariances, steps
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 
@@ -88,11 +88,11 @@ def _with_next(fitted: Fit, effects: Sequence[Effect], poses: Floats) -> tuple[F
     model, state = carried.model, carried.state
     added = candidate_columns(carried.dwells, effects, model.bench, state)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
-    upper = accumulated(whitened(carried.dwells, columns, noise, state), fitted.walk_variances)
+    upper = accumulated(whitened(carried.dwells, columns, noise, state), steps(carried.dwells, noise))
     stimulus = _next_stimulus(fitted, poses)
     design = np.concatenate([model.columns(stimulus, state), effect_columns(effects, stimulus)], axis=2)
     counts = np.full(len(poses), np.median(carried.means.counts))
-    means = Means(design, np.zeros((len(poses), 3)), stimulus.force_mps2, counts)
+    means = Means(design, np.zeros((len(poses), 3)), stimulus.force_mps2, counts, np.zeros((len(poses), 2)))
     root = np.linalg.cholesky(mean_covariances(noise, means, state))
     return upper[:-1, :-1], np.asarray(np.linalg.solve(root, design), float)
 

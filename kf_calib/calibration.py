@@ -23,16 +23,15 @@ from kf_calib.effects import of_the_users, remarks_of
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.fitting import WALK, Fit, fit
 from kf_calib.folding import Carried, DwellFactor, Folder, means_of, samples_of
+from kf_calib.held_out import held_out, orientations
 from kf_calib.information import Step
 from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
-from kf_calib.noise import Noise, considered, mean_covariances
+from kf_calib.noise import Noise, considered, mean_covariances, steps
 from kf_calib.readings import Readings, Watch
 from kf_calib.samples import Floats, Mask, Source
 from kf_calib.spectrum import lines
 from kf_calib.visibility import sights
-
-SAME_POSE_DEG = 1.0
-"""Dwells whose gravity directions are closer than this are visits of one orientation."""
+from kf_calib.walk import predicted, to_mean
 
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # a larger sigma means: not seen by this run
 _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
@@ -207,7 +206,8 @@ class Calibration:
         ]
         shown = [*(_SHOWN[unit] for unit in paper.UNITS), *((c.shown_unit, c.per_si) for c in coefficients)]
         if self.model.walks:
-            found.append((WALK.symbol, self.fit.walk.intensity, self.fit.walk.sigma or math.nan, 0.0, WALK.unit))
+            intensity, spread = self.noise.walk_mps2_per_sqrt_s, self.noise.walk_spread
+            found.append((WALK.symbol, intensity, intensity * spread if spread else math.nan, 0.0, WALK.unit))
             shown.append((WALK.shown_unit, WALK.per_si))
         for effect in self.model.stepped:
             assert effect.unknown is not None
@@ -240,17 +240,17 @@ class Calibration:
     def trace(self) -> Iterator[tuple[float, int, Estimate]]:
         """(elapsed_s, dwell index, estimate) within and after every dwell: after a second, two, four ..."""
         model, state, around = self.model, self.carried.state, self.model.nominal_state()
-        walks = self.fit.walk_variances
         factor = information.start(self.settings.prior, model)
         extra = np.zeros((model.count, model.count))
-        for index, (dwell, columns, walk) in enumerate(
-            zip(self.carried.dwells, self.carried.columns, walks, strict=True)
+        for index, (dwell, columns, (pause, _)) in enumerate(
+            zip(self.carried.dwells, self.carried.columns, self.fit.steps, strict=True)
         ):
-            before, extra_before = information.predict(factor, walk), extra
+            before, extra_before = factor, extra
             for part in dwell.prefixes():
                 own = [columns[: len(part.pieces)]]
                 rows = information.whitened([part], own, self.noise.weights, state)[0]
-                factor = information.update(before, rows).factor
+                walked = np.array([pause, steps([part], self.noise)[0, 1]])
+                factor = information.update(before, rows, walked).factor
                 extra = extra_before + considered(self.noise, means_of([part], own), state)[0]
                 yield part.end_s, index, _estimate(factor, around, extra)
             if len(self.fit.following[index]):
@@ -385,15 +385,15 @@ def evaluated(fitted: Fit, settings: Settings) -> Calibration:
     """The filter run over a fit, its innovations, and the judgement of the misfit."""
     carried, noise, model = fitted.carried, fitted.noise, fitted.carried.model
     first = information.start(settings.prior, model)
-    steps = information.run(first, fitted.rows(), fitted.walk_variances, fitted.following)
+    steps = information.run(first, fitted.rows(), fitted.steps, fitted.following)
     extra = considered(noise, carried.means, carried.state)
     final = _estimate(steps[-1].factor, model.nominal_state(), extra.sum(axis=0) + fitted.considered)
     residuals = carried.means.readings - carried.means.design @ final.state
     visits = _visits(fitted, steps, residuals, extra, settings)
-    held_out, floor = _held_out(fitted)
+    left_out, floor = held_out(fitted)
     judged = consistency(fitted)
     return Calibration(
-        model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), held_out, floor,
+        model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), left_out, floor,
         Tally(), tuple(_remarks(carried, noise, final, judged, residuals)),
     )  # fmt: skip
 
@@ -402,7 +402,7 @@ def filterpy_estimate(
     source: Source, result: Calibration, form: Literal["square-root", "plain"] = "square-root"
 ) -> Estimate:
     """The same posterior by filterpy's filter, sample by sample: a second pass over the source."""
-    prior, q, model = result.settings.prior, result.fit.walk.intensity, result.model
+    prior, model = result.settings.prior, result.model
     scale = np.concatenate([np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), result.carried.sizes[STATE_COUNT:]])
     posterior = kalman.estimate(
         samples_of(Pass(source, result.settings).rows(), result.carried),
@@ -411,7 +411,6 @@ def filterpy_estimate(
         None if prior.diffuse else information.prior_covariance(prior, model),
         result.carried.state,
         scale,
-        (lambda elapsed_s: np.full(3, q**2 * elapsed_s)) if q else None,
         form,
     )
     return result.considering(posterior.state, posterior.covariance)
@@ -470,11 +469,11 @@ def _estimate(factor: Floats, nominal_state: Floats, extra: Floats) -> Estimate:
 
 def _visits(fitted: Fit, steps: list[Step], residuals: Floats, extra: Floats, settings: Settings) -> tuple[Visit, ...]:
     carried, means, around = fitted.carried, fitted.carried.means, fitted.carried.model.nominal_state()
-    own, walks = mean_covariances(fitted.noise, means, carried.state), fitted.walk_variances
+    own, walked = mean_covariances(fitted.noise, means, carried.state), to_mean(fitted.steps)
     before, extra = information.start(settings.prior, carried.model), np.cumsum(extra, axis=0)
     visits = list[Visit]()
     for k, (dwell, step) in enumerate(zip(carried.dwells, steps, strict=True)):
-        known = _estimate(information.predict(before, walks[k]), around, extra[k - 1] if k else 0.0 * extra[0])
+        known = _estimate(predicted(before, float(walked[k])), around, extra[k - 1] if k else 0.0 * extra[0])
         innovation, sigma = np.full(3, np.nan), np.full(3, np.nan)
         if not known.undetermined.size:
             rows = means.design[k]
@@ -490,8 +489,8 @@ def consistency(fitted: Fit) -> Consistency:
     """Whether the dwells agree with the fitted model within the noise it is judged by."""
     from scipy.special import fdtrc
 
-    noise, dwells, (rows, walk_variances) = fitted.noise, fitted.dwells, fitted.judged
-    upper = information.accumulated(rows, walk_variances)
+    noise, dwells, rows = fitted.noise, fitted.dwells, fitted.judged
+    upper = information.accumulated(rows, fitted.steps)
     statistic = float(upper[-1, -1] ** 2)
     dof = sum(information.row_rank(own) for own in rows) - information.rank(upper[:-1])
     dof -= int(not noise.setting_stated and noise.setting_rad > 0)
@@ -505,53 +504,6 @@ def consistency(fitted: Fit) -> Consistency:
 def format_p(p_value: float | None) -> str:
     """``= 0.034``, or a bound where the number has underflowed."""
     return "= -" if p_value is None else "< 1e-300" if p_value < 1e-300 else f"= {p_value:.2g}"
-
-
-def orientations(dwells: list[DwellFactor]) -> list[list[int]]:
-    """Dwells grouped by orientation: the same direction of gravity in the platform, and nearly the same pose."""
-    means = np.array([dwell.means for dwell in dwells])
-    direction = means[:, 1:4] / np.linalg.norm(means[:, 1:4], axis=1, keepdims=True)
-    place = np.column_stack([direction, [dwell.pose for dwell in dwells]])
-    groups, heads = list[list[int]](), np.empty((0, place.shape[1]))
-    for k, here in enumerate(place):
-        near = np.flatnonzero(np.abs(heads - here).max(axis=1) < np.radians(SAME_POSE_DEG))
-        if near.size:
-            groups[near[0]].append(k)
-        else:
-            groups.append([k])
-            heads = np.vstack([heads, here])
-    return groups
-
-
-def _held_out(fitted: Fit) -> tuple[float | None, float | None]:
-    """Rms error of the dwell means of orientations left out of the fit, and the rms that the noise alone would give.
-
-    Factors of the orientations before and after the one left out are merged: no refit from the start. None where a
-    fit without one of the orientations is undetermined. Slews are left out of no fit.
-    """
-    carried, noise = fitted.carried, fitted.noise.judging
-    rows = information.whitened(carried.dwells, carried.columns, noise.weights, carried.state)
-    extra = considered(noise, carried.means, carried.state)
-    groups, empty = orientations(carried.dwells), information.start(Prior(), carried.model)
-    slews = information.update(empty, np.concatenate(fitted.following)).factor if carried.slews else empty
-    own = [information.update(empty, np.concatenate([rows[k] for k in group])).factor for group in groups]
-    heads, tails = [slews], [empty]
-    for factor in own[:-1]:
-        heads.append(information.update(heads[-1], factor).factor)
-    for factor in own[:0:-1]:
-        tails.insert(0, information.update(tails[0], factor).factor)
-    errors, expected = list[Floats](), list[Floats]()
-    for group, head, tail in zip(groups, heads, tails, strict=True):
-        rest = extra.sum(axis=0) - extra[group].sum(axis=0)
-        left = _estimate(information.update(head, tail).factor, carried.model.nominal_state(), rest)
-        if left.undetermined.size:
-            return None, None
-        means = carried.means[group]
-        design = means.design
-        spread = design @ left.covariance @ np.swapaxes(design, 1, 2) + mean_covariances(noise, means, carried.state)
-        errors.append(((means.readings - design @ left.state) ** 2).ravel())
-        expected.append(np.einsum("dii->di", spread).ravel())
-    return float(np.sqrt(np.mean(np.concatenate(errors)))), float(np.sqrt(np.mean(np.concatenate(expected))))
 
 
 def _remarks(

@@ -22,9 +22,9 @@ from kf_calib.advice import Advice
 from kf_calib.calibration import Calibration, Parameter, consistency, format_p, refitted
 from kf_calib.drivers import families
 from kf_calib.effects import Effect, effect_named, names
-from kf_calib.fitting import Fit, Walk, likely_walk
+from kf_calib.fitting import Fit, walk_gain
 from kf_calib.model import Model
-from kf_calib.noise import mean_covariances, scatter_gain
+from kf_calib.noise import mean_covariances
 from kf_calib.samples import Floats
 from kf_calib.scan import Candidate, Scan, scan
 from kf_calib.spectrum import Line, lines
@@ -57,7 +57,7 @@ class Test:
     scores: dict[str, float]
     p_values: dict[str, float]
     misfit_p: float | None
-    walk: Walk | None
+    walking: str
     effective_tests: float
     in_slews_only: tuple[str, ...]
     lines: tuple[Line, ...]
@@ -77,7 +77,7 @@ class Test:
     @property
     def count(self) -> int:
         """How many effects were looked for or could not be."""
-        return len(self.best) + len(self.in_slews_only) + (self.walk is not None)
+        return len(self.best) + len(self.in_slews_only) + bool(self.walking)
 
     @property
     def ranked(self) -> list[str]:
@@ -119,7 +119,7 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
     """
     from scipy.special import chdtrc, chdtri
 
-    found = scan(fitted.carried, fitted.noise.judging, candidates(fitted.carried.model), fitted.walk_variances)
+    found = scan(fitted.carried, fitted.noise.judging, candidates(fitted.carried.model))
     dofs, statistics = np.array([each.dof for each in found.candidates]), found.statistics
     own = np.where(dofs > 0, chdtrc(np.maximum(dofs, 1), statistics), 1.0)
     tests = tests or independent_tests(found, seed)
@@ -131,9 +131,9 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
             best[name] = k
             if candidate.dof:
                 scores[name], p_values[name] = score, run_level(float(own[k]), tests)
-    walk = _walk_test(fitted)
-    if walk is not None:
-        name, _, fall, ratio = walk
+    name = _walking(fitted)
+    if name:
+        fall, ratio = (2.0 * gain for gain in walk_gain(fitted))
         p_values[name] = run_level(0.5 * float(chdtrc(1, max(ratio, 0.0))), tests)
         scores[name] = (fall if ratio > _threshold(1, tests) else ratio) - _threshold(1, tests)
     model, misfit_p = fitted.carried.model, consistency(fitted).p_value
@@ -143,7 +143,7 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
         p_values[swinging] = seen_lines[0].p_value * _SHARE / _LINES
         scores[swinging] = float(chdtri(1, max(seen_lines[0].p_value, 1e-300))) - _threshold(1, 1.0)
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
-    return Test(found, best, scores, p_values, misfit_p, walk and walk[1], tests, slewing, seen_lines, swinging)
+    return Test(found, best, scores, p_values, misfit_p, name, tests, slewing, seen_lines, swinging)
 
 
 def price(candidate: Candidate, tests: float) -> float:
@@ -182,17 +182,13 @@ def _smallest_p(found: Scan, seen: NDArray[np.intp], seed: int) -> Floats:
     return chdtrc(np.array([basis.shape[1] for basis in bases], float), squares).min(axis=1)
 
 
-def _walk_test(fitted: Fit) -> tuple[str, Walk, float, float] | None:
-    """The effect that lets the biases walk, its likeliest intensity, twice its gain in log-likelihood, and how much of
-    that a mere scatter from dwell to dwell has not, which any unexplained misfit looks like."""
+def _walking(fitted: Fit) -> str:
+    """The name of the effect that lets the biases walk; empty where it is in the model, or cannot be looked for."""
     model = fitted.carried.model
-    kinds = [effect_named(name, model.bench) for name in names(model.bench) if ":" not in name]
-    walking = [effect for effect in kinds if effect.walks]
-    if model.walks or not walking or len(fitted.dwells) < 8 or fitted.walk.intensity:
-        return None
-    walk, gain = likely_walk(fitted)
-    over_scatter = gain - scatter_gain(fitted.noise.judging, fitted.carried.means, fitted.carried.state)
-    return str(walking[0]), walk, 2.0 * gain, 2.0 * over_scatter
+    if model.walks or len(fitted.dwells) < 8 or fitted.noise.walk_mps2_per_sqrt_s:
+        return ""
+    kinds = (effect_named(name, model.bench) for name in names(model.bench) if ":" not in name)
+    return next((str(effect) for effect in kinds if effect.walks), "")
 
 
 @dataclass(frozen=True)
@@ -303,7 +299,7 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
     """Whether some formula explains the misfit better than the effects at the constants that were found for them."""
     fitted, tests = found.before.fit, found.test.effective_tests
     effects = [effect for effect in refit.model.effects if str(effect) in names]
-    scanned = scan(fitted.carried, fitted.noise.judging, effects, fitted.walk_variances)
+    scanned = scan(fitted.carried, fitted.noise.judging, effects)
     basis = np.concatenate([each.basis for each in scanned.candidates], axis=1)
     left, singular, _ = np.linalg.svd(basis, full_matrices=False)
     own = float(np.sum((left[:, singular > 1e-6].T @ scanned.residual) ** 2))
@@ -379,7 +375,7 @@ def _leaps(refit: Calibration) -> bool:
     """Whether walking biases take a step no walk would: one jump is not a walk."""
     from scipy.special import ndtr
 
-    if not refit.fit.walk.intensity:
+    if not refit.noise.walk_mps2_per_sqrt_s:
         return False
     steps = np.array([visit.innovation_mps2 / visit.innovation_sigma_mps2 for visit in refit.visits])
     steps = np.abs(steps[np.isfinite(steps)])

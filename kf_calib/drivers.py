@@ -76,7 +76,7 @@ def families(fitted: Fit) -> tuple[list[Family], float]:
         with contextlib.suppress(InputError):  # a jump so late, a decay so fast that the trial of a formula misses it
             effects += [effect_named(_named(text), bench) for text in texts]
             listed.append((driver, texts))
-    scanned = scan(fitted.carried, fitted.noise.judging, effects, fitted.walk_variances)
+    scanned = scan(fitted.carried, fitted.noise.judging, effects)
     out, place = list[Family](), 0
     for driver, texts in listed:
         own, place = slice(place, place + len(texts)), place + len(texts)

@@ -18,8 +18,9 @@ import numpy as np
 from kf_calib import information
 from kf_calib.effects import Coefficient, Effect
 from kf_calib.folding import Carried, DwellFactor, candidate_columns, stimulus_of
+from kf_calib.likelihood import gain_of, wandering, with_dwell_parts
 from kf_calib.model import Model, on_basis
-from kf_calib.noise import FLOOR_MPS2, Noise, with_dwell_parts, within_dwells
+from kf_calib.noise import FLOOR_MPS2, Noise, steps, within_dwells
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
 
@@ -34,18 +35,6 @@ _CLOSER = ((0.45, 41), (0.0225, 17), (0.0028, 9))  # half width in ln(value) and
 
 
 @dataclass(frozen=True)
-class Walk:
-    """The biases' random walk, m/s^2 per sqrt(s), and 1 sigma of it (None: it was stated, or is zero)."""
-
-    intensity: float = 0.0
-    sigma: float | None = None
-
-    def variances(self, dwells: Sequence[DwellFactor]) -> Floats:
-        """Variance (D, 3) of the biases' steps before each dwell: q^2 times the time between the dwells' starts."""
-        return np.repeat(self.intensity**2 * _gaps_s(dwells)[:, None], 3, axis=1)
-
-
-@dataclass(frozen=True)
 class Fit:
     """Dwells with the fitted model's columns, and the noise they are weighted by.
 
@@ -54,7 +43,6 @@ class Fit:
 
     carried: Carried
     noise: Noise
-    walk: Walk
     spreads: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @property
@@ -62,17 +50,17 @@ class Fit:
         return self.carried.dwells
 
     @property
-    def walk_variances(self) -> Floats:
-        return self.walk.variances(self.dwells)
+    def steps(self) -> Floats:
+        """Variances (D, 2) of the biases' steps before and in each dwell; zeros where they do not walk."""
+        return steps(self.dwells, self.noise)
 
     @cached_property
-    def judged(self) -> tuple[list[Floats], Floats]:
-        """Rows [H | W | z] by which the misfit is judged, and the variances of the biases' steps before each block."""
+    def judged(self) -> list[Floats]:
+        """Rows [H | W | z] by which the misfit is judged."""
         carried = self.carried
-        rows, _ = information.judged(
+        return information.judged(
             self.dwells, carried.columns, self.noise.judging, carried.state, carried.model.count
-        )
-        return rows, np.vstack([np.zeros((len(rows) - len(self.dwells), 3)), self.walk_variances])
+        )[0]
 
     @cached_property
     def following(self) -> list[Floats]:
@@ -87,9 +75,13 @@ class Fit:
                 out[place] = np.vstack([out[place], own])
         return out
 
-    def all_rows(self) -> list[Floats]:
-        """Whitened rows of each dwell and the slew after it."""
-        return [np.vstack(both) if len(both[1]) else both[0] for both in zip(self.rows(), self.following, strict=True)]
+    def all_rows(self, noise: Noise | None = None) -> list[Floats]:
+        """Whitened rows of each dwell and the slew after it, in which the biases stand."""
+        out = list[Floats]()
+        for own, more in zip(self.rows(noise), self.following, strict=True):
+            standing = np.zeros((len(more), own.shape[1] - more.shape[1]))
+            out.append(np.vstack([own, np.hstack([standing, more])]) if len(more) else own)
+        return out
 
     @cached_property
     def considered(self) -> Floats:
@@ -106,7 +98,7 @@ class Fit:
             changes = [0.5 * (a - b) @ carried.state[part, None] for a, b in zip(more, less, strict=True)]
             columns = [np.concatenate(both, axis=3) for both in zip(carried.columns, changes, strict=True)]
             rows = information.whitened(carried.dwells, columns, self.noise.weights, carried.state)
-            upper = information.accumulated(rows, self.walk_variances)
+            upper = information.accumulated(rows, self.steps)
             gain = upper[: len(out), : len(out)].T @ upper[: len(out), len(out)]
             out += np.outer(gain, gain)
         return out
@@ -120,9 +112,10 @@ def fit(
     dwells: list[DwellFactor], model: Model, walk_mps2_per_sqrt_s: float = 0.0, slews: Sequence[DwellFactor] = ()
 ) -> Fit:
     """Noise, linearisation and the model's unknowns, each given the others, until they stand still."""
-    within, bench = within_dwells(dwells), model.bench
+    within, bench = within_dwells(dwells, walk_mps2_per_sqrt_s), model.bench
+    within = replace(within, walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
     slews = [slew for slew in slews if slew.number >= dwells[0].number] if model.dynamic else []
-    fitted = Fit(Carried(dwells, model, model.nominal_state(), slews), within, Walk(walk_mps2_per_sqrt_s))
+    fitted = Fit(Carried(dwells, model, model.nominal_state(), slews), within)
     searching = False
     for number in range(_PASSES_WITH_UNKNOWNS if model.unknowns or model.stepped else _PASSES):
         if number == 1 and model.unknowns:
@@ -136,10 +129,12 @@ def fit(
         if searching:
             model = model.moved(np.clip(moved, -reach, reach))
         carried = Carried(dwells, model, state, slews)
-        noise = with_dwell_parts(within, carried.means, state, bench.angle_sigma_deg, bench.scatter_sigma_mps2)
+        stated = bench.angle_sigma_deg, bench.scatter_sigma_mps2
+        noise = with_dwell_parts(within, carried.means, state, *stated, walks=model.walks)
         noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
-        walk = likely_walk(replace(fitted, carried=carried, noise=noise))[0] if model.walks else fitted.walk
-        fitted = replace(fitted, carried=carried, noise=noise, walk=walk)
+        fitted = replace(fitted, carried=carried, noise=noise)
+        if model.walks:
+            within = within_dwells(dwells, noise.walk_mps2_per_sqrt_s)
         # where columns step, they hold the input axes to where they are taken to be: that gives way slowly
         if number >= _PASSES - 1 and (np.abs(moved) <= _STILL * reach).all() and not model.stepped:
             break
@@ -148,7 +143,7 @@ def fit(
 
 def _solved(fitted: Fit) -> tuple[Floats, Floats]:
     """The estimate (p,) with unknowns at zero, and how far these would move (p,), zeros elsewhere."""
-    factor = information.accumulated(fitted.all_rows(), fitted.walk_variances)[:-1]
+    factor = information.accumulated(fitted.all_rows(), fitted.steps)[:-1]
     state = information.solve(factor, fitted.carried.model.nominal_state())[0]
     moved = np.zeros_like(state)
     places = list(fitted.carried.model.unknowns)
@@ -181,7 +176,7 @@ def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
         own[:, : slew.width] -= triangles[:, : slew.width, : slew.width] @ on_basis(np.moveaxis(model, 1, 2))
         squares, counts = squares + (own**2).sum(axis=(0, 1)), counts + slew.count
     sizes = np.sqrt(squares / counts) + FLOOR_MPS2
-    factor = information.accumulated(fitted.all_rows(), fitted.walk_variances)[:-1]
+    factor = information.accumulated(fitted.all_rows(), fitted.steps)[:-1]
     covariance = information.solve(factor, state)[1]
     freedom = information.row_rank(rows) - float(np.einsum("rp,pq,rq->", rows[:, :-1], covariance, rows[:, :-1]))
     level = np.linalg.norm(rows[:, -1] - rows[:, :-1] @ state) / np.sqrt(max(freedom, 1.0))
@@ -240,34 +235,16 @@ def _falls(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> Floats:
     carried, statistics = Carried(fitted.dwells, rest, state), list[Floats]()
     for first in range(0, len(grid), _TOGETHER):
         part = grid[first : first + _TOGETHER]
-        statistics.append(scan(carried, fitted.noise.weights, part, fitted.walk_variances).statistics)
+        statistics.append(scan(carried, fitted.noise.weights, part).statistics)
     return np.concatenate(statistics)
 
 
-def _gaps_s(dwells: Sequence[DwellFactor]) -> Floats:
-    starts = np.array([dwell.start_s for dwell in dwells])
-    return np.diff(starts, prepend=starts[:1])
+def walk_gain(fitted: Fit) -> tuple[float, float]:
+    """What a walk of the biases gains in log-likelihood over none, and over a mere scatter from dwell to dwell.
 
-
-def likely_walk(fitted: Fit) -> tuple[Walk, float]:
-    """The walk's most likely intensity, its sigma from the likelihood's curvature, and the gain in log-likelihood.
-
-    The scatter from dwell to dwell is kept as it was found or stated; where it was found, the walk explains it first.
+    Both beside what a stated scatter may be; scatter that was estimated from the same misfit is left out.
     """
-    from scipy.optimize import minimize_scalar
-
-    noise, (rows, _) = fitted.noise.judging, fitted.judged
-    gaps = np.append(np.zeros(len(rows) - len(fitted.dwells)), _gaps_s(fitted.dwells))
-    level = math.log(float(np.mean(noise.effective_sigma_mps2)) / math.sqrt(max(float(gaps.mean()), 1e-9)))
-
-    def cost(log_intensity: float) -> float:
-        variances = np.repeat(math.exp(2.0 * log_intensity) * gaps[:, None], 3, axis=1)
-        return -information.log_likelihood(rows, variances)
-
-    found = minimize_scalar(cost, bounds=(level - 12.0, level + 6.0), method="bounded", options={"xatol": 1e-3})
-    best, step = float(found.x), 0.05
-    curvature = (cost(best + step) - 2.0 * float(found.fun) + cost(best - step)) / step**2
-    gain = -float(found.fun) - information.log_likelihood(rows, np.zeros((len(gaps), 3)))
-    if gain < 0.5 or curvature <= 0:
-        return Walk(), 0.0
-    return Walk(math.exp(best), math.exp(best) / math.sqrt(curvature)), gain
+    noise, carried = replace(fitted.noise.judging, walk_mps2_per_sqrt_s=0.0), fitted.carried
+    means, prior = wandering(carried.dwells, noise, carried.means)
+    walk, scatter = (gain_of(part, noise, means, carried.state, prior) for part in ("walk", "scatter"))
+    return walk, walk - scatter

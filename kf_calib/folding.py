@@ -14,7 +14,7 @@ known by nine nodes, three of its plain part and three of each envelope. K is 3 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -25,6 +25,7 @@ from kf_calib.model import Model, Nodes, Rows, basis, effect_columns, on_basis, 
 from kf_calib.samples import Floats
 from kf_calib.spectrum import Spectrum
 from kf_calib.triangle import triangle
+from kf_calib.walk import Path, path
 
 _VIBRATING = 25.0  # mean squared deviation of the variances in their own sigma; autocorrelation alone makes up to 10
 _LAGS = 64
@@ -114,6 +115,13 @@ class DwellFactor:
         squares, spare = self.squares, np.maximum(self.counts - float(self.width), 0.0)[:, None]
         pooled = squares.sum(axis=0) / max(spare.sum(), 1)
         return np.where(spare >= 8, squares / np.maximum(spare, 1), pooled)
+
+    @cached_property
+    def walk(self) -> Path:
+        """What a walk of the biases does in it."""
+        ends = np.array([piece.nodes.elapsed_s[[0, -1]] for piece in self.pieces])
+        triangles = np.array([piece.triangle[: self.width, : self.width] for piece in self.pieces])
+        return path(ends[:, 0], ends[:, 1], [piece.count for piece in self.pieces], triangles)
 
     @property
     def start_s(self) -> float:
@@ -298,15 +306,17 @@ def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Float
 
 @dataclass(frozen=True)
 class Means:
-    """Of D dwells: mean model columns (D, 3, p), readings (D, 3), specific force (D, 3); counts of readings (D,)."""
+    """Of D dwells: mean model columns (D, 3, p), readings (D, 3), specific force (D, 3); counts of readings (D,), when
+    each begins and ends (D, 2)."""
 
     design: Floats
     readings: Floats
     force_mps2: Floats
     counts: Floats
+    ends_s: Floats
 
     def __getitem__(self, part: int | list[int]) -> Means:
-        return Means(self.design[part], self.readings[part], self.force_mps2[part], self.counts[part])
+        return Means(*(getattr(self, each.name)[part] for each in fields(self)))
 
 
 def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
@@ -319,7 +329,8 @@ def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
         design.append(np.einsum("b,bk,bkc->c", weights, first, coefficients).reshape(own.shape[2:]))
     means = np.array([dwell.means for dwell in dwells])
     counts = np.array([dwell.count for dwell in dwells], float)
-    return Means(np.array(design), means[:, 4:], means[:, 1:4], counts)
+    ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
+    return Means(np.array(design), means[:, 4:], means[:, 1:4], counts, ends)
 
 
 class Carried:
@@ -358,11 +369,11 @@ class Carried:
 class Samples:
     """Rows of one piece, sample by sample: H (n, 3, p), regressors of the dwell states (n, 4), readings (n, 3).
 
-    moving: of the slew after the dwell.
+    elapsed_s (n,). moving: of the slew after the dwell.
     """
 
     dwell: int
-    start_s: float
+    elapsed_s: Floats
     observation: Floats
     regressors: Floats
     readings: Floats
@@ -373,7 +384,6 @@ def samples_of(rows: Iterable[Rows], carried: Carried) -> Iterator[Samples]:
     """A second pass over the rows with the columns of the first: what filterpy and batch least squares work on."""
     every, columns = [*carried.dwells, *carried.slews], [*carried.columns, *carried.slew_columns]
     known = {(each.number, each.moving): iter(own) for each, own in zip(every, columns, strict=True)}
-    starts = {(each.number, each.moving): each.start_s for each in every}
     for block in rows:
         key = block.dwell, block.moving
         if key not in known:
@@ -383,7 +393,7 @@ def samples_of(rows: Iterable[Rows], carried: Carried) -> Iterator[Samples]:
             functions = basis(u, block.elapsed_s[part], carried.carrier_hz)
             observation = (functions.T @ on_basis(own.reshape(len(own), -1))).reshape(len(u), *own.shape[1:])
             regressors, readings = block.columns[part], block.readings[part]
-            yield Samples(block.dwell, starts[key], observation, regressors, readings, block.moving)
+            yield Samples(block.dwell, block.elapsed_s[part], observation, regressors, readings, block.moving)
 
 
 class Folder:

@@ -20,12 +20,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from kf_calib import information, paper
-from kf_calib.calibration import Calibration, Parameter, evaluate, format_p, orientations, refitted
+from kf_calib.calibration import Calibration, Parameter, evaluate, format_p, refitted
 from kf_calib.diagnosis import Diagnosis, diagnose
 from kf_calib.effects import as_text, effect_named, merged, refuse_unknown
 from kf_calib.errors import InputError, UnobservableError
-from kf_calib.fitting import Fit, likely_walk
+from kf_calib.fitting import Fit, walk_gain
 from kf_calib.folding import Carried, without
+from kf_calib.held_out import orientations
 from kf_calib.noise import mean_covariances
 from kf_calib.samples import Floats
 
@@ -294,11 +295,11 @@ def removals(fitted: Fit) -> tuple[Removal, ...]:
     from scipy.special import chdtrc
 
     carried = fitted.carried
-    upper = information.accumulated(fitted.all_rows(), fitted.walk_variances)
+    upper = information.accumulated(fitted.all_rows(), fitted.steps)
     rank, least, out = information.rank(upper[:-1]), upper[-1, -1] ** 2, list[Removal]()
     for effect in carried.model.effects:
         if effect.walks:
-            gain = 2.0 * likely_walk(fitted)[1]
+            gain = 2.0 * walk_gain(fitted)[0]
             out.append(Removal(str(effect), gain, 1, 0.5 * float(chdtrc(1, max(gain, 0.0)))))
             continue
         rest = np.delete(upper, carried.model.parts[str(effect)], axis=1)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kf_calib import paper
+from kf_calib import paper, walk
 from kf_calib.folding import DwellFactor
 from kf_calib.model import STATE_COUNT, Model, Prior, dwell_map, on_basis, parabola
 from kf_calib.noise import FLOOR_MPS2, Noise, flicker_sigma, wander
@@ -20,6 +20,7 @@ from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 
 _SLOW = np.arange(1, 5)
+_STILL = np.zeros(2)
 
 
 def whitened(
@@ -30,7 +31,9 @@ def whitened(
     about: Floats | None = None,
     flicker_mps2: Floats | None = None,
 ) -> list[Floats]:
-    """Rows [H | z] of unit noise (r, p + 1) of each dwell, its nuisance states eliminated by QR.
+    """Rows [S | H | z] of unit noise (r, s + p + 1) of each dwell, its nuisance states eliminated by QR.
+
+    S: of the steps that the biases take in the dwell, where they walk (s 3, else 0); H has the biases at its end.
 
     ``columns``: the model's, at the nodes of each dwell. Channel i's rows are divided by the sigma of a white reading
     that averages like the true one; the setting error (three rotations) and the scatter (three offsets) enter as states
@@ -45,7 +48,9 @@ def whitened(
     offsets, priors = len(used), sigmas[used]
     if flicker_mps2 is not None:
         priors = np.append(priors, np.outer(np.maximum(flicker_mps2, FLOOR_MPS2), 1.0 / np.sqrt(_SLOW)))
-    count = len(priors)
+    count, ratios = len(priors), noise.walk_mps2_per_sqrt_s / sigma
+    inside = 3 if noise.walk_mps2_per_sqrt_s else 0
+    first_of_model = count + inside
     out = list[Floats]()
     for dwell, own in zip(dwells, columns, strict=True):
         triangles = np.array([piece.triangle for piece in dwell.pieces])
@@ -53,21 +58,24 @@ def whitened(
             np.array([piece.nodes.regressors for piece in dwell.pieces])
         )
         carried, size, width = triangles[:, : dwell.width, : dwell.width], dwell.width * len(triangles), own.shape[-1]
-        rows = np.zeros((3 * size + count, count + width + 1))
+        rows = np.zeros((3 * size + count, first_of_model + width + 1))
         for i in range(3):
             part = rows[i * size : (i + 1) * size]
             part[:, :offsets] = (regressors @ nuisances[i]).reshape(size, offsets) / sigma[i]
             if slow:
                 first = offsets + slow * i
                 part[:, first : first + slow] = (carried @ on_basis(_waves(dwell))).reshape(size, slow) / sigma[i]
-            part[:, count:-1] = (carried @ on_basis(own[:, :, i])).reshape(size, width) / sigma[i]
+            part[:, first_of_model:-1] = (carried @ on_basis(own[:, :, i])).reshape(size, width) / sigma[i]
             readings = triangles[:, : dwell.width, dwell.width + i]
             if about is not None:
                 readings = readings - (carried @ on_basis((own[:, :, i] @ about)[:, :, None]))[:, :, 0]
             part[:, -1] = readings.reshape(size) / sigma[i]
+            if inside:
+                part[:, count + i] = dwell.walk.step / sigma[i]
+                part[:] = dwell.walk.whiten(part, float(ratios[i]))
         rows[3 * size :, :count] = np.diag(1.0 / priors)
         folded = triangle(rows)
-        out.append(_informative(folded[count:, count:], units))
+        out.append(_informative(folded[count:, count:], np.append(np.ones(inside), units)))
     return out
 
 
@@ -138,32 +146,13 @@ def start(prior: Prior, model: Model) -> Floats:
     return triangle(np.column_stack([root, root @ model.nominal_state()]))[: model.count]
 
 
-def predict(factor: Floats, walk_variance: Floats) -> Floats:
-    """Time update: the three biases take a step of variance (3,), 0: none. SRIF form, valid for a singular factor."""
-    count = int((walk_variance > 0).sum())
-    return _walked(factor, walk_variance)[count:, count:] if count else factor
-
-
-def _walked(factor: Floats, walk_variance: Floats) -> Floats:
-    """Triangle [steps w | states | z] after a step of the biases: rows of w first, to be eliminated."""
-    walking = np.flatnonzero(walk_variance > 0)
-    count = len(walking)
-    biases = 4 * walking + 3
-    width = len(factor)
-    augmented = np.zeros((count + width, count + width + 1))
-    augmented[:count, :count] = np.diag(1.0 / np.sqrt(walk_variance[walking]))
-    augmented[count:, :count] = -factor[:, biases]
-    augmented[count:, count:] = factor
-    return triangle(augmented)[: count + width]
-
-
-def update(factor: Floats, rows: Floats) -> Step:
-    """Measurement update with whitened rows (m, p + 1)."""
-    width = len(factor)
-    upper = triangle(np.vstack([factor, rows]))
-    after = upper[:width]
+def update(factor: Floats, rows: Floats, walked: Floats = _STILL) -> Step:
+    """Time and measurement update with whitened rows (m, s + p + 1); ``walked`` (2,): variances of the biases' steps in
+    the pause before the dwell and in the dwell."""
+    width, (upper, count) = len(factor), walk.advanced(factor, walked, rows)
+    after, left = upper[count : count + width, count:], upper[count + width :, -1]
     gained = rank(after) - rank(factor)
-    return Step(after, float(upper[width, width] ** 2), row_rank(rows) - gained)
+    return Step(after, float(left @ left), row_rank(rows) - gained)
 
 
 def restricted(factor: Floats, kept: Sequence[int]) -> Floats:
@@ -179,56 +168,36 @@ def row_rank(rows: Floats) -> int:
     return int(rows[:, :-1].any(axis=1).sum())
 
 
-def run(
-    first: Floats, rows: Iterable[Floats], walk_variances: Iterable[Floats], following: Iterable[Floats]
-) -> list[Step]:
-    """The recursion over dwells; one step of the biases' walk before each, the rows ``following`` of its slew after it.
+def run(first: Floats, rows: Iterable[Floats], walked: Iterable[Floats], following: Iterable[Floats]) -> list[Step]:
+    """The recursion over dwells, ``walked`` the variances of the biases' steps of each; rows ``following`` of its slew.
 
     A step's factor is that after the slew, its innovation that of the dwell.
     """
-    steps, factor = list[Step](), first
-    for dwell_rows, variance, more in zip(rows, walk_variances, following, strict=True):
-        step = update(predict(factor, variance), dwell_rows)
-        steps.append(replace(step, factor=update(step.factor, more).factor) if len(more) else step)
-        factor = steps[-1].factor
-    return steps
+    found, factor = list[Step](), first
+    for dwell_rows, variances, more in zip(rows, walked, following, strict=True):
+        step = update(factor, dwell_rows, variances)
+        found.append(replace(step, factor=update(step.factor, more).factor) if len(more) else step)
+        factor = found[-1].factor
+    return found
 
 
-def accumulated(rows: Sequence[Floats], walk_variances: Floats | None = None) -> Floats:
-    """The triangle [H | z] of all rows (a diffuse prior), the residual in its last row; the biases walk between dwells.
+def accumulated(rows: Sequence[Floats], walked: Floats | None = None) -> Floats:
+    """The triangle [H | z] of all rows (a diffuse prior), the residual in its last row.
 
-    ``walk_variances`` (D, 3); without a walk all rows are folded at once.
+    ``walked`` (D, 2): variances of the biases' steps before and in each dwell, the last D of the rows; without a walk
+    all rows are folded at once.
     """
-    if walk_variances is None or not walk_variances.any():
+    if walked is None or not walked.any():
         stacked = np.concatenate(rows)
         return triangle(np.vstack([stacked, np.zeros((max(stacked.shape[1] - len(stacked), 0), stacked.shape[1]))]))
-    width = rows[0].shape[1]
-    factor, left = np.zeros((width - 1, width)), np.zeros((1, width))
-    for own, variance in zip(rows, walk_variances, strict=True):
-        upper = triangle(np.vstack([predict(factor, variance), own]))
-        factor, left[0, -1] = upper[:-1], np.hypot(left[0, -1], upper[-1, -1])
-    return np.vstack([factor, left])
+    width = rows[-1].shape[1] - 4
+    factor, left = np.zeros((width, width + 1)), 0.0
+    padded = np.vstack([np.zeros((len(rows) - len(walked), 2)), walked])
+    for own, variances in zip(rows, padded, strict=True):
+        upper, count = walk.advanced(factor, variances, own)
+        factor, left = upper[count : count + width, count:], np.hypot(left, np.linalg.norm(upper[count + width :, -1]))
+    return np.vstack([factor, np.append(np.zeros(width), left)])
 
-
-def log_likelihood(rows: Sequence[Floats], walk_variances: Floats) -> float:
-    """Restricted log-likelihood of the rows under a walk of the biases, up to a constant in the walk.
-
-    -1/2 (sum of squared residuals) - sum log(|R_ww| sigma_w) over the eliminated steps - log|R| of what is left.
-    """
-    width = rows[0].shape[1]
-    factor, total = np.zeros((width - 1, width)), 0.0
-    for own, variance in zip(rows, walk_variances, strict=True):
-        walking = variance > 0
-        count = int(walking.sum())
-        if count:
-            upper = _walked(factor, variance)
-            steps = np.abs(np.diag(upper)[:count]) * np.sqrt(variance[walking])
-            factor, total = upper[count:, count:], total - float(np.log(steps).sum())
-        upper = triangle(np.vstack([factor, own]))
-        factor, total = upper[:-1], total - 0.5 * float(upper[-1, -1] ** 2)
-    singular = np.linalg.svd(scaled(factor)[0], compute_uv=False)
-    sizes = np.log(scaled(factor)[1]).sum()
-    return total - float(np.log(singular[singular > 1e-9]).sum() + sizes)
 
 
 def scaled(factor: Floats) -> tuple[Floats, Floats]:

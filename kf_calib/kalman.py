@@ -7,7 +7,8 @@ the covariance after tens of thousands of static samples with a wide prior (``fo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -40,13 +41,12 @@ def estimate(
     prior_covariance: Floats | None,
     linearised_at: Floats,
     scale: Floats,
-    walk_variance: Callable[[float], Floats] | None = None,
     form: Literal["square-root", "plain"] = "square-root",
 ) -> Posterior:
     """Run the filter over all samples.
 
     prior_covariance None: diffuse. scale (p,): m/s^2 that a unit of each state makes in a reading, about.
-    walk_variance(seconds): the variance of the biases' steps (process noise Q).
+    The biases walk by the noise's intensity from reading to reading (process noise Q).
     """
     count, used = len(nominal_state), np.flatnonzero(noise.dwell_sigmas > 0)
     nuisances = dwell_map(linearised_at)[:, :, used]
@@ -57,16 +57,17 @@ def estimate(
     else:
         root = np.linalg.cholesky(prior_covariance * np.outer(scale, scale))
     kf = _Filter(form, nominal_state * scale, root, noise.dwell_sigmas[used])
-    place, nis, done, previous_s = (-1, False), 0.0, 0, None
+    place, nis, done, previous_s = (-1, False), 0.0, 0, math.nan
     for piece in samples:
         if (piece.dwell, piece.moving) != place:
-            if walk_variance is not None and previous_s is not None and not piece.moving:
-                kf.walk(walk_variance(piece.start_s - previous_s))
             kf.enter_dwell(noise.of(piece.moving).effective_sigma_mps2)
-            place, previous_s = (piece.dwell, piece.moving), previous_s if piece.moving else piece.start_s
+            place = (piece.dwell, piece.moving)
         own = np.einsum("nc,icp->nip", piece.regressors, nuisances)
         observations = np.concatenate([piece.observation / scale, own], axis=2)
-        for observation, reading in zip(observations, piece.readings, strict=True):
+        for observation, reading, now_s in zip(observations, piece.readings, piece.elapsed_s.tolist(), strict=True):
+            if noise.walk_mps2_per_sqrt_s and now_s > previous_s:
+                kf.walk(noise.walk_mps2_per_sqrt_s**2 * (now_s - previous_s))
+            previous_s = now_s
             nis += kf.update(observation, reading)
         done += len(piece.readings)
     state, covariance = kf.posterior()
@@ -106,8 +107,8 @@ class _Filter:
         matrix[:, own] = 0.0  # the root is lower triangular: its leading block is the root of the leading covariance
         matrix[own, own] = np.diag(sigma)
 
-    def walk(self, variance: Floats) -> None:
-        """Time update with F = I; filterpy's Q is the identity until it is set."""
+    def walk(self, variance: float) -> None:
+        """Time update with F = I, the biases' steps of that variance; filterpy's Q is the identity until it is set."""
         steps = np.zeros(len(self.kf.x))
         steps[3:STATE_COUNT:4] = variance
         if self.plain:

@@ -3,7 +3,8 @@
 Three parts (all 1 sigma). sigma_w: the noise of a reading within a dwell, with an inflation kappa for its
 autocorrelation (kappa = spectral density at zero frequency / that of white noise of the same variance, so that the
 mean of n readings has variance kappa sigma_w^2 / n). sigma_alpha: the setting error, one small rotation a dwell, common
-to the three accelerometers. sigma_s: the scatter of each sensor from dwell to dwell. Each is stated or estimated.
+to the three accelerometers. sigma_s: the scatter of each sensor from dwell to dwell. Each is stated or estimated
+(``likelihood``). Beside them the biases may walk at random, by q times the square root of the time.
 """
 
 from __future__ import annotations
@@ -13,16 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kf_calib import walk
 from kf_calib.folding import Autocovariance, DwellFactor, Means
 from kf_calib.samples import Floats
-from kf_calib.triangle import triangle
 
 FLOOR_MPS2 = 1e-9
 """Readings that are exactly constant get this sigma: the rounding of a double is 1e-15 m/s^2."""
 
 _MAX_ORDER = 20
 _WANDER = 6
-_SIGNIFICANT = 5.41  # 1 % point of the likelihood ratio of a variance against zero: half of chi2 with 1 dof
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,8 @@ class Noise:
     force. The estimate then leans on the readings along it, which no rotation changes; otherwise dwells weigh by their
     scatter alone, and the setting error is *considered* (Schmidt): it enlarges the covariance and moves no estimate.
     slew_sigma_mps2 (3,): what stands for sigma and inflation in slews; None where none are used.
+    walk_mps2_per_sqrt_s: intensity q of the random walk of each bias; walk_spread: 1 sigma of ln q, None where q was
+    stated or is zero.
     """
 
     sigma_mps2: Floats
@@ -43,6 +45,8 @@ class Noise:
     scatter_stated: bool = False
     checked: bool = True
     slew_sigma_mps2: Floats | None = None
+    walk_mps2_per_sqrt_s: float = 0.0
+    walk_spread: float | None = None
 
     def __post_init__(self) -> None:
         if self.scatter_mps2 is None:  # pyright: ignore[reportUnnecessaryComparison]
@@ -67,7 +71,7 @@ class Noise:
         """The noise in dwells, or that in slews."""
         if not moving or self.slew_sigma_mps2 is None:
             return self
-        return replace(self, sigma_mps2=self.slew_sigma_mps2, inflation=np.ones(3))
+        return replace(self, sigma_mps2=self.slew_sigma_mps2, inflation=np.ones(3), walk_mps2_per_sqrt_s=0.0)
 
     @property
     def dwell_sigmas(self) -> Floats:
@@ -75,8 +79,14 @@ class Noise:
         return np.concatenate([np.full(3, self.setting_rad), self.scatter_mps2])
 
 
-def within_dwells(dwells: Sequence[DwellFactor]) -> Noise:
-    """sigma_w and kappa of each accelerometer, pooled over the pieces of the dwells.
+def steps(dwells: Sequence[DwellFactor], noise: Noise) -> Floats:
+    """Variances (D, 2) of the steps of a bias in the pause before each dwell and over the dwell."""
+    ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
+    return walk.variances(ends[:, 0], ends[:, 1], noise.walk_mps2_per_sqrt_s)
+
+
+def within_dwells(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float = 0.0) -> Noise:
+    """sigma_w and kappa of each accelerometer, pooled over the pieces; a known walk of the biases is not in them.
 
     The sum of squares about a parabola has expectation sigma^2 (n - 3 kappa) over a piece of 40 kappa readings or more;
     where there is none, sigma_w is that of the autocovariance.
@@ -84,13 +94,28 @@ def within_dwells(dwells: Sequence[DwellFactor]) -> Noise:
     total = dwells[0].autocovariance
     for dwell in dwells[1:]:
         total += dwell.autocovariance
+    if walk_mps2_per_sqrt_s:
+        total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _lagged(dwells))
     inflation, variance = np.array([_inflation(total, i) for i in range(3)]).T
     squares, counts = (np.concatenate([getattr(each, key) for each in dwells]) for key in ("squares", "counts"))
+    if walk_mps2_per_sqrt_s:
+        rest = np.concatenate([dwell.walk.rest for dwell in dwells])
+        squares = np.maximum(squares - walk_mps2_per_sqrt_s**2 * rest[:, None], 0.0)
     on_carrier = dwells[0].width - 3
     long = counts[:, None] >= np.where(variance > 0, 40.0 * inflation, 0.0)
     freedom = np.where(long, np.maximum(counts[:, None] - 3.0 * inflation - on_carrier, 0.0), 0.0).sum(axis=0)
     pooled = np.where(long, squares, 0.0).sum(axis=0) / np.maximum(freedom, 1.0)
     return Noise(np.sqrt(np.where(long.any(axis=0), pooled, variance)), inflation)
+
+
+def _lagged(dwells: Sequence[DwellFactor]) -> Floats:
+    """What a walk of q = 1 adds to the sums of lagged products (L + 1, 1) of all dwells."""
+    out = 0.0 * dwells[0].autocovariance.pairs
+    for dwell in dwells:
+        known, period_s = dwell.autocovariance, (dwell.end_s - dwell.start_s) / max(dwell.count - 1, 1)
+        if known.blocks:
+            out += walk.lagged(period_s, max(round(known.count / known.blocks), 1), known.pairs)
+    return out[:, None]
 
 
 def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
@@ -131,69 +156,6 @@ def _autoregressive_inflation(gamma: Floats, count: int) -> float:
     return best[1]
 
 
-def with_dwell_parts(
-    within: Noise,
-    means: Means,
-    state: Floats,
-    angle_sigma_deg: float | None,
-    scatter_mps2: float | None,
-) -> Noise:
-    """The noise with its dwell parts: as stated, else estimated by restricted maximum likelihood where significant.
-
-    Of the parts not stated (the scatter one number for all accelerometers, or one each), the combination with the best
-    likelihood is taken, each number charged for by the 1 % point of its ratio against zero. Fewer than 6 degrees of
-    freedom between dwells: nothing is estimated. Too few orientations to tell a setting error from the sensors'
-    scatter: the whole misfit counts as scatter.
-    """
-    from scipy.special import chdtrc
-
-    stated = replace(
-        within,
-        setting_rad=float(np.radians(angle_sigma_deg or 0.0)),
-        scatter_mps2=np.full(3, scatter_mps2 or 0.0),
-        setting_stated=angle_sigma_deg is not None,
-        scatter_stated=scatter_mps2 is not None,
-        checked=scatter_mps2 is not None or _setting_is_checked(means.force_mps2),
-    )
-    freedom = means.readings.size - means.design.shape[2]
-    if freedom < 6 or (stated.setting_stated and stated.scatter_stated):
-        return stated
-    if chdtrc(freedom, _misfit(stated.weights, means, state)) > 0.1:  # nothing to explain: spares the search
-        return stated
-    if not stated.checked:
-        free = {("common",)}
-    else:
-        settings = [()] if stated.setting_stated else [(), ("setting",)]
-        scatters = [()] if stated.scatter_stated else [(), ("common",), ("scatter",)]
-        free = {setting + scatter for setting in settings for scatter in scatters} - {()}
-    best, best_score = stated, restricted_log_likelihood(stated.weights, means, state)
-    for parts in sorted(free):
-        found, score = _most_likely(stated, parts, means, state)
-        if score > best_score:
-            best, best_score = found, score
-    return best
-
-
-def _setting_is_checked(force_mps2: Floats) -> bool:
-    """Whether the readings along f overdetermine what they see by 3 or more: f^T S f + f^T b, 9 numbers at most."""
-    x, y, z = force_mps2.T / np.linalg.norm(force_mps2, axis=1).mean()
-    design = np.column_stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z])
-    directions = len(np.unique(np.round(design[:, 6:], 2), axis=0))
-    return directions - int(np.linalg.matrix_rank(design, tol=0.02)) >= 3
-
-
-def _most_likely(stated: Noise, parts: tuple[str, ...], means: Means, state: Floats) -> tuple[Noise, float]:
-    """The noise with the most likely sizes of ``parts``, and its log-likelihood less the charge for them."""
-    from scipy.optimize import minimize
-
-    def cost(logs: Floats) -> float:
-        return -restricted_log_likelihood(_unpack(stated, logs, parts).weights, means, state)
-
-    begin = _spread(means, parts)
-    found = minimize(cost, begin, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4, "maxiter": 600})
-    return _unpack(stated, found.x, parts), -float(found.fun) - 0.5 * _SIGNIFICANT * len(begin)
-
-
 def wander(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floats], Floats]:
     """The slow part of a stated scatter: columns at the nodes of each dwell (pieces, nodes, 3, q), constant in it, and
     the sigma (q,) of their coefficients.
@@ -219,44 +181,6 @@ def wander(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floats], F
 def flicker_sigma(noise: Noise, dwells: int) -> Floats:
     """sqrt(h) (3,) of a scatter stated for so many dwells, were it flicker."""
     return noise.scatter_mps2 / np.sqrt(np.log(max(dwells, 2)))
-
-
-def scatter_gain(noise: Noise, means: Means, state: Floats) -> float:
-    """What a further scatter from dwell to dwell, as likely as can be, gains in log-likelihood."""
-    from scipy.optimize import minimize_scalar
-
-    def cost(log_sigma: float) -> float:
-        scatter = np.hypot(noise.scatter_mps2, np.exp(log_sigma))
-        return -restricted_log_likelihood(replace(noise, scatter_mps2=scatter), means, state)
-
-    begin = float(_spread(means, ("common",))[0])
-    found = minimize_scalar(cost, bounds=(begin - 5.0, begin + 2.0), method="bounded", options={"xatol": 1e-2})
-    return max(-float(found.fun) - restricted_log_likelihood(noise, means, state), 0.0)
-
-
-def _spread(means: Means, parts: tuple[str, ...]) -> Floats:
-    """A starting point of the search: log sigmas at the size of the misfit of the dwell means."""
-    design = means.design.reshape(-1, means.design.shape[2])
-    scale = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
-    fitted = design / scale @ np.linalg.lstsq(design / scale, means.readings.ravel(), rcond=1e-9)[0]
-    size = np.sqrt(np.mean((means.readings - fitted.reshape(-1, 3)) ** 2, axis=0)) + FLOOR_MPS2
-    gravity = np.linalg.norm(means.force_mps2, axis=1).mean()
-    logs = (
-        ([np.log(size.mean() / gravity)] if "setting" in parts else [])
-        + (list(np.log(size)) if "scatter" in parts else [])
-        + ([np.log(size.mean())] if "common" in parts else [])
-    )
-    return np.array(logs)
-
-
-def _unpack(noise: Noise, logs: Floats, parts: tuple[str, ...]) -> Noise:
-    if "setting" in parts:
-        noise = replace(noise, setting_rad=float(np.exp(logs[0])))
-    if "scatter" in parts:
-        noise = replace(noise, scatter_mps2=np.exp(logs[-3:]))
-    if "common" in parts:
-        noise = replace(noise, scatter_mps2=np.full(3, np.exp(logs[-1])))
-    return noise
 
 
 def mean_covariances(noise: Noise, means: Means, state: Floats) -> Floats:
@@ -287,26 +211,3 @@ def considered(noise: Noise, means: Means, state: Floats) -> Floats:
     weight = 1.0 / np.einsum("dii->di", mean_covariances(noise.weights, means, state))
     weighted = weight[:, :, None] * means.design
     return noise.setting_rad**2 * np.swapaxes(weighted, 1, 2) @ _turned(means, state) @ weighted
-
-
-def _misfit(noise: Noise, means: Means, state: Floats) -> float:
-    """Chi-squared of the dwell means about their generalised least-squares fit."""
-    return float(_between(noise, means, state)[0][-1, -1] ** 2)
-
-
-def restricted_log_likelihood(noise: Noise, means: Means, state: Floats) -> float:
-    """REML of the dwell means: -1/2 (sum log|V_d| + log|sum A' V^-1 A| + r' V^-1 r), up to a constant."""
-    upper, log_roots = _between(noise, means, state)
-    size = np.abs(np.diag(upper))[:-1]
-    seen = size > 1e-9 * size.max()
-    return float(-log_roots - np.log(size[seen]).sum() - 0.5 * upper[-1, -1] ** 2)
-
-
-def _between(noise: Noise, means: Means, state: Floats) -> tuple[Floats, float]:
-    """Triangle (p + 1, p + 1) of the whitened dwell means [A | z], A in units of its size; sum of log|V_d|^(1/2)."""
-    root = np.linalg.cholesky(mean_covariances(noise, means, state))
-    scale = np.linalg.norm(means.design, axis=(0, 1))
-    design = means.design / np.where(scale > 0, scale, 1.0)
-    stacked = np.concatenate([design, means.readings[:, :, None]], axis=2)
-    upper = triangle(np.linalg.solve(root, stacked).reshape(-1, stacked.shape[2]))
-    return upper, float(np.log(np.einsum("dii->di", root)).sum())

@@ -25,10 +25,9 @@ import numpy as np
 from kf_calib import information
 from kf_calib.effects import Effect, effect_named
 from kf_calib.errors import InputError
-from kf_calib.fitting import Walk
 from kf_calib.folding import Carried, DwellFactor
 from kf_calib.model import STATE_COUNT, Model, Prior
-from kf_calib.noise import Noise
+from kf_calib.noise import Noise, steps
 from kf_calib.samples import Floats
 from kf_calib.scan import Scan, projected
 from kf_calib.triangle import triangle
@@ -45,7 +44,6 @@ class Running:
     inside: tuple[str, ...]
     noise: Noise
     prior: Prior
-    walk: Walk
     factor: Floats
     left: float = 0.0
     rows: int = 0
@@ -59,7 +57,6 @@ class Running:
         state: Floats,
         candidates: Iterable[Effect] = (),
         prior: Prior | None = None,
-        walk: Walk | None = None,
     ) -> Running:
         """The filter after ``dwells`` (one or more), linearised at the affine ``state`` (12,)."""
         every = model
@@ -68,7 +65,7 @@ class Running:
         at = np.concatenate([state[:STATE_COUNT], np.zeros(every.count - STATE_COUNT)])
         inside = tuple(str(effect) for effect in model.effects)
         empty = np.zeros((every.count, every.count + 1))
-        return cls(Carried(dwells, every, at), inside, noise, prior or Prior(), walk or Walk(), empty)._folded()
+        return cls(Carried(dwells, every, at), inside, noise, prior or Prior(), empty)._folded()
 
     @property
     def dwells(self) -> list[DwellFactor]:
@@ -94,8 +91,7 @@ class Running:
         more = replace(self, carried=carried)
         if exact and not all(map(np.array_equal, self.carried.columns, carried.columns[:-1])):
             return more._folded()
-        known = information.predict(self.factor, self.walk.variances(carried.dwells)[-1])
-        return replace(more, factor=known)._updated(more._rows([-1])[0])
+        return more._updated(more._rows([-1])[0], steps(carried.dwells[-2:], self.noise)[-1])
 
     def with_effect(self, text: str) -> Running:
         """With that effect (a name or a formula) in the model; raises InputError where it cannot be added."""
@@ -144,20 +140,20 @@ class Running:
         parts, count = self.carried.model.parts, len(self.about)
         return [*range(STATE_COUNT), *(k for name in self.inside for k in range(*parts[name].indices(count)))]
 
-    def _updated(self, rows: Floats) -> Running:
-        step = information.update(self.factor, rows)
+    def _updated(self, rows: Floats, walked: Floats) -> Running:
+        step = information.update(self.factor, rows, walked)
         return replace(self, factor=step.factor, left=self.left + step.nis, rows=self.rows + len(rows))
 
     def _folded(self) -> Running:
         """The same with its factor made anew from the dwells."""
         factor = information.start(self.prior, self.carried.model)
         factor[:, -1] -= factor[:, :-1] @ self.about
-        variances = self.walk.variances(self.dwells)
+        variances = steps(self.dwells, self.noise)
         out = replace(self, factor=factor, left=0.0, rows=0)
         if not variances.any():
-            return out._updated(np.concatenate(self._rows()))
+            return out._updated(np.concatenate(self._rows()), variances[0])
         for own, variance in zip(self._rows(), variances, strict=True):
-            out = replace(out, factor=information.predict(out.factor, variance))._updated(own)
+            out = out._updated(own, variance)
         return out
 
     def _rows(self, chosen: Sequence[int] | None = None) -> list[Floats]:

@@ -17,7 +17,7 @@ import numpy as np
 from kf_calib import information
 from kf_calib.effects import Effect
 from kf_calib.folding import Carried, candidate_columns
-from kf_calib.noise import Noise
+from kf_calib.noise import Noise, steps
 from kf_calib.samples import Floats, Mask
 
 _SEEN = 1e-6
@@ -73,15 +73,13 @@ class Scan:
         return candidate.inverse @ (candidate.basis.T @ self.residual)
 
 
-def scan(carried: Carried, noise: Noise, effects: Sequence[Effect], walk_variances: Floats | None = None) -> Scan:
-    """Project ``effects`` off the model carried; ``walk_variances`` (D, 3): of the biases' steps before each dwell."""
+def scan(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Scan:
+    """Project ``effects`` off the model carried."""
     added = candidate_columns(carried.dwells, effects, carried.model.bench, carried.state)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
     rows, width = information.judged(carried.dwells, columns, noise, carried.state, carried.model.count)
-    if walk_variances is not None and len(rows) > len(walk_variances):
-        walk_variances = np.vstack([np.zeros((1, 3)), walk_variances])
     counts = [len(effect.coefficients) for effect in effects]
-    return projected(information.accumulated(rows, walk_variances), width, effects, counts)
+    return projected(information.accumulated(rows, steps(carried.dwells, noise)), width, effects, counts)
 
 
 def projected(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:

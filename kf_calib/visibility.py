@@ -93,7 +93,7 @@ def _beside(fitted: Fit, model: Model, effects: Sequence[Effect]) -> list[Sight]
     tried = [at for each in (*effects, *others) if _has_columns(each) for at in _values(each)]
     state = np.concatenate([fitted.carried.state[:STATE_COUNT], np.zeros(model.count - STATE_COUNT)])
     carried = Carried(fitted.dwells, model, state)
-    found = scan(carried, fitted.noise.judging, tried, fitted.walk_variances)
+    found = scan(carried, fitted.noise.judging, tried)
     return [replace(_sight(found, each), degeneracy=each.degeneracy(bench)) for each in effects]
 
 

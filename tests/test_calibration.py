@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from synthetic import G, Run, sensitivities
 
 from kf_calib.bench import Bench, axes_of
-from kf_calib.calibration import Settings, calibrate, orientations
+from kf_calib.calibration import Settings, calibrate
 from kf_calib.errors import InputError, UnobservableError
+from kf_calib.held_out import orientations
 from kf_calib.samples import Batch, Stream
 from kf_calib.sources.recording import Recording
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from kf_calib.calibration import Calibration, Estimate, Pass, Settings, calibrat
 from kf_calib.comparison import compare
 from kf_calib.effects import SensorEffect, Stimulus, effect_named, names
 from kf_calib.errors import InputError
-from kf_calib.fitting import WALK, Fit, Walk, fit
+from kf_calib.fitting import WALK, Fit, fit
 from kf_calib.folding import Carried, DwellFactor
 from kf_calib.model import PRIORS, Model
 from kf_calib.noise import Noise as NoiseModel
@@ -263,12 +264,13 @@ def test_left_out_effect_biases_the_twelve_and_the_effect_in_the_model_mends_it(
 def estimated(fitted: Fit) -> dict[str, tuple[float, float]]:
     """Value and sigma (NaN: not seen) of all but the twelve, without the rest of a calibration."""
     model = fitted.carried.model
-    factor = information.accumulated(fitted.rows(), fitted.walk_variances)[:-1]
+    factor = information.accumulated(fitted.rows(), fitted.steps)[:-1]
     estimate = Estimate(*information.solve(factor, model.nominal_state()))
     found, gains = model.natural(estimate.state)
     out = {c.symbol: own for c, *own in zip(model.coefficients, found, estimate.effect_sigma * gains, strict=True)}
     if model.walks:
-        out[WALK.symbol] = [fitted.walk.intensity, fitted.walk.sigma or np.nan]
+        noise = fitted.noise
+        out[WALK.symbol] = [noise.walk_mps2_per_sqrt_s, noise.walk_mps2_per_sqrt_s * (noise.walk_spread or np.nan)]
     return {symbol: (float(value), float(sigma)) for symbol, (value, sigma) in out.items()}
 
 
@@ -352,13 +354,14 @@ def test_a_factor_restricted_equals_that_of_fewer_columns(navigation, name: str)
 def test_effects_go_in_and_out_of_a_running_filter(navigation, walk: float, prior: str) -> None:
     """Any choice of effects at any dwell is a refit from the start; the formula was not even carried."""
     dwells, noise, state = navigation
+    noise = replace(noise, walk_mps2_per_sqrt_s=walk)
     small = Model.of(BENCH, ("thermal-bias",))
     others = [effect_named(name, BENCH) for name in NAMES if name != "thermal-bias"]
 
     def refit(count: int, model: Model) -> Running:
-        return Running.over(dwells[:count], model, noise, state, (), PRIORS[prior], Walk(walk))
+        return Running.over(dwells[:count], model, noise, state, (), PRIORS[prior])
 
-    running = Running.over(dwells[:11], small, noise, state, others, PRIORS[prior], Walk(walk))
+    running = Running.over(dwells[:11], small, noise, state, others, PRIORS[prior])
     same(running, refit(11, small))
     for dwell in dwells[11:20]:
         running = running.after(dwell)

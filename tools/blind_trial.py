@@ -268,7 +268,7 @@ def _scanned(path: Path, wanted: Sequence[str] | None) -> tuple[dict[str, list[C
         effect = effect_named(name, bench)
         if (wanted is None or name in wanted) and not effect.dynamic and not effect.walks:
             effects += [effect] if effect.unknown is None else [effect.at(value) for value in effect.unknown.grid(2.0)]
-    found = scan(fitted.carried, fitted.noise.judging, effects, fitted.walk_variances)
+    found = scan(fitted.carried, fitted.noise.judging, effects)
     spaces = dict[str, list[Candidate]]()
     for candidate in found.candidates:
         spaces.setdefault(str(candidate.effect), []).append(candidate)

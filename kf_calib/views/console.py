@@ -12,10 +12,11 @@ from rich.table import Table
 from rich.text import Text
 
 from kf_calib import paper
-from kf_calib.calibration import Calibration, Parameter, format_p, orientations
+from kf_calib.calibration import Calibration, Parameter, format_p
 from kf_calib.comparison import Comparison
 from kf_calib.effects import Effect, as_text
 from kf_calib.fitting import WALK
+from kf_calib.held_out import orientations
 from kf_calib.model import Model
 
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}

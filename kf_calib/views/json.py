@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from kf_calib.calibration import Calibration, orientations
+from kf_calib.calibration import Calibration
 from kf_calib.comparison import Comparison
+from kf_calib.held_out import orientations
 from kf_calib.readings import Readings
 
 

@@ -1,0 +1,111 @@
+"""Leave one orientation out: how far its mean readings are from what all other dwells predict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kf_calib import information, walk
+from kf_calib.fitting import Fit
+from kf_calib.folding import DwellFactor
+from kf_calib.model import Prior
+from kf_calib.noise import considered, mean_covariances
+from kf_calib.samples import Floats
+
+SAME_POSE_DEG = 1.0
+"""Dwells whose gravity directions are closer than this are visits of one orientation."""
+
+
+def orientations(dwells: Sequence[DwellFactor]) -> list[list[int]]:
+    """Dwells grouped by orientation: the same direction of gravity in the platform, and nearly the same pose."""
+    means = np.array([dwell.means for dwell in dwells])
+    direction = means[:, 1:4] / np.linalg.norm(means[:, 1:4], axis=1, keepdims=True)
+    place = np.column_stack([direction, [dwell.pose for dwell in dwells]])
+    groups, heads = list[list[int]](), np.empty((0, place.shape[1]))
+    for k, here in enumerate(place):
+        near = np.flatnonzero(np.abs(heads - here).max(axis=1) < np.radians(SAME_POSE_DEG))
+        if near.size:
+            groups[near[0]].append(k)
+        else:
+            groups.append([k])
+            heads = np.vstack([heads, here])
+    return groups
+
+
+def held_out(fitted: Fit) -> tuple[float | None, float | None]:
+    """Rms error of the dwell means of orientations left out of the fit, and the rms that the noise alone would give.
+
+    None where a fit without one of the orientations is undetermined. Slews are left out of no fit.
+    """
+    predicted = (_beside if fitted.noise.walk_mps2_per_sqrt_s else _without)(fitted, orientations(fitted.dwells))
+    if predicted is None:
+        return None, None
+    errors, spreads = predicted
+    return float(np.sqrt(np.mean(errors**2))), float(np.sqrt(np.mean(np.einsum("dii->di", spreads))))
+
+
+def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | None:
+    """Errors (D, 3) and their covariance (D, 3, 3) where the biases stand.
+
+    Factors of the orientations before and after the one left out are merged: no refit from the start.
+    """
+    carried, noise, around = fitted.carried, fitted.noise.judging, fitted.carried.model.nominal_state()
+    rows = fitted.rows(noise.weights)
+    extra, own = considered(noise, carried.means, carried.state), mean_covariances(noise, carried.means, carried.state)
+    empty = information.start(Prior(), carried.model)
+    slews = information.update(empty, np.concatenate(fitted.following)).factor if carried.slews else empty
+    factors = [information.update(empty, np.concatenate([rows[k] for k in group])).factor for group in groups]
+    heads, tails = [slews], [empty]
+    for factor in factors[:-1]:
+        heads.append(information.update(heads[-1], factor).factor)
+    for factor in factors[:0:-1]:
+        tails.insert(0, information.update(tails[0], factor).factor)
+    errors, spreads = np.zeros((len(rows), 3)), own
+    for group, head, tail in zip(groups, heads, tails, strict=True):
+        state, covariance, lost = information.solve(information.update(head, tail).factor, around)
+        if lost.size:
+            return None
+        covariance = covariance + covariance @ (extra.sum(axis=0) - extra[group].sum(axis=0)) @ covariance
+        design = carried.means.design[group]
+        errors[group] = carried.means.readings[group] - design @ state
+        spreads[group] = own[group] + design @ covariance @ np.swapaxes(design, 1, 2)
+    return errors, spreads
+
+
+def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | None:
+    """The same where the biases walk: they are known by the dwells before and after the one left out (a smoother of two
+    filters, one forward and one backward in time; Fraser and Potter, 1969)."""
+    carried, noise, steps = fitted.carried, fitted.noise.judging, fitted.steps
+    rows, means, around = fitted.all_rows(noise.weights), carried.means, carried.model.nominal_state()
+    errors, spreads = np.zeros((len(rows), 3)), mean_covariances(noise, means, carried.state)
+    spreads += (steps[:, 1] / 12.0)[:, None, None] * np.eye(3)  # of a path's mean about the middle of its ends
+    alone = _passes(rows, steps, ())
+    for group in groups:
+        heads, tails = alone if len(group) == 1 else _passes(rows, steps, group)
+        for k in group:
+            nothing = np.zeros((len(around), 3))
+            upper, count = walk.advanced(heads[k], steps[k], np.hstack([nothing, tails[k]]))
+            order = [*range(count, upper.shape[1] - 1), *range(count), upper.shape[1] - 1]
+            moving = np.append(around, np.zeros(count))
+            state, covariance, lost = information.solve(upper[: len(moving), order], moving)
+            if lost.size:
+                return None
+            half = np.hstack([-0.5 * np.eye(3), np.zeros((3, count - 3))])  # the mean is half a step short of the end
+            design = np.hstack([means.design[k], half])
+            errors[k] = means.readings[k] - design @ state
+            spreads[k] += design @ covariance @ design.T
+    return errors, spreads
+
+
+def _passes(rows: Sequence[Floats], steps: Floats, left_out: Sequence[int]) -> tuple[list[Floats], list[Floats]]:
+    """Factors of the biases before each dwell from the dwells before, and at its end from those after it."""
+    width = rows[0].shape[1] - 4
+    known = [own[:0] if k in left_out else own for k, own in enumerate(rows)]
+    heads, tails = [np.zeros((width, width + 1))], [np.zeros((width, width + 1))]
+    for own, variances in zip(known[:-1], steps, strict=False):
+        upper, count = walk.advanced(heads[-1], variances, own)
+        heads.append(upper[count : count + width, count:])
+    for own, variances in zip(known[:0:-1], steps[:0:-1], strict=True):
+        tails.insert(0, walk.receded(tails[0], variances, own))
+    return heads, tails

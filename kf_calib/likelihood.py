@@ -1,0 +1,236 @@
+"""The dwell parts of the noise by restricted maximum likelihood of the dwell means: setting error, scatter, walk.
+
+The means of the readings of D dwells scatter about the model by V_d = diag(kappa sigma_w^2 / n + sigma_s^2) +
+sigma_alpha^2 S (|f|^2 I - f f^T) S^T; a walk of the biases by steps from one to the next. The model's coefficients are
+integrated out (Patterson and Thompson, 1971).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from kf_calib import walk
+from kf_calib.folding import DwellFactor, Means
+from kf_calib.noise import FLOOR_MPS2, Noise, mean_covariances, wander
+from kf_calib.samples import Floats
+from kf_calib.triangle import triangle
+
+_SIGNIFICANT = 5.41  # 1 % point of the likelihood ratio of a variance against zero: half of chi2 with 1 dof
+_RANGE = (-9.0, 3.0)  # of the logarithm of a part's size, about the size of the misfit
+
+Part = Literal["setting", "common", "scatter", "walk"]
+
+
+def with_dwell_parts(
+    within: Noise,
+    means: Means,
+    state: Floats,
+    angle_sigma_deg: float | None,
+    scatter_mps2: float | None,
+    walks: bool = False,
+) -> Noise:
+    """The noise with its dwell parts: as stated, else estimated by restricted maximum likelihood where significant.
+
+    Of the parts not stated (the scatter one number for all accelerometers, or one each), the combination with the best
+    likelihood is taken, each number charged for by the 1 % point of its ratio against zero. ``walks``: the intensity
+    of a walk of the biases is found with each, and not charged for. Fewer than 6 degrees of freedom between dwells:
+    nothing is estimated. Too few orientations to tell a setting error from the sensors' scatter: the whole misfit
+    counts as scatter.
+    """
+    from scipy.special import chdtrc
+
+    stated = replace(
+        within,
+        setting_rad=float(np.radians(angle_sigma_deg or 0.0)),
+        scatter_mps2=np.full(3, scatter_mps2 or 0.0),
+        setting_stated=angle_sigma_deg is not None,
+        scatter_stated=scatter_mps2 is not None,
+        checked=scatter_mps2 is not None or _setting_is_checked(means.force_mps2),
+    )
+    freedom = means.readings.size - means.design.shape[2]
+    if freedom < 6 or (stated.setting_stated and stated.scatter_stated and not walks):
+        return stated
+    if not walks and chdtrc(freedom, _misfit(stated.weights, means, state)) > 0.1:  # spares the search
+        return stated
+    settings: list[tuple[Part, ...]] = [()] if stated.setting_stated or not stated.checked else [(), ("setting",)]
+    scatters: list[tuple[Part, ...]] = [()] if stated.scatter_stated else [(), ("common",)]
+    if stated.checked and not stated.scatter_stated:
+        scatters.append(("scatter",))
+    best, best_score = stated, restricted_log_likelihood(stated.weights, means, state)
+    for parts in sorted({setting + scatter for setting in settings for scatter in scatters} - {()}):
+        found, score = _most_likely(stated, parts, means, state)
+        if score > best_score:
+            best, best_score = found, score
+    return best if not walks else _walking(stated, settings, scatters, means, state, best, best_score)
+
+
+def _walking(
+    stated: Noise,
+    settings: list[tuple[Part, ...]],
+    scatters: list[tuple[Part, ...]],
+    means: Means,
+    state: Floats,
+    best: Noise,
+    least: float,
+) -> Noise:
+    """The noise with a walk of the biases beside its most likely dwell parts; without, where it gains nothing."""
+    score = least + 0.5
+    for parts in sorted({setting + scatter for setting in settings for scatter in scatters}):
+        found, own = _most_likely(stated, (*parts, "walk"), means, state)
+        if own + 0.5 * _SIGNIFICANT > score:
+            spread = _walk_spread(stated, found, (*parts, "walk"), means, state)
+            best, score = replace(found, walk_spread=spread), own + 0.5 * _SIGNIFICANT
+    return best
+
+
+def _setting_is_checked(force_mps2: Floats) -> bool:
+    """Whether the readings along f overdetermine what they see by 3 or more: f^T S f + f^T b, 9 numbers at most."""
+    x, y, z = force_mps2.T / np.linalg.norm(force_mps2, axis=1).mean()
+    design = np.column_stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z])
+    directions = len(np.unique(np.round(design[:, 6:], 2), axis=0))
+    return directions - int(np.linalg.matrix_rank(design, tol=0.02)) >= 3
+
+
+def _most_likely(stated: Noise, parts: tuple[Part, ...], means: Means, state: Floats) -> tuple[Noise, float]:
+    """The noise with the most likely sizes of ``parts``, and its log-likelihood less the charge for them."""
+    from scipy.optimize import minimize
+
+    cost, begin = _cost(stated, parts, means, state), _spread(means, parts)
+    found = minimize(cost, begin, method="L-BFGS-B", bounds=begin[:, None] + np.array(_RANGE))
+    return _unpack(stated, found.x, parts), -float(found.fun) - 0.5 * _SIGNIFICANT * len(begin)
+
+
+def _cost(stated: Noise, parts: tuple[Part, ...], means: Means, state: Floats) -> Callable[[Floats], float]:
+    return lambda logs: -restricted_log_likelihood(_unpack(stated, logs, parts).weights, means, state)
+
+
+def _walk_spread(stated: Noise, found: Noise, parts: tuple[Part, ...], means: Means, state: Floats) -> float:
+    """1 sigma of ln q, the other parts being found with it: from the likelihood's curvature (central differences)."""
+    cost, at, step = _cost(stated, parts, means, state), _pack(found, parts), 0.05
+    moves = step * np.eye(len(at))
+    curvature = np.array([
+        [cost(at + a + b) - cost(at + a - b) - cost(at - a + b) + cost(at - a - b) for a in moves] for b in moves
+    ]) / (4.0 * step**2)  # fmt: skip
+    values, vectors = np.linalg.eigh(curvature)
+    seen = values > 1e-3  # the others are parts that have run to zero
+    return float(np.sqrt(np.sum(vectors[-1, seen] ** 2 / values[seen])))
+
+
+def gain_of(part: Literal["scatter", "walk"], noise: Noise, means: Means, state: Floats, prior: Floats) -> float:
+    """What more of a part of the noise, as much as is likeliest, gains in log-likelihood.
+
+    ``means`` and ``prior`` as ``wandering`` has them.
+    """
+    from scipy.optimize import minimize_scalar
+
+    def cost(log_size: float) -> float:
+        more = math.exp(log_size)
+        if part == "walk":
+            wider = replace(noise, walk_mps2_per_sqrt_s=math.hypot(noise.walk_mps2_per_sqrt_s, more))
+        else:
+            wider = replace(noise, scatter_mps2=np.hypot(noise.scatter_mps2, more))
+        return -restricted_log_likelihood(wider, means, state, prior)
+
+    begin = float(_spread(means, ("walk" if part == "walk" else "common",))[0])
+    bounds = begin + _RANGE[0], begin + _RANGE[1]
+    found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-2})
+    return max(-float(found.fun) - restricted_log_likelihood(noise, means, state, prior), 0.0)
+
+
+def wandering(dwells: Sequence[DwellFactor], noise: Noise, means: Means) -> tuple[Means, Floats]:
+    """Means with the columns of what a stated scatter may have in common in dwells that follow each other, and the
+    rows of their prior (q, p + q + 1)."""
+    columns, sigma = wander(dwells, noise)
+    design = np.concatenate([means.design, [own[0, 0] for own in columns]], axis=2)
+    prior = np.zeros((len(sigma), design.shape[2] + 1))
+    prior[:, means.design.shape[2] : -1] = np.diag(1.0 / sigma)
+    return replace(means, design=design), prior
+
+
+def _spread(means: Means, parts: tuple[Part, ...]) -> Floats:
+    """A starting point of the search: log sigmas at the size of the misfit of the dwell means."""
+    design = means.design.reshape(-1, means.design.shape[2])
+    scale = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+    fitted = design / scale @ np.linalg.lstsq(design / scale, means.readings.ravel(), rcond=1e-9)[0]
+    size = np.sqrt(np.mean((means.readings - fitted.reshape(-1, 3)) ** 2, axis=0)) + FLOOR_MPS2
+    span_s = max(float(means.ends_s[-1, 1] - means.ends_s[0, 0]), 1e-9)
+    sizes: dict[Part, Floats] = {
+        "setting": np.full(1, size.mean() / np.linalg.norm(means.force_mps2, axis=1).mean()),
+        "common": np.full(1, size.mean()),
+        "scatter": size,
+        "walk": np.full(1, 2.0 * size.mean() / math.sqrt(span_s)),
+    }
+    return np.log(np.concatenate([sizes[part] for part in parts]))
+
+
+def _pack(noise: Noise, parts: tuple[Part, ...]) -> Floats:
+    """The logarithms that ``_unpack`` reads."""
+    sizes: dict[Part, Floats] = {
+        "setting": np.full(1, noise.setting_rad),
+        "common": noise.scatter_mps2[:1],
+        "scatter": noise.scatter_mps2,
+        "walk": np.full(1, noise.walk_mps2_per_sqrt_s),
+    }
+    return np.log(np.concatenate([sizes[part] for part in parts]))
+
+
+def _unpack(noise: Noise, logs: Floats, parts: tuple[Part, ...]) -> Noise:
+    sizes = iter(np.exp(logs).tolist())
+    for part in parts:
+        if part == "setting":
+            noise = replace(noise, setting_rad=next(sizes))
+        elif part == "walk":
+            noise = replace(noise, walk_mps2_per_sqrt_s=next(sizes))
+        elif part == "common":
+            noise = replace(noise, scatter_mps2=np.full(3, next(sizes)))
+        else:
+            noise = replace(noise, scatter_mps2=np.array([next(sizes) for _ in range(3)]))
+    return noise
+
+
+def _misfit(noise: Noise, means: Means, state: Floats) -> float:
+    """Chi-squared of the dwell means about their generalised least-squares fit, without a walk."""
+    rows, _ = _rows(replace(noise, walk_mps2_per_sqrt_s=0.0), means, state)
+    return float(triangle(np.concatenate(rows))[-1, -1] ** 2)
+
+
+def restricted_log_likelihood(noise: Noise, means: Means, state: Floats, prior: Floats | None = None) -> float:
+    """REML of the dwell means, up to a constant; ``prior`` (q, p + 1): rows of what is known of the coefficients.
+
+    -1/2 (sum log|V_d| + log|sum A' V^-1 A| + r' V^-1 r); with a walk its steps are integrated out, too.
+    """
+    rows, log_roots = _rows(noise, means, state)
+    width = means.design.shape[2]
+    first = np.zeros((0, width + 1)) if prior is None else prior
+    if noise.walk_mps2_per_sqrt_s:
+        begin = triangle(np.vstack([first, np.zeros((width, width + 1))]))[:width]
+        steps = walk.variances(means.ends_s[:, 0], means.ends_s[:, 1], noise.walk_mps2_per_sqrt_s)
+        total, upper = walk.log_likelihood(begin, steps, rows)
+    else:
+        upper = triangle(np.concatenate([first, *rows]))
+        total = -0.5 * float(np.sum(upper[width:, -1] ** 2))
+    scale = np.linalg.norm(upper[:, :-1], axis=0)
+    size = np.abs(np.diag(triangle(upper[:width, :-1] / np.where(scale > 0, scale, 1.0))))
+    seen = size > 1e-9
+    return float(total - log_roots - np.log(size[seen]).sum() - np.log(scale[scale > 0]).sum())
+
+
+def _rows(noise: Noise, means: Means, state: Floats) -> tuple[list[Floats], float]:
+    """Whitened mean [S | A | z] (3, c) of each dwell, and sum of log|V_d|^(1/2).
+
+    S: of the biases' steps over the dwell, where they walk: their mean is half a step short of the end, and scatters
+    about that by q^2 T / 12.
+    """
+    own, stacked = mean_covariances(noise, means, state), [means.design, means.readings[:, :, None]]
+    if noise.walk_mps2_per_sqrt_s:
+        spans = means.ends_s[:, 1] - means.ends_s[:, 0]
+        own = own + (noise.walk_mps2_per_sqrt_s**2 / 12.0 * spans)[:, None, None] * np.eye(3)
+        stacked.insert(0, np.broadcast_to(-0.5 * np.eye(3), (len(own), 3, 3)))
+    root = np.linalg.cholesky(own)
+    rows = np.asarray(np.linalg.solve(root, np.concatenate(stacked, axis=2)), float)
+    return list(rows), float(np.log(np.einsum("dii->di", root)).sum())
