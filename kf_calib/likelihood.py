@@ -14,7 +14,6 @@ from typing import Literal
 
 import numpy as np
 
-from kf_calib import walk
 from kf_calib.folding import DwellFactor, Means
 from kf_calib.noise import FLOOR_MPS2, Noise, mean_covariances, wander
 from kf_calib.samples import Floats
@@ -101,7 +100,8 @@ def _most_likely(stated: Noise, parts: tuple[Part, ...], means: Means, state: Fl
     from scipy.optimize import minimize
 
     cost, begin = _cost(stated, parts, means, state), _spread(means, parts)
-    found = minimize(cost, begin, method="L-BFGS-B", bounds=begin[:, None] + np.array(_RANGE))
+    bounds = begin[:, None] + np.array(_RANGE)
+    found = minimize(cost, begin, method="L-BFGS-B", bounds=bounds, options={"eps": 1e-3})  # a step of ln(size)
     return _unpack(stated, found.x, parts), -float(found.fun) - 0.5 * _SIGNIFICANT * len(begin)
 
 
@@ -194,43 +194,57 @@ def _unpack(noise: Noise, logs: Floats, parts: tuple[Part, ...]) -> Noise:
 
 
 def _misfit(noise: Noise, means: Means, state: Floats) -> float:
-    """Chi-squared of the dwell means about their generalised least-squares fit, without a walk."""
-    rows, _ = _rows(replace(noise, walk_mps2_per_sqrt_s=0.0), means, state)
-    return float(triangle(np.concatenate(rows))[-1, -1] ** 2)
+    """Chi-squared of the dwell means about their generalised least-squares fit."""
+    return float(triangle(_rows(noise, means, state)[0])[-1, -1] ** 2)
 
 
 def restricted_log_likelihood(noise: Noise, means: Means, state: Floats, prior: Floats | None = None) -> float:
-    """REML of the dwell means, up to a constant; ``prior`` (q, p + 1): rows of what is known of the coefficients.
+    """REML of the dwell means: -1/2 (log|V| + log|A' V^-1 A| + r' V^-1 r), up to a constant.
 
-    -1/2 (sum log|V_d| + log|sum A' V^-1 A| + r' V^-1 r); with a walk its steps are integrated out, too.
+    ``prior`` (q, p + 1): rows of what is known of the coefficients.
     """
-    rows, log_roots = _rows(noise, means, state)
-    width = means.design.shape[2]
-    first = np.zeros((0, width + 1)) if prior is None else prior
+    rows, log_root = _rows(noise, means, state)
+    upper = triangle(rows if prior is None else np.vstack([prior, rows]))
+    width = upper.shape[1] - 1
+    scale = np.linalg.norm(upper[:width, :-1], axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    size = np.abs(np.diag(triangle(upper[:width, :-1] / scale)))
+    left = float(np.sum(upper[width:, -1] ** 2))
+    return -log_root - float(np.log(size[size > 1e-9]).sum() + np.log(scale).sum()) - 0.5 * left
+
+
+def _rows(noise: Noise, means: Means, state: Floats) -> tuple[Floats, float]:
+    """Whitened dwell means [A | z] (3 D, p + 1), and log|V|^(1/2) of their covariance V."""
+    own = mean_covariances(noise, means, state)
+    stacked = np.concatenate([means.design, means.readings[:, :, None]], axis=2)
     if noise.walk_mps2_per_sqrt_s:
-        begin = triangle(np.vstack([first, np.zeros((width, width + 1))]))[:width]
-        steps = walk.variances(means.ends_s[:, 0], means.ends_s[:, 1], noise.walk_mps2_per_sqrt_s)
-        total, upper = walk.log_likelihood(begin, steps, rows)
-    else:
-        upper = triangle(np.concatenate([first, *rows]))
-        total = -0.5 * float(np.sum(upper[width:, -1] ** 2))
-    scale = np.linalg.norm(upper[:, :-1], axis=0)
-    size = np.abs(np.diag(triangle(upper[:width, :-1] / np.where(scale > 0, scale, 1.0))))
-    seen = size > 1e-9
-    return float(total - log_roots - np.log(size[seen]).sum() - np.log(scale[scale > 0]).sum())
-
-
-def _rows(noise: Noise, means: Means, state: Floats) -> tuple[list[Floats], float]:
-    """Whitened mean [S | A | z] (3, c) of each dwell, and sum of log|V_d|^(1/2).
-
-    S: of the biases' steps over the dwell, where they walk: their mean is half a step short of the end, and scatters
-    about that by q^2 T / 12.
-    """
-    own, stacked = mean_covariances(noise, means, state), [means.design, means.readings[:, :, None]]
-    if noise.walk_mps2_per_sqrt_s:
-        spans = means.ends_s[:, 1] - means.ends_s[:, 0]
-        own = own + (noise.walk_mps2_per_sqrt_s**2 / 12.0 * spans)[:, None, None] * np.eye(3)
-        stacked.insert(0, np.broadcast_to(-0.5 * np.eye(3), (len(own), 3, 3)))
+        return _walked_rows(own, means.ends_s, noise.walk_mps2_per_sqrt_s, stacked)
     root = np.linalg.cholesky(own)
-    rows = np.asarray(np.linalg.solve(root, np.concatenate(stacked, axis=2)), float)
-    return list(rows), float(np.log(np.einsum("dii->di", root)).sum())
+    rows = np.linalg.solve(root, stacked).reshape(-1, stacked.shape[2])
+    return np.asarray(rows, float), float(np.log(np.einsum("dii->di", root)).sum())
+
+
+def _walked_rows(own: Floats, ends_s: Floats, intensity: float, stacked: Floats) -> tuple[Floats, float]:
+    """The same where the biases walk: of the means' differences from dwell to dwell, whose covariance is banded.
+
+    A path's mean over a dwell of T is T / 3 from its beginning and its end, in variance per q^2, the two T / 6 alike.
+    """
+    from scipy.linalg import cholesky_banded, solve_banded
+
+    spans, pauses = ends_s[:, 1] - ends_s[:, 0], np.append(0.0, np.maximum(ends_s[1:, 0] - ends_s[:-1, 1], 0.0))
+    rows = stacked.copy()
+    rows[1:] -= stacked[:-1]
+    alone = pauses + spans / 3.0
+    alone[1:] += spans[:-1] / 3.0
+    diagonal = own + intensity**2 * alone[:, None, None] * np.eye(3)
+    diagonal[1:] += own[:-1]
+    beside = intensity**2 * (spans[:-1] / 6.0)[:, None, None] * np.eye(3) - own[:-1]
+    bands = np.zeros((6, len(own), 3))
+    for i in range(3):
+        for j in range(3):
+            if i >= j:
+                bands[i - j, :, j] = diagonal[:, i, j]
+            bands[3 + i - j, :-1, j] += beside[:, i, j]
+    root = cholesky_banded(bands.reshape(6, -1), lower=True)
+    whitened = solve_banded((5, 0), root, rows.reshape(-1, rows.shape[2]))
+    return np.asarray(whitened, float), float(np.log(root[0]).sum())

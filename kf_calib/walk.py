@@ -165,18 +165,3 @@ def predicted(factor: Floats, variance: float) -> Floats:
         return factor
     upper, count = advanced(factor, np.array([variance, 0.0]), np.zeros((0, factor.shape[1])))
     return upper[count : count + len(factor), count:]
-
-
-def log_likelihood(factor: Floats, steps: Floats, rows: Sequence[Floats]) -> tuple[float, Floats]:
-    """Of whitened rows of dwells after ``factor``, less what is left of the states; and the factor after them.
-
-    -1/2 (sum of squared residuals) - sum log(|R_ww| sigma_w) over the eliminated steps.
-    """
-    width, total = len(factor), 0.0
-    for own, variance in zip(rows, steps, strict=True):
-        upper, count = advanced(factor, variance, own)
-        sigma = _sigmas(variance, own.shape[1] - width - 1)
-        total -= float(np.log(np.abs(np.diag(upper)[:count]) * sigma).sum())
-        factor = upper[count : count + width, count:]
-        total -= 0.5 * float(np.sum(upper[count + width :, -1] ** 2))
-    return total, factor
