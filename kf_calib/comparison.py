@@ -94,7 +94,10 @@ def _remarks(settings: Settings, result: Calibration) -> list[str]:
     if not settings.prior.diffuse:
         said.append("a prior was stated: the filters use it, batch least squares does not, so it may differ.")
     if result.noise.walk_mps2_per_sqrt_s:
-        said.append("the biases walk: the filters follow them, batch least squares holds them still, so it may differ.")
+        said.append(
+            "the biases walk: the filters follow them (the block engine by what parabolas see of a path, some 0.001 "
+            "sigma), batch least squares holds them still, so it may differ."
+        )
     if result.tally.gated:
         said.append(f"the gate rejected {result.tally.gated} readings, the same ones for all three.")
     if not said:

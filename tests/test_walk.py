@@ -1,0 +1,189 @@
+"""A walk of the biases against dense covariance matrices, and against a truth that walks from reading to reading."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, multivariate_normal
+from synthetic import Run
+
+from kf_calib import information, walk
+from kf_calib.calibration import Calibration, Settings, calibrate
+from kf_calib.held_out import held_out
+from kf_calib.likelihood import restricted_log_likelihood
+from kf_calib.noise import mean_covariances, steps
+from kf_calib.samples import Floats, Stream
+
+Q = 1e-5
+
+
+def walking(seed: int, intensity: float = Q, **options: object) -> Run:
+    """A run whose biases walk from reading to reading, through the pauses as well; ``biases`` are those at its end."""
+    made = Run(seed=seed, white_mps2=5e-5, **options)  # type: ignore[arg-type]
+    rng, time_ns = np.random.default_rng([seed, 1]), made.accel.time_ns
+    deltas = np.diff(time_ns * 1e-9, prepend=time_ns[0] * 1e-9)
+    path = np.cumsum(rng.normal(size=(len(time_ns), 3)) * intensity * np.sqrt(deltas)[:, None], axis=0)
+    made.accel = Stream(time_ns, made.accel.values + path)
+    made.truth[3::4] += path[-1]
+    return made
+
+
+def fitted(run: Run) -> Calibration:
+    return calibrate(run, Settings(effects=("bias-walk",)))
+
+
+def covariance_at(times_s: Floats) -> Floats:
+    """Of a walk with q = 1 that is zero at the first of the times."""
+    since = times_s - times_s[0]
+    return np.minimum(since[:, None], since[None, :])
+
+
+def test_a_path_has_the_covariance_of_its_readings() -> None:
+    """Rows of parabolas over uneven pieces with a gap between two, from the covariance of all readings."""
+    parts = [np.arange(11) * 0.1, 1.1 + np.arange(7) * 0.1, 4.0 + np.arange(25) * 0.1]
+    times, onto, triangles = np.concatenate(parts), [], []
+    for part in parts:
+        u = (part - part.mean()) / np.ptp(part) * 2.0
+        orthogonal, upper = np.linalg.qr(np.column_stack([np.ones_like(u), u, u * u]))
+        onto.append(orthogonal.T)
+        triangles.append(upper)
+    path = walk.path(
+        np.array([part[0] for part in parts]), np.array([part[-1] for part in parts]), [11, 7, 25], np.array(triangles)
+    )
+    full, project, first = covariance_at(times), np.zeros((9, len(times))), 0
+    for k, own in enumerate(onto):
+        project[3 * k : 3 * k + 3, first : first + own.shape[1]] = own
+        first += own.shape[1]
+    span = times[-1] - times[0]
+    mean = project @ (full[:, -1] / span)  # what W is, given its end
+    given = project @ (full - np.outer(full[:, -1], full[:, -1]) / span) @ project.T
+    np.testing.assert_allclose((path.modes * path.variances) @ path.modes.T, given, atol=1e-12)
+    np.testing.assert_allclose(path.step, mean - project @ np.ones(len(times)), atol=1e-12)
+    left = [np.trace(full[a:b, a:b]) for a, b in ((0, 11), (11, 18), (18, 43))]
+    inside = [
+        np.trace(own @ full[a:b, a:b] @ own.T) for own, (a, b) in zip(onto, ((0, 11), (11, 18), (18, 43)), strict=True)
+    ]
+    np.testing.assert_allclose(path.rest, np.array(left) - inside, rtol=1e-9)
+
+
+def test_the_likelihood_is_that_of_a_dense_covariance() -> None:
+    """Against scipy's density of the residuals of the dwell means, the coefficients integrated out."""
+    result = fitted(walking(3, dwells=9, setting_deg=1e-4))
+    means, state = result.carried.means, result.carried.state
+    times, which = [], []
+    for k, (begin, end) in enumerate(means.ends_s):
+        times.append(np.linspace(begin, end, 2001))
+        which.append(np.full(2001, k))
+    instants, kernel = np.concatenate(times), np.zeros((9, 9))
+    for i in range(9):
+        for j in range(9):
+            kernel[i, j] = np.minimum(times[i][:, None], times[j][None, :]).mean() - instants[0]
+    design = means.design.reshape(27, -1)
+    rest = np.linalg.svd(design / np.linalg.norm(design, axis=0))[0][:, design.shape[1] :]
+    values = []
+    for q in (0.3 * Q, Q, 3.0 * Q):
+        noise = replace(result.noise, walk_mps2_per_sqrt_s=0.0)
+        full = q**2 * np.kron(kernel, np.eye(3))
+        for k, own in enumerate(mean_covariances(noise, means, state)):
+            full[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own
+        expected = multivariate_normal(cov=rest.T @ full @ rest).logpdf(rest.T @ means.readings.ravel())
+        found = restricted_log_likelihood(replace(noise, walk_mps2_per_sqrt_s=q), means, state)
+        values.append((expected, found))
+    differences = np.diff(np.array(values), axis=0)
+    np.testing.assert_allclose(differences[:, 0], differences[:, 1], atol=2e-3)
+
+
+def test_leaving_an_orientation_out_equals_a_fit_without_it() -> None:
+    """The two filters that meet at the dwell left out, against the covariance of all means and generalised least
+    squares; one orientation is visited twice. In dwells as short as here a path shows in the means alone."""
+    poses = np.random.default_rng(2).uniform(-np.pi, np.pi, (12, 3))
+    poses[9] = poses[4]
+    result = fitted(walking(4, dwells=12, poses=poses, count=80, gap_s=100.0))
+    found, floor = held_out(result.fit)
+    expected, floor_expected = by_conditioning(result)
+    assert found == pytest.approx(expected, rel=0.02) and floor == pytest.approx(floor_expected, rel=0.02)
+
+
+def by_conditioning(result: Calibration) -> tuple[float, float]:
+    """Rms held-out error and its expectation from the dense covariance of the dwell means."""
+    means, count, full = result.carried.means, len(result.visits), dense(result)
+    design, readings = means.design.reshape(3 * count, -1), means.readings.ravel()
+    errors, expected = [], []
+    for group in ([0], [1], [2], [3], [4, 9], [5], [6], [7], [8], [10], [11]):
+        out = np.concatenate([np.arange(3 * k, 3 * k + 3) for k in group])
+        kept = np.setdiff1d(np.arange(3 * count), out)
+        weight = np.linalg.inv(full[np.ix_(kept, kept)])
+        spread = np.linalg.inv(design[kept].T @ weight @ design[kept])
+        state = spread @ design[kept].T @ weight @ readings[kept]
+        gain = full[np.ix_(out, kept)] @ weight
+        tilt = design[out] - gain @ design[kept]
+        own = full[np.ix_(out, out)] - gain @ full[np.ix_(kept, out)] + tilt @ spread @ tilt.T
+        errors.append((readings[out] - design[out] @ state - gain @ (readings[kept] - design[kept] @ state)) ** 2)
+        expected.append(np.diag(own))
+    return float(np.sqrt(np.mean(np.concatenate(errors)))), float(np.sqrt(np.mean(np.concatenate(expected))))
+
+
+def dense(result: Calibration) -> Floats:
+    """Covariance (3 D, 3 D) of the dwells' mean readings about the model, by the moments of a Brownian path."""
+    means, noise = result.carried.means, result.noise
+    starts, ends = means.ends_s.T
+    middle = 0.5 * (starts + ends) - starts[0]
+    kernel = np.minimum(middle[:, None], middle[None, :])
+    np.fill_diagonal(kernel, starts - starts[0] + (ends - starts) / 3.0)
+    full = noise.walk_mps2_per_sqrt_s**2 * np.kron(kernel, np.eye(3))
+    for k, own in enumerate(mean_covariances(noise, means, result.carried.state)):
+        full[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own
+    return full
+
+
+def test_sigmas_of_a_walk_and_of_the_twelve_beside_it_are_honest() -> None:
+    """24 runs: 95 % intervals, the NEES of the twelve (biases at the end of the run), the run's own misfit."""
+    ratios, nees, misfit = [], 0.0, 0
+    for seed in range(24):
+        run = walking(seed)
+        result = fitted(run)
+        found = result.parameters["qb"]
+        assert found.value is not None and found.sigma is not None
+        ratios.append((found.value - Q) / found.sigma)
+        error = result.estimate.parameters - run.truth
+        nees += float(error @ np.linalg.solve(result.estimate.parameter_covariance, error))
+        misfit += result.consistency.consistent is False
+    low, high = chi2.ppf([5e-4, 1.0 - 5e-4], 12 * 24)
+    assert np.mean(np.abs(ratios) < 1.96) >= 0.85 and abs(np.mean(ratios)) < 0.6 and 0.75 < np.std(ratios) < 1.3
+    assert low < nees < 1.15 * high  # the intensity is estimated, too
+    assert misfit <= 3
+
+
+def test_no_walk_is_seen_where_there_is_none() -> None:
+    results = [fitted(walking(seed, 0.0)) for seed in range(100, 108)]
+    unseen = [result.parameters["qb"].value is None for result in results]
+    assert sum(unseen) >= 2  # half the time the likelihood is highest at zero
+    for result in results:
+        value = result.parameters["qb"]
+        assert value.value is None or value.value < 4.0 * value.sigma
+
+
+def test_a_walk_in_the_model_lets_the_held_out_error_fall() -> None:
+    run = walking(7, 3.0 * Q)
+    bare, result = calibrate(run), fitted(run)
+    assert result.held_out_rms_mps2 < 0.6 * bare.held_out_rms_mps2
+    assert 0.75 < result.held_out_rms_mps2 / result.held_out_floor_mps2 < 1.3
+
+
+def test_going_back_in_time_is_going_forward_on_reversed_dwells() -> None:
+    """The factor of the biases before the first dwell, from all dwells, is what a filter over all finds for them."""
+    result = fitted(walking(5, dwells=8))
+    fit = result.fit
+    rows, variances = fit.rows(), steps(fit.dwells, fit.noise)
+    factor = np.zeros((12, 13))
+    for own, variance in zip(rows[::-1], variances[::-1], strict=True):
+        factor = walk.receded(factor, variance, own)
+    forward = information.accumulated(rows, variances)[:-1]
+    gains = [k for k in range(12) if k % 4 != 3]
+    one, other = (information.solve(each, np.zeros(12)) for each in (factor, forward))
+    sigma = np.sqrt(np.diag(other[1]))[gains]
+    np.testing.assert_allclose(one[0][gains] / sigma, other[0][gains] / sigma, rtol=0, atol=1e-6)
+    covariances = (each[1][np.ix_(gains, gains)] / np.outer(sigma, sigma) for each in (one, other))
+    np.testing.assert_allclose(*covariances, rtol=0, atol=1e-6)
