@@ -66,14 +66,16 @@ PLANS: dict[str, tuple[str, ...]] = {
 FIGURES = ("noise", "name", "unstated", "power", "invisible", "outside", "pair", "plans", "improve", "advice")
 COUNTS: dict[str, float] = {
     "noise@white": 200, "noise": 60, "name": 1, "unstated": 0.4, "power": 4, "invisible": 0.2, "outside": 2, "pair": 40,
-    "plans@nothing": 8, "plans": 0.2, "improve": 0.4, "advice": 0.4,
+    "plans@nothing": 8, "plans": 0.2, "improve": 0.4, "advice": 1,
 }  # fmt: skip
 """Trials a unit of ``--runs``: in all, or for each effect (and size, and plan) that is hidden; at least one."""
 
 _SPREAD_PLANS = 50  # of a seed of the trial: to spread orientations takes as long as to simulate a run through them
 _SAME = 1.0 - 1e-6
 _APART = 0.7
-_LARGE = 100  # sigma
+_LIKE = 0.9  # overlap of what may be taken for each other at 8 sigma
+_FEW = 12  # orientations
+_LARGE = 100  # sigma, or times
 _POWER = (0.86, 0.94)
 _SECOND = 5_000_000  # from the seed of a run to that of its second run
 _ENOUGH = 20  # trials; fewer are shown and not judged
@@ -440,41 +442,68 @@ def improve(task: Task) -> Outcome:
 
 
 def advice(task: Task, advised: int = 4, random: int = 12) -> Outcome:
-    """Twelve orientations, an ambiguous pair: how far apart, in sigma, after the advised and after random ones."""
+    """Twelve orientations, an ambiguous pair: how far apart, in sigma, after the advised and after random ones.
+
+    Fewer than four where nothing more is advised.
+    """
     from kf_calib.sources.plans import spread_plan
 
-    rows = [visit.gimbal_deg for visit in spread_plan(12, seed=task.seed)]
-    start, truth, said = _on_plan(task, rows)
+    rows = [visit.gimbal_deg for visit in spread_plan(_FEW, seed=task.seed)]
+    truth, said = _on_plan(task, rows)
     rivals = [name for name in said["ambiguity_set"] if name != truth["name"]]
     if said["missing"] in (None, "unknown") or not rivals or truth["name"] not in said["ambiguity_set"]:
         return Outcome(task, task.names, said["missing"], error="not ambiguous to begin with")
-    fixed = dataclasses.replace(task, hidden=(f"{truth['name']}={','.join(map(repr, truth['sizes'].values()))}",))
-    here, more = said, list(rows)
-    for _ in range(advised):
-        if here["next_orientation"] is None:
-            return Outcome(task, task.names, error="no orientation was advised", refused=True)
+    fixed, here, more = _sized(task, truth, 1.0), said, list(rows)
+    while len(more) < len(rows) + advised and here["next_orientation"] is not None:
         more.append(tuple(here["next_orientation"]["gimbal_deg"]))
-        _, _, here = _on_plan(fixed, more)
+        _, here = _on_plan(fixed, more)
     others = [visit.gimbal_deg for visit in spread_plan(random, seed=task.seed + _SECOND)]
-    paths = {"before": start, "advised": _on_plan(fixed, more)[0], "random": _on_plan(fixed, [*rows, *others])[0]}
-    apart = {which: _separation(path, truth, rivals) for which, path in paths.items()}
-    return Outcome(task, task.names, here["missing"], extra={**apart, "rivals": rivals})
+    plans = {"before": rows, "advised": more, "random": [*rows, *others]}
+    apart = {which: _separation(task, truth, rivals, plan) for which, plan in plans.items()}
+    extra = {**apart, "rivals": rivals, "count": len(more) - len(rows)}
+    return Outcome(task, task.names, said["missing"], ambiguity=tuple(said["ambiguity_set"]), extra=extra)
 
 
-def _on_plan(task: Task, rows: Sequence[Sequence[float]]) -> tuple[Path, dict[str, Any], dict[str, Any]]:
-    """Recording, its one hidden effect, and the diagnosis, of a run through these orientations."""
-    path = Path(f"{len(rows)}.mcap")
+def _on_plan(task: Task, rows: Sequence[Sequence[float]]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The one hidden effect and the diagnosis of a run through these orientations."""
+    truth = _through(task, rows, Path("few.mcap"))
+    return truth["effects"][0], run("diagnose", "few.mcap", "--json")
+
+
+def _through(task: Task, rows: Sequence[Sequence[float]], path: Path) -> dict[str, Any]:
     np.savetxt("plan.csv", rows, delimiter=",")
-    truth = simulated(dataclasses.replace(task, options=("--plan", "plan.csv")), path)
-    return path, truth["effects"][0], run("diagnose", str(path), "--json")
+    return simulated(dataclasses.replace(task, options=("--plan", "plan.csv")), path)
 
 
-def _separation(path: Path, truth: dict[str, Any], rivals: Sequence[str]) -> float:
-    """What of the hidden effect neither the twelve nor a rival explain, in sigma; the smallest over the rivals."""
-    spaces = candidates(path, [truth["name"], *rivals])
-    signal = spaces[truth["name"]][0].columns @ np.array(list(truth["sizes"].values()))
+def _sized(task: Task, truth: dict[str, Any], factor: float) -> Task:
+    """With the effect as large as it was, times ``factor``, whatever the orientations are."""
+    sizes = ",".join(repr(factor * size) for size in truth["sizes"].values())
+    return dataclasses.replace(task, hidden=(f"{truth['name']}={sizes}",))
+
+
+def _separation(task: Task, truth: dict[str, Any], rivals: Sequence[str], rows: Sequence[Sequence[float]]) -> float:
+    """What of the hidden effect neither the twelve nor a rival explain, in sigma; the smallest over the rivals.
+
+    Of an effect a hundred times as large, so that noise does not matter.
+    """
+    noise = _through(_sized(task, truth, _LARGE), rows, Path("large.mcap"))["noise"]
+    spaces, signal = _scanned(Path("large.mcap"), [truth["name"], *rivals], noise["white_mps2"])
     others = [each.basis for name in rivals for each in spaces[name]]
-    return min(float(np.linalg.norm(signal - basis @ (basis.T @ signal))) for basis in others)
+    return min(float(np.linalg.norm(signal - basis @ (basis.T @ signal))) for basis in others) / _LARGE
+
+
+def confusable(names: Sequence[str]) -> list[str]:
+    """Effects that another one nearly mimics in a dozen orientations."""
+    from kf_calib.sources.plans import spread_plan
+
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        _through(Task("", "", 1), [visit.gimbal_deg for visit in spread_plan(_FEW, seed=1)], Path("few.mcap"))
+        spaces = {name: own for name, own in candidates(Path("few.mcap")).items() if name in names}
+    pairs = itertools.permutations(spaces, 2)
+    near = {
+        a for a, b in pairs if _LIKE < max(p.overlap(q) for p, q in itertools.product(spaces[a], spaces[b])) < _SAME
+    }
+    return [name for name in names if name in near]
 
 
 PLAYS: dict[str, Callable[[Task], Outcome]] = {
@@ -555,7 +584,8 @@ def _family_tasks(
                 add(f"{plan}, one hidden", [f"{effect}=10sigma"], PLANS[plan])
     else:
         sizes = {"name": (8, 10, 15), "unstated": (10,), "outside": (15,), "improve": (15,), "advice": (8,)}[family]
-        hidden = outside_effects() if family == "outside" else visible
+        kinds = {"outside": outside_effects, "advice": lambda: list(effects) or confusable(visible)}
+        hidden = kinds.get(family, lambda: visible)()
         options = NOISES["unstated"] if family == "unstated" else ()
         for size, name, _ in itertools.product(sizes, hidden, _count(family, runs)):
             add(str(size), [f"{name}={size}sigma"], options)
