@@ -385,6 +385,8 @@ def power(task: Task) -> Outcome:
     if name not in stated:
         return Outcome(task, task.names, error=f"{name}: no smallest size of one coefficient is stated")
     size, worst, count = stated[name]
+    if count != len(catalogue()[name.partition(":")[0]].coefficients):
+        return Outcome(task, task.names, error=f"{name}: its coefficients are not those of the truth")
     sizes = [repr(size) if k == worst else "0" for k in range(count)]
     path, times = Path("trial.mcap"), dict[str, float]()
     effects = simulated(dataclasses.replace(task, hidden=(f"{name}={','.join(sizes)}",)), path, times)["effects"]
