@@ -122,6 +122,17 @@ def test_a_trial_through_the_command_line(trial: Any, tmp_path: Path, monkeypatc
     assert "<svg" in files["picture.svg"].read_text() and files["failures.txt"].exists()
 
 
+def test_the_picture_is_small_and_the_tables_hold_only_what_there_is(trial: Any, tmp_path: Path) -> None:
+    names = [f"some-longish-effect-{k}:x" for k in range(50)]
+    outcomes = [
+        outcome(trial, "name@8", said, (true,)) for true in names for said in (true, names[len(true) % 50], None)
+    ]
+    trial.save_picture(outcomes, tmp_path / "picture.png")
+    assert 5_000 < (tmp_path / "picture.png").stat().st_size < 150_000
+    assert trial.effect_rows(outcomes)[0] == ["hidden", "right, 8", "set holds it", "named instead"]
+    assert len(trial.effect_rows(outcomes)) == 51
+
+
 def test_what_means_the_same_is_read_from_the_run(trial: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On six faces the zero of one encoder is the skewness of the axis it carries; a cubic term is not a square one."""
     monkeypatch.chdir(tmp_path)

@@ -851,7 +851,9 @@ def effect_rows(outcomes: Sequence[Outcome]) -> list[list[str]]:
         noticed = [each.consistent is False for each in own if each.task.family == "power"]
         others = [f"{name} {count}" for name, count in said.get(true, Counter()).most_common() if name != true]
         rows.append([true, *map(_share, [*right, given, noticed]), ", ".join(others)])
-    return rows
+    rows[1:] = [row for row in rows[1:] if any(row[1:])]
+    used = [k for k in range(len(rows[0])) if k == 0 or any(row[k] for row in rows[1:])]
+    return [[row[k] for k in used] for row in rows]
 
 
 def _share(hits: Sequence[bool]) -> str:
@@ -927,6 +929,10 @@ def save_picture(outcomes: Sequence[Outcome], path: Path) -> None:
     axes.set_ylabel("hidden")
     sheet.colorbar(image, shrink=0.5, label="share of trials")
     sheet.savefig(path, dpi=100)
+    if path.suffix == ".png":  # a palette: small enough for the repository
+        from PIL import Image
+
+        Image.open(path).convert("RGB").quantize(64).save(path, optimize=True)
 
 
 def save_failures(outcomes: Sequence[Outcome], path: Path) -> None:
