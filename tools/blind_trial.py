@@ -545,7 +545,8 @@ def tasks(
     families: Sequence[str], runs: int, seed: int, effects: Sequence[str] = (), setting: str = Task.setting
 ) -> list[Task]:
     """All trials, each with a seed of its own whatever else is asked for; ``effects``: only these are hidden."""
-    visible = list(effects) or visible_effects()
+    needed = set(families) - {"noise", "invisible", "outside"}
+    visible = list(effects) or (visible_effects() if needed else [])
     return [task for each in families for task in _family_tasks(each, runs, seed, effects, visible, setting)]
 
 
@@ -884,6 +885,8 @@ def report(outcomes: Sequence[Outcome]) -> Any:
 
     tables = list[Table]()
     for title, rows in (("Figures", figure_rows(outcomes)), ("Hidden, and what was named", effect_rows(outcomes))):
+        if len(rows) == 1:
+            continue
         tables.append(Table(*rows[0], title=title, title_justify="left"))
         for row in rows[1:]:
             tables[-1].add_row(*(f"[bold red]{cell}" if cell == "missed" else cell for cell in row))
@@ -895,6 +898,7 @@ def markdown(outcomes: Sequence[Outcome]) -> str:
     tables = [
         "\n".join("| " + " | ".join(row) + " |" for row in (rows[0], ["---"] * len(rows[0]), *rows[1:]))
         for rows in (figure_rows(outcomes), effect_rows(outcomes))
+        if len(rows) > 1
     ]
     return "\n\n".join([*tables, *notes(outcomes)]) + "\n"
 
