@@ -65,7 +65,7 @@ PLANS: dict[str, tuple[str, ...]] = {
 }
 FIGURES = ("noise", "name", "unstated", "power", "invisible", "outside", "pair", "plans", "improve", "advice")
 COUNTS: dict[str, float] = {
-    "noise@white": 200, "noise": 60, "name": 1, "unstated": 0.4, "power": 4, "invisible": 0.2, "outside": 2, "pair": 40,
+    "noise@white": 250, "noise": 60, "name": 1, "unstated": 0.25, "power": 4, "invisible": 0.2, "outside": 2, "pair": 40,
     "plans@nothing": 8, "plans": 0.2, "improve": 0.4, "advice": 1,
 }  # fmt: skip
 """Trials a unit of ``--runs``: in all, or for each effect (and size, and plan) that is hidden; at least one."""
@@ -967,7 +967,7 @@ def keep(task: Task, folder: Path) -> None:
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
-@click.option("--runs", type=click.IntRange(min=1), default=5, show_default=True, help="Trials an effect and size.")
+@click.option("--runs", type=click.IntRange(min=1), default=4, show_default=True, help="Trials an effect and size.")
 @click.option("--seed", type=click.IntRange(min=1), default=1, show_default=True, help="Of all trials.")
 @click.option("--jobs", type=click.IntRange(min=1), default=2, show_default=True, help="Processes.")
 @click.option("--only", multiple=True, type=click.Choice(FIGURES), help="Only this family of figures; repeatable.")
