@@ -65,8 +65,8 @@ PLANS: dict[str, tuple[str, ...]] = {
 }
 FIGURES = ("noise", "name", "unstated", "power", "invisible", "outside", "pair", "plans", "improve", "advice")
 COUNTS: dict[str, float] = {
-    "noise@white": 250, "noise": 60, "name": 1, "unstated": 0.25, "power": 4, "invisible": 0.2, "outside": 2, "pair": 40,
-    "plans@nothing": 8, "plans": 0.2, "improve": 0.4, "advice": 1,
+    "noise@white": 250, "noise": 60, "name": 1, "unstated": 0.25, "power": 4, "invisible": 0.2, "outside": 2,
+    "pair": 40, "plans@nothing": 8, "plans": 0.2, "improve": 0.4, "advice": 1,
 }  # fmt: skip
 """Trials a unit of ``--runs``: in all, or for each effect (and size, and plan) that is hidden; at least one."""
 
