@@ -48,7 +48,8 @@ def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequen
         mix = np.zeros((factor.shape[1], count + 1))
         mix[:count, :count], mix[count:, count] = np.eye(count), coefficients
         before = min(before, abs(float(triangle(factor @ mix)[-1, -1])))
-        after = np.minimum(after, [abs(float(triangle(np.vstack([factor @ mix, own @ mix]))[-1, -1])) for own in rows])
+        so_far = np.broadcast_to(factor @ mix, (len(rows), len(factor), count + 1))
+        after = np.minimum(after, np.abs(triangle(np.concatenate([so_far, rows @ mix], axis=1))[:, -1, -1]))
     best = int(np.argmax(after))
     return Advice(tuple(np.degrees(poses[best]).round(1).tolist()), before, float(after[best]))
 
@@ -62,11 +63,11 @@ def to_show(fitted: Fit, hidden: Sequence[Effect]) -> tuple[Advice, int] | None:
     width, shown = fitted.carried.model.count, np.zeros(len(poses))
     ends = np.cumsum([width, *(len(effect.coefficients) for effect in hidden)]).tolist()
     scales = np.array([coefficient.scale for effect in hidden for coefficient in effect.coefficients])
-    for k, own in enumerate(rows):
-        for start, end in itertools.pairwise(ends):
-            kept = np.r_[0:width, start:end]
-            left = np.abs(triangle(np.vstack([factor[:, kept], own[:, kept]]))[width:, width:])
-            shown[k] += bool((left * scales[start - width : end - width]).max() > 5.0)
+    for start, end in itertools.pairwise(ends):
+        kept = np.r_[0:width, start:end]
+        so_far = np.broadcast_to(factor[:, kept], (len(rows), len(factor), len(kept)))
+        left = np.abs(triangle(np.concatenate([so_far, rows[:, :, kept]], axis=1))[:, width:, width:])
+        shown += (left * scales[start - width : end - width]).max(axis=(1, 2)) > 5.0
     best = int(np.argmax(shown))
     return Advice(tuple(np.degrees(poses[best]).round(1).tolist()), 0.0, float(shown[best])), int(shown[best])
 

@@ -12,6 +12,8 @@ import pytest
 from click.testing import CliRunner
 from scipy.stats import beta
 
+from kf_calib.errors import KfCalibError
+
 TOOL = Path(__file__).resolve().parents[1] / "tools" / "blind_trial.py"
 
 
@@ -113,21 +115,104 @@ def test_a_trial_through_the_command_line(trial: Any, tmp_path: Path, monkeypatc
          "--failures", str(files["failures.txt"])],
         catch_exceptions=False,
     )  # fmt: skip
-    assert "right name first, n = 15" in done.output and "Seconds a trial" in done.output
+    assert "right name first, n = 15" in done.output and "seconds a trial" in done.output
     found = json.loads(files["trial.json"].read_text())
     assert len(found["outcomes"]) == 1 and found["confusion"]["hysteresis"] == {"hysteresis": 1}
     assert all(each["extra"]["sizes"][0] == pytest.approx(15.0, rel=0.01) for each in found["outcomes"])
     assert "<svg" in files["picture.svg"].read_text() and files["failures.txt"].exists()
 
 
+def test_the_picture_is_small_and_the_tables_hold_only_what_there_is(trial: Any, tmp_path: Path) -> None:
+    names = [f"some-longish-effect-{k}:x" for k in range(50)]
+    outcomes = [
+        outcome(trial, "name@8", said, (true,)) for true in names for said in (true, names[len(true) % 50], None)
+    ]
+    trial.save_picture(outcomes, tmp_path / "picture.png")
+    assert 5_000 < (tmp_path / "picture.png").stat().st_size < 150_000
+    assert trial.effect_rows(outcomes)[0] == ["hidden", "right, 8", "set holds it", "named instead"]
+    assert len(trial.effect_rows(outcomes)) == 51
+
+
 def test_what_means_the_same_is_read_from_the_run(trial: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On six faces the zero of one encoder is the skewness of the axis it carries; a cubic term is not a square one."""
     monkeypatch.chdir(tmp_path)
-    trial.run(*trial.Task("", "", 1, (), ("--plan", "faces")).simulate("t.mcap"))
+    trial.simulated(trial.Task("", "", 1, (), ("--plan", "faces")), Path("t.mcap"))
     same = trial._meaning_the_same(Path("t.mcap"), ["encoder-offset:z"], ["axis-nonorthogonality:x", "second-order"])
     assert set(same) == {(name, other) for name in ["encoder-offset:z"] for other in [name, "axis-nonorthogonality:x"]}
 
 
 def test_a_trial_that_cannot_be_made_says_why(trial: Any) -> None:
     found = trial.played(trial.Task("name@8", "diagnose", 1, ("gravity-error=8sigma",)))
-    assert "cannot be seen" in found.error and not trial.figures([found])
+    assert "cannot be seen" in found.error and not found.refused and not trial.figures([found])
+
+
+def test_a_refusal_counts_as_not_right(trial: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether the program says that it cannot judge a recording, or falls over it."""
+
+    def refused(figure: str, hidden: tuple[str, ...] = ()) -> Any:
+        return trial.played(trial.Task(figure, "diagnose", 1, hidden))
+
+    for error in (KfCalibError("no."), ZeroDivisionError("division")):
+        monkeypatch.setitem(trial.PLAYS, "diagnose", lambda _, error=error: raising(error))
+        found = refused("name@8", ("a=8sigma",))
+        assert found.refused and found.truth == ("a",) and str(error) in found.error and trial.failed(found)
+    right = outcome(trial, "name@8", "a", ("a",))
+    figures = by_name(trial, [right, found])
+    assert figures["right name first, n = 8"].value == 0.5 and figures["right name first, n = 8"].refused == 1
+    assert figures["ambiguity set holds the truth, n = 8"].value == 0.5 and figures["wrong name, n = 8"].value == 0.0
+    assert trial.confusion([right, found]) == {"a": {"a": 1, "(refused)": 1}}
+    assert "| a | 1/2 |" in trial.markdown([right, found]) and "Refused, 1 times: name@8" in trial.markdown([found])
+
+    for family, which in (("noise", "white"), ("plans", "monotone, nothing hidden")):
+        assert next(iter(trial.figures([refused(f"{family}@{which}")]))).value == 1.0  # a false alarm
+    hidden = ("a=1sigma",)
+    others = ["unstated@10", "power@stated", "outside@15", "pair@10", "plans@x, one hidden", "improve@15", "advice@8"]
+    for family in (*others, "invisible@x"):
+        found = trial.figures([refused(family, () if "invisible" in family else hidden)])
+        assert found and all(each.value == 0.0 and each.refused == 1 for each in found), family
+
+
+def raising(error: Exception) -> None:
+    raise error
+
+
+def test_an_effect_is_no_larger_than_itself(trial: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Overlap is of the whole effect: what goes on within dwells counts on both sides. A known effect mimics itself."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(trial, "diagnosed", trial.Outcome)
+    overlaps = {}
+    for name in ("thermal-tilt", "thermal-misalignment"):
+        task = trial.Task("outside@15", "outside", 10_000_016, (f"{name}=15sigma",))
+        overlaps[name] = trial.outside(task).extra["overlap"]
+    assert overlaps["thermal-misalignment"] > 0.98 and overlaps["thermal-tilt"] < 0.7
+
+
+def test_trials_go_on_where_they_stopped_and_are_pooled(
+    trial: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = list[Any]()
+
+    def play(task: Any) -> Any:
+        played.append(task)
+        return trial.Outcome(task, ("a",), "a", ("a",), ("a",), (("a", "a"),), False, extra={"sizes": [8.0]})
+
+    monkeypatch.setitem(trial.PLAYS, "diagnose", play)
+    every = [trial.Task("name@8", "diagnose", seed, ("a=8sigma",), ("--plan", "faces")) for seed in range(1, 5)]
+    kept, other = tmp_path / "kept.jsonl", tmp_path / "other.jsonl"
+
+    def run(todo: list[Any], *words: str) -> str:
+        monkeypatch.setattr(trial, "tasks", lambda *_: todo)
+        return CliRunner().invoke(trial.main, ["--jobs", "1", *words], catch_exceptions=False).output
+
+    run(every[:2], "--resume", str(kept))
+    assert len(played) == 2 and sorted(each.task.seed for each in trial.read(kept)) == [1, 2]
+    assert trial.read(kept)[0] == play(trial.read(kept)[0].task)
+    kept.write_text(kept.read_text() + '{"task": {"fig')  # killed in the middle of a line
+    played.clear()
+    run(every[:3], "--resume", str(kept))
+    assert [task.seed for task in played] == [3] and len(trial.read(kept)) == 3
+    run(every[3:], "--resume", str(other))
+    played.clear()
+    table = run(every, "--no-trials", "--pool", str(kept), "--pool", str(other), "--markdown", str(tmp_path / "t.md"))
+    assert not played and "right name first, n = 8" in table
+    assert "| right name first, n = 8 | 1.000 | 0.398 to 1.000 | 4 |" in (tmp_path / "t.md").read_text()
