@@ -1,0 +1,46 @@
+"""The command line: options in, one call of the library, a view out.
+
+Every command with ``--json`` prints one JSON object on stdout and nothing else there. Exit 0: done; 1: the model is
+inconsistent and ``--strict`` asked; 2: bad usage or input, with one sentence on stderr.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import click
+
+from kf_calib.cli.making import demo, record, simulate
+from kf_calib.cli.runs import compare, diagnose, improve, list_effects, replay
+from kf_calib.errors import KfCalibError
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(package_name="kf_calib")
+def cli() -> None:
+    """Calibrate accelerometers on a stationary gimballed bench with a Kalman filter."""
+
+
+for command in (demo, simulate, record, replay, compare, list_effects, diagnose, improve):
+    cli.add_command(command)
+
+
+def main() -> None:
+    """Entry point of ``kf-calib``."""
+    try:
+        code = cli.main(standalone_mode=False)
+    except click.exceptions.Abort:
+        sys.exit(130)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except click.ClickException as error:
+        ctx = getattr(error, "ctx", None)
+        hint = f" (see {ctx.command_path} --help)" if ctx is not None else ""
+        click.echo(f"kf-calib: {error.format_message().rstrip()}{hint}", err=True)
+        sys.exit(2)
+    except KfCalibError as error:
+        click.echo(f"kf-calib: {error}", err=True)
+        sys.exit(2)
+    except BrokenPipeError:
+        sys.exit(0)
+    sys.exit(code if isinstance(code, int) else 0)

@@ -1,0 +1,303 @@
+"""Commands that make a recording: simulate, record, demo."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from kf_calib.cli.options import F, bench_options, json_option, overrides, print_json, progress, save_views, show
+from kf_calib.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from kf_calib.bench import Vector
+    from kf_calib.samples import Source
+    from kf_calib.sources.plans import Visit
+    from kf_calib.sources.simulator import Simulation
+
+
+_HOW_TO_HIDE = """\
+--hide NAME=SIZE: one size for all coefficients, with signs drawn from the seed, or SIZE,SIZE,... one for each;
+constants after semicolons: 'warm-up=20ug;tau=600'. Without :AXIS an effect is on every gimbal axis.
+SIZE: a number in the SI unit, one with a unit (4ug/g^2), or 10sigma: 10 times what the noise of the run leaves
+uncertain, after what the twelve parameters absorb.
+--hide random, random-known (in the catalogue), random-unknown (not in it), also with =10sigma: drawn from the seed."""
+
+
+def _hidden_table() -> RenderableType:
+    """Every kind of hidden effect, in two lines or more."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Group
+    from rich.table import Table
+
+    from kf_calib.sources.hidden import INNER, catalogue
+
+    kinds = catalogue().values()
+    table = Table(title=f"{len(kinds)} effects to hide", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("effect\nwhat it is", min_width=26)
+    for heading in ("in the\ncatalogue", "SI unit\ncoefficients", "constants", "navigation grade\nMEMS"):
+        table.add_column(heading, no_wrap=True)
+    for kind in kinds:
+        names = kind.coefficients if len(kind.coefficients) < 7 else (*kind.coefficients[:2], "...")
+        constants = [f"{name}={value:.4g} {INNER[name].unit}" for name, value in kind.inner.items()]
+        sizes = [" to ".join(dict.fromkeys(sizes)) for sizes in (kind.navigation, kind.mems)]
+        table.add_row(
+            f"{kind.name}{':AXIS' * kind.per_axis}\n{kind.title}", "yes" if kind.known else "no",
+            f"{kind.unit}\n{' '.join(names)}", "\n".join(constants), "\n".join(sizes),
+        )  # fmt: skip
+    return Group(table, _HOW_TO_HIDE)
+
+
+def _list_hidden(ctx: click.Context, _: click.Parameter, texts: tuple[str, ...]) -> tuple[str, ...]:
+    """``--hide help`` prints what can be hidden, and ends."""
+    if "help" in texts:
+        show(_hidden_table())
+        ctx.exit()
+    return texts
+
+
+def simulation_options(command: F) -> F:
+    """What the simulated bench is and does."""
+    options = [
+        click.option("--grade", type=click.Choice(["paper", "navigation", "mems"]), default="navigation",
+                     show_default=True, help="Grade of the simulated sensors."),
+        click.option("--plan", default="spread", show_default=True,
+                     help="spread, faces, or a CSV file of gimbal angles in deg, an orientation a line."),
+        click.option("--orientations", "count", type=click.IntRange(min=1), default=24, show_default=True,
+                     help="Orientations of a spread plan."),
+        click.option("--dwell-s", type=click.FloatRange(min=0, min_open=True), default=30.0, show_default=True,
+                     help="Seconds in each orientation."),
+        click.option("--sample-hz", type=click.FloatRange(min=0, min_open=True), default=100.0, show_default=True,
+                     help="Rate of the readings."),
+        click.option("--angle-hz", type=click.FloatRange(min=0, min_open=True), default=10.0, show_default=True,
+                     help="Rate of the platform angles."),
+        click.option("--slew-degps", type=click.FloatRange(min=0, min_open=True), default=20.0, show_default=True,
+                     help="Greatest speed between orientations, deg/s."),
+        click.option("--white", "white_mps2", type=float, help="White noise of a reading, m/s^2."),
+        click.option("--ar1", "ar1_phi", type=float, help="Correlation of that noise from one reading to the next."),
+        click.option("--flicker", "flicker_mps2", type=float, help="1/f noise: floor of the Allan deviation, m/s^2."),
+        click.option("--walk", "walk_mps2_per_sqrt_s", type=float, help="Random walk of the biases, m/s^2/sqrt(s)."),
+        click.option("--scatter", "scatter_mps2", type=float, help="Offset of each sensor in each dwell, m/s^2."),
+        click.option("--setting", "setting_sigma_deg", type=float, help="Setting error of each orientation, deg."),
+        click.option("--encoder-sigma", "encoder_sigma_deg", type=float, help="Noise of the encoders, deg."),
+        click.option("--encoder-step", "encoder_step_deg", type=float, help="Resolution of the encoders, deg."),
+        click.option("--outlier-rate", type=float, help="Share of readings that are outliers."),
+        click.option("--outlier-size", "outlier_mps2", type=float, help="Size of an outlier, m/s^2."),
+        click.option("--hide", "hidden", multiple=True, metavar="NAME=SIZE", is_eager=True, callback=_list_hidden,
+                     help="Hide an effect in the truth, for example second-order=4ug/g^2, second-order=10sigma (10 "
+                     "times what noise leaves uncertain), random or random=10sigma; repeatable; help lists them all."),
+        click.option("--temperature", "constant_c", type=float, default=25.0, show_default=True,
+                     help="Temperature about which it swings, degC."),
+        click.option("--temperature-swing", "swing_c", type=float, default=0.0, show_default=True,
+                     help="Swing of the temperature to either side, K."),
+        click.option("--temperature-period-s", "period_s", type=float, default=3600.0, show_default=True,
+                     help="Period of that swing, s."),
+        click.option("--warm-up-c", "warm_up_c", type=float, default=0.0, show_default=True,
+                     help="How much colder the start is, K."),
+        click.option("--warm-up-s", "warm_up_s", type=float, default=1800.0, show_default=True,
+                     help="Time constant of the warming up, s."),
+        click.option("--unstated", is_flag=True, help="Do not state the setting error and scatter in the recording."),
+        click.option("--seed", type=int, default=0, show_default=True, help="Seed of sensors, plan and noise."),
+    ]  # fmt: skip
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def _simulation(options: Mapping[str, Any]) -> Simulation:
+    from dataclasses import fields, replace
+    from functools import partial
+
+    from kf_calib.bench import Bench, parse_axes
+    from kf_calib.sources.hidden import parse, sized
+    from kf_calib.sources.physics import Ambient
+    from kf_calib.sources.sensors import GRADES
+    from kf_calib.sources.simulator import Simulation
+
+    keys = {"axes": "y z x", **overrides(options)}
+    if "latitude_deg" not in keys:
+        keys.setdefault("gravity_mps2", "9.81")
+    grade = GRADES[options["grade"]]
+    names = {field.name for field in fields(grade.noise)}
+    noise = replace(grade.noise, **{key: options[key] for key in names if options.get(key) is not None})
+    axes = parse_axes(keys["axes"])
+    visits = _visits(options, axes)
+    if not options["unstated"]:
+        keys.setdefault("angle_sigma_deg", repr(noise.setting_sigma_deg))
+        keys.setdefault("scatter_sigma_mps2", repr(noise.dwell_sigma_mps2(len(visits))))
+    ambient = Ambient(**{field.name: options[field.name] for field in fields(Ambient) if field.name in options})
+    run = Simulation(
+        Bench.from_metadata(keys), grade.sensors(options["seed"]), noise, visits,
+        sample_hz=options["sample_hz"], angle_hz=options["angle_hz"], slew_rate_degps=options["slew_degps"],
+        ambient=ambient, seed=options["seed"], grade=options["grade"],
+    )  # fmt: skip
+    return run.hiding(
+        parse(options["hidden"], axes, seed=options["seed"], grade=options["grade"], sized=partial(sized, run))
+    )
+
+
+def _visits(options: Mapping[str, Any], axes: tuple[Vector, ...]) -> list[Visit]:
+    from kf_calib.sources.plans import explicit_plan, six_faces, spread_plan
+
+    if options["plan"] == "spread":
+        return spread_plan(options["count"], axes, options["dwell_s"], options["seed"])
+    if options["plan"] == "faces":
+        return six_faces(axes, options["dwell_s"])
+    return explicit_plan(_angles_from_csv(Path(options["plan"]), len(axes)), options["dwell_s"])
+
+
+def _angles_from_csv(path: Path, width: int) -> list[list[float]]:
+    """Rows of gimbal angles, deg; a first line of names is passed over."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: the plan cannot be read ({getattr(error, 'strerror', None) or error}).") from None
+    rows = list[list[float]]()
+    for number, line in enumerate(lines, start=1):
+        cells = line.split("#")[0].replace(",", " ").split()
+        try:
+            row = [float(cell) for cell in cells]
+        except ValueError:
+            if rows or number > 1:
+                raise InputError(f"{path}, line {number}: {line!r} is not {width} angles in deg.") from None
+            continue
+        if row and len(row) != width:
+            raise InputError(f"{path}, line {number}: {len(row)} angles for {width} gimbal axes.")
+        rows += [row] if row else []
+    if not rows:
+        raise InputError(f"{path}: holds no orientation; write a line of {width} angles in deg for each.")
+    return rows
+
+
+def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], None]) -> tuple[int, int, float]:
+    """Write a source to a recording, a chunk closed at the end of each dwell; readings, dwells, seconds."""
+    from kf_calib.dwells import Segmenter
+    from kf_calib.sources.recorder import Recorder
+
+    readings, first_ns, last_ns, segmenter = 0, None, 0, Segmenter(source.bench)
+    with Recorder(out, source.bench, overwrite=overwrite) as recorder:
+        for batch in source:
+            recorder.write(batch)
+            before = segmenter.dwell_count
+            for _ in segmenter.push(batch):
+                pass
+            if segmenter.dwell_count > before > 0:
+                recorder.end_dwell()
+            readings += len(batch.accel)
+            if len(batch.accel):
+                first_ns = int(batch.accel.time_ns[0]) if first_ns is None else first_ns
+                last_ns = int(batch.accel.time_ns[-1])
+            tick(source.fraction)
+        for _ in segmenter.finish():
+            pass
+    return readings, segmenter.dwell_count, (last_ns - (first_ns or last_ns)) / 1e9
+
+
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace the file if it exists.")
+
+
+@click.command()
+@click.argument("out", type=click.Path(path_type=Path))
+@simulation_options
+@bench_options
+@overwrite_option
+@json_option
+def simulate(out: Path, overwrite: bool, as_json: bool, **options: Any) -> None:
+    """Record a simulated bench run to OUT; its truth goes to a side file that no estimator opens."""
+    source = _simulation(options)
+    with progress(f"simulating {out.name}", as_json) as tick:
+        readings, dwells, duration_s = _record(source, out, overwrite, tick)
+    truth = source.write_truth(out)
+    content = {
+        "recording": str(out),
+        "truth": str(truth),
+        "samples": readings,
+        "dwells": dwells,
+        "duration_s": duration_s,
+    }
+    if as_json:
+        print_json(content)
+    else:
+        click.echo(f"{out}: {readings} readings, {dwells} dwells, {duration_s:.0f} s; truth in {truth}")
+
+
+@click.command()
+@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("lines", type=click.Path(path_type=Path, allow_dash=True), default="-")
+@click.option(
+    "--column",
+    "columns",
+    multiple=True,
+    metavar="THEIRS=OURS",
+    help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.',
+)
+@bench_options
+@overwrite_option
+@json_option
+def record(
+    out: Path, lines: Path, columns: tuple[str, ...], overwrite: bool, as_json: bool, **options: Any
+) -> None:  # fmt: skip
+    """Record CSV or JSON LINES (a file, or - for standard input) to the MCAP file OUT."""
+    from kf_calib.sources.lines import Lines
+
+    renamed = dict(_pair(text) for text in columns)
+    source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, overrides(options), renamed)
+    with progress(f"recording {out.name}", as_json or str(lines) == "-") as tick:
+        readings, dwells, duration_s = _record(source, out, overwrite, tick)
+    content = {
+        "recording": str(out), "samples": readings, "dwells": dwells, "duration_s": duration_s,
+        "warnings": source.warnings,
+    }  # fmt: skip
+    if as_json:
+        print_json(content)
+        return
+    click.echo(f"{out}: {readings} readings, {dwells} dwells, {duration_s:.0f} s")
+    for warning in source.warnings:
+        click.echo(f"Note: {warning}")
+
+
+def _pair(text: str) -> tuple[str, str]:
+    theirs, equals, ours = text.rpartition("=")
+    if not (equals and theirs and ours):
+        raise InputError(f"--column {text!r} names no pair: write --column THEIRS=OURS, for example acc_x=ax_g.")
+    return theirs, ours
+
+
+@click.command()
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default="out")
+@json_option
+def demo(folder: Path, as_json: bool) -> None:
+    """The main job on a simulated run: record, replay, compare with least squares, save the view; files in FOLDER."""
+    from kf_calib.comparison import compare as run
+    from kf_calib.sources.recording import Recording
+
+    folder.mkdir(parents=True, exist_ok=True)
+    recording, rrd = folder / "demo.mcap", folder / "demo.rrd"
+    options = simulate.make_context("simulate", [str(recording)]).params
+    source = _simulation(options | {"dwell_s": 15.0, "slew_degps": 90.0, "seed": 2019})
+    with progress("recording a simulated run", as_json) as tick:
+        readings, dwells, duration_s = _record(source, recording, True, tick)
+        truth = source.write_truth(recording)
+    with progress("replaying and comparing", as_json):
+        compared = run(Recording(recording))
+        save_views(compared.result, rrd, None)
+    if as_json:
+        from kf_calib.views.json import compare_object, replay_object
+
+        files = {"recording": str(recording), "truth": str(truth), "view": str(rrd)}
+        print_json({**files, "replay": replay_object(compared.result), "compare": compare_object(compared)})
+        return
+    from kf_calib.views.console import comparison_table, summary
+
+    click.echo(
+        f"Recorded a simulated bench run to {recording}: {readings} readings, {dwells} dwells, {duration_s:.0f} s.\n"
+    )
+    show(summary(compared.result))
+    click.echo()
+    show(comparison_table(compared))
+    click.echo(f"\nTruth: {truth}. View: {rrd} (open it with .venv/bin/rerun {rrd}).")

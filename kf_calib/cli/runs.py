@@ -1,0 +1,292 @@
+"""Commands that evaluate a recording: replay, compare, effects, diagnose, improve."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from kf_calib.cli.options import (
+    BENCH_OPTIONS,
+    effects_of,
+    filter_options,
+    json_option,
+    opened,
+    overrides,
+    print_json,
+    progress,
+    recording_of,
+    recording_options,
+    save_views,
+    settings_of,
+    show,
+    strict_option,
+)
+
+if TYPE_CHECKING:
+    pass
+
+
+@click.command()
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option("--rrd", type=click.Path(path_type=Path), help="Save the Rerun view here.")
+@click.option("--png", type=click.Path(path_type=Path), help="Save a picture of the Rerun view here.")
+@click.option("--save-model", type=click.Path(path_type=Path), help="Save the model here, for --model to read.")
+@recording_options
+@filter_options
+@strict_option
+@json_option
+@click.pass_context
+def replay(
+    ctx: click.Context,
+    recording: Path,
+    rrd: Path | None,
+    png: Path | None,
+    save_model: Path | None,
+    strict: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Run a recording through the filter: twelve parameters, their sigma, and whether the model fits."""
+    from kf_calib.calibration import calibrate
+
+    source, settings = opened(recording, options)
+    with progress(f"replaying {recording.name}", as_json) as tick:
+        result = calibrate(source, settings, tick)
+    save_views(result, rrd, png)
+    if save_model:
+        from kf_calib import model_file
+
+        model_file.write(save_model, result)
+    if as_json:
+        from kf_calib.views.json import replay_object
+
+        print_json(replay_object(result))
+    else:
+        from kf_calib.views.console import summary
+
+        show(summary(result))
+        for path in filter(None, (rrd, png, save_model)):
+            click.echo(f"saved {path}")
+    if strict and result.consistency.consistent is False:
+        ctx.exit(1)
+
+
+@click.command()
+@click.argument("recording", type=click.Path(path_type=Path))
+@recording_options
+@filter_options
+@json_option
+def compare(recording: Path, as_json: bool, **options: Any) -> None:
+    """Block engine, filterpy and batch least squares on the same recording: differences, time, memory."""
+    from kf_calib.comparison import compare as run
+
+    source, settings = opened(recording, options)
+    with progress(f"comparing on {recording.name}", as_json):
+        compared = run(source, settings)
+    if as_json:
+        from kf_calib.views.json import compare_object
+
+        print_json(compare_object(compared))
+    else:
+        from kf_calib.views.console import comparison_table
+
+        show(comparison_table(compared))
+
+
+@click.command("effects")
+@click.argument("names", nargs=-1, metavar="[NAME]...")
+@click.option(
+    "--recording",
+    type=click.Path(path_type=Path),
+    metavar="REC",
+    help="Say of each effect what this recording shows of it: visible, smallest size, confused with what.",
+)
+@recording_options
+@filter_options
+@json_option
+def list_effects(names: tuple[str, ...], recording: Path | None, as_json: bool, **options: Any) -> None:
+    """The effects a model may have: all of the catalogue and your own, or those NAMEd (formulas too) in detail.
+
+    Without --recording they are those of a bench with --axes "y z x" at --latitude 50, or as stated.
+    """  # fmt: skip
+    from kf_calib.bench import Bench
+    from kf_calib.effects import effect_named, refuse_unknown
+    from kf_calib.effects import names as known
+    from kf_calib.views import catalogue
+
+    effects_of(options)
+    for name in names:
+        refuse_unknown(name)
+    if recording is not None:
+        _list_visible(recording, names, as_json, options)
+        return
+    bench = Bench.from_metadata({"axes": "y z x", "latitude_deg": "50"} | overrides(options))
+    chosen = [effect_named(name, bench) for name in names or known(bench)]
+    if as_json:
+        print_json(catalogue.effects_object(chosen))
+    else:
+        show(catalogue.details(chosen) if names else catalogue.overview(chosen))
+
+
+def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, options: Mapping[str, Any]) -> None:
+    """What a recording shows of effects, beside the model of the options."""
+    from kf_calib.calibration import calibrate
+    from kf_calib.effects import effect_named
+    from kf_calib.effects import names as known
+    from kf_calib.views import catalogue
+    from kf_calib.views.json import clean
+    from kf_calib.visibility import sights
+
+    source, settings = opened(recording, options)
+    chosen = [effect_named(name, source.bench) for name in names or known(source.bench)]
+    with progress(f"reading {recording.name}", as_json) as tick:
+        result = calibrate(source, settings, tick)
+    seen = sights(result.fit, chosen)
+    if as_json:
+        print_json(clean(catalogue.sights_object(seen, [str(effect) for effect in result.model.effects])))
+    else:
+        title = f"What {recording.name} shows of {len(seen)} effects beside {result.model.sum}"
+        show(catalogue.sight_report(seen, title))
+
+
+@click.command()
+@click.argument("recording", type=click.Path(path_type=Path))
+@recording_options
+@filter_options
+@strict_option
+@json_option
+@click.pass_context
+def diagnose(ctx: click.Context, recording: Path, strict: bool, as_json: bool, **options: Any) -> None:
+    """Which physical effect is missing in the model: verdict, suspects, what this run cannot see, where to go next."""
+    from kf_calib.calibration import calibrate
+    from kf_calib.diagnosis import diagnose as run
+    from kf_calib.views import diagnosis as views
+
+    source, settings = opened(recording, options)
+    with progress(f"diagnosing {recording.name}", as_json) as tick:
+        found = run(calibrate(source, settings, tick))
+    if as_json:
+        print_json(views.diagnosis_object(found))
+    else:
+        show(views.diagnosis_report(found))
+    if strict and found.test.consistent is False:
+        ctx.exit(1)
+
+
+@click.command()
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option("--interactive/--unattended", default=None, help="Ask at every step, or never; on a terminal it asks.")
+@click.option("--accept-first", is_flag=True, help="Of effects that explain it equally well, take the first.")
+@click.option(
+    "--honest",
+    is_flag=True,
+    help="Held-out error with the choice of effects repeated without what is held out, in 6 folds.",
+)
+@click.option("--save-model", "--out-model", type=click.Path(path_type=Path), help="Save the last model here.")
+@click.option("--journal", "journal_file", type=click.Path(path_type=Path), help="Keep a journal of the steps here.")
+@click.option("--from-journal", type=click.Path(path_type=Path), help="First take the steps of this journal again.")
+@recording_options
+@filter_options
+@strict_option
+@json_option
+@click.pass_context
+def improve(
+    ctx: click.Context,
+    recording: Path,
+    interactive: bool | None,
+    accept_first: bool,
+    honest: bool,
+    save_model: Path | None,
+    journal_file: Path | None,
+    from_journal: Path | None,
+    strict: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:  # fmt: skip
+    """Add the effects that are missing, one after another, and see the error fall, until there is a reason to stop."""
+    from kf_calib import improvement, journal, model_file
+    from kf_calib.calibration import calibrate
+    from kf_calib.views import improvement as views
+
+    if interactive is None:
+        interactive = not as_json and sys.stdin.isatty() and sys.stdout.isatty()
+    if interactive and as_json:
+        raise click.UsageError("--interactive asks questions, --json prints one object and nothing else: choose one.")
+    earlier = journal.read(from_journal) if from_journal else None
+    if earlier is not None:
+        options |= _of_journal(ctx, options, earlier.origin.options)
+    _refuse_engine(options)
+    settings = settings_of(options)
+    origin = journal.Origin.of(recording, _for_journal(options, settings.effects))
+    if earlier is not None:
+        earlier.refuse_other(origin, from_journal)
+
+    def keep(state: improvement.Improvement) -> None:
+        if journal_file:
+            journal.write(journal_file, state, origin)
+
+    difference = None
+    with progress(f"improving on {recording.name}", as_json) as tick:
+        start = calibrate(recording_of(recording, options), settings, tick)
+        if earlier is not None:
+            state, difference = journal.replayed(earlier, start)
+        elif interactive:
+            state = improvement.begun(start)
+        else:
+            state = improvement.improve(start, accept_first, keep)
+    if interactive:
+        state = views.session(state, lambda text, usual: click.prompt(text, default=usual or None), show, keep)
+    with progress("holding out orientations", as_json or not honest) as tick:
+        checked = improvement.honest(start, on_fold=tick) if honest else None
+    keep(state)
+    if save_model:
+        model_file.write(save_model, state.result)
+    files = {"saved_model": save_model, "journal": journal_file}
+    if as_json:
+        print_json(views.improvement_object(state, checked, difference, files))
+    else:
+        show(views.improvement_report(state, checked, difference, files))
+    if strict and state.found.test.consistent is False:
+        ctx.exit(1)
+
+
+_BY_CONTENT = ("bench_file", "model_file", *BENCH_OPTIONS)
+
+
+def _refuse_engine(options: Mapping[str, Any]) -> None:
+    if options["engine"] != "block":
+        raise click.UsageError(
+            "improve refits from folded dwells, as the block engine does: leave out --engine, and check what it finds "
+            "with replay --model FILE --engine filterpy."
+        )
+
+
+def _for_journal(options: Mapping[str, Any], effects: tuple[str, ...]) -> dict[str, Any]:
+    """All options that numbers depend on; files of bench keys and of models by what they say."""
+    from kf_calib import model_file
+
+    files = [*options["effects_from"]]
+    if options["model_file"] is not None:
+        files += model_file.read(options["model_file"]).effects_from
+    kept = {key: value for key, value in options.items() if value is not None and key not in _BY_CONTENT}
+    plain = {"effects": list(effects), "effects_from": [str(path.resolve()) for path in files]}
+    return kept | overrides(options) | plain
+
+
+def _of_journal(ctx: click.Context, options: Mapping[str, Any], kept: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of a journal, as if they had been given; raises UsageError where some are given as well."""
+    from click.core import ParameterSource
+
+    own = [param for param in ctx.command.params if param.name in options]
+    given = [
+        param.opts[0] for param in own if ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE
+    ]
+    if given:
+        raise click.UsageError(f"--from-journal has its options from the journal: leave out {', '.join(given)}.")
+    return {param.name or "": param.type_cast_value(ctx, kept[param.name]) for param in own if param.name in kept} | {
+        key: None for key in _BY_CONTENT if key not in kept
+    }
