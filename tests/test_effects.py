@@ -277,9 +277,7 @@ def ratios_of(name: str, seed: int, still: list[DwellFactor]) -> dict[str, float
     if name not in HIDDEN:
         return {symbol: value / sigma for symbol, (value, sigma) in estimated(fit(still, with_(name))).items()}
     text, constant = HIDDEN[name]
-    source = run(
-        [text], 5e-5, seed, CHEAP, 10.0, 150.0, 100.0, 180.0
-    )  # settling: an arrival is known to an angle's period
+    source = run([text], 5e-5, seed, CHEAP, 10.0, 150.0, 2.0, 180.0)
     found = estimated(fit(Pass(source, Settings()).fold(), with_(name)))
     truth = [*source.hidden[0].sizes, constant][-len(found) :]
     return {symbol: (value - true) / sigma for (symbol, (value, sigma)), true in zip(found.items(), truth, strict=True)}
