@@ -57,6 +57,10 @@ class Block:
     temperature_c: Floats
     curve: Curve | None = None
     """How the angles went, in a slew; None in a dwell."""
+    variance_mps2_2: Floats | None = None
+    """Of averaged readings: variance (n, 3) of those that each was made of."""
+    taken: int = 1
+    """How many readings each new one stands for."""
 
 
 @dataclass

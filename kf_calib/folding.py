@@ -65,12 +65,16 @@ class Autocovariance:
 
 @dataclass(frozen=True)
 class Piece:
-    """A stretch of a dwell, folded: triangle (K + 3, K + 3) over [1 u u^2 ... | z1 z2 z3], and its nodes (3)."""
+    """A stretch of a dwell, folded: triangle (K + 3, K + 3) over [1 u u^2 ... | z1 z2 z3], and its nodes (3).
+
+    count: of what was folded, readings or averages of them; taken: of readings.
+    """
 
     triangle: Floats
     nodes: Nodes
     count: int
     carrier_hz: float = 0.0
+    taken: int = 0
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,19 @@ class DwellFactor:
         squares, spare = self.squares, np.maximum(self.counts - float(self.width), 0.0)[:, None]
         pooled = squares.sum(axis=0) / max(spare.sum(), 1)
         return np.where(spare >= 8, squares / np.maximum(spare, 1), pooled)
+
+    @property
+    def averaged(self) -> bool:
+        """Whether averages of readings were folded."""
+        return self.pieces[0].nodes.variance_mps2_2 is not None
+
+    @cached_property
+    def shaking(self) -> tuple[Floats, Floats]:
+        """Variance of the readings at the nodes of each piece (pieces, 3, 3), and of how many, (pieces,)."""
+        own = [piece.nodes.variance_mps2_2 for piece in self.pieces]
+        known = [variances if mine is None else mine for mine, variances in zip(own, self.variances[:, None], strict=True)]
+        taken = np.array([piece.taken for piece in self.pieces], float)
+        return np.array([np.broadcast_to(each, (3, 3)) for each in known]), taken
 
     @property
     def start_s(self) -> float:
@@ -182,7 +199,7 @@ def fold(rows: Rows, carrier_hz: float = 0.0) -> tuple[Piece, ...]:
         stacked[:width], stacked[width:] = basis(u, rows.elapsed_s[part], carrier_hz), channels[:, part]
         folded = _folded(stacked.T)
         folded[0, width:] += folded[0, 0] * level
-        pieces.append(Piece(folded, nodes, len(u), carrier_hz))
+        pieces.append(Piece(folded, nodes, len(u), carrier_hz, len(u) * rows.taken))
     return tuple(pieces)
 
 
@@ -223,7 +240,7 @@ def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> S
         previous_pose=np.repeat([each.pose for each in before], 3, axis=0),
         temperature_c=_signal_only(dwells, np.concatenate([each.temperature_c for each in nodes])),
         sensitivity=state[:12].reshape(3, 4)[:, :3],
-        variance_mps2_2=np.repeat(_varying(dwells), 3, axis=0),
+        variance_mps2_2=_varying(dwells).reshape(-1, 3),
         rate_radps=np.concatenate([_still if each.rate_radps is None else each.rate_radps for each in nodes]),
         rate_change_radps2=np.concatenate(
             [_still if each.rate_change_radps2 is None else each.rate_change_radps2 for each in nodes]
@@ -268,11 +285,13 @@ def _signal_only(dwells: Sequence[DwellFactor], temperature_c: Floats) -> Floats
 
 
 def _varying(dwells: Sequence[DwellFactor]) -> Floats:
-    """Variances of the readings (pieces, 3) where they vary beyond what their estimates scatter by, else their mean."""
-    variances, counts = (np.concatenate([getattr(each, key) for each in dwells]) for key in ("variances", "counts"))
+    """Variances of the readings (pieces, nodes, 3) where they vary beyond what their estimates scatter by, else their
+    mean."""
+    at_nodes, counts = (np.concatenate(parts) for parts in zip(*(dwell.shaking for dwell in dwells), strict=True))
+    variances = at_nodes.mean(axis=1)
     mean = np.average(variances, axis=0, weights=counts)
     excess = np.mean(0.5 * counts[:, None] * (variances / np.where(mean > 0, mean, 1.0) - 1.0) ** 2, axis=0)
-    return np.where(excess > _VIBRATING, variances, mean)
+    return np.where(excess > _VIBRATING, at_nodes, mean)
 
 
 def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[Floats]:

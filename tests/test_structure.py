@@ -16,6 +16,7 @@ LEVELS = [
     ["bench"],
     ["effects", "slews"],
     ["triangle", "dwells", "paper", "gate", "spectrum"],
+    ["averaging"],
     ["model"],
     ["folding"],
     ["noise"],
