@@ -272,7 +272,7 @@ class Pass:
     def rows(self) -> Iterator[Rows]:
         model, bench = Model.of(self.source.bench, self.settings.effects), self.source.bench
         blocks = dwell_blocks(self.source, Segmenter(bench, self.settings.stillness, self.tally, bool(model.dynamic)))
-        averages = model.averages or self.settings.averaged and not model.oscillates
+        averages = model.averages or (self.settings.averaged and not model.oscillates)
         return model_rows(blocks, bench, self.tally, self.settings.gate_sigma, averages)
 
     def fold(self, on_progress: Callable[[float], None] | None = None) -> list[DwellFactor]:

@@ -383,8 +383,8 @@ class Segmenter:
         if last < 0:
             return arrival_ns
         quarter_ns = round(self.stillness.window_s * _SECOND_NS) // 4
-        begin_ns, settled_ns, end_ns = int(self._pose.time_ns[last]), arrival_ns + quarter_ns, arrival_ns + 3 * quarter_ns
-        first, there, end = np.searchsorted(self._accel.time_ns, (begin_ns, settled_ns, end_ns))
+        stamps = int(self._pose.time_ns[last]), arrival_ns + quarter_ns, arrival_ns + 3 * quarter_ns
+        first, there, end = np.searchsorted(self._accel.time_ns, stamps)
         if there == end:
             return arrival_ns
         settled = self._accel.values[there:end]

@@ -127,10 +127,10 @@ class DwellFactor:
     @cached_property
     def shaking(self) -> tuple[Floats, Floats]:
         """Variance of the readings at the nodes of each piece (pieces, 3, 3), and of how many, (pieces,)."""
-        own = [piece.nodes.variance_mps2_2 for piece in self.pieces]
-        known = [variances if mine is None else mine for mine, variances in zip(own, self.variances[:, None], strict=True)]
         taken = np.array([piece.taken for piece in self.pieces], float)
-        return np.array([np.broadcast_to(each, (3, 3)) for each in known]), taken
+        if not self.averaged:
+            return np.repeat(self.variances[:, None], 3, axis=1), taken
+        return np.array([piece.nodes.variance_mps2_2 for piece in self.pieces], float), taken
 
     @property
     def start_s(self) -> float:
