@@ -45,6 +45,7 @@ class Stillness:
 class Block:
     """Up to 4000 consecutive readings of one dwell, which began at ``arrival_s``, or of the slew that ended it.
 
+    arrival_s: as the angles tell it; felt_s: as the readings do, from which on they settle (None: not known better).
     elapsed_s (n,) since the first sample of the recording; accel_mps2 (n, 3); pose (1, k): the mean of the angle
     messages while the platform stands still, or (n, k) where it creeps; temperature_c (n,), NaN where not measured.
     """
@@ -61,6 +62,7 @@ class Block:
     """Of averaged readings: variance (n, 3) of those that each was made of."""
     taken: int = 1
     """How many readings each new one stands for."""
+    felt_s: float | None = None
 
 
 @dataclass
@@ -471,7 +473,9 @@ class Segmenter:
         assert self._dwell is not None and self.first_ns is not None
         self.tally.used += len(accel)
         elapsed_s = (accel.time_ns - self.first_ns) / _SECOND_NS
-        arrival_s = max((self._dwell.felt_ns - self.first_ns) / _SECOND_NS, 0.0)
+        arrival_s, felt_s = (
+            max((stamp - self.first_ns) / _SECOND_NS, 0.0) for stamp in (self._dwell.arrival_ns, self._dwell.felt_ns)
+        )
         return Block(
             self._dwell.number,
             arrival_s,
@@ -479,6 +483,7 @@ class Segmenter:
             accel.values,
             self._block_pose(accel.time_ns),
             _carried_on(self._temperature, accel.time_ns),
+            felt_s=felt_s,
         )
 
     def _block_pose(self, accel_ns: Times) -> Floats:

@@ -350,9 +350,8 @@ def _piece(block: Block, part: slice, bench: Bench, force: Floats | None) -> tup
     if force is None:
         force = bench.specific_force(at, pose)
     variance = None if block.variance_mps2_2 is None else _values_at_nodes(u, block.variance_mps2_2[part])
-    nodes = Nodes(
-        at, at - block.arrival_s, np.broadcast_to(force, (3, 3)), pose, _temperatures(u, warm), variance_mps2_2=variance
-    )
+    since_s = at - (block.arrival_s if block.felt_s is None else block.felt_s)
+    nodes = Nodes(at, since_s, np.broadcast_to(force, (3, 3)), pose, _temperatures(u, warm), variance_mps2_2=variance)
     return part, u, nodes
 
 
