@@ -46,6 +46,7 @@ class Settings:
     """How a run is evaluated.
 
     walk_mps2_per_sqrt_s: random walk of the biases (process noise), 0: none. effects: names of those in the model.
+    averaged: readings are averaged over windows first, as they are for effects that go with vibration.
     """
 
     engine: Engine = "block"
@@ -54,6 +55,7 @@ class Settings:
     gate_sigma: float | None = 6.0
     walk_mps2_per_sqrt_s: float = 0.0
     effects: tuple[str, ...] = ()
+    averaged: bool = False
 
 
 @dataclass(frozen=True)
@@ -268,16 +270,16 @@ class Pass:
     watch: Watch = field(default_factory=Watch)
 
     def rows(self) -> Iterator[Rows]:
-        slews = bool(Model.of(self.source.bench, self.settings.effects).dynamic)
-        segmenter = Segmenter(self.source.bench, self.settings.stillness, self.tally, slews)
-        blocks = dwell_blocks(self.source, segmenter)
-        return model_rows(blocks, self.source.bench, self.tally, self.settings.gate_sigma)
+        model, bench = Model.of(self.source.bench, self.settings.effects), self.source.bench
+        blocks = dwell_blocks(self.source, Segmenter(bench, self.settings.stillness, self.tally, bool(model.dynamic)))
+        averages = model.averages or (self.settings.averaged and not model.oscillates)
+        return model_rows(blocks, bench, self.tally, self.settings.gate_sigma, averages)
 
     def fold(self, on_progress: Callable[[float], None] | None = None) -> list[DwellFactor]:
         """All dwells of the source that hold enough readings to be used."""
         for rows in self.rows():
             self.folder.add(rows)
-            self.watch.add(rows)
+            self.watch.add(rows.raw or rows)
             if on_progress is not None:
                 on_progress(self.source.fraction)
         return usable(self.folder.dwells)
@@ -317,11 +319,13 @@ def calibrate(
 def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
     """The same run with these effects in the model, whatever was in it before: from the dwell factors alone.
 
-    Only effects that need other factors (an oscillation its carrier, some the slews) cost another pass over the source.
+    Only effects that need other factors (an oscillation its carrier, some the slews, some averages of the readings)
+    cost another pass over the source.
     """
     settings = replace(before.settings, effects=tuple(effects))
     model = Model.of(before.bench, settings.effects)
     other = model.oscillates and not any(dwell.carrier_hz for dwell in before.fit.dwells)
+    other |= model.averages and not all(dwell.averaged for dwell in before.fit.dwells)
     if before.reread is not None and (other or (model.dynamic and not before.carried.slews)):
         return before.reread(settings)
     with threadpool_limits(1, user_api="blas"):  # small decompositions, and the same bits every time

@@ -248,7 +248,11 @@ def _diagnosed(before: Calibration) -> Diagnosis:
     test = _without_vibration(before, assessed(before.fit))
     found = _explained(before, test)
     if found.unknown and test.lines:  # of one phase all along and not of one amplitude
-        found = _explained(before, test.without_lines())
+        test = test.without_lines()
+        found = _explained(before, test)
+    if test.vibration and not before.fit.dwells[0].averaged and before.reread is not None:
+        rested = before.reread(replace(before.settings, averaged=True))
+        found = _explained(rested, replace(assessed(rested.fit), vibration=test.vibration))
     return replace(found, verdict=_verdict(found))
 
 

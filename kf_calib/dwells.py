@@ -45,6 +45,7 @@ class Stillness:
 class Block:
     """Up to 4000 consecutive readings of one dwell, which began at ``arrival_s``, or of the slew that ended it.
 
+    arrival_s: as the angles tell it; felt_s: as the readings do, from which on they settle (None: not known better).
     elapsed_s (n,) since the first sample of the recording; accel_mps2 (n, 3); pose (1, k): the mean of the angle
     messages while the platform stands still, or (n, k) where it creeps; temperature_c (n,), NaN where not measured.
     """
@@ -57,6 +58,11 @@ class Block:
     temperature_c: Floats
     curve: Curve | None = None
     """How the angles went, in a slew; None in a dwell."""
+    variance_mps2_2: Floats | None = None
+    """Of averaged readings: variance (n, 3) of those that each was made of."""
+    taken: int = 1
+    """How many readings each new one stands for."""
+    felt_s: float | None = None
 
 
 @dataclass
@@ -153,12 +159,14 @@ class _Event(Enum):
 class _Dwell:
     """The open dwell: its number, its arrival, and the first pose message that belongs to it.
 
+    felt_ns: the arrival as the readings tell it; what settles counts from there.
     settling_ns: what is left out after the arrival; None while the dwell may still be too short for the whole margin.
     pose (1, k): where the platform stands, from the messages of the dwell's first block.
     """
 
     number: int
     arrival_ns: int
+    felt_ns: int
     first_pose_ns: int
     settling_ns: int | None
     pose: Floats | None = None
@@ -239,11 +247,12 @@ class Segmenter:
     def _advance(self, final: bool) -> Iterator[Block]:
         for stamp, event, settles in self._judge(final):
             if event is _Event.ARRIVE:
+                felt_ns = self._felt_ns(stamp)
                 yield from self._slew(stamp)
                 self._discard(stamp)
                 self.dwell_count += 1
                 number, settling_ns = self.dwell_count - 1, None if settles else 0
-                self._dwell = _Dwell(number, stamp, self._next_pose_ns(stamp), settling_ns)
+                self._dwell = _Dwell(number, stamp, felt_ns, self._next_pose_ns(stamp), settling_ns)
             else:
                 lead_ns = min(self._lead_ns, (stamp - self._dwell.arrival_ns) // 10) if self._dwell else 0
                 yield from self._emit(stamp - lead_ns, closing=True)
@@ -366,6 +375,30 @@ class Segmenter:
         arrive = end_ns if kept_new < 2 else int(times[(count - kept_new + 1) * size])
         return leave, max(arrive, leave)
 
+    def _felt_ns(self, arrival_ns: int) -> int:
+        """When, since the last angle before an arrival, the readings came to the level they have just after it.
+
+        Angles tell an arrival to their period only, and a slew that ends gently seems over before it is. The level is
+        that of half a window, which begins a quarter of it after the arrival and is over before this is judged.
+        """
+        last = int(np.searchsorted(self._pose.time_ns, arrival_ns)) - 1
+        if last < 0:
+            return arrival_ns
+        quarter_ns = round(self.stillness.window_s * _SECOND_NS) // 4
+        stamps = int(self._pose.time_ns[last]), arrival_ns + quarter_ns, arrival_ns + 3 * quarter_ns
+        first, there, end = np.searchsorted(self._accel.time_ns, stamps)
+        if there == end:
+            return arrival_ns
+        settled = self._accel.values[there:end]
+        resting = np.radians(self.stillness.tolerance_deg) / 50.0 * self.bench.gravity_mps2
+        allowed = 6.0 * float(settled.std(axis=0).max()) + resting
+        apart = np.abs(self._accel.values[first:there] - settled.mean(axis=0)).max(axis=1, initial=0.0)
+        away = np.flatnonzero(apart > allowed)
+        if not away.size:
+            return arrival_ns
+        moving_ns, standing_ns = self._accel.time_ns[first + away[-1] :][:2].tolist()
+        return (moving_ns + standing_ns) // 2
+
     def _next_pose_ns(self, stamp: int) -> int:
         """The first pose message at or after an arrival: the dwell's own poses start there."""
         index = int(np.searchsorted(self._pose.time_ns, stamp))
@@ -440,7 +473,9 @@ class Segmenter:
         assert self._dwell is not None and self.first_ns is not None
         self.tally.used += len(accel)
         elapsed_s = (accel.time_ns - self.first_ns) / _SECOND_NS
-        arrival_s = max((self._dwell.arrival_ns - self.first_ns) / _SECOND_NS, 0.0)
+        arrival_s, felt_s = (
+            max((stamp - self.first_ns) / _SECOND_NS, 0.0) for stamp in (self._dwell.arrival_ns, self._dwell.felt_ns)
+        )
         return Block(
             self._dwell.number,
             arrival_s,
@@ -448,6 +483,7 @@ class Segmenter:
             accel.values,
             self._block_pose(accel.time_ns),
             _carried_on(self._temperature, accel.time_ns),
+            felt_s=felt_s,
         )
 
     def _block_pose(self, accel_ns: Times) -> Floats:

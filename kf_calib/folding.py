@@ -66,12 +66,16 @@ class Autocovariance:
 
 @dataclass(frozen=True)
 class Piece:
-    """A stretch of a dwell, folded: triangle (K + 3, K + 3) over [1 u u^2 ... | z1 z2 z3], and its nodes (3)."""
+    """A stretch of a dwell, folded: triangle (K + 3, K + 3) over [1 u u^2 ... | z1 z2 z3], and its nodes (3).
+
+    count: of what was folded, readings or averages of them; taken: of readings.
+    """
 
     triangle: Floats
     nodes: Nodes
     count: int
     carrier_hz: float = 0.0
+    taken: int = 0
 
 
 @dataclass(frozen=True)
@@ -122,6 +126,19 @@ class DwellFactor:
         ends = np.array([piece.nodes.elapsed_s[[0, -1]] for piece in self.pieces])
         triangles = np.array([piece.triangle[: self.width, : self.width] for piece in self.pieces])
         return path(ends[:, 0], ends[:, 1], [piece.count for piece in self.pieces], triangles)
+
+    @property
+    def averaged(self) -> bool:
+        """Whether averages of readings were folded."""
+        return self.pieces[0].nodes.variance_mps2_2 is not None
+
+    @cached_property
+    def shaking(self) -> tuple[Floats, Floats]:
+        """Variance of the readings at the nodes of each piece (pieces, 3, 3), and of how many, (pieces,)."""
+        taken = np.array([piece.taken for piece in self.pieces], float)
+        if not self.averaged:
+            return np.repeat(self.variances[:, None], 3, axis=1), taken
+        return np.array([piece.nodes.variance_mps2_2 for piece in self.pieces], float), taken
 
     @property
     def start_s(self) -> float:
@@ -190,7 +207,7 @@ def fold(rows: Rows, carrier_hz: float = 0.0) -> tuple[Piece, ...]:
         stacked[:width], stacked[width:] = basis(u, rows.elapsed_s[part], carrier_hz), channels[:, part]
         folded = _folded(stacked.T)
         folded[0, width:] += folded[0, 0] * level
-        pieces.append(Piece(folded, nodes, len(u), carrier_hz))
+        pieces.append(Piece(folded, nodes, len(u), carrier_hz, len(u) * rows.taken))
     return tuple(pieces)
 
 
@@ -231,7 +248,7 @@ def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> S
         previous_pose=np.repeat([each.pose for each in before], 3, axis=0),
         temperature_c=_signal_only(dwells, np.concatenate([each.temperature_c for each in nodes])),
         sensitivity=state[:12].reshape(3, 4)[:, :3],
-        variance_mps2_2=np.repeat(_varying(dwells), 3, axis=0),
+        variance_mps2_2=_varying(dwells).reshape(-1, 3),
         rate_radps=np.concatenate([_still if each.rate_radps is None else each.rate_radps for each in nodes]),
         rate_change_radps2=np.concatenate(
             [_still if each.rate_change_radps2 is None else each.rate_change_radps2 for each in nodes]
@@ -276,11 +293,13 @@ def _signal_only(dwells: Sequence[DwellFactor], temperature_c: Floats) -> Floats
 
 
 def _varying(dwells: Sequence[DwellFactor]) -> Floats:
-    """Variances of the readings (pieces, 3) where they vary beyond what their estimates scatter by, else their mean."""
-    variances, counts = (np.concatenate([getattr(each, key) for each in dwells]) for key in ("variances", "counts"))
+    """Variances of the readings (pieces, nodes, 3) where they vary beyond what their estimates scatter by, else their
+    mean."""
+    at_nodes, counts = (np.concatenate(parts) for parts in zip(*(dwell.shaking for dwell in dwells), strict=True))
+    variances = at_nodes.mean(axis=1)
     mean = np.average(variances, axis=0, weights=counts)
     excess = np.mean(0.5 * counts[:, None] * (variances / np.where(mean > 0, mean, 1.0) - 1.0) ** 2, axis=0)
-    return np.where(excess > _VIBRATING, variances, mean)
+    return np.where(excess > _VIBRATING, at_nodes, mean)
 
 
 def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[Floats]:

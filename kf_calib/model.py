@@ -17,6 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib import gate, paper
+from kf_calib.averaging import averaged
 from kf_calib.bench import Bench
 from kf_calib.dwells import Block, Tally
 from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named
@@ -38,6 +39,7 @@ class Nodes:
     elapsed_s, since_arrival_s, temperature_c (m,); force_mps2 (m, 3); pose (m, k). The three nodes of a
     piece are its beginning, middle and end. temperature_c is NaN where it is not measured. rate_radps,
     rate_change_radps2 (m, 3): the platform's omega in its own frame, and its derivative; None where it stands.
+    variance_mps2_2 (m, 3): of the readings, where averages of them were folded; else None.
     """
 
     elapsed_s: Floats
@@ -47,6 +49,7 @@ class Nodes:
     temperature_c: Floats
     rate_radps: Floats | None = None
     rate_change_radps2: Floats | None = None
+    variance_mps2_2: Floats | None = None
 
     @property
     def regressors(self) -> Floats:
@@ -77,6 +80,7 @@ class Rows:
     static: the columns are the same in every row, and the innovation is the readings less their mean.
     pieces: parts of the rows, u (n',) from -1 to 1 over each, and its nodes. moving: of the slew after the dwell.
     gated: in which channels each reading lay out that is not among them, (3, m) bool; None: there were none.
+    raw: the rows before they were averaged, where they were; taken: how many readings a row then stands for.
     """
 
     dwell: int
@@ -88,6 +92,8 @@ class Rows:
     pieces: tuple[tuple[slice, Floats, Nodes], ...]
     moving: bool = False
     gated: Mask | None = None
+    raw: Rows | None = None
+    taken: int = 1
 
 
 @dataclass(frozen=True)
@@ -155,6 +161,11 @@ class Model:
     def oscillates(self) -> bool:
         """Whether an effect may be faster than a piece of a dwell, so that the dwells are folded on a carrier."""
         return any(effect.oscillates for effect in self.effects)
+
+    @property
+    def averages(self) -> bool:
+        """Whether an effect needs averaged readings; an oscillation would go with the vibration."""
+        return any(effect.averages for effect in self.effects) and not self.oscillates
 
     @property
     def unknowns(self) -> dict[int, Effect]:
@@ -244,8 +255,13 @@ def dwell_map(state: Floats) -> Floats:
     return out
 
 
-def model_rows(blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0) -> Iterator[Rows]:
-    """Rows of every block, outliers gated out; the same rows feed both engines and batch least squares."""
+def model_rows(
+    blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0, averages: bool = False
+) -> Iterator[Rows]:
+    """Rows of every block, outliers gated out; the same rows feed both engines and batch least squares.
+
+    averages: rows of averaged readings; blocks too short for it are left out.
+    """
     standing: tuple[Floats, Floats] | None = None  # a pose and its force: the same for all blocks of a dwell
     for block in blocks:
         if block.curve is not None:  # not gated: what an effect in a slew adds is no outlier
@@ -261,8 +277,14 @@ def model_rows(blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: 
             if keep is not None:
                 tally.gated += int((~keep).sum())
                 out = rows.innovation[:, ~keep]
-                rows = _rows(_kept(block, keep), bench, force)
+                block = _kept(block, keep)
+                rows = _rows(block, bench, force)
                 rows = replace(rows, gated=gate.channels(out, rows.innovation, gate_sigma))
+        if averages:
+            means = averaged(block)
+            if means is not None:
+                yield replace(_rows(means, bench, force), raw=rows, taken=means.taken)
+            continue
         yield rows
 
 
@@ -327,7 +349,9 @@ def _piece(block: Block, part: slice, bench: Bench, force: Floats | None) -> tup
     pose = np.repeat(block.pose, 3, axis=0) if len(block.pose) == 1 else _values_at_nodes(u, block.pose[part])
     if force is None:
         force = bench.specific_force(at, pose)
-    nodes = Nodes(at, at - block.arrival_s, np.broadcast_to(force, (3, 3)), pose, _temperatures(u, warm))
+    variance = None if block.variance_mps2_2 is None else _values_at_nodes(u, block.variance_mps2_2[part])
+    since_s = at - (block.arrival_s if block.felt_s is None else block.felt_s)
+    nodes = Nodes(at, since_s, np.broadcast_to(force, (3, 3)), pose, _temperatures(u, warm), variance_mps2_2=variance)
     return part, u, nodes
 
 

@@ -103,6 +103,16 @@ def test_what_comes_out_does_not_depend_on_batches() -> None:
     for one, other in zip(whole, again, strict=True):
         np.testing.assert_array_equal(one.accel_mps2, other.accel_mps2)
         np.testing.assert_array_equal(one.pose, other.pose)
+        assert one.felt_s == other.felt_s
+
+
+@pytest.mark.parametrize("angle_hz", [2.0, 10.0, 100.0])
+def test_an_arrival_is_known_to_a_reading_whatever_the_angles_say(angle_hz: float) -> None:
+    """Slews end at 14 and 25 s; angles tell it to half a second."""
+    pose, accel = path(*SLEWS, rate_hz=angle_hz), readings(path(*SLEWS, rate_hz=1000), 35)
+    blocks = list(dwell_blocks(Given(Batch(accel, pose)), Segmenter(BENCH)))
+    arrivals = {block.dwell: block.felt_s for block in blocks}
+    assert [arrivals[1], arrivals[2]] == pytest.approx([14.0, 25.0], abs=0.02)
 
 
 def test_an_attitude_in_place_of_angles() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -48,16 +49,18 @@ INVISIBLE = {  # exactly: wrong g is a common scale, the innermost zero a misali
     "encoder-harmonic-2:y": {"s2_y", "c2_y"},
 }
 NOT_SIZED = {"vibration-rectification", "dead-zone", "bias-walk"}
-"""Too weak at 20 sigma of white noise to be found from below vibration; a width; not the same in two runs."""
+"""Needs readings fast enough to resolve vibration; a width; not the same in two runs."""
 CHEAP = spread_plan(24, dwell_s=8.0, seed=4)
 HIDDEN = {
     "warm-up": ("warm-up=5e-3;tau=80", 80.0),
-    "settling": ("settling=1e-4;tau=4", 4.0),
+    "settling": ("settling=3e-5;tau=4", 4.0),
     "thermal-lag": ("thermal-lag=5e-4;tau=60", 60.0),
     "bias-walk": ("bias-walk=1e-5", 1e-5),
+    "vibration-rectification": ("vibration-rectification=2e-6", None),
 }
-"""What is hidden, and its constant, where an interval of an unknown is meant to cover something."""
-COVERED = [name for name in NAMES if name not in {*INVISIBLE, *NOT_SIZED, "sinusoid"}]
+"""What is hidden, and its constant, where an interval is meant to cover something that is there."""
+RESOLVING_HZ = {"vibration-rectification": 50.0}
+COVERED = [name for name in NAMES if name not in {*INVISIBLE, "dead-zone", "bias-walk", "sinusoid"}]
 """An oscillation that is not there has no frequency to cover; test_sinusoid.py hides one."""
 SIZES = {
     "rad": 1e-5, "rad/s": 1e-8, "1": 1e-5, "m/s^2": 1e-4, "s^2/m": 1e-6, "s^4/m^2": 1e-7, "m/s^3": 1e-7, "1/s": 1e-8,
@@ -149,12 +152,24 @@ def test_a_walk_of_the_biases_is_found_with_its_sigma() -> None:
     assert still.parameters["qb"].value is None
 
 
-def test_vibration_rectification_is_found_from_readings_that_resolve_it() -> None:
-    """33.7 Hz at 200 readings a second. What vibration leaves in the means of dwells limits it; sigma says more yet."""
-    source = run(["vibration-rectification=0.02,-0.015,0.01;rms=3;period=170"], 5e-5,
-                 plan=spread_plan(24, dwell_s=15.0, seed=4), sample_hz=200.0)  # fmt: skip
-    found = values(with_effect("vibration-rectification", source))
-    np.testing.assert_allclose([value for value, _ in found.values()], source.hidden[0].sizes, atol=6e-4)
+def test_vibration_rectification_is_found_at_the_size_white_noise_allows() -> None:
+    """Vibration of 3 m/s^2, 60 000 times the noise, leaves nothing in averages over smooth windows: sigma is 2e-7."""
+    for seed in (5, 6):
+        source = run(["vibration-rectification=4e-6,-3e-6,2e-6"], 5e-5, seed, CHEAP, sample_hz=50.0)
+        result, bare = with_effect("vibration-rectification", source), calibrate(source)
+        for (value, sigma), truth in zip(values(result).values(), source.hidden[0].sizes, strict=True):
+            assert abs(value - truth) < 4.0 * sigma < 1.2e-6
+        assert result.consistency.p_value > 1e-3 and result.noise.effective_sigma_mps2.max() < 2e-5
+        assert bare.noise.effective_sigma_mps2.min() > 1.0  # where the readings themselves are folded
+
+
+def test_averages_of_still_readings_say_the_same_with_hardly_less_information() -> None:
+    source = run([], 5e-5, plan=spread_plan(24, dwell_s=15.0, seed=4))
+    whole, means = calibrate(source), calibrate(source, Settings(averaged=True))
+    ratio = means.estimate.sigma / whole.estimate.sigma
+    assert 0.9 < ratio.min() and ratio.max() < 1.2 and means.consistency.consistent
+    assert (np.abs(means.estimate.parameters - whole.estimate.parameters) < whole.estimate.sigma).all()
+    assert compare(run([], 5e-5, plan=CHEAP), Settings(averaged=True)).max_difference_sigma <= 1e-6
 
 
 def sweep_plan(source: Simulation, step_rad: float = 2e-4) -> list[Visit]:
@@ -279,11 +294,9 @@ def ratios_of(name: str, seed: int, still: list[DwellFactor]) -> dict[str, float
     if name not in HIDDEN:
         return {symbol: value / sigma for symbol, (value, sigma) in estimated(fit(still, with_(name))).items()}
     text, constant = HIDDEN[name]
-    source = run(
-        [text], 5e-5, seed, CHEAP, 10.0, 150.0, 100.0, 180.0
-    )  # settling: an arrival is known to an angle's period
-    found = estimated(fit(Pass(source, Settings()).fold(), with_(name)))
-    truth = [*source.hidden[0].sizes, constant][-len(found) :]
+    source = run([text], 5e-5, seed, CHEAP, RESOLVING_HZ.get(name, 10.0), 150.0, 2.0, 180.0)
+    found = estimated(fit(Pass(source, Settings(effects=(name,))).fold(), with_(name)))
+    truth = [*source.hidden[0].sizes, *([] if constant is None else [constant])][-len(found) :]
     return {symbol: (value - true) / sigma for (symbol, (value, sigma)), true in zip(found.items(), truth, strict=True)}
 
 
@@ -306,20 +319,26 @@ def test_intervals_cover_pooled_over_effects() -> None:
     assert np.std(ratios) == pytest.approx(1.0, abs=0.12)
 
 
+still_dwells_once = functools.cache(still_dwells)
+
+
 @pytest.mark.slow
-def test_intervals_of_each_coefficient_cover_over_300_runs() -> None:
-    """95 % intervals cover 92-98 % (an honest one does with a probability of 98 %: the seeds are fixed)."""
-    ratios: dict[tuple[str, str], list[float]] = {}
+@pytest.mark.parametrize("name", [*COVERED, "bias-walk"])
+def test_intervals_of_an_effect_cover_over_300_runs(name: str) -> None:
+    """95 % intervals cover 92-98 % of the effect's coefficients, and of none less than 90 % or more than 99 %.
+
+    Of an honest coefficient 300 runs show a share outside 92-98 % with a probability of 1.3 %: among a hundred one or
+    two are; outside 90-99 % it is 0.1 %. Printed by ``-m slow -s``.
+    """
+    ratios: dict[str, list[float]] = {}
     for seed in range(1000, 1300):
-        still = still_dwells(seed)
-        for name in [*COVERED, "bias-walk"]:
-            for symbol, ratio in ratios_of(name, seed, still).items():
-                ratios.setdefault((name, symbol), []).append(ratio)
-    coverage = {key: float(np.mean(np.abs(own) < 1.96)) for key, own in ratios.items()}
-    for (name, symbol), share in coverage.items():
-        own = ratios[name, symbol]
-        print(f"{name:26} {symbol:10} {share:.3f}  mean {np.mean(own):+.2f}  std {np.std(own):.2f}")
-    assert not {key: share for key, share in coverage.items() if not 0.92 <= share <= 0.98}
+        for symbol, ratio in ratios_of(name, seed, still_dwells_once(seed)).items():
+            ratios.setdefault(symbol, []).append(ratio)
+    shares = {symbol: float(np.mean(np.abs(own) < 1.96)) for symbol, own in ratios.items()}
+    for symbol, own in ratios.items():
+        print(f"\n{name:26} {symbol:10} {shares[symbol]:.3f}  mean {np.mean(own):+.2f}  std {np.std(own):.2f}", end="")
+    assert 0.92 <= np.mean(list(shares.values())) <= 0.98
+    assert not {symbol: share for symbol, share in shares.items() if not 0.90 <= share <= 0.99}
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ LEVELS = [
     ["bench"],
     ["effects", "slews"],
     ["triangle", "dwells", "paper", "gate", "spectrum"],
-    ["walk"],
+    ["averaging", "walk"],
     ["model"],
     ["folding"],
     ["noise"],

@@ -61,6 +61,7 @@ class Effect(ABC):
     dynamic: it shows in slews only, so these are evaluated too.
     oscillates: its columns may be faster than a piece of a dwell, so the dwells are folded on a carrier, and
     ``columns`` gives the part that the stimulus asks for (``Stimulus.part``).
+    averages: vibration goes with it, so readings are averaged over windows first, and their variance in these is known.
     step: of ln(value) in the differences of ``derivative``.
     """
 
@@ -73,6 +74,7 @@ class Effect(ABC):
     walks: ClassVar[bool] = False
     dynamic: ClassVar[bool] = False
     oscillates: ClassVar[bool] = False
+    averages: ClassVar[bool] = False
     step: ClassVar[float] = 1e-4
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""

@@ -109,10 +109,11 @@ class CrossAxisSquare(_CrossCoupling):
 
 
 class VibrationRectification(SensorEffect):
-    """K2v <v^2>, <v^2> the variance of the readings within a piece of the dwell."""
+    """K2v <v^2>, <v^2> the variance of the readings about here."""
 
     name, title, source = "vibration-rectification", "shift of the bias under vibration", IEEE
     confused_with = "needs vibration that varies"
+    averages = True
     symbol, unit, scale, shown = "K2v", "s^2/m", 1e-4, ("µg/g²", 1e6 * G)
 
     def terms(self, s: Stimulus) -> Floats:

@@ -108,7 +108,8 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
         )
     if found.test.vibration:
         seen = ", ".join(f"{line.frequency_hz:.4g}" for line in found.test.vibration)
-        parts.append(Text(f"Vibration at {seen} Hz: not of one amplitude all along, so it counts as noise."))
+        treated = "the test is of averages free of it" if found.before.fit.dwells[0].averaged else "it counts as noise"
+        parts.append(Text(f"Vibration at {seen} Hz: not of one amplitude all along, so {treated}."))
     if going is not None:
         angles = ", ".join(f"{angle:g}" for angle in going[0].gimbal_deg)
         parts.append(Text(f"Next orientation: gimbals at {angles} deg: {going[1]}."))

@@ -15,7 +15,9 @@ white noise, for AR(1) times kappa = (1 + phi) / (1 - phi), and offsets of the w
 
 S the rows of sensitivities, f the specific force. So the mean of a dwell, of covariance D + kappa sigma^2 / N, and what
 departs from it, of covariance kappa sigma^2, are independent: sums over each dwell suffice, and memory stays flat.
-Random walk, outliers and errors of the encoders are not in V.
+Random walk, outliers and errors of the encoders are not in V, nor is vibration: it is at its own frequency, far above
+what an effect is sought by. Of the rectification of a sinusoid, K2 v^2, half of n^2 is at twice that frequency, so that
+an evaluation which averages the vibration away sees about 0.7 n of it.
 """
 
 from __future__ import annotations

@@ -1,0 +1,53 @@
+"""Readings averaged over windows of a second, before anything else is made of them.
+
+Vibration of the bench is thousands of times the noise of a good accelerometer, and averages away a thousand times
+better than noise of that size would: what it leaves in the mean of a dwell are the cycles cut off at the ends. Windows
+that rise and fall smoothly cut nothing off, and what remains of the readings in them is their noise at low frequencies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from kf_calib.dwells import Block
+from kf_calib.samples import Floats
+
+_WINDOW_S = 1.0
+_WINDOWS = 4  # one after another, at least, in a block
+_OVERLAP = 3  # each reading lies in as many windows: with them a Hann window's squares add up to a constant
+_SHORTEST_S = 0.5  # blocks that are shorter are left out: a window in them is no longer than the vibration's periods
+
+
+def averaged(block: Block) -> Block | None:
+    """A block of averages over windows cos^4, with the variance of the readings in each; None: it is too short.
+
+    Side lobes of the window fall as the fifth power of the frequency: at 30 cycles a window 1e-7 of an oscillation is
+    left. Variances are about a parabola over the block: what shakes has no mean in a window as short.
+    """
+    count, span_s = len(block.elapsed_s), float(block.elapsed_s[-1] - block.elapsed_s[0])
+    length = int(min(_WINDOW_S / max(span_s, 1e-9), 1.0 / _WINDOWS) * count)
+    if span_s < _SHORTEST_S or length < _OVERLAP:
+        return None
+    weights = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 4
+    weights /= weights.sum()
+
+    def means(values: Floats) -> Floats:
+        return np.asarray(sliding_window_view(values, length, axis=0)[:: length // _OVERLAP] @ weights)
+
+    u = np.linspace(-1.0, 1.0, count)
+    curve = np.linalg.qr(np.column_stack([np.ones(count), u, u * u]))[0]
+    level = block.accel_mps2.mean(axis=0)
+    left = block.accel_mps2 - level
+    shaking = left - curve @ (curve.T @ left)
+    return replace(
+        block,
+        elapsed_s=means(block.elapsed_s),
+        accel_mps2=level + means(left),
+        pose=block.pose if len(block.pose) == 1 else means(block.pose),
+        temperature_c=means(block.temperature_c),
+        variance_mps2_2=means(shaking**2),
+        taken=length // _OVERLAP,
+    )
