@@ -29,6 +29,7 @@ def whitened(
     state: Floats,
     about: Floats | None = None,
     flicker_mps2: Floats | None = None,
+    reduced: bool = True,
 ) -> list[Floats]:
     """Rows [H | z] of unit noise (r, p + 1) of each dwell, its nuisance states eliminated by QR.
 
@@ -38,6 +39,7 @@ def whitened(
     ``about`` (p,): z is the readings less what the model reads there, and states solved for count from it. A reading of
     size g is 1e6 sigma and more: its rounding is then no longer the largest error of whatever follows.
     ``flicker_mps2`` (3,): sqrt(h) of 1/f noise of density h / f, whose slow parts within a dwell are states, too.
+    ``reduced``: to as few rows as the columns have rank; else all are there, which is faster where columns are many.
     """
     sigma, sigmas = noise.effective_sigma_mps2, noise.dwell_sigmas
     used, units = np.flatnonzero(sigmas > 0), _units(columns)
@@ -66,13 +68,23 @@ def whitened(
                 readings = readings - (carried @ on_basis((own[:, :, i] @ about)[:, :, None]))[:, :, 0]
             part[:, -1] = readings.reshape(size) / sigma[i]
         rows[3 * size :, :count] = np.diag(1.0 / priors)
-        folded = triangle(rows)
-        out.append(_informative(folded[count:, count:], units))
+        out.append(_informative(triangle(rows)[count:, count:], units) if reduced else _less(rows, count))
     return out
 
 
+def _less(rows: Floats, count: int) -> Floats:
+    """Rows without the first ``count`` columns, projected off them."""
+    nuisances = np.linalg.qr(rows[:, :count])[0]
+    return rows[:, count:] - nuisances @ (nuisances.T @ rows[:, count:])
+
+
 def judged(
-    dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats, width: int
+    dwells: Sequence[DwellFactor],
+    columns: Sequence[Floats],
+    noise: Noise,
+    state: Floats,
+    width: int,
+    reduced: bool = True,
 ) -> tuple[list[Floats], int]:
     """Rows [H | W | G | z] by which a misfit is judged, and how many columns come before G (of the first ``width``: H).
 
@@ -81,13 +93,13 @@ def judged(
     """
     slow, sigma = wander(dwells, noise)
     if not sigma.size:
-        return whitened(dwells, columns, noise, state), width
+        return whitened(dwells, columns, noise, state, reduced=reduced), width
     flicker = flicker_sigma(noise, len(dwells))
     count, places = columns[0].shape[3] + len(sigma) + 1, width + np.arange(len(sigma))
     prior = np.zeros((len(sigma), count))
     prior[np.arange(len(sigma)), places] = 1.0 / sigma
     both = [np.insert(own, [width] * len(sigma), more, axis=3) for own, more in zip(columns, slow, strict=True)]
-    return [prior, *whitened(dwells, both, noise, state, flicker_mps2=flicker)], width + len(sigma)
+    return [prior, *whitened(dwells, both, noise, state, flicker_mps2=flicker, reduced=reduced)], width + len(sigma)
 
 
 def _waves(dwell: DwellFactor) -> Floats:

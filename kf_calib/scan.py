@@ -23,6 +23,8 @@ from kf_calib.samples import Floats, Mask
 _SEEN = 1e-6
 """A candidate of which the model leaves less than this share is invisible."""
 
+_TOGETHER = 100  # of many effects, so many are held at a time
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -75,9 +77,7 @@ class Scan:
 
 def scan(carried: Carried, noise: Noise, effects: Sequence[Effect], walk_variances: Floats | None = None) -> Scan:
     """Project ``effects`` off the model carried; ``walk_variances`` (D, 3): of the biases' steps before each dwell."""
-    added = candidate_columns(carried.dwells, effects, carried.model.bench, carried.state)
-    columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
-    rows, width = information.judged(carried.dwells, columns, noise, carried.state, carried.model.count)
+    rows, width = _rows(carried, noise, effects)
     if walk_variances is not None and len(rows) > len(walk_variances):
         walk_variances = np.vstack([np.zeros((1, 3)), walk_variances])
     counts = [len(effect.coefficients) for effect in effects]
@@ -86,17 +86,51 @@ def scan(carried: Carried, noise: Noise, effects: Sequence[Effect], walk_varianc
 
 def projected(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
     """The scan of a triangle [H | G | z] whose first ``width`` columns are the model's, then ``counts`` an effect."""
-    rest, sizes = upper[:, width:], np.linalg.norm(upper[:, width:-1], axis=0)
-    left, singular, _ = np.linalg.svd(information.scaled(upper[:, : width + 1])[0], full_matrices=False)
-    explained = left[:, singular > 1e-9]
-    for _ in range(2):  # twice, or the rounding of what is large stays in what is left
-        rest = rest - explained @ (explained.T @ rest)
+    sizes, rest = np.linalg.norm(upper[:, width:-1], axis=0), _beside(upper, width)
     units = np.where(sizes > 0, sizes, 1.0)
     columns, residual = rest[:-1, :-1] / units, rest[:-1, -1]
     ends = np.cumsum([0, *counts]).tolist()
     parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
     found = [_candidate(each, columns[:, part], units[part]) for each, part in zip(effects, parts, strict=True)]
     return Scan(tuple(found), residual)
+
+
+def _beside(rows: Floats, width: int) -> Floats:
+    """What rows [H | G | z] hold of G and z beside the first ``width`` columns."""
+    left, singular, _ = np.linalg.svd(information.scaled(rows[:, : width + 1])[0], full_matrices=False)
+    explained, rest = left[:, singular > 1e-9], rows[:, width:]
+    for _ in range(2):  # twice, or the rounding of what is large stays in what is left
+        rest = rest - explained @ (explained.T @ rest)
+    return rest
+
+
+def falls(carried: Carried, noise: Noise, effects: Sequence[Effect], walk_variances: Floats | None = None) -> Floats:
+    """By how much each of many effects of one kind, alone, would lower chi-squared (n,): a scan's ``statistics``.
+
+    Nothing else is asked of them, so the rows are not folded: of n columns in d rows that takes d n, not d n^2.
+    """
+    walking, out = walk_variances is not None and walk_variances.any(), list[Floats]()
+    for first in range(0, len(effects), _TOGETHER):
+        part = effects[first : first + _TOGETHER]
+        if walking:
+            out.append(scan(carried, noise, part, walk_variances).statistics)
+            continue
+        rows, width = _rows(carried, noise, part, reduced=False)
+        stacked = np.concatenate(rows)
+        sizes, rest = np.linalg.norm(stacked[:, width:-1], axis=0), _beside(stacked, width)
+        columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
+        columns = columns.T.reshape(len(part), -1, len(rest))
+        along, gram = columns @ rest[:, -1], columns @ columns.swapaxes(1, 2)
+        inverse = np.linalg.pinv(gram, rcond=_SEEN, hermitian=True)
+        out.append(np.einsum("ni,nij,nj->n", along, inverse, along))
+    return np.concatenate(out)
+
+
+def _rows(carried: Carried, noise: Noise, effects: Sequence[Effect], reduced: bool = True) -> tuple[list[Floats], int]:
+    """Rows [H | G | z] of the model carried and of ``effects``, and how many columns come before G."""
+    added = candidate_columns(carried.dwells, effects, carried.model.bench, carried.state)
+    columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
+    return information.judged(carried.dwells, columns, noise, carried.state, carried.model.count, reduced)
 
 
 def _candidate(effect: Effect, columns: Floats, units: Floats) -> Candidate:
