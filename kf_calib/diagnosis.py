@@ -23,11 +23,12 @@ from kf_calib.calibration import Calibration, Parameter, consistency, format_p, 
 from kf_calib.drivers import families
 from kf_calib.effects import Effect, effect_named, names
 from kf_calib.fitting import Fit, Walk, likely_walk
+from kf_calib.folding import stimulus_of
 from kf_calib.model import Model
 from kf_calib.noise import mean_covariances, scatter_gain
 from kf_calib.samples import Floats
-from kf_calib.scan import Candidate, Scan, scan
-from kf_calib.spectrum import Line, lines
+from kf_calib.scan import Candidate, Scan, falls, scan
+from kf_calib.spectrum import Line, lines, lowest_hz
 
 LEVEL = 0.01
 """Chance of a false alarm a run."""
@@ -49,7 +50,8 @@ class Test:
     scores: chi-squared falls less the threshold of their degrees of freedom: above zero is beyond chance.
     p_values: of the run. misfit_p: of the sum of squares as a whole (None: nothing left over to judge by).
     lines: in the spectrum of the readings within dwells, and the name of the effect they speak for. vibration: those
-    that are no oscillation of one amplitude, and count as noise.
+    that are no oscillation of one amplitude, and count as noise. without_lines: the test with its lines as vibration.
+    too_slow: in words, of an oscillation what neither the spectrum nor the scan shows.
     """
 
     scan: Scan
@@ -63,6 +65,8 @@ class Test:
     lines: tuple[Line, ...]
     oscillating: str = ""
     vibration: tuple[Line, ...] = ()
+    without_lines: Test | None = None
+    too_slow: str = ""
 
     @property
     def p_value(self) -> float | None:
@@ -87,15 +91,19 @@ class Test:
     @cached_property
     def invisible(self) -> list[str]:
         """Effects of which these orientations show nothing, and those that only slews could show."""
-        unseen = [name for name, k in self.best.items() if not self.scan.candidates[k].dof]
-        return [*unseen, *self.in_slews_only]
+        return [*self.unseen, *([self.too_slow] if self.too_slow else [])]
 
-    def without_lines(self) -> Test:
-        """The test with its lines taken as vibration."""
-        scores, p_values = (
-            {k: v for k, v in own.items() if k != self.oscillating} for own in (self.scores, self.p_values)
-        )
-        return replace(self, scores=scores, p_values=p_values, lines=(), vibration=self.lines)
+    @cached_property
+    def unseen(self) -> list[str]:
+        """The effects among them of which nothing at all shows."""
+        return [*(name for name, k in self.best.items() if not self.scan.candidates[k].dof), *self.in_slews_only]
+
+    def nearness(self, name: str) -> float:
+        """The score without what many values of a constant cost: that speaks against chance, not for a rival."""
+        if name not in self.best:
+            return self.scores[name]
+        own, tests = self.candidate(name), self.effective_tests
+        return self.scores[name] + price(own, tests) - price(replace(own, tried=1), tests)
 
     def candidate(self, name: str) -> Candidate:
         return self.scan.candidates[self.best[name]]
@@ -117,11 +125,11 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
 
     tests: as how many independent ones they count, where that is known from nearly the same columns.
     """
-    from scipy.special import chdtrc, chdtri
+    from scipy.special import chdtrc
 
-    found = scan(fitted.carried, fitted.noise.judging, candidates(fitted.carried.model), fitted.walk_variances)
-    dofs, statistics = np.array([each.dof for each in found.candidates]), found.statistics
-    own = np.where(dofs > 0, chdtrc(np.maximum(dofs, 1), statistics), 1.0)
+    model, misfit_p = fitted.carried.model, consistency(fitted).p_value
+    found = _scanned(fitted)
+    statistics = found.statistics
     tests = tests or independent_tests(found, seed)
     best, scores, p_values = dict[str, int](), dict[str, float](), dict[str, float]()
     for k, candidate in enumerate(found.candidates):
@@ -130,25 +138,79 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
         if name not in best or score > scores.get(name, -np.inf):
             best[name] = k
             if candidate.dof:
-                scores[name], p_values[name] = score, run_level(float(own[k]), tests)
+                own = run_level(float(chdtrc(candidate.dof, statistics[k])), candidate.tried)
+                scores[name], p_values[name] = score, run_level(own, tests)
     walk = _walk_test(fitted)
     if walk is not None:
         name, _, fall, ratio = walk
         p_values[name] = run_level(0.5 * float(chdtrc(1, max(ratio, 0.0))), tests)
         scores[name] = (fall if ratio > _threshold(1, tests) else ratio) - _threshold(1, tests)
-    model, misfit_p = fitted.carried.model, consistency(fitted).p_value
-    seen_lines = () if model.oscillates else lines((dwell.spectrum for dwell in fitted.dwells), LEVEL * _LINES)
-    swinging = next((name for name in names(model.bench) if effect_named(name, model.bench).oscillates), "")
-    if seen_lines and swinging:
-        p_values[swinging] = seen_lines[0].p_value * _SHARE / _LINES
-        scores[swinging] = float(chdtri(1, max(seen_lines[0].p_value, 1e-300))) - _threshold(1, 1.0)
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
-    return Test(found, best, scores, p_values, misfit_p, walk and walk[1], tests, slewing, seen_lines, swinging)
+    test = Test(found, best, scores, p_values, misfit_p, walk and walk[1], tests, slewing, ())
+    return _with_lines(test, fitted)
+
+
+def _scanned(fitted: Fit) -> Scan:
+    """The scan of all candidates, and of an oscillation at the frequency, below those of lines, that explains most."""
+    carried, noise, walks = fitted.carried, fitted.noise.judging, fitted.walk_variances
+    effect = _oscillation(carried.model)
+    if effect is None or carried.model.oscillates:
+        return scan(carried, noise, candidates(carried.model), walks)
+    values = _slow(fitted, effect)
+    coarse = falls(carried, noise, [effect.at(value) for value in values], walks)
+    near = values[np.argmax(coarse)] + 0.25 * (values[1] - values[0]) * np.arange(-3, 4)
+    slow = [effect.at(value) for value in near]
+    swinging = slow[int(np.argmax(falls(carried, noise, slow, walks)))]
+    found = scan(carried, noise, [*candidates(carried.model), swinging], walks)
+    *others, last = found.candidates
+    return replace(found, candidates=(*others, replace(last, tried=len(values))))
+
+
+def _oscillation(model: Model) -> Effect | None:
+    every = (effect_named(name, model.bench) for name in names(model.bench))
+    return next((effect for effect in every if effect.oscillates), None)
+
+
+def _slow(fitted: Fit, effect: Effect) -> Floats:
+    """Frequencies of oscillations too slow for lines, in halves of 1/run: from a cycle a run up."""
+    stimulus = stimulus_of(fitted.dwells, fitted.carried.model.bench, fitted.carried.state)
+    values = effect.grid(stimulus)[2::2]
+    return values[values < lowest_hz(dwell.spectrum for dwell in fitted.dwells)]
+
+
+def _with_lines(test: Test, fitted: Fit) -> Test:
+    """The test with the lines of the spectrum: they speak for an oscillation, whatever of it is slow."""
+    from scipy.special import chdtri
+
+    effect = _oscillation(fitted.carried.model)
+    if effect is None or fitted.carried.model.oscillates:
+        return test
+    name, spectra = str(effect), [dwell.spectrum for dwell in fitted.dwells]
+    top, first = float(_slow(fitted, effect)[-1]), lowest_hz(spectra)
+    if np.isfinite(first) and first > 1.5 * top:
+        test = replace(test, too_slow=f"{name} of {top:.2g} to {first:.2g} Hz")
+    seen = lines(spectra, LEVEL * _LINES)
+    if not seen:
+        return test
+    p_value = seen[0].p_value
+    return replace(
+        test,
+        best={key: k for key, k in test.best.items() if key != name},
+        scores=test.scores | {name: float(chdtri(1, max(p_value, 1e-300))) - _threshold(1, 1.0)},
+        p_values=test.p_values | {name: p_value * _SHARE / _LINES},
+        lines=seen,
+        oscillating=name,
+        without_lines=replace(test, vibration=seen),
+    )
 
 
 def price(candidate: Candidate, tests: float) -> float:
-    """The fall of chi-squared that chance gives one of so many candidates; a constant looked for counts as one more."""
-    return _threshold(candidate.dof + (candidate.effect.unknown is not None), tests)
+    """The fall of chi-squared that chance gives one of so many candidates.
+
+    A constant looked for counts as one degree of freedom more, or, where it takes many tests, as these.
+    """
+    looked_for = candidate.effect.unknown is not None and candidate.tried == 1
+    return _threshold(candidate.dof + looked_for, tests * candidate.tried)
 
 
 @functools.cache
@@ -251,8 +313,8 @@ def diagnose(before: Calibration) -> Diagnosis:
 def _diagnosed(before: Calibration) -> Diagnosis:
     test = _without_vibration(before, assessed(before.fit))
     found = _explained(before, test)
-    if found.unknown and test.lines:  # of one phase all along and not of one amplitude
-        found = _explained(before, test.without_lines())
+    if found.unknown and test.without_lines:  # of one phase all along and not of one amplitude
+        found = _explained(before, test.without_lines)
     return replace(found, verdict=_verdict(found))
 
 
@@ -274,14 +336,14 @@ def _explained(before: Calibration, test: Test) -> Diagnosis:
 
 def _without_vibration(before: Calibration, test: Test) -> Test:
     """The test as it is where an oscillation of one amplitude explains its lines; else they are vibration."""
-    if not (test.lines and test.oscillating):
+    if test.without_lines is None:
         return test
     refit = with_effects(before, (test.oscillating,))
     # what the coherent fit over the whole run finds of the amplitude that each stretch of readings shows
     share = np.linalg.norm(refit.estimate.state[refit.model.parts[test.oscillating]]) / np.linalg.norm(
         test.lines[0].amplitude_mps2
     )
-    return test if share > 0.5 else test.without_lines()
+    return test if share > 0.5 else test.without_lines
 
 
 def _one(found: Diagnosis, first: Suspect) -> Diagnosis:
@@ -292,7 +354,7 @@ def _one(found: Diagnosis, first: Suspect) -> Diagnosis:
     test = found.test
     if first.name in test.best and _outdone(found, first.refit, (first.name,)):
         return replace(found, unknown=True)
-    close = [name for name in test.ranked if test.scores[name] > test.scores[first.name] - _EQUAL]
+    close = [name for name in test.ranked if test.nearness(name) > test.scores[first.name] - _EQUAL]
     overlaps = {name: _overlap(test, first.name, name) for name in close if name != first.name}
     overlaps = {name: overlap for name, overlap in overlaps.items() if overlap > _ALIKE}
     names = (first.name, *overlaps)
@@ -454,7 +516,7 @@ def _verdict(found: Diagnosis) -> str:
     if test.consistent is None:
         return "Nothing is left over to judge the model by: visit more orientations."
     if test.consistent:
-        blind = f" It cannot see {len(test.invisible)} of {test.count} effects." if test.invisible else ""
+        blind = f" It cannot see {len(test.unseen)} of {test.count} effects." if test.unseen else ""
         agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
         return f"{agreed}: no effect is missing that this run could show.{blind}"
     start = f"Residuals fail (p {format_p(test.p_value)})."

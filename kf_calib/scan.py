@@ -32,7 +32,8 @@ class Candidate:
 
     basis (d, k): orthonormal, of what is left of its columns; inverse (q, k): coefficients = inverse @ basis^T r;
     columns (d, q): what is left of the columns, per unit of the coefficients; hidden (q,): which of these are not
-    determined; visibility: the largest share of a column that is left.
+    determined; visibility: the largest share of a column that is left; tried: the best of so many values of its
+    constant, each a test of its own.
     """
 
     effect: Effect
@@ -41,6 +42,7 @@ class Candidate:
     inverse: Floats
     hidden: Mask
     visibility: float
+    tried: int = 1
 
     @property
     def dof(self) -> int:
