@@ -23,7 +23,7 @@ from kf_calib.samples import Floats, Mask
 _SEEN = 1e-6
 """A candidate of which the model leaves less than this share is invisible."""
 
-_TOGETHER = 100  # of many effects, so many are held at a time
+_TOGETHER = 200  # of many effects, so many are held at a time
 
 
 @dataclass(frozen=True)
@@ -111,14 +111,16 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect], walk_varian
 
     Nothing else is asked of them, so the rows are not folded: of n columns in d rows that takes d n, not d n^2.
     """
-    walking, out = walk_variances is not None and walk_variances.any(), list[Floats]()
+    out = list[Floats]()
     for first in range(0, len(effects), _TOGETHER):
         part = effects[first : first + _TOGETHER]
-        if walking:
-            out.append(scan(carried, noise, part, walk_variances).statistics)
-            continue
         rows, width = _rows(carried, noise, part, reduced=False)
         stacked = np.concatenate(rows)
+        if walk_variances is not None and walk_variances.any():
+            steps = _steps(rows, walk_variances)
+            beside = np.pad(stacked, [(0, len(steps) - len(stacked)), (0, 0)])
+            stacked = np.concatenate([beside[:, :width], steps, beside[:, width:]], axis=1)
+            width += steps.shape[1]
         sizes, rest = np.linalg.norm(stacked[:, width:-1], axis=0), _beside(stacked, width)
         columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
         columns = columns.T.reshape(len(part), -1, len(rest))
@@ -126,6 +128,17 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect], walk_varian
         inverse = np.linalg.pinv(gram, rcond=_SEEN, hermitian=True)
         out.append(np.einsum("ni,nij,nj->n", along, inverse, along))
     return np.concatenate(out)
+
+
+def _steps(rows: Sequence[Floats], walk_variances: Floats) -> Floats:
+    """Columns of the steps of the biases before each dwell beside its rows, in their sigma, and rows of their priors.
+
+    A step is in every dwell after it.
+    """
+    dwell = np.repeat(np.arange(len(rows)), [len(own) for own in rows]) - (len(rows) - len(walk_variances))
+    places, channels = np.nonzero(walk_variances)
+    later = np.concatenate(rows)[:, 4 * channels + 3] * (dwell[:, None] >= places)
+    return np.vstack([later * np.sqrt(walk_variances[places, channels]), np.eye(len(places))])
 
 
 def _rows(carried: Carried, noise: Noise, effects: Sequence[Effect], reduced: bool = True) -> tuple[list[Floats], int]:

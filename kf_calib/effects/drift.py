@@ -105,7 +105,7 @@ class Sinusoid(Effect):
         return out
 
     def derivative(self, s: Stimulus, coefficients: Floats) -> Floats:
-        """A_i and B_i times the changes of the sine and the cosine per unit of ln f: d(e^(i d)) = 2 pi i f t e^(i d)."""
+        """A_i and B_i times the changes of sine and cosine per unit of ln f: d(e^(i d)) = 2 pi i f t e^(i d)."""
         at_s, shares = s.about
         changes = 2j * np.pi * self.value * (shares * at_s * self._wave(s, at_s)).sum(axis=1)
         return (coefficients.reshape(3, 2) @ np.array(_parts(s, changes))).T[:, :, None]
