@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -282,7 +282,8 @@ class Suspect:
 class Diagnosis:
     """missing: the names that make the model fit (empty: nothing is missing, or none of the known ones does).
 
-    ambiguity: every single effect that fits as well as the first; overlaps: of each with it.
+    ambiguity: every single effect that fits as well as the first, and those that do together; overlaps: of each with
+    it. together: the pairs among them that explain as much, and are no exchange of one effect for one that is alike.
     """
 
     before: Calibration
@@ -294,6 +295,7 @@ class Diagnosis:
     overlaps: dict[str, float]
     after: Calibration | None
     verdict: str
+    together: tuple[tuple[str, str], ...] = ()
 
     @property
     def residual_ratios(self) -> Floats:
@@ -328,10 +330,12 @@ def _explained(before: Calibration, test: Test) -> Diagnosis:
     least = test.scores[test.ranked[0]] - 2.0 * _EQUAL if test.ranked else 0.0
     explaining = [each for each in suspects if each.fits and test.scores[each.name] > least]
     found = replace(nothing, suspects=suspects)
+    pairs = _pairs(test) if not explaining or explaining[0].name in test.best else {}
     if explaining:
-        return _one(found, explaining[0])
+        clearly = {pair: score for pair, score in pairs.items() if score > test.scores[explaining[0].name] + _EQUAL}
+        return _two(found, clearly) or _one(found, explaining[0], pairs)
     scatter = before.noise.scatter_mps2.any() and not before.noise.scatter_stated
-    return _two(found) or replace(found, unknown=not scatter)
+    return _two(found, pairs) or replace(found, unknown=not scatter)
 
 
 def _without_vibration(before: Calibration, test: Test) -> Test:
@@ -346,8 +350,8 @@ def _without_vibration(before: Calibration, test: Test) -> Test:
     return test if share > 0.5 else test.without_lines
 
 
-def _one(found: Diagnosis, first: Suspect) -> Diagnosis:
-    """One effect explains the misfit; with it, all that explain it as well and look like it.
+def _one(found: Diagnosis, first: Suspect, pairs: dict[tuple[int, int], float]) -> Diagnosis:
+    """One effect explains the misfit; with it, all that explain it as well and look like it, alone or in pairs.
 
     Unless a formula that is no known effect explains it better: then the effect is not the one that is missing.
     """
@@ -357,12 +361,40 @@ def _one(found: Diagnosis, first: Suspect) -> Diagnosis:
     close = [name for name in test.ranked if test.nearness(name) > test.scores[first.name] - _EQUAL]
     overlaps = {name: _overlap(test, first.name, name) for name in close if name != first.name}
     overlaps = {name: overlap for name, overlap in overlaps.items() if overlap > _ALIKE}
-    names = (first.name, *overlaps)
-    return replace(found, missing=(first.name,), ambiguity=names, overlaps=overlaps, after=first.refit)
+    single = replace(found, missing=(first.name,), ambiguity=(first.name, *overlaps), overlaps=overlaps)
+    together = _as_good(test, pairs, test.scores[first.name], {first.name})
+    return replace(_beside(single, [pair for pair in together if _both_fit(found, pair)]), after=first.refit)
+
+
+def _both_fit(found: Diagnosis, names: tuple[str, str]) -> bool:
+    return _fits(with_effects(found.before, names), found.test)
+
+
+def _beside(found: Diagnosis, together: Sequence[tuple[str, str]]) -> Diagnosis:
+    """With the pairs that explain as much in the ambiguity set."""
+    added = dict.fromkeys(name for pair in together for name in pair if name not in found.ambiguity)
+    return replace(found, together=tuple(together), ambiguity=(*found.ambiguity, *added))
+
+
+def _as_good(
+    test: Test, pairs: dict[tuple[int, int], float], score: float, but: Collection[str]
+) -> list[tuple[str, str]]:
+    """Names of the best few pairs that explain as much as what scores so much, none of them in ``but``."""
+    near = sorted((pair for pair in pairs if pairs[pair] > score - _EQUAL), key=lambda pair: -pairs[pair])
+    named = dict.fromkeys(_names_of(test, pair) for pair in near)
+    return [pair for pair in named if not set(pair) & set(but)][:_PAIRS]
+
+
+def _names_of(test: Test, pair: tuple[int, int]) -> tuple[str, str]:
+    one, two = (str(test.scan.candidates[k].effect) for k in pair)
+    return one, two
 
 
 def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool:
-    """Whether some formula explains the misfit better than the effects at the constants that were found for them."""
+    """Whether some formula explains the misfit better than the effects at the constants that were found for them.
+
+    Formulas that are known effects themselves do not count: together they are no effect that is unknown.
+    """
     fitted, tests = found.before.fit, found.test.effective_tests
     effects = [effect for effect in refit.model.effects if str(effect) in names]
     scanned = scan(fitted.carried, fitted.noise.judging, effects, fitted.walk_variances)
@@ -370,16 +402,18 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
     left, singular, _ = np.linalg.svd(basis, full_matrices=False)
     own = float(np.sum((left[:, singular > 1e-6].T @ scanned.residual) ** 2))
     own -= sum(price(each, tests) for each in scanned.candidates)
-    return any(each.dof and each.fall - _threshold(each.dof, tests) > own + _EQUAL for each in families(fitted)[0])
+    known = [found.test.candidate(name).effect for name in found.test.best]
+    tried = [each for each in families(fitted, known)[0] if each.dof and not each.known]
+    return any(each.fall - _threshold(each.dof, tests) > own + _EQUAL for each in tried)
 
 
-def _two(found: Diagnosis) -> Diagnosis | None:
+def _two(found: Diagnosis, pairs: dict[tuple[int, int], float]) -> Diagnosis | None:
     """Two effects explain the misfit where no single one does: they may mask each other. The best few are refitted."""
-    candidates, pairs = found.test.scan.candidates, _pairs(found.test)
+    test, candidates = found.test, found.test.scan.candidates
     for pair in sorted(pairs, key=lambda pair: -pairs[pair])[:_PAIRS]:
-        names = (str(candidates[pair[0]].effect), str(candidates[pair[1]].effect))
+        names = _names_of(test, pair)
         refit = with_effects(found.before, names)
-        if not _fits(refit, found.test):
+        if not _fits(refit, test):
             continue
         if _outdone(found, refit, names):
             return None
@@ -391,7 +425,8 @@ def _two(found: Diagnosis) -> Diagnosis | None:
                 name, alike = str(candidates[new].effect), candidates[lost].overlap(candidates[new])
                 if alike > max(_ALIKE, overlaps.get(name, 0.0)) and name not in names:
                     overlaps[name] = alike
-        return replace(found, missing=names, ambiguity=(*names, *overlaps), overlaps=overlaps, after=refit)
+        both = replace(found, missing=names, ambiguity=(*names, *overlaps), overlaps=overlaps, after=refit)
+        return _beside(both, _as_good(test, pairs, pairs[pair], names))
     return None
 
 
@@ -523,13 +558,18 @@ def _verdict(found: Diagnosis) -> str:
     if found.missing and found.after is not None:
         first = found.missing[0]
         if len(found.missing) > 1:
-            named = f"{' and '.join(found.missing)} together explain it; no single known effect does"
+            named = f"{' and '.join(found.missing)} together explain it; no single known effect does as well"
         else:
             named = f"Missing: {first}{_size(found)}"
-            others = [name for name in found.ambiguity if name != first]
-            if others:
-                told = ", ".join(f"{name} (overlap {found.overlaps[name]:.2f})" for name in others)
-                named = f"Best: {first}{_size(found)}. Cannot yet be told from {told}"
+            if len(found.ambiguity) > 1:
+                named = f"Best: {first}{_size(found)}"
+        told = [f"{name} (overlap {overlap:.2f})" for name, overlap in found.overlaps.items()]
+        told = [
+            *(told if len(found.missing) == 1 else []),
+            *(f"{' and '.join(pair)} together" for pair in found.together),
+        ]
+        if told:
+            named += f". Cannot yet be told from {', '.join(told)}"
         return f"{start} {named}.{_held_out(found)}"
     if found.unknown:
         nearest = next((each.name for each in found.suspects if each.fits), None)

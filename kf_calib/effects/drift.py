@@ -11,6 +11,7 @@ from kf_calib.samples import Floats
 
 _HELD = 2.0  # cycles in a piece, of which its parabola holds a ninth of the power
 
+
 class BiasDrift(SensorEffect):
     """beta t, t since the first sample."""
 
