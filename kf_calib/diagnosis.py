@@ -51,7 +51,7 @@ class Test:
     p_values: of the run. misfit_p: of the sum of squares as a whole (None: nothing left over to judge by).
     lines: in the spectrum of the readings within dwells, and the name of the effect they speak for. vibration: those
     that are no oscillation of one amplitude, and count as noise. without_lines: the test with its lines as vibration.
-    too_slow: in words, of an oscillation what neither the spectrum nor the scan shows.
+    between: in words, of an oscillation what is too fast for the scan and too slow for a line.
     """
 
     scan: Scan
@@ -66,7 +66,7 @@ class Test:
     oscillating: str = ""
     vibration: tuple[Line, ...] = ()
     without_lines: Test | None = None
-    too_slow: str = ""
+    between: str = ""
 
     @property
     def p_value(self) -> float | None:
@@ -91,7 +91,7 @@ class Test:
     @cached_property
     def invisible(self) -> list[str]:
         """Effects of which these orientations show nothing, and those that only slews could show."""
-        return [*self.unseen, *([self.too_slow] if self.too_slow else [])]
+        return [*self.unseen, *([self.between] if self.between else [])]
 
     @cached_property
     def unseen(self) -> list[str]:
@@ -187,8 +187,9 @@ def _with_lines(test: Test, fitted: Fit) -> Test:
         return test
     name, spectra = str(effect), [dwell.spectrum for dwell in fitted.dwells]
     top, first = float(_slow(fitted, effect)[-1]), lowest_hz(spectra)
-    if np.isfinite(first) and first > 1.5 * top:
-        test = replace(test, too_slow=f"{name} of {top:.2g} to {first:.2g} Hz")
+    if first > 1.5 * top:
+        band = f"of {top:.2g} to {first:.2g} Hz" if np.isfinite(first) else f"above {top:.2g} Hz"
+        test = replace(test, between=f"{name} {band}")
     seen = lines(spectra, LEVEL * _LINES)
     if not seen:
         return test

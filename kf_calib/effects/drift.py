@@ -9,7 +9,7 @@ from kf_calib.effects.effect import Coefficient, Effect, G, SensorEffect, Unknow
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.samples import Floats
 
-_HELD = 2.0  # cycles in a piece, of which its parabola holds a ninth of the power
+_HELD = 2.5  # cycles in a piece, of which its parabola holds a fourteenth of the power
 
 
 class BiasDrift(SensorEffect):
