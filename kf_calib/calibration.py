@@ -37,6 +37,7 @@ _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # a larger sigma 
 _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
 _CARRIERS = 3  # passes at most in search of one
 _CYCLES = 50.0  # a dwell, of a line that may be what is left of a slow oscillation
+_SLOW = 0.4  # cycles of a slow oscillation in a piece: its parabola leaves a hundredth of its power
 _NEAR = 0.06  # cycles between oscillation and carrier in a piece: a parabola then leaves 1e-3 of its amplitude
 Engine = Literal["block", "filterpy"]
 
@@ -324,12 +325,13 @@ def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
     """
     settings = replace(before.settings, effects=tuple(effects))
     model = Model.of(before.bench, settings.effects)
-    other = model.oscillates and not any(dwell.carrier_hz for dwell in before.fit.dwells)
-    other |= model.averages and not all(dwell.averaged for dwell in before.fit.dwells)
+    other = model.averages and not all(dwell.averaged for dwell in before.fit.dwells)
     if before.reread is not None and (other or (model.dynamic and not before.carried.slews)):
         return before.reread(settings)
     with threadpool_limits(1, user_api="blas"):  # small decompositions, and the same bits every time
         fitted = fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews)
+        if before.reread is not None and not _followed(fitted):
+            return before.reread(settings)
         again = evaluated(fitted, settings)
         return replace(again, tally=before.tally, readings=before.readings, reread=before.reread)
 
@@ -344,12 +346,26 @@ def _on_carrier(
     """
     seen = lines(dwell.spectrum for dwell in dwells)
     if not seen:
-        return _nearer(passed, _fitted(passed, dwells), on_progress)[:2]
+        fitted = _fitted(passed, dwells)
+        return (passed, dwells) if _followed(fitted) else _nearer(passed, fitted, on_progress)[:2]
     shortest_s = min(dwell.end_s - dwell.start_s for dwell in dwells if dwell.count > dwells[0].count // 2)
     found = [_nearer(passed, seen[0].frequency_hz, on_progress)]
     if seen[0].frequency_hz * shortest_s < _CYCLES:
         found.append(_nearer(passed, _fitted(passed, dwells), on_progress))
     return min(found, key=lambda each: float(np.log(each[2].noise.effective_sigma_mps2).sum()))[:2]
+
+
+def _followed(fitted: Fit) -> bool:
+    """Whether the dwells are folded so that they hold the model's oscillation, if it has one: on a carrier, or it is so
+    slow that parabolas over their pieces do."""
+    dwells = fitted.dwells
+    if not fitted.carried.model.oscillates or dwells[0].carrier_hz:
+        return True
+    return _oscillation_hz(fitted) * _longest_s(dwells) < _SLOW and not lines(dwell.spectrum for dwell in dwells)
+
+
+def _longest_s(dwells: Sequence[DwellFactor]) -> float:
+    return max(float(np.ptp(piece.nodes.elapsed_s)) for dwell in dwells for piece in dwell.pieces)
 
 
 def _nearer(
@@ -361,8 +377,7 @@ def _nearer(
         passed = Pass(passed.source, passed.settings, folder=Folder(carrier_hz))
         dwells = passed.fold(on_progress)
         fitted = _fitted(passed, dwells)
-        longest_s = max(float(np.ptp(piece.nodes.elapsed_s)) for dwell in dwells for piece in dwell.pieces)
-        if not left or abs(_oscillation_hz(fitted) - carrier_hz) * longest_s < _NEAR:
+        if not left or abs(_oscillation_hz(fitted) - carrier_hz) * _longest_s(dwells) < _NEAR:
             return passed, dwells, fitted
         carrier_hz = _oscillation_hz(fitted)
     raise AssertionError("unreachable: the last of the carriers is taken as it is")

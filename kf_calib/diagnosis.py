@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -23,11 +23,12 @@ from kf_calib.calibration import Calibration, Parameter, consistency, format_p, 
 from kf_calib.drivers import families
 from kf_calib.effects import Effect, effect_named, names
 from kf_calib.fitting import Fit, walk_gain
+from kf_calib.folding import stimulus_of
 from kf_calib.model import Model
 from kf_calib.noise import mean_covariances
 from kf_calib.samples import Floats
-from kf_calib.scan import Candidate, Scan, scan
-from kf_calib.spectrum import Line, lines
+from kf_calib.scan import Candidate, Scan, falls, scan
+from kf_calib.spectrum import Line, lines, lowest_hz
 
 LEVEL = 0.01
 """Chance of a false alarm a run."""
@@ -49,7 +50,8 @@ class Test:
     scores: chi-squared falls less the threshold of their degrees of freedom: above zero is beyond chance.
     p_values: of the run. misfit_p: of the sum of squares as a whole (None: nothing left over to judge by).
     lines: in the spectrum of the readings within dwells, and the name of the effect they speak for. vibration: those
-    that are no oscillation of one amplitude, and count as noise.
+    that are no oscillation of one amplitude, and count as noise. without_lines: the test with its lines as vibration.
+    between: in words, of an oscillation what is too fast for the scan and too slow for a line.
     """
 
     scan: Scan
@@ -63,6 +65,8 @@ class Test:
     lines: tuple[Line, ...]
     oscillating: str = ""
     vibration: tuple[Line, ...] = ()
+    without_lines: Test | None = None
+    between: str = ""
 
     @property
     def p_value(self) -> float | None:
@@ -87,15 +91,19 @@ class Test:
     @cached_property
     def invisible(self) -> list[str]:
         """Effects of which these orientations show nothing, and those that only slews could show."""
-        unseen = [name for name, k in self.best.items() if not self.scan.candidates[k].dof]
-        return [*unseen, *self.in_slews_only]
+        return [*self.unseen, *([self.between] if self.between else [])]
 
-    def without_lines(self) -> Test:
-        """The test with its lines taken as vibration."""
-        scores, p_values = (
-            {k: v for k, v in own.items() if k != self.oscillating} for own in (self.scores, self.p_values)
-        )
-        return replace(self, scores=scores, p_values=p_values, lines=(), vibration=self.lines)
+    @cached_property
+    def unseen(self) -> list[str]:
+        """The effects among them of which nothing at all shows."""
+        return [*(name for name, k in self.best.items() if not self.scan.candidates[k].dof), *self.in_slews_only]
+
+    def nearness(self, name: str) -> float:
+        """The score without what many values of a constant cost: that speaks against chance, not for a rival."""
+        if name not in self.best:
+            return self.scores[name]
+        own, tests = self.candidate(name), self.effective_tests
+        return self.scores[name] + price(own, tests) - price(replace(own, tried=1), tests)
 
     def candidate(self, name: str) -> Candidate:
         return self.scan.candidates[self.best[name]]
@@ -117,11 +125,11 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
 
     tests: as how many independent ones they count, where that is known from nearly the same columns.
     """
-    from scipy.special import chdtrc, chdtri
+    from scipy.special import chdtrc
 
-    found = scan(fitted.carried, fitted.noise.judging, candidates(fitted.carried.model))
-    dofs, statistics = np.array([each.dof for each in found.candidates]), found.statistics
-    own = np.where(dofs > 0, chdtrc(np.maximum(dofs, 1), statistics), 1.0)
+    model, misfit_p = fitted.carried.model, consistency(fitted).p_value
+    found = _scanned(fitted)
+    statistics = found.statistics
     tests = tests or independent_tests(found, seed)
     best, scores, p_values = dict[str, int](), dict[str, float](), dict[str, float]()
     for k, candidate in enumerate(found.candidates):
@@ -130,25 +138,80 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
         if name not in best or score > scores.get(name, -np.inf):
             best[name] = k
             if candidate.dof:
-                scores[name], p_values[name] = score, run_level(float(own[k]), tests)
+                own = run_level(float(chdtrc(candidate.dof, statistics[k])), candidate.tried)
+                scores[name], p_values[name] = score, run_level(own, tests)
     name = _walking(fitted)
     if name:
         fall, ratio = (2.0 * gain for gain in walk_gain(fitted))
         p_values[name] = run_level(0.5 * float(chdtrc(1, max(ratio, 0.0))), tests)
         scores[name] = (fall if ratio > _threshold(1, tests) else ratio) - _threshold(1, tests)
-    model, misfit_p = fitted.carried.model, consistency(fitted).p_value
-    seen_lines = () if model.oscillates else lines((dwell.spectrum for dwell in fitted.dwells), LEVEL * _LINES)
-    swinging = next((name for name in names(model.bench) if effect_named(name, model.bench).oscillates), "")
-    if seen_lines and swinging:
-        p_values[swinging] = seen_lines[0].p_value * _SHARE / _LINES
-        scores[swinging] = float(chdtri(1, max(seen_lines[0].p_value, 1e-300))) - _threshold(1, 1.0)
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
-    return Test(found, best, scores, p_values, misfit_p, name, tests, slewing, seen_lines, swinging)
+    test = Test(found, best, scores, p_values, misfit_p, name, tests, slewing, ())
+    return _with_lines(test, fitted)
+
+
+def _scanned(fitted: Fit) -> Scan:
+    """The scan of all candidates, and of an oscillation at the frequency, below those of lines, that explains most."""
+    carried, noise = fitted.carried, fitted.noise.judging
+    effect = _oscillation(carried.model)
+    if effect is None or carried.model.oscillates:
+        return scan(carried, noise, candidates(carried.model))
+    values = _slow(fitted, effect)
+    coarse = falls(carried, noise, [effect.at(value) for value in values])
+    near = values[np.argmax(coarse)] + 0.25 * (values[1] - values[0]) * np.arange(-3, 4)
+    slow = [effect.at(value) for value in near]
+    swinging = slow[int(np.argmax(falls(carried, noise, slow)))]
+    found = scan(carried, noise, [*candidates(carried.model), swinging])
+    *others, last = found.candidates
+    return replace(found, candidates=(*others, replace(last, tried=len(values))))
+
+
+def _oscillation(model: Model) -> Effect | None:
+    every = (effect_named(name, model.bench) for name in names(model.bench))
+    return next((effect for effect in every if effect.oscillates), None)
+
+
+def _slow(fitted: Fit, effect: Effect) -> Floats:
+    """Frequencies of oscillations too slow for lines, in halves of 1/run: from a cycle a run up."""
+    stimulus = stimulus_of(fitted.dwells, fitted.carried.model.bench, fitted.carried.state)
+    values = effect.grid(stimulus)[2::2]
+    return values[values < lowest_hz(dwell.spectrum for dwell in fitted.dwells)]
+
+
+def _with_lines(test: Test, fitted: Fit) -> Test:
+    """The test with the lines of the spectrum: they speak for an oscillation, whatever of it is slow."""
+    from scipy.special import chdtri
+
+    effect = _oscillation(fitted.carried.model)
+    if effect is None or fitted.carried.model.oscillates:
+        return test
+    name, spectra = str(effect), [dwell.spectrum for dwell in fitted.dwells]
+    top, first = float(_slow(fitted, effect)[-1]), lowest_hz(spectra)
+    if first > 1.5 * top:
+        band = f"of {top:.2g} to {first:.2g} Hz" if np.isfinite(first) else f"above {top:.2g} Hz"
+        test = replace(test, between=f"{name} {band}")
+    seen = lines(spectra, LEVEL * _LINES)
+    if not seen:
+        return test
+    p_value = seen[0].p_value
+    return replace(
+        test,
+        best={key: k for key, k in test.best.items() if key != name},
+        scores=test.scores | {name: float(chdtri(1, max(p_value, 1e-300))) - _threshold(1, 1.0)},
+        p_values=test.p_values | {name: p_value * _SHARE / _LINES},
+        lines=seen,
+        oscillating=name,
+        without_lines=replace(test, vibration=seen),
+    )
 
 
 def price(candidate: Candidate, tests: float) -> float:
-    """The fall of chi-squared that chance gives one of so many candidates; a constant looked for counts as one more."""
-    return _threshold(candidate.dof + (candidate.effect.unknown is not None), tests)
+    """The fall of chi-squared that chance gives one of so many candidates.
+
+    A constant looked for counts as one degree of freedom more, or, where it takes many tests, as these.
+    """
+    looked_for = candidate.effect.unknown is not None and candidate.tried == 1
+    return _threshold(candidate.dof + looked_for, tests * candidate.tried)
 
 
 @functools.cache
@@ -216,7 +279,8 @@ class Suspect:
 class Diagnosis:
     """missing: the names that make the model fit (empty: nothing is missing, or none of the known ones does).
 
-    ambiguity: every single effect that fits as well as the first; overlaps: of each with it.
+    ambiguity: every single effect that fits as well as the first, and those that do together; overlaps: of each with
+    it. together: the pairs among them that explain as much, and are no exchange of one effect for one that is alike.
     """
 
     before: Calibration
@@ -228,6 +292,7 @@ class Diagnosis:
     overlaps: dict[str, float]
     after: Calibration | None
     verdict: str
+    together: tuple[tuple[str, str], ...] = ()
 
     @property
     def residual_ratios(self) -> Floats:
@@ -247,8 +312,8 @@ def diagnose(before: Calibration) -> Diagnosis:
 def _diagnosed(before: Calibration) -> Diagnosis:
     test = _without_vibration(before, assessed(before.fit))
     found = _explained(before, test)
-    if found.unknown and test.lines:  # of one phase all along and not of one amplitude
-        test = test.without_lines()
+    if found.unknown and test.without_lines:  # of one phase all along and not of one amplitude
+        test = test.without_lines
         found = _explained(before, test)
     if test.vibration and not before.fit.dwells[0].averaged and before.reread is not None:
         rested = before.reread(replace(before.settings, averaged=True))
@@ -266,41 +331,71 @@ def _explained(before: Calibration, test: Test) -> Diagnosis:
     least = test.scores[test.ranked[0]] - 2.0 * _EQUAL if test.ranked else 0.0
     explaining = [each for each in suspects if each.fits and test.scores[each.name] > least]
     found = replace(nothing, suspects=suspects)
+    pairs = _pairs(test) if not explaining or explaining[0].name in test.best else {}
     if explaining:
-        return _one(found, explaining[0])
+        clearly = {pair: score for pair, score in pairs.items() if score > test.scores[explaining[0].name] + _EQUAL}
+        return _two(found, clearly) or _one(found, explaining[0], pairs)
     scatter = before.noise.scatter_mps2.any() and not before.noise.scatter_stated
-    return _two(found) or replace(found, unknown=not scatter)
+    return _two(found, pairs) or replace(found, unknown=not scatter)
 
 
 def _without_vibration(before: Calibration, test: Test) -> Test:
     """The test as it is where an oscillation of one amplitude explains its lines; else they are vibration."""
-    if not (test.lines and test.oscillating):
+    if test.without_lines is None:
         return test
     refit = with_effects(before, (test.oscillating,))
     # what the coherent fit over the whole run finds of the amplitude that each stretch of readings shows
     share = np.linalg.norm(refit.estimate.state[refit.model.parts[test.oscillating]]) / np.linalg.norm(
         test.lines[0].amplitude_mps2
     )
-    return test if share > 0.5 else test.without_lines()
+    return test if share > 0.5 else test.without_lines
 
 
-def _one(found: Diagnosis, first: Suspect) -> Diagnosis:
-    """One effect explains the misfit; with it, all that explain it as well and look like it.
+def _one(found: Diagnosis, first: Suspect, pairs: dict[tuple[int, int], float]) -> Diagnosis:
+    """One effect explains the misfit; with it, all that explain it as well and look like it, alone or in pairs.
 
     Unless a formula that is no known effect explains it better: then the effect is not the one that is missing.
     """
     test = found.test
     if first.name in test.best and _outdone(found, first.refit, (first.name,)):
         return replace(found, unknown=True)
-    close = [name for name in test.ranked if test.scores[name] > test.scores[first.name] - _EQUAL]
+    close = [name for name in test.ranked if test.nearness(name) > test.scores[first.name] - _EQUAL]
     overlaps = {name: _overlap(test, first.name, name) for name in close if name != first.name}
     overlaps = {name: overlap for name, overlap in overlaps.items() if overlap > _ALIKE}
-    names = (first.name, *overlaps)
-    return replace(found, missing=(first.name,), ambiguity=names, overlaps=overlaps, after=first.refit)
+    single = replace(found, missing=(first.name,), ambiguity=(first.name, *overlaps), overlaps=overlaps)
+    together = _as_good(test, pairs, test.scores[first.name], {first.name})
+    return replace(_beside(single, [pair for pair in together if _both_fit(found, pair)]), after=first.refit)
+
+
+def _both_fit(found: Diagnosis, names: tuple[str, str]) -> bool:
+    return _fits(with_effects(found.before, names), found.test)
+
+
+def _beside(found: Diagnosis, together: Sequence[tuple[str, str]]) -> Diagnosis:
+    """With the pairs that explain as much in the ambiguity set."""
+    added = dict.fromkeys(name for pair in together for name in pair if name not in found.ambiguity)
+    return replace(found, together=tuple(together), ambiguity=(*found.ambiguity, *added))
+
+
+def _as_good(
+    test: Test, pairs: dict[tuple[int, int], float], score: float, but: Collection[str]
+) -> list[tuple[str, str]]:
+    """Names of the best few pairs that explain as much as what scores so much, none of them in ``but``."""
+    near = sorted((pair for pair in pairs if pairs[pair] > score - _EQUAL), key=lambda pair: -pairs[pair])
+    named = dict.fromkeys(_names_of(test, pair) for pair in near)
+    return [pair for pair in named if not set(pair) & set(but)][:_PAIRS]
+
+
+def _names_of(test: Test, pair: tuple[int, int]) -> tuple[str, str]:
+    one, two = (str(test.scan.candidates[k].effect) for k in pair)
+    return one, two
 
 
 def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool:
-    """Whether some formula explains the misfit better than the effects at the constants that were found for them."""
+    """Whether some formula explains the misfit better than the effects at the constants that were found for them.
+
+    Formulas that are known effects themselves do not count: together they are no effect that is unknown.
+    """
     fitted, tests = found.before.fit, found.test.effective_tests
     effects = [effect for effect in refit.model.effects if str(effect) in names]
     scanned = scan(fitted.carried, fitted.noise.judging, effects)
@@ -308,16 +403,18 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
     left, singular, _ = np.linalg.svd(basis, full_matrices=False)
     own = float(np.sum((left[:, singular > 1e-6].T @ scanned.residual) ** 2))
     own -= sum(price(each, tests) for each in scanned.candidates)
-    return any(each.dof and each.fall - _threshold(each.dof, tests) > own + _EQUAL for each in families(fitted)[0])
+    known = [found.test.candidate(name).effect for name in found.test.best]
+    tried = [each for each in families(fitted, known)[0] if each.dof and not each.known]
+    return any(each.fall - _threshold(each.dof, tests) > own + _EQUAL for each in tried)
 
 
-def _two(found: Diagnosis) -> Diagnosis | None:
+def _two(found: Diagnosis, pairs: dict[tuple[int, int], float]) -> Diagnosis | None:
     """Two effects explain the misfit where no single one does: they may mask each other. The best few are refitted."""
-    candidates, pairs = found.test.scan.candidates, _pairs(found.test)
+    test, candidates = found.test, found.test.scan.candidates
     for pair in sorted(pairs, key=lambda pair: -pairs[pair])[:_PAIRS]:
-        names = (str(candidates[pair[0]].effect), str(candidates[pair[1]].effect))
+        names = _names_of(test, pair)
         refit = with_effects(found.before, names)
-        if not _fits(refit, found.test):
+        if not _fits(refit, test):
             continue
         if _outdone(found, refit, names):
             return None
@@ -329,7 +426,8 @@ def _two(found: Diagnosis) -> Diagnosis | None:
                 name, alike = str(candidates[new].effect), candidates[lost].overlap(candidates[new])
                 if alike > max(_ALIKE, overlaps.get(name, 0.0)) and name not in names:
                     overlaps[name] = alike
-        return replace(found, missing=names, ambiguity=(*names, *overlaps), overlaps=overlaps, after=refit)
+        both = replace(found, missing=names, ambiguity=(*names, *overlaps), overlaps=overlaps, after=refit)
+        return _beside(both, _as_good(test, pairs, pairs[pair], names))
     return None
 
 
@@ -454,20 +552,25 @@ def _verdict(found: Diagnosis) -> str:
     if test.consistent is None:
         return "Nothing is left over to judge the model by: visit more orientations."
     if test.consistent:
-        blind = f" It cannot see {len(test.invisible)} of {test.count} effects." if test.invisible else ""
+        blind = f" It cannot see {len(test.unseen)} of {test.count} effects." if test.unseen else ""
         agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
         return f"{agreed}: no effect is missing that this run could show.{blind}"
     start = f"Residuals fail (p {format_p(test.p_value)})."
     if found.missing and found.after is not None:
         first = found.missing[0]
         if len(found.missing) > 1:
-            named = f"{' and '.join(found.missing)} together explain it; no single known effect does"
+            named = f"{' and '.join(found.missing)} together explain it; no single known effect does as well"
         else:
             named = f"Missing: {first}{_size(found)}"
-            others = [name for name in found.ambiguity if name != first]
-            if others:
-                told = ", ".join(f"{name} (overlap {found.overlaps[name]:.2f})" for name in others)
-                named = f"Best: {first}{_size(found)}. Cannot yet be told from {told}"
+            if len(found.ambiguity) > 1:
+                named = f"Best: {first}{_size(found)}"
+        told = [f"{name} (overlap {overlap:.2f})" for name, overlap in found.overlaps.items()]
+        told = [
+            *(told if len(found.missing) == 1 else []),
+            *(f"{' and '.join(pair)} together" for pair in found.together),
+        ]
+        if told:
+            named += f". Cannot yet be told from {', '.join(told)}"
         return f"{start} {named}.{_held_out(found)}"
     if found.unknown:
         nearest = next((each.name for each in found.suspects if each.fits), None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from kf_calib.samples import Floats
 from kf_calib.scan import scan
 
 _CHANCE = 1e-4  # of a family to fall as much where nothing is missing: there are about a hundred
+_SAME = 0.99  # cosine above which a formula is a known effect
 _DECAYS_S = (10, 30, 100, 300)
 
 
@@ -37,7 +38,7 @@ class Description:
 class Family:
     """Formulas with one driver, as a candidate of its own; fall: of chi-squared, with all of them; dof: what they see.
 
-    falls: with each of them alone.
+    falls: with each of them alone. known: each of them is what some known effect is, or nearly.
     """
 
     driver: str
@@ -45,6 +46,7 @@ class Family:
     fall: float
     dof: int
     falls: tuple[float, ...]
+    known: bool = False
 
     @property
     def score(self) -> float:
@@ -69,23 +71,32 @@ def described(fitted: Fit, residuals: Floats) -> Description | None:
     return Description(_channel(residuals), best.driver, best.fall / max(misfit, 1e-300), formulas)
 
 
-def families(fitted: Fit) -> tuple[list[Family], float]:
-    """All families tried on what the model leaves, and the sum of squares there."""
+def families(fitted: Fit, known: Sequence[Effect] = ()) -> tuple[list[Family], float]:
+    """All families tried on what the model leaves, beside effects that are ``known``; and the sum of squares there."""
     bench, listed, effects = fitted.carried.model.bench, list[tuple[str, list[str]]](), list[Effect]()
     for driver, texts in _families(bench, fitted.dwells[-1].end_s):
         with contextlib.suppress(InputError):  # a jump so late, a decay so fast that the trial of a formula misses it
             effects += [effect_named(_named(text), bench) for text in texts]
             listed.append((driver, texts))
-    scanned = scan(fitted.carried, fitted.noise.judging, effects)
+    scanned = scan(fitted.carried, fitted.noise.judging, [*effects, *known])
+    bases = [each.basis for each in scanned.candidates[len(effects) :]]
     out, place = list[Family](), 0
     for driver, texts in listed:
         own, place = slice(place, place + len(texts)), place + len(texts)
-        basis = np.concatenate([each.basis for each in scanned.candidates[own]], axis=1)
+        parts = [each.basis for each in scanned.candidates[own]]
+        same = all(any(_within(part, each) for each in bases) for part in parts)
+        basis = np.concatenate(parts, axis=1)
         left, singular, _ = np.linalg.svd(basis, full_matrices=False)
         left = left[:, singular > 1e-6]
         fall = float(np.sum((left.T @ scanned.residual) ** 2))
-        out.append(Family(driver, tuple(texts), fall, left.shape[1], tuple(scanned.statistics[own].tolist())))
+        out.append(Family(driver, tuple(texts), fall, left.shape[1], tuple(scanned.statistics[own].tolist()), same))
     return out, float(scanned.residual @ scanned.residual)
+
+
+def _within(one: Floats, other: Floats) -> bool:
+    """Whether some combination of ``other`` (d, q) mimics any of ``one`` (d, k): by the largest principal angle."""
+    cosines = np.linalg.svd(other.T @ one, compute_uv=False) if 0 < one.shape[1] <= other.shape[1] else np.zeros(1)
+    return bool(cosines[-1] > _SAME)
 
 
 def _named(text: str, number: int = 0) -> str:

@@ -22,7 +22,7 @@ from kf_calib.likelihood import gain_of, wandering, with_dwell_parts
 from kf_calib.model import Model, on_basis
 from kf_calib.noise import FLOOR_MPS2, Noise, steps, within_dwells
 from kf_calib.samples import Floats
-from kf_calib.scan import scan
+from kf_calib.scan import falls
 
 WALK = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5, "µg/√s", 1e6 / 9.80665)
 """The intensity of a walk of the biases as a parameter."""
@@ -30,7 +30,6 @@ WALK = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5, "µg/√s", 1e6 / 9.80665)
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
 _STILL = 2.5e-4  # a step of ln(value), in reaches, that ends the search
-_TOGETHER = 40  # values of a grid in one scan
 _CLOSER = ((0.45, 41), (0.0225, 17), (0.0028, 9))  # half width in ln(value) and points of ever finer grids
 
 
@@ -232,11 +231,7 @@ def _best(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> int:
 def _falls(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> Floats:
     """By how much the same effect at several values would lower chi-squared beside the ``rest`` of the model."""
     state = np.concatenate([fitted.carried.state[:12], np.zeros(rest.count - 12)])
-    carried, statistics = Carried(fitted.dwells, rest, state), list[Floats]()
-    for first in range(0, len(grid), _TOGETHER):
-        part = grid[first : first + _TOGETHER]
-        statistics.append(scan(carried, fitted.noise.weights, part).statistics)
-    return np.concatenate(statistics)
+    return falls(Carried(fitted.dwells, rest, state), fitted.noise.weights, grid)
 
 
 def walk_gain(fitted: Fit) -> tuple[float, float]:

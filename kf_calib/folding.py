@@ -253,6 +253,8 @@ def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> S
         rate_change_radps2=np.concatenate(
             [_still if each.rate_change_radps2 is None else each.rate_change_radps2 for each in nodes]
         ),
+        half_s=np.repeat([0.5 * (each.elapsed_s[2] - each.elapsed_s[0]) for each in nodes], 3),
+        within=np.tile([-1.0, 0.0, 1.0], len(nodes)),
         carrier_hz=dwells[0].carrier_hz,
     )
 

@@ -30,6 +30,7 @@ def whitened(
     state: Floats,
     about: Floats | None = None,
     flicker_mps2: Floats | None = None,
+    reduced: bool = True,
 ) -> list[Floats]:
     """Rows [S | H | z] of unit noise (r, s + p + 1) of each dwell, its nuisance states eliminated by QR.
 
@@ -41,6 +42,7 @@ def whitened(
     ``about`` (p,): z is the readings less what the model reads there, and states solved for count from it. A reading of
     size g is 1e6 sigma and more: its rounding is then no longer the largest error of whatever follows.
     ``flicker_mps2`` (3,): sqrt(h) of 1/f noise of density h / f, whose slow parts within a dwell are states, too.
+    ``reduced``: to as few rows as the columns have rank; else all are there, which is faster where columns are many.
     """
     sigma, sigmas = noise.effective_sigma_mps2, noise.dwell_sigmas
     used, units = np.flatnonzero(sigmas > 0), _units(columns)
@@ -74,13 +76,24 @@ def whitened(
                 part[:, count + i] = dwell.walk.step / sigma[i]
                 part[:] = dwell.walk.whiten(part, float(ratios[i]))
         rows[3 * size :, :count] = np.diag(1.0 / priors)
-        folded = triangle(rows)
-        out.append(_informative(folded[count:, count:], np.append(np.ones(inside), units)))
+        informative = np.append(np.ones(inside), units)
+        out.append(_informative(triangle(rows)[count:, count:], informative) if reduced else _less(rows, count))
     return out
 
 
+def _less(rows: Floats, count: int) -> Floats:
+    """Rows without the first ``count`` columns, projected off them."""
+    nuisances = np.linalg.qr(rows[:, :count])[0]
+    return rows[:, count:] - nuisances @ (nuisances.T @ rows[:, count:])
+
+
 def judged(
-    dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats, width: int
+    dwells: Sequence[DwellFactor],
+    columns: Sequence[Floats],
+    noise: Noise,
+    state: Floats,
+    width: int,
+    reduced: bool = True,
 ) -> tuple[list[Floats], int]:
     """Rows [H | W | G | z] by which a misfit is judged, and how many columns come before G (of the first ``width``: H).
 
@@ -89,13 +102,13 @@ def judged(
     """
     slow, sigma = wander(dwells, noise)
     if not sigma.size:
-        return whitened(dwells, columns, noise, state), width
+        return whitened(dwells, columns, noise, state, reduced=reduced), width
     flicker = flicker_sigma(noise, len(dwells))
     count, places = columns[0].shape[3] + len(sigma) + 1, width + np.arange(len(sigma))
     prior = np.zeros((len(sigma), count))
     prior[np.arange(len(sigma)), places] = 1.0 / sigma
     both = [np.insert(own, [width] * len(sigma), more, axis=3) for own, more in zip(columns, slow, strict=True)]
-    return [prior, *whitened(dwells, both, noise, state, flicker_mps2=flicker)], width + len(sigma)
+    return [prior, *whitened(dwells, both, noise, state, flicker_mps2=flicker, reduced=reduced)], width + len(sigma)
 
 
 def _waves(dwell: DwellFactor) -> Floats:

@@ -19,9 +19,12 @@ from kf_calib.effects import Effect
 from kf_calib.folding import Carried, candidate_columns
 from kf_calib.noise import Noise, steps
 from kf_calib.samples import Floats, Mask
+from kf_calib.walk import unfolded
 
 _SEEN = 1e-6
 """A candidate of which the model leaves less than this share is invisible."""
+
+_TOGETHER = 200  # of many effects, so many are held at a time
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,8 @@ class Candidate:
 
     basis (d, k): orthonormal, of what is left of its columns; inverse (q, k): coefficients = inverse @ basis^T r;
     columns (d, q): what is left of the columns, per unit of the coefficients; hidden (q,): which of these are not
-    determined; visibility: the largest share of a column that is left.
+    determined; visibility: the largest share of a column that is left; tried: the best of so many values of its
+    constant, each a test of its own.
     """
 
     effect: Effect
@@ -39,6 +43,7 @@ class Candidate:
     inverse: Floats
     hidden: Mask
     visibility: float
+    tried: int = 1
 
     @property
     def dof(self) -> int:
@@ -75,26 +80,59 @@ class Scan:
 
 def scan(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Scan:
     """Project ``effects`` off the model carried."""
-    added = candidate_columns(carried.dwells, effects, carried.model.bench, carried.state)
-    columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
-    rows, width = information.judged(carried.dwells, columns, noise, carried.state, carried.model.count)
+    rows, width = _rows(carried, noise, effects)
     counts = [len(effect.coefficients) for effect in effects]
     return projected(information.accumulated(rows, steps(carried.dwells, noise)), width, effects, counts)
 
 
 def projected(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
     """The scan of a triangle [H | G | z] whose first ``width`` columns are the model's, then ``counts`` an effect."""
-    rest, sizes = upper[:, width:], np.linalg.norm(upper[:, width:-1], axis=0)
-    left, singular, _ = np.linalg.svd(information.scaled(upper[:, : width + 1])[0], full_matrices=False)
-    explained = left[:, singular > 1e-9]
-    for _ in range(2):  # twice, or the rounding of what is large stays in what is left
-        rest = rest - explained @ (explained.T @ rest)
+    sizes, rest = np.linalg.norm(upper[:, width:-1], axis=0), _beside(upper, width)
     units = np.where(sizes > 0, sizes, 1.0)
     columns, residual = rest[:-1, :-1] / units, rest[:-1, -1]
     ends = np.cumsum([0, *counts]).tolist()
     parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
     found = [_candidate(each, columns[:, part], units[part]) for each, part in zip(effects, parts, strict=True)]
     return Scan(tuple(found), residual)
+
+
+def _beside(rows: Floats, width: int) -> Floats:
+    """What rows [H | G | z] hold of G and z beside the first ``width`` columns."""
+    left, singular, _ = np.linalg.svd(information.scaled(rows[:, : width + 1])[0], full_matrices=False)
+    explained, rest = left[:, singular > 1e-9], rows[:, width:]
+    for _ in range(2):  # twice, or the rounding of what is large stays in what is left
+        rest = rest - explained @ (explained.T @ rest)
+    return rest
+
+
+def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
+    """By how much each of many effects of one kind, alone, would lower chi-squared (n,): a scan's ``statistics``.
+
+    Nothing else is asked of them, so the rows are not folded: of n columns in d rows that takes d n, not d n^2.
+    """
+    out = list[Floats]()
+    for first in range(0, len(effects), _TOGETHER):
+        part = effects[first : first + _TOGETHER]
+        rows, width = _rows(carried, noise, part, reduced=False)
+        if noise.walk_mps2_per_sqrt_s:
+            stacked, walked = unfolded(rows, steps(carried.dwells, noise), width)
+            width += walked
+        else:
+            stacked = np.concatenate(rows)
+        sizes, rest = np.linalg.norm(stacked[:, width:-1], axis=0), _beside(stacked, width)
+        columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
+        columns = columns.T.reshape(len(part), -1, len(rest))
+        along, gram = columns @ rest[:, -1], columns @ columns.swapaxes(1, 2)
+        inverse = np.linalg.pinv(gram, rcond=_SEEN, hermitian=True)
+        out.append(np.einsum("ni,nij,nj->n", along, inverse, along))
+    return np.concatenate(out)
+
+
+def _rows(carried: Carried, noise: Noise, effects: Sequence[Effect], reduced: bool = True) -> tuple[list[Floats], int]:
+    """Rows [H | G | z] of the model carried and of ``effects``, and how many columns come before G."""
+    added = candidate_columns(carried.dwells, effects, carried.model.bench, carried.state)
+    columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
+    return information.judged(carried.dwells, columns, noise, carried.state, carried.model.count, reduced)
 
 
 def _candidate(effect: Effect, columns: Floats, units: Floats) -> Candidate:

@@ -81,15 +81,26 @@ def lines(spectra: Iterable[Spectrum], level: float = 0.01) -> tuple[Line, ...]:
 
     The length of segment in which most readings came is used; channels that do not vary are left out.
     """
-    total = reduce(Spectrum.__add__, spectra, Spectrum())
-    if not total.sums:
+    length, own = _most(spectra)
+    if own is None:
         return ()
-    length = max(total.sums, key=lambda each: each * total.sums[each].segments)
-    own = total.sums[length]
     moving = np.asarray((own.power[_FIRST_BIN:-1] > 0).all(axis=0))
     if not moving.any():
         return ()
     return _Search(own, length, moving).lines(level)
+
+
+def lowest_hz(spectra: Iterable[Spectrum]) -> float:
+    """From which frequency on ``lines`` looks for lines; infinite where there is no spectrum."""
+    own = _most(spectra)[1]
+    return np.inf if own is None else _FIRST_BIN * own.segments / own.duration_s
+
+
+def _most(spectra: Iterable[Spectrum]) -> tuple[int, _Sum | None]:
+    """The length of segment in which most readings came, and the sum over these segments."""
+    total = reduce(Spectrum.__add__, spectra, Spectrum())
+    length = max(total.sums, key=lambda each: each * total.sums[each].segments, default=0)
+    return length, total.sums.get(length)
 
 
 class _Search:

@@ -159,6 +159,30 @@ def _sigmas(steps: Floats, inside: int) -> Floats:
     return np.sqrt(np.repeat(variances, 3))
 
 
+def unfolded(rows: Sequence[Floats], steps: Floats, width: int) -> tuple[Floats, int]:
+    """All rows at once, [H | W | G | z] of H ``width``, the biases those at the beginning, and how many columns W has.
+
+    W: of each bias's steps in the pauses and the dwells, in their sigma; the rows of their priors come last. Rows
+    before those of the dwells have no S.
+    """
+    before, dwells = rows[: len(rows) - len(steps)], rows[len(rows) - len(steps) :]
+    place = np.repeat(np.arange(len(dwells)), [len(own) for own in dwells])
+    stacked = np.concatenate(dwells)
+    inside, body = stacked[:, :3], stacked[:, 3:]
+    later = body[:, None, [3, 7, 11]] * (place[:, None] >= np.arange(len(dwells)))[:, :, None]
+    within = later + inside[:, None, :] * (place[:, None] == np.arange(len(dwells)))[:, :, None]
+    moving = np.stack([later * np.sqrt(steps[:, 0, None]), within * np.sqrt(steps[:, 1, None])], axis=1)
+    moving = moving.reshape(len(body), -1)[:, np.repeat(steps.T.ravel() > 0, 3)]
+    count = moving.shape[1]
+    above = np.concatenate([np.zeros((0, body.shape[1])), *before])
+    out = np.zeros((len(above) + len(body) + count, body.shape[1] + count))
+    beside = np.concatenate([above, body, np.zeros((count, body.shape[1]))])
+    out[:, :width], out[:, width + count :] = beside[:, :width], beside[:, width:]
+    out[len(above) : len(above) + len(body), width : width + count] = moving
+    out[len(above) + len(body) :, width : width + count] = np.eye(count)
+    return out, count
+
+
 def predicted(factor: Floats, variance: float) -> Floats:
     """Time update alone: the three biases take a step of that variance, 0: none."""
     if variance <= 0:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 
 import pytest
+from synthetic import Run
 from test_diagnosis import BENCH
 
 from kf_calib.calibration import Calibration, calibrate
@@ -81,6 +82,48 @@ def test_a_line_is_named_with_its_frequency() -> None:
     frequency = found.after.parameters["fSin"]
     assert frequency.value is not None and frequency.sigma is not None
     assert abs(frequency.value - 7.3) < 5.0 * frequency.sigma < 0.01
+
+
+@pytest.mark.parametrize("frequency_hz", [0.01, 0.1, 0.3])
+def test_a_slow_oscillation_is_named_with_its_frequency(frequency_hz: float) -> None:
+    """Too slow for a line in the spectrum: three cycles a run, one and two cycles a dwell."""
+    found = diagnose(run(f"sinusoid=15sigma;frequency={frequency_hz}"))
+    assert found.missing == ("sinusoid",) and not found.test.lines and found.after is not None
+    frequency = found.after.parameters["fSin"]
+    assert frequency.value is not None and frequency.sigma is not None
+    assert abs(frequency.value - frequency_hz) < 4.0 * frequency.sigma < 1e-3
+
+
+def test_one_cycle_a_run_is_not_told_from_what_the_temperature_does() -> None:
+    """The temperature of these runs swings once, too."""
+    not_wrong(diagnose(run("sinusoid=15sigma;frequency=0.0045")), "sinusoid")
+    both = diagnose(run("thermal-bias=12sigma", "thermal-rate=12sigma"))
+    assert {"thermal-bias", "thermal-rate"} <= set(both.ambiguity), both.verdict
+    assert ("thermal-bias", "thermal-rate") in both.together and "thermal-rate together" in both.verdict
+
+
+def test_what_the_run_has_no_sight_of_is_said() -> None:
+    """40 readings a dwell have no spectrum: what is faster than their pieces show is not seen."""
+    test = assessed(calibrate(Run(count=40, rate_hz=1.0)).fit)
+    assert test.between.startswith("sinusoid above 0.1") and test.between in test.invisible
+    assert not assessed(run().fit).between
+
+
+def test_other_pairs_that_explain_as_much_are_said() -> None:
+    """Here two others happen to explain it a little better than the two that were hidden."""
+    truth = {"cross-coupling-io", "scale-asymmetry"}
+    for seed in (21, 22):
+        found = diagnose(run(*(f"{name}=15sigma" for name in sorted(truth)), seed=seed))
+        assert not found.unknown and truth <= set(found.ambiguity), found.verdict
+
+
+def test_two_effects_with_a_constant_each_are_both_found() -> None:
+    found = diagnose(run("warm-up=25sigma;tau=60", "settling=25sigma;tau=4"))
+    assert set(found.missing) == {"warm-up", "settling"}, found.verdict
+    assert found.after is not None
+    for symbol, truth in (("tauWarm", 60.0), ("tauSettle", 4.0)):
+        own = found.after.parameters[symbol]
+        assert own.value is not None and own.sigma is not None and abs(own.value - truth) < 4.0 * own.sigma
 
 
 def test_vibration_is_no_oscillation_of_one_amplitude_and_what_it_rectifies_is_named() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -11,8 +13,9 @@ from test_effects import BENCH
 from kf_calib.calibration import Calibration, Settings, calibrate
 from kf_calib.comparison import compare
 from kf_calib.effects import checks, effect_named
-from kf_calib.folding import less_curve
+from kf_calib.folding import less_curve, stimulus_of
 from kf_calib.samples import Floats
+from kf_calib.scan import falls, scan
 from kf_calib.sources.hidden import parse
 from kf_calib.sources.noise_sources import Noise
 from kf_calib.sources.plans import spread_plan
@@ -63,6 +66,30 @@ def test_intervals_cover(runs: int, low: float, off: float) -> None:
 def test_engines_and_batch_agree() -> None:
     compared = compare(run(1.3, 2.0, dwells=16), WITH)
     assert compared.max_difference_sigma <= 1e-6
+
+
+@pytest.mark.parametrize("scatter_mps2", [0.0, 2e-5])
+@pytest.mark.parametrize("walk_mps2", [0.0, 1e-6])
+def test_many_frequencies_are_tried_as_a_scan_would(scatter_mps2: float, walk_mps2: float) -> None:
+    fitted = calibrate(run(0.1, 1.0, dwells=10), Settings(effects=("scale-drift",))).fit
+    effects = [effect_named("sinusoid", BENCH).at(value) for value in np.linspace(0.01, 0.5, 20)]
+    noise = replace(fitted.noise, scatter_mps2=np.full(3, scatter_mps2), scatter_stated=True)
+    walk = np.outer(np.arange(10) > 0, [walk_mps2**2, 0.0, walk_mps2**2])
+    expected = scan(fitted.carried, noise, effects, walk).statistics
+    assert expected.max() > 10.0
+    np.testing.assert_allclose(falls(fitted.carried, noise, effects, walk), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_columns_are_the_nearest_parabolas() -> None:
+    """One and a half cycles in the longest piece, against least squares on dense instants."""
+    result, effect = calibrate(run(0.1, 0.0, dwells=6)), effect_named("sinusoid", BENCH).at(0.5)
+    at = stimulus_of(result.fit.dwells, BENCH, result.carried.state)
+    own = effect.columns(at)[:, 0, :2].reshape(-1, 3, 2)
+    u = np.linspace(-1.0, 1.0, 20_001)
+    for nodes, times in zip(own, at.elapsed_s.reshape(-1, 3), strict=True):
+        phase = np.pi * np.interp(u, [-1.0, 0.0, 1.0], times)
+        nearest = np.polynomial.legendre.legfit(u, np.column_stack([np.sin(phase), np.cos(phase)]), 2)
+        np.testing.assert_allclose(nodes, np.polynomial.legendre.legval([-1.0, 0.0, 1.0], nearest).T, atol=2e-3)
 
 
 def test_columns_pass_the_checks() -> None:

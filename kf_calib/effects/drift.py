@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kf_calib.effects.effect import Coefficient, Effect, G, SensorEffect, Unknown
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.samples import Floats
+
+_HELD = 2.5  # cycles in a piece, of which its parabola holds a fourteenth of the power
 
 
 class BiasDrift(SensorEffect):
@@ -79,6 +82,7 @@ class Sinusoid(Effect):
 
     On a carrier f0, with d = 2 pi (f - f0) t: sin 2 pi f t = sin d cos 2 pi f0 t + cos d sin 2 pi f0 t, and the cosine
     likewise: the envelopes are slow where f is near f0, however fast the carrier.
+    In a piece of a dwell it is the parabola nearest to it, so that one of a cycle or two a piece is still seen.
     """
 
     name, title, source = "sinusoid", "oscillation of one frequency", "Peterson, USGS OFR 93-322 (microseism); mains"
@@ -94,32 +98,43 @@ class Sinusoid(Effect):
         return tuple(Coefficient(symbol, "m/s^2", 1e-3, "µg", 1e6 / G) for symbol in kinds)
 
     def columns(self, s: Stimulus) -> Floats:
-        phase = 2.0 * np.pi * (self.value - s.carrier_hz) * s.elapsed_s
-        sin, cos = np.sin(phase), np.cos(phase)
-        if s.carrier_hz:
-            none = np.zeros_like(phase)
-            sin, cos = ((none, none), (sin, cos), (cos, -sin))[s.part]
+        at_s, shares = s.about
+        sin, cos = _parts(s, (shares * self._wave(s, at_s)).sum(axis=1))
         out = np.zeros((len(s), 3, 6))
         for i in range(3):
             out[:, i, 2 * i], out[:, i, 2 * i + 1] = sin, cos
         return out
 
     def derivative(self, s: Stimulus, coefficients: Floats) -> Floats:
-        """2 pi f t (A_i cos 2 pi f t - B_i sin 2 pi f t)."""
-        turned = coefficients.reshape(3, 2)[:, ::-1] * [-1.0, 1.0]
-        return (2.0 * np.pi * self.value * s.elapsed_s)[:, None, None] * (self.columns(s) @ turned.ravel())[:, :, None]
+        """A_i and B_i times the changes of sine and cosine per unit of ln f: d(e^(i d)) = 2 pi i f t e^(i d)."""
+        at_s, shares = s.about
+        changes = 2j * np.pi * self.value * (shares * at_s * self._wave(s, at_s)).sum(axis=1)
+        return (coefficients.reshape(3, 2) @ np.array(_parts(s, changes))).T[:, :, None]
+
+    def _wave(self, s: Stimulus, at_s: Floats) -> NDArray[np.complex128]:
+        """e^(i d) at instants."""
+        return np.exp(2j * np.pi * (self.value - s.carrier_hz) * at_s)
 
     def grid(self, s: Stimulus) -> Floats:
-        """In quarters of 1/run, about the carrier; without one, as far as parabolas over the pieces can follow."""
-        step, longest = 0.25 / s.span_s, s.longest_piece_s
+        """In quarters of 1/run, about the carrier; without one, as far as parabolas over the pieces hold much of it."""
+        step = 0.25 / s.span_s
         if s.carrier_hz:
-            count = int(np.ceil(max(0.15 / longest, 2.0 / s.span_s) / step))
+            count = int(np.ceil(max(0.15 / s.longest_piece_s, 2.0 / s.span_s) / step))
             found = s.carrier_hz + step * np.arange(-count, count + 1, dtype=float)
             return found[found > 0]
-        return step * np.arange(2, int(np.clip(0.8 / longest / step, 8, 4000)), dtype=float)
+        return step * np.arange(2, int(np.clip(_HELD / s.usual_piece_s / step, 8, 4000)), dtype=float)
 
     def reach(self, s: Stimulus) -> float:
         return 0.25 / s.span_s / self.value
+
+
+def _parts(s: Stimulus, wave: NDArray[np.complex128]) -> tuple[Floats, Floats]:
+    """Sine and cosine (m,) of a wave e^(i d), or what of them the stimulus asks for on a carrier."""
+    sin, cos = wave.imag, wave.real
+    if not s.carrier_hz:
+        return sin, cos
+    none = np.zeros_like(sin)
+    return ((none, none), (sin, cos), (cos, -sin))[s.part]
 
 
 class BiasWalk(Effect):

@@ -6,12 +6,16 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from numpy.polynomial import legendre
 
 from kf_calib.bench import Bench, turn
 from kf_calib.samples import Floats
 
 REFERENCE_TEMPERATURE_C = 25.0
 """T of the catalogue is the temperature less this."""
+
+_POINTS, _WEIGHTS = legendre.leggauss(10)
+_INTEGRALS = legendre.legvander(_POINTS, 2).T * _WEIGHTS  # (3, n): of Legendre's polynomials times a function
 
 _RATE_WINDOW_S = 5.0  # a thermometer of 0.01 K noise then shows rates of 1e-3 K/s
 
@@ -23,8 +27,10 @@ class Stimulus:
     elapsed_s, since_arrival_s, temperature_c: (m,); force_mps2: specific force in the platform frame, (m, 3), and pose,
     (m, k), each of the dwell before, too; sensitivity (3, 3): rows K_i E_i at which small rotations are linearised;
     variance_mps2_2: variance of the readings about here, (m, 3). rate_radps, rate_change_radps2: omega of the platform
-    in its own frame and its derivative there, (m, 3), zero where it stands. carrier_hz: of dwells folded on a carrier,
-    0: none; part: of a column, that without the carrier (0) or the envelope of its cosine (1), sine (2).
+    in its own frame and its derivative there, (m, 3), zero where it stands. half_s, within: half the length of the
+    piece of a dwell an instant belongs to, and where in it that is, from -1 to 1, (m,); zeros where it is of no piece.
+    carrier_hz: of dwells folded on a carrier, 0: none; part: of a column, that without the carrier (0) or the envelope
+    of its cosine (1), sine (2).
     """
 
     bench: Bench
@@ -39,6 +45,8 @@ class Stimulus:
     variance_mps2_2: Floats = field(default_factory=lambda: np.zeros((1, 3)))
     rate_radps: Floats = field(default_factory=lambda: np.zeros((1, 3)))
     rate_change_radps2: Floats = field(default_factory=lambda: np.zeros((1, 3)))
+    half_s: Floats = field(default_factory=lambda: np.zeros(1))
+    within: Floats = field(default_factory=lambda: np.zeros(1))
     carrier_hz: float = 0.0
     part: int = 0
 
@@ -52,8 +60,26 @@ class Stimulus:
 
     @property
     def longest_piece_s(self) -> float:
-        """Of the pieces of dwells, whose nodes are three instants each."""
-        return float(max((self.elapsed_s[2::3] - self.elapsed_s[:-2:3]).max(), 1e-9))
+        """Of the pieces of dwells."""
+        return float(max(2.0 * self.half_s.max(), 1e-9))
+
+    @property
+    def usual_piece_s(self) -> float:
+        """Length of the piece that the middle of all the time in dwells lies in."""
+        halves = np.sort(self.half_s)
+        return float(max(2.0 * halves[np.searchsorted(np.cumsum(halves), 0.5 * halves.sum())], 1e-9))
+
+    @cached_property
+    def about(self) -> tuple[Floats, Floats]:
+        """Instants (m, n) in the piece of each instant, and shares (m, n): the sum over them of shares times a function
+        of time is, at the instant, the parabola nearest to that function in the piece.
+
+        sum_l (2 l + 1) / 2 c_l P_l(u), c_l the integral of P_l times the function over -1 < u < 1, P_l Legendre's
+        polynomials: by Gauss's rule, which holds for up to three cycles.
+        """
+        at_s = (self.elapsed_s - self.within * self.half_s)[:, None] + self.half_s[:, None] * _POINTS
+        shares = legendre.legvander(self.within, 2) @ (np.array([[0.5], [1.5], [2.5]]) * _INTEGRALS)
+        return at_s, np.broadcast_to(shares, at_s.shape)
 
     @cached_property
     def axes(self) -> Floats:

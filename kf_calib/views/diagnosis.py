@@ -40,6 +40,7 @@ def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
             "suspects": [_suspect_object(each) for each in found.suspects],
             "ambiguity_set": list(found.ambiguity),
             "overlaps": found.overlaps,
+            "together": [list(pair) for pair in found.together],
             "invisible": found.test.invisible,
             "vibration_hz": [line.frequency_hz for line in found.test.vibration],
             "detectable": [
