@@ -152,3 +152,11 @@ def test_spectra_add_up() -> None:
     assert line.frequency_hz == same.frequency_hz and line.p_value == same.p_value
     assert line.channel == 2 and line.frequency_hz == pytest.approx(20.0, abs=0.05)
     np.testing.assert_allclose(line.amplitude_mps2, [0.0, 0.3, 1.0], atol=0.15)
+
+
+def test_a_stated_scatter_goes_with_a_carrier() -> None:
+    """Dwells folded on a carrier have nine nodes a piece; the slow part of the scatter has none of its envelopes."""
+    source = run(7.3, 1.0, dwells=16)
+    source = replace(source, bench=replace(BENCH, scatter_sigma_mps2=1e-5))
+    result = calibrate(source, WITH)
+    assert result.carried.carrier_hz and np.abs(errors(result, 7.3, 1.0)).max() < 4.0
