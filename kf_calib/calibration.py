@@ -37,7 +37,7 @@ _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # a larger sigma 
 _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
 _CARRIERS = 3  # passes at most in search of one
 _CYCLES = 50.0  # a dwell, of a line that may be what is left of a slow oscillation
-_SLOW = 0.4  # cycles of a slow oscillation in a piece: its parabola leaves a hundredth of its power
+_SLOW = 0.3  # cycles of a slow oscillation in a dwell: its parabola leaves less than a thousandth of its power
 _NEAR = 0.06  # cycles between oscillation and carrier in a piece: a parabola then leaves 1e-3 of its amplitude
 Engine = Literal["block", "filterpy"]
 
@@ -357,15 +357,12 @@ def _on_carrier(
 
 def _followed(fitted: Fit) -> bool:
     """Whether the dwells are folded so that they hold the model's oscillation, if it has one: on a carrier, or it is so
-    slow that parabolas over their pieces do."""
+    slow that a parabola over a dwell does, or what that leaves would count as correlated noise."""
     dwells = fitted.dwells
     if not fitted.carried.model.oscillates or dwells[0].carrier_hz:
         return True
-    return _oscillation_hz(fitted) * _longest_s(dwells) < _SLOW and not lines(dwell.spectrum for dwell in dwells)
-
-
-def _longest_s(dwells: Sequence[DwellFactor]) -> float:
-    return max(float(np.ptp(piece.nodes.elapsed_s)) for dwell in dwells for piece in dwell.pieces)
+    longest_s = max(dwell.end_s - dwell.start_s for dwell in dwells)
+    return _oscillation_hz(fitted) * longest_s < _SLOW and not lines(dwell.spectrum for dwell in dwells)
 
 
 def _nearer(
@@ -377,7 +374,8 @@ def _nearer(
         passed = Pass(passed.source, passed.settings, folder=Folder(carrier_hz))
         dwells = passed.fold(on_progress)
         fitted = _fitted(passed, dwells)
-        if not left or abs(_oscillation_hz(fitted) - carrier_hz) * _longest_s(dwells) < _NEAR:
+        longest_s = max(float(np.ptp(piece.nodes.elapsed_s)) for dwell in dwells for piece in dwell.pieces)
+        if not left or abs(_oscillation_hz(fitted) - carrier_hz) * longest_s < _NEAR:
             return passed, dwells, fitted
         carrier_hz = _oscillation_hz(fitted)
     raise AssertionError("unreachable: the last of the carriers is taken as it is")

@@ -66,7 +66,8 @@ def whitened(
             part[:, :offsets] = (regressors @ nuisances[i]).reshape(size, offsets) / sigma[i]
             if slow:
                 first = offsets + slow * i
-                part[:, first : first + slow] = (carried @ on_basis(_waves(dwell))).reshape(size, slow) / sigma[i]
+                waves = carried[:, :, :3] @ on_basis(_waves(dwell))
+                part[:, first : first + slow] = waves.reshape(size, slow) / sigma[i]
             part[:, first_of_model:-1] = (carried @ on_basis(own[:, :, i])).reshape(size, width) / sigma[i]
             readings = triangles[:, : dwell.width, dwell.width + i]
             if about is not None:

@@ -170,10 +170,10 @@ def wander(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floats], F
     start, span = dwells[0].start_s, dwells[-1].end_s - dwells[0].start_s
     orders, out = np.arange(1, _WANDER + 1), list[Floats]()
     for dwell in dwells:
-        own = np.zeros((len(dwell.pieces), 3, 3, len(channels), _WANDER))
+        own = np.zeros((len(dwell.pieces), dwell.width, 3, len(channels), _WANDER))
         at = (0.5 * (dwell.start_s + dwell.end_s) - start) / span
-        own[:, :, channels, np.arange(len(channels))] = np.sqrt(2.0) * np.cos(np.pi * orders * at)
-        out.append(own.reshape(len(dwell.pieces), 3, 3, -1))
+        own[:, :3, channels, np.arange(len(channels))] = np.sqrt(2.0) * np.cos(np.pi * orders * at)
+        out.append(own.reshape(*own.shape[:3], -1))
     sigma = flicker_sigma(noise, len(dwells))[channels, None] / np.sqrt(orders)
     return out, sigma.ravel()
 

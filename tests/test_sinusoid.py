@@ -10,6 +10,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 from test_effects import BENCH
 
+from kf_calib.bench import Bench
 from kf_calib.calibration import Calibration, Settings, calibrate
 from kf_calib.comparison import compare
 from kf_calib.effects import checks, effect_named
@@ -28,10 +29,12 @@ SHARES = (1.0, -0.6, 0.8)
 WITH = Settings(effects=("sinusoid",))
 
 
-def run(frequency_hz: float, size_sigma: float, dwell_s: float = 6.0, seed: int = 5, dwells: int = 30) -> Simulation:
+def run(
+    frequency_hz: float, size_sigma: float, dwell_s: float = 6.0, seed: int = 5, dwells: int = 30, bench: Bench = BENCH
+) -> Simulation:
     sizes = ",".join(str(size_sigma * SIGMA * share) for share in SHARES)
     return Simulation(
-        BENCH, GRADES["navigation"].sensors(seed), Noise(white_mps2=SIGMA),
+        bench, GRADES["navigation"].sensors(seed), Noise(white_mps2=SIGMA),
         spread_plan(dwells, dwell_s=dwell_s, seed=4), sample_hz=100.0, slew_rate_degps=90.0, seed=seed,
         hidden=parse([f"sinusoid={sizes};frequency={frequency_hz}"], BENCH.axes, seed=seed),
     )  # fmt: skip
@@ -153,3 +156,9 @@ def test_spectra_add_up() -> None:
     assert line.frequency_hz == same.frequency_hz and line.p_value == same.p_value
     assert line.channel == 2 and line.frequency_hz == pytest.approx(20.0, abs=0.05)
     np.testing.assert_allclose(line.amplitude_mps2, [0.0, 0.3, 1.0], atol=0.15)
+
+
+def test_a_stated_scatter_goes_with_a_carrier() -> None:
+    """Dwells folded on a carrier have nine nodes a piece; the slow part of the scatter has none of its envelopes."""
+    result = calibrate(run(7.3, 1.0, dwells=16, bench=replace(BENCH, scatter_sigma_mps2=1e-5)), WITH)
+    assert result.carried.carrier_hz and np.abs(errors(result, 7.3, 1.0)).max() < 4.0

@@ -125,7 +125,7 @@ class Sinusoid(Effect):
         return step * np.arange(2, int(np.clip(_HELD / s.usual_piece_s / step, 8, 4000)), dtype=float)
 
     def reach(self, s: Stimulus) -> float:
-        return 0.25 / s.span_s / self.value
+        return min(0.25 / s.span_s / self.value, 0.5)  # slower than the run: no step leads out of any range
 
 
 def _parts(s: Stimulus, wave: NDArray[np.complex128]) -> tuple[Floats, Floats]:
