@@ -76,11 +76,12 @@ def test_engines_and_batch_agree() -> None:
 def test_many_frequencies_are_tried_as_a_scan_would(scatter_mps2: float, walk_mps2: float) -> None:
     fitted = calibrate(run(0.1, 1.0, dwells=10), Settings(effects=("scale-drift",))).fit
     effects = [effect_named("sinusoid", BENCH).at(value) for value in np.linspace(0.01, 0.5, 20)]
-    noise = replace(fitted.noise, scatter_mps2=np.full(3, scatter_mps2), scatter_stated=True)
-    walk = np.outer(np.arange(10) > 0, [walk_mps2**2, 0.0, walk_mps2**2])
-    expected = scan(fitted.carried, noise, effects, walk).statistics
+    noise = replace(
+        fitted.noise, scatter_mps2=np.full(3, scatter_mps2), scatter_stated=True, walk_mps2_per_sqrt_s=walk_mps2
+    )
+    expected = scan(fitted.carried, noise, effects).statistics
     assert expected.max() > 10.0
-    np.testing.assert_allclose(falls(fitted.carried, noise, effects, walk), expected, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(falls(fitted.carried, noise, effects), expected, rtol=1e-6, atol=1e-6)
 
 
 def test_columns_are_the_nearest_parabolas() -> None:
