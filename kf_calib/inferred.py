@@ -53,17 +53,20 @@ def search(latitude_deg: float = Conditions.latitude_deg) -> Search:
         for kind in (True, False)
     )
     excess = bias_excess(experiment.printed(experiment.NONOPTIMAL_PRINTED))
-    return Search(len(found), together, in_turn, shared_floor(), experiment.scatter(experiment.REPETITIONS), excess)
+    tried = len(found) * len(PERIODS_S)
+    return Search(tried, together, in_turn, shared_floor(), experiment.scatter(experiment.REPETITIONS), excess)
 
 
 def _tried(base: Conditions) -> Iterator[Found]:
-    """All periods, turns and orders of sampling, by the closed form."""
+    """The nearest period for every reading of the turns and order of sampling, by the closed form."""
     column, vertical = experiment.printed(experiment.NONOPTIMAL_PRINTED), _vertical(base)
+    attitudes = {turns: base.bench.attitude(experiment.attitudes(turns)) for turns in TURNS}
     for turns, sampled in product(TURNS, SAMPLED):
-        moments = _moments(vertical, base.bench.attitude(experiment.attitudes(turns)), sampled)
+        moments = _moments(vertical, attitudes[turns], sampled)
         figures = experiment.log_ratio(experiment.expected_of(experiment.normal_of(moments)), column)
-        for period_s, figure in zip(PERIODS_S.tolist(), figures.tolist(), strict=True):
-            yield Found(replace(base, period_s=period_s, turns=turns, sampled=sampled), figure)
+        best = int(figures.argmin())
+        own = replace(base, period_s=float(PERIODS_S[best]), turns=turns, sampled=sampled)
+        yield Found(own, float(figures[best]))
 
 
 def _vertical(base: Conditions) -> Floats:
