@@ -12,7 +12,7 @@ with its D; the filter is the package's, on the affine state, without linearisat
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, permutations
 from typing import Literal
@@ -36,7 +36,7 @@ OPTIMAL_PRINTED = {
     "nu1": 0.6982, "nu2": 0.6816, "K2": 1.2563, "b2": 10.7666,
     "theta3": 0.7201, "phi3": 0.6652, "K3": 1.0919, "b3": 11.4856,
 }  # fmt: skip
-"""Table 2: mean of \\|estimate - truth\\| / \\|truth\\|, per cent."""
+"""Table 2: mean of |estimate - truth| / |truth|, per cent."""
 NONOPTIMAL_PRINTED = {
     "theta1": 17.5745, "phi1": 19.5877, "K1": 30.1383, "b1": 495.4044,
     "nu1": 7.8072, "nu2": 11.3287, "K2": 56.1574, "b2": 540.8591,
@@ -92,7 +92,8 @@ class Conditions:
             return np.tile(np.arange(4 * READINGS) * self.period_s, (3, 1))
         place = np.array([self.sampled.index(i) for i in "123"])
         block = 3 * np.arange(4) + place[:, None]
-        return ((block[..., None] * READINGS + np.arange(READINGS)) * self.period_s).reshape(3, -1)
+        count = block[..., None] * READINGS + np.arange(READINGS)
+        return self.period_s * count.reshape(3, -1).astype(float)
 
 
 FIXED = Bench((), GRAVITY_MPS2)
@@ -104,7 +105,6 @@ class OrientationSet:
     """Four orientations with 100 readings each: the specific force (3, n, 3) that each accelerometer sees."""
 
     force_mps2: Floats
-    elapsed_s: Floats = field(default_factory=lambda: np.zeros((3, 4 * READINGS)))
 
     @cached_property
     def design(self) -> Floats:
@@ -199,16 +199,15 @@ def log_ratio(figures: Floats, column: Floats) -> Floats:
 
 
 def scatter(repetitions: int) -> float:
-    """Relative 1 sigma of a mean of \\|normal error\\| over so many runs: sqrt((pi/2 - 1) / r), 5.3 % for 200."""
+    """Relative 1 sigma of a mean of |normal error| over so many runs: sqrt((pi/2 - 1) / r), 5.3 % for 200."""
     return math.sqrt((math.pi / 2 - 1) / repetitions)
 
 
-def nonoptimal(conditions: Conditions | None = None) -> OrientationSet:
-    """The paper's first set; None: with gravity fixed in the bench."""
-    bench, own = (FIXED, Conditions(0.0)) if conditions is None else (conditions.bench, conditions)
-    pose = np.repeat(attitudes(own.turns), READINGS, axis=0)
-    elapsed_s = own.elapsed_s()
-    return OrientationSet(np.array([bench.specific_force(each, pose) for each in elapsed_s]), elapsed_s)
+def nonoptimal(conditions: Conditions, earth_turns: bool = True) -> OrientationSet:
+    """The paper's first set; without the Earth's rotation: as printed."""
+    bench = conditions.bench if earth_turns else FIXED
+    pose = np.repeat(attitudes(conditions.turns), READINGS, axis=0)
+    return OrientationSet(np.array([bench.specific_force(each, pose) for each in conditions.elapsed_s()]))
 
 
 def attitudes(turns: Turns) -> Floats:
@@ -222,17 +221,16 @@ def optimal(conditions: Conditions | None = None, turned_after: bool = True) -> 
     turned_after: under ``conditions`` every orientation points at gravity as it stands on arrival, else as at first.
     """
     along = paper.optimal_directions(paper.nominal())
-    bench, elapsed_s = FIXED, np.tile(np.arange(4 * READINGS) * 1.0, (3, 1))
-    carried = Rotation.identity(4)
+    bench, period_s, carried = FIXED, 0.0, Rotation.identity(4)
     if conditions is not None:
-        bench, elapsed_s = conditions.bench, elapsed_s * conditions.period_s
-        if turned_after:
-            carried = Rotation.from_rotvec(np.outer(elapsed_s[0, ::READINGS], bench.earth_rate_radps))
-    force = [
-        bench.specific_force(own, np.repeat((carried * _pointing(directions)).as_quat(), READINGS, axis=0))
-        for own, directions in zip(elapsed_s, along, strict=True)
-    ]
-    return OrientationSet(np.array(force), elapsed_s)
+        bench, period_s = conditions.bench, conditions.period_s
+    elapsed_s = period_s * np.arange(4.0 * READINGS)
+    if conditions is not None and turned_after:
+        carried = Rotation.from_rotvec(np.outer(elapsed_s[::READINGS], bench.earth_rate_radps))
+    poses = [(carried * _pointing(directions)).as_quat() for directions in along]
+    return OrientationSet(
+        np.array([bench.specific_force(elapsed_s, np.repeat(pose, READINGS, axis=0)) for pose in poses])
+    )
 
 
 def _pointing(directions: Floats) -> Rotation:
@@ -242,16 +240,14 @@ def _pointing(directions: Floats) -> Rotation:
 
 @dataclass(frozen=True)
 class Column:
-    """A set run many times: mean of \\|error\\| by least squares and by the filter, (12,) per cent.
+    """A set run many times: mean of |error| by least squares and by the filter, (12,) per cent.
 
-    covariances (n, 12, 12): the filter's, of the affine state, after every reading. difference_sigma: the largest
-    difference of the two estimates.
+    difference_sigma: the largest difference of the two estimates in any repetition.
     """
 
     orientations: OrientationSet
     least_squares: Floats
     kalman: Floats
-    covariances: Floats
     difference_sigma: float
 
 
@@ -262,10 +258,12 @@ def run(orientations: OrientationSet, repetitions: int, rng: np.random.Generator
     clean, expected = (_readings(orientations.force_mps2, each)[..., None] for each in (truth, nominal))
     readings = clean + NOISE_MPS2 * rng.standard_normal((*clean.shape[:2], repetitions))
     by_batch = nominal[:, None] + _least_squares(orientations.design, readings - expected)
-    by_filter, covariances = _filtered(orientations.force_mps2, readings)
+    diffuse = np.eye(12) * _DIFFUSE * NOISE_MPS2 / np.tile(_SCALE, 3)
+    states, _ = _filtered(orientations.force_mps2, readings, diffuse)
+    by_filter = paper.parameters_of(states.T).T
     figures = [per_cent(np.abs(each - truth[:, None]).mean(axis=1)) for each in (by_batch, by_filter)]
     difference = np.abs(by_filter - by_batch).max(axis=1) / orientations.sigma
-    return Column(orientations, figures[0], figures[1], covariances, float(difference.max()))
+    return Column(orientations, figures[0], figures[1], float(difference.max()))
 
 
 def _readings(force_mps2: Floats, parameters: Floats) -> Floats:
@@ -279,19 +277,26 @@ def _least_squares(design: Floats, differences: Floats) -> Floats:
     return np.concatenate([np.linalg.lstsq(own, b, rcond=None)[0] for own, b in zip(design, differences, strict=True)])
 
 
-def _filtered(force_mps2: Floats, readings: Floats) -> tuple[Floats, Floats]:
-    """Parameters (12, r) and the covariance of the affine state (n, 12, 12) after every reading, diffuse prior."""
-    count = force_mps2.shape[1]
-    observations = np.zeros((count, 3, 12))
+def _filtered(force_mps2: Floats, readings: Floats, root: Floats) -> tuple[Floats, Floats]:
+    """Affine states (12, r) at the end, and their covariance (n, 12, 12) after every reading.
+
+    The prior is nominal, of covariance L L^T, L = ``root`` (12, 12).
+    """
+    observations = np.zeros((force_mps2.shape[1], 3, 12))
     for i in range(3):
         observations[:, i, 4 * i : 4 * i + 3], observations[:, i, 4 * i + 3] = force_mps2[i], 1.0
-    start, wide = paper.state_of(paper.nominal()), _DIFFUSE * NOISE_MPS2 / np.tile(_SCALE, 3)
-    # in units of m/s^2 all twelve states are of one size
-    scale = np.tile(_SCALE, 3)
+    scale = np.tile(_SCALE, 3)  # in units of m/s^2 all twelve states are of one size
+    start = scale * paper.state_of(paper.nominal())
     states, covariances = kalman.repeated(
-        observations / scale, readings.transpose(1, 0, 2), NOISE_MPS2, start * scale, wide * scale
+        observations / scale, readings.transpose(1, 0, 2), NOISE_MPS2, start, scale[:, None] * root
     )
-    return paper.parameters_of((states / scale[:, None]).T).T, covariances / np.outer(scale, scale)
+    return states / scale[:, None], covariances / np.outer(scale, scale)
+
+
+def shrinking(orientations: OrientationSet, prior: Floats) -> Floats:
+    """Covariance of the affine state (n + 1, 12, 12): that of the ``prior`` (12, 12), and after every reading."""
+    none, root = np.empty((3, 4 * READINGS, 0)), np.linalg.cholesky(prior).astype(float)
+    return np.stack([prior, *_filtered(orientations.force_mps2, none, root)[1]])
 
 
 @dataclass(frozen=True)
@@ -309,5 +314,5 @@ class Experiment:
 def repeat(conditions: Conditions | None = None, repetitions: int = REPETITIONS, seed: int = 0) -> Experiment:
     """The paper's experiment: the optimal set with gravity fixed, the non-optimal one under inferred conditions."""
     own, rng = conditions or Conditions(), np.random.default_rng(seed)
-    columns = [run(orientations, repetitions, rng) for orientations in (optimal(), nonoptimal(own))]
-    return Experiment(own, repetitions, seed, *columns, nonoptimal())
+    best, other = run(optimal(), repetitions, rng), run(nonoptimal(own), repetitions, rng)
+    return Experiment(own, repetitions, seed, best, other, nonoptimal(own, earth_turns=False))

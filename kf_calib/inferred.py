@@ -95,9 +95,9 @@ def shared_floor() -> float:
     nominal 0.5 deg: theta1, theta3, K2 g show that along y, phi1, nu2, K3 that along z, nu1, phi3, K1 that along x,
     and the three biases have one error. The best any conditions can do is the geometric mean of each four.
     """
-    column = dict(zip(paper.SYMBOLS, experiment.printed(experiment.NONOPTIMAL_PRINTED) * DEVIATIONS, strict=True))
+    error = experiment.printed(experiment.NONOPTIMAL_PRINTED) * DEVIATIONS
     groups = (("theta1", "theta3", "K2"), ("phi1", "nu2", "K3"), ("nu1", "phi3", "K1"), ("b1", "b2", "b3"))
-    logs = np.log([[column[symbol] for symbol in group] for group in groups])
+    logs = np.log([[error[paper.SYMBOLS.index(symbol)] for symbol in group] for group in groups])
     return float(np.sqrt(np.mean((logs - logs.mean(axis=1, keepdims=True)) ** 2)))
 
 

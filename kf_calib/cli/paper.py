@@ -12,17 +12,41 @@ from kf_calib.cli.options import json_option, print_json, progress, save_picture
 @click.command()
 @click.option("--repetitions", type=click.IntRange(1, 20000), default=200, show_default=True, help="Runs of each set.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the noise.")
-@click.option("--period-s", type=click.FloatRange(min=0, min_open=True, max=3600), default=25.0, show_default=True,
-              help="From reading to reading in the non-optimal set, s; inferred, not printed in the paper.")
-@click.option("--latitude", type=click.FloatRange(-85, 85), default=55.75, show_default=True,
-              help="Latitude of the bench, deg; inferred.")
-@click.option("--azimuth", type=click.FloatRange(-360, 360), default=0.0, show_default=True,
-              help="Azimuth of the bench's x axis, deg; inferred.")
-@click.option("--turns", type=click.Choice(["platform", "platform-after-2", "bench", "bench-after-2"]),
-              default="platform", show_default=True,
-              help="Whose axes the turns are about, and whether the third orientation goes on after the second.")
-@click.option("--sampled", type=click.Choice(["together", "123", "132", "213", "231", "312", "321"]),
-              default="together", show_default=True, help="Accelerometers read at once, or in turn in each orientation.")
+@click.option(
+    "--period-s",
+    type=click.FloatRange(min=0, min_open=True, max=3600),
+    default=25.0,
+    show_default=True,
+    help="From reading to reading in the non-optimal set, s; inferred, not printed in the paper.",
+)
+@click.option(
+    "--latitude",
+    type=click.FloatRange(-85, 85),
+    default=55.75,
+    show_default=True,
+    help="Latitude of the bench, deg; inferred.",
+)
+@click.option(
+    "--azimuth",
+    type=click.FloatRange(-360, 360),
+    default=0.0,
+    show_default=True,
+    help="Azimuth of the bench's x axis, deg; inferred.",
+)
+@click.option(
+    "--turns",
+    type=click.Choice(["platform", "platform-after-2", "bench", "bench-after-2"]),
+    default="platform",
+    show_default=True,
+    help="Whose axes the turns are about, and whether the third orientation goes on after the second.",
+)
+@click.option(
+    "--sampled",
+    type=click.Choice(["together", "123", "132", "213", "231", "312", "321"]),
+    default="together",
+    show_default=True,
+    help="Accelerometers read at once, or in turn in each orientation.",
+)
 @click.option("--rrd", type=click.Path(path_type=Path), help="Save the Rerun view here.")
 @click.option("--png", type=click.Path(path_type=Path), help="Save a picture of the Rerun view here.")
 @json_option

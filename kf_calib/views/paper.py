@@ -10,19 +10,19 @@ from rich.table import Table
 from rich.text import Text
 
 from kf_calib import experiment, paper
-from kf_calib.experiment import NONOPTIMAL_PRINTED, OPTIMAL_PRINTED, TOGETHER, Column, Conditions, Experiment
+from kf_calib.experiment import NONOPTIMAL_PRINTED, OPTIMAL_PRINTED, TOGETHER, Conditions, Experiment
 from kf_calib.inferred import AZIMUTHS_DEG, PERIODS_S, Found, Search
 from kf_calib.samples import Floats
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
 
 _ABOUT = {
-    "platform": "turns about the platform's axes, 3 from the first orientation",
-    "platform-after-2": "turns about the platform's axes, 3 after 2",
-    "bench": "turns about the bench's axes, 3 from the first orientation",
-    "bench-after-2": "turns about the bench's axes, 3 after 2",
+    "platform": "turns about the platform's axes, the third from the start",
+    "platform-after-2": "turns about the platform's axes, the third after the second",
+    "bench": "turns about the bench's axes, the third from the start",
+    "bench-after-2": "turns about the bench's axes, the third after the second",
 }
-_WORDS = {2: "two", 3: "three"}
+_WORDS = {1: "one", 2: "two", 3: "three"}
 
 
 def paper_object(found: Experiment, searched: Search) -> dict[str, Any]:
@@ -110,20 +110,14 @@ def table2(found: Experiment) -> Table:
         for k, heading in enumerate(("paper", "expected", "batch", "filter")):
             table.add_column(f"{name if k == 0 else ''}\n{heading}", justify="right")
     for k, name in enumerate(_order()):
-        cells = [_cells(column, _printed(key), name)
-                 for key, column in (("optimal", found.optimal), ("nonoptimal", found.nonoptimal))]  # fmt: skip
-        table.add_row(symbol(name), *cells[0], *cells[1], end_section=k in (5, 8))
+        table.add_row(symbol(name), *_both(found, name), end_section=k in (5, 8))
     return table
 
 
 def markdown(found: Experiment, searched: Search) -> str:
     """The same in one page for the Rerun view."""
-    head = "| % | optimal: paper | expected | batch | non-optimal: paper | expected | batch |\n|:--|--:|--:|--:|--:|--:|--:|\n"
-    rows = [
-        f"| {symbol(name)} | " + " | ".join(_cells(found.optimal, _printed("optimal"), name)[:3]
-        + _cells(found.nonoptimal, _printed("nonoptimal"), name)[:3]) + " |"
-        for name in _order()
-    ]  # fmt: skip
+    head = "| | optimal % | batch | non-opt. % | batch |\n|:--|--:|--:|--:|--:|\n"
+    rows = [f"| {symbol(name)} | " + " | ".join(np.array(_both(found, name))[[0, 2, 4, 6]]) + " |" for name in _order()]
     return head + "\n".join(rows) + "\n\n" + "\n\n".join(sentences(found, searched)) + "\n"
 
 
@@ -136,10 +130,13 @@ def _of_unit(unit: str) -> list[str]:
     return [name for name, own in zip(paper.SYMBOLS, paper.UNITS, strict=True) if own == unit]
 
 
-def _cells(column: Column, printed: Floats, name: str) -> list[str]:
-    k = paper.SYMBOLS.index(name)
-    figures = (column.orientations.expected[k], column.least_squares[k], column.kalman[k])
-    return [f"{printed[k]:.4f}", *(f"{figure:#.4g}" for figure in figures)]
+def _both(found: Experiment, name: str) -> list[str]:
+    """Print, expectation, least squares and filter of the optimal set, then of the other."""
+    k, cells = paper.SYMBOLS.index(name), list[str]()
+    for key, column in (("optimal", found.optimal), ("nonoptimal", found.nonoptimal)):
+        figures = (column.orientations.expected[k], column.least_squares[k], column.kalman[k])
+        cells += [f"{_printed(key)[k]:.4f}", *(f"{figure:#.4g}" for figure in figures)]
+    return cells
 
 
 def sentences(found: Experiment, searched: Search) -> list[str]:
@@ -149,13 +146,13 @@ def sentences(found: Experiment, searched: Search) -> list[str]:
 
 
 def _scatter(found: Experiment) -> str:
-    ours, print_ = experiment.scatter(found.repetitions), experiment.scatter(experiment.REPETITIONS)
-    off = np.abs(found.optimal.least_squares / _printed("optimal") - 1).max()
-    expected = np.abs(_printed("optimal") / found.optimal.orientations.expected - 1).max()
+    column = _printed("optimal")
+    expected = np.abs(column / found.optimal.orientations.expected - 1).max()
+    off = np.abs(found.optimal.least_squares / column - 1).max()
     return (
-        f"A mean of {found.repetitions} repetitions scatters by {_percent(ours)} (1σ), the print by {_percent(print_)}. "
-        f"Optimal set: the print is at most {_percent(expected)} from the expectation, these runs at most "
-        f"{_percent(off)} from the print. Expected: sqrt(2/pi) σ / |deviation|."
+        f"Expected is sqrt(2/pi) σ / deviation; a mean of {found.repetitions} runs scatters about it by "
+        f"{_percent(experiment.scatter(found.repetitions))} (1σ). Optimal set: the print is within "
+        f"{_percent(expected)} of the expectation, these runs within {_percent(off)} of the print."
     )
 
 
@@ -164,69 +161,68 @@ def rank_sentence(found: Experiment) -> str:
     rank = int(found.fixed.rank.min())
     same = " and ".join(f"orientations {one} and {other} share the vertical" for one, other in found.fixed.same_vector)
     return (
-        f"Non-optimal set with gravity fixed: {same}, so the accelerometers see {_WORDS[rank]} different vectors for four "
-        f"unknowns, D has rank {rank} of 4, and the errors are infinite: as printed, the figures are not possible."
+        f"Non-optimal set with gravity fixed: {same}, so there are {_WORDS[rank]} different vectors for four unknowns; "
+        f"D has rank {rank}, and the errors would be infinite."
     )
 
 
 def _inferred(found: Experiment) -> str:
-    column, own = _printed("nonoptimal"), found.conditions
-    closed, ran = (experiment.log_ratio(each, column) for each in
-                   (found.nonoptimal.orientations.expected, found.nonoptimal.least_squares))  # fmt: skip
+    column, hours = _printed("nonoptimal"), found.conditions.duration_s / 3600
+    closed = experiment.log_ratio(found.nonoptimal.orientations.expected, column)
+    ran = experiment.log_ratio(found.nonoptimal.least_squares, column)
     return (
-        "They are finite where the platform is held in inertial space and the Earth turns gravity in it. INFERRED, not "
-        f"printed: {_described(own)}, {own.duration_s / 3600:.1f} h in all. "
-        f"Rms log-ratio to the print: {closed:.2f} expected, {ran:.2f} in these runs."
+        "They are finite where the platform is held in inertial space and the Earth turns gravity in it. Under which "
+        f"conditions the paper does not say; INFERRED from its table: {_described(found.conditions)} ({hours:.1f} h in "
+        f"all), latitude {found.conditions.latitude_deg:g}°. Rms log-ratio to the print: {closed:.2f} expected, "
+        f"{ran:.2f} in these runs."
     )
 
 
 def _described(conditions: Conditions) -> str:
-    sampled = "the accelerometers read together" if conditions.sampled == TOGETHER else (
-        f"the accelerometers read one after another in the order {' '.join(conditions.sampled)}"
-    )  # fmt: skip
+    order = " ".join(conditions.sampled)
+    sampled = "together" if conditions.sampled == TOGETHER else f"one after another ({order}) in each orientation"
     return (
-        f"a sampling period of {conditions.period_s:.3g} s, latitude {conditions.latitude_deg:g}°, azimuth "
-        f"{conditions.azimuth_deg:g}°, {_ABOUT[conditions.turns]}, {sampled}"
+        f"accelerometers read {sampled}, a reading every {conditions.period_s:.3g} s, azimuth "
+        f"{conditions.azimuth_deg:g}°, {_ABOUT[conditions.turns]}"
     )
 
 
 def _searched(searched: Search) -> list[str]:
     together, in_turn, worst = searched.together, searched.in_turn, int(searched.bias_excess.argmax())
     return [
-        f"Searched: {searched.tried} conditions ({len(AZIMUTHS_DEG)} azimuths, {len(PERIODS_S)} periods, "
-        f"{len(experiment.TURNS)} readings of the turns, {len(experiment.SAMPLED)} orders of sampling). Nearest with "
-        f"the accelerometers read together: {together.log_ratio:.3f}, {_described(together.conditions)}; no condition "
-        f"at all can come below {searched.floor:.3f} while all three see the same vectors. Nearest one after another: "
-        f"{in_turn.log_ratio:.3f}, {_described(in_turn.conditions)}.",
-        f"True conditions would leave about {searched.scatter:.3f}, so none of these are: of so many, some come near "
-        f"by chance. The print of accelerometer {worst + 1} is itself {searched.bias_excess[worst]:.2f} times what any "
-        "directions allow for the error of its bias beside those of its angles and scale factor.",
+        f"Of {searched.tried} conditions tried ({len(AZIMUTHS_DEG)} azimuths, {len(PERIODS_S)} periods, "
+        f"{len(experiment.TURNS)} readings of the turns, {len(experiment.SAMPLED)} orders of sampling) the nearest are "
+        f"{together.log_ratio:.3f}: {_described(together.conditions)}; and {in_turn.log_ratio:.3f}: "
+        f"{_described(in_turn.conditions)}.",
+        f"Read together, nothing can come below {searched.floor:.3f}, because θ1 and θ3, φ1 and ν2, ν1 and φ3 then "
+        f"have equal errors. The print's own scatter would leave {searched.scatter:.3f}: neither is shown to be the "
+        "paper's, and of so many some come near by chance. "
+        f"The print for b{worst + 1} is {searched.bias_excess[worst]:.2f} times what any directions allow beside the print for that accelerometer's angles and scale factor.",
     ]
 
 
 def _earth(found: Experiment) -> str:
     turned, left = _turning(found)
     return (
-        "The optimal set above has gravity fixed. With the Earth turning as inferred, its expectation is "
-        f"{turned:.3f} from the print where each orientation is pointed at gravity as it stands on arrival, {left:.3f} "
-        "where as it stood at first."
+        "The optimal set above has gravity fixed. Were the Earth to turn as inferred, its expectation would be "
+        f"{turned:.3f} from the print with each orientation set by gravity as it stands on arrival, {left:.3f} as it "
+        "stood at first."
     )
 
 
 def _conditioning(found: Experiment) -> str:
     parts = [
-        f"{name} {', '.join(f'{value:.4g}' for value in each.condition_numbers)} "
-        f"({each.condition_numbers_in_g.max():.3g} in units of g)"
+        f"{name} {each.condition_numbers.max():.4g} ({each.condition_numbers_in_g.max():.3g} in units of g)"
         for name, each in (("optimal", found.optimal.orientations), ("non-optimal", found.nonoptimal.orientations))
     ]
-    return f"Condition numbers of D for accelerometers 1, 2, 3: {'; '.join(parts)}; with gravity fixed infinite."
+    return f"Condition number of D, the largest of the three: {', '.join(parts)}; with gravity fixed infinite."
 
 
 def _filter(found: Experiment) -> str:
     largest = max(found.optimal.difference_sigma, found.nonoptimal.difference_sigma)
     return (
-        f"The filter and least squares differ by at most {largest:.2g} σ in any repetition: the paper's D is linear in "
-        "the deviations, the filter's model is exact."
+        f"Filter and least squares differ by at most {largest:.2g} σ in any repetition: D is linear in the deviations, "
+        "the filter's model is exact."
     )
 
 

@@ -1,8 +1,9 @@
 """The Rerun view of the paper's experiment: D in blocks, the directions of gravity, both sets' sigmas falling.
 
-Timelines: ``reading`` (of each accelerometer, 1 to 400), and ``orientation`` (1 to 4, at its last reading).
+Timelines: ``reading`` (of each accelerometer, 1 to 400), and ``orientation`` (1 to 4, at its last reading); 0 is the
+prior. The covariance is the filter's from the prior of the navigation grade, the same for both sets.
 Entities: ``optimal/...`` and ``nonoptimal/...``: ``parameters/ACCELEROMETER/SYMBOL/log10_sigma``,
-``directions/...``; ``design/{picture,...}``; ``summary``. Where a parameter is not determined yet there is no point.
+``directions/...``; ``design/{picture,labels}``; ``summary``.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from kf_calib import paper
-from kf_calib.calibration import Estimate
 from kf_calib.errors import InputError
-from kf_calib.experiment import GRAVITY_MPS2, READINGS, Column, Experiment
+from kf_calib.experiment import GRAVITY_MPS2, READINGS, Column, Experiment, shrinking
+from kf_calib.model import PRIORS
 from kf_calib.samples import Floats
 from kf_calib.views.rerun.correlation import LIFT, picture
 from kf_calib.views.rerun.names import (
@@ -36,7 +37,7 @@ from kf_calib.views.rerun.names import (
 )
 
 READING = "reading"
-SETS = {"optimal": "optimal set", "nonoptimal": "non-optimal set"}
+SETS = {"optimal": "optimal", "nonoptimal": "non-optimal"}
 _COLUMN, _GAP, _BETWEEN = 24, 14, 60  # pixels of a column of D, between accelerometers, between the sets
 _UNIT = np.array([GRAVITY_MPS2, GRAVITY_MPS2, GRAVITY_MPS2, 1.0])
 
@@ -64,23 +65,22 @@ def _columns(found: Experiment) -> dict[str, Column]:
 
 
 def _sigmas(column: Column) -> Floats:
-    """log10 of sigma after every reading in shown units (n, 12), NaN where not determined."""
-    state, determined = paper.state_of(paper.nominal()), np.empty((12, 0))
-    sigma = [Estimate(state, covariance, determined).sigma for covariance in column.covariances]
-    return np.log10(np.array(sigma) * PER_SI)
+    """log10 of sigma in shown units (n + 1, 12): of the prior, and after every reading."""
+    nominal = paper.nominal()
+    jacobian = paper.jacobian(paper.state_of(nominal))
+    covariances = shrinking(column.orientations, PRIORS["navigation"].covariance(nominal))
+    variance = np.diagonal(jacobian @ covariances @ jacobian.T, axis1=1, axis2=2)
+    return np.log10(np.sqrt(variance) * PER_SI)
 
 
 def _log_sigmas(stream: rr.RecordingStream, name: str, logs: Floats) -> None:
-    reading = np.arange(1, len(logs) + 1)
+    reading = np.arange(len(logs))
     last = reading % READINGS == 0
     for k, symbol in enumerate(paper.SYMBOLS):
-        path, seen = f"{name}/{path_of(symbol)}/log10_sigma", np.isfinite(logs[:, k])
-        for rows in (seen & last, seen & ~last):
-            index = [rr.TimeColumn(READING, sequence=reading[rows])]
-            if last[rows].any():
-                index.append(rr.TimeColumn(ORIENTATION, sequence=reading[rows] // READINGS))
-            if rows.any():
-                stream.send_columns(path, index, rr.Scalars.columns(scalars=logs[rows, k]))
+        path = f"{name}/{path_of(symbol)}/log10_sigma"
+        for rows, index in ((last, [rr.TimeColumn(ORIENTATION, sequence=reading[last] // READINGS)]), (~last, [])):
+            times = [rr.TimeColumn(READING, sequence=reading[rows]), *index]
+            stream.send_columns(path, times, rr.Scalars.columns(scalars=logs[rows, k]))
         stream.log(path, rr.SeriesLines(names=LABELS[symbol], colors=colour_of(symbol), widths=1.5), static=True)
 
 
@@ -96,9 +96,9 @@ def _log_directions(stream: rr.RecordingStream, name: str, column: Column) -> No
     arcs = (column.orientations.force_mps2 / GRAVITY_MPS2).reshape(3, 4, READINGS, 3)
     shared = np.allclose(arcs, arcs[0])
     colours = [GOLD] if shared else ACCELEROMETERS
-    for i, (arc, colour) in enumerate(zip(arcs[:1] if shared else arcs, colours, strict=True)):
+    for i, (arc, colour) in enumerate(zip(arcs[: len(colours)], colours, strict=True)):
         path = f"{name}/directions/{'all' if shared else f'a{i + 1}'}"
-        stream.log(path, rr.LineStrips3D(arc, colors=colour, radii=0.012), static=True)
+        stream.log(path, rr.LineStrips3D(list(arc), colors=colour, radii=0.012), static=True)
         points = rr.Points3D(
             arc[:, 0], colors=colour, radii=0.035, labels=[f"{k}" for k in range(1, 5)], show_labels=shared
         )
@@ -111,11 +111,11 @@ def _log_design(stream: rr.RecordingStream, found: Experiment) -> None:
     left = 0
     for name, column in _columns(found).items():
         width = 3 * 4 * _COLUMN + 2 * _GAP
-        labels.append((left + width / 2, -52.0, SETS[name], WHITE))
+        labels.append((left + width / 2, -66.0, SETS[name], WHITE))
         for i, design in enumerate(column.orientations.design):
             panels += [_blocks(design), _blank(_GAP if i < 2 else _BETWEEN)]
             for k, symbol in enumerate(paper.SYMBOLS[4 * i : 4 * i + 4]):
-                labels.append((left + (k + 0.5) * _COLUMN, -22.0, LABELS[symbol], colour_of(symbol)))
+                labels.append((left + (k + 0.5) * _COLUMN, -36.0, LABELS[symbol], colour_of(symbol)))
             left += 4 * _COLUMN + (_GAP if i < 2 else _BETWEEN)
     whole = np.concatenate(panels[:-1], axis=1)
     stream.log("design/picture", rr.Image(whole), static=True)
@@ -136,12 +136,12 @@ def _blank(width: int) -> NDArray[np.uint8]:
 
 def _layout(sigmas: dict[str, Floats]) -> rrb.Blueprint:
     curves = [
-        rrb.Vertical(*(_curves(name, group.title, group.unit, group.symbols, sigmas) for group in GROUPS),
+        rrb.Vertical(*(_curves(name, group.unit, group.symbols, sigmas) for group in GROUPS),
                      row_shares=[5, 4, 4]) for name in SETS
     ]  # fmt: skip
     spheres = [
         rrb.Spatial3DView(
-            origin=f"{name}/directions", name=f"{SETS[name]}: specific force in the platform", line_grid=False,
+            origin=f"{name}/directions", name=f"{SETS[name]}: up in the platform", line_grid=False,
             eye_controls=rrb.EyeControls3D(position=(1.9, 1.3, 2.3), look_target=(0.0, 0.1, 0.0), eye_up=(0, 1, 0)),
         )
         for name in SETS
@@ -150,14 +150,14 @@ def _layout(sigmas: dict[str, Floats]) -> rrb.Blueprint:
     design = rrb.Spatial2DView(
         origin="design",
         name="D: blue −g, orange +g (bias: 1); a row a reading",
-        visual_bounds=rrb.VisualBounds2D(x_range=[-40.0, width + 10.0], y_range=[-75.0, 4 * READINGS + 10.0]),
+        visual_bounds=rrb.VisualBounds2D(x_range=[-40.0, width + 10.0], y_range=[-80.0, 4 * READINGS + 10.0]),
     )
     return rrb.Blueprint(
         rrb.Horizontal(
             *curves,
-            rrb.Vertical(design, rrb.Horizontal(*spheres), row_shares=[5, 4]),
+            rrb.Vertical(design, rrb.Horizontal(*spheres), row_shares=[1, 1]),
             rrb.TextDocumentView(origin="summary", name="Table 2"),
-            column_shares=[3, 3, 5, 3.4],
+            column_shares=[3.2, 3.2, 4.8, 4.2],
         ),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
@@ -165,17 +165,15 @@ def _layout(sigmas: dict[str, Floats]) -> rrb.Blueprint:
     )
 
 
-def _curves(
-    name: str, title: str, unit: str, symbols: Sequence[str], sigmas: dict[str, Floats]
-) -> rrb.TimeSeriesView:
+def _curves(name: str, unit: str, symbols: Sequence[str], sigmas: dict[str, Floats]) -> rrb.TimeSeriesView:
     """sigma of one kind of parameter over the readings; the same scale in both sets."""
     places = [paper.SYMBOLS.index(symbol) for symbol in symbols]
     logs = np.concatenate([each[:, places] for each in sigmas.values()])
-    low, high = float(np.nanmin(logs)), float(np.nanmax(logs[np.isfinite(logs)]))
+    low, high = float(logs.min()), float(logs.max())
     ends = rr.TimeRangeBoundary.infinite()
     return rrb.TimeSeriesView(
         contents=[f"{name}/{path_of(symbol)}/log10_sigma" for symbol in symbols],
-        name=f"{SETS[name]}: σ of {title}, log₁₀ of {unit}",
+        name=f"{SETS[name]}: σ, log₁₀ of {unit}",
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftBottom, visible=True),
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=ends, end=ends)),
         axis_y=rrb.ScalarAxis(range=(low - 0.2, high + 0.2)),
