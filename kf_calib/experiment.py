@@ -93,7 +93,7 @@ class Conditions:
         place = np.array([self.sampled.index(i) for i in "123"])
         block = 3 * np.arange(4) + place[:, None]
         count = block[..., None] * READINGS + np.arange(READINGS)
-        return self.period_s * count.reshape(3, -1).astype(float)
+        return np.asarray(self.period_s * count.reshape(3, -1))
 
 
 FIXED = Bench((), GRAVITY_MPS2)

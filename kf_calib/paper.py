@@ -111,6 +111,7 @@ def h_rows(parameters: Floats) -> Floats:
     - (9): the root sqrt(1 - sin nu1 - sin nu2) lacks the squares.
     - (10): both derivatives of E_z have a sqrt(1 - sin^2 psi3) where sqrt(1 - cos^2 psi3) = -sin psi3 is meant, as in
       its row of K: at psi3 = -90 deg d E_z / d theta is 0 instead of -sin theta3, d E_z / d phi is 0/0 instead of 0.
+      The figures were not computed so: K3 of Table 2 would be off by 2.5 %.
     - psi is phi; Table 1 names nu2 a second nu1, and has 30 arcsec as the nominal value of both, where (3) has 0.
     """
     jacobian = sensitivity_jacobian(parameters)

@@ -197,7 +197,8 @@ def _searched(searched: Search) -> list[str]:
         f"Read together, nothing can come below {searched.floor:.3f}, because θ1 and θ3, φ1 and ν2, ν1 and φ3 then "
         f"have equal errors. The print's own scatter would leave {searched.scatter:.3f}: neither is shown to be the "
         "paper's, and of so many some come near by chance. "
-        f"The print for b{worst + 1} is {searched.bias_excess[worst]:.2f} times what any directions allow beside the print for that accelerometer's angles and scale factor.",
+        f"The print for b{worst + 1} is {searched.bias_excess[worst]:.2f} times what any "
+        "directions allow beside the print for that accelerometer's angles and scale factor.",
     ]
 
 

@@ -141,8 +141,8 @@ def _layout(sigmas: dict[str, Floats]) -> rrb.Blueprint:
     ]  # fmt: skip
     spheres = [
         rrb.Spatial3DView(
-            origin=f"{name}/directions", name=f"{SETS[name]}: up in the platform", line_grid=False,
-            eye_controls=rrb.EyeControls3D(position=(1.9, 1.3, 2.3), look_target=(0.0, 0.1, 0.0), eye_up=(0, 1, 0)),
+            origin=f"{name}/directions", name=f"{SETS[name]}: up", line_grid=False,
+            eye_controls=rrb.EyeControls3D(position=(2.4, 1.6, 2.9), look_target=(0.0, 0.1, 0.0), eye_up=(0, 1, 0)),
         )
         for name in SETS
     ]  # fmt: skip
