@@ -89,11 +89,11 @@ class Conditions:
     def elapsed_s(self) -> Floats:
         """When each accelerometer's readings are taken, (3, n)."""
         if self.sampled == TOGETHER:
-            return np.tile(np.arange(4 * READINGS) * self.period_s, (3, 1))
+            return np.tile(np.asarray(np.arange(4 * READINGS) * self.period_s, dtype=np.float64), (3, 1))
         place = np.array([self.sampled.index(i) for i in "123"])
         block = 3 * np.arange(4) + place[:, None]
         count = block[..., None] * READINGS + np.arange(READINGS)
-        return np.asarray(self.period_s * count.reshape(3, -1))
+        return np.asarray(self.period_s * count.reshape(3, -1), dtype=np.float64)
 
 
 FIXED = Bench((), GRAVITY_MPS2)
