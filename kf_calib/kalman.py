@@ -74,6 +74,29 @@ def estimate(
     return Posterior(state / scale, covariance / np.outer(scale, scale), nis, done)
 
 
+def repeated(
+    observations: Floats, readings: Floats, sigma_mps2: float, start: Floats, start_root: Floats
+) -> tuple[Floats, Floats]:
+    """One experiment many times over: its final states (p, r) and the covariance (n, p, p) after every sample.
+
+    observations (n, m, p) and the prior, ``start`` (p,) with covariance L L^T, L = ``start_root`` (p, p), are the same
+    in all repetitions, and so are gains and covariance: filterpy's filter runs once, its state a column a repetition.
+    readings (n, m, r).
+    """
+    from filterpy.kalman import SquareRootKalmanFilter
+
+    samples, channels, count = observations.shape
+    kf: Any = SquareRootKalmanFilter(dim_x=count, dim_z=channels)
+    kf.x = np.repeat(start[:, None], readings.shape[2], axis=1)
+    kf._P1_2, kf._R1_2 = start_root, sigma_mps2 * np.eye(channels)  # setters would lose half the digits
+    covariances = np.empty((samples, count, count))
+    for k in range(samples):
+        kf.H = observations[k]
+        kf.update(readings[k])
+        covariances[k] = kf.P
+    return kf.x, covariances
+
+
 class _Filter:
     """One of filterpy's two filters behind the few calls needed here."""
 

@@ -86,11 +86,7 @@ def _arcsine_gradient(axis: Floats, k: int) -> Floats:
 
 
 def sensitivity_jacobian(parameters: Floats) -> Floats:
-    """d state / d parameters (12, 12), in closed form: its blocks are the paper's H transposed (eq. 8-10).
-
-    The paper's print has misprints (signs in (8), missing squares in (9), sqrt(1 - sin^2) for sin in (10));
-    these are derived from (3) and checked against finite differences.
-    """
+    """d state / d parameters (12, 12), in closed form: its blocks are the paper's H transposed (see ``h_rows``)."""
     out = np.zeros((12, 12))
     for i, (p1, p2, scale, _) in enumerate(np.reshape(parameters, (3, 4))):
         c1, s1, c2, s2 = math.cos(p1), math.sin(p1), math.cos(p2), math.sin(p2)
@@ -103,3 +99,40 @@ def sensitivity_jacobian(parameters: Floats) -> Floats:
         block[:3, :3] = np.column_stack([scale * np.array(first), scale * np.array(second), axis])
         out[4 * i : 4 * i + 4, 4 * i : 4 * i + 4] = block
     return out
+
+
+def h_rows(parameters: Floats) -> Floats:
+    """The paper's H (3, 3, 3), eq. 8-10: of each accelerometer the rows d(KE)/dp1, d(KE)/dp2, E.
+
+    What the paper prints differs. Each of these is checked by finite differences in tests/test_paper_experiment.py:
+
+    - (5) has g_j on the right-hand side again, although the left-hand side is the reading less g_j.
+    - (8): d E_z / d theta and d E_z / d phi have the sign of the opposite Z axis; the row of K has the right one.
+    - (9): the root sqrt(1 - sin nu1 - sin nu2) lacks the squares.
+    - (10): both derivatives of E_z have a sqrt(1 - sin^2 psi3) where sqrt(1 - cos^2 psi3) = -sin psi3 is meant, as in
+      its row of K: at psi3 = -90 deg d E_z / d theta is 0 instead of -sin theta3, d E_z / d phi is 0/0 instead of 0.
+      The figures were not computed so: K3 of Table 2 would be off by 2.5 %.
+    - psi is phi; Table 1 names nu2 a second nu1, and has 30 arcsec as the nominal value of both, where (3) has 0.
+    """
+    jacobian = sensitivity_jacobian(parameters)
+    return np.stack([jacobian[4 * i : 4 * i + 3, 4 * i : 4 * i + 3].T for i in range(3)])
+
+
+def design(force_mps2: Floats, parameters: Floats) -> Floats:
+    """The paper's D (3, n, 4), eq. 6-7: d reading / d (p1, p2, K, b) of each accelerometer, a row [H f, 1] a reading.
+
+    force_mps2 (3, n, 3): the specific force at each reading of each accelerometer; (n, 3): the same for all three.
+    """
+    slopes = np.broadcast_to(force_mps2, (3, *np.shape(force_mps2)[-2:])) @ h_rows(parameters).transpose(0, 2, 1)
+    return np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=2)
+
+
+def optimal_directions(parameters: Floats) -> Floats:
+    """The paper's optimal set: unit vectors (3, 4, 3), the specific force in four orientations for each accelerometer.
+
+    Along h2 x h3, h1 x h3 and h1 x h2 one parameter alone is excited; the fourth is opposite to the third.
+    """
+    h1, h2, h3 = np.moveaxis(h_rows(parameters), 1, 0)
+    along = np.stack([np.cross(h2, h3), np.cross(h1, h3), np.cross(h1, h2)], axis=1)
+    along /= np.linalg.norm(along, axis=2, keepdims=True)
+    return np.concatenate([along, -along[:, 2:]], axis=1)

@@ -196,14 +196,23 @@ def progress(text: str, quiet: bool = False) -> Iterator[Callable[[float], None]
 
 
 def save_views(result: Any, rrd: Path | None, png: Path | None) -> None:
+    """The Rerun view of a run, and its picture."""
+    if rrd or png:
+        from kf_calib.views import rerun
+
+        save_pictures(lambda path: rerun.save(result, path), rrd, png)
+
+
+def save_pictures(save: Callable[[Path], object], rrd: Path | None, png: Path | None) -> None:
+    """What ``save`` writes as a Rerun recording, and a picture of it; either may be left out."""
     if not (rrd or png):
         return
     import tempfile
 
-    from kf_calib.views import rerun, screenshot
+    from kf_calib.views import screenshot
 
     with tempfile.TemporaryDirectory() as folder:
         saved = rrd or Path(folder) / "view.rrd"
-        rerun.save(result, saved)
+        save(saved)
         if png:
             screenshot.screenshot(saved, png)
