@@ -31,7 +31,10 @@ _UNITS = {
     "m/s^2": {"m/s^2": 1.0, "m/s2": 1.0, "um/s2": 1e-6, "g": G, "mg": 1e-3 * G, "ug": 1e-6 * G},
 }
 _TINY = 1e-12
-_SOFT = (8.0, 64.0, 512.0)
+_SOFT = (16.0, 400.0)
+
+
+Score = Callable[[Floats, float], Floats]
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,7 @@ class Aim:
 
     name: str
     measures: str
-    cost: Callable[[Floats, float], Floats]
+    cost: Score
     powers: tuple[float, ...] = (math.inf,)
 
     def __call__(self, factors: Floats, power: float = math.inf) -> Floats:
@@ -120,7 +123,7 @@ def unseen(factor: Floats) -> Mask:
     return np.asarray((np.abs(lost) > 1e-6).any(axis=0))
 
 
-def slope(aim: Aim, factor: Floats, power: float) -> Floats:
+def slope(aim: Score, factor: Floats, power: float) -> Floats:
     """G (p, p), symmetric: what an aim changes by when the information becomes R^T (1 + B) R is tr(G B).
 
     By central differences R (1 +- h N), upper triangular N; relative to R itself, so that it holds however badly the

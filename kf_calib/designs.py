@@ -21,17 +21,19 @@ import numpy as np
 from scipy.optimize import minimize
 
 from kf_calib import aims
-from kf_calib.aims import Aim
+from kf_calib.aims import Aim, Score
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.prospect import Prospect
 from kf_calib.reach import Reach, wrapped
-from kf_calib.samples import Floats
+from kf_calib.samples import Floats, Ints
 from kf_calib.triangle import triangle
 
+_TIE = 1e-3
 _FIRST = 32  # candidates that promise most, tried exactly
 _SWEEPS = 12
+_FEW = 16  # orientations that one start may lead into a corner
 _STEP_RAD = 1e-5
-_WEIGHINGS = 300
+_WEIGHINGS = 1000
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,8 @@ class Search:
     reach: Reach
     aim: Aim
     scheme: Scheme = Scheme()
+    at_s: Floats | None = None
+    """The middles of the dwells where the orientations are a sequence of visits; None: each might be the next."""
 
     @cached_property
     def candidates(self) -> Floats:
@@ -104,7 +108,7 @@ class Search:
 
     def rows(self, poses: Floats) -> Floats:
         """Whitened rows (n, r, p) of all visits for each orientation (n, k)."""
-        rows = self.prospect.rows(self.scheme.visits(poses))
+        rows = self.prospect.rows(self.scheme.visits(poses), self.at_s)
         return rows.reshape(len(poses), -1, rows.shape[2])
 
     def factor(self, rows: Floats) -> Floats:
@@ -127,47 +131,56 @@ class Search:
         poses = self.candidates[chosen]
         if not self.reach.continuous:
             return poses
-        polished = [self.polished(poses), *(self.polished(self._scattered(count, seed)) for seed in range(2))]
+        starts = [poses, *(self._scattered(count, seed) for seed in range(2 if count <= _FEW else 0))]
+        polished = [self.polished(start) for start in starts]
         return min([poses, *polished], key=self.cost)
 
     def cost(self, poses: Floats) -> float:
-        return float(self.aim(self.factor(self.rows(poses))))
+        return float(self._score(self.factor(self.rows(poses))))
+
+    def _score(self, factors: Floats, power: float = math.inf) -> Floats:
+        """The aim; of sets that serve it alike the one that tells more of everything is better."""
+        return self.aim(factors, power) + _TIE * aims.D(factors)
 
     def _scattered(self, count: int, seed: int) -> Floats:
         return np.random.default_rng(seed).choice(self.candidates, count)
 
     def exchanged(self, count: int) -> list[int]:
-        """Numbers of candidates: greedy, then each dwell exchanged for the best there is until none changes."""
+        """Numbers of candidates: greedy, then each dwell exchanged for the best there is until none changes.
+
+        Greedy by D, which every dwell can improve: a largest sigma falls only when all that is as large does.
+        """
         rows, chosen = self.candidate_rows, list[int]()
         for _ in range(count):
-            chosen.append(self._choice(rows[chosen], chosen + [0])[0])
+            chosen.append(self._choice(aims.D, rows[chosen])[0])
         for _ in range(_SWEEPS):
             before = list(chosen)
             for place in range(count):
                 rest = chosen[:place] + chosen[place + 1 :]
-                best, cost = self._choice(rows[rest], chosen)
-                if cost < float(self.aim(self.factor(rows[chosen]))) - 1e-9:
+                best, cost = self._choice(self._score, rows[rest])
+                if cost < float(self._score(self.factor(rows[chosen]))) - 1e-9:
                     chosen[place] = best
             if chosen == before:
                 break
         return chosen
 
-    def _choice(self, rest: Floats, chosen: list[int]) -> tuple[int, float]:
+    def _choice(self, score: Score, rest: Floats) -> tuple[int, float]:
         """The candidate to go with rows ``rest`` (n, r, p), and the cost of both; those that promise most are tried."""
         rows, upper = self.candidate_rows, self.factor(rest)
         wide = len(rows) > 8 * _FIRST
-        tried = self._promising(upper, chosen) if wide else np.arange(len(rows))
+        tried = self._promising(score, upper) if wide else np.arange(len(rows))
         both = np.concatenate([np.broadcast_to(upper, (len(tried), *upper.shape)), rows[tried]], axis=1)
-        costs = self.aim(triangle(both))
+        costs = score(triangle(both), math.inf)
         k = int(np.argmin(costs))
         return int(tried[k]), float(costs[k])
 
-    def _promising(self, upper: Floats, chosen: list[int]) -> Floats:
-        """Candidates that the slope of the aim, at the design as it is, favours."""
-        full = triangle(np.vstack([upper, self.candidate_rows[chosen[-1]], 1e-3 * np.abs(upper).max() * np.eye(len(upper))]))
-        gradient = aims.slope(self.aim, full, self.aim.powers[0])
-        white = self.candidate_rows @ np.linalg.inv(full)
-        promise = np.einsum("nri,ij,nrj->n", white, gradient, white)
+    def _promising(self, score: Score, upper: Floats) -> Ints:
+        """Candidates that the slope of the aim favours, a little of all of them added to what there is."""
+        rows = self.candidate_rows
+        some = (0.1 / math.sqrt(len(rows))) * rows.reshape(-1, rows.shape[2])
+        spread = triangle(np.vstack([upper, some]))
+        white = rows @ np.linalg.inv(spread)
+        promise = np.einsum("nri,ij,nrj->n", white, aims.slope(score, spread, self.aim.powers[0]), white)
         return np.argsort(promise)[:_FIRST]
 
     def polished(self, poses: Floats) -> Floats:
@@ -175,7 +188,7 @@ class Search:
         shape, rooms = poses.shape, self._rooms(poses)
         for power in self.aim.powers:
             found = minimize(self._with_slope, poses.ravel(), args=(shape, power), jac=True, method="L-BFGS-B",
-                             bounds=rooms.reshape(-1, 2), options={"maxiter": 400, "ftol": 1e-12, "gtol": 1e-9})  # fmt: skip
+                             bounds=rooms.reshape(-1, 2), options={"maxiter": 200, "ftol": 1e-11, "gtol": 1e-9})  # fmt: skip
             poses = found.x.reshape(shape)
         return np.where(np.isfinite(rooms).any(axis=2), poses, wrapped(poses))
 
@@ -192,12 +205,12 @@ class Search:
         rows = self.rows(poses)
         upper = self.factor(rows)
         inverse = np.linalg.inv(aims.regular(upper))
-        weights = rows @ inverse @ aims.slope(self.aim, upper, power) @ inverse.T
+        weights = rows @ inverse @ aims.slope(self._score, upper, power) @ inverse.T
         for j in range(shape[1]):
             step = _STEP_RAD * np.eye(shape[1])[j]
             change = (self.rows(poses + step) - self.rows(poses - step)) / (2.0 * _STEP_RAD)
             gradient[:, j] = 2.0 * np.einsum("nrp,nrp->n", weights, change)
-        return float(self.aim(upper, power)), gradient.ravel()
+        return float(self._score(upper, power)), gradient.ravel()
 
     def variance_function(self, rows: Floats, poses: Floats) -> tuple[float, float]:
         """tr(M0 M^-1), and the largest tr(I(x) M^-1) that can be reached, M of the design ``rows`` (n, r, p)."""
@@ -218,19 +231,19 @@ class Search:
     def d_bound(self, rows: Floats) -> float:
         """An upper bound of log det M*^(1/p) over all designs of as many orientations as ``rows`` (n, r, p).
 
-        Of two: by the design itself, which is tight where that is the optimum, and by the best weights of candidates.
+        Of three: by the design itself, which is tight where that is the optimum, by the best weights of candidates, and
+        by balanced directions.
         """
-        weighted = np.sqrt(len(rows) * self._weights(len(rows)))[:, None, None] * self.candidate_rows
-        bounds = list[float]()
-        for design in (rows, weighted):
+        bounds, balanced = list[float](), self.prospect.balanced(len(rows) * self.scheme.copies)
+        for design in (rows, self._weighted(len(rows)), *([] if balanced is None else [balanced])):
             known, largest = self.variance_function(design, self.candidates)
             width = design.shape[2]
             ratio = (known + len(rows) * largest) / width
             bounds.append(-float(aims.D(self.factor(design))) * 2.0 + math.log(ratio))
         return min(bounds)
 
-    def _weights(self, count: int) -> Floats:
-        """Weights (c,) of the candidates for the D-optimal approximate design, by multiplicative steps."""
+    def _weighted(self, count: int) -> Floats:
+        """Rows (c, r, p) of the candidates times the roots of their D-optimal weights, by multiplicative steps."""
         rows = self.candidate_rows
         weights = np.full(len(rows), 1.0 / len(rows))
         for _ in range(_WEIGHINGS):
@@ -240,7 +253,7 @@ class Search:
             weights = weights * gain / mean
             if gain.max() < mean * (1.0 + 1e-6):
                 break
-        return weights
+        return np.sqrt(count * weights)[:, None, None] * rows
 
     def next(self) -> Floats:
         """The orientation (k,) after which the cost is least: candidates first, then ever closer about the best."""
@@ -253,9 +266,9 @@ class Search:
             poses = np.vstack([best, about[self.reach.allowed(wrapped(about))]])
             rows = self.rows(poses)
             so_far = np.broadcast_to(self.prospect.start, (len(rows), *self.prospect.start.shape))
-            best = poses[int(np.argmin(self.aim(triangle(np.concatenate([so_far, rows], axis=1)))))]
+            best = poses[int(np.argmin(self._score(triangle(np.concatenate([so_far, rows], axis=1)))))]
         return wrapped(best)
 
     def without_limits(self) -> Search:
         """The same over all that the axes can reach."""
-        return replace(self, reach=Reach(self.reach.bench), scheme=Scheme(self.scheme.copies))
+        return replace(self, reach=Reach(self.reach.bench), scheme=Scheme())

@@ -31,6 +31,16 @@ PAUSE_S = 60.0
 _SINCE_ARRIVAL_S = 15.0
 
 
+def _icosahedron() -> Floats:
+    """Its vertices (12, 3): means over them of all polynomials up to degree 5 are those over the sphere."""
+    golden = 0.5 * (1.0 + math.sqrt(5.0))
+    corners = np.array([[0.0, one, other * golden] for one in (1.0, -1.0) for other in (1.0, -1.0)])
+    return np.concatenate([np.roll(corners, k, axis=1) for k in range(3)]) / math.hypot(1.0, golden)
+
+
+_ICOSAHEDRON = _icosahedron()
+
+
 @dataclass(frozen=True)
 class Last:
     """The dwell before those to come: when it ended, pose (k,), specific force (3,), temperature, variances (3,)."""
@@ -122,6 +132,16 @@ class Prospect:
         """
         stimulus = self.stimulus(poses, at_s)
         return self.whitened(self.model.columns(stimulus, self.state), stimulus) @ self.transform
+
+    def balanced(self, count: int) -> Floats | None:
+        """Whitened rows (12, 3, p) that ``count`` dwells have in all, their directions spread as the vertices of an
+        icosahedron, wherever the gimbals may go; None where effects are in the model, which need not depend on these."""
+        if self.model.effects:
+            return None
+        stimulus = self.stimulus(np.zeros((len(_ICOSAHEDRON), len(self.model.bench.axes))))
+        stimulus = replace(stimulus, force_mps2=self.model.bench.gravity_mps2 * _ICOSAHEDRON)
+        rows = self.whitened(self.model.columns(stimulus, self.state), stimulus) @ self.transform
+        return math.sqrt(count / len(_ICOSAHEDRON)) * rows
 
     def columns(self, effects: Sequence[Effect], poses: Floats) -> Floats:
         """Whitened columns (n, 3, p + q) of the affine model and further effects, of the next dwell at each pose."""

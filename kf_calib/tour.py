@@ -11,17 +11,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kf_calib.reach import Reach
-from kf_calib.samples import Floats
-
-Ints = NDArray[np.int64]
+from kf_calib.samples import Floats, Ints
 
 PEAK_OVER_MEAN = 1.875
 """Of the speed of a minimum-jerk slew."""
 
 _CROSSING_S = 1e4  # what a way through a forbidden zone costs: no order takes one that can avoid it
+_AGAIN_S = 1e3  # what it costs not to leave an orientation that is to be visited again
 _MOVES, _FRUITLESS, _STARTS = 400, 12, 6
 
 
@@ -78,7 +76,7 @@ def order(poses: Floats, columns: Floats, timing: Timing, reach: Reach, start: F
         return np.arange(count)
     rng, space = np.random.default_rng(seed), _space(columns)
     ways = slews_s(poses[:, None], poses[None], timing.slew_degps)
-    costs = ways + _CROSSING_S * reach.crosses(poses[:, None], poses[None])
+    costs = ways + _CROSSING_S * reach.crosses(poses[:, None], poses[None]) + np.where(ways > 0, 0.0, _AGAIN_S)
     first = np.zeros(count)
     if start is not None:
         first = slews_s(poses, start, timing.slew_degps) + _CROSSING_S * reach.crosses(start[None], poses)
