@@ -135,6 +135,10 @@ class Search:
         polished = [self.polished(start) for start in starts]
         return min([poses, *polished], key=self.cost)
 
+    def measure(self, poses: Floats) -> float:
+        """The aim of orientations (n, k)."""
+        return float(self.aim(self.factor(self.rows(poses))))
+
     def cost(self, poses: Floats) -> float:
         return float(self._score(self.factor(self.rows(poses))))
 

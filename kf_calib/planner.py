@@ -87,6 +87,20 @@ class Plan:
         return float(np.exp(self.search.aim(self.factors[-1])))
 
     @cached_property
+    def generalised_sigma(self) -> float:
+        """Geometric mean of the principal sigmas of the twelve (rad, 1, g) that this plan adds by itself."""
+        rows = self.prospect.rows(self.poses, self.at_s)[:, :, :STATE_COUNT].reshape(-1, STATE_COUNT)
+        return math.exp(float(aims.D(triangle(rows))))
+
+    @cached_property
+    def papers_generalised_sigma(self) -> float:
+        """The same of the paper's set, as many readings in each of its orientations."""
+        covariances = papers_covariances(self.prospect)
+        units = self.prospect.units[:STATE_COUNT].reshape(3, 4)
+        scaled = covariances / (units[:, :, None] * units[:, None, :])
+        return math.exp(float(np.linalg.slogdet(scaled)[1].sum()) / (2 * STATE_COUNT))
+
+    @cached_property
     def _rows(self) -> Floats:
         return self.prospect.rows(self.poses)
 
@@ -178,8 +192,8 @@ def fewest(search: Search, timing: Timing, seed: int = 0, on_try: Callable[[int]
         """What the best ``count`` orientations measure."""
         if count not in tried:
             on_try(count * copies)
-            factor = search.factor(search.rows(search.best(count)))
-            tried[count] = math.inf if aims.unseen(factor).any() else float(np.exp(search.aim(factor)))
+            enough = not aims.unseen(search.factor(search.candidate_rows[search.exchanged(count)])).any()
+            tried[count] = math.exp(search.measure(search.best(count))) if enough else math.inf
         return tried[count]
 
     with threadpool_limits(1, user_api="blas"):
@@ -199,22 +213,24 @@ def fewest(search: Search, timing: Timing, seed: int = 0, on_try: Callable[[int]
     return plan(search, count * copies, timing, seed)
 
 
-def papers_sigma(prospect: Prospect) -> Floats:
-    """1 sigma (12,) in SI by the paper's optimal set: four orientations for each accelerometer alone, as many readings
-    in each, along h2 x h3, h1 x h3, h1 x h2 and against the last (h: rows of H; eq. 7-11)."""
+def papers_covariances(prospect: Prospect) -> Floats:
+    """Covariances (3, 4, 4) in SI of each accelerometer's four parameters by the paper's optimal set: four orientations
+    for each alone, along h2 x h3, h1 x h3, h1 x h2 and against the last (h: rows of H; eq. 7-11)."""
     gravity, sigma = prospect.model.bench.gravity_mps2, prospect.noise.effective_sigma_mps2
     to_state = paper.sensitivity_jacobian(paper.nominal(prospect.model.bench.nominal))
-    out = np.empty(STATE_COUNT)
+    out = np.empty((3, 4, 4))
     for i in range(3):
-        own = slice(4 * i, 4 * i + 4)
-        h = to_state[own, own][:3, :3].T
+        h = to_state[4 * i : 4 * i + 3, 4 * i : 4 * i + 3].T
         across = np.array([np.cross(h[1], h[2]), np.cross(h[0], h[2]), np.cross(h[0], h[1])])
         across /= np.linalg.norm(across, axis=1, keepdims=True)
-        forces = gravity * np.vstack([across, -across[2]])
-        design = np.column_stack([forces @ h.T, np.ones(4)])
-        covariance = np.linalg.inv(design.T @ design) * sigma[i] ** 2 / prospect.readings
-        out[own] = np.sqrt(np.diag(covariance))
+        design = np.column_stack([gravity * np.vstack([across, -across[2]]) @ h.T, np.ones(4)])
+        out[i] = np.linalg.inv(design.T @ design) * sigma[i] ** 2 / prospect.readings
     return out
+
+
+def papers_sigma(prospect: Prospect) -> Floats:
+    """1 sigma (12,) in SI by the paper's optimal set."""
+    return np.sqrt(np.einsum("ijj->ij", papers_covariances(prospect))).ravel()
 
 
 def _rounded(search: Search, poses: Floats) -> Floats:

@@ -196,14 +196,21 @@ def progress(text: str, quiet: bool = False) -> Iterator[Callable[[float], None]
 
 
 def save_views(result: Any, rrd: Path | None, png: Path | None) -> None:
-    if not (rrd or png):
-        return
+    """The Rerun view of a run, and a picture of it."""
+    if rrd or png:
+        from kf_calib.views import rerun
+
+        save_picture(lambda path: rerun.save(result, path), rrd, png)
+
+
+def save_picture(save: Callable[[Path], object], rrd: Path | None, png: Path | None) -> None:
+    """What ``save`` writes to a file, and a picture of it."""
     import tempfile
 
-    from kf_calib.views import rerun, screenshot
+    from kf_calib.views import screenshot
 
     with tempfile.TemporaryDirectory() as folder:
         saved = rrd or Path(folder) / "view.rrd"
-        rerun.save(result, saved)
+        save(saved)
         if png:
             screenshot.screenshot(saved, png)
