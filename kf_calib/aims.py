@@ -77,7 +77,7 @@ CONDITION = Aim("condition", "condition number", _condition, _SOFT)
 
 
 def minimax(tolerated: Floats) -> Aim:
-    """The largest sigma over what is tolerated of it, (p,) in the units of the factors; infinite where it is all one."""
+    """The largest sigma over what is tolerated of it, (p,) in the units of the factors; infinity: anything is."""
     asked = np.isfinite(tolerated)
 
     def cost(factors: Floats, power: float) -> Floats:
@@ -140,7 +140,7 @@ def slope(aim: Score, factor: Floats, power: float) -> Floats:
 
 
 def tolerated(texts: tuple[str, ...], gravity_mps2: float) -> Floats:
-    """What is tolerated of each parameter (12,), in rad, 1 and g, from ``K=2ppm``, ``b2=20ug``, ``angles=0.1arcsec``."""
+    """What is tolerated of each parameter (12,), in rad, 1, g, from ``K=2ppm``, ``b2=20ug``, ``angles=0.1arcsec``."""
     out = np.full(len(paper.SYMBOLS), np.inf)
     for text in texts:
         name, equals, size = text.replace(" ", "").partition("=")

@@ -8,11 +8,12 @@ dwells, M0 what is known already and I(x) the information of a dwell at x,
 
     det M*^(1/p) <= det M^(1/p) (tr(M0 M^-1) + N max_x tr(I(x) M^-1)) / p.
 
-Where nothing is known already, N tr(I(x) M^-1) is the variance function; its maximum is p for the optimum, and only there.
+Where nothing is known already, N tr(I(x) M^-1) is the variance function; its maximum is p at the optimum, and there only.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,6 +30,7 @@ from kf_calib.samples import Floats, Ints
 from kf_calib.triangle import triangle
 
 _TIE = 1e-3
+_UNTIL = {"maxiter": 200, "ftol": 1e-11, "gtol": 1e-9}
 _FIRST = 32  # candidates that promise most, tried exactly
 _SWEEPS = 12
 _FEW = 16  # orientations that one start may lead into a corner
@@ -40,11 +42,13 @@ _WEIGHINGS = 1000
 class Scheme:
     """What is visited for every orientation chosen: it, ``repeats`` times, and its antipode (gravity turned over).
 
-    turned: the gimbal that turns gravity over when it goes half a turn; None: no antipodes.
+    turned: the gimbal that turns gravity over when it goes half a turn and the others as ``signs`` say (-1: to the
+    other side of zero); None: no antipodes.
     """
 
     repeats: int = 1
     turned: int | None = None
+    signs: tuple[float, ...] = ()
 
     @property
     def copies(self) -> int:
@@ -58,7 +62,7 @@ class Scheme:
         return np.repeat(both, self.repeats, axis=0).reshape(-1, poses.shape[1])
 
     def antipodes(self, poses: Floats) -> Floats:
-        other = poses.copy()
+        other = poses * np.array(self.signs)
         other[:, self.turned] += np.pi
         return wrapped(other)
 
@@ -66,17 +70,20 @@ class Scheme:
     def of(cls, reach: Reach, repeats: int, antipodal: bool) -> Scheme:
         if not antipodal:
             return cls(repeats)
-        bench = reach.bench
-        poses = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, len(bench.axes)))
-        for j in range(poses.shape[1]):
-            scheme = cls(repeats, j)
+        bench, width = reach.bench, len(reach.bench.axes)
+        poses = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, width))
+        found = list[tuple[int, Scheme]]()
+        for j, signs in itertools.product(range(width), itertools.product((1.0, -1.0), repeat=width)):
+            scheme = cls(repeats, j, signs)
             forces = (bench.specific_force(np.zeros(32), each) for each in (poses, scheme.antipodes(poses)))
             if np.abs(sum(forces)).max() < 1e-9 * bench.gravity_mps2:
-                return scheme
-        raise InputError(
-            "no gimbal of these axes turns gravity over by half a turn, so there are no antipodal pairs: leave out "
-            "--antipodal."
-        )
+                found.append((int(reach.allowed(scheme.antipodes(reach.candidates)).sum()), scheme))
+        if not found:
+            raise InputError(
+                "no gimbal of these axes turns gravity over by half a turn, so there are no antipodal pairs: leave out "
+                "--antipodal."
+            )
+        return max(found, key=lambda each: each[0])[1]
 
 
 @dataclass(frozen=True)
@@ -191,8 +198,10 @@ class Search:
         """The orientations moved within their rooms to the least cost."""
         shape, rooms = poses.shape, self._rooms(poses)
         for power in self.aim.powers:
-            found = minimize(self._with_slope, poses.ravel(), args=(shape, power), jac=True, method="L-BFGS-B",
-                             bounds=rooms.reshape(-1, 2), options={"maxiter": 200, "ftol": 1e-11, "gtol": 1e-9})  # fmt: skip
+            found = minimize(
+                self._with_slope, poses.ravel(), (shape, power), "L-BFGS-B", jac=True, bounds=rooms.reshape(-1, 2),
+                options=_UNTIL,
+            )  # fmt: skip
             poses = found.x.reshape(shape)
         return np.where(np.isfinite(rooms).any(axis=2), poses, wrapped(poses))
 
@@ -201,7 +210,10 @@ class Search:
         if self.scheme.turned is None:
             return rooms
         other = self.scheme.antipodes(poses)
-        theirs = self.reach.rooms(other) + (poses - other)[:, :, None]
+        theirs = self.reach.rooms(other) - other[:, :, None]
+        mirrored = np.array(self.scheme.signs) < 0
+        theirs[:, mirrored] = -theirs[:, mirrored, ::-1]
+        theirs += poses[:, :, None]
         return np.stack([np.maximum(rooms, theirs)[..., 0], np.minimum(rooms, theirs)[..., 1]], axis=2)
 
     def _with_slope(self, flat: Floats, shape: tuple[int, int], power: float) -> tuple[float, Floats]:

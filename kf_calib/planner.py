@@ -76,7 +76,12 @@ class Plan:
 
     @cached_property
     def condition_number(self) -> float:
-        """The paper's: of the readings per unit of the twelve parameters (rad, 1, g), one row a dwell and channel."""
+        """The paper's: of the readings per unit of the twelve parameters (rad, 1, g), a row for a dwell and channel.
+
+        After a run so far: of the factor, which has its dwells, too.
+        """
+        if self.prospect.last is not None:
+            return float(np.linalg.cond(self.factors[-1][:STATE_COUNT, :STATE_COUNT]))
         stimulus = self.prospect.stimulus(self.poses, self.at_s)
         design = self.prospect.model.columns(stimulus, self.prospect.state) @ self.prospect.transform
         return float(np.linalg.cond(design[:, :, :STATE_COUNT].reshape(-1, STATE_COUNT)))
@@ -204,8 +209,8 @@ def fewest(search: Search, timing: Timing, seed: int = 0, on_try: Callable[[int]
             guess = count + 1 if math.isinf(excess) else max(math.floor(count * excess**2), count + 1)
             if guess * copies > _MOST:
                 raise InputError(
-                    f"the targets need about {guess * copies} dwells of {timing.dwell_s:g} s: dwell longer (--dwell-s), "
-                    "or allow larger sigmas."
+                    f"the targets need about {guess * copies} dwells of {timing.dwell_s:g} s: dwell longer "
+                    "(--dwell-s), or allow larger sigmas."
                 )
             count = guess
         while count > 1 and ratio(count - 1) <= 1.0:

@@ -135,7 +135,7 @@ class Prospect:
 
     def balanced(self, count: int) -> Floats | None:
         """Whitened rows (12, 3, p) that ``count`` dwells have in all, their directions spread as the vertices of an
-        icosahedron, wherever the gimbals may go; None where effects are in the model, which need not depend on these."""
+        icosahedron, wherever the gimbals may go; None where effects are in the model, which may depend on more."""
         if self.model.effects:
             return None
         stimulus = self.stimulus(np.zeros((len(_ICOSAHEDRON), len(self.model.bench.axes))))
@@ -153,7 +153,8 @@ class Prospect:
         count = len(stimulus)
         means = Means(design, np.zeros((count, 3)), stimulus.force_mps2, np.full(count, self.readings),
                       np.zeros((count, 2)))  # fmt: skip
-        return np.linalg.solve(np.linalg.cholesky(mean_covariances(self.noise, means, self.state)), design)
+        root = np.linalg.cholesky(mean_covariances(self.noise, means, self.state))
+        return np.asarray(np.linalg.solve(root, design), float)
 
     def stimulus(self, poses: Floats, at_s: Floats | None = None) -> Stimulus:
         """What the block would feel at poses (n, k)."""

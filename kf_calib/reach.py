@@ -74,7 +74,8 @@ class Reach:
         count = int(_POSES ** (1.0 / len(self.bench.axes)) + 1e-9)
         if j not in self.limits_deg:
             return (np.arange(count) - count // 2) * (2.0 * np.pi / count)
-        return np.unique(np.append(np.linspace(low, high, count), np.clip(0.0, low, high)))
+        values = np.append(np.linspace(low, high, count), np.clip(0.0, low, high))
+        return np.asarray(np.unique(values), float)
 
     def allowed(self, poses: Floats) -> Mask:
         """Which poses (n, k) are within the limits and in no forbidden zone, (n,) bool."""

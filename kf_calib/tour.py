@@ -25,7 +25,7 @@ _MOVES, _FRUITLESS, _STARTS = 400, 12, 6
 
 @dataclass(frozen=True)
 class Timing:
-    """How long a dwell is, how fast the fastest gimbal slews, and the greatest correlation of time that is tolerated."""
+    """How long a dwell is, how fast the fastest gimbal slews, the greatest correlation of time that is tolerated."""
 
     dwell_s: float
     slew_degps: float

@@ -49,7 +49,8 @@ def _plan_options(command: F) -> F:
         click.option("--positions", type=click.Path(path_type=Path), metavar="FILE.csv",
                      help="Choose from these orientations, a line of gimbal angles in deg each."),
         click.option("--limit", "limits", multiple=True, metavar="AXIS=LOW:HIGH",
-                     help="Range of a gimbal in deg, as z=-90:90; AXIS: its axis, number, or outer, middle, inner; repeatable."),
+                     help="Range of a gimbal in deg, as z=-90:90; AXIS: its axis, number, or outer, middle, inner; "
+                     "repeatable."),
         click.option("--forbid", "zones", multiple=True, metavar="AXIS=LOW:HIGH,...",
                      help="Angles not to be taken, of one gimbal or of several at once; repeatable."),
         click.option("--repeats", type=click.IntRange(min=1), default=1, show_default=True,
@@ -66,9 +67,11 @@ def _plan_options(command: F) -> F:
                      "shortest below it."),
         click.option("--recording", type=click.Path(path_type=Path), metavar="REC",
                      help="A run so far: what comes next, from the filter's own covariance."),
-        click.option("--beside-paper", is_flag=True, help="The paper's optimal set beside it, as many readings a dwell."),
+        click.option("--beside-paper", is_flag=True,
+                     help="The paper's optimal set beside it, as many readings a dwell."),
         click.option("--seed", type=int, default=0, show_default=True, help="Seed of the order of visits."),
-        click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Save the angles, for simulate --plan."),
+        click.option("--csv", "csv_file", type=click.Path(path_type=Path), 
+                     help="Save the angles, for simulate --plan."),
         click.option("--rrd", type=click.Path(path_type=Path), help="Save the Rerun view here."),
         click.option("--png", type=click.Path(path_type=Path), help="Save a picture of the Rerun view here."),
     ]  # fmt: skip
@@ -125,7 +128,9 @@ def _refuse_contradictions(options: Mapping[str, Any]) -> None:
     if options["grid_deg"] and options["positions"]:
         raise click.UsageError("--grid-deg and --positions are two answers to one question: choose one.")
     if options["effects"] and not options["recording"]:
-        raise click.UsageError("--with needs a recording (--recording): a plan from nothing is for the twelve parameters.")
+        raise click.UsageError(
+            "--with needs a recording (--recording): a plan from nothing is for the twelve parameters."
+        )
 
 
 def _prospect(options: Mapping[str, Any], quiet: bool) -> Prospect:

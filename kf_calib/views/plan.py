@@ -81,13 +81,18 @@ def generalised_ratio(made: Plan) -> float:
 
 def plan_report(made: Plan, beside_paper: bool = False) -> RenderableType:
     """What ``plan`` prints."""
-    return Group(_orientations(made), _sigmas(made, beside_paper), *map(Text, _sentences(made, beside_paper)),
+    return Group(_orientations(made), _sigmas(made, beside_paper), *map(Text, sentences(made, beside_paper)),
                  *(Text(f"Note: {remark}", style="yellow") for remark in made.remarks))  # fmt: skip
 
 
 def _orientations(made: Plan) -> Table:
     table = Table(title=f"{len(made.poses)} orientations, in this order", title_justify="left")
-    for heading in ("", "begins, s", *(f"{name.replace('_', ' ')}, deg" for name in gimbal_names(made)), "up, in the platform"):
+    for heading in (
+        "",
+        "begins, s",
+        *(f"{name.replace('_', ' ')}, deg" for name in gimbal_names(made)),
+        "up, in the platform",
+    ):
         table.add_column(heading, justify="right")
     begins = made.at_s - 0.5 * made.timing.dwell_s
     for k, (begin, angles, up) in enumerate(zip(begins, made.gimbal_deg, made.directions, strict=True), 1):
@@ -131,20 +136,21 @@ def _figure(value: float, percent: bool, per_si: float) -> str:
     return f"{value:.3g} %" if percent else f"{value * per_si:.3g}"
 
 
-def _sentences(made: Plan, beside_paper: bool) -> list[str]:
+def sentences(made: Plan, beside_paper: bool = False) -> list[str]:
+    """What the plan is worth."""
     count = len(made.prospect.symbols)
     told = [
         f"Aim {made.search.aim.name}: {made.search.aim.measures} {made.cost:.4g}. Condition number "
         f"{made.condition_number:.4g} (rad, 1, g; the least is √3).",
-        f"D-efficiency {made.d_efficiency:.4f} of the bound; {made.d_efficiency_within_reach:.4f} of what these gimbals "
-        f"can. Largest variance function {made.largest_variance:.4g} ({count} where D-optimal).",
-        f"{made.duration_s:.0f} s, {made.slews_s.sum():.0f} s of them in slews. Correlation of time with the direction of "
-        f"gravity: {made.correlation:.2f}.",
+        f"D-efficiency {made.d_efficiency:.4f} of the bound; {made.d_efficiency_within_reach:.4f} of what these "
+        f"gimbals can. Largest variance function {made.largest_variance:.4g} ({count} where D-optimal).",
+        f"{made.duration_s:.0f} s, {made.slews_s.sum():.0f} s of them in slews. Correlation of time with the direction "
+        f"of gravity: {made.correlation:.2f}.",
     ]
     if beside_paper:
         told.append(
-            f"The paper's set needs four orientations for each accelerometer alone; generalised sigma of this plan over "
-            f"that of the paper's set: {generalised_ratio(made):.3f}."
+            "The paper's set has four orientations for each accelerometer alone, this plan serves the three at "
+            f"once; its generalised sigma is {generalised_ratio(made):.3f} of that of the paper's set."
         )
     return told
 
