@@ -8,7 +8,8 @@ dwells, M0 what is known already and I(x) the information of a dwell at x,
 
     det M*^(1/p) <= det M^(1/p) (tr(M0 M^-1) + N max_x tr(I(x) M^-1)) / p.
 
-Where nothing is known already, N tr(I(x) M^-1) is the variance function; its maximum is p at the optimum, and there only.
+Where nothing is known already, N tr(I(x) M^-1) is the variance function; its maximum is p at the
+optimum, and there only.
 """
 
 from __future__ import annotations
@@ -26,13 +27,15 @@ from kf_calib.aims import Aim, Score
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.prospect import Prospect
 from kf_calib.reach import Reach, wrapped
-from kf_calib.samples import Floats, Ints
+from kf_calib.samples import Floats, Ints, Mask
 from kf_calib.triangle import triangle
 
 _TIE = 1e-3
 _UNTIL = {"maxiter": 200, "ftol": 1e-11, "gtol": 1e-9}
 _FIRST = 32  # candidates that promise most, tried exactly
 _SWEEPS = 12
+_SCATTERED, _ABOUT = 256, 48
+_OTHERS = 6  # random starts of an exchange that no polishing follows
 _FEW = 16  # orientations that one start may lead into a corner
 _STEP_RAD = 1e-5
 _WEIGHINGS = 1000
@@ -124,6 +127,8 @@ class Search:
 
     def refuse_unseen(self) -> None:
         """Raise UnobservableError where even all candidates together leave parameters undetermined."""
+        if not aims.unseen(self.prospect.start).any():
+            return
         lost = aims.unseen(self.factor(self.candidate_rows))
         if lost.any():
             names = ", ".join(symbol for symbol, own in zip(self.prospect.symbols, lost, strict=True) if own)
@@ -157,16 +162,24 @@ class Search:
         return np.random.default_rng(seed).choice(self.candidates, count)
 
     def exchanged(self, count: int) -> list[int]:
-        """Numbers of candidates: greedy, then each dwell exchanged for the best there is until none changes.
+        """Numbers of candidates: greedy, then exchanged; where they are all there is, from random starts as well.
 
         Greedy by D, which every dwell can improve: a largest sigma falls only when all that is as large does.
         """
-        rows, chosen = self.candidate_rows, list[int]()
+        rows, greedy = self.candidate_rows, list[int]()
         for _ in range(count):
-            chosen.append(self._choice(aims.D, rows[chosen])[0])
+            greedy.append(self._choice(aims.D, rows[greedy])[0])
+        rng = np.random.default_rng(0)
+        others = [] if self.reach.continuous else [rng.choice(len(rows), count).tolist() for _ in range(_OTHERS)]
+        found = [self._exchanged(start) for start in (greedy, *others)]
+        return min(found, key=lambda each: float(self._score(self.factor(rows[each]))))
+
+    def _exchanged(self, start: list[int]) -> list[int]:
+        """Each dwell exchanged for the best there is, until none changes."""
+        rows, chosen = self.candidate_rows, list(start)
         for _ in range(_SWEEPS):
             before = list(chosen)
-            for place in range(count):
+            for place in range(len(chosen)):
                 rest = chosen[:place] + chosen[place + 1 :]
                 best, cost = self._choice(self._score, rows[rest])
                 if cost < float(self._score(self.factor(rows[chosen]))) - 1e-9:
@@ -272,18 +285,25 @@ class Search:
         return np.sqrt(count * weights)[:, None, None] * rows
 
     def next(self) -> Floats:
-        """The orientation (k,) after which the cost is least: candidates first, then ever closer about the best."""
-        best, poses = self.candidates[self.exchanged(1)[0]], self.candidates
+        """The orientation (k,) after which the cost is least: scattered ones first, then ever closer about the best."""
         if not self.reach.continuous:
-            return best
-        rng = np.random.default_rng(0)
-        for reach_deg in (12.0, 4.0, 1.3, 0.4):
-            about = best + np.radians(rng.uniform(-reach_deg, reach_deg, (96, len(best))))
-            poses = np.vstack([best, about[self.reach.allowed(wrapped(about))]])
-            rows = self.rows(poses)
-            so_far = np.broadcast_to(self.prospect.start, (len(rows), *self.prospect.start.shape))
-            best = poses[int(np.argmin(self._score(triangle(np.concatenate([so_far, rows], axis=1)))))]
+            return self._first_of(self.candidates)
+        rng, (low, high) = np.random.default_rng(0), self.reach.bounds.T
+        scattered = rng.uniform(low, high, (_SCATTERED, len(low)))
+        best = self._first_of(np.vstack([scattered[self._allowed(scattered)], self.reach.candidates[:1]]))
+        for reach_deg in (24.0, 8.0, 2.5, 0.8):
+            about = best + np.radians(rng.uniform(-reach_deg, reach_deg, (_ABOUT, len(best))))
+            best = self._first_of(np.vstack([best, about[self._allowed(about)]]))
         return wrapped(best)
+
+    def _allowed(self, poses: Floats) -> Mask:
+        inside = self.reach.allowed(wrapped(poses))
+        return inside if self.scheme.turned is None else inside & self.reach.allowed(self.scheme.antipodes(poses))
+
+    def _first_of(self, poses: Floats) -> Floats:
+        rows, start = self.rows(poses), self.prospect.start
+        so_far = np.broadcast_to(start, (len(rows), *start.shape))
+        return poses[int(np.argmin(self._score(triangle(np.concatenate([so_far, rows], axis=1)))))]
 
     def without_limits(self) -> Search:
         """The same over all that the axes can reach."""

@@ -81,20 +81,25 @@ class Prospect:
         return cls(model, model.nominal_state(), noise, readings, dwell_s, np.zeros((model.count, model.count)))
 
     @classmethod
+    def following(cls, fitted: Fit) -> Prospect:
+        """Of a run so far, dwells to come like those it has had; what is known by it is left out."""
+        carried, last = fitted.carried, fitted.dwells[-1]
+        dwell_s = float(np.median([dwell.end_s - dwell.start_s for dwell in fitted.dwells]))
+        temperature_c = float(last.pieces[-1].nodes.temperature_c[-1])
+        before = Last(last.end_s, last.pose, last.means[1:4], temperature_c, last.variances[-1])
+        readings, nothing = float(np.median(carried.means.counts)), np.zeros((carried.model.count,) * 2)
+        return cls(carried.model, carried.state, fitted.noise, readings, dwell_s, nothing, before)
+
+    @classmethod
     def after(cls, fitted: Fit, prior: Prior | None = None) -> Prospect:
-        """Of a run so far: known is the filter's own factor, dwells to come are like those it has had."""
-        carried, dwells, last = fitted.carried, fitted.dwells, fitted.dwells[-1]
-        model, noise, width = carried.model, fitted.noise, carried.model.count
-        steps = information.run(information.start(prior or Prior(), model), fitted.rows(), fitted.steps,
-                                fitted.following)  # fmt: skip
-        dwell_s = float(np.median([dwell.end_s - dwell.start_s for dwell in dwells]))
-        waited = noise.walk_mps2_per_sqrt_s**2 * (PAUSE_S + dwell_s / 3.0)
-        known = walk.predicted(steps[-1].factor, waited)[:, :width]
-        before = Last(last.end_s, last.pose, last.means[1:4], float(last.pieces[-1].nodes.temperature_c[-1]),
-                      last.variances[-1])  # fmt: skip
+        """Of a run so far, with what is known by it: the filter's own factor."""
+        carried, noise, made = fitted.carried, fitted.noise, cls.following(fitted)
+        first = information.start(prior or Prior(), carried.model)
+        steps = information.run(first, fitted.rows(), fitted.steps, fitted.following)
+        waited = noise.walk_mps2_per_sqrt_s**2 * (PAUSE_S + made.dwell_s / 3.0)
+        known = walk.predicted(steps[-1].factor, waited)[:, :-1]
         more = considered(noise, carried.means, carried.state).sum(axis=0) + fitted.considered
-        readings = float(np.median(carried.means.counts))
-        return cls(model, carried.state, noise, readings, dwell_s, _less(known, more), before)
+        return replace(made, known=_less(known, more))
 
     @cached_property
     def units(self) -> Floats:
@@ -172,7 +177,7 @@ class Prospect:
         return Stimulus(
             bench=bench,
             elapsed_s=at_s,
-            since_arrival_s=np.full(count, min(_SINCE_ARRIVAL_S, 0.5 * self.dwell_s)),
+            since_arrival_s=np.full(count, _SINCE_ARRIVAL_S),
             force_mps2=force,
             previous_force_mps2=earlier[0],
             pose=poses,
@@ -181,10 +186,6 @@ class Prospect:
             sensitivity=self.state[:STATE_COUNT].reshape(3, 4)[:, :3],
             variance_mps2_2=np.repeat(before.variance_mps2_2[None], count, axis=0),
         )
-
-    def judging(self) -> Prospect:
-        """By the noise by which a misfit is judged."""
-        return replace(self, noise=self.noise.judging)
 
 
 def _less(factor: Floats, more: Floats) -> Floats:

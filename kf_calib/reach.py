@@ -69,13 +69,14 @@ class Reach:
         low, high = self.bounds[j]
         if self.grid_deg is not None:
             step = math.radians(self.grid_deg)
-            values = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
-            return values[:-1] if j not in self.limits_deg and len(values) > 1 and _turns(values) else values
+            values: Floats = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
+            twice = j not in self.limits_deg and len(values) > 1 and _turns(values)  # -180 and 180 deg are one
+            return values[: len(values) - twice]
         count = int(_POSES ** (1.0 / len(self.bench.axes)) + 1e-9)
         if j not in self.limits_deg:
             return (np.arange(count) - count // 2) * (2.0 * np.pi / count)
         values = np.append(np.linspace(low, high, count), np.clip(0.0, low, high))
-        return np.asarray(np.unique(values), float)
+        return np.unique(values)
 
     def allowed(self, poses: Floats) -> Mask:
         """Which poses (n, k) are within the limits and in no forbidden zone, (n,) bool."""

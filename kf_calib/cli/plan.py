@@ -70,7 +70,7 @@ def _plan_options(command: F) -> F:
         click.option("--beside-paper", is_flag=True,
                      help="The paper's optimal set beside it, as many readings a dwell."),
         click.option("--seed", type=int, default=0, show_default=True, help="Seed of the order of visits."),
-        click.option("--csv", "csv_file", type=click.Path(path_type=Path), 
+        click.option("--csv", "csv_file", type=click.Path(path_type=Path),
                      help="Save the angles, for simulate --plan."),
         click.option("--rrd", type=click.Path(path_type=Path), help="Save the Rerun view here."),
         click.option("--png", type=click.Path(path_type=Path), help="Save a picture of the Rerun view here."),
