@@ -74,7 +74,7 @@ class Reach:
             return values[: len(values) - twice]
         count = int(_POSES ** (1.0 / len(self.bench.axes)) + 1e-9)
         if j not in self.limits_deg:
-            return (np.arange(count) - count // 2) * (2.0 * np.pi / count)
+            return np.asarray((np.arange(count) - count // 2) * (2.0 * np.pi / count), np.float64)
         values = np.append(np.linspace(low, high, count), np.clip(0.0, low, high))
         return np.unique(values)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import re
 import sys
 import time
 from pathlib import Path
@@ -350,3 +351,19 @@ def test_the_rerun_view_of_a_plan(tmp_path: Path) -> None:
     assert path.stat().st_size > 10_000
     with pytest.raises(InputError, match="no folder"):
         save(plan(search(), 6, TIMING), tmp_path / "none" / "plan.rrd")
+
+
+def test_the_readme_shows_what_the_command_prints(command) -> None:
+    text = (Path(__file__).resolve().parents[1] / "README.md").read_text()
+    shown = text[text.index("$ kf-calib plan --count 4") :].split("```")[0]
+    line, _, body = shown.partition("\n")
+    code, out, _ = command(*line.split()[2:])
+    printed = " ".join(out.split())
+    assert code == 0
+    for part in body.split("\n...\n"):
+        assert " ".join(_without_angles(part)) in " ".join(_without_angles(printed))
+
+
+def _without_angles(text: str) -> list[str]:
+    """Of a plan that is one of many as good: without its angles, times and directions."""
+    return re.sub(r"\[?[+-]?\d+\.\d+\]? ?|\d+ s\b|│ +\d+ │ +\d+ │", "#", " ".join(text.split())).split()
