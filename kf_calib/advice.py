@@ -5,22 +5,21 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kf_calib.effects import Effect, Stimulus
+from kf_calib.effects import Effect
 from kf_calib.fitting import Fit
-from kf_calib.folding import Means, candidate_columns
+from kf_calib.folding import candidate_columns
 from kf_calib.information import accumulated, whitened
-from kf_calib.model import effect_columns
-from kf_calib.noise import mean_covariances, steps
+from kf_calib.noise import steps
+from kf_calib.prospect import Prospect
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 
 _POSES = 160
 _STEP_DEG = 5.0
-_LATER_S = 60.0  # when the next dwell would be, and how far into it
 
 
 @dataclass(frozen=True)
@@ -90,26 +89,5 @@ def _with_next(fitted: Fit, effects: Sequence[Effect], poses: Floats) -> tuple[F
     added = candidate_columns(carried.dwells, effects, model.bench, state)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
     upper = accumulated(whitened(carried.dwells, columns, noise, state), steps(carried.dwells, noise))
-    stimulus = _next_stimulus(fitted, poses)
-    design = np.concatenate([model.columns(stimulus, state), effect_columns(effects, stimulus)], axis=2)
-    counts = np.full(len(poses), np.median(carried.means.counts))
-    means = Means(design, np.zeros((len(poses), 3)), stimulus.force_mps2, counts, np.zeros((len(poses), 2)))
-    root = np.linalg.cholesky(mean_covariances(noise, means, state))
-    return upper[:-1, :-1], np.asarray(np.linalg.solve(root, design), float)
-
-
-def _next_stimulus(fitted: Fit, poses: Floats) -> Stimulus:
-    last, bench, count = fitted.dwells[-1], fitted.carried.model.bench, len(poses)
-    at = np.linspace(last.end_s + _LATER_S, last.end_s + _LATER_S + 0.1, count)
-    return Stimulus(
-        bench=bench,
-        elapsed_s=at,
-        since_arrival_s=np.full(count, 15.0),
-        force_mps2=bench.specific_force(at, poses),
-        previous_force_mps2=np.repeat(last.means[None, 1:4], count, axis=0),
-        pose=poses,
-        previous_pose=np.repeat(last.pose[None], count, axis=0),
-        temperature_c=np.full(count, last.pieces[-1].nodes.temperature_c[-1]),
-        sensitivity=fitted.carried.state[:12].reshape(3, 4)[:, :3],
-        variance_mps2_2=np.repeat(last.variances[-1:], count, axis=0),
-    )
+    prospect = replace(Prospect.following(fitted), noise=noise)
+    return upper[:-1, :-1], prospect.columns(effects, poses)

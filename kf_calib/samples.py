@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 Times = NDArray[np.int64]
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 

@@ -12,6 +12,7 @@ import click
 
 from kf_calib.cli.making import demo, record, simulate
 from kf_calib.cli.paper import paper
+from kf_calib.cli.plan import plan
 from kf_calib.cli.runs import compare, diagnose, improve, list_effects, replay
 from kf_calib.errors import KfCalibError
 
@@ -22,7 +23,7 @@ def cli() -> None:
     """Calibrate accelerometers on a stationary gimballed bench with a Kalman filter."""
 
 
-for command in (demo, simulate, record, replay, compare, list_effects, diagnose, improve, paper):
+for command in (demo, simulate, record, replay, compare, list_effects, diagnose, improve, plan, paper):
     cli.add_command(command)
 
 

@@ -148,10 +148,10 @@ def _visits(options: Mapping[str, Any], axes: tuple[Vector, ...]) -> list[Visit]
         return spread_plan(options["count"], axes, options["dwell_s"], options["seed"])
     if options["plan"] == "faces":
         return six_faces(axes, options["dwell_s"])
-    return explicit_plan(_angles_from_csv(Path(options["plan"]), len(axes)), options["dwell_s"])
+    return explicit_plan(angles_from_csv(Path(options["plan"]), len(axes)), options["dwell_s"])
 
 
-def _angles_from_csv(path: Path, width: int) -> list[list[float]]:
+def angles_from_csv(path: Path, width: int) -> list[list[float]]:
     """Rows of gimbal angles, deg; a first line of names is passed over."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()

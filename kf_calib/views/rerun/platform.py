@@ -48,13 +48,13 @@ def _axes(estimate: Estimate) -> Floats:
 
 
 def log_platform(result: Calibration, stream: rr.RecordingStream) -> None:
-    _log_frame(result, stream)
+    log_frame(stream)
     _log_axes(result, stream)
     _log_ellipsoids(result, stream)
     _log_directions(result, stream)
 
 
-def _log_frame(result: Calibration, stream: rr.RecordingStream) -> None:
+def log_frame(stream: rr.RecordingStream) -> None:
     """What stands still: the sphere of directions, the platform's axes, the nominal sensitive axes."""
     stream.log("platform", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
     turn = np.linspace(0, 2 * np.pi, 97)

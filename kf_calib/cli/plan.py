@@ -1,0 +1,179 @@
+"""The command plan: orientations for the bench at hand, before a run or in the course of one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from kf_calib.cli.making import angles_from_csv
+from kf_calib.cli.options import (
+    F,
+    filter_options,
+    json_option,
+    opened,
+    overrides,
+    print_json,
+    progress,
+    recording_options,
+    save_pictures,
+    show,
+)
+from kf_calib.errors import InputError
+
+if TYPE_CHECKING:
+    from kf_calib.aims import Aim
+    from kf_calib.bench import Bench
+    from kf_calib.prospect import Prospect
+    from kf_calib.reach import Reach
+
+_CRITERIA = ("D", "A", "E", "minimax", "condition")
+
+
+def _plan_options(command: F) -> F:
+    """What is aimed at, what the bench can do, and what a dwell tells."""
+    positive = click.FloatRange(min=0, min_open=True)
+    options = [
+        click.option("--count", type=click.IntRange(min=1), help="Dwells; 12, and 1 where a recording is given."),
+        click.option("--criterion", type=click.Choice(_CRITERIA), default="D", show_default=True,
+                     help="Least generalised variance, mean variance, largest principal sigma, largest sigma (rad, 1, "
+                     "g), or the paper's condition number."),
+        click.option("--target", "targets", multiple=True, metavar="NAME=SIZE",
+                     help="Sigma wanted of a parameter or kind, as K=2ppm, b2=20ug, angles=0.1arcsec; repeatable: the "
+                     "worst relative to its target is made least."),
+        click.option("--fewest", is_flag=True, help="The fewest dwells that reach all targets."),
+        click.option("--grid-deg", type=positive, help="Angles are multiples of this."),
+        click.option("--positions", type=click.Path(path_type=Path), metavar="FILE.csv",
+                     help="Choose from these orientations, a line of gimbal angles in deg each."),
+        click.option("--limit", "limits", multiple=True, metavar="AXIS=LOW:HIGH",
+                     help="Range of a gimbal in deg, as z=-90:90; AXIS: its axis, number, or outer, middle, inner; "
+                     "repeatable."),
+        click.option("--forbid", "zones", multiple=True, metavar="AXIS=LOW:HIGH,...",
+                     help="Angles not to be taken, of one gimbal or of several at once; repeatable."),
+        click.option("--repeats", type=click.IntRange(min=1), default=1, show_default=True,
+                     help="Visits to each orientation, coming from others: scatter and hysteresis show."),
+        click.option("--antipodal", is_flag=True, help="Each orientation with its opposite, gravity turned over."),
+        click.option("--dwell-s", type=positive, help="Seconds in each orientation; 30, or as in the recording."),
+        click.option("--sample-hz", type=positive, default=100.0, show_default=True, help="Rate of the readings."),
+        click.option("--readings", type=positive, help="Readings of a dwell that are used, in place of the two above."),
+        click.option("--white", "white_mps2", type=positive, default=1e-4, show_default=True,
+                     help="White noise of a reading, m/s^2, where no recording tells it."),
+        click.option("--slew-degps", type=positive, default=20.0, show_default=True, help="Greatest speed, deg/s."),
+        click.option("--time-correlation", type=click.FloatRange(0, 1), default=0.1, show_default=True,
+                     help="Correlation of time with the direction of gravity that the order may have; slews are the "
+                     "shortest below it."),
+        click.option("--recording", type=click.Path(path_type=Path), metavar="REC",
+                     help="A run so far: what comes next, from the filter's own covariance."),
+        click.option("--beside-paper", is_flag=True,
+                     help="The paper's optimal set beside it, as many readings a dwell."),
+        click.option("--seed", type=int, default=0, show_default=True, help="Seed of the order of visits."),
+        click.option("--csv", "csv_file", type=click.Path(path_type=Path),
+                     help="Save the angles, for simulate --plan."),
+        click.option("--rrd", type=click.Path(path_type=Path), help="Save the Rerun view here."),
+        click.option("--png", type=click.Path(path_type=Path), help="Save a picture of the Rerun view here."),
+    ]  # fmt: skip
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+@click.command()
+@_plan_options
+@recording_options
+@filter_options
+@json_option
+def plan(as_json: bool, csv_file: Path | None, rrd: Path | None, png: Path | None, **options: Any) -> None:
+    """Orientations that determine the parameters best: which, in which order, and the sigmas to expect."""
+    from kf_calib import planner
+    from kf_calib.designs import Scheme, Search
+    from kf_calib.tour import Timing
+    from kf_calib.views import plan as views
+
+    _refuse_contradictions(options)
+    prospect = _prospect(options, as_json)
+    reach = _reach(prospect.model.bench, options)
+    scheme = Scheme.of(reach, options["repeats"], options["antipodal"])
+    search = Search(prospect, reach, _aim(options, prospect.model.bench.gravity_mps2), scheme)
+    timing = Timing(prospect.dwell_s, options["slew_degps"], options["time_correlation"])
+    with progress("planning", as_json):
+        if options["fewest"]:
+            made = planner.fewest(search, timing, options["seed"])
+        else:
+            count = options["count"] or (scheme.copies if options["recording"] else 12)
+            made = planner.plan(search, count, timing, options["seed"])
+    if csv_file:
+        views.write_csv(made, csv_file)
+    if rrd or png:
+        from kf_calib.views.rerun.plan import save
+
+        save_pictures(lambda path: save(made, path), rrd, png)
+    if as_json:
+        print_json(views.plan_object(made, options["beside_paper"]))
+        return
+    show(views.plan_report(made, options["beside_paper"]))
+    for path in filter(None, (csv_file, rrd, png)):
+        click.echo(f"saved {path}")
+
+
+def _refuse_contradictions(options: Mapping[str, Any]) -> None:
+    if options["fewest"] and not options["targets"]:
+        raise click.UsageError("--fewest needs a target to reach, for example --target K=2ppm.")
+    if options["fewest"] and options["count"]:
+        raise click.UsageError("--fewest finds the count itself: leave out --count.")
+    if options["targets"] and options["criterion"] not in ("D", "minimax"):
+        raise click.UsageError("--target has a criterion of its own, the worst sigma: leave out --criterion.")
+    if options["grid_deg"] and options["positions"]:
+        raise click.UsageError("--grid-deg and --positions are two answers to one question: choose one.")
+    if options["effects"] and not options["recording"]:
+        raise click.UsageError(
+            "--with needs a recording (--recording): a plan from nothing is for the twelve parameters."
+        )
+
+
+def _prospect(options: Mapping[str, Any], quiet: bool) -> Prospect:
+    from kf_calib.bench import Bench
+    from kf_calib.prospect import Prospect
+
+    if options["recording"] is not None:
+        return _after(options["recording"], options, quiet)
+    keys = {"axes": "y z x", **overrides(options)}
+    if "latitude_deg" not in keys:
+        keys.setdefault("gravity_mps2", "9.81")
+    dwell_s = options["dwell_s"] or 30.0
+    made = Prospect.of_bench(Bench.from_metadata(keys), options["white_mps2"], 1.0, dwell_s)
+    return replace(made, readings=options["readings"] or max(made.still_s * options["sample_hz"], 1.0))
+
+
+def _after(recording: Path, options: Mapping[str, Any], quiet: bool) -> Prospect:
+    from kf_calib.calibration import calibrate
+    from kf_calib.prospect import Prospect
+
+    source, settings = opened(recording, options)
+    if not source.bench.axes:
+        raise InputError(f"{recording} has an attitude and no gimbal angles, so no angles can be planned: give --axes.")
+    with progress(f"reading {recording.name}", quiet) as tick:
+        result = calibrate(source, settings, tick)
+    made = Prospect.after(result.fit, settings.prior)
+    longer = (options["dwell_s"] or made.dwell_s) / made.dwell_s
+    return replace(made, dwell_s=longer * made.dwell_s, readings=options["readings"] or longer * made.readings)
+
+
+def _reach(bench: Bench, options: Mapping[str, Any]) -> Reach:
+    from kf_calib.reach import Reach, ranges
+
+    limits = {j: ends for text in options["limits"] for j, ends in ranges(text, bench).items()}
+    zones = [ranges(text, bench) for text in options["zones"]]
+    path = options["positions"]
+    positions = angles_from_csv(path, len(bench.axes)) if path else None
+    return Reach(bench, limits, zones, options["grid_deg"], positions)
+
+
+def _aim(options: Mapping[str, Any], gravity_mps2: float) -> Aim:
+    from kf_calib import aims
+
+    if options["targets"]:
+        return aims.minimax(aims.tolerated(options["targets"], gravity_mps2))
+    return aims.NAMED[options["criterion"]]

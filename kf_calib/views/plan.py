@@ -1,0 +1,164 @@
+"""A plan for people, for programs, and as lines that a bench (or ``simulate --plan``) runs."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from kf_calib import paper
+from kf_calib.errors import InputError
+from kf_calib.experiment import DEVIATIONS
+from kf_calib.model import STATE_COUNT
+from kf_calib.planner import Plan, papers_sigma
+from kf_calib.samples import Floats
+from kf_calib.views.console import symbol
+from kf_calib.views.json import clean
+
+_SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("µm/s²", 1e6)}
+
+
+def gimbal_names(made: Plan) -> list[str]:
+    """``1_y``, ``2_z``, ...: number and axis, outer first."""
+    axes = made.prospect.model.bench.to_metadata()["axes"].split()
+    return [f"{k}_{axis.replace(',', ';')}" for k, axis in enumerate(axes, 1)]
+
+
+def plan_object(made: Plan, beside_paper: bool = False) -> dict[str, Any]:
+    """What ``plan --json`` prints: angles in deg, sigmas in SI."""
+    symbols, before = made.prospect.symbols, made.prospect.last is not None
+    out = {
+        "axes": made.prospect.model.bench.to_metadata()["axes"],
+        "count": len(made.poses),
+        "gimbal_deg": made.gimbal_deg,
+        "directions": made.directions,
+        "begin_s": made.at_s - 0.5 * made.timing.dwell_s,
+        "duration_s": made.duration_s,
+        "slew_s": float(made.slews_s.sum()),
+        "criterion": made.search.aim.name,
+        "cost": made.cost,
+        "sigma": dict(zip(symbols, made.sigma[-1], strict=True)),
+        "sigma_before": dict(zip(symbols, made.sigma[0], strict=True)) if before else None,
+        "sigma_balanced": _named(symbols, made.balanced_sigma),
+        "condition_number": made.condition_number,
+        "d_efficiency": made.d_efficiency,
+        "d_efficiency_within_reach": made.d_efficiency_within_reach,
+        "largest_variance": made.largest_variance,
+        "parameters": len(symbols),
+        "time_correlation": made.correlation,
+        "remarks": made.remarks,
+    }
+    if beside_paper:
+        theirs = papers_sigma(made.prospect)
+        out["paper"] = {
+            "sigma": dict(zip(paper.SYMBOLS, theirs, strict=True)),
+            "mean_error_percent": dict(zip(paper.SYMBOLS, mean_error_percent(theirs), strict=True)),
+            "plan_mean_error_percent": dict(zip(paper.SYMBOLS, mean_error_percent(made.sigma[-1, :12]), strict=True)),
+            "generalised_sigma_ratio": generalised_ratio(made),
+        }
+    return clean(out)
+
+
+def _named(symbols: tuple[str, ...], values: Floats | None) -> dict[str, float] | None:
+    return None if values is None else dict(zip(symbols, values.tolist(), strict=True))
+
+
+def mean_error_percent(sigma: Floats) -> Floats:
+    """The figure of the paper's Table 2 that sigmas (12,) give: sqrt(2/pi) sigma over the deviation, per cent."""
+    return 100.0 * math.sqrt(2.0 / math.pi) * sigma / DEVIATIONS
+
+
+def generalised_ratio(made: Plan) -> float:
+    """Geometric mean of the principal sigmas, of the plan over that of the paper's set."""
+    return made.generalised_sigma / made.papers_generalised_sigma
+
+
+def plan_report(made: Plan, beside_paper: bool = False) -> RenderableType:
+    """What ``plan`` prints."""
+    return Group(_orientations(made), _sigmas(made, beside_paper), *map(Text, sentences(made, beside_paper)),
+                 *(Text(f"Note: {remark}", style="yellow") for remark in made.remarks))  # fmt: skip
+
+
+def _orientations(made: Plan) -> Table:
+    table = Table(title=f"{len(made.poses)} orientations, in this order", title_justify="left")
+    for heading in (
+        "",
+        "begins, s",
+        *(f"{name.replace('_', ' ')}, deg" for name in gimbal_names(made)),
+        "up, in the platform",
+    ):
+        table.add_column(heading, justify="right")
+    begins = made.at_s - 0.5 * made.timing.dwell_s
+    for k, (begin, angles, up) in enumerate(zip(begins, made.gimbal_deg, made.directions, strict=True), 1):
+        direction = " ".join(f"{part:+.3f}" for part in up)
+        table.add_row(str(k), f"{begin:.0f}", *(f"{angle:.2f}" for angle in angles), direction)
+    return table
+
+
+def _sigmas(made: Plan, beside_paper: bool) -> Table:
+    table = Table(title="Predicted sigma (1σ)", title_justify="left")
+    columns = _columns(made, beside_paper)
+    for heading in ("parameter", *columns, "unit"):
+        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
+    units = [_SHOWN[unit] for unit in paper.UNITS]
+    units += [(c.shown_unit, c.per_si) for c in made.prospect.model.coefficients]
+    for k, (name, (unit, per_si)) in enumerate(zip(made.prospect.symbols, units, strict=True)):
+        values = [_figure(values[k], percent, per_si) for values, percent in columns.values()]
+        table.add_row(symbol(name), *values, unit, end_section=k % 4 == 3)
+    return table
+
+
+def _columns(made: Plan, beside_paper: bool) -> dict[str, tuple[Floats, bool]]:
+    """Headings, values (p,), and whether they are per cent."""
+    out = dict[str, tuple[Floats, bool]]()
+    if made.prospect.last is not None:
+        out["now"] = made.sigma[0], False
+    out["this plan"] = made.sigma[-1], False
+    if made.balanced_sigma is not None:
+        out["balanced"] = made.balanced_sigma, False
+    if beside_paper:
+        theirs, none = papers_sigma(made.prospect), np.full(len(made.prospect.symbols) - STATE_COUNT, np.nan)
+        out["paper's set"] = np.append(theirs, none), False
+        out["as in Table 2: plan"] = np.append(mean_error_percent(made.sigma[-1, :STATE_COUNT]), none), True
+        out["paper"] = np.append(mean_error_percent(theirs), none), True
+    return out
+
+
+def _figure(value: float, percent: bool, per_si: float) -> str:
+    if not math.isfinite(value):
+        return "not seen"
+    return f"{value:.3g} %" if percent else f"{value * per_si:.3g}"
+
+
+def sentences(made: Plan, beside_paper: bool = False) -> list[str]:
+    """What the plan is worth."""
+    count = len(made.prospect.symbols)
+    told = [
+        f"Aim {made.search.aim.name}: {made.search.aim.measures} {made.cost:.4g}. Condition number "
+        f"{made.condition_number:.4g} (rad, 1, g; the least is √3).",
+        f"D-efficiency {made.d_efficiency:.4f} of the bound; {made.d_efficiency_within_reach:.4f} of what these "
+        f"gimbals can. Largest variance function {made.largest_variance:.4g} ({count} where D-optimal).",
+        f"{made.duration_s:.0f} s, {made.slews_s.sum():.0f} s of them in slews. Correlation of time with the direction "
+        f"of gravity: {made.correlation:.2f}.",
+    ]
+    if beside_paper:
+        told.append(
+            "The paper's set has four orientations for each accelerometer alone, this plan serves the three at "
+            f"once; its generalised sigma is {generalised_ratio(made):.3f} of that of the paper's set."
+        )
+    return told
+
+
+def write_csv(made: Plan, path: Path) -> None:
+    """Names of the gimbals, then a line of angles in deg for each dwell."""
+    header = ",".join(f"gimbal_{name}_deg" for name in gimbal_names(made))
+    rows = [",".join(repr(float(angle)) for angle in row) for row in made.gimbal_deg]
+    try:
+        path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: the plan cannot be written ({error.strerror}).") from None
