@@ -21,7 +21,7 @@ from kf_calib.bench import Bench
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.samples import Batch, Stream
 from kf_calib.sources import cdr
-from kf_calib.sources.mcap_file import HEAD, MAGIC
+from kf_calib.sources.mcap_file import HEAD, MAGIC, McapFile, MessageFinder
 from kf_calib.sources.recording import (
     ACCEL_TOPIC,
     ANGLES_TOPIC,
@@ -141,6 +141,17 @@ class Recorder:
         with self._storing():
             self._sync()
 
+    def read_back(self, start: int, end: int) -> Iterator[Batch]:
+        """What was written between two sizes that the file had after a ``flush``, as a replay gives it."""
+        find = MessageFinder()
+        decoders = [cdr.Decoder(channel.kind, channel.width) for channel in self._channels]
+        for block in McapFile(self.path).blocks(_ignore, start, end):
+            streams = [Stream.empty(channel.width) for channel in self._channels]
+            for group in find(block).groups:
+                k = next(k for k, channel in enumerate(self._channels) if channel.id == group.channel)
+                streams[k] += decoders[k](block.data, group.at, group.size)
+            yield Batch(*streams)
+
     def close(self) -> None:
         """Finishes the file. A second call does nothing."""
         if self._file is None:
@@ -247,12 +258,20 @@ def _finish(path: Path) -> int:
         return whole
 
 
+def _ignore(_: str) -> None:
+    """Of a file written here and now nothing is lost."""
+
+
 @dataclass
 class _Channel:
     topic: str
     kind: cdr.MessageType
     template: bytes
     id: int = 0
+
+    @property
+    def width(self) -> int:
+        return self.kind.layout(self.template).width
 
     def register(self, writer: Writer) -> int:
         """The channel's number in the file, made known there on first use."""
