@@ -157,6 +157,7 @@ class Recorder:
         if self._file is None:
             return
         with self._storing():
+            self._flush()
             self._writer.finish()
             self._file.flush()
             self._settle()
