@@ -110,6 +110,7 @@ class Pty:
         """A terminal has no connection to end."""
 
     def close(self) -> None:
+        time.sleep(0.2)  # what is not read when a terminal hangs up is lost
         os.close(self._ours)
 
     def _is_hung_up(self) -> bool:

@@ -20,8 +20,8 @@ class Continuity:
     def __init__(self) -> None:
         self.gaps = self.missing = 0
         self.last_ns: int | None = None
-        self._steps = np.empty(0, np.int64)  # the latest, and those not judged yet
-        self._judged = self._since = 0
+        self._steps = self._unjudged = np.empty(0, np.int64)
+        self._since = 0
         self._period_ns = self._limit_ns = 0.0
         self._is_cut = False
 
@@ -40,11 +40,10 @@ class Continuity:
             self._is_cut = False
             self.gaps += int(not 0.0 < self._limit_ns < steps[0])  # else it counts itself
         self._learn(steps)
+        self._unjudged = np.concatenate([self._unjudged, steps])
         if not self._limit_ns:
             return
-        unjudged = self._steps if not self._judged else steps
-        self._judged += len(unjudged)
-        long = unjudged[unjudged > self._limit_ns]
+        long, self._unjudged = self._unjudged[self._unjudged > self._limit_ns], self._unjudged[:0]
         self.gaps += len(long)
         self.missing += round(float(np.rint(long / self._period_ns - 1.0).sum()))
 

@@ -338,7 +338,7 @@ class LiveSource:
             return None
 
     def _mark_gap(self, reason: str, seconds: float) -> None:
-        facts = {"after_ns": str(self._continuity.last_ns or 0), "seconds": f"{seconds:.3f}", "reason": reason}
+        facts = {"after_ns": str(self._continuity.last_ns or 0), "seconds": f"{seconds:.6f}", "reason": reason}
         with self._lock:
             self._store_if_open(lambda recorder: recorder.mark(GAP_RECORD, facts))
 
