@@ -34,10 +34,9 @@ from kf_calib.sources.live.continuity import Abreast, Continuity
 from kf_calib.sources.live.feed import Feed, Lost, Regained
 from kf_calib.sources.live.links import Link
 from kf_calib.sources.live.protocols import Protocol
-from kf_calib.sources.live.source import GAP_RECORD
 from kf_calib.sources.live.streamed import StreamedFeed
 from kf_calib.sources.recorder import Recorder
-from kf_calib.sources.recording import Recording
+from kf_calib.sources.recording import GAP_RECORD, Recording
 
 KEYS = {"axes": "y z x", "gravity_mps2": "9.81"}
 HEADER = "time_ns,ax_mps2,ay_mps2,az_mps2,outer_rad,middle_rad,inner_rad"
@@ -249,7 +248,9 @@ def test_a_lost_link_costs_what_was_amid_and_is_marked_in_the_recording(tmp_path
     lost = 200 - len(got.accel)
     assert lost in (49, 50)  # in frames the reading came before the pose that was cut
     assert (status.reconnects, status.gaps, status.missing, status.refused) == (1, 1, lost, 1)
-    assert_equal(read(Recording(path)), got)
+    recording = Recording(path)
+    assert_equal(read(recording), got)
+    assert "the link to the bench was lost 1 times (first: the other side closed" in recording.warnings[0]
     with path.open("rb") as file:
         marks = [each.metadata for each in make_reader(file).iter_metadata() if each.name == GAP_RECORD]
     assert [mark["after_ns"] for mark in marks] == [str(START_NS + (numbers(got).index(150) - 1) * 1_000_000)]

@@ -19,9 +19,7 @@ from kf_calib.samples import Batch, Stream
 from kf_calib.sources.live.continuity import Abreast, Continuity
 from kf_calib.sources.live.feed import Feed, Lost, Regained
 from kf_calib.sources.recorder import Recorder, refuse_existing
-
-GAP_RECORD = "kf_calib.gap"
-"""Metadata record at a place in a recording where the link was down: after_ns, seconds, reason."""
+from kf_calib.sources.recording import GAP_RECORD
 
 _FLUSH_S = 0.5  # with the time that flushing takes, less than the second that a kill may cost
 QUEUED = 200_000
