@@ -521,6 +521,15 @@ def test_jitter_is_no_gap() -> None:
     assert (found.gaps, found.missing) == (0, 0)
 
 
+def test_bursts_are_no_gaps_but_a_pause_between_them_is() -> None:
+    arrival = START_NS + 8_000_000 * (np.arange(4000) // 8) + 20_000 * (np.arange(4000) % 8)
+    arrival[2000:] += 50_000_000
+    found = Continuity()
+    for k in range(0, 4000, 16):
+        found.add(arrival[k : k + 16])
+    assert found.gaps == 1 and 45 <= found.missing <= 60
+
+
 def test_poses_wait_for_the_readings_but_not_for_ever() -> None:
     whole, abreast = made_batch(100), Abreast(3)
     none = Stream.empty(3)
