@@ -39,7 +39,7 @@ class Status:
     with the reason of the first. gaps: places where the stamps leap or the link broke; missing: readings lost on the
     way, exact where the bench numbers its frames, else what the gaps have room for. dropped: readings that the
     consumer was too slow for and that are in no recording; waiting: readings on their way to it. recorded: readings in
-    whole chunks of the recording; sync_age_s: age of the newest that the disk is known to hold, None without a
+    whole chunks of the recording; sync_age_s: age of the newest that the disk is known to hold, None without an open
     recording; recording_trouble: why it ended early.
     """
 
@@ -197,7 +197,7 @@ class LiveSource:
                 reconnects=feed.reconnects,
                 bytes=feed.bytes,
                 recorded=recorder.flushed if recorder else 0,
-                sync_age_s=now - recorder.synced_s if recorder else None,
+                sync_age_s=now - recorder.synced_s if recorder and not self._is_finished else None,
                 recording_trouble=self._recording_trouble,
             )
 
