@@ -186,7 +186,7 @@ def kills(count: int, folder: Path) -> dict[str, Any]:
         with child("acquire", bench.url, out) as process:
             assert process.stdout is not None
             process.stdout.readline()
-            time.sleep(chance.uniform(0.3, 4.0))
+            time.sleep(chance.uniform(0.3, 2.5))
             process.kill()
             killed_ns = time.time_ns()
         bench.stopping = True
