@@ -106,9 +106,7 @@ def _begun(dwells: Sequence[DwellFactor], bench: Bench, settings: Settings) -> t
     model = Model.of(bench, settings.effects)
     fitted = fit(list(dwells), model, settings.walk_mps2_per_sqrt_s)
     noise = replace(fitted.noise.judging, checked=True)  # a setting error counts in full where a misfit is judged
-    running = Running.over(
-        dwells, fitted.carried.model, noise, fitted.carried.state, _watched(fitted)
-    )
+    running = Running.over(dwells, fitted.carried.model, noise, fitted.carried.state, _watched(fitted))
     return running, len(dwells), independent_tests(running.scan)
 
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kf_calib.cli.making import angles_from_csv
 from kf_calib.cli.options import (
     F,
     filter_options,
@@ -163,6 +162,7 @@ def _after(recording: Path, options: Mapping[str, Any], quiet: bool) -> Prospect
 
 def _reach(bench: Bench, options: Mapping[str, Any]) -> Reach:
     from kf_calib.reach import Reach, ranges
+    from kf_calib.sources.plans import angles_from_csv
 
     limits = {j: ends for text in options["limits"] for j, ends in ranges(text, bench).items()}
     zones = [ranges(text, bench) for text in options["zones"]]

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -34,6 +35,29 @@ class Visit:
 def explicit_plan(gimbal_deg: Iterable[Sequence[float]], dwell_s: float = 60.0) -> list[Visit]:
     """The orientations given, one row of gimbal angles each, in that order."""
     return [Visit(tuple(float(angle) for angle in row), dwell_s) for row in gimbal_deg]
+
+
+def angles_from_csv(path: Path, width: int) -> list[list[float]]:
+    """Rows of gimbal angles, deg; a first line of names is passed over."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: the plan cannot be read ({getattr(error, 'strerror', None) or error}).") from None
+    rows = list[list[float]]()
+    for number, line in enumerate(lines, start=1):
+        cells = line.split("#")[0].replace(",", " ").split()
+        try:
+            row = [float(cell) for cell in cells]
+        except ValueError:
+            if rows or number > 1:
+                raise InputError(f"{path}, line {number}: {line!r} is not {width} angles in deg.") from None
+            continue
+        if row and len(row) != width:
+            raise InputError(f"{path}, line {number}: {len(row)} angles for {width} gimbal axes.")
+        rows += [row] if row else []
+    if not rows:
+        raise InputError(f"{path}: holds no orientation; write a line of {width} angles in deg for each.")
+    return rows
 
 
 def six_faces(axes: Sequence[Vector] = YZX, dwell_s: float = 60.0) -> list[Visit]:

@@ -6,6 +6,7 @@ Topics are found by their schema. What is whole in a damaged or unfinished file 
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -27,6 +28,9 @@ from kf_calib.sources.mcap_file import Block, DamagedError, McapFile, MessageFin
 BENCH_RECORD = "kf_calib.bench"
 CHECKSUM_KEY = "crc32"
 """Key of the bench record with the checksum of the others: gravity and axes lie outside every chunk's CRC."""
+
+GAP_RECORD = "kf_calib.gap"
+"""Metadata record at a place where the link to the bench was down: after_ns, seconds, reason."""
 
 ACCEL_TOPIC = "/accelerometer"
 ANGLES_TOPIC = "/platform/angles"
@@ -180,13 +184,20 @@ class Recording:
         self._opening_warnings = len(self.warnings)
 
     def __iter__(self) -> Iterator[Batch]:
+        return self._batches(growing=False)
+
+    def following(self) -> Iterator[Batch]:
+        """The batches of a file that is being written, from its start; an empty one: nothing more has come yet."""
+        return self._batches(growing=True)
+
+    def _batches(self, growing: bool) -> Iterator[Batch]:
         del self.warnings[self._opening_warnings :]
         self.fraction = 0.0
         passage = _Passage(self._contents, self.warnings.append)
         accel = passage.track(_ACCEL, self._accel, 3)
         pose = passage.track(_POSE, self._pose, self.bench.pose_width)
         temperature = None
-        for block in self._file.blocks(self.warnings.append):
+        for block in self._file.blocks(self.warnings.append, growing=growing):
             messages = passage.find(block)
             if not temperature and (topic := self._contents.choose(_TEMPERATURE, self._wanted[_TEMPERATURE])):
                 temperature = passage.track(_TEMPERATURE, topic, 1)
@@ -196,8 +207,8 @@ class Recording:
                 pose.read(block, messages),
                 temperature.read(block, messages) if temperature else Stream.empty(1),
             )
-            self.fraction = min(block.end / self._file.size, 1.0)
-            if len(batch.accel) or len(batch.pose) or len(batch.temperature):
+            self.fraction = math.nan if growing else min(block.end / self._file.size, 1.0)
+            if growing or len(batch.accel) or len(batch.pose) or len(batch.temperature):
                 yield batch
         self.fraction = 1.0
         passage.account(self._file.summary.message_counts if self._file.summary else {})
@@ -267,6 +278,7 @@ class _Passage:
         self._find = MessageFinder()
         self._tracks: list[_Track] = []
         self._met = Counter[int]()
+        self._gaps = list[Mapping[str, str]]()
 
     def track(self, role: _Role, topic: str, width: int) -> _Track:
         track = _Track(self.contents, topic, Decoder(self.contents.kind(role, topic), width))
@@ -277,6 +289,7 @@ class _Passage:
         messages = self._find(block)
         for opcode, content in messages.others:
             self.contents.add(opcode, content, self.warn)
+            self._gaps += _gap(opcode, content)
         if messages.lost:
             self.warn(f"{self.contents.path}: {messages.lost} bytes of records before byte {block.end} make no sense.")
         for group in messages.groups:
@@ -284,7 +297,12 @@ class _Passage:
         return messages
 
     def account(self, stated: Mapping[int, int]) -> None:
-        """Warns of messages that the file should have (``stated``, by channel) but that were not met."""
+        """Warns of messages that the file should have (``stated``, by channel) but that were not met, and of gaps."""
+        if self._gaps:
+            reason = self._gaps[0].get("reason", "unknown")
+            self.warn(
+                f"{self.contents.path}: the link to the bench was lost {len(self._gaps)} times (first: {reason})."
+            )
         for track in self._tracks:
             ids = self.contents.ids(track.topic)
             total = sum(stated.get(channel, 0) for channel in ids)
@@ -317,6 +335,17 @@ class _Track:
         joined = sum(parts, Stream.empty(self.decode.width))
         order = np.argsort(np.concatenate([np.empty(0, np.int64), *(group.at for group in groups)]))
         return Stream(joined.time_ns[order], joined.values[order])
+
+
+def _gap(opcode: int, content: bytes) -> list[Mapping[str, str]]:
+    """The facts of a record that marks a gap; none of any other."""
+    if opcode != Opcode.METADATA:
+        return []
+    try:
+        record = parse(Metadata.read, content)
+    except DamagedError:  # told already
+        return []
+    return [record.metadata] if record.name == GAP_RECORD else []
 
 
 def _ignore(_: str) -> None:
