@@ -10,8 +10,9 @@ how the streams were chopped into batches.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -204,6 +205,20 @@ class Segmenter:
         accel, pose, temperature = (order.flush() for order in self._orders)
         self._take(Batch(accel, pose, temperature), counted=True)
         yield from self._advance(final=True)
+
+    @property
+    def standing(self) -> int | None:
+        """Number of the dwell that is open; None while the platform moves, or is not known to stand."""
+        return None if self._dwell is None else self._dwell.number
+
+    def waiting(self) -> list[Block]:
+        """The readings of the open dwell that wait for their block to fill, in a block that is not taken from it."""
+        horizon = self._horizon(final=False)
+        if self._dwell is None or horizon is None:
+            return []
+        aside = copy.copy(self)
+        aside.tally, aside._dwell = Tally(), replace(self._dwell)
+        return list(aside._emit(horizon, closing=True))
 
     def _take(self, batch: Batch, counted: bool = False) -> None:
         accel, pose = batch.accel, batch.pose

@@ -170,6 +170,11 @@ class DwellFactor:
             spectrum=self.spectrum + other.spectrum,
         )
 
+    def repeated(self, times: float) -> DwellFactor:
+        """The same dwell as if its readings had come that many times over."""
+        pieces = (replace(own, triangle=own.triangle * times**0.5, count=round(own.count * times)) for own in self.pieces)
+        return replace(self, pieces=tuple(pieces))
+
     def prefixes(self) -> Iterator[DwellFactor]:
         """The dwell as it stood after 1, 2, 4 ... of its pieces, and in the end."""
         size = 1
