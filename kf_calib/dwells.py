@@ -11,6 +11,7 @@ how the streams were chopped into batches.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -210,6 +211,13 @@ class Segmenter:
     def standing(self) -> int | None:
         """Number of the dwell that is open; None while the platform moves, or is not known to stand."""
         return None if self._dwell is None else self._dwell.number
+
+    @property
+    def arrival_s(self) -> float:
+        """When the open dwell began, since the first sample; NaN where none is open."""
+        if self._dwell is None or self.first_ns is None:
+            return math.nan
+        return (self._dwell.arrival_ns - self.first_ns) / _SECOND_NS
 
     def waiting(self) -> list[Block]:
         """The readings of the open dwell that wait for their block to fill, in a block that is not taken from it."""

@@ -47,13 +47,15 @@ class Watch:
     alarmed: int | None = None
 
     @classmethod
-    def over(cls, dwells: Sequence[DwellFactor], bench: Bench, settings: Settings | None = None) -> Watch:
-        """A watch over the dwells so far, at least four; they count as one look."""
+    def over(
+        cls, dwells: Sequence[DwellFactor], bench: Bench, settings: Settings | None = None, looks: int = 0
+    ) -> Watch:
+        """A watch over the dwells so far, at least four; they count as one look, after ``looks`` with another model."""
         settings = settings or Settings()
         if len(dwells) < _FEWEST:
             raise ValueError(f"a watch begins with {_FEWEST} dwells, not {len(dwells)}")
         with threadpool_limits(1, user_api="blas"):
-            return cls(bench, settings, *_begun(dwells, bench, settings))._looked()
+            return cls(bench, settings, *_begun(dwells, bench, settings), looks)._looked()
 
     def after(self, dwell: DwellFactor) -> Watch:
         """The watch after one more dwell."""
@@ -106,9 +108,7 @@ def _begun(dwells: Sequence[DwellFactor], bench: Bench, settings: Settings) -> t
     model = Model.of(bench, settings.effects)
     fitted = fit(list(dwells), model, settings.walk_mps2_per_sqrt_s)
     noise = replace(fitted.noise.judging, checked=True)  # a setting error counts in full where a misfit is judged
-    running = Running.over(
-        dwells, fitted.carried.model, noise, fitted.carried.state, _watched(fitted)
-    )
+    running = Running.over(dwells, fitted.carried.model, noise, fitted.carried.state, _watched(fitted))
     return running, len(dwells), independent_tests(running.scan)
 
 

@@ -10,6 +10,7 @@ import sys
 
 import click
 
+from kf_calib.cli.live import live
 from kf_calib.cli.making import demo, record, simulate
 from kf_calib.cli.runs import compare, diagnose, improve, list_effects, replay
 from kf_calib.errors import KfCalibError
@@ -21,7 +22,7 @@ def cli() -> None:
     """Calibrate accelerometers on a stationary gimballed bench with a Kalman filter."""
 
 
-for command in (demo, simulate, record, replay, compare, list_effects, diagnose, improve):
+for command in (demo, simulate, record, live, replay, compare, list_effects, diagnose, improve):
     cli.add_command(command)
 
 

@@ -1,0 +1,109 @@
+"""The Rerun view of a run that goes on: nothing that a viewer does, or does not do, reaches whoever offers results.
+
+A thread turns results into the bytes of an .rrd file, and passes them on to a file and through a pipe to a process of
+its own: ``rerun -``, which sends them to the viewer that listens on the port, or becomes that viewer. In this process
+no call of Rerun's waits for a network: one that does, for a viewer that hangs, holds even the exit of its program.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import subprocess
+import tempfile
+import threading
+import uuid
+from contextlib import suppress
+from pathlib import Path
+from typing import IO
+
+import rerun as rr
+
+from kf_calib.calibration import Calibration
+from kf_calib.errors import InputError
+from kf_calib.views.rerun import grow
+from kf_calib.views.screenshot import binary, obituary
+
+PORT = 9876
+_WAITING = 4  # results; the next one that comes through shows what those left out would have
+
+
+class GrowingView:
+    """Offer it results; ``close`` it. rrd: a file to write; port: of the viewer, None: no viewer.
+
+    bind: the address a viewer that is opened listens on. dropped: results that came while ``waiting`` others waited;
+    the dwells they would have shown are shown by the next. trouble: why the viewer shows nothing any more.
+    """
+
+    def __init__(
+        self, rrd: Path | None = None, port: int | None = PORT, bind: str = "127.0.0.1", waiting: int = _WAITING
+    ) -> None:
+        self.dropped, self.trouble = 0, ""
+        self._results = queue.Queue[Calibration | None](waiting)
+        self._file = _created(rrd) if rrd else None
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the viewer's pipe
+        self._viewer = None if port is None else _viewer(port, bind, self._log)
+        self._thread = threading.Thread(target=self._show, name="rerun", daemon=True)
+        self._thread.start()
+
+    def offer(self, result: Calibration) -> None:
+        """Show a result when there is time; never waits."""
+        try:
+            self._results.put_nowait(result)
+        except queue.Full:
+            self.dropped += 1
+
+    def close(self, patience_s: float = 5.0) -> None:
+        """Show what waits, for no longer than that; a viewer that is open stays so."""
+        with suppress(queue.Full):
+            self._results.put(None, timeout=patience_s)
+        self._thread.join(patience_s)
+        if self._thread.is_alive() and self._viewer is not None:
+            self.trouble = self.trouble or "the Rerun viewer does not answer: open the recording with `replay --rrd`."
+            self._viewer.kill()  # ends the wait for it
+            self._thread.join(patience_s)
+
+    def _show(self) -> None:
+        stream, shown = rr.RecordingStream("kf_calib", recording_id=uuid.uuid4()), 0
+        encoded = stream.binary_stream()
+        while (result := self._results.get()) is not None:
+            try:
+                grow(result, stream, shown)
+                shown, data = len(result.visits), encoded.read()
+                self._pass_on(data or b"")
+            except Exception as error:  # a view that fails is no reason for a run to
+                self.trouble = f"the Rerun view stopped: {error}"
+                break
+        for sink in (self._file, self._viewer.stdin if self._viewer else None):
+            if sink is not None:
+                with suppress(OSError):
+                    sink.close()
+
+    def _pass_on(self, data: bytes) -> None:
+        if self._file is not None:
+            self._file.write(data)
+            self._file.flush()
+        if self._viewer is None or self._viewer.stdin is None or self.trouble:
+            return
+        try:
+            self._viewer.stdin.write(data)
+            self._viewer.stdin.flush()
+        except OSError:
+            self._viewer.wait()
+            self._log.seek(0)
+            self.trouble = obituary(self._log.read().decode(errors="replace"))
+
+
+def _created(path: Path) -> IO[bytes]:
+    try:
+        return path.open("wb")
+    except OSError as error:
+        raise InputError(f"the Rerun recording {path} cannot be written ({error.strerror}).") from None
+
+
+def _viewer(port: int, bind: str, log: IO[bytes]) -> subprocess.Popen[bytes]:
+    command = [binary(), "--port", str(port), "--bind", bind, "--hide-welcome-screen", "-"]
+    quiet = {**os.environ, "RUST_LOG": "error"}
+    return subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=quiet, start_new_session=True
+    )  # its own session: Ctrl-C is for the run
