@@ -55,15 +55,16 @@ def log(result: Calibration, stream: rr.RecordingStream) -> None:
         _log(result, History.of(result), stream)
 
 
-def grow(result: Calibration, stream: rr.RecordingStream, shown: int) -> None:
-    """Send what a run shows beyond its first ``shown`` dwells, which were sent already, and lay it out.
+def grow(result: Calibration, stream: rr.RecordingStream, shown: int, lay_out: bool) -> None:
+    """Send what a run shows beyond its first ``shown`` dwells, which were sent already, and the layout if asked to.
 
     A dwell stays in the curves as it was known when it was sent; the platform and the page of text are made anew.
     """
     with _strict():
         history = History.of(result)
         _log(result, history, stream, shown)
-        stream.send_blueprint(layout(result, history, BENCH_TIME, TABS[0]))
+        if lay_out:
+            stream.send_blueprint(layout(result, history, BENCH_TIME, TABS[0]))
 
 
 def _log(result: Calibration, history: History, stream: rr.RecordingStream, shown: int = 0) -> None:

@@ -40,9 +40,13 @@ class GrowingView:
     ) -> None:
         self.dropped, self.trouble = 0, ""
         self._results = queue.Queue[Calibration | None](waiting)
-        self._file = _created(rrd) if rrd else None
+        self._streams, self._viewer = [_saving(rrd)] if rrd else [], None
         self._log = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the viewer's pipe
-        self._viewer = None if port is None else _viewer(port, bind, self._log)
+        if port is not None:
+            piped = _stream()
+            self._encoded = piped.binary_stream()
+            self._streams.append(piped)
+            self._viewer = _viewer(port, bind, self._log)
         self._thread = threading.Thread(target=self._show, name="rerun", daemon=True)
         self._thread.start()
 
@@ -64,41 +68,47 @@ class GrowingView:
             self._thread.join(patience_s)
 
     def _show(self) -> None:
-        stream, shown = rr.RecordingStream("kf_calib", recording_id=uuid.uuid4()), 0
-        encoded = stream.binary_stream()
-        while (result := self._results.get()) is not None:
-            try:
-                grow(result, stream, shown)
-                shown, data = len(result.visits), encoded.read()
-                self._pass_on(data or b"")
-            except Exception as error:  # a view that fails is no reason for a run to
-                self.trouble = f"the Rerun view stopped: {error}"
-                break
-        for sink in (self._file, self._viewer.stdin if self._viewer else None):
-            if sink is not None:
-                with suppress(OSError):
-                    sink.close()
-
-    def _pass_on(self, data: bytes) -> None:
-        if self._file is not None:
-            self._file.write(data)
-            self._file.flush()
-        if self._viewer is None or self._viewer.stdin is None or self.trouble:
-            return
+        shown, laid_out = 0, 0
         try:
-            self._viewer.stdin.write(data)
-            self._viewer.stdin.flush()
+            while (result := self._results.get()) is not None:
+                count = len(result.visits)
+                lay_out = count >= 2 * laid_out or count < shown  # not each time: who looks on may have changed it
+                for stream in self._streams:
+                    grow(result, stream, shown, lay_out)
+                    stream.flush()
+                shown, laid_out = count, count if lay_out else laid_out
+                if self._viewer is not None and not self.trouble:
+                    self._pass_on(self._viewer, self._encoded.read() or b"")
+        except Exception as error:  # a view that fails is no reason for a run to
+            self.trouble = f"the Rerun view stopped: {error}"
+        for stream in self._streams:
+            stream.disconnect()
+        if self._viewer is not None and self._viewer.stdin is not None:
+            with suppress(OSError):
+                self._viewer.stdin.close()
+        self._log.close()
+
+    def _pass_on(self, viewer: subprocess.Popen[bytes], data: bytes) -> None:
+        assert viewer.stdin is not None
+        try:
+            viewer.stdin.write(data)
+            viewer.stdin.flush()
         except OSError:
-            self._viewer.wait()
+            viewer.wait()
             self._log.seek(0)
-            self.trouble = obituary(self._log.read().decode(errors="replace"))
+            self.trouble = self.trouble or obituary(self._log.read().decode(errors="replace"))
 
 
-def _created(path: Path) -> IO[bytes]:
-    try:
-        return path.open("wb")
-    except OSError as error:
-        raise InputError(f"the Rerun recording {path} cannot be written ({error.strerror}).") from None
+def _stream() -> rr.RecordingStream:
+    return rr.RecordingStream("kf_calib", recording_id=uuid.uuid4())
+
+
+def _saving(path: Path) -> rr.RecordingStream:
+    if not path.parent.is_dir():
+        raise InputError(f"the Rerun recording {path} cannot be written: there is no folder {path.parent}.")
+    stream = _stream()
+    stream.save(path)
+    return stream
 
 
 def _viewer(port: int, bind: str, log: IO[bytes]) -> subprocess.Popen[bytes]:
