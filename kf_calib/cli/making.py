@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +15,7 @@ from kf_calib.errors import InputError
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from kf_calib.bench import Vector
     from kf_calib.samples import Source
-    from kf_calib.sources.plans import Visit
-    from kf_calib.sources.simulator import Simulation
 
 
 _HOW_TO_HIDE = """\
@@ -109,71 +106,6 @@ def simulation_options(command: F) -> F:
     return command
 
 
-def _simulation(options: Mapping[str, Any]) -> Simulation:
-    from dataclasses import fields, replace
-    from functools import partial
-
-    from kf_calib.bench import Bench, parse_axes
-    from kf_calib.sources.hidden import parse, sized
-    from kf_calib.sources.physics import Ambient
-    from kf_calib.sources.sensors import GRADES
-    from kf_calib.sources.simulator import Simulation
-
-    keys = {"axes": "y z x", **overrides(options)}
-    if "latitude_deg" not in keys:
-        keys.setdefault("gravity_mps2", "9.81")
-    grade = GRADES[options["grade"]]
-    names = {field.name for field in fields(grade.noise)}
-    noise = replace(grade.noise, **{key: options[key] for key in names if options.get(key) is not None})
-    axes = parse_axes(keys["axes"])
-    visits = _visits(options, axes)
-    if not options["unstated"]:
-        keys.setdefault("angle_sigma_deg", repr(noise.setting_sigma_deg))
-        keys.setdefault("scatter_sigma_mps2", repr(noise.dwell_sigma_mps2(len(visits))))
-    ambient = Ambient(**{field.name: options[field.name] for field in fields(Ambient) if field.name in options})
-    run = Simulation(
-        Bench.from_metadata(keys), grade.sensors(options["seed"]), noise, visits,
-        sample_hz=options["sample_hz"], angle_hz=options["angle_hz"], slew_rate_degps=options["slew_degps"],
-        ambient=ambient, seed=options["seed"], grade=options["grade"],
-    )  # fmt: skip
-    return run.hiding(
-        parse(options["hidden"], axes, seed=options["seed"], grade=options["grade"], sized=partial(sized, run))
-    )
-
-
-def _visits(options: Mapping[str, Any], axes: tuple[Vector, ...]) -> list[Visit]:
-    from kf_calib.sources.plans import explicit_plan, six_faces, spread_plan
-
-    if options["plan"] == "spread":
-        return spread_plan(options["count"], axes, options["dwell_s"], options["seed"])
-    if options["plan"] == "faces":
-        return six_faces(axes, options["dwell_s"])
-    return explicit_plan(_angles_from_csv(Path(options["plan"]), len(axes)), options["dwell_s"])
-
-
-def _angles_from_csv(path: Path, width: int) -> list[list[float]]:
-    """Rows of gimbal angles, deg; a first line of names is passed over."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: the plan cannot be read ({getattr(error, 'strerror', None) or error}).") from None
-    rows = list[list[float]]()
-    for number, line in enumerate(lines, start=1):
-        cells = line.split("#")[0].replace(",", " ").split()
-        try:
-            row = [float(cell) for cell in cells]
-        except ValueError:
-            if rows or number > 1:
-                raise InputError(f"{path}, line {number}: {line!r} is not {width} angles in deg.") from None
-            continue
-        if row and len(row) != width:
-            raise InputError(f"{path}, line {number}: {len(row)} angles for {width} gimbal axes.")
-        rows += [row] if row else []
-    if not rows:
-        raise InputError(f"{path}: holds no orientation; write a line of {width} angles in deg for each.")
-    return rows
-
-
 def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], None]) -> tuple[int, int, float]:
     """Write a source to a recording, a chunk closed at the end of each dwell; readings, dwells, seconds."""
     from kf_calib.dwells import Segmenter
@@ -209,7 +141,9 @@ overwrite_option = click.option("--overwrite", is_flag=True, help="Replace the f
 @json_option
 def simulate(out: Path, overwrite: bool, as_json: bool, **options: Any) -> None:
     """Record a simulated bench run to OUT; its truth goes to a side file that no estimator opens."""
-    source = _simulation(options)
+    from kf_calib.sources.simulated import simulation
+
+    source = simulation(options, overrides(options))
     with progress(f"simulating {out.name}", as_json) as tick:
         readings, dwells, duration_s = _record(source, out, overwrite, tick)
     truth = source.write_truth(out)
@@ -275,11 +209,12 @@ def demo(folder: Path, as_json: bool) -> None:
     """The main job on a simulated run: record, replay, compare with least squares, save the view; files in FOLDER."""
     from kf_calib.comparison import compare as run
     from kf_calib.sources.recording import Recording
+    from kf_calib.sources.simulated import simulation
 
     folder.mkdir(parents=True, exist_ok=True)
     recording, rrd = folder / "demo.mcap", folder / "demo.rrd"
     options = simulate.make_context("simulate", [str(recording)]).params
-    source = _simulation(options | {"dwell_s": 15.0, "slew_degps": 90.0, "seed": 2019})
+    source = simulation(options | {"dwell_s": 15.0, "slew_degps": 90.0, "seed": 2019}, overrides(options))
     with progress("recording a simulated run", as_json) as tick:
         readings, dwells, duration_s = _record(source, recording, True, tick)
         truth = source.write_truth(recording)

@@ -34,6 +34,7 @@ class Account:
     malformed: int = 0
     first_malformed: tuple[int, str] | None = None
     unknown: Counter[str] = field(default_factory=Counter[str])
+    what: str = "lines"
 
     def refuse(self, line: int, reason: str) -> None:
         self.malformed += 1
@@ -51,10 +52,11 @@ class Account:
         if self.first_malformed:
             line, reason = self.first_malformed
             out.append(
-                f"{self.malformed} of {self.lines} lines were malformed and skipped (first line {line}: {reason})."
+                f"{self.malformed} of {self.lines} {self.what} were malformed and skipped "
+                f"(first {self.what.removesuffix('s')} {line}: {reason})."
             )
         if self.unknown:
-            named = ", ".join(f"{name!r} ({count})" for name, count in self.unknown.items())
+            named = ", ".join(f"{name!r} ({count})" for name, count in dict(self.unknown).items())
             out.append(f"names that are not known were left out, with the values under them: {named}.")
         return out
 

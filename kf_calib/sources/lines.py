@@ -12,7 +12,7 @@ from contextlib import contextmanager, nullcontext
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
-from typing import BinaryIO
+from typing import BinaryIO, Protocol
 
 from kf_calib.bench import Bench
 from kf_calib.errors import BenchError, InputError
@@ -22,7 +22,7 @@ from kf_calib.sources.json_lines import JsonLines
 from kf_calib.sources.line_parts import Account, LineReader
 
 _BLOCK_BYTES = 1 << 18
-_LONGEST_LINE_BYTES = 1 << 20
+LONGEST_LINE_BYTES = 1 << 20
 _SURVEY_LINES = 1_000_000  # without a pose in them, none will come
 
 
@@ -88,17 +88,72 @@ class Lines:
         return self._latest
 
     def _describe_bench(self, passage: _Passage) -> Bench:
-        lines = passage.parser
-        try:
-            bench = Bench.from_metadata({**lines.metadata, **self._overrides}, lines.has_angles)
-        except BenchError as error:
-            raise BenchError(f"{self.name}: {error}") from error
-        if bench.pose_width != lines.pose_width:
-            raise InputError(
-                f"{self.name}: poses have {lines.pose_width} angles and the bench has {bench.pose_width} axes: state "
-                'as many axes as there are angles, outer first, for example --axes "y z x".'
-            )
-        return bench
+        return described(self.name, passage.parser, self._overrides)
+
+
+class Described(Protocol):
+    """What has been learnt of the bench from what it sent."""
+
+    metadata: dict[str, str]
+    has_angles: bool
+    pose_width: int
+
+
+def described(name: str, reader: Described, overrides: Mapping[str, str]) -> Bench:
+    """The bench, once a pose has been read. Raises InputError where it cannot be that one."""
+    try:
+        bench = Bench.from_metadata({**reader.metadata, **overrides}, reader.has_angles)
+    except BenchError as error:
+        raise BenchError(f"{name}: {error}") from error
+    if bench.pose_width != reader.pose_width:
+        raise InputError(
+            f"{name}: poses have {reader.pose_width} angles and the bench has {bench.pose_width} axes: state "
+            'as many axes as there are angles, outer first, for example --axes "y z x".'
+        )
+    return bench
+
+
+class Cutter:
+    """Bytes as they come, cut into lines; a line that is too long is refused and left empty."""
+
+    def __init__(self, account: Account) -> None:
+        self._account, self._tail, self._cut = account, bytearray(), 0
+
+    @property
+    def is_amid(self) -> bool:
+        """Whether the last line has not ended yet."""
+        return bool(self._tail)
+
+    def push(self, block: bytes) -> list[str]:
+        """The lines that end in ``block``."""
+        end, lines = block.rfind(b"\n") + 1, list[str]()
+        if end:
+            lines = self._decoded(bytes(self._tail) + block[: end - 1])
+            self._tail.clear()
+        if len(self._tail) <= LONGEST_LINE_BYTES:  # else what comes up to the next end of line is not kept
+            self._tail += block[end:]
+        return lines
+
+    def rest(self) -> list[str]:
+        """The line without an end, if there is one."""
+        block = bytes(self._tail)
+        self._tail.clear()
+        return self._decoded(block) if block else []
+
+    def _decoded(self, block: bytes) -> list[str]:
+        lines = block.replace(b"\r\n", b"\n").removesuffix(b"\r").split(b"\n")
+        if len(block) > LONGEST_LINE_BYTES:
+            for i, line in enumerate(lines):
+                if len(line) > LONGEST_LINE_BYTES:
+                    self._account.refuse(self._cut + i + 1, "it is longer than 1 MiB")
+                    lines[i] = b""
+        self._cut += len(lines)
+        return b"\n".join(lines).decode("utf-8", errors="replace").split("\n")
+
+
+def reader_for(first: str, columns: Mapping[str, str], account: Account) -> LineReader:
+    """The reader that the first line asks for. Raises InputError for a header that does not say what is needed."""
+    return JsonLines(columns, account) if first[0] in "{[" else CsvLines(first, columns, account)
 
 
 class _Passage:
@@ -156,16 +211,16 @@ class _Passage:
     def _start(self, first: str, lines: list[str], before: int) -> None:
         """Chooses the parser by the first line and has it read the rest of the first block."""
         self.account.lines += before
-        if first[0] in "{[":
-            self.parser = JsonLines(self._columns, self.account)
-            self._ahead.append(self._parse([first, *lines[1:]]))
-            return
         try:
-            self.parser = CsvLines(first, self._columns, self.account)
+            self.parser = reader_for(first, self._columns, self.account)
         except InputError as error:
             raise InputError(f"{self._name}: {error}") from None
-        self.account.lines += 1
-        self._ahead.append(self._parse(lines[1:]))
+        rows = lines[1:]
+        if isinstance(self.parser, CsvLines):  # the header has been read
+            self.account.lines += 1
+        else:
+            rows = [first, *rows]
+        self._ahead.append(self._parse(rows))
 
     def _next_batch(self) -> Batch | None:
         lines = next(self._blocks, None)
@@ -179,31 +234,16 @@ class _Passage:
         return batch
 
     def _split(self, stream: BinaryIO) -> Iterator[list[str]]:
-        """Whole lines, block by block as they arrive; a line that is too long is refused and left empty."""
-        tail, cut, position = bytearray(), 0, 0
+        """Whole lines, block by block as they arrive."""
+        cutter, position = Cutter(self.account), 0
         for block in self._read(stream):
             position += len(block)
-            end = block.rfind(b"\n") + 1
-            if end:
-                lines = self._decoded(bytes(tail) + block[: end - 1], cut)
-                cut += len(lines)
+            if lines := cutter.push(block):
                 self.fraction = min(position / self._size, 1.0) if self._size else math.nan
                 yield lines
-                tail.clear()
-            if len(tail) <= _LONGEST_LINE_BYTES:  # else what comes up to the next end of line is not kept
-                tail += block[end:]
-        if tail:
-            yield self._decoded(bytes(tail), cut)
+        if lines := cutter.rest():
+            yield lines
         self.fraction = 1.0
-
-    def _decoded(self, block: bytes, before: int) -> list[str]:
-        lines = block.replace(b"\r\n", b"\n").removesuffix(b"\r").split(b"\n")
-        if len(block) > _LONGEST_LINE_BYTES:
-            for i, line in enumerate(lines):
-                if len(line) > _LONGEST_LINE_BYTES:
-                    self.account.refuse(before + i + 1, "it is longer than 1 MiB")
-                    lines[i] = b""
-        return b"\n".join(lines).decode("utf-8", errors="replace").split("\n")
 
     def _read(self, stream: BinaryIO) -> Iterator[bytes]:
         read = getattr(stream, "read1", stream.read)  # read1 does not wait until a whole block has come

@@ -53,6 +53,7 @@ _LEAST: dict[int, int] = {
     Opcode.MESSAGE_INDEX: 6, Opcode.ATTACHMENT: 36, Opcode.METADATA: 8, Opcode.DATA_END: 4,
 }  # fmt: skip
 _FIRST_PRIVATE_OPCODE = 0x80
+_NOTHING_YET = -1  # in place of an opcode: the next record of a growing file is not whole
 _LOOSE = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA)
 _Record = TypeVar("_Record")
 _Item = TypeVar("_Item")
@@ -233,12 +234,16 @@ class McapFile:
                 raise DamagedError("a record is not where it should be")
             return file.read(length)
 
-    def blocks(self, warn: Warn) -> Iterator[Block]:
-        """Every whole stretch of records, from the start; ``warn`` is told what is lost. Raises InputError."""
+    def blocks(self, warn: Warn, start: int = 0, end: int | None = None, growing: bool = False) -> Iterator[Block]:
+        """Every whole stretch of records, from the start; ``warn`` is told what is lost. Raises InputError.
+
+        start, end: bytes between which whole records lie, where not all are wanted. growing: the file is being written;
+        an empty block means that no further record is whole yet.
+        """
         with self.open() as file:
-            walk = _Walk(self, file, warn)
+            walk = _Walk(self, file, warn, start, end, growing)
             try:
-                yield from _ahead(walk.unpack, walk.parcels())
+                yield from (map if growing else _ahead)(walk.unpack, walk.parcels())
             except OSError as error:
                 raise InputError(f"{self.path} cannot be read ({error.strerror}): check its medium.") from error
             walk.compare_checksum()
@@ -268,27 +273,31 @@ class _Parcel:
 class _Walk:
     """One passage through the data section, keeping the checksum of all that it passed."""
 
-    def __init__(self, mcap: McapFile, file: IO[bytes], warn: Warn) -> None:
+    def __init__(
+        self, mcap: McapFile, file: IO[bytes], warn: Warn, start: int = 0, end: int | None = None, growing: bool = False
+    ) -> None:
         self.path = mcap.path
+        self.growing = growing
         self.file = file
         self.warn = warn
-        self.end = mcap.summary.start if mcap.summary else file.seek(0, 2)
+        self.end = end or (mcap.summary.start if mcap.summary else file.seek(0, 2))
         self.chunks = {index.chunk_start_offset: index for index in mcap.summary.chunks} if mcap.summary else {}
         self.chunk_starts = sorted(start for start in self.chunks if start < self.end)
         self.indexed = mcap.summary is not None
-        self.position = file.seek(0)
+        self.position = file.seek(start)
         self.crc = self.crc_before_end = self.stated_crc = 0
-        self.whole = True  # nothing lost so far
+        self.whole = not start  # nothing lost so far
         self.unchecked = False  # readings were passed that no chunk's checksum covers
-        self._take(len(MAGIC))
+        if not start:
+            self._take(len(MAGIC))
 
     def parcels(self) -> Iterator[_Parcel]:
         parcel = _Parcel()
         for start, opcode, content in self._records():
-            if parcel.size >= _BLOCK and opcode != Opcode.MESSAGE_INDEX:
+            if opcode == _NOTHING_YET or (parcel.size >= _BLOCK and opcode != Opcode.MESSAGE_INDEX):
                 yield parcel
                 parcel = _Parcel()
-            if opcode != Opcode.HEADER:
+            if opcode not in (Opcode.HEADER, _NOTHING_YET):
                 parcel.records.append((start, opcode, content))
                 parcel.size += _CHUNK.unpack_from(content)[2] if opcode == Opcode.CHUNK else len(content)
                 parcel.end = self.position
@@ -321,7 +330,10 @@ class _Walk:
 
     def _records(self) -> Iterator[tuple[int, int, bytes]]:
         """Start, opcode and content of record after record; attachments and kinds not known are passed over."""
-        while self.position < self.end:
+        while self.growing or self.position < self.end:
+            if self.growing and not self._has_come():
+                yield self.position, _NOTHING_YET, b""
+                continue
             start, limit, crc = self.position, self._limit(), self.crc
             head = self._take(min(HEAD.size, limit - start))
             opcode, length = HEAD.unpack(head.ljust(HEAD.size, b"\x00"))
@@ -340,6 +352,17 @@ class _Walk:
                 self.warn(f"{self.path}: the record at byte {start} is damaged: its {length} bytes are passed over.")
                 continue
             yield start, opcode, content
+
+    def _has_come(self) -> bool:
+        """Whether the record at the present position is whole, or will never be."""
+        self.end = self.file.seek(0, 2)
+        self.file.seek(self.position)
+        head = self.file.read(HEAD.size)
+        self.file.seek(self.position)
+        if len(head) < HEAD.size:
+            return False
+        opcode, length = HEAD.unpack(head)
+        return length > _CHUNK_LIMIT + _PIECE or not opcode or self.position + HEAD.size + length <= self.end
 
     def _take(self, length: int) -> bytes:
         data = self.file.read(length)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from os import PathLike
@@ -13,12 +14,14 @@ from types import TracebackType
 from typing import IO, Self
 
 import numpy as np
+from mcap.opcode import Opcode
 from mcap.writer import Writer
 
 from kf_calib.bench import Bench
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.samples import Batch, Stream
 from kf_calib.sources import cdr
+from kf_calib.sources.mcap_file import HEAD, MAGIC, McapFile, MessageFinder
 from kf_calib.sources.recording import (
     ACCEL_TOPIC,
     ANGLES_TOPIC,
@@ -30,15 +33,27 @@ from kf_calib.sources.recording import (
 )
 
 _AXIS_NAMES = {2: ("outer", "inner"), 3: ("outer", "middle", "inner")}
+_END = (  # of a file without a summary: all fields are zero
+    HEAD.pack(Opcode.DATA_END, 4) + bytes(4) + HEAD.pack(Opcode.FOOTER, 20) + bytes(20) + MAGIC
+)
+
+
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Raises InputError where a recording cannot be begun at ``path``: before a bench is waited for, not after."""
+    if path.exists() and not overwrite:
+        raise InputError(f"{path} exists already: give another name, or --overwrite to replace it.")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{path} cannot be created (its folder does not exist): choose another place.")
 
 
 class Recorder:
     """An open recording of ``bench``; a context manager that finishes the file.
 
     flush_s: a write that comes this long (wall clock) after the last one brought to the disk is brought there too.
-    chunk_size: bytes of readings packed into one chunk at most.
+    chunk_size: bytes of readings packed into one chunk at most. background: the disk is waited for in a thread of its
+    own, and what it refuses is told by the next call.
     Raises InputError where the file exists (unless ``overwrite``) or cannot be made, KfCalibError where it cannot be
-    written on; what was written till then stays readable.
+    written on; the file is then finished without a summary, and what was written till then stays readable.
     """
 
     def __init__(
@@ -49,11 +64,22 @@ class Recorder:
         flush_s: float = 1.0,
         chunk_size: int = 1 << 20,
         overwrite: bool = False,
+        background: bool = False,
     ) -> None:
         self.path = Path(path)
+        self.readings = 0
+        """Readings written."""
+        self.flushed = 0
+        """Of these, readings in whole chunks of the file, which survive this process."""
+        self.size = 0
+        """Bytes of the file with whole chunks; another reader sees them."""
+        self.synced_s = time.monotonic()
+        """When what the disk is known to hold was written (``time.monotonic``)."""
         self._file: IO[bytes] | None = self._create(overwrite)
         self._flush_s = flush_s
-        self._flushed_s = time.monotonic()
+        self._flushed_s = self.synced_s
+        self._disk = ThreadPoolExecutor(1, "disk") if background else None
+        self._pending: Future[None] | None = None
         self._writer = Writer(self._file, chunk_size=chunk_size, enable_data_crcs=True)
         names = _AXIS_NAMES.get(len(bench.axes)) or [f"axis{i}" for i in range(len(bench.axes))]
         self._channels = (
@@ -89,24 +115,57 @@ class Recorder:
         with self._storing():
             for i, stamp in zip(order.tolist(), stamps[order].tolist(), strict=True):
                 self._writer.add_message(ids[i], log_time=stamp, data=messages[i], publish_time=stamp)
-            if time.monotonic() - self._flushed_s >= self._flush_s:
-                self._sync()
+            self.readings += len(batch.accel)
+            self._sync_when_due()
+
+    def tick(self) -> None:
+        """To be called while nothing comes to be written: what was written last is brought to the disk when due."""
+        with self._storing():
+            self._sync_when_due()
+
+    def flush(self) -> int:
+        """Ends the chunk at hand; the bytes up to which another reader sees the file."""
+        with self._storing():
+            self._flush()
+        return self.size
+
+    def mark(self, name: str, facts: Mapping[str, str]) -> None:
+        """Puts a metadata record among the samples, after those written so far."""
+        with self._storing():
+            self._flush()
+            self._writer.add_metadata(name, dict(facts))
+            self._flush()
 
     def end_dwell(self) -> None:
         """Brings all samples so far to the disk: they are safe when this returns."""
         with self._storing():
             self._sync()
 
+    def read_back(self, start: int, end: int) -> Iterator[Batch]:
+        """What was written between two sizes that the file had after a ``flush``, as a replay gives it."""
+        find = MessageFinder()
+        decoders = [cdr.Decoder(channel.kind, channel.width) for channel in self._channels]
+        for block in McapFile(self.path).blocks(_ignore, start, end):
+            streams = [Stream.empty(channel.width) for channel in self._channels]
+            for group in find(block).groups:
+                k = next(k for k, channel in enumerate(self._channels) if channel.id == group.channel)
+                streams[k] += decoders[k](block.data, group.at, group.size)
+            yield Batch(*streams)
+
     def close(self) -> None:
         """Finishes the file. A second call does nothing."""
         if self._file is None:
             return
         with self._storing():
+            self._flush()
             self._writer.finish()
             self._file.flush()
+            self._settle()
             os.fsync(self._file.fileno())
             self._file.close()
-            self._file = None
+            self._file, self.flushed = None, self.readings
+        if self._disk:
+            self._disk.shutdown()
 
     def __enter__(self) -> Self:
         return self
@@ -130,11 +189,35 @@ class Recorder:
         except cdr.CdrError as error:
             raise InputError(f"samples for {channel.topic} do not fit into {self.path}: {error}.") from error
 
-    def _sync(self) -> None:
+    def _sync_when_due(self) -> None:
+        if time.monotonic() - self._flushed_s >= self._flush_s:
+            self._sync()
+
+    def _flush(self) -> None:
         if self._file is not None:
             self._writer.flush()
-            os.fsync(self._file.fileno())
-            self._flushed_s = time.monotonic()
+            self.size, self.flushed = self._file.tell(), self.readings
+
+    def _sync(self) -> None:
+        if self._file is None:
+            return
+        self._flush()
+        self._flushed_s = time.monotonic()
+        if self._disk is None:
+            self._bring(self._file.fileno(), self._flushed_s)
+        elif self._pending is None or self._pending.done():  # else the disk is slow: the next time is soon
+            self._settle()
+            self._pending = self._disk.submit(self._bring, self._file.fileno(), self._flushed_s)
+
+    def _bring(self, descriptor: int, written_s: float) -> None:
+        os.fsync(descriptor)
+        self.synced_s = written_s
+
+    def _settle(self) -> None:
+        """Waits for the disk; raises what it refused."""
+        pending, self._pending = self._pending, None
+        if pending:
+            pending.result()
 
     @contextmanager
     def _storing(self) -> Iterator[None]:
@@ -145,14 +228,39 @@ class Recorder:
             yield
         except BaseException as error:
             file, self._file = self._file, None
+            if self._disk:
+                wait([self._pending] if self._pending else [])
+                self._disk.shutdown()
             with suppress(OSError):  # what is left in its buffer fails again
                 file.close()
             if isinstance(error, OSError):
+                with suppress(OSError):  # then it stays as it is, and readable all the same
+                    self.size = _finish(self.path)
                 raise KfCalibError(
                     f"{self.path} cannot be written on ({error.strerror}): it holds what was recorded till then; "
                     "make room and record the rest into a new file."
                 ) from error
             raise
+
+
+def _finish(path: Path) -> int:
+    """Cuts a file behind its last whole record and ends it there: that takes less room than it makes."""
+    with path.open("r+b") as file:
+        size, whole = file.seek(0, os.SEEK_END), len(MAGIC)
+        while whole + HEAD.size <= size:
+            file.seek(whole)
+            end = whole + HEAD.size + HEAD.unpack(file.read(HEAD.size))[1]
+            if end > size:
+                break
+            whole = end
+        file.truncate(whole)
+        file.seek(whole)
+        file.write(_END)
+        return whole
+
+
+def _ignore(_: str) -> None:
+    """Of a file written here and now nothing is lost."""
 
 
 @dataclass
@@ -161,6 +269,10 @@ class _Channel:
     kind: cdr.MessageType
     template: bytes
     id: int = 0
+
+    @property
+    def width(self) -> int:
+        return self.kind.layout(self.template).width
 
     def register(self, writer: Writer) -> int:
         """The channel's number in the file, made known there on first use."""

@@ -6,6 +6,7 @@ Topics are found by their schema. What is whole in a damaged or unfinished file 
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -180,13 +181,20 @@ class Recording:
         self._opening_warnings = len(self.warnings)
 
     def __iter__(self) -> Iterator[Batch]:
+        return self._batches(growing=False)
+
+    def following(self) -> Iterator[Batch]:
+        """The batches of a file that is being written, from its start; an empty one: nothing more has come yet."""
+        return self._batches(growing=True)
+
+    def _batches(self, growing: bool) -> Iterator[Batch]:
         del self.warnings[self._opening_warnings :]
         self.fraction = 0.0
         passage = _Passage(self._contents, self.warnings.append)
         accel = passage.track(_ACCEL, self._accel, 3)
         pose = passage.track(_POSE, self._pose, self.bench.pose_width)
         temperature = None
-        for block in self._file.blocks(self.warnings.append):
+        for block in self._file.blocks(self.warnings.append, growing=growing):
             messages = passage.find(block)
             if not temperature and (topic := self._contents.choose(_TEMPERATURE, self._wanted[_TEMPERATURE])):
                 temperature = passage.track(_TEMPERATURE, topic, 1)
@@ -196,8 +204,8 @@ class Recording:
                 pose.read(block, messages),
                 temperature.read(block, messages) if temperature else Stream.empty(1),
             )
-            self.fraction = min(block.end / self._file.size, 1.0)
-            if len(batch.accel) or len(batch.pose) or len(batch.temperature):
+            self.fraction = math.nan if growing else min(block.end / self._file.size, 1.0)
+            if growing or len(batch.accel) or len(batch.pose) or len(batch.temperature):
                 yield batch
         self.fraction = 1.0
         passage.account(self._file.summary.message_counts if self._file.summary else {})

@@ -1,0 +1,99 @@
+"""The order of samples: what is missing in it, and one stream kept from running ahead of the other."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kf_calib.samples import Batch, Stream, Times
+
+_ENOUGH = 16  # steps that give a period
+_REMEMBERED = 256
+_HELD_S = 0.25
+
+
+class Continuity:
+    """Gaps in the stamps of readings, and how many readings they have room for.
+
+    A step is a gap where it exceeds the median step by half, or by eight robust deviations where stamps jitter.
+    """
+
+    def __init__(self) -> None:
+        self.gaps = self.missing = 0
+        self.last_ns: int | None = None
+        self._steps = np.empty(0, np.int64)  # the latest, and those not judged yet
+        self._judged = self._since = 0
+        self._period_ns = self._limit_ns = 0.0
+        self._is_cut = False
+
+    def cut(self) -> None:
+        """The link broke here: whatever the next stamp is, there is a gap before it."""
+        self._is_cut = True
+
+    def add(self, time_ns: Times) -> None:
+        """The stamps (n,) of further readings."""
+        if not len(time_ns):
+            return
+        steps = np.diff(time_ns, prepend=time_ns[0] if self.last_ns is None else self.last_ns)
+        steps = steps[1:] if self.last_ns is None else steps
+        self.last_ns = int(time_ns[-1])
+        if self._is_cut and len(steps):
+            self._is_cut = False
+            self.gaps += int(not 0.0 < self._limit_ns < steps[0])  # else it counts itself
+        self._learn(steps)
+        if not self._limit_ns:
+            return
+        unjudged = self._steps if not self._judged else steps
+        self._judged += len(unjudged)
+        long = unjudged[unjudged > self._limit_ns]
+        self.gaps += len(long)
+        self.missing += round(float(np.rint(long / self._period_ns - 1.0).sum()))
+
+    def _learn(self, steps: Times) -> None:
+        known = len(self._steps)
+        self._steps = np.concatenate([self._steps, steps])[-_REMEMBERED:]
+        self._since += len(steps)
+        if len(self._steps) < _ENOUGH or (known >= _ENOUGH and self._since < _REMEMBERED):
+            return
+        forward = self._steps[self._steps > 0]
+        if len(forward):
+            self._since = 0
+            self._period_ns = float(np.median(forward))
+            jitter_ns = 1.48 * float(np.median(np.abs(forward - self._period_ns)))
+            self._limit_ns = self._period_ns + max(0.5 * self._period_ns, 8.0 * jitter_ns)
+
+
+class Abreast:
+    """Holds angle messages back until the readings have reached their stamps, for a quarter of a second at most.
+
+    Where dwells begin and end then does not depend on how far one stream was ahead of the other on the way here, and a
+    replay, which sees them side by side, finds the same.
+    """
+
+    def __init__(self, pose_width: int) -> None:
+        self._pose = Stream.empty(pose_width)
+        self._reached_ns: int | None = None
+        self._since_s: float | None = None
+
+    def push(self, batch: Batch, now_s: float) -> Batch:
+        """What can go on, now that this has come."""
+        if len(batch.accel):
+            latest = int(batch.accel.time_ns.max())
+            self._reached_ns = latest if self._reached_ns is None else max(self._reached_ns, latest)
+        pose = self._pose + batch.pose
+        early = (
+            np.flatnonzero(pose.time_ns > self._reached_ns) if self._reached_ns is not None else np.arange(len(pose))
+        )
+        count = int(early[0]) if len(early) else len(pose)
+        if self._since_s is not None and now_s - self._since_s > _HELD_S:
+            count = len(pose)
+        if count == len(pose):
+            self._since_s = None
+        elif count or self._since_s is None:
+            self._since_s = now_s
+        self._pose = pose[count:]
+        return Batch(batch.accel, pose[:count], batch.temperature)
+
+    def rest(self) -> Batch:
+        """What is still held."""
+        pose, self._pose = self._pose, self._pose[:0]
+        return Batch(Stream.empty(3), pose)

@@ -1,0 +1,362 @@
+"""The live source: recording first, then a queue that a slow consumer cannot clog."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from kf_calib.bench import Bench
+from kf_calib.errors import InputError, KfCalibError
+from kf_calib.samples import Batch, Stream
+from kf_calib.sources.live.continuity import Abreast, Continuity
+from kf_calib.sources.live.feed import Feed, Lost, Regained
+from kf_calib.sources.recorder import Recorder, refuse_existing
+
+GAP_RECORD = "kf_calib.gap"
+"""Metadata record at a place in a recording where the link was down: after_ns, seconds, reason."""
+
+_FLUSH_S = 0.5  # with the time that flushing takes, less than the second that a kill may cost
+QUEUED = 200_000
+"""Samples, of all kinds, that wait for the consumer at most."""
+
+_TAKEN = 1 << 16  # samples of one batch, where several wait
+_RATE_S = 2.0
+_LATEST_NS = (1 << 31) * 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """A live source at one moment.
+
+    link: connecting, live, lost (being tried again) or ended; trouble: why it is down. rate_hz: readings a second, of
+    the last two seconds. samples: readings; poses: angle messages. refused: lines or frames that could not be used,
+    with the reason of the first. gaps: places where the stamps leap or the link broke; missing: readings lost on the
+    way, exact where the bench numbers its frames, else what the gaps have room for. dropped: readings that the
+    consumer was too slow for and that are in no recording; waiting: readings on their way to it. recorded: readings in
+    whole chunks of the recording; sync_age_s: age of the newest that the disk is known to hold, None without a
+    recording; recording_trouble: why it ended early.
+    """
+
+    link: str = "connecting"
+    trouble: str = ""
+    rate_hz: float = 0.0
+    samples: int = 0
+    poses: int = 0
+    temperatures: int = 0
+    refused: int = 0
+    first_refusal: str = ""
+    gaps: int = 0
+    missing: int = 0
+    dropped: int = 0
+    waiting: int = 0
+    reconnects: int = 0
+    bytes: int = 0
+    recorded: int = 0
+    sync_age_s: float | None = None
+    recording_trouble: str = ""
+
+    def sentences(self) -> list[str]:
+        """What a user must know once the run has ended."""
+        said = [
+            (self.reconnects, f"the link was lost and regained {self.reconnects} times"),
+            (self.missing, f"{self.missing} readings were lost on the way, in {self.gaps} gaps"),
+            (self.dropped, f"{self.dropped} readings came faster than they could be evaluated and were left out"),
+            (self.recording_trouble, self.recording_trouble.removesuffix(".")),
+            (self.trouble, self.trouble.removesuffix(".")),
+        ]
+        return [f"{text}." for condition, text in said if condition]
+
+
+@dataclass
+class _Counts:
+    readings: int = 0
+    poses: int = 0
+    temperatures: int = 0
+    dropped: int = 0
+
+
+@dataclass
+class _Queue:
+    """Batches on their way to the consumer.
+
+    behind_from: byte of the recording from which on the consumer has to read what did not fit in here; nothing is put
+    in here meanwhile.
+    """
+
+    limit: int
+    batches: deque[Batch] = field(default_factory=deque[Batch])
+    samples: int = 0
+    behind_from: int | None = None
+    behind: int = 0
+
+    def fits(self, size: int) -> bool:
+        return not self.batches or self.samples + size <= self.limit
+
+    def push(self, batch: Batch) -> None:
+        self.batches.append(batch)
+        self.samples += _size(batch)
+
+    def pop(self) -> Batch | None:
+        """All that waits, up to some number of samples, in one batch; None where nothing does."""
+        taken = list[Batch]()
+        while self.batches and sum(map(_size, taken)) < _TAKEN:
+            taken.append(self.batches.popleft())
+        if not taken:
+            return None
+        self.samples -= sum(map(_size, taken))
+        return (
+            taken[0]
+            if len(taken) == 1
+            else Batch(*(_joined(streams) for streams in zip(*map(_streams, taken), strict=True)))
+        )
+
+    @property
+    def waiting(self) -> int:
+        return self.behind + sum(len(batch.accel) for batch in self.batches)
+
+
+def _streams(batch: Batch) -> tuple[Stream, Stream, Stream]:
+    return batch.accel, batch.pose, batch.temperature
+
+
+def _size(batch: Batch) -> int:
+    return sum(map(len, _streams(batch)))
+
+
+def _joined(streams: tuple[Stream, ...]) -> Stream:
+    return Stream(np.concatenate([each.time_ns for each in streams]), np.concatenate([each.values for each in streams]))
+
+
+class LiveSource:
+    """A ``Source`` that is read while it comes; iterated once. A context manager that finishes the recording.
+
+    Batches hold exactly the samples, in each stream in the order, that a replay of the recording gives. A consumer that
+    falls behind gets from the recording what did not fit into the queue of ``queued`` samples; without a recording that
+    is dropped, and counted. Raises InputError where the recording cannot be begun.
+    """
+
+    def __init__(self, feed: Feed, record: Path | None = None, overwrite: bool = False, queued: int = QUEUED) -> None:
+        if record is not None:
+            refuse_existing(record, overwrite)
+        self.name = feed.name
+        self._feed, self._record, self._overwrite = feed, record, overwrite
+        self._lock = threading.Condition()  # of all that follows
+        self._queue = _Queue(queued)
+        self._counts, self._continuity = _Counts(), Continuity()
+        self._arrivals = deque[tuple[float, int]]()
+        self._recorder: Recorder | None = None
+        self._recording_trouble = ""
+        self._bench: Bench | None = None
+        self._failure: BaseException | None = None
+        self._is_finished = self._is_exhausted = False
+        self._worker = threading.Thread(target=self._work, name="acquisition", daemon=True)
+        self._worker.start()
+
+    @property
+    def bench(self) -> Bench:
+        """The bench; waits until it has told what is needed of it. Raises InputError where it has not."""
+        with self._lock:
+            self._wait_until(lambda: self._bench is not None or self._is_finished)
+            if self._bench is None:
+                raise self._failure or InputError(f"{self.name}: stopped before the bench was known.")
+            return self._bench
+
+    @property
+    def warnings(self) -> list[str]:
+        return [f"{self.name}: {said}" for said in [*self._feed.account.sentences(), *self.status.sentences()]]
+
+    @property
+    def fraction(self) -> float:
+        return self._feed.fraction
+
+    @property
+    def status(self) -> Status:
+        """How things stand now."""
+        feed, first = self._feed, self._feed.account.first_malformed
+        with self._lock:
+            now, recorder = time.monotonic(), self._recorder
+            return Status(
+                link=feed.link,
+                trouble=feed.trouble,
+                rate_hz=sum(count for at_s, count in self._arrivals if at_s >= now - _RATE_S) / _RATE_S,
+                samples=self._counts.readings,
+                poses=self._counts.poses,
+                temperatures=self._counts.temperatures,
+                refused=feed.account.malformed,
+                first_refusal=f"{first[0]}: {first[1]}" if first else "",
+                gaps=self._continuity.gaps,
+                missing=self._continuity.missing if feed.lost is None else feed.lost,
+                dropped=self._counts.dropped,
+                waiting=self._queue.waiting,
+                reconnects=feed.reconnects,
+                bytes=feed.bytes,
+                recorded=recorder.flushed if recorder else 0,
+                sync_age_s=now - recorder.synced_s if recorder else None,
+                recording_trouble=self._recording_trouble,
+            )
+
+    def stop(self) -> None:
+        """Ends the iteration after what has come; from any thread, or a signal handler."""
+        self._feed.stop()
+
+    def close(self) -> None:
+        """Stops, and waits until the recording is finished."""
+        self.stop()
+        self._worker.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[Batch]:
+        if self._is_exhausted:
+            raise InputError(f"{self.name} can be read only once: record it, and replay the recording.")
+        _ = self.bench  # so that a bench that cannot be used is told first
+        queue = self._queue
+        while True:
+            with self._lock:
+                self._wait_until(lambda: queue.batches or queue.behind_from is not None or self._is_finished)
+                batch = queue.pop()
+                self._lock.notify_all()  # there is room again
+                stretch = self._caught_up() if batch is None else None
+            if batch is not None:
+                yield batch
+            elif stretch is not None:
+                yield from stretch
+            else:
+                break
+        self._is_exhausted = True
+        if self._failure is not None:
+            raise self._failure
+
+    def _wait_until(self, is_so: Callable[[], Any]) -> None:
+        while not is_so():
+            self._lock.wait(0.2)  # not for ever: where a lock is waited for, Windows does not hear Ctrl-C
+
+    def _caught_up(self) -> Iterator[Batch] | None:
+        """What is in the recording and did not fit into the queue, which is used again from now on."""
+        start, recorder = self._queue.behind_from, self._recorder
+        if start is None or recorder is None:
+            return None
+        if not self._is_finished:
+            self._store(recorder.flush)
+        self._queue.behind_from, self._queue.behind = None, 0
+        return recorder.read_back(start, recorder.size) if recorder.size > start else iter(())
+
+    # -- what the worker does --
+
+    def _work(self) -> None:
+        try:
+            bench = self._feed.begin()
+            if self._record is not None:
+                self._recorder = Recorder(
+                    self._record, bench, flush_s=_FLUSH_S, overwrite=self._overwrite, background=True
+                )
+            with self._lock:
+                self._bench = bench
+                self._lock.notify_all()
+            self._take_all(bench)
+        except BaseException as error:  # the consumer is told, after what came before
+            self._failure = error
+        self._feed.close()
+        with self._lock:
+            if self._recorder:
+                self._store(self._recorder.close)
+            self._feed.link = "ended"
+            self._is_finished = True
+            self._lock.notify_all()
+
+    def _take_all(self, bench: Bench) -> None:
+        abreast, reason = Abreast(bench.pose_width), ""
+        for item in self._feed:
+            match item:
+                case Batch():
+                    self._take(abreast.push(item, time.monotonic()))
+                case Lost(reason):
+                    self._take(abreast.rest())
+                    self._continuity.cut()
+                case Regained(after_s):
+                    self._mark_gap(reason, after_s)
+        self._take(abreast.rest())
+
+    def _take(self, batch: Batch) -> None:
+        """One batch: checked, recorded, handed on."""
+        batch = Batch(*map(self._storable, _streams(batch)))
+        size, queue = _size(batch), self._queue
+        with self._lock:
+            if not size:
+                self._store_if_open(Recorder.tick)
+                return
+            if not (self._feed.patient or queue.fits(size)) and queue.behind_from is None:
+                queue.behind_from = self._store_if_open(Recorder.flush)
+            self._store_if_open(lambda recorder: recorder.write(batch))
+            self._count(batch)
+            while self._feed.patient and not queue.fits(size) and not self._feed.stopping:
+                self._lock.wait(0.1)
+                self._store_if_open(Recorder.tick)
+            self._hand_on(batch, size)
+            self._lock.notify_all()
+
+    def _hand_on(self, batch: Batch, size: int) -> None:
+        queue = self._queue
+        is_stored = self._recorder is not None and not self._recording_trouble
+        if queue.behind_from is not None and is_stored:
+            queue.behind += len(batch.accel)
+        elif queue.behind_from is None and (self._feed.patient or queue.fits(size)):
+            queue.push(batch)
+        else:
+            self._counts.dropped += len(batch.accel)
+
+    def _store_if_open(self, write: Callable[[Recorder], int | None]) -> int | None:
+        recorder = self._recorder
+        return self._store(lambda: write(recorder)) if recorder else None
+
+    def _store(self, write: Callable[[], int | None]) -> int | None:
+        """What ``write`` returns; None where the disk refuses, or has: that ends the recording and nothing else."""
+        recorder = self._recorder
+        if self._recording_trouble or recorder is None:
+            return None
+        try:
+            return write()
+        except KfCalibError as error:
+            self._recording_trouble = str(error)
+            if self._queue.behind_from is not None:  # what was to be read back from the chunk that is lost
+                self._counts.dropped += recorder.readings - recorder.flushed
+                self._queue.behind -= recorder.readings - recorder.flushed
+            return None
+
+    def _mark_gap(self, reason: str, seconds: float) -> None:
+        facts = {"after_ns": str(self._continuity.last_ns or 0), "seconds": f"{seconds:.3f}", "reason": reason}
+        with self._lock:
+            self._store_if_open(lambda recorder: recorder.mark(GAP_RECORD, facts))
+
+    def _storable(self, stream: Stream) -> Stream:
+        """The samples whose stamps a recording can hold; the others are refused."""
+        fits = (stream.time_ns >= 0) & (stream.time_ns < _LATEST_NS)
+        if not fits.all():
+            account = self._feed.account
+            for _ in range(int((~fits).sum())):
+                account.refuse(account.lines, "its time stamp is not between 1970 and 2038")
+        return stream[fits]
+
+    def _count(self, batch: Batch) -> None:
+        counts, now = self._counts, time.monotonic()
+        counts.readings += len(batch.accel)
+        counts.poses += len(batch.pose)
+        counts.temperatures += len(batch.temperature)
+        self._continuity.add(batch.accel.time_ns)
+        self._arrivals.append((now, len(batch.accel)))
+        while self._arrivals[0][0] < now - _RATE_S:
+            self._arrivals.popleft()

@@ -1,0 +1,106 @@
+"""A simulated run from options: those of ``kf-calib simulate``, or of a URL ``sim://?sample_hz=1000&seed=3``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+from urllib.parse import parse_qsl
+
+from kf_calib.bench import Bench, Vector, parse_axes
+from kf_calib.errors import InputError
+from kf_calib.sources.hidden import parse, sized
+from kf_calib.sources.physics import Ambient
+from kf_calib.sources.plans import Visit, explicit_plan, six_faces, spread_plan
+from kf_calib.sources.sensors import GRADES
+from kf_calib.sources.simulator import Simulation
+
+DEFAULTS: Mapping[str, Any] = MappingProxyType(
+    {
+        "grade": "navigation", "plan": "spread", "count": 24, "dwell_s": 30.0, "sample_hz": 100.0, "angle_hz": 10.0,
+        "slew_degps": 20.0, "hidden": (), "unstated": False, "seed": 0,
+    }
+)  # fmt: skip
+_NUMBERS = {"count": int, "seed": int}  # all others that are no words are float
+_WORDS = frozenset(("grade", "plan"))
+_SHORT = {"orientations": "count", "hide": "hidden"}
+
+
+def options_from_query(query: str) -> dict[str, Any]:
+    """Options from ``dwell_s=5&hide=second-order=10sigma``; ``hide`` may be repeated. Raises InputError."""
+    known = {*DEFAULTS, *(each.name for kind in (*GRADES.values(),) for each in fields(kind.noise))}
+    known |= {each.name for each in fields(Ambient)}
+    options: dict[str, Any] = {}
+    for key, text in parse_qsl(query, keep_blank_values=True):
+        name = _SHORT.get(key, key).replace("-", "_")
+        if name not in known:
+            raise InputError(f"sim:// has no setting {key!r}: use speed, hide or one of {', '.join(sorted(known))}.")
+        try:
+            if name == "hidden":
+                options[name] = (*options.get(name, ()), text)
+            elif name == "unstated":
+                options[name] = text not in ("0", "no", "false")
+            else:
+                options[name] = text if name in _WORDS else _NUMBERS.get(name, float)(text)
+        except ValueError:
+            raise InputError(f"sim://: {key}={text} is not a number.") from None
+    return options
+
+
+def simulation(options: Mapping[str, Any], bench_keys: Mapping[str, str], batch_samples: int = 65536) -> Simulation:
+    """The run that these options describe (those of ``simulate``; None: as the grade has it). Raises InputError."""
+    options = {**DEFAULTS} | {key: value for key, value in options.items() if value is not None}
+    keys = {"axes": "y z x", **bench_keys}
+    if "latitude_deg" not in keys:
+        keys.setdefault("gravity_mps2", "9.81")
+    grade = GRADES[options["grade"]]
+    names = {field.name for field in fields(grade.noise)}
+    noise = replace(grade.noise, **{key: options[key] for key in names if key in options})
+    axes = parse_axes(keys["axes"])
+    visits = _visits(options, axes)
+    if not options["unstated"]:
+        keys.setdefault("angle_sigma_deg", repr(noise.setting_sigma_deg))
+        keys.setdefault("scatter_sigma_mps2", repr(noise.dwell_sigma_mps2(len(visits))))
+    ambient = Ambient(**{field.name: options[field.name] for field in fields(Ambient) if field.name in options})
+    run = Simulation(
+        Bench.from_metadata(keys), grade.sensors(options["seed"]), noise, visits,
+        sample_hz=options["sample_hz"], angle_hz=options["angle_hz"], slew_rate_degps=options["slew_degps"],
+        ambient=ambient, seed=options["seed"], grade=options["grade"], batch_samples=batch_samples,
+    )  # fmt: skip
+    return run.hiding(
+        parse(options["hidden"], axes, seed=options["seed"], grade=options["grade"], sized=partial(sized, run))
+    )
+
+
+def _visits(options: Mapping[str, Any], axes: tuple[Vector, ...]) -> list[Visit]:
+    if options["plan"] == "spread":
+        return spread_plan(options["count"], axes, options["dwell_s"], options["seed"])
+    if options["plan"] == "faces":
+        return six_faces(axes, options["dwell_s"])
+    return explicit_plan(_angles_from_csv(Path(options["plan"]), len(axes)), options["dwell_s"])
+
+
+def _angles_from_csv(path: Path, width: int) -> list[list[float]]:
+    """Rows of gimbal angles, deg; a first line of names is passed over."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: the plan cannot be read ({getattr(error, 'strerror', None) or error}).") from None
+    rows = list[list[float]]()
+    for number, line in enumerate(lines, start=1):
+        cells = line.split("#")[0].replace(",", " ").split()
+        try:
+            row = [float(cell) for cell in cells]
+        except ValueError:
+            if rows or number > 1:
+                raise InputError(f"{path}, line {number}: {line!r} is not {width} angles in deg.") from None
+            continue
+        if row and len(row) != width:
+            raise InputError(f"{path}, line {number}: {len(row)} angles for {width} gimbal axes.")
+        rows += [row] if row else []
+    if not rows:
+        raise InputError(f"{path}: holds no orientation; write a line of {width} angles in deg for each.")
+    return rows
