@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kf_calib.cli.making import overwrite_option
+from kf_calib.cli.making import overwrite_option, pair
 from kf_calib.cli.options import (
     bench_options,
     filter_options,
@@ -49,6 +49,13 @@ _KINDS = {"rad": ("rad", "deg", "arcmin", "arcsec"), "1": ("1", "ppm"), "m/s^2":
 @click.argument("source", metavar="SOURCE")
 @click.option("--record", type=click.Path(path_type=Path), metavar="OUT.mcap", help="Record the run here.")
 @overwrite_option
+@click.option("--column", "columns", multiple=True, metavar="THEIRS=OURS",
+              help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.')
+@click.option("--header", default="", metavar="NAMES", help="Names of the columns of CSV rows that come without any.")
+@click.option("--give-up-s", type=click.FloatRange(min=0), default=600.0, show_default=True,
+              help="Seconds for which a lost link is tried again.")
+@click.option("--idle-s", type=click.FloatRange(min=0, min_open=True), default=math.inf, show_default="never",
+              help="End the run when nothing has come for so long.")
 @click.option("--target", "targets", multiple=True, metavar="SYMBOL=SIGMA",
               help="The sigma wanted of a parameter (theta1) or of a kind (theta, phi, nu, K, b), with a unit: "
               "theta1=2arcsec, K=5ppm, b=10ug; repeatable.")  # fmt: skip
@@ -70,6 +77,10 @@ def live(
     source: str,
     record: Path | None,
     overwrite: bool,
+    columns: tuple[str, ...],
+    header: str,
+    give_up_s: float,
+    idle_s: float,
     targets: tuple[str, ...],
     auto: bool,
     with_viewer: bool,
@@ -90,7 +101,8 @@ def live(
 
     settings, wanted = settings_of(options), _targets(targets)
     _refuse(settings)
-    with open_live(source, overrides(options), record, overwrite) as opened:
+    how = {"columns": dict(map(pair, columns)), "header": header, "give_up_s": give_up_s, "idle_s": idle_s}
+    with open_live(source, overrides(options), record, overwrite, **how) as opened:
         run = _Run(opened, settings, wanted, auto, record, not sys.stdout.isatty() or as_json)
         view = _view(rrd, rerun_port if with_viewer else None, rerun_bind)
         if view is not None:
