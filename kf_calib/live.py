@@ -29,6 +29,8 @@ from kf_calib.samples import Batch, Source
 from kf_calib.standing import Judgement, Standing, concluding, current, judged, targets
 
 _FIRST_LOOK_S = 1.0
+_AGREEING = 3  # judgements in a row that name the same effects before they are accepted unasked
+_FREEDOM = 9  # degrees left over with them in the model, at least
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ class Session:
         self._lock = threading.Condition()
         self._waiting, self._ended, self._hurried = deque[_Closed](), False, False
         self._last: _Closed | None = None
+        self._named = deque[frozenset[str]](maxlen=_AGREEING)
 
     def run(self) -> Judgement:
         """Evaluate the source to its end; the final judgement. Raises KfCalibError where nothing can be said."""
@@ -145,20 +148,21 @@ class Session:
         closed = sum(1 for dwell in folded[self._closed :] if standing is None or dwell.number < standing)
         with self._lock:
             self._publish(samples=passed.tally.read, elapsed_s=elapsed_s)
-        if closed:
-            self._closed += closed
-            self._close(elapsed_s)
+        self._close_next(closed, elapsed_s)
         self._look(standing, elapsed_s)
 
     def _finish(self) -> None:
         passed = self._passed
         for rows in passed.rows_of(self._segmenter.finish()):
             passed.add(rows)
-        if len(passed.folder.dwells) > self._closed:
-            self._closed = len(passed.folder.dwells)
-            self._close(self.standing.elapsed_s)
+        self._close_next(len(passed.folder.dwells) - self._closed, self.standing.elapsed_s)
         with self._lock:
             self._publish(samples=passed.tally.read, current=None)
+
+    def _close_next(self, count: int, elapsed_s: float) -> None:
+        for _ in range(count):
+            self._closed += 1
+            self._close(elapsed_s)
 
     def _close(self, elapsed_s: float) -> None:
         """Hand the dwells that have closed to be judged; nothing in them changes any more."""
@@ -225,12 +229,20 @@ class Session:
             listener(judgement)
 
     def _automatic(self, judgement: Judgement) -> None:
-        """With ``auto``: accept what is missing, where nothing else explains it as well."""
-        missing = judgement.found.missing if judgement.alarm else ()
-        if not self.auto or not missing or len(judgement.found.ambiguity) > len(missing):
+        """With ``auto``: accept what is missing, once it has been told from all else dwell after dwell.
+
+        After few orientations a wrong effect may be the only one that fits.
+        """
+        found = judgement.found
+        told_apart = judgement.alarm and found.after is not None and len(found.ambiguity) == len(found.missing)
+        if not (told_apart and found.after is not None and found.after.consistency.dof >= _FREEDOM):
+            self._named = deque(maxlen=_AGREEING)
+            return
+        self._named.append(frozenset(found.missing))
+        if not self.auto or len(self._named) < _AGREEING or len(set(self._named)) > 1:
             return
         try:
-            self.accept(*missing)
+            self.accept(*found.missing)
         except InputError as error:
             self.say(str(error))
 

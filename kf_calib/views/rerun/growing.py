@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import queue
+import socket
 import subprocess
 import tempfile
 import threading
@@ -40,12 +41,13 @@ class GrowingView:
     ) -> None:
         self.dropped, self.trouble = 0, ""
         self._results = queue.Queue[Calibration | None](waiting)
-        self._streams, self._viewer = [_saving(rrd)] if rrd else [], None
+        self._streams, self._viewer, self._relays = [_saving(rrd)] if rrd else [], None, False
         self._log = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the viewer's pipe
         if port is not None:
             piped = _stream()
             self._encoded = piped.binary_stream()
             self._streams.append(piped)
+            self._relays = _listens(port)
             self._viewer = _viewer(port, bind, self._log)
         self._thread = threading.Thread(target=self._show, name="rerun", daemon=True)
         self._thread.start()
@@ -62,10 +64,19 @@ class GrowingView:
         with suppress(queue.Full):
             self._results.put(None, timeout=patience_s)
         self._thread.join(patience_s)
-        if self._thread.is_alive() and self._viewer is not None:
-            self.trouble = self.trouble or "the Rerun viewer does not answer: open the recording with `replay --rrd`."
-            self._viewer.kill()  # ends the wait for it
+        viewer = self._viewer
+        if viewer is None:
+            return
+        if self._relays and not self._thread.is_alive():  # what sends to a viewer that was there ends by itself
+            with suppress(subprocess.TimeoutExpired):
+                viewer.wait(patience_s)
+        if self._thread.is_alive() or (self._relays and viewer.poll() is None):
+            self.trouble = self.trouble or "the Rerun viewer does not answer: look at the recording with replay --rrd."
+            viewer.kill()  # ends the wait for it
+            viewer.wait()
             self._thread.join(patience_s)
+        elif viewer.poll() is None:
+            viewer.returncode = 0  # it is the user's window now, and not to be waited for
 
     def _show(self) -> None:
         shown, laid_out = 0, 0
@@ -109,6 +120,14 @@ def _saving(path: Path) -> rr.RecordingStream:
     stream = _stream()
     stream.save(path)
     return stream
+
+
+def _listens(port: int) -> bool:
+    try:
+        socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
+    except OSError:
+        return False
+    return True
 
 
 def _viewer(port: int, bind: str, log: IO[bytes]) -> subprocess.Popen[bytes]:
