@@ -58,9 +58,9 @@ class Fit:
     def judged(self) -> list[Floats]:
         """Rows [H | W | z] by which the misfit is judged."""
         carried = self.carried
-        return information.judged(
-            self.dwells, carried.columns, self.noise.judging, carried.state, carried.model.count
-        )[0]
+        return information.judged(self.dwells, carried.columns, self.noise.judging, carried.state, carried.model.count)[
+            0
+        ]
 
     @cached_property
     def following(self) -> list[Floats]:

@@ -199,7 +199,6 @@ def accumulated(rows: Sequence[Floats], walked: Floats | None = None) -> Floats:
     return np.vstack([factor, np.append(np.zeros(width), left)])
 
 
-
 def scaled(factor: Floats) -> tuple[Floats, Floats]:
     """R in units in which its columns are of the same order, and those units (p,).
 

@@ -66,5 +66,5 @@ class Feed(ABC):
         """Ends the iteration after what has come. Only sets a flag: a signal handler must not wait for a lock."""
         self.stopping = True
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - most hold nothing open
         """Lets go of what is open; called by the thread that iterates."""

@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from urllib.parse import parse_qsl, urlencode
+from typing import Any
+from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from kf_calib.errors import InputError
+from kf_calib.sources.live.bag import BagFeed
 from kf_calib.sources.live.feed import Feed
+from kf_calib.sources.live.links import GrowingFile, Link, SerialPort, StandardInput, Tcp
 from kf_calib.sources.live.source import QUEUED, LiveSource
+from kf_calib.sources.live.streamed import StreamedFeed
 from kf_calib.sources.recorder import refuse_existing
+from kf_calib.sources.recording import Recording
+
+_TEXT_FILES = (".csv", ".jsonl", ".txt", ".tsv", ".log")
+_PORT_SETTINGS: dict[str, tuple[str, Callable[[str], Any]]] = {
+    "baud": ("baudrate", int), "parity": ("parity", str.upper), "bytesize": ("bytesize", int),
+    "stopbits": ("stopbits", float), "rtscts": ("rtscts", lambda text: text != "0"),
+    "xonxoff": ("xonxoff", lambda text: text != "0"),
+}  # fmt: skip
 
 
 def open_live(
@@ -35,12 +47,84 @@ def open_live(
     """
     if record is not None:
         refuse_existing(record, overwrite)
-    scheme, separator, rest = url.partition("://")
-    if separator and scheme == "sim":
-        feed = _simulated(rest, overrides or {})
+    address, query = _split(url)
+    give_up_s, idle_s = query.pop("give_up", give_up_s), query.pop("idle", idle_s)
+    scheme = url.partition("://")[0] if "://" in url else ""
+    if scheme == "sim":
+        feed = _simulated(url.partition("://")[2], overrides or {})
+    elif (path := _bag(address)) is not None:
+        feed = BagFeed(path, lambda path: Recording(path, overrides or {}), idle_s)
     else:
-        raise InputError(f"{url} cannot be opened.")
+        link = _link(address)
+        name = "standard input" if address == "-" else address.removeprefix("tail:")
+        feed = StreamedFeed(name, link, overrides or {}, columns, header, give_up_s, idle_s)
     return LiveSource(feed, record, overwrite, queued)
+
+
+def _split(url: str) -> tuple[str, dict[str, float]]:
+    """The address, and what its query says of us: give_up, idle, and a serial port's baud, parity ..., as numbers."""
+    if url.startswith("sim:"):
+        return url, {}
+    address, _, query = url.partition("?")
+    ours = {key: text for key, text in parse_qsl(query) if key in ("give_up", "idle")}
+    rest = urlencode([pair for pair in parse_qsl(query, keep_blank_values=True) if pair[0] not in ours])
+    return address + ("?" + rest) * bool(rest), {key: _positive(key, text) for key, text in ours.items()}
+
+
+def _bag(address: str) -> Path | None:
+    """The MCAP file at this address, if it is one: that file, or the latest in the folder of a bag."""
+    path = Path(address.removeprefix("tail:"))
+    if path.is_dir():
+        files = sorted(path.glob("*.mcap"), key=lambda file: file.stat().st_mtime)
+        if not files:
+            raise InputError(f"{path} holds no .mcap file: give the folder of a bag recorded with -s mcap.")
+        return files[-1]
+    return path if path.suffix == ".mcap" else None
+
+
+def _link(address: str) -> Link:
+    if address == "-":
+        return StandardInput()
+    if address.startswith("socket://"):
+        return _tcp(address)
+    if address.startswith("tail:"):
+        return GrowingFile(Path(address.removeprefix("tail:")))
+    plain, _, query = address.partition("?")
+    if "://" not in address and (Path(plain).is_file() or Path(plain).suffix in _TEXT_FILES):
+        return GrowingFile(Path(plain))
+    if "://" not in address and not (plain.startswith("/dev/") or plain.upper().startswith("COM")):
+        raise InputError(
+            f"{address} is neither a file nor a port: give a path, /dev/ttyUSB0?baud=115200, COM3, socket://HOST:PORT, "
+            "rfc2217://HOST:PORT, - or sim://."
+        )
+    settings: dict[str, Any] = {"baudrate": 115200}
+    left = list[tuple[str, str]]()
+    for key, text in parse_qsl(query, keep_blank_values=True):
+        if key in _PORT_SETTINGS:
+            name, kind = _PORT_SETTINGS[key]
+            try:
+                settings[name] = kind(text)
+            except ValueError:
+                raise InputError(f"{address}: {key}={text} is not a number.") from None
+        else:
+            left.append((key, text))
+    if left and "://" not in plain:
+        names = ", ".join(_PORT_SETTINGS)
+        raise InputError(f"{address}: {left[0][0]!r} is no setting of a port: use one of {names}, give_up, idle.")
+    return SerialPort(plain + ("?" + urlencode(left)) * bool(left), settings)
+
+
+def _tcp(address: str) -> Tcp:
+    parts = urlsplit(address)
+    try:
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if not host or port is None:
+        raise InputError(
+            f"{address} names no host and port: write socket://HOST:PORT, for example socket://10.0.0.5:5000."
+        )
+    return Tcp(host, port)
 
 
 def _simulated(rest: str, overrides: Mapping[str, str]) -> Feed:

@@ -1,0 +1,235 @@
+"""Binary frames for high rates (docs/live.md): CDR structs with a CRC-32, COBS-encoded, each ended by a zero byte.
+
+A frame before encoding, little-endian::
+
+    octet kind; octet version; unsigned short reserved; unsigned long number; long long time_ns;
+    double values[n]; unsigned long crc32
+
+``number`` counts the frames of each kind, modulo 2^32: what is missing in it was lost. The bench's own frame holds the
+text of a JSON object in place of values.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kf_calib.samples import Batch, Floats, Mask, Stream, Times
+from kf_calib.sources.line_parts import Account
+
+VERSION = 1
+BENCH, ACCEL, ANGLES, ATTITUDE, TEMPERATURE = b"BAGQT"
+HEAD = struct.Struct("<BBHIq")  # kind, version, reserved, number, time_ns
+_CRC = struct.Struct("<I")
+_LONGEST = 1 << 16  # bytes of a frame; one of samples has 254 at most
+_SHORT = 254  # up to this many bytes COBS adds one byte and no more
+_PLAUSIBLE = 1 << 20  # frames lost at once; more is a bench that counts anew
+_HEADS = np.dtype([("kind", "u1"), ("version", "u1"), ("reserved", "<u2"), ("number", "<u4"), ("time_ns", "<i8")])
+Bytes = NDArray[np.uint8]
+Places = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Samples of one kind, and the numbers of the frames they came in."""
+
+    kind: int
+    places: Places
+    time_ns: Times
+    values: Floats
+
+
+def encode(kind: int, number: int, time_ns: int, content: bytes) -> bytes:
+    """One frame, with the zero byte that ends it."""
+    body = HEAD.pack(kind, VERSION, 0, number & 0xFFFFFFFF, time_ns) + content
+    return cobs(body + _CRC.pack(zlib.crc32(body))) + b"\0"
+
+
+def sample(kind: int, number: int, time_ns: int, values: Sequence[float]) -> bytes:
+    """A frame of one reading (m/s^2), pose (rad, or a quaternion) or temperature (degC)."""
+    return encode(kind, number, time_ns, struct.pack(f"<{len(values)}d", *values))
+
+
+def bench(metadata: Mapping[str, Any]) -> bytes:
+    """The frame that describes the bench; to be sent first, and again whenever a link begins."""
+    return encode(BENCH, 0, 0, json.dumps(metadata).encode())
+
+
+def cobs(data: bytes) -> bytes:
+    """Consistent Overhead Byte Stuffing (Cheshire and Baker, 1999): no zero byte is left."""
+    out = bytearray()
+    for part in data.split(b"\0"):
+        while len(part) >= 254:
+            out += b"\xff" + part[:254]
+            part = part[254:]
+        out.append(len(part) + 1)
+        out += part
+    return bytes(out)
+
+
+def uncobs(data: bytes) -> bytes | None:
+    """What was encoded, None where that cannot be."""
+    out, position = bytearray(), 0
+    while position < len(data):
+        code = data[position]
+        if not code or position + code > len(data):
+            return None
+        out += data[position + 1 : position + code]
+        position += code
+        if code < 0xFF and position < len(data):
+            out.append(0)
+    return bytes(out)
+
+
+def _uncobs_alike(table: Bytes) -> tuple[Bytes, Mask]:
+    """Frames (n, m) of one encoded length m <= 255, decoded (n, m - 1), and which of them could be, (n,)."""
+    count, length = table.shape
+    decoded, rows, at = table.copy(), np.arange(count), np.zeros(count, np.int64)
+    sound = np.ones(count, bool)
+    while len(rows):  # every frame's next code byte at once; as many turns as the frame with most zeros has
+        code = table[rows, at].astype(np.int64)
+        decoded[rows, at] = 0
+        at = at + code
+        sound[rows[(at > length) | (code == 0)]] = False
+        on = (at < length) & (code > 0)
+        rows, at = rows[on], at[on]
+    return decoded[:, 1:], sound
+
+
+class FrameReader:
+    """Reads frames block by block; those that cannot be used are put down in the account.
+
+    metadata, has_angles, pose_width: of the bench, as of a ``LineReader``. lost: readings whose numbers are missing.
+    """
+
+    advice = (
+        "send a frame of the bench, then frames of readings (kind A) and of poses (kind G or Q), as docs/live.md says"
+    )
+
+    def __init__(self, account: Account) -> None:
+        self.metadata: dict[str, str] = {}
+        self.has_angles, self.pose_width, self.lost = True, 0, 0
+        self._account = account
+        account.what = "frames"
+        self._tail = b""
+        self._number: int | None = None
+
+    def push(self, block: bytes) -> Batch:
+        """The samples of the frames that end in ``block``."""
+        *frames, self._tail = (self._tail + block).split(b"\0")
+        if len(self._tail) > _LONGEST:  # no frame: what follows up to the next zero byte is none either
+            self._tail = self._tail[: _LONGEST + 1]
+        frames = [frame for frame in frames if frame]
+        first = self._account.lines + 1
+        self._account.lines += len(frames)
+        return self._read(frames, first)
+
+    def cut_off(self) -> None:
+        """The link broke: a frame that has begun will not end."""
+        if self._tail:
+            self._account.lines += 1
+            self._account.refuse(self._account.lines, "the link broke in it")
+        self._tail = b""
+
+    def _read(self, frames: list[bytes], first: int) -> Batch:
+        lengths = np.fromiter(map(len, frames), np.int64, len(frames))
+        found = list[_Found]()
+        for length in np.unique(lengths).tolist():
+            at = np.flatnonzero(lengths == length)
+            if length > _SHORT + 1:
+                for i in at.tolist():
+                    self._read_long(frames[i], first + i)
+            elif length > HEAD.size + _CRC.size:
+                table = np.frombuffer(b"".join([frames[i] for i in at.tolist()]), np.uint8).reshape(-1, length)
+                found += self._read_alike(table, first + at)
+            else:
+                self._refuse(first + at, "it is too short")
+        poses = ANGLES if self.has_angles else ATTITUDE
+        return Batch(_stream(found, ACCEL, 3), _stream(found, poses, self.pose_width), _stream(found, TEMPERATURE, 1))
+
+    def _read_alike(self, table: Bytes, places: Places) -> Iterator[_Found]:
+        """The samples in frames (n, m) of one encoded length, by kind."""
+        bodies, sound = _uncobs_alike(table)
+        size = bodies.shape[1] - _CRC.size
+        stated = np.ascontiguousarray(bodies[:, size:]).view("<u4")[:, 0]
+        texts = np.ascontiguousarray(bodies[:, :size]).tobytes()
+        sound &= stated == np.array([zlib.crc32(texts[k : k + size]) for k in range(0, len(texts), size)], np.uint32)
+        self._refuse(places[~sound], "its checksum does not fit")
+        for kind in np.unique(bodies[sound, 0]).tolist():
+            own = sound & (bodies[:, 0] == kind)
+            heads = np.frombuffer(np.ascontiguousarray(bodies[own, : HEAD.size]).tobytes(), _HEADS)
+            contents = np.ascontiguousarray(bodies[own, HEAD.size : size])
+            if kind == BENCH:
+                for content, place in zip(contents, places[own].tolist(), strict=True):
+                    self._learn(content.tobytes(), place)
+            elif reason := self._misfit(kind, contents.shape[1], heads):
+                self._refuse(places[own], reason)
+            else:
+                values = contents.view("<f8").astype(float)
+                usable = np.isfinite(values).all(axis=1)
+                self._refuse(places[own][~usable], "a number is not finite")
+                if kind == ACCEL:
+                    self._follow(heads["number"].astype(np.int64))
+                yield _Found(kind, places[own][usable], heads["time_ns"][usable], values[usable])
+
+    def _misfit(self, kind: int, size: int, heads: NDArray[np.void]) -> str | None:
+        """Why frames of this kind with so many bytes of values cannot be used; a first pose settles what poses are."""
+        if (heads["version"] != VERSION).any():
+            return f"it is not of version {VERSION}"
+        if kind in (ANGLES, ATTITUDE) and size and size % 8 == 0 and not self.pose_width:
+            self.has_angles, self.pose_width = kind == ANGLES, size // 8
+        widths = {ACCEL: 3, TEMPERATURE: 1, ANGLES if self.has_angles else ATTITUDE: self.pose_width}
+        if kind not in widths:
+            return "it is of a kind that is not known, or not like the poses before it"
+        return None if size == 8 * widths[kind] else f"it has {size} bytes of values"
+
+    def _read_long(self, frame: bytes, place: int) -> None:
+        body = uncobs(frame) if len(frame) <= _LONGEST else None
+        if body is None or len(body) < HEAD.size + _CRC.size or _CRC.unpack(body[-4:])[0] != zlib.crc32(body[:-4]):
+            self._account.refuse(place, "its checksum does not fit")
+        elif body[0] != BENCH:
+            self._account.refuse(place, f"it has {len(body) - HEAD.size - 4} bytes of values")
+        else:
+            self._learn(body[HEAD.size : -4], place)
+
+    def _learn(self, text: bytes, place: int) -> None:
+        try:
+            facts = json.loads(text)
+        except (ValueError, RecursionError):
+            facts = None
+        if not isinstance(facts, dict):
+            self._account.refuse(place, "it holds no JSON object")
+            return
+        pairs = ((key, value) for key, value in facts.items() if value is not None)
+        self.metadata = {key: value if isinstance(value, str) else json.dumps(value) for key, value in pairs}
+
+    def _follow(self, numbers: NDArray[np.int64]) -> None:
+        """Counts the numbers passed over; one that is far off is that of a bench that counts anew."""
+        if self._number is not None:
+            numbers = np.concatenate([[self._number], numbers])
+        passed = (np.diff(numbers) - 1) % (1 << 32)
+        self.lost += int(passed[passed < _PLAUSIBLE].sum())
+        self._number = int(numbers[-1])
+
+    def _refuse(self, places: Places, reason: str) -> None:
+        for place in places.tolist():
+            self._account.refuse(place, reason)
+
+
+def _stream(found: Sequence[_Found], kind: int, width: int) -> Stream:
+    """All samples of a kind, in the order of their frames."""
+    own = [each for each in found if each.kind == kind and len(each.places)]
+    if not own:
+        return Stream.empty(width)
+    order = np.argsort(np.concatenate([each.places for each in own]), kind="stable")
+    return Stream(
+        np.concatenate([each.time_ns for each in own]).astype(np.int64)[order],
+        np.concatenate([each.values for each in own])[order],
+    )

@@ -1,0 +1,143 @@
+"""Links that bytes come over: TCP, serial ports, standard input, a file that grows.
+
+A link is opened, read and closed by one thread. ``read`` gives what has come, b"" where nothing comes for a moment, and
+raises OSError where the link broke, EOFError where it ended.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import sys
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from kf_calib.sources.live.feed import IDLE_S
+
+_BLOCK_BYTES = 1 << 18
+_WAIT_S = 0.1
+_CONNECT_S = 5.0
+
+
+class Link(ABC):
+    """reopens: it may come back after it broke. patient: what is not read yet stays where it is."""
+
+    reopens = True
+    patient = False
+    starts_amid = False
+    """What is read first after opening may be the end of a line."""
+
+    @abstractmethod
+    def open(self) -> None: ...
+
+    @abstractmethod
+    def read(self) -> bytes: ...
+
+    @abstractmethod
+    def close(self) -> None: ...
+
+
+class Tcp(Link):
+    """A TCP server. (pyserial's socket:// drops what came before it was first read, and what came before the end.)"""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._address = (host, port)
+        self._socket: socket.socket | None = None
+
+    def open(self) -> None:
+        self._socket = socket.create_connection(self._address, timeout=_CONNECT_S)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # a peer that lost its power says nothing
+        self._socket.settimeout(_WAIT_S)
+
+    def read(self) -> bytes:
+        assert self._socket is not None
+        try:
+            block = self._socket.recv(_BLOCK_BYTES)
+        except TimeoutError:
+            return b""
+        if not block:
+            raise ConnectionError("the other side closed the connection")
+        return block
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+class SerialPort(Link):
+    """Whatever pyserial opens: /dev/ttyUSB0, COM3, rfc2217://host:port, loop://."""
+
+    starts_amid = True
+
+    def __init__(self, url: str, settings: Mapping[str, Any]) -> None:
+        self._url, self._settings = url, settings
+        self.port: Any = None
+
+    def open(self) -> None:
+        import serial
+
+        try:
+            self.port = serial.serial_for_url(self._url, timeout=_WAIT_S, **self._settings)
+        except ValueError as error:  # settings that the port does not know
+            raise OSError(str(error)) from None
+
+    def read(self) -> bytes:
+        return self.port.read(min(max(self.port.in_waiting, 1), _BLOCK_BYTES))  # its errors are OSErrors
+
+    def close(self) -> None:
+        if self.port is not None:
+            self.port.close()
+            self.port = None
+
+
+class StandardInput(Link):
+    """Bytes piped in; their end is the end."""
+
+    reopens = False
+    patient = True
+
+    def open(self) -> None:
+        self._descriptor = sys.stdin.fileno()
+
+    def read(self) -> bytes:
+        if sys.platform != "win32" and not select.select([self._descriptor], [], [], _WAIT_S)[0]:
+            return b""  # elsewhere pipes cannot be waited for, and stopping waits for the next bytes
+        block = os.read(self._descriptor, _BLOCK_BYTES)
+        if not block:
+            raise EOFError
+        return block
+
+    def close(self) -> None:
+        """It is not ours."""
+
+
+class GrowingFile(Link):
+    """A text file that a logger appends to, from its start; a file that was cut or replaced is begun anew."""
+
+    patient = True
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file: Any = None
+
+    def open(self) -> None:
+        self._file = self._path.open("rb", buffering=0)
+
+    def read(self) -> bytes:
+        block = self._file.read(_BLOCK_BYTES)
+        if not block:
+            here, now = os.fstat(self._file.fileno()), self._path.stat()
+            if now.st_size < self._file.tell() or (here.st_ino, here.st_dev) != (now.st_ino, now.st_dev):
+                raise OSError("the file was cut or replaced")
+            time.sleep(IDLE_S)
+        return block
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None

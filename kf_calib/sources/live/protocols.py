@@ -1,0 +1,174 @@
+"""What the bytes of a bench mean: JSON lines, CSV lines or binary frames, whichever they begin with."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+
+from kf_calib.errors import InputError
+from kf_calib.samples import Batch
+from kf_calib.sources.csv_lines import CsvLines
+from kf_calib.sources.json_lines import JsonLines
+from kf_calib.sources.line_parts import Account, LineReader
+from kf_calib.sources.lines import Cutter
+from kf_calib.sources.live.feed import nothing
+from kf_calib.sources.live.frames import FrameReader
+
+_FEWEST_CELLS = 5
+_MOST_LINES = 2000  # without a beginning among them
+_MOST_BYTES = 1 << 23
+_HELD_BYTES = 1 << 16
+
+
+class LineProtocol:
+    """JSON or CSV lines as bytes come, from wherever in a line they begin.
+
+    header: of CSV rows that come without one. Raises InputError for a header that does not say what is needed.
+    """
+
+    def __init__(self, name: str, columns: Mapping[str, str], header: str, account: Account) -> None:
+        self._name, self._columns, self._account = name, columns, account
+        self._cutter = Cutter(account)
+        self._header = header.strip()
+        self.reader: LineReader | None = CsvLines(self._header, columns, account) if self._header else None
+        self._is_first = False
+
+    def push(self, block: bytes) -> Batch:
+        """The samples on the lines that end in ``block``."""
+        lines = self._cutter.push(block)
+        if self.reader is None:
+            lines = self._begin(lines)
+        if self.reader is None:
+            return nothing(0)
+        if self._is_first and lines:
+            self._is_first = False
+            lines = self._without_half_a_row(lines)
+        if self._header and self._header in lines:  # a logger that begins again sends its header again
+            lines = ["" if line == self._header else line for line in lines]
+        elif isinstance(self.reader, JsonLines):
+            lines = ["" if line.startswith('{"bench"') and self.reader.pose_width else line for line in lines]
+        batch = self.reader.read(lines, self._account.lines + 1)
+        self._account.lines += len(lines)
+        return batch
+
+    def joined_amid(self) -> None:
+        """What comes next may begin within a line: half a row of CSV could pass for a whole one."""
+        self._is_first = True
+
+    def cut_off(self) -> None:
+        """The link broke: a line that has begun will not end."""
+        if self._cutter.is_amid:
+            self._account.lines += len(self._cutter.rest())
+            self._account.refuse(self._account.lines, "the link broke in it")
+
+    def rest(self) -> Batch:
+        """The sample on a last line without an end."""
+        return self.push(b"\n") if self._cutter.is_amid else nothing(self.reader.pose_width if self.reader else 0)
+
+    def _without_half_a_row(self, lines: list[str]) -> list[str]:
+        if isinstance(self.reader, CsvLines) and lines[0] and lines[0] != self._header:
+            self._account.refuse(self._account.lines + 1, "it may not be whole: the link was joined in it")
+            return ["", *lines[1:]]
+        return lines
+
+    def _begin(self, lines: list[str]) -> list[str]:
+        """The lines from the first on that says what they are; those before it are refused."""
+        for i, line in enumerate(lines):
+            text = line.lstrip("\ufeff").strip()
+            if text and self._begins(text):
+                return lines[i + isinstance(self.reader, CsvLines) :]
+            self._account.lines += 1
+            if text:
+                self._account.refuse(self._account.lines, "it is neither a JSON object nor a header of CSV")
+        return []
+
+    def _begins(self, text: str) -> bool:
+        if text[0] == "{":
+            try:
+                json.loads(text)
+            except (ValueError, RecursionError):
+                return False
+            self.reader = JsonLines(self._columns, self._account)
+            return True
+        cells = text.split(max(",;\t", key=text.count))
+        if (
+            len(cells) < _FEWEST_CELLS
+            or not text.isprintable()
+            or not all(cell.strip(' "')[:1].isalpha() for cell in cells)
+        ):
+            return False
+        try:
+            self.reader, self._header = CsvLines(text, self._columns, self._account), text
+        except InputError as error:
+            raise InputError(f"{self._name}: {error}") from None
+        self._account.lines += 1
+        self._is_first = False
+        return True
+
+
+class Protocol:
+    """Finds out what the bytes are, then reads them."""
+
+    def __init__(self, name: str, columns: Mapping[str, str], header: str) -> None:
+        self.account = Account()
+        self._name = name
+        self._lines: LineProtocol | None = LineProtocol(name, columns, header, self.account)
+        self._frames: FrameReader | None = None
+        self._held = b""
+        self._seen = 0
+
+    @property
+    def reader(self) -> LineReader | FrameReader | None:
+        """What has been learnt of the bench; None while it is not known what it speaks."""
+        return self._frames or (self._lines.reader if self._lines else None)
+
+    @property
+    def lost(self) -> int | None:
+        """Readings known to be lost by their numbers."""
+        return self._frames.lost if self._frames else None
+
+    def push(self, block: bytes) -> Batch:
+        """The samples that are whole with this block. Raises InputError where it makes no sense at all."""
+        if self._frames:
+            return self._frames.push(block)
+        assert self._lines is not None
+        if self._lines.reader is None:
+            self._held = (self._held + block)[-_HELD_BYTES:]
+            if b"\0" in self._held and (found := self._frames_in(self._held)) is not None:
+                return found
+        batch = self._lines.push(block)
+        if self._lines.reader is None:
+            self._seen += len(block)
+            if self.account.lines > _MOST_LINES or self._seen > _MOST_BYTES:
+                raise self.unusable("no header of CSV, no JSON object and no binary frame")
+        else:
+            self._held = b""
+        return batch
+
+    def _frames_in(self, held: bytes) -> Batch | None:
+        account = Account()
+        frames = FrameReader(account)
+        batch = frames.push(held)
+        if account.malformed == account.lines:
+            return None
+        self.account, self._frames, self._lines, self._held = account, frames, None, b""
+        return batch
+
+    def joined_amid(self) -> None:
+        if self._lines:
+            self._lines.joined_amid()
+
+    def cut_off(self) -> None:
+        """The link broke: what has begun will not end."""
+        for each in (self._lines, self._frames):
+            if each:
+                each.cut_off()
+
+    def rest(self) -> Batch:
+        return self._lines.rest() if self._lines else nothing(0)
+
+    def unusable(self, what: str) -> InputError:
+        """That the bytes cannot be used, with what was seen of them."""
+        found = "".join(f"; {said.rstrip('.')}" for said in self.account.sentences())
+        advice = self.reader.advice if self.reader else "have it send its header again, or state it (--header)"
+        return InputError(f"{self._name}: {what} in {self.account.lines} {self.account.what}{found}: {advice}.")
