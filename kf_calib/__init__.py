@@ -52,6 +52,7 @@ _HOMES = {
     "KfCalibError": ("errors", "KfCalibError"),
     "UnobservableError": ("errors", "UnobservableError"),
     "Running": ("running", "Running"),
+    "Session": ("live", "Session"),
     "Recorder": ("sources.recorder", "Recorder"),
     "open_recording": ("sources.recording", "Recording"),
     "save_view": ("views.rerun", "save"),
@@ -60,7 +61,7 @@ _HOMES = {
 
 __all__ = [
     "Bench", "Calibration", "Diagnosis", "Improvement", "InputError", "KfCalibError", "Parameter", "Recorder",
-    "Running", "Settings", "UnobservableError", "Watch", "calibrate", "compare", "diagnose", "improve",
+    "Running", "Session", "Settings", "UnobservableError", "Watch", "calibrate", "compare", "diagnose", "improve",
     "open_recording", "save_view",
 ]  # fmt: skip
 

@@ -49,13 +49,28 @@ _KINDS = {"rad": ("rad", "deg", "arcmin", "arcsec"), "1": ("1", "ppm"), "m/s^2":
 @click.argument("source", metavar="SOURCE")
 @click.option("--record", type=click.Path(path_type=Path), metavar="OUT.mcap", help="Record the run here.")
 @overwrite_option
-@click.option("--column", "columns", multiple=True, metavar="THEIRS=OURS",
-              help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.')
+@click.option(
+    "--column",
+    "columns",
+    multiple=True,
+    metavar="THEIRS=OURS",
+    help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.',
+)
 @click.option("--header", default="", metavar="NAMES", help="Names of the columns of CSV rows that come without any.")
-@click.option("--give-up-s", type=click.FloatRange(min=0), default=600.0, show_default=True,
-              help="Seconds for which a lost link is tried again.")
-@click.option("--idle-s", type=click.FloatRange(min=0, min_open=True), default=math.inf, show_default="never",
-              help="End the run when nothing has come for so long.")
+@click.option(
+    "--give-up-s",
+    type=click.FloatRange(min=0),
+    default=600.0,
+    show_default=True,
+    help="Seconds for which a lost link is tried again.",
+)
+@click.option(
+    "--idle-s",
+    type=click.FloatRange(min=0, min_open=True),
+    default=math.inf,
+    show_default="never",
+    help="End the run when nothing has come for so long.",
+)
 @click.option("--target", "targets", multiple=True, metavar="SYMBOL=SIGMA",
               help="The sigma wanted of a parameter (theta1) or of a kind (theta, phi, nu, K, b), with a unit: "
               "theta1=2arcsec, K=5ppm, b=10ug; repeatable.")  # fmt: skip
@@ -101,8 +116,11 @@ def live(
 
     settings, wanted = settings_of(options), _targets(targets)
     _refuse(settings)
-    how = {"columns": dict(map(pair, columns)), "header": header, "give_up_s": give_up_s, "idle_s": idle_s}
-    with open_live(source, overrides(options), record, overwrite, **how) as opened:
+    opening = open_live(
+        source, overrides(options), record, overwrite, columns=dict(map(pair, columns)), header=header,
+        give_up_s=give_up_s, idle_s=idle_s,
+    )  # fmt: skip
+    with opening as opened:
         run = _Run(opened, settings, wanted, auto, record, not sys.stdout.isatty() or as_json)
         view = _view(rrd, rerun_port if with_viewer else None, rerun_bind)
         if view is not None:

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from kf_calib import paper
-from kf_calib.samples import Floats
+from kf_calib.samples import Floats, Mask
 from kf_calib.standing import Judgement, Standing
 from kf_calib.views.console import symbol
 from kf_calib.views.diagnosis import diagnosis_object
@@ -21,8 +21,9 @@ from kf_calib.views.json import clean, replay_object
 if TYPE_CHECKING:
     from kf_calib.sources.live import Status
 
-_BAR = 18
-_TARGET_DECADES, _DECADES = 3.0, 7.0  # of a full bar: over the target; from one radian, one, or one g downward
+_BAR, _NAME = 18, 30
+_TARGET_DECADES = 3.0  # of a full bar, over the target
+_COARSE, _DECADES = 1e-3, 5.0  # without a target: a full bar, of a radian, of one, of g; and the decades below it
 _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("µg", 1e6 / 9.80665)}
 
 
@@ -79,6 +80,8 @@ def screen(standing: Standing, status: Status | None, name: str, recording: str 
     parts: list[RenderableType] = [_link(standing, status, name, recording), _here(standing), _sigmas(standing)]
     if judgement is not None:
         parts += [_fit(judgement), Text(judgement.verdict, style=_style(judgement))]
+        if _set(judgement).any() and (standing.sigma <= judgement.wanted)[_set(judgement)].all():
+            parts.append(Text("every target is reached", style="bold green"))
         going = judgement.next_orientation
         if going is not None:
             parts.append(Text(f"next: gimbals at {_angles(going[0])} deg: {going[1]}", style="bold"))
@@ -88,6 +91,10 @@ def screen(standing: Standing, status: Status | None, name: str, recording: str 
     return Group(*parts)
 
 
+def _set(judgement: Judgement) -> Mask:
+    return np.isfinite(judgement.wanted)
+
+
 def _style(judgement: Judgement) -> str:
     return {True: "bold green", False: "bold yellow", None: "bold"}[judgement.consistent]
 
@@ -95,7 +102,7 @@ def _style(judgement: Judgement) -> str:
 def _link(standing: Standing, status: Status | None, name: str, recording: str) -> Text:
     if status is None:
         return Text(f"{name}: {standing.samples} readings")
-    out = Text.assemble((name, "bold"), " ")
+    out = Text.assemble((name if len(name) <= _NAME else f"{name[:_NAME]}...", "bold"), " ")
     out.append(status.link, {"live": "green", "lost": "bold red"}.get(status.link, "yellow"))
     out.append(f"  {status.rate_hz:.0f} Hz  {status.samples} readings")
     counts = {"gaps": status.gaps, "refused": status.refused, "reconnects": status.reconnects,
@@ -113,16 +120,15 @@ def _link(standing: Standing, status: Status | None, name: str, recording: str) 
 
 
 def _here(standing: Standing) -> Text:
-    here, model = standing.current, f"model: 12 parameters{''.join(f' + {name}' for name in standing.model)}"
+    here = standing.current
     if here is None:
-        return Text(f"{standing.dwells} dwells in {span(standing.elapsed_s)}; moving or settling; {model}")
+        return Text(f"{standing.dwells} dwells in {span(standing.elapsed_s)}; moving or settling")
     angles = _angles(np.degrees(here.pose)) if len(here.pose) < 4 else "attitude"
     out = Text(f"orientation {here.number} at {angles} deg: {span(here.seconds)}, {here.readings} readings")
     if here.enough:
         out.append(": enough, go on", "bold green")
     elif here.enough is False:
         out.append(": stay, it still sharpens")
-    out.append(f"; {model}")
     return out
 
 
@@ -141,7 +147,12 @@ def _sigmas(standing: Standing) -> Table:
             continue
         target = f"{wanted[k] * per_si:.3g}" if math.isfinite(wanted[k]) else "half"
         table.add_row(
-            symbol(name), f"{sigma * per_si:.3g}", unit, target, span(left), _bar(float(sigma), float(wanted[k]), k)
+            symbol(name),
+            f"{sigma * per_si:.3g}",
+            unit,
+            target,
+            span(left) if left else "",
+            _bar(float(sigma), float(wanted[k]), k),
         )
     return table
 
@@ -151,7 +162,8 @@ def _bar(sigma: float, wanted: float, k: int) -> Text:
     if math.isfinite(wanted):
         share = math.log10(max(sigma / wanted, 1e-9)) / _TARGET_DECADES
     else:
-        share = 1.0 + math.log10(max(sigma / (9.80665 if paper.UNITS[k] == "m/s^2" else 1.0), 1e-30)) / _DECADES
+        size = _COARSE * (9.80665 if paper.UNITS[k] == "m/s^2" else 1.0)
+        share = 1.0 + math.log10(max(sigma / size, 1e-30)) / _DECADES
     if math.isfinite(wanted) and share <= 0:
         return Text("reached", style="green")
     full = round(_BAR * min(max(share, 0.0), 1.0))
@@ -161,7 +173,8 @@ def _bar(sigma: float, wanted: float, k: int) -> Text:
 def _fit(judgement: Judgement) -> Text:
     result = judgement.result
     judged = result.consistency
-    text = "NIS: nothing to judge by" if judged.nis_per_dof is None else f"NIS/dof {judged.nis_per_dof:.3g}"
+    text = f"12 parameters{''.join(f' + {effect}' for effect in result.model.effects)}; "
+    text += "NIS: nothing to judge by" if judged.nis_per_dof is None else f"NIS/dof {judged.nis_per_dof:.3g}"
     if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2:
         text += f"; held out {result.held_out_rms_mps2:.2g} m/s² rms, noise alone {result.held_out_floor_mps2:.2g}"
     return Text(text)
