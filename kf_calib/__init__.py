@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from kf_calib.diagnosis import Diagnosis, diagnose
     from kf_calib.errors import InputError, KfCalibError, UnobservableError
     from kf_calib.improvement import Improvement, improve
+    from kf_calib.live import Session
     from kf_calib.running import Running
     from kf_calib.sources.recorder import Recorder
     from kf_calib.sources.recording import Recording as open_recording
