@@ -110,6 +110,7 @@ class Pty:
         """A terminal has no connection to end."""
 
     def close(self) -> None:
+        time.sleep(0.2)  # what is not read when a terminal hangs up is lost
         os.close(self._ours)
 
     def _is_hung_up(self) -> bool:
@@ -212,8 +213,6 @@ class Emulator:
 
     def _send_all(self) -> None:
         started_s, is_here = time.monotonic(), True
-        if self._wall:
-            self._shift_ns = time.time_ns() - START_NS
         for batch in self._run:
             for due_ns, samples in _in_steps(batch, round(_STEP_S * 1e9 * self._speed)):
                 if self.stopping:
@@ -261,7 +260,7 @@ class Emulator:
         is_reading = kind == frames.ACCEL
         self.ledger.readings += is_reading
         number, self._numbers[kind] = self._numbers[kind], self._numbers[kind] + 1
-        stamp = time_ns + self._shift_ns
+        stamp = time.time_ns() if self._wall else time_ns + self._shift_ns
         data = FORMATS[self._form](kind, number, stamp, values)
         whole = (data, stamp if is_reading else None, False)
         if not (self._faults and is_here and self._left > 0 and self._rng.random() < 1.0 / self._every):

@@ -29,6 +29,9 @@ BENCH_RECORD = "kf_calib.bench"
 CHECKSUM_KEY = "crc32"
 """Key of the bench record with the checksum of the others: gravity and axes lie outside every chunk's CRC."""
 
+GAP_RECORD = "kf_calib.gap"
+"""Metadata record at a place where the link to the bench was down: after_ns, seconds, reason."""
+
 ACCEL_TOPIC = "/accelerometer"
 ANGLES_TOPIC = "/platform/angles"
 ATTITUDE_TOPIC = "/platform/attitude"
@@ -275,6 +278,7 @@ class _Passage:
         self._find = MessageFinder()
         self._tracks: list[_Track] = []
         self._met = Counter[int]()
+        self._gaps = list[Mapping[str, str]]()
 
     def track(self, role: _Role, topic: str, width: int) -> _Track:
         track = _Track(self.contents, topic, Decoder(self.contents.kind(role, topic), width))
@@ -285,6 +289,7 @@ class _Passage:
         messages = self._find(block)
         for opcode, content in messages.others:
             self.contents.add(opcode, content, self.warn)
+            self._gaps += _gap(opcode, content)
         if messages.lost:
             self.warn(f"{self.contents.path}: {messages.lost} bytes of records before byte {block.end} make no sense.")
         for group in messages.groups:
@@ -292,7 +297,12 @@ class _Passage:
         return messages
 
     def account(self, stated: Mapping[int, int]) -> None:
-        """Warns of messages that the file should have (``stated``, by channel) but that were not met."""
+        """Warns of messages that the file should have (``stated``, by channel) but that were not met, and of gaps."""
+        if self._gaps:
+            reason = self._gaps[0].get("reason", "unknown")
+            self.warn(
+                f"{self.contents.path}: the link to the bench was lost {len(self._gaps)} times (first: {reason})."
+            )
         for track in self._tracks:
             ids = self.contents.ids(track.topic)
             total = sum(stated.get(channel, 0) for channel in ids)
@@ -325,6 +335,17 @@ class _Track:
         joined = sum(parts, Stream.empty(self.decode.width))
         order = np.argsort(np.concatenate([np.empty(0, np.int64), *(group.at for group in groups)]))
         return Stream(joined.time_ns[order], joined.values[order])
+
+
+def _gap(opcode: int, content: bytes) -> list[Mapping[str, str]]:
+    """The facts of a record that marks a gap; none of any other."""
+    if opcode != Opcode.METADATA:
+        return []
+    try:
+        record = parse(Metadata.read, content)
+    except DamagedError:  # told already
+        return []
+    return [record.metadata] if record.name == GAP_RECORD else []
 
 
 def _ignore(_: str) -> None:

@@ -15,13 +15,14 @@ class Continuity:
     """Gaps in the stamps of readings, and how many readings they have room for.
 
     A step is a gap where it exceeds the median step by half, or by eight robust deviations where stamps jitter.
+    Readings stamped as they arrive come in bursts: then one is a gap that exceeds the longest of the last by half.
     """
 
     def __init__(self) -> None:
         self.gaps = self.missing = 0
         self.last_ns: int | None = None
-        self._steps = np.empty(0, np.int64)  # the latest, and those not judged yet
-        self._judged = self._since = 0
+        self._steps = self._unjudged = np.empty(0, np.int64)
+        self._since = 0
         self._period_ns = self._limit_ns = 0.0
         self._is_cut = False
 
@@ -39,12 +40,15 @@ class Continuity:
         if self._is_cut and len(steps):
             self._is_cut = False
             self.gaps += int(not 0.0 < self._limit_ns < steps[0])  # else it counts itself
+        self._unjudged = np.concatenate([self._unjudged, steps])
+        self._judge()
         self._learn(steps)
+        self._judge()  # those that came before enough was known
+
+    def _judge(self) -> None:
         if not self._limit_ns:
             return
-        unjudged = self._steps if not self._judged else steps
-        self._judged += len(unjudged)
-        long = unjudged[unjudged > self._limit_ns]
+        long, self._unjudged = self._unjudged[self._unjudged > self._limit_ns], self._unjudged[:0]
         self.gaps += len(long)
         self.missing += round(float(np.rint(long / self._period_ns - 1.0).sum()))
 
@@ -57,9 +61,14 @@ class Continuity:
         forward = self._steps[self._steps > 0]
         if len(forward):
             self._since = 0
-            self._period_ns = float(np.median(forward))
-            jitter_ns = 1.48 * float(np.median(np.abs(forward - self._period_ns)))
-            self._limit_ns = self._period_ns + max(0.5 * self._period_ns, 8.0 * jitter_ns)
+            median_ns, mean_ns = (
+                float(np.median(forward)),
+                float(np.sort(forward)[: -(len(forward) // 50) or None].mean()),
+            )
+            jitter_ns = 1.48 * float(np.median(np.abs(forward - median_ns)))
+            self._period_ns, self._limit_ns = median_ns, median_ns + max(0.5 * median_ns, 8.0 * jitter_ns)
+            if median_ns < 0.5 * mean_ns:
+                self._period_ns, self._limit_ns = float(forward.mean()), 1.5 * float(forward.max())
 
 
 class Abreast:

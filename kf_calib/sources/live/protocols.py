@@ -133,9 +133,10 @@ class Protocol:
             return self._frames.push(block)
         assert self._lines is not None
         if self._lines.reader is None:
-            self._held = (self._held + block)[-_HELD_BYTES:]
-            if b"\0" in self._held and (found := self._frames_in(self._held)) is not None:
+            held = self._held + block
+            if b"\0" in held and (found := self._frames_in(held)) is not None:
                 return found
+            self._held = held[-_HELD_BYTES:]
         batch = self._lines.push(block)
         if self._lines.reader is None:
             self._seen += len(block)

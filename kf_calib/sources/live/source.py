@@ -19,9 +19,7 @@ from kf_calib.samples import Batch, Stream
 from kf_calib.sources.live.continuity import Abreast, Continuity
 from kf_calib.sources.live.feed import Feed, Lost, Regained
 from kf_calib.sources.recorder import Recorder, refuse_existing
-
-GAP_RECORD = "kf_calib.gap"
-"""Metadata record at a place in a recording where the link was down: after_ns, seconds, reason."""
+from kf_calib.sources.recording import GAP_RECORD
 
 _FLUSH_S = 0.5  # with the time that flushing takes, less than the second that a kill may cost
 QUEUED = 200_000
@@ -41,7 +39,7 @@ class Status:
     with the reason of the first. gaps: places where the stamps leap or the link broke; missing: readings lost on the
     way, exact where the bench numbers its frames, else what the gaps have room for. dropped: readings that the
     consumer was too slow for and that are in no recording; waiting: readings on their way to it. recorded: readings in
-    whole chunks of the recording; sync_age_s: age of the newest that the disk is known to hold, None without a
+    whole chunks of the recording; sync_age_s: age of the newest that the disk is known to hold, None without an open
     recording; recording_trouble: why it ended early.
     """
 
@@ -199,7 +197,7 @@ class LiveSource:
                 reconnects=feed.reconnects,
                 bytes=feed.bytes,
                 recorded=recorder.flushed if recorder else 0,
-                sync_age_s=now - recorder.synced_s if recorder else None,
+                sync_age_s=now - recorder.synced_s if recorder and not self._is_finished else None,
                 recording_trouble=self._recording_trouble,
             )
 
@@ -338,7 +336,7 @@ class LiveSource:
             return None
 
     def _mark_gap(self, reason: str, seconds: float) -> None:
-        facts = {"after_ns": str(self._continuity.last_ns or 0), "seconds": f"{seconds:.3f}", "reason": reason}
+        facts = {"after_ns": str(self._continuity.last_ns or 0), "seconds": f"{seconds:.6f}", "reason": reason}
         with self._lock:
             self._store_if_open(lambda recorder: recorder.mark(GAP_RECORD, facts))
 

@@ -1,0 +1,281 @@
+"""Figures of live acquisition, against the bench emulator: CPU, latency, loss, memory, kills and faults.
+
+    tools/bench_live.py            all of them, about five minutes
+    tools/bench_live.py --quick    shorter runs, about one minute
+    tools/bench_live.py --only memory --json
+
+The source under test runs in a process of its own, the emulator in another.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import resource
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bench_emulator import Emulator, Tcp
+
+from kf_calib.sources.live import LiveSource, frames, open_live
+from kf_calib.sources.live.links import Link
+from kf_calib.sources.live.streamed import StreamedFeed
+from kf_calib.sources.recording import Recording
+from kf_calib.sources.simulated import options_from_query, simulation
+
+HERE = Path(__file__).resolve().parent
+KEYS = {"axes": "y z x", "gravity_mps2": "9.81"}
+
+
+def resident_mb() -> float:
+    """Resident memory of this process now."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+# -- the process under test --
+
+
+def acquire(url: str, out: Path) -> dict[str, Any]:
+    """Reads a source to its end, recording it; what it took, and how late each reading was (stamps are wall time)."""
+    late_ms, samples = list[float](), 0
+    with open_live(url, KEYS, out) as source:
+        _ = source.bench
+        print(json.dumps({"ready": True}), flush=True)
+        before, began_s = resource.getrusage(resource.RUSAGE_SELF), time.monotonic()
+        for batch in source:
+            now_ns = time.time_ns()
+            samples += len(batch.accel)
+            late_ms += ((now_ns - batch.accel.time_ns) / 1e6).tolist()
+            after, ended_s = resource.getrusage(resource.RUSAGE_SELF), time.monotonic()
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    status = source.status
+    settled = np.array(late_ms[len(late_ms) // 20 :])
+    return {
+        "samples": samples,
+        "cpu_share": cpu_s / (ended_s - began_s),
+        "late_ms": np.percentile(settled, [50, 99, 100]).round(2).tolist(),
+        "missing": status.missing,
+        "refused": status.refused,
+        "dropped": status.dropped,
+        "recorded": status.recorded,
+    }
+
+
+class Endless(Link):
+    """The same frames over and over, as fast as they are taken."""
+
+    reopens = False
+    patient = True
+
+    def __init__(self, samples: int) -> None:
+        block = [frames.sample(frames.ACCEL, i, 10**18 + i * 100_000, (i * 1e-4, 9.8, -0.25)) for i in range(10_000)]
+        block += [frames.sample(frames.ANGLES, i, 10**18 + i * 10_000_000, (0.1, 0.2, 0.3)) for i in range(100)]
+        self._block, self._left = b"".join(block), samples // 10_000
+
+    def open(self) -> None: ...
+
+    def read(self) -> bytes:
+        if not self._left:
+            raise EOFError
+        self._left -= 1
+        return self._block
+
+    def close(self) -> None: ...
+
+
+def gorge(samples: int, out: Path) -> dict[str, Any]:
+    """Resident memory while so many readings pass through a source that records them."""
+    feed = StreamedFeed("endless", Endless(samples), KEYS, {}, "", 1.0, float("inf"))
+    done, marks, began_s = 0, list[float](), time.monotonic()
+    with LiveSource(feed, out) as source:
+        for batch in source:
+            done += len(batch.accel)
+            if done >= (len(marks) + 1) * samples / 10:
+                marks.append(round(resident_mb(), 1))
+    return {"samples": done, "resident_mb": marks, "samples_per_s": done / (time.monotonic() - began_s)}
+
+
+def random_bytes(size: int, out: Path) -> dict[str, Any]:
+    """Resident memory, and what is told, while so many random bytes come after a good beginning."""
+    url, noise = out, np.random.default_rng(0).bytes(1 << 20)
+
+    class Noise(Link):
+        reopens, patient = False, True
+        pieces: Iterator[bytes] = iter(())
+
+        def open(self) -> None:
+            good = b"time_ns,ax_g,ay_g,az_g,a_deg,b_deg,c_deg\n1,0,1,0,0,0,0\n"
+            self.pieces = iter([good, *[noise] * (size >> 20), b"\n" + good[-16:]])
+
+        def read(self) -> bytes:
+            piece = next(self.pieces, None)
+            if piece is None:
+                raise EOFError
+            return piece
+
+        def close(self) -> None: ...
+
+    began_s, before = time.monotonic(), resident_mb()
+    with LiveSource(StreamedFeed("noise", Noise(), KEYS, {}, "", 1.0, float("inf")), url) as source:
+        kept = sum(len(batch.accel) for batch in source)
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 - before
+    return {
+        "mb": size / 1e6, "kept": kept, "refused": source.status.refused, "grown_mb": round(grown, 1),
+        "seconds": time.monotonic() - began_s,
+    }  # fmt: skip
+
+
+# -- measurements --
+
+
+def emulator(*options: str) -> tuple[subprocess.Popen[str], str]:
+    child = subprocess.Popen(
+        [sys.executable, str(HERE / "bench_emulator.py"), *options], stdout=subprocess.PIPE, text=True
+    )
+    assert child.stdout is not None
+    return child, child.stdout.readline().strip()
+
+
+def child(*arguments: object) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, __file__, "--child", *map(str, arguments)], stdout=subprocess.PIPE, text=True
+    )
+
+
+def answer(process: subprocess.Popen[str]) -> dict[str, Any]:
+    out, _ = process.communicate(timeout=1200)
+    return json.loads(out.splitlines()[-1])
+
+
+def steady(form: str, rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
+    """A run without faults in real time: what was sent must be there to the last reading."""
+    dwell_s = seconds / 8
+    bench, url = emulator(
+        "--format", form, "--wall", "--sim",
+        f"sample_hz={rate_hz:g}&angle_hz=100&dwell_s={dwell_s:g}&orientations=8&slew_degps=inf",
+    )  # fmt: skip
+    with bench:
+        found = answer(child("acquire", f"{url}?give_up=0.5", folder / f"{form}{rate_hz:g}.mcap"))
+        sent = json.loads((bench.stdout.read() if bench.stdout else "").splitlines()[-1])
+    return {
+        "rate_hz": rate_hz,
+        "format": form,
+        "sent": sent["readings"],
+        **found,
+        "lost": sent["readings"] - found["samples"],
+    }
+
+
+def kills(count: int, folder: Path) -> dict[str, Any]:
+    """kill -9 at random moments of a run at 1 kHz: seconds of readings that are not in the file."""
+    lost_s, chance = list[float](), random.Random(0)
+    for k in range(count):
+        run = simulation(options_from_query("sample_hz=1000&dwell_s=30&orientations=2"), {}, 2048)
+        bench = Emulator(run, Tcp(), "frames", wall=True, keep=True)
+        thread = bench.in_background()
+        out = folder / f"killed{k}.mcap"
+        with child("acquire", bench.url, out) as process:
+            assert process.stdout is not None
+            process.stdout.readline()
+            time.sleep(chance.uniform(0.3, 2.5))
+            process.kill()
+            killed_ns = time.time_ns()
+        bench.stopping = True
+        thread.join()
+        stamps = np.concatenate([batch.accel.time_ns for batch in Recording(out)])
+        sent = np.array(bench.ledger.stamps_ns)
+        assert np.array_equal(stamps, sent[: len(stamps)]), "nothing but the end is missing"
+        lost_s.append((killed_ns - int(stamps[-1])) / 1e9)
+    return {"kills": count, "lost_s": [round(x, 3) for x in sorted(lost_s)[:: max(count - 1, 1)]]}
+
+
+def faults(count: int, form: str, folder: Path) -> dict[str, Any]:
+    """So many random faults: every reading that was not sent whole is counted as missing, and no other."""
+    query = "sample_hz=1000&angle_hz=100&dwell_s=600&orientations=8&slew_degps=inf"
+    kinds = ("drop", "garbage", "damage", "stall", "burst", "disconnect")
+    bench = Emulator(
+        simulation(options_from_query(query), {}, 2048), Tcp(), form, speed=5.0, faults=kinds, every=200.0, seed=1,
+        keep=True, most_faults=count, outage_s=0.1,
+    )  # fmt: skip
+    thread = bench.in_background()
+    out = folder / f"faults_{form}.mcap"
+
+    def end() -> None:
+        while sum(bench.ledger.faults.values()) < count:
+            time.sleep(0.05)
+        time.sleep(0.5)
+        bench.stopping = True
+
+    threading.Thread(target=end, daemon=True).start()
+    with open_live(f"{bench.url}?give_up=1", KEYS, out) as source:
+        got = np.concatenate([batch.accel.time_ns for batch in source])
+    thread.join()
+    ledger, status = bench.ledger, source.status
+    replayed = np.concatenate([batch.accel.time_ns for batch in Recording(out)])
+    return {
+        "format": form,
+        "faults": sum(ledger.faults.values()),
+        "readings": ledger.readings,
+        "not_sent": ledger.readings - ledger.sent,
+        "sent_and_not_got": len(np.setdiff1d(ledger.stamps_ns, got)),
+        "got_and_not_sent": len(np.setdiff1d(got, ledger.stamps_ns)),
+        "missing": status.missing,
+        "refused": status.refused,
+        "reconnects": status.reconnects,
+        "replay_is_same": bool(np.array_equal(replayed, got)),
+    }
+
+
+def measurements(quick: bool, folder: Path) -> dict[str, Callable[[], dict[str, Any]]]:
+    millions = 500_000 if quick else 5_000_000
+    return {
+        "json_1khz": lambda: steady("json", 1000.0, 8.0 if quick else 30.0, folder),
+        "frames_1khz": lambda: steady("frames", 1000.0, 8.0 if quick else 30.0, folder),
+        "frames_10khz": lambda: steady("frames", 10_000.0, 8.0 if quick else 60.0, folder),
+        "memory": lambda: answer(child("gorge", millions, folder / "memory.mcap")),
+        "random_bytes": lambda: answer(child("random_bytes", (10 if quick else 100) << 20, folder / "noise.mcap")),
+        "kills": lambda: kills(3 if quick else 30, folder),
+        "faults_frames": lambda: faults(100 if quick else 1000, "frames", folder),
+        "faults_json": lambda: faults(100 if quick else 1000, "json", folder),
+    }
+
+
+CHILDREN: dict[str, Callable[[str, Path], dict[str, Any]]] = {
+    "acquire": acquire,
+    "gorge": lambda count, out: gorge(int(count), out),
+    "random_bytes": lambda size, out: random_bytes(int(size), out),
+}
+
+
+def main() -> None:
+    if sys.argv[1:2] == ["--child"]:
+        print(json.dumps(CHILDREN[sys.argv[2]](sys.argv[3], Path(sys.argv[4]))), flush=True)
+        return
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--only", action="append", default=[], help="name of a measurement; repeatable")
+    parser.add_argument("--json", action="store_true")
+    chosen = parser.parse_args()
+    figures: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, measure in measurements(chosen.quick, Path(folder)).items():
+            if chosen.only and name not in chosen.only:
+                continue
+            figures[name] = measure()
+            if not chosen.json:
+                print(f"{name:14}", "  ".join(f"{key} {value}" for key, value in figures[name].items()), flush=True)
+    if chosen.json:
+        print(json.dumps(figures))
+
+
+if __name__ == "__main__":
+    main()
