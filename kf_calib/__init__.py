@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from kf_calib.diagnosis import Diagnosis, diagnose
     from kf_calib.errors import InputError, KfCalibError, UnobservableError
     from kf_calib.improvement import Improvement, improve
+    from kf_calib.live import Session
     from kf_calib.running import Running
     from kf_calib.sources.recorder import Recorder
     from kf_calib.sources.recording import Recording as open_recording
@@ -52,6 +53,7 @@ _HOMES = {
     "KfCalibError": ("errors", "KfCalibError"),
     "UnobservableError": ("errors", "UnobservableError"),
     "Running": ("running", "Running"),
+    "Session": ("live", "Session"),
     "Recorder": ("sources.recorder", "Recorder"),
     "open_recording": ("sources.recording", "Recording"),
     "save_view": ("views.rerun", "save"),
@@ -60,7 +62,7 @@ _HOMES = {
 
 __all__ = [
     "Bench", "Calibration", "Diagnosis", "Improvement", "InputError", "KfCalibError", "Parameter", "Recorder",
-    "Running", "Settings", "UnobservableError", "Watch", "calibrate", "compare", "diagnose", "improve",
+    "Running", "Session", "Settings", "UnobservableError", "Watch", "calibrate", "compare", "diagnose", "improve",
     "open_recording", "save_view",
 ]  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Where to go next: the orientation that tells two suspects apart, or shows what none has shown yet."""
+"""Where to go next: the orientation that tells two suspects apart, shows what none has, or sharpens the twelve."""
 
 from __future__ import annotations
 
@@ -9,17 +9,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kf_calib import paper
 from kf_calib.effects import Effect
 from kf_calib.fitting import Fit
 from kf_calib.folding import candidate_columns
 from kf_calib.information import accumulated, whitened
-from kf_calib.noise import steps
+from kf_calib.model import STATE_COUNT
+from kf_calib.noise import Noise, steps
 from kf_calib.prospect import Prospect
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 
 _POSES = 160
 _STEP_DEG = 5.0
+_STEPS = 12
+_WAY_S = 10.0  # to the next orientation, where there has been none
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,69 @@ def to_show(fitted: Fit, hidden: Sequence[Effect]) -> tuple[Advice, int] | None:
     return Advice(tuple(np.degrees(poses[best]).round(1).tolist()), 0.0, float(shown[best])), int(shown[best])
 
 
+@dataclass(frozen=True)
+class Course:
+    """How the twelve sigmas would fall over the orientations that sharpen them most, one after another.
+
+    gimbal_deg: the first of them; sigma (N + 1, 12): now and after each; dwells: so far; each_s: a dwell and the way
+    to it.
+    """
+
+    gimbal_deg: tuple[float, ...]
+    sigma: Floats
+    dwells: int
+    each_s: float
+
+    def sharpened(self, sizes: Floats) -> tuple[str, float]:
+        """The parameter whose sigma is largest over ``sizes`` (12,), and by which factor its sigma falls next."""
+        worst = int(np.argmax(self.sigma[0] / sizes))
+        return paper.SYMBOLS[worst], float(self.sigma[1, worst] / self.sigma[0, worst])
+
+    def seconds_to(self, wanted: Floats, sigma: Floats) -> Floats:
+        """Seconds (12,) until each sigma is as wanted (12,); beyond the course they fall by the root of the dwells.
+
+        ``sigma`` (12,): as they are now; NaN counts as far from any target.
+        """
+        last, steps = self.sigma[-1], len(self.sigma) - 1
+        reached = self.sigma <= wanted
+        beyond = (self.dwells + steps) * (last / wanted) ** 2 - self.dwells
+        needed = np.where(reached.any(axis=0), reached.argmax(axis=0), np.ceil(beyond))
+        return np.where(sigma <= wanted, 0.0, np.maximum(needed, 1.0) * self.each_s)
+
+
+def course(fitted: Fit, sizes: Floats, count: int = _STEPS) -> Course | None:
+    """The orientations that sharpen the twelve parameters most, each chosen after those before it.
+
+    Of the candidates the one that makes the sum of (sigma / size)^2 smallest, which is ruled by the worst. ``sizes``
+    (12,): targets, or what sigmas are compared by; inf for what does not matter. None without gimbals.
+    """
+    poses = _poses(fitted)
+    if poses is None:
+        return None
+    factor, rows = _with_next(fitted, [], poses, fitted.noise)
+    jacobian = paper.jacobian(fitted.carried.state[:STATE_COUNT])
+    at_least = np.diag(1.0 / np.maximum(fitted.carried.sizes, 1.0))  # what is not seen at all: to the size of g
+    factor = triangle(np.vstack([factor, at_least]))
+    sigmas, first = [_sigmas(factor[None], jacobian)[0]], 0
+    for number in range(count):
+        after = triangle(np.concatenate([np.broadcast_to(factor, (len(rows), *factor.shape)), rows], axis=1))
+        reached = _sigmas(after, jacobian)
+        best = int(np.argmin(((reached / sizes) ** 2).sum(axis=1)))
+        first = first if number else best
+        factor = after[best]
+        sigmas.append(reached[best])
+    means, starts = fitted.carried.means, fitted.carried.means.ends_s[:, 0]
+    lengths = np.diff(starts) if len(starts) > 1 else np.ptp(means.ends_s, axis=1) + _WAY_S
+    angles = tuple(np.degrees(poses[first]).round(1).tolist())
+    return Course(angles, np.array(sigmas), len(starts), float(np.median(lengths)))
+
+
+def _sigmas(factors: Floats, jacobian: Floats) -> Floats:
+    """Sigmas (m, 12) of the paper's parameters from triangles (m, p, p)."""
+    roots = np.linalg.inv(factors[:, : factors.shape[2]])[:, :STATE_COUNT]
+    return np.linalg.norm(jacobian @ roots, axis=2)
+
+
 def _poses(fitted: Fit) -> Floats | None:
     """Gimbal angles (m, k) to choose from, rad: multiples of 45 deg and a spread of others; None without gimbals."""
     count = len(fitted.carried.model.bench.axes)
@@ -82,9 +149,11 @@ def _poses(fitted: Fit) -> Floats | None:
     return np.radians(np.concatenate([coarse, fine]))
 
 
-def _with_next(fitted: Fit, effects: Sequence[Effect], poses: Floats) -> tuple[Floats, Floats]:
+def _with_next(
+    fitted: Fit, effects: Sequence[Effect], poses: Floats, noise: Noise | None = None
+) -> tuple[Floats, Floats]:
     """Triangle of the run so far over [H | G], and whitened rows (m, 3, p + q) of a dwell's mean at each pose."""
-    carried, noise = fitted.carried, fitted.noise.judging
+    carried, noise = fitted.carried, noise or fitted.noise.judging
     model, state = carried.model, carried.state
     added = candidate_columns(carried.dwells, effects, model.bench, state)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]

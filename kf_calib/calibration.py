@@ -8,7 +8,7 @@ of the whole run, so the curves of a replay do not jump when the noise becomes b
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Literal
@@ -18,11 +18,11 @@ from threadpoolctl import threadpool_limits
 
 from kf_calib import information, kalman, paper
 from kf_calib.bench import Bench
-from kf_calib.dwells import Segmenter, Stillness, Tally, dwell_blocks
+from kf_calib.dwells import Block, Segmenter, Stillness, Tally, dwell_blocks
 from kf_calib.effects import of_the_users, remarks_of
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.fitting import WALK, Fit, fit
-from kf_calib.folding import Carried, DwellFactor, Folder, means_of, samples_of
+from kf_calib.folding import Carried, DwellFactor, Folder, columns_of, means_of, samples_of
 from kf_calib.held_out import held_out, orientations
 from kf_calib.information import Step
 from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
@@ -259,6 +259,24 @@ class Calibration:
             if len(self.fit.following[index]):
                 factor = information.update(factor, self.fit.following[index]).factor
 
+    def during(self, dwell: DwellFactor) -> Estimate:
+        """The estimate were a dwell that follows the run, and is not in it yet, to end as it is now."""
+        fitted, (factor, extra) = self.fit, self.reached
+        both, state = [fitted.dwells[-1], dwell], self.carried.state
+        own = columns_of(both, self.model, state)[1:]
+        rows = information.whitened([dwell], own, self.noise.weights, state)[0]
+        factor = information.update(factor, rows, steps(both, self.noise)[-1]).factor
+        extra = extra + considered(self.noise, means_of([dwell], own), state)[0]
+        return _estimate(factor, self.model.nominal_state(), extra)
+
+    @cached_property
+    def reached(self) -> tuple[Floats, Floats]:
+        """The filter's factor after the last dwell, and what is considered only, as in the covariance."""
+        fitted, first = self.fit, information.start(self.settings.prior, self.model)
+        last = information.run(first, fitted.rows(), fitted.steps, fitted.following)[-1]
+        extra = considered(self.noise, self.carried.means, self.carried.state)
+        return last.factor, extra.sum(axis=0) + fitted.considered
+
 
 @dataclass
 class Pass:
@@ -270,17 +288,27 @@ class Pass:
     folder: Folder = field(default_factory=Folder)
     watch: Watch = field(default_factory=Watch)
 
+    def segmenter(self) -> Segmenter:
+        """What cuts the source into dwells, and into slews where an effect of the model shows in them."""
+        slews = bool(Model.of(self.source.bench, self.settings.effects).dynamic)
+        return Segmenter(self.source.bench, self.settings.stillness, self.tally, slews)
+
     def rows(self) -> Iterator[Rows]:
-        model, bench = Model.of(self.source.bench, self.settings.effects), self.source.bench
-        blocks = dwell_blocks(self.source, Segmenter(bench, self.settings.stillness, self.tally, bool(model.dynamic)))
+        return self.rows_of(dwell_blocks(self.source, self.segmenter()))
+
+    def rows_of(self, blocks: Iterable[Block]) -> Iterator[Rows]:
+        model = Model.of(self.source.bench, self.settings.effects)
         averages = model.averages or (self.settings.averaged and not model.oscillates)
-        return model_rows(blocks, bench, self.tally, self.settings.gate_sigma, averages)
+        return model_rows(blocks, self.source.bench, self.tally, self.settings.gate_sigma, averages)
+
+    def add(self, rows: Rows) -> None:
+        self.folder.add(rows)
+        self.watch.add(rows.raw or rows)
 
     def fold(self, on_progress: Callable[[float], None] | None = None) -> list[DwellFactor]:
         """All dwells of the source that hold enough readings to be used."""
         for rows in self.rows():
-            self.folder.add(rows)
-            self.watch.add(rows.raw or rows)
+            self.add(rows)
             if on_progress is not None:
                 on_progress(self.source.fraction)
         return usable(self.folder.dwells)
@@ -298,23 +326,38 @@ def calibrate(
 
     Raises InputError where the source holds nothing usable, UnobservableError where one orientation was visited only.
     """
-    settings = settings or Settings()
-    passed = Pass(source, settings)
+    passed = Pass(source, settings or Settings())
     with threadpool_limits(1, user_api="blas"):  # small decompositions: with threads they take three times as long
-        dwells = passed.fold(on_progress)
-        refuse_unusable(dwells, passed.tally, source.bench)
-        if Model.of(source.bench, settings.effects).oscillates:
-            passed, dwells = _on_carrier(passed, dwells, on_progress)
-        result = evaluate(dwells, source.bench, settings, passed.folder.slews)
+        passed.fold(on_progress)
+        return concluded(passed, source, on_progress)
+
+
+def concluded(
+    passed: Pass, again: Source | None = None, on_progress: Callable[[float], None] | None = None
+) -> Calibration:
+    """The calibration of a pass that has come to its end.
+
+    again: the same samples to be read once more, for models that need them folded otherwise; None: they are gone.
+    """
+    settings, bench, dwells = passed.settings, passed.source.bench, usable(passed.folder.dwells)
+    refuse_unusable(dwells, passed.tally, bench)
+    if again is not None and Model.of(bench, settings.effects).oscillates:
+        passed, dwells = _on_carrier(replace(passed, source=again), dwells, on_progress)
+    result = evaluate(dwells, bench, settings, passed.folder.slews)
     refuse_unseen(result)
+    if again is not None and settings.engine == "filterpy":
+        result = replace(result, estimate=filterpy_estimate(again, result))
+    reread = None if again is None else partial(calibrate, again)
+    return replace(told(result, passed), reread=reread)
+
+
+def told(result: Calibration, passed: Pass) -> Calibration:
+    """The result with what its pass counted and saw, and a sentence on each thing that a user must know."""
     own = [effect for effect in result.model.effects if of_the_users(effect)]
     notes = [f"{sight}." for sight in sights(result.fit, own)]
-    if settings.engine == "filterpy":
-        result = replace(result, estimate=filterpy_estimate(source, result))
-    readings = passed.watch.judged(dwells, result.noise)
-    said = [*source.warnings, *passed.tally.sentences(), *readings.warnings, *result.warnings, *notes]
-    again = partial(calibrate, source)
-    return replace(result, tally=passed.tally, readings=readings, warnings=tuple(said), reread=again)
+    readings = passed.watch.judged(result.fit.dwells, result.noise)
+    said = [*passed.source.warnings, *passed.tally.sentences(), *readings.warnings, *result.warnings, *notes]
+    return replace(result, tally=passed.tally, readings=readings, warnings=tuple(said))
 
 
 def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:

@@ -10,8 +10,10 @@ how the streams were chopped into batches.
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -212,6 +214,27 @@ class Segmenter:
         accel, pose, temperature = (order.flush() for order in self._orders)
         self._take(Batch(accel, pose, temperature), counted=True)
         yield from self._advance(final=True)
+
+    @property
+    def standing(self) -> int | None:
+        """Number of the dwell that is open; None while the platform moves, or is not known to stand."""
+        return None if self._dwell is None else self._dwell.number
+
+    @property
+    def arrival_s(self) -> float:
+        """When the open dwell began, since the first sample; NaN where none is open."""
+        if self._dwell is None or self.first_ns is None:
+            return math.nan
+        return (self._dwell.arrival_ns - self.first_ns) / _SECOND_NS
+
+    def waiting(self) -> list[Block]:
+        """The readings of the open dwell that wait for their block to fill, in a block that is not taken from it."""
+        horizon = self._horizon(final=False)
+        if self._dwell is None or horizon is None:
+            return []
+        aside = copy.copy(self)
+        aside.tally, aside._dwell = Tally(), replace(self._dwell)
+        return list(aside._emit(horizon, closing=True))
 
     def _take(self, batch: Batch, counted: bool = False) -> None:
         accel, pose = batch.accel, batch.pose

@@ -187,6 +187,13 @@ class DwellFactor:
             spectrum=self.spectrum + other.spectrum,
         )
 
+    def repeated(self, times: float) -> DwellFactor:
+        """The same dwell as if its readings had come that many times over."""
+        pieces = (
+            replace(own, triangle=own.triangle * times**0.5, count=round(own.count * times)) for own in self.pieces
+        )
+        return replace(self, pieces=tuple(pieces))
+
     def prefixes(self) -> Iterator[DwellFactor]:
         """The dwell as it stood after 1, 2, 4 ... of its pieces, and in the end."""
         size = 1
@@ -321,7 +328,7 @@ def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Float
     parts = [columns(stimulus)]
     if stimulus.carrier_hz:
         parts += [columns(replace(stimulus, part=part)) for part in (1, 2)]
-    shaped = np.concatenate([part.reshape(-1, 3, *part.shape[1:]) for part in parts], axis=1)
+    shaped = np.concatenate([part.reshape(len(part) // 3, 3, *part.shape[1:]) for part in parts], axis=1)
     return np.split(shaped, np.cumsum([len(dwell.pieces) for dwell in dwells])[:-1])
 
 

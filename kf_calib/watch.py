@@ -47,13 +47,15 @@ class Watch:
     alarmed: int | None = None
 
     @classmethod
-    def over(cls, dwells: Sequence[DwellFactor], bench: Bench, settings: Settings | None = None) -> Watch:
-        """A watch over the dwells so far, at least four; they count as one look."""
+    def over(
+        cls, dwells: Sequence[DwellFactor], bench: Bench, settings: Settings | None = None, looks: int = 0
+    ) -> Watch:
+        """A watch over the dwells so far, at least four; they count as one look, after ``looks`` with another model."""
         settings = settings or Settings()
         if len(dwells) < _FEWEST:
             raise ValueError(f"a watch begins with {_FEWEST} dwells, not {len(dwells)}")
         with threadpool_limits(1, user_api="blas"):
-            return cls(bench, settings, *_begun(dwells, bench, settings))._looked()
+            return cls(bench, settings, *_begun(dwells, bench, settings), looks)._looked()
 
     def after(self, dwell: DwellFactor) -> Watch:
         """The watch after one more dwell."""

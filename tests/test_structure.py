@@ -31,7 +31,8 @@ LEVELS = [
     ["comparison", "model_file"],
     ["diagnosis"],
     ["improvement", "watch"],
-    ["journal"],
+    ["journal", "standing"],
+    ["live"],
     ["views"],
     ["cli"],
 ]

@@ -10,6 +10,7 @@ import sys
 
 import click
 
+from kf_calib.cli.live import live
 from kf_calib.cli.making import demo, record, simulate
 from kf_calib.cli.paper import paper
 from kf_calib.cli.plan import plan
@@ -23,7 +24,7 @@ def cli() -> None:
     """Calibrate accelerometers on a stationary gimballed bench with a Kalman filter."""
 
 
-for command in (demo, simulate, record, replay, compare, list_effects, diagnose, improve, plan, paper):
+for command in (demo, simulate, record, live, replay, compare, list_effects, diagnose, improve, plan, paper):
     cli.add_command(command)
 
 

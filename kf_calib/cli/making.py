@@ -179,7 +179,7 @@ def record(
     """Record CSV or JSON LINES (a file, or - for standard input) to the MCAP file OUT."""
     from kf_calib.sources.lines import Lines
 
-    renamed = dict(_pair(text) for text in columns)
+    renamed = dict(pair(text) for text in columns)
     source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, overrides(options), renamed)
     with progress(f"recording {out.name}", as_json or str(lines) == "-") as tick:
         readings, dwells, duration_s = _record(source, out, overwrite, tick)
@@ -195,7 +195,7 @@ def record(
         click.echo(f"Note: {warning}")
 
 
-def _pair(text: str) -> tuple[str, str]:
+def pair(text: str) -> tuple[str, str]:
     theirs, equals, ours = text.rpartition("=")
     if not (equals and theirs and ours):
         raise InputError(f"--column {text!r} names no pair: write --column THEIRS=OURS, for example acc_x=ax_g.")

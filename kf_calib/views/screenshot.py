@@ -62,9 +62,9 @@ def screenshot(
 def viewer(rrd: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
     """A headless viewer that has loaded the file; its process is ended whatever happens."""
     with tempfile.TemporaryDirectory(prefix="kf_calib_") as folder:
-        port, log = _free_port(), Path(folder, "viewer.log")
+        port, log = free_port(), Path(folder, "viewer.log")
         command = [
-            _binary(), "--headless", "--port", str(port), "--bind", "127.0.0.1", "--hide-welcome-screen",
+            binary(), "--headless", "--port", str(port), "--bind", "127.0.0.1", "--hide-welcome-screen",
             "--window-size", f"{size[0]}x{size[1] + _MENU_PX}", str(rrd),
         ]  # fmt: skip
         quiet = {**os.environ, "CI": "true", "RUST_LOG": "error"}  # CI: the viewer then sends no usage data
@@ -77,13 +77,13 @@ def viewer(rrd: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
             process.wait()
 
 
-def _free_port() -> int:
+def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
-def _binary() -> str:
+def binary() -> str:
     """The viewer itself: the script of the same name would be a second process, which outlives a kill."""
     import rerun_cli
 
@@ -97,7 +97,7 @@ def _loaded(process: subprocess.Popen[bytes], port: int, log: Path) -> ViewerCli
     began = idle_since = clock.monotonic()
     while clock.monotonic() < began + _PATIENCE_S:
         if process.poll() is not None:
-            raise ScreenshotError(_obituary(log.read_text(errors="replace")))
+            raise ScreenshotError(obituary(log.read_text(errors="replace")))
         clock.sleep(_POLL_S)
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
@@ -114,7 +114,7 @@ def _loaded(process: subprocess.Popen[bytes], port: int, log: Path) -> ViewerCli
     raise ScreenshotError(f"the Rerun viewer did not load the recording within {_PATIENCE_S:g} s: try again.")
 
 
-def _obituary(log: str) -> str:
+def obituary(log: str) -> str:
     """Why the viewer ended, from its log."""
     if any(word in log for word in ("render context", "graphics adapter", "Vulkan")):
         return (

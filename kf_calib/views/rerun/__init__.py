@@ -28,7 +28,7 @@ from kf_calib.views.rerun.platform import log_platform
 from kf_calib.views.rerun.series import History, log_bench, log_innovations, log_nis, log_parameters
 from kf_calib.views.rerun.summary import summary
 
-__all__ = ["BENCH_TIME", "ORIENTATION", "TABS", "layout", "log", "save"]
+__all__ = ["BENCH_TIME", "ORIENTATION", "TABS", "grow", "layout", "log", "save"]
 
 
 def save(result: Calibration, path: str | Path, timeline: str = BENCH_TIME, tab: str = TABS[0]) -> Path:
@@ -55,13 +55,27 @@ def log(result: Calibration, stream: rr.RecordingStream) -> None:
         _log(result, History.of(result), stream)
 
 
-def _log(result: Calibration, history: History, stream: rr.RecordingStream) -> None:
-    log_parameters(history, stream)
-    log_platform(result, stream)
-    log_innovations(result.visits, stream)
-    log_nis(result.visits, stream)
-    log_correlation(result.visits, stream)
-    log_bench(result, stream)
+def grow(result: Calibration, stream: rr.RecordingStream, shown: int, lay_out: bool) -> None:
+    """Send what a run shows beyond its first ``shown`` dwells, which were sent already, and the layout if asked to.
+
+    A dwell stays in the curves as it was known when it was sent; the platform and the page of text are made anew.
+    """
+    with _strict():
+        history = History.of(result)
+        _log(result, history, stream, shown)
+        if lay_out:
+            stream.send_blueprint(layout(result, history, BENCH_TIME, TABS[0]))
+
+
+def _log(result: Calibration, history: History, stream: rr.RecordingStream, shown: int = 0) -> None:
+    fresh = result.visits[shown:]
+    if fresh:
+        log_parameters(history.after(shown), stream)
+        log_platform(result, stream)
+        log_innovations(fresh, stream, shown)
+        log_nis(fresh, stream, shown)
+        log_correlation(fresh, stream, shown)
+        log_bench(result, stream, shown)
     stream.log("summary", rr.TextDocument(summary(result), media_type=rr.MediaType.MARKDOWN), static=True)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import rerun as rr
@@ -49,6 +49,11 @@ class History:
     deviation: Floats
     sigma: Floats
 
+    def after(self, dwells: int) -> History:
+        """What came after so many dwells; the prior only where there were none."""
+        late = self.orientation > (dwells or -1)
+        return History(*(getattr(self, each.name)[late] for each in fields(self)))
+
     @classmethod
     def of(cls, result: Calibration) -> History:
         steps = [(0.0, -1, _prior(result)), *result.trace()]
@@ -76,9 +81,9 @@ def times(elapsed_s: Floats, orientation: Counts | None = None) -> list[rr.TimeC
     return [bench_time] if orientation is None else [bench_time, rr.TimeColumn(ORIENTATION, sequence=orientation)]
 
 
-def ends(visits: Sequence[Visit]) -> tuple[Floats, Counts]:
-    """When each dwell ended, and its number."""
-    return np.array([visit.dwell.end_s for visit in visits]), np.arange(1, len(visits) + 1)
+def ends(visits: Sequence[Visit], before: int = 0) -> tuple[Floats, Counts]:
+    """When each dwell ended, and its number, after those ``before`` them."""
+    return np.array([visit.dwell.end_s for visit in visits]), np.arange(1, len(visits) + 1) + before
 
 
 def log_parameters(history: History, stream: rr.RecordingStream) -> None:
@@ -117,9 +122,9 @@ def _style(stream: rr.RecordingStream, path: str, style: rr.SeriesLines | rr.Ser
     stream.log(path, style, static=True)
 
 
-def log_innovations(visits: Sequence[Visit], stream: rr.RecordingStream) -> None:
+def log_innovations(visits: Sequence[Visit], stream: rr.RecordingStream, before: int = 0) -> None:
     """Innovation of each dwell and channel with its bounds of 2 sigma, um/s^2; and in units of its own sigma."""
-    elapsed_s, number = ends(visits)
+    (elapsed_s, number), count = ends(visits, before), before + len(visits)
     innovation = np.array([visit.innovation_mps2 for visit in visits]) * MICRO
     sigma = np.array([visit.innovation_sigma_mps2 for visit in visits]) * MICRO
     for i, (channel, colour) in enumerate(zip(CHANNELS, ACCELEROMETERS, strict=True)):
@@ -127,17 +132,17 @@ def log_innovations(visits: Sequence[Visit], stream: rr.RecordingStream) -> None
         _send(stream, f"{path}/value", elapsed_s, number, innovation[:, i])
         _send(stream, f"{path}/bound", elapsed_s, number, np.column_stack([-bound, bound]))
         _send(stream, f"{path}/in_sigma", elapsed_s, number, innovation[:, i] / sigma[:, i])
-        _style(stream, f"{path}/value", _points(channel, colour, len(visits)))
+        _style(stream, f"{path}/value", _points(channel, colour, count))
         _style(stream, f"{path}/bound", _bounds("−2σ", "+2σ"))
-        _style(stream, f"{path}/in_sigma", _points(channel, colour, len(visits)))
+        _style(stream, f"{path}/in_sigma", _points(channel, colour, count))
     known = np.where(np.isfinite(sigma).all(axis=1), 2.0, np.nan)
     _send(stream, "innovation/bound", elapsed_s, number, np.column_stack([-known, known]))
     _style(stream, "innovation/bound", _bounds("−2σ", "+2σ"))
 
 
-def log_nis(visits: Sequence[Visit], stream: rr.RecordingStream) -> None:
+def log_nis(visits: Sequence[Visit], stream: rr.RecordingStream, before: int = 0) -> None:
     """NIS of each dwell that has degrees of freedom, with the middle 95 % of chi-squared; red above it."""
-    judged = [(k + 1, visit) for k, visit in enumerate(visits) if visit.dof > 0]
+    judged = [(k, visit) for k, visit in enumerate(visits, before + 1) if visit.dof > 0]
     if not judged:
         return
     number = np.array([number for number, _ in judged])
@@ -147,7 +152,7 @@ def log_nis(visits: Sequence[Visit], stream: rr.RecordingStream) -> None:
     high = above(value, band)
     for name, place, colour in (("value", ~high, WHITE), ("above", high, RED)):
         _send(stream, f"nis/{name}", elapsed_s[place], number[place], value[place])
-        _style(stream, f"nis/{name}", _points(name, colour, len(visits)))
+        _style(stream, f"nis/{name}", _points(name, colour, before + len(visits)))
     _send(stream, "nis/band", elapsed_s, number, band)
     _style(stream, "nis/band", _bounds("2.5 %", "97.5 %"))
 
@@ -175,11 +180,11 @@ def _bounds(lower: str, upper: str) -> rr.SeriesLines:
     return rr.SeriesLines(names=[lower, upper], colors=[GREY, GREY], widths=[1.0, 1.0])
 
 
-def log_bench(result: Calibration, stream: rr.RecordingStream) -> None:
+def log_bench(result: Calibration, stream: rr.RecordingStream, before: int = 0) -> None:
     """The lane of dwells (empty while the platform moves), and the pose: gimbal angles in deg, or the quaternion."""
-    dwells = [visit.dwell for visit in result.visits]
+    dwells = [visit.dwell for visit in result.visits[before:]]
     begun = np.array([dwell.start_s for dwell in dwells])
-    done, number = ends(result.visits)
+    done, number = ends(result.visits[before:], before)
     states = rr.StateChange.columns(state=[f"{k}" for k in number])
     rr.send_columns("bench/dwell", times(begun, number), states, recording=stream)
     edge = done[-1] + EDGE * (done[-1] - begun[0])

@@ -1,0 +1,412 @@
+"""The command that evaluates a run while it goes on: live."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import queue
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from kf_calib.cli.making import overwrite_option, pair
+from kf_calib.cli.options import (
+    bench_options,
+    filter_options,
+    json_option,
+    overrides,
+    print_json,
+    settings_of,
+    show,
+    strict_option,
+)
+from kf_calib.errors import InputError, KfCalibError
+
+if TYPE_CHECKING:
+    from kf_calib.calibration import Settings
+    from kf_calib.live import Session
+    from kf_calib.samples import Source
+    from kf_calib.sources.live import LiveSource
+    from kf_calib.standing import Judgement
+    from kf_calib.views.rerun.growing import GrowingView
+
+_REFRESH_S = 0.25
+_SIZES = {"rad": 1.0, "deg": math.pi / 180, "arcmin": math.pi / 10800, "arcsec": math.pi / 648000, "1": 1.0,
+          "ppm": 1e-6, "m/s^2": 1.0, "mg": 9.80665e-3, "ug": 9.80665e-6, "µg": 9.80665e-6}  # fmt: skip
+_KINDS = {"rad": ("rad", "deg", "arcmin", "arcsec"), "1": ("1", "ppm"), "m/s^2": ("m/s^2", "mg", "ug", "µg")}
+
+
+@click.command()
+@click.argument("source", metavar="SOURCE")
+@click.option("--record", type=click.Path(path_type=Path), metavar="OUT.mcap", help="Record the run here.")
+@overwrite_option
+@click.option(
+    "--column",
+    "columns",
+    multiple=True,
+    metavar="THEIRS=OURS",
+    help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.',
+)
+@click.option("--header", default="", metavar="NAMES", help="Names of the columns of CSV rows that come without any.")
+@click.option(
+    "--give-up-s",
+    type=click.FloatRange(min=0),
+    default=600.0,
+    show_default=True,
+    help="Seconds for which a lost link is tried again.",
+)
+@click.option(
+    "--idle-s",
+    type=click.FloatRange(min=0, min_open=True),
+    default=math.inf,
+    show_default="never",
+    help="End the run when nothing has come for so long.",
+)
+@click.option("--target", "targets", multiple=True, metavar="SYMBOL=SIGMA",
+              help="The sigma wanted of a parameter (theta1) or of a kind (theta, phi, nu, K, b), with a unit: "
+              "theta1=2arcsec, K=5ppm, b=10ug; repeatable.")  # fmt: skip
+@click.option("--auto", is_flag=True, help="Accept a missing effect when it can be told from all others.")
+@click.option("--rerun", "with_viewer", is_flag=True, help="Show the run in the Rerun viewer, opened if none is.")
+@click.option("--rerun-port", type=click.IntRange(1, 65535), default=9876, show_default=True, help="The viewer's port.")
+@click.option(
+    "--rerun-bind", default="127.0.0.1", show_default=True, help="Address a viewer that is opened listens on."
+)
+@click.option("--rrd", type=click.Path(path_type=Path), help="Save the Rerun view here.")
+@click.option("--save-model", type=click.Path(path_type=Path), help="Save the model here, for --model to read.")
+@bench_options
+@filter_options
+@strict_option
+@json_option
+@click.pass_context
+def live(
+    ctx: click.Context,
+    source: str,
+    record: Path | None,
+    overwrite: bool,
+    columns: tuple[str, ...],
+    header: str,
+    give_up_s: float,
+    idle_s: float,
+    targets: tuple[str, ...],
+    auto: bool,
+    with_viewer: bool,
+    rerun_port: int,
+    rerun_bind: str,
+    rrd: Path | None,
+    save_model: Path | None,
+    strict: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Evaluate a bench while it runs: sigmas, verdict and the next orientation as they stand; record it.
+
+    SOURCE: a serial port, socket://HOST:PORT, rfc2217://HOST:PORT, - (standard input), a file that grows, or sim://.
+    Ctrl-C ends the run: the recording is finished and the summary printed.
+    """
+    from kf_calib.sources.live import open_live
+
+    settings, wanted = settings_of(options), _targets(targets)
+    _refuse(settings)
+    opening = open_live(
+        source, overrides(options), record, overwrite, columns=dict(map(pair, columns)), header=header,
+        give_up_s=give_up_s, idle_s=idle_s,
+    )  # fmt: skip
+    with opening as opened:
+        run = _Run(opened, settings, wanted, auto, record, not sys.stdout.isatty() or as_json)
+        view = _view(rrd, rerun_port if with_viewer else None, rerun_bind)
+        if view is not None:
+            run.listeners.append(lambda judgement: view.offer(judgement.result))
+        with _ending(run):
+            _watched(run, source, record, as_json)
+        if view is not None:
+            view.close()
+    final = _outcome(run, as_json)
+    if final is None:
+        return
+    _save(final, rrd, save_model, as_json)
+    for said in _of_the_view(view):
+        click.echo(said, err=True)
+    if strict and final.consistent is False:
+        ctx.exit(1)
+
+
+class _Run:
+    """A session in a thread of its own: the main thread has the screen, the keys and the signals.
+
+    judgements: those not shown yet. stopped: by a key or a signal.
+    """
+
+    def __init__(
+        self,
+        source: LiveSource,
+        settings: Settings,
+        wanted: Mapping[str, float],
+        auto: bool,
+        record: Path | None,
+        every: bool,
+    ) -> None:
+        self.source, self.stopped, self.unshown = source, False, 0
+        self.session: Session | None = None
+        self.final: Judgement | None = None
+        self.error: BaseException | None = None
+        self.listeners: list[Callable[[Judgement], None]] = [self._keep]
+        self.judgements = queue.Queue["Judgement"](256)
+        self._thread = threading.Thread(target=self._work, args=(settings, wanted, auto, record, every), daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    @property
+    def going(self) -> bool:
+        return self._thread.is_alive() or not self.judgements.empty()
+
+    def stop(self) -> None:
+        self.stopped = True
+        self.source.stop()
+        if self.session is not None:
+            self.session.hurry()
+
+    def accept(self) -> None:
+        """The effect that is missing, as it stands."""
+        judgement = self.session.standing.judgement if self.session else None
+        if self.session is None or judgement is None:
+            return
+        try:
+            if not (judgement.alarm and judgement.found.missing):
+                raise InputError("no effect is known to be missing: nothing to accept.")
+            self.session.accept(*judgement.found.missing)
+        except InputError as error:
+            self.session.say(str(error))
+
+    def _work(
+        self, settings: Settings, wanted: Mapping[str, float], auto: bool, record: Path | None, every: bool
+    ) -> None:
+        from kf_calib.live import Session
+
+        def again() -> Source | None:
+            from kf_calib.sources.recording import Recording
+
+            return Recording(record) if record and not self.source.status.recording_trouble else None
+
+        try:
+            self.session = Session(self.source, settings, wanted, every=every, auto=auto, again=again)
+            self.session.listeners += self.listeners
+            self.final = self.session.run()
+        except BaseException as error:  # for the main thread to tell
+            self.error = error
+
+    def _keep(self, judgement: Judgement) -> None:
+        try:
+            self.judgements.put_nowait(judgement)
+        except queue.Full:
+            self.unshown += 1
+
+
+def _watched(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
+    """The run to its end, with a screen, lines or objects."""
+    run.start()
+    if not as_json and sys.stdout.isatty():
+        _on_screen(run, name, record)
+        return
+    told = ""
+    while run.going:
+        with contextlib.suppress(queue.Empty):
+            judgement = run.judgements.get(timeout=_REFRESH_S)
+            _print(run, judgement, as_json)
+        standing = run.session.standing if run.session else None
+        said = (standing.problem or standing.notice) if standing else ""
+        if said and said != told and not as_json:
+            _echo(run, said)
+        told = said
+
+
+def _print(run: _Run, judgement: Judgement, as_json: bool) -> None:
+    from kf_calib.views import live as views
+
+    assert run.session is not None
+    if as_json:
+        with _piped(run):
+            print_json(views.live_object(judgement, run.session.standing, run.source.status))
+            sys.stdout.flush()
+    elif not judgement.final:
+        _echo(run, views.line(judgement))
+
+
+def _echo(run: _Run, text: str) -> None:
+    with _piped(run):
+        click.echo(text)
+        sys.stdout.flush()
+
+
+@contextlib.contextmanager
+def _piped(run: _Run) -> Iterator[None]:
+    """Where nobody reads any more, a run that is recorded goes on in silence; another ends."""
+    try:
+        yield
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if run.source.status.sync_age_s is None:
+            run.stop()
+        else:
+            click.echo("kf-calib: nobody reads this output any more; the recording goes on.", err=True)
+
+
+def _on_screen(run: _Run, name: str, record: Path | None) -> None:
+    from rich.console import Console
+    from rich.live import Live
+
+    from kf_calib.standing import Standing
+    from kf_calib.views.live import screen
+
+    with _keys(use=name != "-") as pressed, Live(console=Console(), auto_refresh=False, transient=True) as display:
+        while run.going:
+            with contextlib.suppress(queue.Empty):
+                run.judgements.get_nowait()
+            standing = run.session.standing if run.session else Standing()
+            hint = "ending ..." if run.stopped else "a: accept what is missing   q: end the run"
+            display.update(screen(standing, run.source.status, name, str(record or ""), hint), refresh=True)
+            key = pressed(_REFRESH_S)
+            if key == "a":
+                run.accept()
+            elif key == "q":
+                run.stop()
+
+
+@contextlib.contextmanager
+def _keys(use: bool) -> Iterator[Callable[[float], str]]:
+    """A function that waits for a key so long, and gives it or nothing."""
+    if not (use and sys.stdin.isatty()):
+        yield _no_key
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin)
+    try:
+        yield lambda seconds: os.read(0, 1).decode(errors="replace") if select.select([0], [], [], seconds)[0] else ""
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+
+def _no_key(seconds: float) -> str:
+    time.sleep(seconds)
+    return ""
+
+
+@contextlib.contextmanager
+def _ending(run: _Run) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the run as its end would; a second Ctrl-C does not wait for it."""
+
+    def asked(number: int, _: FrameType | None) -> None:
+        if run.stopped and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        run.stop()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, asked) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _outcome(run: _Run, as_json: bool) -> Judgement | None:
+    """The last judgement, after its summary; None where a run that was ended had nothing to evaluate yet."""
+    if run.error is not None:
+        if not (run.stopped and isinstance(run.error, KfCalibError)):
+            raise run.error
+        if as_json:
+            samples = run.session.standing.samples if run.session else 0
+            print_json({"samples": samples, "dwells": 0, "final": True, "problem": str(run.error)})
+        else:
+            click.echo(f"Nothing to evaluate: {run.error}", err=True)
+        return None
+    final = run.final
+    assert final is not None
+    if not as_json:
+        from rich.console import Group
+        from rich.text import Text
+
+        from kf_calib.views import diagnosis
+        from kf_calib.views.console import summary
+
+        style = {True: "bold green", False: "bold yellow", None: "bold"}[final.consistent]
+        with _piped(run):
+            show(Group(summary(final.result), Text(diagnosis.verdict(final.found), style=style)))
+    return final
+
+
+def _save(final: Judgement, rrd: Path | None, save_model: Path | None, as_json: bool) -> None:
+    if rrd:
+        from kf_calib.views import rerun
+
+        rerun.save(final.result, rrd)  # in place of what grew there: every point by the noise of the whole run
+    if save_model:
+        from kf_calib import model_file
+
+        model_file.write(save_model, final.result)
+    for path in filter(None, (rrd, save_model)):
+        if not as_json:
+            click.echo(f"saved {path}")
+
+
+def _view(rrd: Path | None, port: int | None, bind: str) -> GrowingView | None:
+    if rrd is None and port is None:
+        return None
+    from kf_calib.views.rerun.growing import GrowingView
+
+    return GrowingView(rrd, port, bind)
+
+
+def _of_the_view(view: GrowingView | None) -> list[str]:
+    if view is None:
+        return []
+    late = f"the Rerun view left out {view.dropped} updates: it was slower than the run" if view.dropped else ""
+    return [f"kf-calib: {said}" for said in (view.trouble, late) if said]
+
+
+def _refuse(settings: Settings) -> None:
+    if settings.engine != "block":
+        raise click.UsageError(
+            "live evaluates folded dwells, as the block engine does: leave out --engine, and check the recording with "
+            "replay --engine filterpy."
+        )
+
+
+def _targets(texts: tuple[str, ...]) -> dict[str, float]:
+    """Sigmas wanted by symbol, SI; a kind (theta, K ...) stands for all its parameters."""
+    from kf_calib import paper
+
+    out = dict[str, float]()
+    for text in texts:
+        name, _, size = text.partition("=")
+        symbols = [s for s in paper.SYMBOLS if name == s or name == s.rstrip("123")]
+        if not symbols:
+            raise InputError(
+                f"--target {text!r} names no parameter: use one of {', '.join(paper.SYMBOLS)}, or theta, phi, nu, K, b."
+            )
+        kinds = _KINDS[paper.UNITS[paper.SYMBOLS.index(symbols[0])]]
+        unit = next((unit for unit in sorted(kinds, key=len, reverse=True) if size.endswith(unit) and unit != "1"), "")
+        try:
+            value = float(size.removesuffix(unit)) * _SIZES[unit or kinds[0]]
+        except ValueError:
+            value = math.nan
+        if not 0.0 < value < math.inf:
+            raise InputError(
+                f"--target {text!r}: give a sigma above zero in {', '.join(kinds)}, as {name}=1{kinds[-1]}."
+            )
+        out |= dict.fromkeys(symbols, value)
+    return out

@@ -1,0 +1,194 @@
+"""A run that goes on: a screen, a line a dwell, an object a dwell."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from kf_calib import paper
+from kf_calib.samples import Floats, Mask
+from kf_calib.standing import Judgement, Standing
+from kf_calib.views.console import symbol
+from kf_calib.views.diagnosis import diagnosis_object
+from kf_calib.views.json import clean, replay_object
+
+if TYPE_CHECKING:
+    from kf_calib.sources.live import Status
+
+_BAR, _NAME = 18, 30
+_TARGET_DECADES = 3.0  # of a full bar, over the target
+_COARSE, _DECADES = 1e-3, 5.0  # without a target: a full bar, of a radian, of one, of g; and the decades below it
+_SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("µg", 1e6 / 9.80665)}
+
+
+def live_object(judgement: Judgement, standing: Standing, status: Status | None) -> dict[str, Any]:
+    """One line of ``live --json``: the keys of replay and of diagnose as they stand, and what is of a live run only."""
+    found = diagnosis_object(judgement.found)
+    going = judgement.next_orientation
+    if not (judgement.final and found["next_orientation"]) and going is not None:
+        found["next_orientation"] = {"gimbal_deg": list(going[0]), "why": going[1]}
+    left = dict(zip(paper.SYMBOLS, judgement.left_s, strict=True))
+    wanted = dict(zip(paper.SYMBOLS, judgement.wanted, strict=True))
+    own = {
+        "consistent": judgement.consistent,
+        "final": judgement.final,
+        "standing": judgement.verdict,
+        "alarm": judgement.alarm,
+        "looks": judgement.watch.looks if judgement.watch else 0,
+        "elapsed_s": judgement.result.visits[-1].dwell.end_s,
+        "targets": {name: value for name, value in wanted.items() if math.isfinite(value)},
+        "time_left_s": left,
+        "notice": standing.notice,
+        "source": source_object(status),
+    }
+    return replay_object(judgement.result) | found | clean(own)
+
+
+def source_object(status: Status | None) -> dict[str, Any] | None:
+    return None if status is None else clean(asdict(status))
+
+
+def line(judgement: Judgement) -> str:
+    """A dwell in a line of text."""
+    result = judgement.result
+    dwell, sigma = result.visits[-1].dwell, result.estimate.sigma
+    seen = "sigmas not determined yet"
+    if np.isfinite(sigma).any():
+        k = int(np.nanargmax(sigma / np.where(np.isfinite(judgement.worst), judgement.worst, np.inf)))
+        unit, per_si = _SHOWN[paper.UNITS[k]]
+        left = f", {span(judgement.left_s[k])} to its target" if np.isfinite(judgement.wanted[k]) else ""
+        seen = f"worst sigma {paper.SYMBOLS[k]} {sigma[k] * per_si:.3g} {unit}{left}"
+    going = judgement.next_orientation
+    following = f"; next {_angles(going[0])} deg ({going[1]})" if going else ""
+    per_dof = result.consistency.nis_per_dof
+    nis = "" if per_dof is None else f"; NIS/dof {per_dof:.3g}"
+    return (
+        f"dwell {len(result.visits)} to {dwell.end_s:.0f} s: {result.tally.read} readings; {seen}{nis}; "
+        f"{judgement.verdict}{following}"
+    )
+
+
+def screen(standing: Standing, status: Status | None, name: str, recording: str = "", hint: str = "") -> RenderableType:
+    """All that is known now, for a terminal of 80 x 24."""
+    judgement = standing.judgement
+    parts: list[RenderableType] = [_link(standing, status, name, recording), _here(standing), _sigmas(standing)]
+    if judgement is not None:
+        parts += [_fit(judgement), Text(judgement.verdict, style=_style(judgement))]
+        if _set(judgement).any() and (standing.sigma <= judgement.wanted)[_set(judgement)].all():
+            parts.append(Text("every target is reached", style="bold green"))
+        going = judgement.next_orientation
+        if going is not None:
+            parts.append(Text(f"next: gimbals at {_angles(going[0])} deg: {going[1]}", style="bold"))
+    parts += [Text(text, style="yellow") for text in (standing.problem, standing.notice) if text]
+    if hint:
+        parts.append(Text(hint, style="dim"))
+    return Group(*parts)
+
+
+def _set(judgement: Judgement) -> Mask:
+    return np.isfinite(judgement.wanted)
+
+
+def _style(judgement: Judgement) -> str:
+    return {True: "bold green", False: "bold yellow", None: "bold"}[judgement.consistent]
+
+
+def _link(standing: Standing, status: Status | None, name: str, recording: str) -> Text:
+    if status is None:
+        return Text(f"{name}: {standing.samples} readings")
+    out = Text.assemble((name if len(name) <= _NAME else f"{name[:_NAME]}...", "bold"), " ")
+    out.append(status.link, {"live": "green", "lost": "bold red"}.get(status.link, "yellow"))
+    out.append(f"  {status.rate_hz:.0f} Hz  {status.samples} readings")
+    counts = {"gaps": status.gaps, "refused": status.refused, "reconnects": status.reconnects,
+              "missing": status.missing, "dropped": status.dropped}  # fmt: skip
+    for word, count in counts.items():
+        if count or word in ("gaps", "refused"):
+            out.append(f"  {count} {word}", "red" if word in ("missing", "dropped") else "yellow" if count else "")
+    for trouble in (status.trouble, status.recording_trouble):
+        if trouble:
+            out.append(f"\n{trouble}", "bold red")
+    if recording and not status.recording_trouble:
+        age = "" if status.sync_age_s is None else f", on the disk up to {status.sync_age_s:.1f} s ago"
+        out.append(f"\nrecording {recording}: {status.recorded} readings{age}")
+    return out
+
+
+def _here(standing: Standing) -> Text:
+    here = standing.current
+    if here is None:
+        return Text(f"{standing.dwells} dwells in {span(standing.elapsed_s)}; moving or settling")
+    angles = _angles(np.degrees(here.pose)) if len(here.pose) < 4 else "attitude"
+    out = Text(f"orientation {here.number} at {angles} deg: {span(here.seconds)}, {here.readings} readings")
+    if here.enough:
+        out.append(": enough, go on", "bold green")
+    elif here.enough is False:
+        out.append(": stay, it still sharpens")
+    return out
+
+
+def _sigmas(standing: Standing) -> Table:
+    """The twelve, four a column group as in the paper: sigma, target and the time to it (or to half), and a bar."""
+    table = Table.grid(padding=(0, 1))
+    wanted = np.full(12, np.nan) if standing.judgement is None else standing.judgement.wanted
+    for justify in ("left", "right", "left", "right", "right", "left"):
+        table.add_column(justify=justify, no_wrap=True)
+    table.add_row("", "σ", "", "target", "left", "", style="dim")
+    for k, name in enumerate(paper.SYMBOLS):
+        unit, per_si = _SHOWN[paper.UNITS[k]]
+        sigma, left = standing.sigma[k], standing.left_s[k]
+        if not math.isfinite(sigma):
+            table.add_row(symbol(name), "-", unit, "", "", "")
+            continue
+        target = f"{wanted[k] * per_si:.3g}" if math.isfinite(wanted[k]) else "half"
+        table.add_row(
+            symbol(name),
+            f"{sigma * per_si:.3g}",
+            unit,
+            target,
+            span(left) if left else "",
+            _bar(float(sigma), float(wanted[k]), k),
+        )
+    return table
+
+
+def _bar(sigma: float, wanted: float, k: int) -> Text:
+    """A bar that is empty at the target; without one it shows the decades of sigma."""
+    if math.isfinite(wanted):
+        share = math.log10(max(sigma / wanted, 1e-9)) / _TARGET_DECADES
+    else:
+        size = _COARSE * (9.80665 if paper.UNITS[k] == "m/s^2" else 1.0)
+        share = 1.0 + math.log10(max(sigma / size, 1e-30)) / _DECADES
+    if math.isfinite(wanted) and share <= 0:
+        return Text("reached", style="green")
+    full = round(_BAR * min(max(share, 0.0), 1.0))
+    return Text("█" * full + "·" * (_BAR - full), style="cyan" if math.isfinite(wanted) else "blue")
+
+
+def _fit(judgement: Judgement) -> Text:
+    result = judgement.result
+    judged = result.consistency
+    text = f"12 parameters{''.join(f' + {effect}' for effect in result.model.effects)}; "
+    text += "NIS: nothing to judge by" if judged.nis_per_dof is None else f"NIS/dof {judged.nis_per_dof:.3g}"
+    if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2:
+        text += f"; held out {result.held_out_rms_mps2:.2g} m/s² rms, noise alone {result.held_out_floor_mps2:.2g}"
+    return Text(text)
+
+
+def _angles(degrees: Floats | tuple[float, ...]) -> str:
+    return ", ".join(f"{round(float(angle), 1):g}" for angle in degrees)
+
+
+def span(seconds: float) -> str:
+    """``45 s``, ``12 min``, ``3.4 h``, ``5 d``; a dash where it is not known or never."""
+    if not math.isfinite(seconds):
+        return "-"
+    for size, unit in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= 2.0 * size:
+            return f"{seconds / size:.2g} {unit}"
+    return f"{seconds:.0f} s"

@@ -1,0 +1,138 @@
+"""The Rerun view of a run that goes on: nothing that a viewer does, or does not do, reaches whoever offers results.
+
+A thread turns results into the bytes of an .rrd file, and passes them on to a file and through a pipe to a process of
+its own: ``rerun -``, which sends them to the viewer that listens on the port, or becomes that viewer. In this process
+no call of Rerun's waits for a network: one that does, for a viewer that hangs, holds even the exit of its program.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import socket
+import subprocess
+import tempfile
+import threading
+import uuid
+from contextlib import suppress
+from pathlib import Path
+from typing import IO
+
+import rerun as rr
+
+from kf_calib.calibration import Calibration
+from kf_calib.errors import InputError
+from kf_calib.views.rerun import grow
+from kf_calib.views.screenshot import binary, obituary
+
+PORT = 9876
+_WAITING = 4  # results; the next one that comes through shows what those left out would have
+
+
+class GrowingView:
+    """Offer it results; ``close`` it. rrd: a file to write; port: of the viewer, None: no viewer.
+
+    bind: the address a viewer that is opened listens on. dropped: results that came while ``waiting`` others waited;
+    the dwells they would have shown are shown by the next. trouble: why the viewer shows nothing any more.
+    """
+
+    def __init__(
+        self, rrd: Path | None = None, port: int | None = PORT, bind: str = "127.0.0.1", waiting: int = _WAITING
+    ) -> None:
+        self.dropped, self.trouble = 0, ""
+        self._results = queue.Queue[Calibration | None](waiting)
+        self._streams, self._viewer, self._relays = [_saving(rrd)] if rrd else [], None, False
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the viewer's pipe
+        if port is not None:
+            piped = _stream()
+            self._encoded = piped.binary_stream()
+            self._streams.append(piped)
+            self._relays = _listens(port)
+            self._viewer = _viewer(port, bind, self._log)
+        self._thread = threading.Thread(target=self._show, name="rerun", daemon=True)
+        self._thread.start()
+
+    def offer(self, result: Calibration) -> None:
+        """Show a result when there is time; never waits."""
+        try:
+            self._results.put_nowait(result)
+        except queue.Full:
+            self.dropped += 1
+
+    def close(self, patience_s: float = 5.0) -> None:
+        """Show what waits, for no longer than that; a viewer that is open stays so."""
+        with suppress(queue.Full):
+            self._results.put(None, timeout=patience_s)
+        self._thread.join(patience_s)
+        viewer = self._viewer
+        if viewer is None:
+            return
+        if self._relays and not self._thread.is_alive():  # what sends to a viewer that was there ends by itself
+            with suppress(subprocess.TimeoutExpired):
+                viewer.wait(patience_s)
+        if self._thread.is_alive() or (self._relays and viewer.poll() is None):
+            self.trouble = self.trouble or "the Rerun viewer does not answer: look at the recording with replay --rrd."
+            viewer.kill()  # ends the wait for it
+            viewer.wait()
+            self._thread.join(patience_s)
+        elif viewer.poll() is None:
+            viewer.returncode = 0  # it is the user's window now, and not to be waited for
+
+    def _show(self) -> None:
+        shown, laid_out = 0, 0
+        try:
+            while (result := self._results.get()) is not None:
+                count = len(result.visits)
+                lay_out = count >= 2 * laid_out or count < shown  # not each time: who looks on may have changed it
+                for stream in self._streams:
+                    grow(result, stream, shown, lay_out)
+                    stream.flush()
+                shown, laid_out = count, count if lay_out else laid_out
+                if self._viewer is not None and not self.trouble:
+                    self._pass_on(self._viewer, self._encoded.read() or b"")
+        except Exception as error:  # a view that fails is no reason for a run to
+            self.trouble = f"the Rerun view stopped: {error}"
+        for stream in self._streams:
+            stream.disconnect()
+        if self._viewer is not None and self._viewer.stdin is not None:
+            with suppress(OSError):
+                self._viewer.stdin.close()
+        self._log.close()
+
+    def _pass_on(self, viewer: subprocess.Popen[bytes], data: bytes) -> None:
+        assert viewer.stdin is not None
+        try:
+            viewer.stdin.write(data)
+            viewer.stdin.flush()
+        except OSError:
+            viewer.wait()
+            self._log.seek(0)
+            self.trouble = self.trouble or obituary(self._log.read().decode(errors="replace"))
+
+
+def _stream() -> rr.RecordingStream:
+    return rr.RecordingStream("kf_calib", recording_id=uuid.uuid4())
+
+
+def _saving(path: Path) -> rr.RecordingStream:
+    if not path.parent.is_dir():
+        raise InputError(f"the Rerun recording {path} cannot be written: there is no folder {path.parent}.")
+    stream = _stream()
+    stream.save(path)
+    return stream
+
+
+def _listens(port: int) -> bool:
+    try:
+        socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
+    except OSError:
+        return False
+    return True
+
+
+def _viewer(port: int, bind: str, log: IO[bytes]) -> subprocess.Popen[bytes]:
+    command = [binary(), "--port", str(port), "--bind", bind, "--hide-welcome-screen", "-"]
+    quiet = {**os.environ, "RUST_LOG": "error"}
+    return subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=quiet, start_new_session=True
+    )  # its own session: Ctrl-C is for the run
