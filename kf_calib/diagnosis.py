@@ -24,6 +24,7 @@ from kf_calib.drivers import families
 from kf_calib.effects import Effect, effect_named, names
 from kf_calib.fitting import Fit, walk_gain
 from kf_calib.folding import stimulus_of
+from kf_calib.likelihood import FEWEST
 from kf_calib.model import Model
 from kf_calib.noise import mean_covariances
 from kf_calib.samples import Floats
@@ -330,13 +331,41 @@ def _explained(before: Calibration, test: Test) -> Diagnosis:
     # what explains all of it explains most: one that fits far behind the first has only made the noise large enough
     least = test.scores[test.ranked[0]] - 2.0 * _EQUAL if test.ranked else 0.0
     explaining = [each for each in suspects if each.fits and test.scores[each.name] > least]
+    explaining = [each for each in explaining if _beyond_scatter(before, test, (each.name,))]
     found = replace(nothing, suspects=suspects)
     pairs = _pairs(test) if not explaining or explaining[0].name in test.best else {}
     if explaining:
         clearly = {pair: score for pair, score in pairs.items() if score > test.scores[explaining[0].name] + _EQUAL}
         return _two(found, clearly) or _one(found, explaining[0], pairs)
-    scatter = before.noise.scatter_mps2.any() and not before.noise.scatter_stated
-    return _two(found, pairs) or replace(found, unknown=not scatter)
+    return _two(found, pairs) or replace(found, unknown=not _may_scatter(before))
+
+
+def _may_scatter(before: Calibration) -> bool:
+    """Whether dwells may scatter by more than was stated: it was found that they do, or so few cannot show it."""
+    noise, few = before.noise, before.consistency.dof < FEWEST
+    return (not noise.scatter_stated and (few or bool(noise.scatter_mps2.any()))) or (not noise.setting_stated and few)
+
+
+def _beyond_scatter(before: Calibration, test: Test, names: Sequence[str]) -> bool:
+    """Whether effects explain more than they would of scatter from dwell to dwell, where that was not all stated.
+
+    F = (fall / q) / (rest / (dof - q)), q coefficients: a scatter as large as it needs to be is in fall and rest alike.
+    What shows within dwells is no matter of scatter between them.
+    """
+    from scipy.special import fdtrc
+
+    noise, misfit = before.noise, before.consistency
+    if (noise.scatter_stated and noise.setting_stated) or any(name not in test.best for name in names):
+        return True
+    basis = np.concatenate([test.candidate(name).basis for name in names], axis=1)
+    left, singular, _ = np.linalg.svd(basis, full_matrices=False)
+    spanned = left[:, singular > 1e-6]
+    fall, dof = float(np.sum((spanned.T @ test.scan.residual) ** 2)), spanned.shape[1]
+    freedom = misfit.dof - dof
+    if freedom <= 0:
+        return False
+    rest = max(misfit.statistic - fall, 1e-9 * misfit.statistic)
+    return run_level(float(fdtrc(dof, freedom, fall / dof / (rest / freedom))), test.effective_tests) < LEVEL
 
 
 def _without_vibration(before: Calibration, test: Test) -> Test:
@@ -414,7 +443,7 @@ def _two(found: Diagnosis, pairs: dict[tuple[int, int], float]) -> Diagnosis | N
     for pair in sorted(pairs, key=lambda pair: -pairs[pair])[:_PAIRS]:
         names = _names_of(test, pair)
         refit = with_effects(found.before, names)
-        if not _fits(refit, test):
+        if not (_beyond_scatter(found.before, test, names) and _fits(refit, test)):
             continue
         if _outdone(found, refit, names):
             return None
@@ -577,9 +606,14 @@ def _verdict(found: Diagnosis) -> str:
         if nearest:
             return f"{start} {nearest} would fit, but what no known effect is explains it better: unknown."
         return f"{start} No known effect explains it, alone or in pairs: unknown."
+    nearest = next((each.name for each in found.suspects if each.fits), None)
+    noise = found.before.noise
+    stated = ("angle_sigma_deg", noise.setting_stated), ("scatter_sigma_mps2", noise.scatter_stated)
+    keys = " and ".join(key for key, known in stated if not known)
+    missing = f"is missing ({nearest} would fit)" if nearest else "is missing that is none of the known ones"
     return (
-        f"{start} Either the sensors scatter from dwell to dwell (which was not stated) or an effect is missing that "
-        "is none of the known ones: state scatter_sigma_mps2, or visit an orientation again to tell."
+        f"{start} Either dwells scatter by what was not stated or an effect {missing}: state {keys}, or visit an "
+        "orientation again to tell."
     )
 
 

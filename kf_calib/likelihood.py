@@ -19,6 +19,9 @@ from kf_calib.noise import FLOOR_MPS2, Noise, mean_covariances, wander
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 
+FEWEST = 6
+"""Degrees of freedom between dwells; with fewer nothing is estimated."""
+
 _SIGNIFICANT = 5.41  # 1 % point of the likelihood ratio of a variance against zero: half of chi2 with 1 dof
 _RANGE = (-9.0, 3.0)  # of the logarithm of a part's size, about the size of the misfit
 
@@ -52,7 +55,7 @@ def with_dwell_parts(
         checked=scatter_mps2 is not None or _setting_is_checked(means.force_mps2),
     )
     freedom = means.readings.size - means.design.shape[2]
-    if freedom < 6 or (stated.setting_stated and stated.scatter_stated and not walks):
+    if freedom < FEWEST or (stated.setting_stated and stated.scatter_stated and not walks):
         return stated
     if not walks and chdtrc(freedom, _misfit(stated.weights, means, state)) > 0.1:  # spares the search
         return stated

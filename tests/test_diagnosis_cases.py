@@ -161,3 +161,12 @@ def test_scatter_that_is_not_stated_gets_no_name() -> None:
                         slew_rate_degps=90.0, seed=9)  # fmt: skip
     found = diagnose(calibrate(source))
     assert not found.missing, found.verdict
+
+
+@pytest.mark.parametrize("dwells", [5, 6, 8])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_few_dwells_name_nothing_that_unstated_scatter_could_be(dwells: int, seed: int) -> None:
+    """With as many coefficients as dwells leave over, an effect fits whatever the setting errors were."""
+    found = diagnose(calibrate(Run(seed=seed, dwells=dwells, setting_deg=0.002, stated=False)))
+    assert not found.missing and not found.unknown, found.verdict
+    assert "state angle_sigma_deg and scatter_sigma_mps2" in found.verdict
