@@ -442,8 +442,10 @@ def _two(found: Diagnosis, pairs: dict[tuple[int, int], float]) -> Diagnosis | N
     test, candidates = found.test, found.test.scan.candidates
     for pair in sorted(pairs, key=lambda pair: -pairs[pair])[:_PAIRS]:
         names = _names_of(test, pair)
+        if not _beyond_scatter(found.before, test, names):
+            continue
         refit = with_effects(found.before, names)
-        if not (_beyond_scatter(found.before, test, names) and _fits(refit, test)):
+        if not _fits(refit, test):
             continue
         if _outdone(found, refit, names):
             return None
