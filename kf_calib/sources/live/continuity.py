@@ -16,15 +16,21 @@ class Continuity:
 
     A step is a gap where it exceeds the median step by half, or by eight robust deviations where stamps jitter.
     Readings stamped as they arrive come in bursts: then one is a gap that exceeds the longest of the last by half.
+    Readings that were only held up follow the gap less than half a period apart: by so many fewer are missing.
     """
 
     def __init__(self) -> None:
-        self.gaps = self.missing = 0
+        self.gaps = 0
         self.last_ns: int | None = None
         self._steps = self._unjudged = np.empty(0, np.int64)
         self._since = 0
         self._period_ns = self._limit_ns = 0.0
         self._is_cut = False
+        self._settled, self._owed = 0, 0.0  # missing for good; of the last gap, while readings may still catch up
+
+    @property
+    def missing(self) -> int:
+        return self._settled + round(self._owed)
 
     def cut(self) -> None:
         """The link broke here: whatever the next stamp is, there is a gap before it."""
@@ -48,9 +54,14 @@ class Continuity:
     def _judge(self) -> None:
         if not self._limit_ns:
             return
-        long, self._unjudged = self._unjudged[self._unjudged > self._limit_ns], self._unjudged[:0]
-        self.gaps += len(long)
-        self.missing += round(float(np.rint(long / self._period_ns - 1.0).sum()))
+        steps, self._unjudged = self._unjudged, self._unjudged[:0]
+        room = steps / self._period_ns - 1.0
+        is_gap, is_hurried = steps > self._limit_ns, steps < 0.5 * self._period_ns
+        self.gaps += int(is_gap.sum())
+        claims = np.where(is_hurried, room, np.where(is_gap, np.rint(room), 0.0))
+        starts = np.concatenate([[0], 1 + np.flatnonzero(~is_hurried)])
+        *settled, self._owed = np.maximum(np.add.reduceat(np.concatenate([[self._owed], claims]), starts), 0.0).tolist()
+        self._settled += sum(map(round, settled))
 
     def _learn(self, steps: Times) -> None:
         known = len(self._steps)
