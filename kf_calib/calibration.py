@@ -179,7 +179,7 @@ class Calibration:
     held_out_floor_mps2: float | None
     tally: Tally
     warnings: tuple[str, ...]
-    reread: Callable[[Settings], Calibration] | None = field(default=None, repr=False, compare=False)
+    reread: Callable[..., Calibration] | None = field(default=None, repr=False, compare=False)
     """The same source evaluated anew: for models that need its readings folded otherwise."""
     readings: Readings = field(default_factory=Readings)
     """What the readings themselves show, whatever the model."""
@@ -320,30 +320,43 @@ def usable(dwells: list[DwellFactor]) -> list[DwellFactor]:
 
 
 def calibrate(
-    source: Source, settings: Settings | None = None, on_progress: Callable[[float], None] | None = None
+    source: Source,
+    settings: Settings | None = None,
+    on_progress: Callable[[float], None] | None = None,
+    plain: Fit | None = None,
 ) -> Calibration:
     """Evaluate a source: fold its dwells, model the noise, run the filter, judge the misfit.
 
+    plain: the fit of the same model to the dwells as they are, which is known to need them folded on a carrier.
     Raises InputError where the source holds nothing usable, UnobservableError where one orientation was visited only.
     """
     passed = Pass(source, settings or Settings())
     with threadpool_limits(1, user_api="blas"):  # small decompositions: with threads they take three times as long
-        passed.fold(on_progress)
-        return concluded(passed, source, on_progress)
+        if plain is None:
+            passed.fold(on_progress)
+        return concluded(passed, source, on_progress, plain)
 
 
 def concluded(
-    passed: Pass, again: Source | None = None, on_progress: Callable[[float], None] | None = None
+    passed: Pass,
+    again: Source | None = None,
+    on_progress: Callable[[float], None] | None = None,
+    plain: Fit | None = None,
 ) -> Calibration:
     """The calibration of a pass that has come to its end.
 
     again: the same samples to be read once more, for models that need them folded otherwise; None: they are gone.
+    plain: the pass has not begun, since its fit is known, and does not do.
     """
-    settings, bench, dwells = passed.settings, passed.source.bench, usable(passed.folder.dwells)
-    refuse_unusable(dwells, passed.tally, bench)
+    settings, bench = passed.settings, passed.source.bench
+    dwells = usable(passed.folder.dwells) if plain is None else plain.dwells
+    if plain is None:
+        refuse_unusable(dwells, passed.tally, bench)
     if again is not None and Model.of(bench, settings.effects).oscillates:
-        passed, dwells = _on_carrier(replace(passed, source=again), dwells, on_progress)
-    result = evaluate(dwells, bench, settings, passed.folder.slews)
+        passed, fitted = _on_carrier(replace(passed, source=again), dwells, plain, on_progress)
+    else:
+        fitted = _fitted(passed, dwells)
+    result = evaluated(fitted, settings)
     refuse_unseen(result)
     if again is not None and settings.engine == "filterpy":
         result = replace(result, estimate=filterpy_estimate(again, result))
@@ -374,14 +387,14 @@ def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
     with threadpool_limits(1, user_api="blas"):  # small decompositions, and the same bits every time
         fitted = fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews)
         if before.reread is not None and not _followed(fitted):
-            return before.reread(settings)
+            return before.reread(settings, None, fitted)
         again = evaluated(fitted, settings)
         return replace(again, tally=before.tally, readings=before.readings, reread=before.reread)
 
 
 def _on_carrier(
-    passed: Pass, dwells: list[DwellFactor], on_progress: Callable[[float], None] | None
-) -> tuple[Pass, list[DwellFactor]]:
+    passed: Pass, dwells: list[DwellFactor], plain: Fit | None, on_progress: Callable[[float], None] | None
+) -> tuple[Pass, Fit]:
     """The source folded again on a carrier at the frequency of the model's oscillation, until it is near enough.
 
     The first carrier is the line in the spectrum; without one, the oscillation is slow, and found on the plain dwells.
@@ -389,13 +402,13 @@ def _on_carrier(
     """
     seen = lines(dwell.spectrum for dwell in dwells)
     if not seen:
-        fitted = _fitted(passed, dwells)
-        return (passed, dwells) if _followed(fitted) else _nearer(passed, fitted, on_progress)[:2]
+        plain = plain or _fitted(passed, dwells)
+        return (passed, plain) if _followed(plain) else _nearer(passed, plain, on_progress)
     shortest_s = min(dwell.end_s - dwell.start_s for dwell in dwells if dwell.count > dwells[0].count // 2)
     found = [_nearer(passed, seen[0].frequency_hz, on_progress)]
     if seen[0].frequency_hz * shortest_s < _CYCLES:
-        found.append(_nearer(passed, _fitted(passed, dwells), on_progress))
-    return min(found, key=lambda each: float(np.log(each[2].noise.effective_sigma_mps2).sum()))[:2]
+        found.append(_nearer(passed, plain or _fitted(passed, dwells), on_progress))
+    return min(found, key=lambda each: float(np.log(each[1].noise.effective_sigma_mps2).sum()))
 
 
 def _followed(fitted: Fit) -> bool:
@@ -410,7 +423,7 @@ def _followed(fitted: Fit) -> bool:
 
 def _nearer(
     passed: Pass, carrier: float | Fit, on_progress: Callable[[float], None] | None
-) -> tuple[Pass, list[DwellFactor], Fit]:
+) -> tuple[Pass, Fit]:
     """The source folded on a carrier, in Hz or where a fit has the oscillation, and the fit there."""
     carrier_hz = _oscillation_hz(carrier) if isinstance(carrier, Fit) else carrier
     for left in reversed(range(_CARRIERS)):
@@ -419,7 +432,7 @@ def _nearer(
         fitted = _fitted(passed, dwells)
         longest_s = max(float(np.ptp(piece.nodes.elapsed_s)) for dwell in dwells for piece in dwell.pieces)
         if not left or abs(_oscillation_hz(fitted) - carrier_hz) * longest_s < _NEAR:
-            return passed, dwells, fitted
+            return passed, fitted
         carrier_hz = _oscillation_hz(fitted)
     raise AssertionError("unreachable: the last of the carriers is taken as it is")
 

@@ -54,6 +54,7 @@ def with_dwell_parts(
         scatter_stated=scatter_mps2 is not None,
         checked=scatter_mps2 is not None or _setting_is_checked(means.force_mps2),
     )
+    means = _reduced(means)
     freedom = means.readings.size - means.design.shape[2]
     if freedom < FEWEST or (stated.setting_stated and stated.scatter_stated and not walks):
         return stated
@@ -99,22 +100,63 @@ def _setting_is_checked(force_mps2: Floats) -> bool:
 
 
 def _most_likely(stated: Noise, parts: tuple[Part, ...], means: Means, state: Floats) -> tuple[Noise, float]:
-    """The noise with the most likely sizes of ``parts``, and its log-likelihood less the charge for them."""
+    """The noise with the most likely sizes of ``parts``, and its log-likelihood less the charge for them.
+
+    Where biases stand the search is over the squares, in which the way to zero has a slope; a walk spans many decades.
+    """
     from scipy.optimize import minimize
 
-    cost, begin = _cost(stated, parts, means, state), _spread(means, parts)
-    bounds = begin[:, None] + np.array(_RANGE)
-    found = minimize(cost, begin, method="L-BFGS-B", bounds=bounds, options={"eps": 1e-3})  # a step of ln(size)
-    return _unpack(stated, found.x, parts), -float(found.fun) - 0.5 * _SIGNIFICANT * len(begin)
+    begin = _sizes(means, parts)
+    if "walk" in parts:
+        cost, bounds = _cost(stated, parts, means, state), np.log(begin)[:, None] + np.array(_RANGE)
+        found = minimize(cost, np.log(begin), method="L-BFGS-B", bounds=bounds, options={"eps": 1e-3})
+        sizes = np.exp(found.x)
+    else:
+        slope, bounds = _cost_and_slope(stated, parts, means, state), [(0.0, math.exp(2.0 * _RANGE[1]))] * len(begin)
+        found = minimize(slope, np.ones(len(begin)), method="L-BFGS-B", jac=True, bounds=bounds)
+        sizes = begin * np.sqrt(found.x)
+    return _with(stated, parts, sizes), -float(found.fun) - 0.5 * _SIGNIFICANT * len(begin)
 
 
 def _cost(stated: Noise, parts: tuple[Part, ...], means: Means, state: Floats) -> Callable[[Floats], float]:
-    return lambda logs: -restricted_log_likelihood(_unpack(stated, logs, parts).weights, means, state)
+    """Minus the log-likelihood, by the logarithms of the sizes."""
+    return lambda logs: -restricted_log_likelihood(_with(stated, parts, np.exp(logs)).weights, means, state)
+
+
+def _cost_and_slope(
+    stated: Noise, parts: tuple[Part, ...], means: Means, state: Floats
+) -> Callable[[Floats], tuple[float, Floats]]:
+    """The same where biases stand, by the squares of the sizes over those the search begins with; and its derivative.
+
+    V = V_0 + sum v_k K_k, dl/dv_k = (r' V^-1 K_k V^-1 r - tr(P K_k)) / 2, P = V^-1 - V^-1 A (A' V^-1 A)^-1 A' V^-1 of
+    which only the dwells' own blocks matter (Searle, Casella and McCulloch, 1992, sec. 6.6).
+    """
+    begin = np.diag(_sizes(means, parts))
+    fixed, *wider = (
+        mean_covariances(_with(stated, parts, own).weights, means, state) for own in [0.0 * begin[0], *begin]
+    )
+    shapes, width = np.array(wider) - fixed, means.design.shape[2]
+    stacked = np.concatenate([means.design, means.readings[:, :, None]], axis=2)
+
+    def cost(squares: Floats) -> tuple[float, Floats]:
+        root = np.linalg.cholesky(fixed + np.tensordot(squares, shapes, 1))
+        back = np.linalg.inv(root)
+        whitened = back @ stacked
+        basis, upper = np.linalg.qr(whitened.reshape(-1, width + 1)[:, :width])
+        rest = whitened[:, :, width].ravel()
+        rest = rest - basis @ (basis.T @ rest)
+        log_root = np.log(np.einsum("dii->di", root)).sum() + np.log(np.abs(np.diag(upper))).sum()
+        blocks, rest = basis.reshape(*means.readings.shape, width), rest.reshape(-1, 3, 1)
+        inner = np.eye(3) - blocks @ np.swapaxes(blocks, 1, 2) - rest @ np.swapaxes(rest, 1, 2)
+        slope = 0.5 * np.einsum("kdij,dij->k", shapes, np.swapaxes(back, 1, 2) @ inner @ back)
+        return float(log_root + 0.5 * np.sum(rest**2)), slope
+
+    return cost
 
 
 def _walk_spread(stated: Noise, found: Noise, parts: tuple[Part, ...], means: Means, state: Floats) -> float:
     """1 sigma of ln q, the other parts being found with it: from the likelihood's curvature (central differences)."""
-    cost, at, step = _cost(stated, parts, means, state), _pack(found, parts), 0.05
+    cost, at, step = _cost(stated, parts, means, state), np.log(_sizes_in(found, parts)), 0.05
     moves = step * np.eye(len(at))
     curvature = np.array([
         [cost(at + a + b) - cost(at + a - b) - cost(at - a + b) + cost(at - a - b) for a in moves] for b in moves
@@ -139,7 +181,7 @@ def gain_of(part: Literal["scatter", "walk"], noise: Noise, means: Means, state:
             wider = replace(noise, scatter_mps2=np.hypot(noise.scatter_mps2, more))
         return -restricted_log_likelihood(wider, means, state, prior)
 
-    begin = float(_spread(means, ("walk" if part == "walk" else "common",))[0])
+    begin = math.log(_sizes(_reduced(means), ("walk" if part == "walk" else "common",))[0])
     bounds = begin + _RANGE[0], begin + _RANGE[1]
     found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-2})
     return max(-float(found.fun) - restricted_log_likelihood(noise, means, state, prior), 0.0)
@@ -155,12 +197,22 @@ def wandering(dwells: Sequence[DwellFactor], noise: Noise, means: Means) -> tupl
     return replace(means, design=design), prior
 
 
-def _spread(means: Means, parts: tuple[Part, ...]) -> Floats:
-    """A starting point of the search: log sigmas at the size of the misfit of the dwell means."""
+def _reduced(means: Means) -> Means:
+    """The same with an orthonormal basis (D, 3, r) of the columns, and the readings less what it explains.
+
+    Another basis changes the likelihood by a constant; the rounding of readings of size g is out of it.
+    """
     design = means.design.reshape(-1, means.design.shape[2])
-    scale = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
-    fitted = design / scale @ np.linalg.lstsq(design / scale, means.readings.ravel(), rcond=1e-9)[0]
-    size = np.sqrt(np.mean((means.readings - fitted.reshape(-1, 3)) ** 2, axis=0)) + FLOOR_MPS2
+    scale = np.linalg.norm(design, axis=0)
+    left, singular, _ = np.linalg.svd(design / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    basis = left[:, singular > 1e-9 * singular[0]]
+    rest = means.readings.ravel() - basis @ (basis.T @ means.readings.ravel())
+    return replace(means, design=basis.reshape(*means.readings.shape, -1), readings=rest.reshape(-1, 3))
+
+
+def _sizes(means: Means, parts: tuple[Part, ...]) -> Floats:
+    """A starting point of the search: each number of the parts as large as the misfit of reduced means."""
+    size = np.sqrt(np.mean(means.readings**2, axis=0)) + FLOOR_MPS2
     span_s = max(float(means.ends_s[-1, 1] - means.ends_s[0, 0]), 1e-9)
     sizes: dict[Part, Floats] = {
         "setting": np.full(1, size.mean() / np.linalg.norm(means.force_mps2, axis=1).mean()),
@@ -168,31 +220,32 @@ def _spread(means: Means, parts: tuple[Part, ...]) -> Floats:
         "scatter": size,
         "walk": np.full(1, 2.0 * size.mean() / math.sqrt(span_s)),
     }
-    return np.log(np.concatenate([sizes[part] for part in parts]))
+    return np.concatenate([sizes[part] for part in parts])
 
 
-def _pack(noise: Noise, parts: tuple[Part, ...]) -> Floats:
-    """The logarithms that ``_unpack`` reads."""
+def _sizes_in(noise: Noise, parts: tuple[Part, ...]) -> Floats:
+    """The numbers that ``_with`` takes."""
     sizes: dict[Part, Floats] = {
         "setting": np.full(1, noise.setting_rad),
         "common": noise.scatter_mps2[:1],
         "scatter": noise.scatter_mps2,
         "walk": np.full(1, noise.walk_mps2_per_sqrt_s),
     }
-    return np.log(np.concatenate([sizes[part] for part in parts]))
+    return np.concatenate([sizes[part] for part in parts])
 
 
-def _unpack(noise: Noise, logs: Floats, parts: tuple[Part, ...]) -> Noise:
-    sizes = iter(np.exp(logs).tolist())
+def _with(noise: Noise, parts: tuple[Part, ...], sizes: Floats) -> Noise:
+    """The noise with its parts of these sizes: one number each, of a scatter that differs three."""
+    left = iter(sizes.tolist())
     for part in parts:
         if part == "setting":
-            noise = replace(noise, setting_rad=next(sizes))
+            noise = replace(noise, setting_rad=next(left))
         elif part == "walk":
-            noise = replace(noise, walk_mps2_per_sqrt_s=next(sizes))
+            noise = replace(noise, walk_mps2_per_sqrt_s=next(left))
         elif part == "common":
-            noise = replace(noise, scatter_mps2=np.full(3, next(sizes)))
+            noise = replace(noise, scatter_mps2=np.full(3, next(left)))
         else:
-            noise = replace(noise, scatter_mps2=np.array([next(sizes) for _ in range(3)]))
+            noise = replace(noise, scatter_mps2=np.array([next(left) for _ in range(3)]))
     return noise
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -9,6 +11,7 @@ from synthetic import Run
 
 from kf_calib.calibration import calibrate
 from kf_calib.folding import Autocovariance, less_curve
+from kf_calib.likelihood import restricted_log_likelihood
 
 
 def test_autocovariance_is_the_sum_of_lagged_products() -> None:
@@ -61,3 +64,19 @@ def test_setting_error_and_scatter_are_told_apart_and_sized() -> None:
 def test_what_is_stated_is_not_estimated() -> None:
     noise = calibrate(Run(seed=3, setting_deg=0.01)).noise
     assert noise.setting_stated and noise.setting_rad == pytest.approx(np.radians(0.01))
+
+
+@pytest.mark.parametrize("kind", [{"setting_deg": 0.01}, {"scatter_mps2": 5e-4}])
+@pytest.mark.parametrize("seed", range(4))
+def test_no_other_size_of_the_dwell_parts_is_likelier(seed: int, kind: dict[str, float]) -> None:
+    """By the likelihood alone, without the derivative that the search goes by."""
+    result = calibrate(Run(seed=seed, dwells=30, stated=False, **kind))
+    noise, means, state = result.noise, result.carried.means, result.carried.state
+
+    def likelihood(setting: float, scatter: float) -> float:
+        other = replace(noise, setting_rad=noise.setting_rad * setting, scatter_mps2=noise.scatter_mps2 * scatter)
+        return restricted_log_likelihood(other.weights, means, state)
+
+    others = [likelihood(*pair) for x in (0.5, 0.9, 0.98, 1.02, 1.1, 2.0) for pair in ((x, 1.0), (1.0, x))]
+    assert noise.setting_rad + noise.scatter_mps2.max() > 0
+    assert max(others) <= likelihood(1.0, 1.0) + 1e-6
