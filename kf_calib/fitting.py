@@ -30,7 +30,6 @@ WALK = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5, "µg/√s", 1e6 / 9.80665)
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
 _STILL = 2.5e-4  # a step of ln(value), in reaches, that ends the search
-_CLOSER = ((0.45, 41), (0.0225, 17), (0.0028, 9))  # half width in ln(value) and points of ever finer grids
 
 
 @dataclass(frozen=True)
@@ -199,28 +198,16 @@ def _averaged(fitted: Fit) -> tuple[Model, dict[str, float]]:
     Likelihood exp(fall of chi^2 / 2), the prior flat in ln(value): between two poses no value is likelier than another.
     """
     model, spreads = fitted.carried.model, dict[str, float]()
+    stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
     for effect in model.stepped:
-        assert effect.unknown is not None
-        rest, values = model - effect, effect.unknown.grid()
-        falls = _falls(fitted, rest, [effect.at(value) for value in values])
-        for half, count in _CLOSER:
-            near = values[np.argmax(falls)] * np.exp(np.linspace(-half, half, count))
-            near = np.clip(near, effect.unknown.low, effect.unknown.high)
-            values = np.append(values, near)
-            falls = np.append(falls, _falls(fitted, rest, [effect.at(value) for value in near]))
-        order = np.argsort(values)
-        logs, falls = np.log(values[order]), falls[order]
-        weights = np.exp(0.5 * (falls - falls.max())) * _cells(logs)
-        mean = float(np.average(logs, weights=weights))
-        spreads[str(effect)] = float(np.sqrt(np.average((logs - mean) ** 2, weights=weights)))
+        edges = np.log(effect.edges(stimulus))
+        middles, widths = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+        falls = _falls(fitted, model - effect, [effect.at(value) for value in np.exp(middles)])
+        weights = np.exp(0.5 * (falls - falls.max())) * widths
+        mean = float(np.average(middles, weights=weights))
+        spreads[str(effect)] = float(np.sqrt(np.average((middles - mean) ** 2 + widths**2 / 12.0, weights=weights)))
         model = model.with_effect(effect.at(math.exp(mean)))
     return model, spreads
-
-
-def _cells(points: Floats) -> Floats:
-    """The length (n,) that each of sorted points stands for: half the way to the points beside it."""
-    steps = np.diff(points)
-    return 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
 
 
 def _best(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> int:

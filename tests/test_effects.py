@@ -300,6 +300,14 @@ def ratios_of(name: str, seed: int, still: list[DwellFactor]) -> dict[str, float
     return {symbol: (value - true) / sigma for (symbol, (value, sigma)), true in zip(found.items(), truth, strict=True)}
 
 
+def dead_zone_ratios(seed: int) -> dict[str, float]:
+    """Of the shares that are not felt, over their sigmas; the width is another in every run."""
+    width = np.random.default_rng(seed).uniform(4e-3, 7e-3)
+    source = run([f"dead-zone={width}"], 5e-5, seed, sweep_plan(run([], seed=seed)), 10.0)
+    found = estimated(fit(Pass(source, Settings(effects=("dead-zone",))).fold(), with_("dead-zone")))
+    return {symbol: (value - 1.0) / sigma for symbol, (value, sigma) in found.items()}
+
+
 def with_(name: str) -> Model:
     return Model.of(BENCH, (name,))
 
@@ -323,7 +331,7 @@ still_dwells_once = functools.cache(still_dwells)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*COVERED, "bias-walk"])
+@pytest.mark.parametrize("name", [*COVERED, "bias-walk", "dead-zone"])
 def test_intervals_of_an_effect_cover_over_300_runs(name: str) -> None:
     """95 % intervals cover 92-98 % of the effect's coefficients, and of none less than 90 % or more than 99 %.
 
@@ -332,11 +340,12 @@ def test_intervals_of_an_effect_cover_over_300_runs(name: str) -> None:
     """
     ratios: dict[str, list[float]] = {}
     for seed in range(1000, 1300):
-        for symbol, ratio in ratios_of(name, seed, still_dwells_once(seed)).items():
+        own = dead_zone_ratios(seed) if name == "dead-zone" else ratios_of(name, seed, still_dwells_once(seed))
+        for symbol, ratio in own.items():
             ratios.setdefault(symbol, []).append(ratio)
     shares = {symbol: float(np.mean(np.abs(own) < 1.96)) for symbol, own in ratios.items()}
-    for symbol, own in ratios.items():
-        print(f"\n{name:26} {symbol:10} {shares[symbol]:.3f}  mean {np.mean(own):+.2f}  std {np.std(own):.2f}", end="")
+    for symbol, r in ratios.items():
+        print(f"\n{name:26} {symbol:10} {shares[symbol]:.3f}  mean {np.mean(r):+.2f}  std {np.std(r):.2f}", end="")
     assert 0.92 <= np.mean(list(shares.values())) <= 0.98
     assert not {symbol: share for symbol, share in shares.items() if not 0.90 <= share <= 0.99}
 

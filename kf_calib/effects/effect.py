@@ -103,6 +103,12 @@ class Effect(ABC):
         assert self.unknown is not None
         return self.unknown.grid()
 
+    def edges(self, s: Stimulus) -> Floats:
+        """Sorted values of an unknown that is not smooth, from its lowest to its highest: between two of them the
+        columns are the same, or nearly so."""
+        assert self.unknown is not None
+        return self.unknown.grid(1.02)
+
     def reach(self, s: Stimulus) -> float:
         """How far from the truth ln(value) may be for its derivative to lead there: the width of the grid."""
         return 0.4

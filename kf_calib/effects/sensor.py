@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from kf_calib.effects.effect import G, SensorEffect, Unknown
@@ -9,6 +11,7 @@ from kf_calib.effects.stimulus import Stimulus
 from kf_calib.samples import Floats
 
 IEEE = "IEEE Std 1293, model equation"
+_EDGES = 500
 
 
 class BiasAsymmetry(SensorEffect):
@@ -126,7 +129,7 @@ class DeadZone(SensorEffect):
     name, title, source = "dead-zone", "no response to small inputs", IEEE
     confused_with = "needs poses that sweep through zero"
     symbol, unit, scale, shown = "Dz", "1", 1.0, ("of the input", 1.0)
-    unknown = Unknown("dZone", "m/s^2", 1e-6, 1e-2, "µg", 1e6 / G)
+    unknown: ClassVar[Unknown] = Unknown("dZone", "m/s^2", 1e-6, 1e-2, "µg", 1e6 / G)
     smooth = False
 
     def __init__(self) -> None:
@@ -134,3 +137,10 @@ class DeadZone(SensorEffect):
 
     def terms(self, s: Stimulus) -> Floats:
         return np.where(np.abs(s.along) < self.value, -s.along, 0.0)
+
+    def edges(self, s: Stimulus) -> Floats:
+        """At every input, or every so many: a pose that moves a little has one at each node."""
+        low, high = self.unknown.low, self.unknown.high
+        inputs = np.unique(np.abs(s.along))
+        inputs = inputs[(inputs > low) & (inputs < high)]
+        return np.array([low, *inputs[:: len(inputs) // _EDGES + 1], high])
