@@ -20,9 +20,9 @@ from threadpoolctl import threadpool_limits
 from kf_calib import advice as advise
 from kf_calib.advice import Advice
 from kf_calib.calibration import Calibration, Parameter, consistency, format_p, refitted
-from kf_calib.drivers import families
+from kf_calib.drivers import JUMP, families
 from kf_calib.effects import Effect, effect_named, names
-from kf_calib.fitting import Fit, walk_gain
+from kf_calib.fitting import WALK, Fit, walk_gain
 from kf_calib.folding import stimulus_of
 from kf_calib.likelihood import FEWEST
 from kf_calib.model import Model
@@ -52,7 +52,8 @@ class Test:
     p_values: of the run. misfit_p: of the sum of squares as a whole (None: nothing left over to judge by).
     lines: in the spectrum of the readings within dwells, and the name of the effect they speak for. vibration: those
     that are no oscillation of one amplitude, and count as noise. without_lines: the test with its lines as vibration.
-    between: in words, of an oscillation what is too fast for the scan and too slow for a line.
+    between: in words, of an oscillation what is too fast for the scan and too slow for a line. as_scatter: what could
+    be a walk of the biases could as well be scatter from dwell to dwell, of more than is stated.
     """
 
     scan: Scan
@@ -68,6 +69,7 @@ class Test:
     vibration: tuple[Line, ...] = ()
     without_lines: Test | None = None
     between: str = ""
+    as_scatter: bool = False
 
     @property
     def p_value(self) -> float | None:
@@ -100,9 +102,12 @@ class Test:
         return [*(name for name, k in self.best.items() if not self.scan.candidates[k].dof), *self.in_slews_only]
 
     def nearness(self, name: str) -> float:
-        """The score without what many values of a constant cost: that speaks against chance, not for a rival."""
+        """The score without what many values of a constant cost: that speaks against chance, not for a rival.
+
+        A walk is judged over all its paths: an effect that happens to look like the one it took has gained on it.
+        """
         if name not in self.best:
-            return self.scores[name]
+            return self.scores[name] + (_EQUAL if name == self.walking else 0.0)
         own, tests = self.candidate(name), self.effective_tests
         return self.scores[name] + price(own, tests) - price(replace(own, tried=1), tests)
 
@@ -141,13 +146,16 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
             if candidate.dof:
                 own = run_level(float(chdtrc(candidate.dof, statistics[k])), candidate.tried)
                 scores[name], p_values[name] = score, run_level(own, tests)
-    name = _walking(fitted)
+    name, as_scatter = _walking(fitted), False
     if name:
-        fall, ratio = (2.0 * gain for gain in walk_gain(fitted))
-        p_values[name] = run_level(0.5 * float(chdtrc(1, max(ratio, 0.0))), tests)
-        scores[name] = (fall if ratio > _threshold(1, tests) else ratio) - _threshold(1, tests)
+        (fall, ratio), least = (2.0 * gain for gain in walk_gain(fitted)), _threshold(1, tests)
+        # more scatter than was stated is less likely than a walk that explains as much
+        fall = fall if ratio > (0.0 if fitted.noise.scatter_stated else least) else ratio
+        as_scatter = ratio < least
+        p_values[name] = run_level(0.5 * float(chdtrc(1, max(fall, 0.0))), tests)
+        scores[name] = fall - least
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
-    test = Test(found, best, scores, p_values, misfit_p, name, tests, slewing, ())
+    test = Test(found, best, scores, p_values, misfit_p, name, tests, slewing, (), as_scatter=as_scatter)
     return _with_lines(test, fitted)
 
 
@@ -386,7 +394,8 @@ def _one(found: Diagnosis, first: Suspect, pairs: dict[tuple[int, int], float]) 
     Unless a formula that is no known effect explains it better: then the effect is not the one that is missing.
     """
     test = found.test
-    if first.name in test.best and _outdone(found, first.refit, (first.name,)):
+    outdone = _outdone(found, first.refit, (first.name,)) if first.name in test.best else _leapt(found, first)
+    if outdone:
         return replace(found, unknown=True)
     close = [name for name in test.ranked if test.nearness(name) > test.scores[first.name] - _EQUAL]
     overlaps = {name: _overlap(test, first.name, name) for name in close if name != first.name}
@@ -435,6 +444,17 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
     known = [found.test.candidate(name).effect for name in found.test.best]
     tried = [each for each in families(fitted, known)[0] if each.dof and not each.known]
     return any(each.fall - _threshold(each.dof, tests) > own + _EQUAL for each in tried)
+
+
+def _leapt(found: Diagnosis, first: Suspect) -> bool:
+    """Whether what could be a walk of the biases is one jump: that explains more, and leaves nothing to walk."""
+    if not first.refit.noise.walk_mps2_per_sqrt_s:
+        return False
+    test, before = found.test, found.before
+    jump = max((each for each in families(before.fit)[0] if each.driver == JUMP), key=lambda each: each.fall)
+    if jump.fall - _threshold(jump.dof, test.effective_tests) < test.nearness(first.name) + _EQUAL:
+        return False
+    return _fits(with_effects(before, jump.formulas), test)
 
 
 def _two(found: Diagnosis, pairs: dict[tuple[int, int], float]) -> Diagnosis | None:
@@ -593,12 +613,13 @@ def _verdict(found: Diagnosis) -> str:
             named = f"{' and '.join(found.missing)} together explain it; no single known effect does as well"
         else:
             named = f"Missing: {first}{_size(found)}"
-            if len(found.ambiguity) > 1:
+            if len(found.ambiguity) > 1 or (first == test.walking and test.as_scatter):
                 named = f"Best: {first}{_size(found)}"
         told = [f"{name} (overlap {overlap:.2f})" for name, overlap in found.overlaps.items()]
         told = [
             *(told if len(found.missing) == 1 else []),
             *(f"{' and '.join(pair)} together" for pair in found.together),
+            *(["dwells that scatter by more than is stated"] if first == test.walking and test.as_scatter else []),
         ]
         if told:
             named += f". Cannot yet be told from {', '.join(told)}"
@@ -623,7 +644,7 @@ def _size(found: Diagnosis) -> str:
     """The largest coefficient of the first name, in sigma, with its unit."""
     assert found.after is not None
     first = next(each for each in found.after.model.effects if str(each) == found.missing[0])
-    sized = [found.after.parameters[c.symbol] for c in first.coefficients]
+    sized = [found.after.parameters[c.symbol] for c in ([WALK] if first.walks else first.coefficients)]
     seen = [p for p in sized if p.value is not None and p.sigma]
     if not seen:
         return ""

@@ -12,12 +12,16 @@ from kf_calib.bench import Bench
 from kf_calib.effects import Effect, effect_named
 from kf_calib.errors import InputError
 from kf_calib.fitting import Fit
+from kf_calib.folding import DwellFactor
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
 
 _CHANCE = 1e-4  # of a family to fall as much where nothing is missing: there are about a hundred
 _SAME = 0.99  # cosine above which a formula is a known effect
 _DECAYS_S = (10, 30, 100, 300)
+_JUMPS = 100  # at most
+
+JUMP = "time (a jump)"
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,8 @@ class Description:
 class Family:
     """Formulas with one driver, as a candidate of its own; fall: of chi-squared, with all of them; dof: what they see.
 
-    falls: with each of them alone. known: each of them is what some known effect is, or nearly.
+    falls: with each of them alone; formulas: as they can be added. known: each of them is what some known effect is,
+    or nearly.
     """
 
     driver: str
@@ -47,6 +52,10 @@ class Family:
     dof: int
     falls: tuple[float, ...]
     known: bool = False
+
+    @property
+    def formulas(self) -> tuple[str, ...]:
+        return tuple(_named(text, number) for number, text in enumerate(self.texts))
 
     @property
     def score(self) -> float:
@@ -74,7 +83,7 @@ def described(fitted: Fit, residuals: Floats) -> Description | None:
 def families(fitted: Fit, known: Sequence[Effect] = ()) -> tuple[list[Family], float]:
     """All families tried on what the model leaves, beside effects that are ``known``; and the sum of squares there."""
     bench, listed, effects = fitted.carried.model.bench, list[tuple[str, list[str]]](), list[Effect]()
-    for driver, texts in _families(bench, fitted.dwells[-1].end_s):
+    for driver, texts in _families(bench, fitted.dwells):
         with contextlib.suppress(InputError):  # a jump so late, a decay so fast that the trial of a formula misses it
             effects += [effect_named(_named(text), bench) for text in texts]
             listed.append((driver, texts))
@@ -111,11 +120,11 @@ def _channel(residuals: Floats) -> str:
     return "xyz"[int(np.argmax(squares))] if squares.max() > 0.7 * squares.sum() else "all"
 
 
-def _families(bench: Bench, duration_s: float) -> Iterator[tuple[str, list[str]]]:
+def _families(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
     """What may drive a misfit, in words, and formulas of it; ``:place = ...`` turns a gimbal or the base."""
     yield from _of_force()
     yield from _of_gimbals(len(bench.axes))
-    yield from _of_time(duration_s)
+    yield from _of_time(dwells)
     yield from _of_surroundings(bench)
 
 
@@ -140,11 +149,13 @@ def _of_gimbals(count: int) -> Iterator[tuple[str, list[str]]]:
         yield f"angle of gimbal {k} in the dwell before", [f"sin(q{k}_before)", f"cos(q{k}_before)"]
 
 
-def _of_time(duration_s: float) -> Iterator[tuple[str, list[str]]]:
+def _of_time(dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
     yield "time", ["t"]
     yield "time", ["t", "t*t"]
-    for share in np.linspace(0.05, 0.95, 19):
-        yield "time (a jump)", [f"t > {share * duration_s:.0f}*s"]
+    moments_s = [moment for dwell in dwells for moment in (dwell.start_s, 0.5 * (dwell.start_s + dwell.end_s))][1:]
+    for moment_s in moments_s[:: len(moments_s) // _JUMPS + 1]:
+        yield JUMP, [f"t > {moment_s:.6g}*s"]
+    duration_s = dwells[-1].end_s
     for decay_s in _DECAYS_S:
         yield "time (a decay)", [f"exp(-t/({10 * decay_s}*s))"]
         yield "time since arrival", [f"exp(-tau/({decay_s}*s))"]

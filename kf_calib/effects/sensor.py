@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from kf_calib.effects.effect import G, SensorEffect, Unknown
@@ -129,7 +127,7 @@ class DeadZone(SensorEffect):
     name, title, source = "dead-zone", "no response to small inputs", IEEE
     confused_with = "needs poses that sweep through zero"
     symbol, unit, scale, shown = "Dz", "1", 1.0, ("of the input", 1.0)
-    unknown: ClassVar[Unknown] = Unknown("dZone", "m/s^2", 1e-6, 1e-2, "µg", 1e6 / G)
+    unknown = Unknown("dZone", "m/s^2", 1e-6, 1e-2, "µg", 1e6 / G)
     smooth = False
 
     def __init__(self) -> None:
@@ -140,6 +138,7 @@ class DeadZone(SensorEffect):
 
     def edges(self, s: Stimulus) -> Floats:
         """At every input, or every so many: a pose that moves a little has one at each node."""
+        assert self.unknown is not None
         low, high = self.unknown.low, self.unknown.high
         inputs = np.unique(np.abs(s.along))
         inputs = inputs[(inputs > low) & (inputs < high)]
