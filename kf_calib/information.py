@@ -56,19 +56,20 @@ def whitened(
     out = list[Floats]()
     for dwell, own in zip(dwells, columns, strict=True):
         triangles = np.array([piece.triangle for piece in dwell.pieces])
-        regressors = triangles[:, : dwell.width, :3] @ parabola(
-            np.array([piece.nodes.regressors for piece in dwell.pieces])
-        )
+        force = np.array([piece.nodes.force_mps2 for piece in dwell.pieces])
+        regressors = triangles[:, : dwell.width, :3] @ parabola(np.insert(force, 0, 1.0, axis=2))
         carried, size, width = triangles[:, : dwell.width, : dwell.width], dwell.width * len(triangles), own.shape[-1]
         rows = np.zeros((3 * size + count, first_of_model + width + 1))
+        turned = regressors @ nuisances[:, None]
+        modelled = carried @ on_basis(np.moveaxis(own, 2, 0))  # (3, pieces, K, p)
         for i in range(3):
             part = rows[i * size : (i + 1) * size]
-            part[:, :offsets] = (regressors @ nuisances[i]).reshape(size, offsets) / sigma[i]
+            part[:, :offsets] = turned[i].reshape(size, offsets) / sigma[i]
             if slow:
                 first = offsets + slow * i
                 waves = carried[:, :, :3] @ on_basis(_waves(dwell))
                 part[:, first : first + slow] = waves.reshape(size, slow) / sigma[i]
-            part[:, first_of_model:-1] = (carried @ on_basis(own[:, :, i])).reshape(size, width) / sigma[i]
+            part[:, first_of_model:-1] = modelled[i].reshape(size, width) / sigma[i]
             readings = triangles[:, : dwell.width, dwell.width + i]
             if about is not None:
                 readings = readings - (carried @ on_basis((own[:, :, i] @ about)[:, :, None]))[:, :, 0]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
+
+from kf_calib.cli import main
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "recordings"
 
@@ -16,3 +19,17 @@ def ferraris() -> Path:
     if not path.exists():
         pytest.skip(f"{path} is not there: the recordings of others are kept outside the project")
     return path
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """The command line: exit code, what it prints, what it prints to the error stream."""
+
+    def call(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["kf-calib", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        out, err = capsys.readouterr()
+        return int(ended.value.code or 0), out, err
+
+    return call

@@ -6,7 +6,6 @@ import itertools
 import json
 import math
 import re
-import sys
 import time
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from synthetic import Run
 from kf_calib import aims, paper
 from kf_calib.bench import Bench, axes_of
 from kf_calib.calibration import calibrate
-from kf_calib.cli import main
 from kf_calib.designs import Scheme, Search
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.planner import fewest, papers_sigma, plan
@@ -246,19 +244,19 @@ def test_slopes_by_finite_differences(name: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def run():
+def eight():
     poses = np.random.default_rng(5).uniform(-0.6, 0.6, (8, 3))
     return calibrate(Run(seed=4, dwells=8, poses=poses))
 
 
-def test_next_orientation_starts_from_the_filters_covariance(run) -> None:
-    ahead = Prospect.after(run.fit)
-    np.testing.assert_allclose(aims.sigmas(ahead.start) * ahead.units, run.estimate.sigma, rtol=1e-6)
-    looking = Search(ahead, Reach(run.bench), aims.NAMED["A"])
+def test_next_orientation_starts_from_the_filters_covariance(eight) -> None:
+    ahead = Prospect.after(eight.fit)
+    np.testing.assert_allclose(aims.sigmas(ahead.start) * ahead.units, eight.estimate.sigma, rtol=1e-6)
+    looking = Search(ahead, Reach(eight.bench), aims.NAMED["A"])
     spent = []
     for _ in range(5):
         begin = time.perf_counter()
-        made = plan(Search(ahead, Reach(run.bench), aims.NAMED["A"]), 1, TIMING)
+        made = plan(Search(ahead, Reach(eight.bench), aims.NAMED["A"]), 1, TIMING)
         _ = made.sigma
         spent.append(time.perf_counter() - begin)
     assert min(spent) < 0.1
@@ -268,36 +266,24 @@ def test_next_orientation_starts_from_the_filters_covariance(run) -> None:
     assert (made.sigma[-1] < made.sigma[0] * (1 + 1e-9)).all() and made.cost < math.exp(float(aims.A(ahead.start)))
 
 
-def test_predicted_sigma_after_the_next_dwell_is_what_the_filter_then_has(run) -> None:
+def test_predicted_sigma_after_the_next_dwell_is_what_the_filter_then_has(eight) -> None:
     """The same recording with one more dwell, there."""
-    made = plan(Search(Prospect.after(run.fit), Reach(run.bench), aims.D), 1, TIMING)
+    made = plan(Search(Prospect.after(eight.fit), Reach(eight.bench), aims.D), 1, TIMING)
     poses = np.vstack([np.random.default_rng(5).uniform(-0.6, 0.6, (8, 3)), made.poses])
     after = calibrate(Run(seed=4, dwells=9, poses=poses))
     np.testing.assert_allclose(made.sigma[-1], after.estimate.sigma, rtol=0.03)
 
 
-@pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    def call(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["kf-calib", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        out, err = capsys.readouterr()
-        return int(ended.value.code or 0), out, err
-
-    return call
-
-
-def test_a_plan_is_run_by_the_simulator_and_its_sigmas_hold(command, tmp_path: Path) -> None:
+def test_a_plan_is_run_by_the_simulator_and_its_sigmas_hold(run, tmp_path: Path) -> None:
     """Errors over predicted sigma of 30 simulated runs of the CSV file: chi-squared of 360."""
     file, out = tmp_path / "plan.csv", tmp_path / "run.mcap"
     words = ["--count", 6, "--dwell-s", 5, "--sample-hz", 50, "--angle-sigma", 0.001, "--white", 1e-3]
-    code, text, err = command("plan", *words, "--csv", file, "--json", "--limit", "z=-100:100")
+    code, text, err = run("plan", *words, "--csv", file, "--json", "--limit", "z=-100:100")
     made = json.loads(text)
     assert code == 0 and err == "" and made["axes"] == "y z x"
     for key in ("gimbal_deg", "sigma", "condition_number", "d_efficiency"):
         assert key in made
-    code, _, err = command("simulate", out, "--plan", file, "--dwell-s", 5, "--slew-degps", 1000, "--json")
+    code, _, err = run("simulate", out, "--plan", file, "--dwell-s", 5, "--slew-degps", 1000, "--json")
     assert code == 0, err
     dwells = calibrate_file(out).fit.dwells
     np.testing.assert_allclose(np.degrees([each.pose for each in dwells]), made["gimbal_deg"], atol=0.01)
@@ -326,8 +312,8 @@ def calibrate_file(path: Path):
     return calibrate(Recording(path))
 
 
-def test_the_command_in_words_and_its_refusals(command, tmp_path: Path) -> None:
-    code, out, _ = command("plan", "--count", 4, "--readings", 100, "--beside-paper")
+def test_the_command_in_words_and_its_refusals(run, tmp_path: Path) -> None:
+    code, out, _ = run("plan", "--count", 4, "--readings", 100, "--beside-paper")
     assert code == 0 and "D-efficiency 1.0000" in out and "0.484 %" in out and "0.685 %" in out
     for words, said in (
         (["--fewest"], "target"),
@@ -339,7 +325,7 @@ def test_the_command_in_words_and_its_refusals(command, tmp_path: Path) -> None:
         (["--with", "second-order"], "--recording"),
         (["--grid-deg", 1], "coarser"),
     ):
-        code, out, err = command("plan", *words)
+        code, out, err = run("plan", *words)
         assert code == 2 and out == "" and err.count("\n") == 1 and said in err, err
 
 
@@ -353,11 +339,11 @@ def test_the_rerun_view_of_a_plan(tmp_path: Path) -> None:
         save(plan(search(), 6, TIMING), tmp_path / "none" / "plan.rrd")
 
 
-def test_the_readme_shows_what_the_command_prints(command) -> None:
+def test_the_readme_shows_what_the_command_prints(run) -> None:
     text = (Path(__file__).resolve().parents[1] / "README.md").read_text()
     shown = text[text.index("$ kf-calib plan --count 4") :].split("```")[0]
     line, _, body = shown.partition("\n")
-    code, out, _ = command(*line.split()[2:])
+    code, out, _ = run(*line.split()[2:])
     printed = " ".join(out.split())
     assert code == 0
     for part in body.split("\n...\n"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 from synthetic import Run
 
 from kf_calib.calibration import calibrate, refitted
-from kf_calib.cli import main
 from kf_calib.readings import Readings, clustering, common_step, missing_above
 from kf_calib.samples import Stream
 from kf_calib.sources.recording import Recording
@@ -178,51 +176,50 @@ def test_a_refit_keeps_what_was_seen() -> None:
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def printed(run):
+    """What a command prints that must end well, without a word of warning."""
+
     def call(*words: object) -> str:
-        monkeypatch.setattr(sys, "argv", ["kf-calib", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        out, err = capsys.readouterr()
-        assert not ended.value.code and not err
+        code, out, err = run(*words)
+        assert not code and not err
         return out
 
     return call
 
 
-def simulated(run, path: Path, *hide: str) -> Path:
-    run("simulate", path, *QUICK, *(word for text in hide for word in ("--hide", text)))
+def simulated(printed, path: Path, *hide: str) -> Path:
+    printed("simulate", path, *QUICK, *(word for text in hide for word in ("--hide", text)))
     return path
 
 
-def test_hidden_flat_tops_are_said_before_an_effect_is_named(run, tmp_path: Path) -> None:
-    path = simulated(run, tmp_path / "flat.mcap", "saturation=0,9.5,0")
-    found = json.loads(run("diagnose", path, "--json"))
+def test_hidden_flat_tops_are_said_before_an_effect_is_named(printed, tmp_path: Path) -> None:
+    path = simulated(printed, tmp_path / "flat.mcap", "saturation=0,9.5,0")
+    found = json.loads(printed("diagnose", path, "--json"))
     assert {each["channel"] for each in found["readings"]["saturation"]} == {2}
     assert {abs(each["level_mps2"]) for each in found["readings"]["saturation"]} == {9.5}
     assert found["verdict"].startswith("Readings of accelerometer 2 are cut off at ")
-    words = run("diagnose", path)
+    words = printed("diagnose", path)
     assert "saturation of accelerometer 2" in words and words.count("widen its range") == len(
         found["readings"]["saturation"]
     )
-    replayed = json.loads(run("replay", path, "--json"))
+    replayed = json.loads(printed("replay", path, "--json"))
     assert replayed["readings"] == found["readings"]
     assert any("cut off" in warning for warning in replayed["warnings"])
 
 
 @pytest.mark.parametrize("step, matters", [(2e-5, False), (1e-3, True)])
-def test_a_hidden_step(run, tmp_path: Path, step: float, matters: bool) -> None:
-    path = simulated(run, tmp_path / "steps.mcap", f"quantisation={step}")
-    found = json.loads(run("replay", path, "--json"))
+def test_a_hidden_step(printed, tmp_path: Path, step: float, matters: bool) -> None:
+    path = simulated(printed, tmp_path / "steps.mcap", f"quantisation={step}")
+    found = json.loads(printed("replay", path, "--json"))
     assert [each["step_mps2"] for each in found["readings"]["quantisation"]] == pytest.approx([step] * 3, rel=1e-6)
     assert [each["matters"] for each in found["readings"]["quantisation"]] == [matters] * 3
     assert any("averaging does not help" in warning for warning in found["warnings"]) == matters
     assert found["readings"]["saturation"] == []
 
 
-def test_hidden_outliers_and_none(run, tmp_path: Path) -> None:
-    found = json.loads(run("replay", simulated(run, tmp_path / "a.mcap", "outliers=10mg;rate=2e-3"), "--json"))
+def test_hidden_outliers_and_none(printed, tmp_path: Path) -> None:
+    found = json.loads(printed("replay", simulated(printed, tmp_path / "a.mcap", "outliers=10mg;rate=2e-3"), "--json"))
     assert found["readings"]["outliers"]["count"] == found["counts"]["gated"] > 20
     assert found["readings"]["outliers"]["clustered_p"] > 1e-3
-    clean = json.loads(run("diagnose", simulated(run, tmp_path / "b.mcap"), "--json"))["readings"]
+    clean = json.loads(printed("diagnose", simulated(printed, tmp_path / "b.mcap"), "--json"))["readings"]
     assert clean["quantisation"] == clean["saturation"] == [] and clean["outliers"]["count"] == 0

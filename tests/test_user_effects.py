@@ -391,18 +391,6 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    def call(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["kf-calib", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        out, err = capsys.readouterr()
-        return int(ended.value.code or 0), out, err
-
-    return call
-
-
 def test_a_class_file_through_the_command_line(run, recording: Path, tmp_path: Path) -> None:
     """Ten lines mend the misfit, and find what the catalogue's class finds."""
     own = written(tmp_path, "print('loading')\n" + TEN_LINES)
