@@ -19,10 +19,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import serial
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_recordings import BENCH, START_NS, assert_equal, made_batch, read, streams_of
 from mcap.reader import make_reader
+from serial.rfc2217 import PortManager
 
 from kf_calib.bench import Bench
 from kf_calib.calibration import calibrate
@@ -232,6 +234,50 @@ def test_a_serial_port_joined_amid_a_row_loses_that_row_only() -> None:
     assert "may not be whole" in source.warnings[0] and source.status.refused == 1
     os.close(theirs)
     os.close(ours)
+
+
+class TerminalServer(threading.Thread):
+    """A serial port behind RFC 2217, by pyserial's own side of it; sends its bytes once the client has set the port."""
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(daemon=True)
+        self.port, self._data = serial.serial_for_url("loop://", baudrate=9600, timeout=0), data
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.url = f"rfc2217://127.0.0.1:{self._server.getsockname()[1]}"
+        self._client: socket.socket | None = None
+
+    def write(self, data: bytes) -> None:
+        assert self._client is not None
+        self._client.sendall(data)
+
+    def run(self) -> None:
+        with self._server:
+            self._client = self._server.accept()[0]
+        with self._client:
+            manager, waiting = PortManager(self.port, self), self._data
+            self._client.settimeout(0.1)
+            while True:
+                try:
+                    received = self._client.recv(1024)
+                except TimeoutError:  # all is set
+                    self.write(b"".join(manager.escape(waiting)))
+                    waiting = b""
+                    continue
+                if not received:
+                    return
+                list(manager.filter(received))
+
+
+@pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")  # pyserial's own
+def test_a_port_on_a_terminal_server_is_set_and_read() -> None:
+    """Bytes that mean something to telnet are among those of the frames."""
+    server = TerminalServer(frame_rows(0, 300))
+    server.start()
+    with open_live(f"{server.url}?baud=57600&parity=E&idle=1", KEYS) as source:
+        got = read(source)
+    assert numbers(got) == list(range(300)) and source.status.refused == 0
+    assert (server.port.baudrate, server.port.parity) == (57600, "E")
+    server.join(5.0)
 
 
 # -- lost links --
