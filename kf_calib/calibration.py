@@ -387,7 +387,7 @@ def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
     with threadpool_limits(1, user_api="blas"):  # small decompositions, and the same bits every time
         fitted = fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews)
         if before.reread is not None and not _followed(fitted):
-            return before.reread(settings, None, fitted)
+            return before.reread(settings, None, None if fitted.dwells[0].averaged else fitted)
         again = evaluated(fitted, settings)
         return replace(again, tally=before.tally, readings=before.readings, reread=before.reread)
 

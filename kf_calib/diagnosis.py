@@ -341,9 +341,11 @@ def _explained(before: Calibration, test: Test) -> Diagnosis:
     explaining = [each for each in suspects if each.fits and test.scores[each.name] > least]
     explaining = [each for each in explaining if _beyond_scatter(before, test, (each.name,))]
     found = replace(nothing, suspects=suspects)
-    pairs = _pairs(test) if not explaining or explaining[0].name in test.best else {}
+    pairs = _pairs(test) if not explaining or explaining[0].name in (*test.best, test.walking) else {}
     if explaining:
-        clearly = {pair: score for pair, score in pairs.items() if score > test.scores[explaining[0].name] + _EQUAL}
+        first = explaining[0].name
+        least = test.scores[first] + (2.0 if first == test.walking else 1.0) * _EQUAL
+        clearly = {pair: score for pair, score in pairs.items() if score > least}
         return _two(found, clearly) or _one(found, explaining[0], pairs)
     return _two(found, pairs) or replace(found, unknown=not _may_scatter(before))
 
@@ -394,7 +396,7 @@ def _one(found: Diagnosis, first: Suspect, pairs: dict[tuple[int, int], float]) 
     Unless a formula that is no known effect explains it better: then the effect is not the one that is missing.
     """
     test = found.test
-    outdone = _outdone(found, first.refit, (first.name,)) if first.name in test.best else _leapt(found, first)
+    outdone = _outdone(found, first.refit, (first.name,)) if first.name in test.best else _walks_not(found, first)
     if outdone:
         return replace(found, unknown=True)
     close = [name for name in test.ranked if test.nearness(name) > test.scores[first.name] - _EQUAL]
@@ -446,15 +448,21 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
     return any(each.fall - _threshold(each.dof, tests) > own + _EQUAL for each in tried)
 
 
-def _leapt(found: Diagnosis, first: Suspect) -> bool:
-    """Whether what could be a walk of the biases is one jump: that explains more, and leaves nothing to walk."""
+def _walks_not(found: Diagnosis, first: Suspect) -> bool:
+    """Whether what could be a walk of the biases is one jump, or follows what the platform does rather than time.
+
+    A walk may take any path: what is simpler, explains more and leaves nothing goes before it.
+    """
     if not first.refit.noise.walk_mps2_per_sqrt_s:
         return False
     test, before = found.test, found.before
-    jump = max((each for each in families(before.fit)[0] if each.driver == JUMP), key=lambda each: each.fall)
-    if jump.fall - _threshold(jump.dof, test.effective_tests) < test.nearness(first.name) + _EQUAL:
+    known = [test.candidate(name).effect for name in test.best]
+    tried = [each for each in families(before.fit, known)[0] if each.dof and not each.known]
+    tried = [each for each in tried if each.driver == JUMP or not each.driver.startswith("time")]
+    gains = [each.fall - _threshold(each.dof, test.effective_tests) for each in tried]
+    if not tried or max(gains) < test.nearness(first.name) + _EQUAL:
         return False
-    return _fits(with_effects(before, jump.formulas), test)
+    return _fits(with_effects(before, tried[int(np.argmax(gains))].formulas), test)
 
 
 def _two(found: Diagnosis, pairs: dict[tuple[int, int], float]) -> Diagnosis | None:

@@ -363,7 +363,7 @@ def stated_sizes(task: Task) -> dict[str, tuple[float, int, int]]:
     said = run("diagnose", str(path), "--json")["detectable"]
     spaces, out = candidates(path), dict[str, tuple[float, int, int]]()
     for each in said:
-        own = spaces[each["effect"]]
+        own = spaces.get(each["effect"], [])  # none of an oscillation: its frequency is not one of a grid
         if len(own) == 1:  # the value of an unknown that the size holds for is not stated
             lengths = np.linalg.norm(own[0].columns, axis=0)
             lengths[own[0].hidden | (lengths == 0.0)] = np.inf
