@@ -54,7 +54,6 @@ _LEAST: dict[int, int] = {
 }  # fmt: skip
 _FIRST_PRIVATE_OPCODE = 0x80
 _NOTHING_YET = -1  # in place of an opcode: the next record of a growing file is not whole
-_LOOSE = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA)
 _Record = TypeVar("_Record")
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")

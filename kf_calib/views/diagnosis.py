@@ -15,7 +15,6 @@ from kf_calib.drivers import Description, described
 from kf_calib.views.console import rounded, symbol
 from kf_calib.views.json import clean, readings_object
 
-_LISTED = 12
 
 
 def description(found: Diagnosis) -> Description | None:
