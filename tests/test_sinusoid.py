@@ -59,11 +59,13 @@ def test_frequency_and_amplitudes_are_found(frequency_hz: float, dwell_s: float,
     np.testing.assert_allclose(result.noise.effective_sigma_mps2, SIGMA, rtol=0.05)
 
 
-@pytest.mark.parametrize("runs, low, off", [(8, 0.85, 0.25), pytest.param(60, 0.92, 0.1, marks=pytest.mark.slow)])
-def test_intervals_cover(runs: int, low: float, off: float) -> None:
-    ratios = [errors(calibrate(run(33.0, 1.0, seed=50 + k), WITH), 33.0, 1.0) for k in range(runs)]
-    assert low <= np.mean(np.abs(ratios) < 1.96) <= 1.0
-    assert np.std(ratios) == pytest.approx(1.0, abs=off)
+@pytest.mark.parametrize("runs, low, high", [(8, 0.85, 1.0), pytest.param(300, 0.92, 0.98, marks=pytest.mark.slow)])
+def test_intervals_cover(runs: int, low: float, high: float) -> None:
+    ratios = np.array([errors(calibrate(run(33.0, 1.0, seed=50 + k), WITH), 33.0, 1.0) for k in range(runs)])
+    share = float(np.mean(np.abs(ratios) < 1.96))
+    print(f"\nsinusoid: {(np.abs(ratios) < 1.96).mean(axis=0).round(3)}, std {np.std(ratios, axis=0).round(2)}", end="")
+    assert low <= share <= high
+    assert np.std(ratios) == pytest.approx(1.0, abs=0.25 if runs < 60 else 0.05)
 
 
 def test_engines_and_batch_agree() -> None:
