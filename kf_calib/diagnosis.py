@@ -326,7 +326,9 @@ def _diagnosed(before: Calibration) -> Diagnosis:
         found = _explained(before, test)
     if test.vibration and not before.fit.dwells[0].averaged and before.reread is not None:
         rested = before.reread(replace(before.settings, averaged=True))
-        found = _explained(rested, replace(assessed(rested.fit), vibration=test.vibration))
+        still = assessed(rested.fit)
+        still = still.without_lines or still  # what the windows let through is vibration, too
+        found = _explained(rested, replace(still, vibration=test.vibration))
     return replace(found, verdict=_verdict(found))
 
 
@@ -346,7 +348,7 @@ def _explained(before: Calibration, test: Test) -> Diagnosis:
         first = explaining[0].name
         least = test.scores[first] + (2.0 if first == test.walking else 1.0) * _EQUAL
         clearly = {pair: score for pair, score in pairs.items() if score > least}
-        return _two(found, clearly) or _one(found, explaining[0], pairs)
+        return _two(found, clearly, explaining[0].name) or _one(found, explaining[0], pairs)
     return _two(found, pairs) or replace(found, unknown=not _may_scatter(before))
 
 
@@ -465,8 +467,11 @@ def _walks_not(found: Diagnosis, first: Suspect) -> bool:
     return _fits(with_effects(before, tried[int(np.argmax(gains))].formulas), test)
 
 
-def _two(found: Diagnosis, pairs: dict[tuple[int, int], float]) -> Diagnosis | None:
-    """Two effects explain the misfit where no single one does: they may mask each other. The best few are refitted."""
+def _two(found: Diagnosis, pairs: dict[tuple[int, int], float], alone: str = "") -> Diagnosis | None:
+    """Two effects explain the misfit where no single one does: they may mask each other. The best few are refitted.
+
+    alone: a single one that would do, if not as well; a walk can take any path, so it stays in the set.
+    """
     test, candidates = found.test, found.test.scan.candidates
     for pair in sorted(pairs, key=lambda pair: -pairs[pair])[:_PAIRS]:
         names = _names_of(test, pair)
@@ -477,7 +482,7 @@ def _two(found: Diagnosis, pairs: dict[tuple[int, int], float]) -> Diagnosis | N
             continue
         if _outdone(found, refit, names):
             return None
-        overlaps = dict[str, float]()
+        overlaps = {alone: 1.0} if alone and alone == test.walking else dict[str, float]()
         for other, score in pairs.items():
             shared = set(pair) & set(other)
             if score > pairs[pair] - _EQUAL and len(shared) == 1:
@@ -624,8 +629,9 @@ def _verdict(found: Diagnosis) -> str:
             if len(found.ambiguity) > 1 or (first == test.walking and test.as_scatter):
                 named = f"Best: {first}{_size(found)}"
         told = [f"{name} (overlap {overlap:.2f})" for name, overlap in found.overlaps.items()]
+        alone = [f"{name} alone" for name in found.overlaps if name == test.walking]
         told = [
-            *(told if len(found.missing) == 1 else []),
+            *(told if len(found.missing) == 1 else alone),
             *(f"{' and '.join(pair)} together" for pair in found.together),
             *(["dwells that scatter by more than is stated"] if first == test.walking and test.as_scatter else []),
         ]

@@ -16,7 +16,6 @@ from kf_calib.views.console import rounded, symbol
 from kf_calib.views.json import clean, readings_object
 
 
-
 def description(found: Diagnosis) -> Description | None:
     """What an unknown misfit looks like; None where the misfit is known, or there is none."""
     if not found.unknown:
