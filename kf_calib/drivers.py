@@ -26,7 +26,7 @@ JUMP = "time (a jump)"
 
 @dataclass(frozen=True)
 class Description:
-    """channel: x, y, z or all; driver: in words; share: of the misfit it explains; formulas: to add as they stand."""
+    """channel: x, y, z or all; driver: in words; share: of what is beyond noise; formulas: to add as they stand."""
 
     channel: str
     driver: str
@@ -70,18 +70,20 @@ def described(fitted: Fit, residuals: Floats) -> Description | None:
 
     residuals: of the dwells, (D, 3).
     """
-    found, misfit = families(fitted)
+    found, excess = families(fitted)
     best = max(found, key=lambda family: family.score)
     if best.score <= 0.0:
         return None
     order = np.argsort(best.falls)[::-1]
     enough = 1 if best.falls[order[0]] > 0.7 * best.fall else len(order)
     formulas = tuple(_named(best.texts[k], number) for number, k in enumerate(order[:enough]))
-    return Description(_channel(residuals), best.driver, best.fall / max(misfit, 1e-300), formulas)
+    share = min((best.fall - best.dof) / excess, 1.0) if excess > 0.0 else 1.0
+    return Description(_channel(residuals), best.driver, share, formulas)
 
 
 def families(fitted: Fit, known: Sequence[Effect] = ()) -> tuple[list[Family], float]:
-    """All families tried on what the model leaves, beside effects that are ``known``; and the sum of squares there."""
+    """All families tried on what the model leaves, beside effects that are ``known``; and the chi-squared that is left
+    there beyond its dof."""
     bench, listed, effects = fitted.carried.model.bench, list[tuple[str, list[str]]](), list[Effect]()
     for driver, texts in _families(bench, fitted.dwells):
         with contextlib.suppress(InputError):  # a jump so late, a decay so fast that the trial of a formula misses it
@@ -99,7 +101,7 @@ def families(fitted: Fit, known: Sequence[Effect] = ()) -> tuple[list[Family], f
         left = left[:, singular > 1e-6]
         fall = float(np.sum((left.T @ scanned.residual) ** 2))
         out.append(Family(driver, tuple(texts), fall, left.shape[1], tuple(scanned.statistics[own].tolist()), same))
-    return out, float(scanned.residual @ scanned.residual)
+    return out, float(scanned.residual @ scanned.residual) - len(scanned.residual)
 
 
 def _within(one: Floats, other: Floats) -> bool:
