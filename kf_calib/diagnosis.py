@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from kf_calib import advice as advise
 from kf_calib.advice import Advice
 from kf_calib.calibration import Calibration, Parameter, consistency, format_p, refitted
-from kf_calib.drivers import JUMP, families
+from kf_calib.drivers import JUMP, Family, families
 from kf_calib.effects import Effect, effect_named, names
 from kf_calib.fitting import WALK, Fit, walk_gain
 from kf_calib.folding import stimulus_of
@@ -369,10 +369,7 @@ def _beyond_scatter(before: Calibration, test: Test, names: Sequence[str]) -> bo
     noise, misfit = before.noise, before.consistency
     if (noise.scatter_stated and noise.setting_stated) or any(name not in test.best for name in names):
         return True
-    basis = np.concatenate([test.candidate(name).basis for name in names], axis=1)
-    left, singular, _ = np.linalg.svd(basis, full_matrices=False)
-    spanned = left[:, singular > 1e-6]
-    fall, dof = float(np.sum((spanned.T @ test.scan.residual) ** 2)), spanned.shape[1]
+    fall, dof = test.scan.explained(np.concatenate([test.candidate(name).basis for name in names], axis=1))
     freedom = misfit.dof - dof
     if freedom <= 0:
         return False
@@ -441,13 +438,17 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
     fitted, tests = found.before.fit, found.test.effective_tests
     effects = [effect for effect in refit.model.effects if str(effect) in names]
     scanned = scan(fitted.carried, fitted.noise.judging, effects)
-    basis = np.concatenate([each.basis for each in scanned.candidates], axis=1)
-    left, singular, _ = np.linalg.svd(basis, full_matrices=False)
-    own = float(np.sum((left[:, singular > 1e-6].T @ scanned.residual) ** 2))
+    own, _ = scanned.explained(np.concatenate([each.basis for each in scanned.candidates], axis=1))
     own -= sum(price(each, tests) for each in scanned.candidates)
-    known = [found.test.candidate(name).effect for name in found.test.best]
-    tried = [each for each in families(fitted, known)[0] if each.dof and not each.known]
-    return any(each.fall - _threshold(each.dof, tests) > own + _EQUAL for each in tried)
+    return any(gain > own + _EQUAL for gain, _ in _formulas(found))
+
+
+def _formulas(found: Diagnosis) -> list[tuple[float, Family]]:
+    """Formulas that are no known effects, each with its fall of chi-squared less what chance would give it."""
+    test = found.test
+    known = [test.candidate(name).effect for name in test.best]
+    tried = [each for each in families(found.before.fit, known)[0] if each.dof and not each.known]
+    return [(each.fall - _threshold(each.dof, test.effective_tests), each) for each in tried]
 
 
 def _walks_not(found: Diagnosis, first: Suspect) -> bool:
@@ -457,14 +458,11 @@ def _walks_not(found: Diagnosis, first: Suspect) -> bool:
     """
     if not first.refit.noise.walk_mps2_per_sqrt_s:
         return False
-    test, before = found.test, found.before
-    known = [test.candidate(name).effect for name in test.best]
-    tried = [each for each in families(before.fit, known)[0] if each.dof and not each.known]
-    tried = [each for each in tried if each.driver == JUMP or not each.driver.startswith("time")]
-    gains = [each.fall - _threshold(each.dof, test.effective_tests) for each in tried]
-    if not tried or max(gains) < test.nearness(first.name) + _EQUAL:
+    simpler = [each for each in _formulas(found) if each[1].driver == JUMP or not each[1].driver.startswith("time")]
+    gain, formula = max(simpler, key=lambda each: each[0], default=(-np.inf, None))
+    if formula is None or gain < found.test.nearness(first.name) + _EQUAL:
         return False
-    return _fits(with_effects(before, tried[int(np.argmax(gains))].formulas), test)
+    return _fits(with_effects(found.before, formula.formulas), found.test)
 
 
 def _two(found: Diagnosis, pairs: dict[tuple[int, int], float], alone: str = "") -> Diagnosis | None:
@@ -504,8 +502,7 @@ def _pairs(test: Test) -> dict[tuple[int, int], float]:
         one, two = candidates[j], candidates[k]
         if str(one.effect) == str(two.effect):
             continue
-        left, singular, _ = np.linalg.svd(two.basis - one.basis @ (one.basis.T @ two.basis), full_matrices=False)
-        fall = falls[j] + np.sum((left[:, singular > 1e-6].T @ test.scan.residual) ** 2)
+        fall = falls[j] + test.scan.explained(two.basis - one.basis @ (one.basis.T @ two.basis))[0]
         if fall - falls[j] > prices[k] and fall - falls[k] > prices[j]:
             out[j, k] = float(fall - prices[j] - prices[k])
     return out

@@ -96,11 +96,8 @@ def families(fitted: Fit, known: Sequence[Effect] = ()) -> tuple[list[Family], f
         own, place = slice(place, place + len(texts)), place + len(texts)
         parts = [each.basis for each in scanned.candidates[own]]
         same = all(any(_within(part, each) for each in bases) for part in parts)
-        basis = np.concatenate(parts, axis=1)
-        left, singular, _ = np.linalg.svd(basis, full_matrices=False)
-        left = left[:, singular > 1e-6]
-        fall = float(np.sum((left.T @ scanned.residual) ** 2))
-        out.append(Family(driver, tuple(texts), fall, left.shape[1], tuple(scanned.statistics[own].tolist()), same))
+        fall, dof = scanned.explained(np.concatenate(parts, axis=1))
+        out.append(Family(driver, tuple(texts), fall, dof, tuple(scanned.statistics[own].tolist()), same))
     return out, float(scanned.residual @ scanned.residual) - len(scanned.residual)
 
 

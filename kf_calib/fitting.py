@@ -169,9 +169,8 @@ def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
     squares, counts = np.zeros(3), 0
     for slew, columns in zip(carried.slews, carried.slew_columns, strict=True):
         model = np.moveaxis(columns @ state, 2, 1)  # (pieces, channels, nodes)
-        triangles = np.array([piece.triangle for piece in slew.pieces])
-        own = triangles[:, :, slew.width :].copy()
-        own[:, : slew.width] -= triangles[:, : slew.width, : slew.width] @ on_basis(np.moveaxis(model, 1, 2))
+        own = slew.triangles[:, :, slew.width :].copy()
+        own[:, : slew.width] -= slew.triangles[:, : slew.width, : slew.width] @ on_basis(np.moveaxis(model, 1, 2))
         squares, counts = squares + (own**2).sum(axis=(0, 1)), counts + slew.count
     sizes = np.sqrt(squares / counts) + FLOOR_MPS2
     factor = information.accumulated(fitted.all_rows(), fitted.steps)[:-1]

@@ -104,9 +104,20 @@ class DwellFactor:
         return self.pieces[0].triangle.shape[1] - 3
 
     @cached_property
+    def triangles(self) -> Floats:
+        """Of the pieces, (pieces, K + 3, K + 3)."""
+        return np.array([piece.triangle for piece in self.pieces])
+
+    @cached_property
+    def regressors(self) -> Floats:
+        """Rows of 1, f_x, f_y, f_z of each piece, (pieces, K, 4)."""
+        values = np.array([piece.nodes.regressors for piece in self.pieces])
+        return self.triangles[:, : self.width, :3] @ parabola(values)
+
+    @cached_property
     def squares(self) -> Floats:
         """Sums of squares of the readings about the functions of the basis, (pieces, 3)."""
-        return np.array([(piece.triangle[self.width :, self.width :] ** 2).sum(axis=0) for piece in self.pieces])
+        return (self.triangles[:, self.width :, self.width :] ** 2).sum(axis=1)
 
     @cached_property
     def counts(self) -> Floats:
@@ -124,7 +135,7 @@ class DwellFactor:
     def walk(self) -> Path:
         """What a walk of the biases does in it."""
         ends = np.array([piece.nodes.elapsed_s[[0, -1]] for piece in self.pieces])
-        triangles = np.array([piece.triangle[: self.width, : self.width] for piece in self.pieces])
+        triangles = self.triangles[:, : self.width, : self.width]
         return path(ends[:, 0], ends[:, 1], [piece.count for piece in self.pieces], triangles)
 
     @property
@@ -172,9 +183,8 @@ class DwellFactor:
         """Rows [X | z1 z2 z3] of plain columns known at the nodes of each piece, (3, c): ((K + 3) pieces, c + 3)."""
         width = columns[0].shape[1]
         out = np.zeros((len(self.pieces), self.width + 3, width + 3))
-        triangles = np.array([piece.triangle for piece in self.pieces])
-        out[:, :3, :width] = triangles[:, :3, :3] @ parabola(np.array(columns))
-        out[:, :, width:] = triangles[:, :, self.width :]
+        out[:, :3, :width] = self.triangles[:, :3, :3] @ parabola(np.array(columns))
+        out[:, :, width:] = self.triangles[:, :, self.width :]
         return out.reshape(-1, width + 3)
 
     def merged(self, other: DwellFactor) -> DwellFactor:
@@ -351,7 +361,7 @@ def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
     design = []
     for dwell, own in zip(dwells, columns, strict=True):
         width = dwell.width
-        first = np.array([piece.triangle[0, :width] / piece.triangle[0, 0] for piece in dwell.pieces])  # means of basis
+        first = dwell.triangles[:, 0, :width] / dwell.triangles[:, :1, 0]  # means of the basis
         weights = np.array([piece.count for piece in dwell.pieces]) / dwell.count
         coefficients = on_basis(own.reshape(*own.shape[:2], -1))
         design.append(np.einsum("b,bk,bkc->c", weights, first, coefficients).reshape(own.shape[2:]))

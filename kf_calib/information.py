@@ -14,7 +14,7 @@ import numpy as np
 
 from kf_calib import paper, walk
 from kf_calib.folding import DwellFactor
-from kf_calib.model import STATE_COUNT, Model, Prior, dwell_map, on_basis, parabola
+from kf_calib.model import STATE_COUNT, Model, Prior, dwell_map, on_basis
 from kf_calib.noise import FLOOR_MPS2, Noise, flicker_sigma, wander
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
@@ -55,9 +55,7 @@ def whitened(
     first_of_model = count + inside
     out = list[Floats]()
     for dwell, own in zip(dwells, columns, strict=True):
-        triangles = np.array([piece.triangle for piece in dwell.pieces])
-        force = np.array([piece.nodes.force_mps2 for piece in dwell.pieces])
-        regressors = triangles[:, : dwell.width, :3] @ parabola(np.insert(force, 0, 1.0, axis=2))
+        triangles, regressors = dwell.triangles, dwell.regressors
         carried, size, width = triangles[:, : dwell.width, : dwell.width], dwell.width * len(triangles), own.shape[-1]
         rows = np.zeros((3 * size + count, first_of_model + width + 1))
         turned = regressors @ nuisances[:, None]
@@ -166,7 +164,8 @@ def update(factor: Floats, rows: Floats, walked: Floats = _STILL) -> Step:
     the pause before the dwell and in the dwell."""
     width, (upper, count) = len(factor), walk.advanced(factor, walked, rows)
     after, left = upper[count : count + width, count:], upper[count + width :, -1]
-    gained = rank(after) - rank(factor)
+    known = rank(factor)
+    gained = rank(after) - known if known < width else 0
     return Step(after, float(left @ left), row_rank(rows) - gained)
 
 

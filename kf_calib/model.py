@@ -62,8 +62,11 @@ def parabola(values: Floats) -> Floats:
 
     Equal values give exact zeros: a column that stands still has no rows but its mean's.
     """
-    first, middle, last = np.moveaxis(values, -2, 0)
-    return np.stack([middle, 0.5 * (last - first), 0.5 * (first - middle) + 0.5 * (last - middle)], axis=-2)
+    first, middle, last = values[..., 0, :], values[..., 1, :], values[..., 2, :]
+    out = np.empty(values.shape)
+    out[..., 0, :], out[..., 1, :] = middle, 0.5 * (last - first)
+    out[..., 2, :] = 0.5 * (first - middle) + 0.5 * (last - middle)
+    return out
 
 
 def on_basis(values: Floats) -> Floats:

@@ -73,6 +73,12 @@ class Scan:
         """By how much adding each candidate would lower chi-squared; chi-squared of its dof if nothing is missing."""
         return np.array([np.sum((each.basis.T @ self.residual) ** 2) for each in self.candidates])
 
+    def explained(self, columns: Floats) -> tuple[float, int]:
+        """By how much all of these columns (d, q) of the frame together lower chi-squared, and their rank."""
+        left, singular, _ = np.linalg.svd(columns, full_matrices=False)
+        spanned = left[:, singular > 1e-6]
+        return float(np.sum((spanned.T @ self.residual) ** 2)), spanned.shape[1]
+
     def coefficients(self, candidate: Candidate) -> Floats:
         """Coefficients (q,) of a candidate, were it the only effect added."""
         return candidate.inverse @ (candidate.basis.T @ self.residual)

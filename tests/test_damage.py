@@ -14,8 +14,6 @@ from kf_calib.samples import Batch
 from kf_calib.sources.recorder import Recorder
 from kf_calib.sources.recording import Recording
 
-TRIALS = 200
-
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -44,12 +42,13 @@ def damaged(content: bytes, rng: np.random.Generator, how: str) -> bytes:
     return content[:place] + bytes([content[place] ^ (1 << int(rng.integers(8)))]) + content[place + 1 :]
 
 
+@pytest.mark.parametrize("trials", [70, pytest.param(1000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("how", ["truncated", "flipped"])
-def test_damage_is_told_or_harmless(whole: Path, tmp_path: Path, how: str) -> None:
+def test_damage_is_told_or_harmless(whole: Path, tmp_path: Path, how: str, trials: int) -> None:
     expected, content, rng = outcome(whole), whole.read_bytes(), np.random.default_rng(5)
     assert isinstance(expected, Calibration) and not expected.warnings
     told = 0
-    for trial in range(TRIALS):
+    for trial in range(trials):
         path = tmp_path / f"{trial}.mcap"
         path.write_bytes(damaged(content, rng, how))
         got = outcome(path)
@@ -62,4 +61,4 @@ def test_damage_is_told_or_harmless(whole: Path, tmp_path: Path, how: str) -> No
         else:
             np.testing.assert_array_equal(got.estimate.state, expected.estimate.state)
             assert got.tally.used == expected.tally.used
-    assert told > TRIALS / 2
+    assert told > trials / 2

@@ -37,13 +37,19 @@ def test_the_ten_lines_print_what_is_shown(tmp_path: Path) -> None:
     assert (tmp_path / "run.rrd").exists()
 
 
-def test_the_demo_prints_the_tables_that_are_shown(tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "kf_calib.cli", "demo", str(tmp_path / "out")]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=120)
+def test_the_demo_does_the_main_job_and_prints_the_tables_that_are_shown(tmp_path: Path) -> None:
+    """In a process of its own."""
+    out = tmp_path / "out"
+    words = [sys.executable, "-m", "kf_calib.cli", "demo", str(out)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     shown, printed = block_after("tools/demo", "text"), done.stdout
     table = slice(3, 27)  # parameters, and the heading of the noise
     assert printed.splitlines()[table] == shown.splitlines()[table]
+    assert "Model and measurements agree" in printed
+    apart = dict(re.findall(r"│ (\w+) +│ +[\d.]+ │ +[\d.]+ │ +([-+.\de]+) │", printed))
+    assert apart.keys() == {"block", "filterpy", "batch"} and max(map(float, apart.values())) <= 1e-6
+    assert all((out / f"demo.{kind}").exists() for kind in ("mcap", "truth.json", "rrd"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

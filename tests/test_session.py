@@ -280,7 +280,7 @@ def test_json_has_an_object_a_dwell_and_ends_with_what_replay_and_diagnose_say(t
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_finishes_the_file_and_prints_the_summary(tmp_path: Path, how: signal.Signals) -> None:
     out = tmp_path / "run.mcap"
-    slow = URL.replace("speed=500", "speed=20").replace("orientations=6", "orientations=200")
+    slow = URL.replace("speed=500", "speed=20").replace("orientations=6", "orientations=60")
     with live(slow, "--record", str(out)) as process:
         assert process.stdout is not None
         for line in process.stdout:
@@ -294,7 +294,7 @@ def test_a_signal_finishes_the_file_and_prints_the_summary(tmp_path: Path, how: 
 
 
 def test_nobody_reading_ends_a_run_that_is_not_recorded() -> None:
-    slow = URL.replace("speed=500", "speed=20").replace("orientations=6", "orientations=200")
+    slow = URL.replace("speed=500", "speed=20").replace("orientations=6", "orientations=60")
     with live(slow) as process:
         assert process.stdout is not None and process.stdout.readline()
         process.stdout.close()
@@ -383,7 +383,7 @@ def test_a_screen_on_a_terminal() -> None:
     import pty
 
     leader, follower = pty.openpty()
-    slow = URL.replace("speed=500", "speed=20").replace("orientations=6", "orientations=200")
+    slow = URL.replace("speed=500", "speed=20").replace("orientations=6", "orientations=60")
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "80", "LINES": "24"}
     process = subprocess.Popen(
         [sys.executable, "-m", "kf_calib.cli", "live", slow], cwd=ROOT, stdin=follower, stdout=follower,

@@ -21,10 +21,13 @@ import click
 from kf_calib.cli.making import overwrite_option, pair
 from kf_calib.cli.options import (
     bench_options,
+    columns_option,
     filter_options,
     json_option,
     overrides,
     print_json,
+    rrd_option,
+    save_model_option,
     settings_of,
     show,
     strict_option,
@@ -49,13 +52,7 @@ _KINDS = {"rad": ("rad", "deg", "arcmin", "arcsec"), "1": ("1", "ppm"), "m/s^2":
 @click.argument("source", metavar="SOURCE")
 @click.option("--record", type=click.Path(path_type=Path), metavar="OUT.mcap", help="Record the run here.")
 @overwrite_option
-@click.option(
-    "--column",
-    "columns",
-    multiple=True,
-    metavar="THEIRS=OURS",
-    help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.',
-)
+@columns_option
 @click.option("--header", default="", metavar="NAMES", help="Names of the columns of CSV rows that come without any.")
 @click.option(
     "--give-up-s",
@@ -80,8 +77,8 @@ _KINDS = {"rad": ("rad", "deg", "arcmin", "arcsec"), "1": ("1", "ppm"), "m/s^2":
 @click.option(
     "--rerun-bind", default="127.0.0.1", show_default=True, help="Address a viewer that is opened listens on."
 )
-@click.option("--rrd", type=click.Path(path_type=Path), help="Save the Rerun view here.")
-@click.option("--save-model", type=click.Path(path_type=Path), help="Save the model here, for --model to read.")
+@rrd_option
+@save_model_option
 @bench_options
 @filter_options
 @strict_option

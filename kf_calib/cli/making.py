@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kf_calib.cli.options import F, bench_options, json_option, overrides, print_json, progress, save_views, show
+from kf_calib.cli.options import (
+    F,
+    bench_options,
+    columns_option,
+    json_option,
+    overrides,
+    print_json,
+    progress,
+    save_views,
+    show,
+)
 from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
@@ -163,13 +173,7 @@ def simulate(out: Path, overwrite: bool, as_json: bool, **options: Any) -> None:
 @click.command()
 @click.argument("out", type=click.Path(path_type=Path))
 @click.argument("lines", type=click.Path(path_type=Path, allow_dash=True), default="-")
-@click.option(
-    "--column",
-    "columns",
-    multiple=True,
-    metavar="THEIRS=OURS",
-    help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.',
-)
+@columns_option
 @bench_options
 @overwrite_option
 @json_option

@@ -59,6 +59,15 @@ def recording_options(command: F) -> F:
     return bench_options(command)
 
 
+columns_option = click.option(
+    "--column", "columns", multiple=True, metavar="THEIRS=OURS",
+    help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.',
+)  # fmt: skip
+rrd_option = click.option("--rrd", type=click.Path(path_type=Path), help="Save the Rerun view here.")
+png_option = click.option("--png", type=click.Path(path_type=Path), help="Save a picture of the Rerun view here.")
+save_model_option = click.option(
+    "--save-model", type=click.Path(path_type=Path), help="Save the model here, for --model to read."
+)
 effects_from_option = click.option(
     "--effects-from", "effects_from", multiple=True, type=click.Path(path_type=Path), metavar="FILE.py",
     help="A Python file with effect classes of your own, for --with to name; repeatable.",

@@ -6,7 +6,15 @@ from pathlib import Path
 
 import click
 
-from kf_calib.cli.options import json_option, print_json, progress, save_pictures, show
+from kf_calib.cli.options import (
+    json_option,
+    png_option,
+    print_json,
+    progress,
+    rrd_option,
+    save_pictures,
+    show,
+)
 
 
 @click.command()
@@ -47,8 +55,8 @@ from kf_calib.cli.options import json_option, print_json, progress, save_picture
     show_default=True,
     help="Accelerometers read at once, or in turn in each orientation.",
 )
-@click.option("--rrd", type=click.Path(path_type=Path), help="Save the Rerun view here.")
-@click.option("--png", type=click.Path(path_type=Path), help="Save a picture of the Rerun view here.")
+@rrd_option
+@png_option
 @json_option
 def paper(
     repetitions: int, seed: int, period_s: float, latitude: float, azimuth: float, turns: str, sampled: str,

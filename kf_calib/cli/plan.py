@@ -15,9 +15,11 @@ from kf_calib.cli.options import (
     json_option,
     opened,
     overrides,
+    png_option,
     print_json,
     progress,
     recording_options,
+    rrd_option,
     save_pictures,
     show,
 )
@@ -71,8 +73,8 @@ def _plan_options(command: F) -> F:
         click.option("--seed", type=int, default=0, show_default=True, help="Seed of the order of visits."),
         click.option("--csv", "csv_file", type=click.Path(path_type=Path),
                      help="Save the angles, for simulate --plan."),
-        click.option("--rrd", type=click.Path(path_type=Path), help="Save the Rerun view here."),
-        click.option("--png", type=click.Path(path_type=Path), help="Save a picture of the Rerun view here."),
+        rrd_option,
+        png_option,
     ]  # fmt: skip
     for option in reversed(options):
         command = option(command)

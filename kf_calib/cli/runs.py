@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -16,25 +16,25 @@ from kf_calib.cli.options import (
     json_option,
     opened,
     overrides,
+    png_option,
     print_json,
     progress,
     recording_of,
     recording_options,
+    rrd_option,
+    save_model_option,
     save_views,
     settings_of,
     show,
     strict_option,
 )
 
-if TYPE_CHECKING:
-    pass
-
 
 @click.command()
 @click.argument("recording", type=click.Path(path_type=Path))
-@click.option("--rrd", type=click.Path(path_type=Path), help="Save the Rerun view here.")
-@click.option("--png", type=click.Path(path_type=Path), help="Save a picture of the Rerun view here.")
-@click.option("--save-model", type=click.Path(path_type=Path), help="Save the model here, for --model to read.")
+@rrd_option
+@png_option
+@save_model_option
 @recording_options
 @filter_options
 @strict_option
