@@ -22,14 +22,13 @@ from kf_calib.dwells import Block, Segmenter, Stillness, Tally, dwell_blocks
 from kf_calib.effects import of_the_users, remarks_of
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.fitting import WALK, Fit, fit
-from kf_calib.folding import Carried, DwellFactor, Folder, columns_of, means_of, samples_of
+from kf_calib.folding import Carried, DwellFactor, Folder, columns_of, lines_of, means_of, samples_of
 from kf_calib.held_out import held_out, orientations
 from kf_calib.information import Step
 from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
 from kf_calib.noise import Noise, considered, mean_covariances, steps
 from kf_calib.readings import Readings, Watch
 from kf_calib.samples import Floats, Mask, Source
-from kf_calib.spectrum import lines
 from kf_calib.visibility import sights
 from kf_calib.walk import predicted, to_mean
 
@@ -398,9 +397,9 @@ def _on_carrier(
     """The source folded again on a carrier at the frequency of the model's oscillation, until it is near enough.
 
     The first carrier is the line in the spectrum; without one, the oscillation is slow, and found on the plain dwells.
-    What a parabola leaves of a slow one makes a line of a few cycles a dwell: there the less noise decides.
+    What a parabola leaves of a slow one makes a line of a few cycles a dwell: there the likelier one is taken.
     """
-    seen = lines(dwell.spectrum for dwell in dwells)
+    seen = lines_of(dwells)
     if not seen:
         plain = plain or _fitted(passed, dwells)
         return (passed, plain) if _followed(plain) else _nearer(passed, plain, on_progress)
@@ -408,7 +407,13 @@ def _on_carrier(
     found = [_nearer(passed, seen[0].frequency_hz, on_progress)]
     if seen[0].frequency_hz * shortest_s < _CYCLES:
         found.append(_nearer(passed, plain or _fitted(passed, dwells), on_progress))
-    return min(found, key=lambda each: float(np.log(each[1].noise.effective_sigma_mps2).sum()))
+    return min(found, key=lambda each: _unlikeliness(each[1]))
+
+
+def _unlikeliness(fitted: Fit) -> float:
+    """-2 ln of the likelihood of the noise within dwells and of the misfit of the model, but for a constant."""
+    sigma, count = fitted.noise.effective_sigma_mps2, sum(dwell.count for dwell in fitted.dwells)
+    return 2.0 * count * float(np.log(sigma).sum()) + consistency(fitted).statistic
 
 
 def _followed(fitted: Fit) -> bool:
@@ -418,12 +423,10 @@ def _followed(fitted: Fit) -> bool:
     if not fitted.carried.model.oscillates or dwells[0].carrier_hz:
         return True
     longest_s = max(dwell.end_s - dwell.start_s for dwell in dwells)
-    return _oscillation_hz(fitted) * longest_s < _SLOW and not lines(dwell.spectrum for dwell in dwells)
+    return _oscillation_hz(fitted) * longest_s < _SLOW and not lines_of(dwells)
 
 
-def _nearer(
-    passed: Pass, carrier: float | Fit, on_progress: Callable[[float], None] | None
-) -> tuple[Pass, Fit]:
+def _nearer(passed: Pass, carrier: float | Fit, on_progress: Callable[[float], None] | None) -> tuple[Pass, Fit]:
     """The source folded on a carrier, in Hz or where a fit has the oscillation, and the fit there."""
     carrier_hz = _oscillation_hz(carrier) if isinstance(carrier, Fit) else carrier
     for left in reversed(range(_CARRIERS)):

@@ -23,13 +23,14 @@ from kf_calib.calibration import Calibration, Parameter, consistency, format_p, 
 from kf_calib.drivers import JUMP, Family, families
 from kf_calib.effects import Effect, effect_named, names
 from kf_calib.fitting import WALK, Fit, walk_gain
-from kf_calib.folding import stimulus_of
+from kf_calib.folding import DwellFactor, lines_of, stimulus_of
 from kf_calib.likelihood import FEWEST
 from kf_calib.model import Model
 from kf_calib.noise import mean_covariances
 from kf_calib.samples import Floats
 from kf_calib.scan import Candidate, Scan, falls, scan
-from kf_calib.spectrum import Line, lines, lowest_hz
+from kf_calib.spectrum import Line, lowest_hz
+from kf_calib.trace import band_hz
 
 LEVEL = 0.01
 """Chance of a false alarm a run."""
@@ -166,8 +167,10 @@ def _scanned(fitted: Fit) -> Scan:
     if effect is None or carried.model.oscillates:
         return scan(carried, noise, candidates(carried.model))
     values = _slow(fitted, effect)
+    if not len(values):
+        return scan(carried, noise, candidates(carried.model))
     coarse = falls(carried, noise, [effect.at(value) for value in values])
-    near = values[np.argmax(coarse)] + 0.25 * (values[1] - values[0]) * np.arange(-3, 4)
+    near = values[np.argmax(coarse)] + 0.125 * values[0] * np.arange(-3, 4)
     slow = [effect.at(value) for value in near]
     swinging = slow[int(np.argmax(falls(carried, noise, slow)))]
     found = scan(carried, noise, [*candidates(carried.model), swinging])
@@ -181,10 +184,16 @@ def _oscillation(model: Model) -> Effect | None:
 
 
 def _slow(fitted: Fit, effect: Effect) -> Floats:
-    """Frequencies of oscillations too slow for lines, in halves of 1/run: from a cycle a run up."""
+    """Frequencies of oscillations too slow to show within dwells, in halves of 1/run: from a cycle a run up."""
     stimulus = stimulus_of(fitted.dwells, fitted.carried.model.bench, fitted.carried.state)
     values = effect.grid(stimulus)[2::2]
-    return values[values < lowest_hz(dwell.spectrum for dwell in fitted.dwells)]
+    return values[values < min(_searched_hz(fitted.dwells))]
+
+
+def _searched_hz(dwells: Sequence[DwellFactor]) -> tuple[float, float, float]:
+    """From which frequency to which a steady oscillation is looked for, and from which on lines; infinite: not."""
+    steady, first = band_hz([dwell.trace for dwell in dwells]), lowest_hz(dwell.spectrum for dwell in dwells)
+    return *steady, first
 
 
 def _with_lines(test: Test, fitted: Fit) -> Test:
@@ -194,12 +203,13 @@ def _with_lines(test: Test, fitted: Fit) -> Test:
     effect = _oscillation(fitted.carried.model)
     if effect is None or fitted.carried.model.oscillates:
         return test
-    name, spectra = str(effect), [dwell.spectrum for dwell in fitted.dwells]
-    top, first = float(_slow(fitted, effect)[-1]), lowest_hz(spectra)
-    if first > 1.5 * top:
-        band = f"of {top:.2g} to {first:.2g} Hz" if np.isfinite(first) else f"above {top:.2g} Hz"
-        test = replace(test, between=f"{name} {band}")
-    seen = lines(spectra, LEVEL * _LINES)
+    name, slow, (low, high, first) = str(effect), _slow(fitted, effect), _searched_hz(fitted.dwells)
+    top = float(slow[-1]) if len(slow) else low
+    gaps = [(top, low), (high, first)] if np.isfinite(low) else [(top, first)]
+    bands = [f"of {a:.2g} to {b:.2g} Hz" if np.isfinite(b) else f"above {a:.2g} Hz" for a, b in gaps if b > 1.5 * a]
+    if bands:
+        test = replace(test, between=f"{name} {' and '.join(bands)}")
+    seen = lines_of(fitted.dwells, LEVEL * _LINES)
     if not seen:
         return test
     p_value = seen[0].p_value

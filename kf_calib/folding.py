@@ -23,7 +23,8 @@ from kf_calib.bench import Bench
 from kf_calib.effects import Effect, Stimulus
 from kf_calib.model import Model, Nodes, Rows, basis, effect_columns, on_basis, parabola
 from kf_calib.samples import Floats
-from kf_calib.spectrum import Spectrum
+from kf_calib.spectrum import Line, Spectrum, lines
+from kf_calib.trace import Cells, Trace, tone
 from kf_calib.triangle import triangle
 from kf_calib.walk import Path, path
 
@@ -80,7 +81,8 @@ class Piece:
 
 @dataclass(frozen=True)
 class DwellFactor:
-    """One dwell: its pieces in order of time, and the autocovariance and the spectrum of its first readings.
+    """One dwell: its pieces in order of time, its readings in cells of the run's clock, and the autocovariance and the
+    spectrum of its first readings.
 
     moving: it is the slew after the dwell of that number, folded like a dwell. came_from: the dwell before it, where
     that one is left out (None: it is there, or there was none).
@@ -90,6 +92,7 @@ class DwellFactor:
     pieces: tuple[Piece, ...]
     autocovariance: Autocovariance = field(default_factory=Autocovariance)
     spectrum: Spectrum = field(default_factory=Spectrum)
+    trace: Trace = field(default_factory=Trace)
     moving: bool = False
     came_from: DwellFactor | None = None
 
@@ -195,6 +198,7 @@ class DwellFactor:
             pieces=tuple(pieces),
             autocovariance=self.autocovariance + other.autocovariance,
             spectrum=self.spectrum + other.spectrum,
+            trace=self.trace + other.trace,
         )
 
     def repeated(self, times: float) -> DwellFactor:
@@ -321,6 +325,15 @@ def _varying(dwells: Sequence[DwellFactor]) -> Floats:
     return np.where(excess > _VIBRATING, at_nodes, mean)
 
 
+def lines_of(dwells: Sequence[DwellFactor], level: float = 0.01) -> tuple[Line, ...]:
+    """Oscillations in the readings of dwells, by a test of ``level``: the lines of their spectra, else one that is too
+    weak for these and keeps its phase from dwell to dwell."""
+    seen = lines((dwell.spectrum for dwell in dwells), 0.5 * level)
+    steady = None if seen else tone([dwell.trace for dwell in dwells], 0.5 * level)
+    found = seen or ((steady,) if steady else ())
+    return tuple(replace(line, p_value=min(1.0, 2.0 * line.p_value)) for line in found)
+
+
 def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[Floats]:
     """The model's columns at the nodes of each dwell, (pieces, K nodes, 3 channels, p)."""
     return _by_dwell(dwells, lambda s: model.columns(s, state), stimulus_of(dwells, model.bench, state))
@@ -441,6 +454,7 @@ class Folder:
         self.dwells: list[DwellFactor] = []
         self.slews: list[DwellFactor] = []
         self.carrier_hz = carrier_hz
+        self._cells: Cells | None = None
 
     def add(self, rows: Rows) -> None:
         folded = self.slews if rows.moving else self.dwells
@@ -451,6 +465,9 @@ class Folder:
             left = less_curve(rows.innovation, rows.elapsed_s, self.carrier_hz)
             own, spectrum = Autocovariance.of(left), Spectrum.of(left, rows.elapsed_s)
             block = replace(block, autocovariance=own, spectrum=spectrum)
+        self._cells = self._cells or Cells.of(rows.elapsed_s)
+        if self._cells and not rows.moving and not block.averaged:
+            block = replace(block, trace=Trace.of(rows.readings, rows.elapsed_s, self._cells))
         if current is None:
             folded.append(block)
         else:

@@ -119,7 +119,7 @@ class _Search:
         self.level = np.column_stack([np.broadcast_to(each, len(self.power)) for each in level])
         self.heights = self.power / self.level
         self.height = self.heights[:, moving].mean(axis=1)
-        self.freedom = 2.0 * own.segments * _independent(self.heights[_FIRST_BIN:-1, moving])
+        self.freedom = 2.0 * own.segments * independent(self.heights[_FIRST_BIN:-1, moving])
 
     def lines(self, level: float) -> tuple[Line, ...]:
         found, open_ = list[Line](), self._peaks()
@@ -166,7 +166,7 @@ class _Search:
         return Line(place * self.bin_hz, p_value, int(np.argmax(self.heights[k])), amplitude), place
 
 
-def _independent(heights: Floats) -> float:
+def independent(heights: Floats) -> float:
     """How many independent channels the mean of heights (b, c) is worth: c^2 / sum of their correlations."""
     count = heights.shape[1]
     if count == 1:

@@ -84,11 +84,11 @@ def test_a_line_is_named_with_its_frequency() -> None:
     assert abs(frequency.value - 7.3) < 5.0 * frequency.sigma < 0.01
 
 
-@pytest.mark.parametrize("frequency_hz", [0.01, 0.1, 0.3])
+@pytest.mark.parametrize("frequency_hz", [0.01, 0.1, 0.3, 1.5])
 def test_a_slow_oscillation_is_named_with_its_frequency(frequency_hz: float) -> None:
-    """Too slow for a line in the spectrum: three cycles a run, one and two cycles a dwell."""
+    """Too slow or too weak for a line in the spectrum: three cycles a run, one and two cycles a dwell, ten."""
     found = diagnose(run(f"sinusoid=15sigma;frequency={frequency_hz}"))
-    assert found.missing == ("sinusoid",) and not found.test.lines and found.after is not None
+    assert found.missing == ("sinusoid",) and found.after is not None
     frequency = found.after.parameters["fSin"]
     assert frequency.value is not None and frequency.sigma is not None
     assert abs(frequency.value - frequency_hz) < 4.0 * frequency.sigma < 1e-3
@@ -103,9 +103,9 @@ def test_one_cycle_a_run_is_not_told_from_what_the_temperature_does() -> None:
 
 
 def test_what_the_run_has_no_sight_of_is_said() -> None:
-    """40 readings a dwell have no spectrum: what is faster than their pieces show is not seen."""
+    """40 readings a dwell have no spectrum: what is faster than their cells show is not seen."""
     test = assessed(calibrate(Run(count=40, rate_hz=1.0)).fit)
-    assert test.between.startswith("sinusoid above 0.1") and test.between in test.invisible
+    assert test.between == "sinusoid above 0.38 Hz" and test.between in test.invisible
     assert not assessed(run().fit).between
 
 

@@ -16,7 +16,7 @@ LEVELS = [
     ["bench"],
     ["effects", "slews"],
     ["triangle", "dwells", "paper", "gate", "spectrum"],
-    ["averaging", "walk"],
+    ["averaging", "trace", "walk"],
     ["model"],
     ["folding"],
     ["noise"],
