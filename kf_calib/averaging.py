@@ -1,4 +1,4 @@
-"""Readings averaged over windows of a second, before anything else is made of them.
+"""Readings averaged over windows of a second or more, before anything else is made of them.
 
 Vibration of the bench is thousands of times the noise of a good accelerometer, and averages away a thousand times
 better than noise of that size would: what it leaves in the mean of a dwell are the cycles cut off at the ends. Windows
@@ -7,6 +7,7 @@ that rise and fall smoothly cut nothing off, and what remains of the readings in
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -15,20 +16,29 @@ from numpy.lib.stride_tricks import sliding_window_view
 from kf_calib.dwells import Block
 from kf_calib.samples import Floats
 
-_WINDOW_S = 1.0
+WINDOW_S = 1.0
+"""Usual length of a window."""
+
+_CYCLES = 20.0  # a window: a millionth of an oscillation is left, and windows are short enough for what comes and goes
 _WINDOWS = 4  # one after another, at least, in a block
 _OVERLAP = 3  # each reading lies in as many windows: with them a Hann window's squares add up to a constant
 _SHORTEST_S = 0.5  # blocks that are shorter are left out: a window in them is no longer than the vibration's periods
 
 
-def averaged(block: Block) -> Block | None:
+def window_s(frequencies_hz: Iterable[float]) -> float:
+    """Length of windows that average vibration of these frequencies away, as it is seen in the readings."""
+    return max([WINDOW_S, *(_CYCLES / frequency_hz for frequency_hz in frequencies_hz)])
+
+
+def averaged(block: Block, length_s: float = WINDOW_S) -> Block | None:
     """A block of averages over windows cos^4, with the variance of the readings in each; None: it is too short.
 
     Side lobes of the window fall as the fifth power of the frequency: at 30 cycles a window 1e-7 of an oscillation is
-    left. Variances are about a parabola over the block: what shakes has no mean in a window as short.
+    left. A window is no longer than a quarter of the block. Variances are about a parabola over the block: what shakes
+    has no mean in a window as short.
     """
     count, span_s = len(block.elapsed_s), float(block.elapsed_s[-1] - block.elapsed_s[0])
-    length = int(min(_WINDOW_S / max(span_s, 1e-9), 1.0 / _WINDOWS) * count)
+    length = int(min(length_s / max(span_s, 1e-9), 1.0 / _WINDOWS) * count)
     if span_s < _SHORTEST_S or length < _OVERLAP:
         return None
     weights = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 4

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from kf_calib import information, kalman, paper
+from kf_calib import averaging, information, kalman, paper
 from kf_calib.bench import Bench
 from kf_calib.dwells import Block, Segmenter, Stillness, Tally, dwell_blocks
 from kf_calib.effects import of_the_users, remarks_of
@@ -46,7 +46,8 @@ class Settings:
     """How a run is evaluated.
 
     walk_mps2_per_sqrt_s: random walk of the biases (process noise), 0: none. effects: names of those in the model.
-    averaged: readings are averaged over windows first, as they are for effects that go with vibration.
+    window_s: readings are averaged over windows of that length first; 0: only for effects that go with vibration, then
+    over windows of a second, or as long as the vibration needs that is seen.
     """
 
     engine: Engine = "block"
@@ -55,7 +56,7 @@ class Settings:
     gate_sigma: float | None = 6.0
     walk_mps2_per_sqrt_s: float = 0.0
     effects: tuple[str, ...] = ()
-    averaged: bool = False
+    window_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -297,8 +298,9 @@ class Pass:
 
     def rows_of(self, blocks: Iterable[Block]) -> Iterator[Rows]:
         model = Model.of(self.source.bench, self.settings.effects)
-        averages = model.averages or (self.settings.averaged and not model.oscillates)
-        return model_rows(blocks, self.source.bench, self.tally, self.settings.gate_sigma, averages)
+        usual_s = averaging.WINDOW_S if model.averages else 0.0
+        window_s = 0.0 if model.oscillates else self.settings.window_s or usual_s
+        return model_rows(blocks, self.source.bench, self.tally, self.settings.gate_sigma, window_s)
 
     def add(self, rows: Rows) -> None:
         self.folder.add(rows)
@@ -329,11 +331,20 @@ def calibrate(
     plain: the fit of the same model to the dwells as they are, which is known to need them folded on a carrier.
     Raises InputError where the source holds nothing usable, UnobservableError where one orientation was visited only.
     """
-    passed = Pass(source, settings or Settings())
+    settings = settings or Settings()
     with threadpool_limits(1, user_api="blas"):  # small decompositions: with threads they take three times as long
+        if Model.of(source.bench, settings.effects).averages and not settings.window_s:
+            settings = replace(settings, window_s=_window_s(source, settings))
+        passed = Pass(source, settings)
         if plain is None:
             passed.fold(on_progress)
         return concluded(passed, source, on_progress, plain)
+
+
+def _window_s(source: Source, settings: Settings) -> float:
+    """Length of the windows that average the vibration in a source away: from a pass of its own."""
+    plain = Pass(source, replace(settings, effects=()))
+    return averaging.window_s(line.frequency_hz for line in lines_of(usable(plain.fold())))
 
 
 def concluded(

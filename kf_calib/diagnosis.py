@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from kf_calib import advice as advise
+from kf_calib import averaging
 from kf_calib.advice import Advice
 from kf_calib.calibration import Calibration, Parameter, consistency, format_p, refitted
 from kf_calib.drivers import JUMP, Family, families
@@ -335,7 +336,8 @@ def _diagnosed(before: Calibration) -> Diagnosis:
         test = test.without_lines
         found = _explained(before, test)
     if test.vibration and not before.fit.dwells[0].averaged and before.reread is not None:
-        rested = before.reread(replace(before.settings, averaged=True))
+        window_s = averaging.window_s(line.frequency_hz for line in test.vibration)
+        rested = before.reread(replace(before.settings, window_s=window_s))
         still = assessed(rested.fit)
         still = still.without_lines or still  # what the windows let through is vibration, too
         found = _explained(rested, replace(still, vibration=test.vibration))
@@ -359,7 +361,24 @@ def _explained(before: Calibration, test: Test) -> Diagnosis:
         least = test.scores[first] + (2.0 if first == test.walking else 1.0) * _EQUAL
         clearly = {pair: score for pair, score in pairs.items() if score > least}
         return _two(found, clearly, explaining[0].name) or _one(found, explaining[0], pairs)
-    return _two(found, pairs) or replace(found, unknown=not _may_scatter(before))
+    several = _two(found, pairs) or _beside_lines(found)
+    return several or replace(found, unknown=not _may_scatter(before))
+
+
+def _beside_lines(found: Diagnosis) -> Diagnosis | None:
+    """What explains the misfit beside the oscillation that makes the lines: that has no column to be paired with."""
+    test = found.test
+    if not test.oscillating:
+        return None
+    known = with_effects(found.before, (test.oscillating,))
+    rest = _explained(known, assessed(known.fit, test.effective_tests))
+    if not rest.missing:
+        return None
+    both = (*rest.missing, test.oscillating)
+    ambiguity = (*both, *(name for name in rest.ambiguity if name not in both))
+    return replace(
+        found, missing=both, ambiguity=ambiguity, overlaps=rest.overlaps, together=rest.together, after=rest.after
+    )
 
 
 def _may_scatter(before: Calibration) -> bool:
@@ -481,14 +500,16 @@ def _two(found: Diagnosis, pairs: dict[tuple[int, int], float], alone: str = "")
     alone: a single one that would do, if not as well; a walk can take any path, so it stays in the set.
     """
     test, candidates = found.test, found.test.scan.candidates
-    for pair in sorted(pairs, key=lambda pair: -pairs[pair])[:_PAIRS]:
-        names = _names_of(test, pair)
-        if not _beyond_scatter(found.before, test, names):
+    likeliest = dict[tuple[str, str], tuple[int, int]]()  # of the values of their constants
+    for pair in sorted(pairs, key=lambda pair: -pairs[pair]):
+        likeliest.setdefault(_names_of(test, pair), pair)
+    for both, pair in list(likeliest.items())[:_PAIRS]:
+        if not _beyond_scatter(found.before, test, both):
             continue
-        refit = with_effects(found.before, names)
+        refit = with_effects(found.before, both)
         if not _fits(refit, test):
             continue
-        if _outdone(found, refit, names):
+        if _outdone(found, refit, both):
             return None
         overlaps = {alone: 1.0} if alone and alone == test.walking else dict[str, float]()
         for other, score in pairs.items():
@@ -496,10 +517,10 @@ def _two(found: Diagnosis, pairs: dict[tuple[int, int], float], alone: str = "")
             if score > pairs[pair] - _EQUAL and len(shared) == 1:
                 (lost,), (new,) = set(pair) - shared, set(other) - shared
                 name, alike = str(candidates[new].effect), candidates[lost].overlap(candidates[new])
-                if alike > max(_ALIKE, overlaps.get(name, 0.0)) and name not in names:
+                if alike > max(_ALIKE, overlaps.get(name, 0.0)) and name not in both:
                     overlaps[name] = alike
-        both = replace(found, missing=names, ambiguity=(*names, *overlaps), overlaps=overlaps, after=refit)
-        return _beside(both, _as_good(test, pairs, pairs[pair], names))
+        named = replace(found, missing=both, ambiguity=(*both, *overlaps), overlaps=overlaps, after=refit)
+        return _beside(named, _as_good(test, pairs, pairs[pair], both))
     return None
 
 
@@ -635,10 +656,13 @@ def _verdict(found: Diagnosis) -> str:
             named = f"Missing: {first}{_size(found)}"
             if len(found.ambiguity) > 1 or (first == test.walking and test.as_scatter):
                 named = f"Best: {first}{_size(found)}"
-        told = [f"{name} (overlap {overlap:.2f})" for name, overlap in found.overlaps.items()]
-        alone = [f"{name} alone" for name in found.overlaps if name == test.walking]
+        instead = "" if len(found.missing) == 1 else "in the place of one of them, "
         told = [
-            *(told if len(found.missing) == 1 else alone),
+            f"{name} alone" if instead and name == test.walking else f"{name} ({instead}overlap {overlap:.2f})"
+            for name, overlap in found.overlaps.items()
+        ]
+        told = [
+            *told,
             *(f"{' and '.join(pair)} together" for pair in found.together),
             *(["dwells that scatter by more than is stated"] if first == test.walking and test.as_scatter else []),
         ]

@@ -259,11 +259,12 @@ def dwell_map(state: Floats) -> Floats:
 
 
 def model_rows(
-    blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0, averages: bool = False
+    blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0, window_s: float = 0.0
 ) -> Iterator[Rows]:
     """Rows of every block, outliers gated out; the same rows feed both engines and batch least squares.
 
-    averages: rows of averaged readings; blocks too short for it are left out.
+    window_s: rows of readings averaged over windows of that length, 0: they are not. Blocks too short for it are left
+    out, and outliers are sought among the averages: a vibration that comes and goes has its own in the readings.
     """
     standing: tuple[Floats, Floats] | None = None  # a pose and its force: the same for all blocks of a dwell
     for block in blocks:
@@ -274,8 +275,12 @@ def model_rows(
         if static and (standing is None or standing[0] is not block.pose):
             standing = block.pose, bench.specific_force(np.zeros(1), block.pose)
         force = standing[1] if static and standing else None
-        rows = _rows(block, bench, force)
-        if gate_sigma is not None:
+        raw = _rows(block, bench, force)
+        means = averaged(block, window_s) if window_s else block
+        if means is None:
+            continue
+        block, rows = means, _rows(means, bench, force) if window_s else raw
+        if gate_sigma is not None and (not window_s or len(rows.readings) >= _GATED):
             keep = gate.inliers(rows.columns, rows.readings, rows.innovation, static, gate_sigma)
             if keep is not None:
                 tally.gated += int((~keep).sum())
@@ -283,12 +288,7 @@ def model_rows(
                 block = _kept(block, keep)
                 rows = _rows(block, bench, force)
                 rows = replace(rows, gated=gate.channels(out, rows.innovation, gate_sigma))
-        if averages:
-            means = averaged(block)
-            if means is not None:
-                yield replace(_rows(means, bench, force), raw=rows, taken=means.taken)
-            continue
-        yield rows
+        yield replace(rows, raw=raw, taken=block.taken) if window_s else rows
 
 
 def _kept(block: Block, keep: Mask) -> Block:
@@ -299,6 +299,7 @@ def _kept(block: Block, keep: Mask) -> Block:
         accel_mps2=block.accel_mps2[keep],
         pose=pose,
         temperature_c=block.temperature_c[keep],
+        variance_mps2_2=None if block.variance_mps2_2 is None else block.variance_mps2_2[keep],
     )
 
 
@@ -342,6 +343,8 @@ def _spread(elapsed_s: Floats) -> tuple[Floats, Floats]:
     return (elapsed_s - middle) / half, np.array([elapsed_s[0], middle, elapsed_s[-1]])
 
 
+_GATED = 32  # averages of a block, at least, among which an outlier can be told
+_GATED = 32  # averages of a block, at least, among which an outlier can be told
 _EDGES_S = np.concatenate([2.0 ** np.arange(6), 60.0 * np.arange(1, 20_000)])
 """A dwell is cut into pieces where 1, 2, 4 ... s have passed since the arrival, and at every further minute."""
 

@@ -165,11 +165,11 @@ def test_vibration_rectification_is_found_at_the_size_white_noise_allows() -> No
 
 def test_averages_of_still_readings_say_the_same_with_hardly_less_information() -> None:
     source = run([], 5e-5, plan=spread_plan(24, dwell_s=15.0, seed=4))
-    whole, means = calibrate(source), calibrate(source, Settings(averaged=True))
+    whole, means = calibrate(source), calibrate(source, Settings(window_s=1.0))
     ratio = means.estimate.sigma / whole.estimate.sigma
     assert 0.9 < ratio.min() and ratio.max() < 1.2 and means.consistency.consistent
     assert (np.abs(means.estimate.parameters - whole.estimate.parameters) < whole.estimate.sigma).all()
-    assert compare(run([], 5e-5, plan=CHEAP), Settings(averaged=True)).max_difference_sigma <= 1e-6
+    assert compare(run([], 5e-5, plan=CHEAP), Settings(window_s=1.0)).max_difference_sigma <= 1e-6
 
 
 def sweep_plan(source: Simulation, step_rad: float = 2e-4) -> list[Visit]:
