@@ -15,6 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from kf_calib.dwells import Block
 from kf_calib.samples import Floats
+from kf_calib.spectrum import Line
 
 WINDOW_S = 1.0
 """Usual length of a window."""
@@ -25,9 +26,13 @@ _OVERLAP = 3  # each reading lies in as many windows: with them a Hann window's 
 _SHORTEST_S = 0.5  # blocks that are shorter are left out: a window in them is no longer than the vibration's periods
 
 
-def window_s(frequencies_hz: Iterable[float]) -> float:
-    """Length of windows that average vibration of these frequencies away, as it is seen in the readings."""
-    return max([WINDOW_S, *(_CYCLES / frequency_hz for frequency_hz in frequencies_hz)])
+def window_s(lines: Iterable[Line]) -> float:
+    """Length of windows that average away the strongest of the lines that a vibration makes in the readings.
+
+    One that is read too slowly is seen at another frequency, and leaves as much as if it had that.
+    """
+    strongest = max(lines, key=lambda line: float(np.linalg.norm(line.amplitude_mps2)), default=None)
+    return WINDOW_S if strongest is None else max(WINDOW_S, _CYCLES / strongest.frequency_hz)
 
 
 def averaged(block: Block, length_s: float = WINDOW_S) -> Block | None:

@@ -344,7 +344,7 @@ def calibrate(
 def _window_s(source: Source, settings: Settings) -> float:
     """Length of the windows that average the vibration in a source away: from a pass of its own."""
     plain = Pass(source, replace(settings, effects=()))
-    return averaging.window_s(line.frequency_hz for line in lines_of(usable(plain.fold())))
+    return averaging.window_s(lines_of(usable(plain.fold())))
 
 
 def concluded(

@@ -336,7 +336,7 @@ def _diagnosed(before: Calibration) -> Diagnosis:
         test = test.without_lines
         found = _explained(before, test)
     if test.vibration and not before.fit.dwells[0].averaged and before.reread is not None:
-        window_s = averaging.window_s(line.frequency_hz for line in test.vibration)
+        window_s = averaging.window_s(test.vibration)
         rested = before.reread(replace(before.settings, window_s=window_s))
         still = assessed(rested.fit)
         still = still.without_lines or still  # what the windows let through is vibration, too

@@ -126,6 +126,14 @@ def test_two_effects_with_a_constant_each_are_both_found() -> None:
         assert own.value is not None and own.sigma is not None and abs(own.value - truth) < 4.0 * own.sigma
 
 
+def test_an_oscillation_and_another_effect_are_both_found() -> None:
+    """The one shows within dwells, the other between them: neither alone explains it, and the one is no column."""
+    found = diagnose(run("base-tilt=12sigma", "sinusoid=12sigma;frequency=0.9"))
+    assert set(found.missing) == {"base-tilt", "sinusoid"}, found.verdict
+    assert found.after is not None and found.after.consistency.consistent
+    assert found.after.parameters["fSin"].value == pytest.approx(0.9, abs=1e-3)
+
+
 def test_vibration_is_no_oscillation_of_one_amplitude_and_what_it_rectifies_is_named() -> None:
     """With a line of 3 m/s^2 in the readings; of vibration alone nothing is said but that it is there."""
     found = diagnose(run("vibration-rectification=15sigma"))

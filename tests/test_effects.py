@@ -163,6 +163,16 @@ def test_vibration_rectification_is_found_at_the_size_white_noise_allows() -> No
         assert bare.noise.effective_sigma_mps2.min() > 1.0  # where the readings themselves are folded
 
 
+def test_windows_are_as_long_as_the_vibration_that_is_seen_needs() -> None:
+    """33.7 Hz read 6 times a second show as 2.3 Hz: windows of a second would let a thousandth of 3 m/s^2 through."""
+    hidden, seed = ["vibration-rectification=4e-5,-3e-5,2e-5"], 3
+    source = run(hidden, 5e-5, seed, spread_plan(24, dwell_s=60.0, seed=4), sample_hz=6.0)
+    result = with_effect("vibration-rectification", source)
+    assert 8.0 < result.settings.window_s < 9.0
+    for (value, sigma), truth in zip(values(result).values(), source.hidden[0].sizes, strict=True):
+        assert abs(value - truth) < 4.0 * sigma < 8e-6
+
+
 def test_averages_of_still_readings_say_the_same_with_hardly_less_information() -> None:
     source = run([], 5e-5, plan=spread_plan(24, dwell_s=15.0, seed=4))
     whole, means = calibrate(source), calibrate(source, Settings(window_s=1.0))
