@@ -52,9 +52,11 @@ class Continuity:
         self._judge()  # those that came before enough was known
 
     def _judge(self) -> None:
-        if not self._limit_ns:
+        if not (self._limit_ns and len(self._unjudged)):
             return
         steps, self._unjudged = self._unjudged, self._unjudged[:0]
+        if not self._owed and 0.5 * self._period_ns <= steps.min() and steps.max() <= self._limit_ns:
+            return  # as nearly all of them are
         room = steps / self._period_ns - 1.0
         is_gap, is_hurried = steps > self._limit_ns, steps < 0.5 * self._period_ns
         self.gaps += int(is_gap.sum())

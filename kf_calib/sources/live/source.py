@@ -343,10 +343,11 @@ class LiveSource:
     def _storable(self, stream: Stream) -> Stream:
         """The samples whose stamps a recording can hold; the others are refused."""
         fits = (stream.time_ns >= 0) & (stream.time_ns < _LATEST_NS)
-        if not fits.all():
-            account = self._feed.account
-            for _ in range(int((~fits).sum())):
-                account.refuse(account.lines, "its time stamp is not between 1970 and 2038")
+        if fits.all():
+            return stream
+        account = self._feed.account
+        for _ in range(int((~fits).sum())):
+            account.refuse(account.lines, "its time stamp is not between 1970 and 2038")
         return stream[fits]
 
     def _count(self, batch: Batch) -> None:
