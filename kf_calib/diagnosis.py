@@ -686,16 +686,17 @@ def _verdict(found: Diagnosis) -> str:
 
 
 def _size(found: Diagnosis) -> str:
-    """The largest coefficient of the first name, in sigma, with its unit."""
+    """The largest coefficient of the first name, in sigma, with its unit; and the constant it has."""
     assert found.after is not None
+    parameters = found.after.parameters
     first = next(each for each in found.after.model.effects if str(each) == found.missing[0])
-    sized = [found.after.parameters[c.symbol] for c in ([WALK] if first.walks else first.coefficients)]
-    seen = [p for p in sized if p.value is not None and p.sigma]
-    if not seen:
-        return ""
-    top = max(seen, key=lambda p: abs(p.value or 0.0) / (p.sigma or 1.0))
-    return (
-        f", {top.symbol} = {(top.value or 0) * top.per_si:.3g} ± {(top.sigma or 0) * top.per_si:.2g} {top.shown_unit}"
+    sized = [parameters[c.symbol] for c in ([WALK] if first.walks else first.coefficients)]
+    shown = [max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or np.inf))]
+    shown += [parameters[first.unknown.symbol]] if first.unknown else []
+    return "".join(
+        f", {p.symbol} = {p.value * p.per_si:.3g} ± {p.sigma * p.per_si:.2g} {p.shown_unit}"
+        for p in shown
+        if p.value is not None and p.sigma
     )
 
 

@@ -86,7 +86,7 @@ class Trace:
         if not len(self) or not len(other):
             return self if len(self) else other
         first, end = min(self.first, other.first), max(self.first + len(self), other.first + len(other))
-        if end - first > _LONGEST:
+        if end - first > _LONGEST or other.cell_s != self.cell_s:
             return self
         sums, counts = np.zeros((end - first, 3)), np.zeros(end - first)
         for each in (self, other):
