@@ -20,6 +20,7 @@ from kf_calib.spectrum import Line, independent
 
 _CELL_S = 0.125  # at most, where readings come more often
 _LONGEST = 1 << 15  # cells of a dwell that are kept: more than an hour
+_LONGEST_RUN = 1 << 20  # cells of a run that are transformed at once: a day and a half
 _FEWEST_CYCLES = 1.5  # a dwell: of fewer a parabola takes more than half
 _HIGHEST = 0.75  # of half the rate of cells
 _BANDS, _BAND_POINTS = 40, 16  # of equal ratio, and frequencies in each at least, whose median gives the noise under it
@@ -109,13 +110,20 @@ class Trace:
 
 def band_hz(traces: Sequence[Trace]) -> tuple[float, float]:
     """From which frequency to which ``tone`` looks for an oscillation; infinite where it cannot."""
-    usual_s = _usual_s(traces)
-    low, high = _FEWEST_CYCLES / max(usual_s, 1e-9), _HIGHEST * 0.5 / traces[0].cell_s
-    return (low, high) if usual_s and high > 2.0 * low else (np.inf, np.inf)
+    seen = [trace for trace in traces if len(trace)]
+    if not seen or np.diff(_ends(seen)) > _LONGEST_RUN:
+        return np.inf, np.inf
+    low, high = _FEWEST_CYCLES / _usual_s(seen), _HIGHEST * 0.5 / seen[0].cell_s
+    return (low, high) if high > 2.0 * low else (np.inf, np.inf)
+
+
+def _ends(traces: Sequence[Trace]) -> tuple[int, int]:
+    """The first cell of a run and that after the last."""
+    return min(trace.first for trace in traces), max(trace.first + len(trace) for trace in traces)
 
 
 def _usual_s(traces: Sequence[Trace]) -> float:
-    """Length of the dwell in which the middle of all cells lies; 0: there are none."""
+    """Length of the dwell in which the middle of all cells lies."""
     lengths = np.sort([len(trace) for trace in traces])
     return float(lengths[np.searchsorted(np.cumsum(lengths), 0.5 * lengths.sum())] * traces[0].cell_s)
 
@@ -130,10 +138,10 @@ def tone(traces: Sequence[Trace], level: float = 0.01) -> Line | None:
     from scipy.special import fdtrc
 
     low_hz, high_hz = band_hz(traces)
-    seen = [trace for trace in traces if trace.counts.any()]
     if not np.isfinite(low_hz):
         return None
-    first, end = min(trace.first for trace in seen), max(trace.first + len(trace) for trace in seen)
+    seen = [trace for trace in traces if len(trace)]
+    first, end = _ends(seen)
     size = 1 << (2 * (end - first)).bit_length()
     grid = np.zeros((3, end - first))
     for trace in seen:

@@ -138,5 +138,7 @@ def test_too_little_is_not_searched() -> None:
     assert Cells.of(np.array([0.0, 1.0])) is None
     short = Cells(0.1, 1)
     assert tone([Trace.of(rng.normal(size=(20, 3)), np.arange(20) * 0.1, short)], 1.0) is None
+    apart = [Trace.of(rng.normal(size=(400, 3)), start_s + np.arange(400) * 0.1, short) for start_s in (0.0, 3e7)]
+    assert tone(apart, 1.0) is None and band_hz(apart) == (np.inf, np.inf), "a year between them"
     still = [Trace.of(np.ones((400, 3)), k * 50.0 + np.arange(400) * 0.1, short) for k in range(4)]
     assert tone(still, 1.0) is None
