@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kf_calib.samples import Floats
 
-_COLUMNS = 32  # a work space of so many columns lets LAPACK work in blocks
+_FEW = 4096  # numbers: of more, the threads of some BLAS get in each other's way unless they are limited
 
 
 def triangle(rows: NDArray[np.floating[Any]]) -> Floats:
@@ -19,10 +19,10 @@ def triangle(rows: NDArray[np.floating[Any]]) -> Floats:
 
     Orthogonal transforms only: the condition number is that of the rows, not its square.
     """
-    if rows.ndim > 2 or not rows.size:
+    if rows.ndim > 2 or not 0 < rows.size <= _FEW:
         return cast("Floats", np.linalg.qr(rows, mode="r"))
     # numpy.linalg.qr calls the same, three times as slowly where rows are few
-    below, _, _, _ = _geqrf()(rows, lwork=_COLUMNS * rows.shape[1])
+    below, _, _, _ = _geqrf()(rows, lwork=rows.shape[1])
     height = min(rows.shape)
     return below[:height] * _upper(height, rows.shape[1])
 

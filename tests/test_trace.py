@@ -64,14 +64,14 @@ def amplitude_of(sigmas: float, dwells: int = 24) -> float:
 @pytest.mark.parametrize("kind", ["white", "common", "coloured", "flicker", "white and flicker", "walk"])
 def test_noise_alone_has_no_tone(kind: str) -> None:
     """At 5 %; the bound is passed once in 200 times."""
-    rng, runs = np.random.default_rng(0), 80
+    rng, runs = np.random.default_rng(0), 40
     found = sum(tone(traces(rng, kind), 0.05) is not None for _ in range(runs))
     assert found <= binom.ppf(0.995, runs, 0.05)
 
 
 def test_readings_that_come_often_are_averaged_without_a_beat() -> None:
     """What is slow shows nowhere else, whatever the rate."""
-    rng, runs = np.random.default_rng(1), 40
+    rng, runs = np.random.default_rng(1), 20
     found = sum(tone(traces(rng, "flicker", rate_hz=47.0), 0.05) is not None for _ in range(runs))
     assert found <= binom.ppf(0.995, runs, 0.05)
 

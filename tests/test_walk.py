@@ -138,10 +138,11 @@ def dense(result: Calibration) -> Floats:
     return full
 
 
-def test_sigmas_of_a_walk_and_of_the_twelve_beside_it_are_honest() -> None:
-    """24 runs: 95 % intervals, the NEES of the twelve (biases at the end of the run), the run's own misfit."""
+@pytest.mark.parametrize("runs", [12, pytest.param(100, marks=pytest.mark.slow)])
+def test_sigmas_of_a_walk_and_of_the_twelve_beside_it_are_honest(runs: int) -> None:
+    """95 % intervals, the NEES of the twelve (biases at the end of the run), the run's own misfit."""
     ratios, nees, misfit = [], 0.0, 0
-    for seed in range(24):
+    for seed in range(runs):
         run = walking(seed)
         result = fitted(run)
         found = result.parameters["qb"]
@@ -150,10 +151,10 @@ def test_sigmas_of_a_walk_and_of_the_twelve_beside_it_are_honest() -> None:
         error = result.estimate.parameters - run.truth
         nees += float(error @ np.linalg.solve(result.estimate.parameter_covariance, error))
         misfit += result.consistency.consistent is False
-    low, high = chi2.ppf([5e-4, 1.0 - 5e-4], 12 * 24)
-    assert np.mean(np.abs(ratios) < 1.96) >= 0.85 and abs(np.mean(ratios)) < 0.6 and 0.75 < np.std(ratios) < 1.3
+    low, high = chi2.ppf([5e-4, 1.0 - 5e-4], 12 * runs)
+    assert np.mean(np.abs(ratios) < 1.96) >= 0.85 and abs(np.mean(ratios)) < 0.6 and 0.6 < np.std(ratios) < 1.4
     assert low < nees < 1.15 * high  # the intensity is estimated, too
-    assert misfit <= 3
+    assert misfit <= max(2, 0.06 * runs)
 
 
 def test_no_walk_is_seen_where_there_is_none() -> None:
