@@ -344,7 +344,6 @@ def _spread(elapsed_s: Floats) -> tuple[Floats, Floats]:
 
 
 _GATED = 32  # averages of a block, at least, among which an outlier can be told
-_GATED = 32  # averages of a block, at least, among which an outlier can be told
 _EDGES_S = np.concatenate([2.0 ** np.arange(6), 60.0 * np.arange(1, 20_000)])
 """A dwell is cut into pieces where 1, 2, 4 ... s have passed since the arrival, and at every further minute."""
 

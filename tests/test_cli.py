@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from pathlib import Path
 
@@ -194,3 +195,15 @@ def test_a_hidden_effect_fails_and_the_right_one_mends_it(run, tmp_path: Path) -
     assert b"second-order" not in path.read_bytes()
     code, out, err = run("replay", path, "--with", "second-ordr")
     assert (code, out) == (2, "") and "did you mean second-order" in err
+
+
+@pytest.mark.slow  # tests/test_readme.py runs it with tables
+def test_demo_does_the_main_job(tmp_path: Path) -> None:
+    """In a process of its own, as the README has it."""
+    words = [sys.executable, "-m", "kf_calib.cli", "demo", str(tmp_path / "out"), "--json"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["compare"]["max_difference_sigma"] <= 1e-6
+    assert result["replay"]["consistency"]["consistent"] is True
+    assert all(Path(result[key]).exists() for key in ("recording", "truth", "view"))

@@ -56,9 +56,10 @@ def test_an_effect_is_named_in_noise_of_other_kinds(noise: dict[str, float]) -> 
     assert found.missing == ("hysteresis",), found.verdict
 
 
+@pytest.mark.parametrize("runs", [5, pytest.param(8, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("noise", [{"flicker_mps2": 1e-5}, {"scatter_mps2": 5e-5}], ids=lambda noise: "+".join(noise))
-def test_stated_scatter_and_flicker_name_nothing(noise: dict[str, float]) -> None:
-    tests = [assessed(run(seed=70 + k, **noise).fit) for k in range(5)]
+def test_stated_scatter_and_flicker_name_nothing(noise: dict[str, float], runs: int) -> None:
+    tests = [assessed(run(seed=70 + k, **noise).fit) for k in range(runs)]
     assert sum(not each.consistent for each in tests) == 0
 
 
@@ -70,10 +71,10 @@ def test_two_accelerometers_with_different_effects() -> None:
     assert all((sigmas[symbol] > 8.0) == (symbol in {"K2_1", "h3"}) for symbol in sigmas), sigmas
 
 
-def test_a_walk_is_not_taken_for_a_drift() -> None:
+@pytest.mark.parametrize("seed", [1, 2, *(pytest.param(k, marks=pytest.mark.slow) for k in (3, 4))])
+def test_a_walk_is_not_taken_for_a_drift(seed: int) -> None:
     """Straight lines and exponentials follow a random walk well; a wrong name is worse than several."""
-    for seed in (1, 2):
-        not_wrong(diagnose(run("bias-walk=15sigma", seed=seed)), "bias-walk")
+    not_wrong(diagnose(run("bias-walk=15sigma", seed=seed)), "bias-walk")
 
 
 def test_a_line_is_named_with_its_frequency() -> None:
@@ -142,7 +143,11 @@ def test_vibration_is_no_oscillation_of_one_amplitude_and_what_it_rectifies_is_n
     assert not quiet.missing and quiet.test.consistent and quiet.test.vibration
 
 
-@pytest.mark.parametrize("name", ["second-order", "thermal-bias", "bias-drift"])
+@pytest.mark.parametrize(
+    "name",
+    ["second-order", "thermal-bias", "bias-drift",
+     *(pytest.param(name, marks=pytest.mark.slow) for name in ("hysteresis", "encoder-harmonic-2:x"))],
+)  # fmt: skip
 def test_poor_plans_give_no_wrong_name(name: str) -> None:
     """Six faces, six dwells, and poses in the order of their angle: mostly it cannot be told, and that is said."""
     short = spread_plan(6, dwell_s=8.0, seed=3)

@@ -326,10 +326,11 @@ def still_dwells(seed: int) -> list[DwellFactor]:
     return Pass(run([], 5e-5, seed, CHEAP, 10.0, 150.0, 2.0, 180.0), Settings()).fold()
 
 
-def test_intervals_cover_pooled_over_effects() -> None:
-    """Four runs of every effect; the ratios of one run share its noise, so the band is wide."""
+@pytest.mark.parametrize("runs", [4, pytest.param(6, marks=pytest.mark.slow)])
+def test_intervals_cover_pooled_over_effects(runs: int) -> None:
+    """A few runs of every effect; the ratios of one run share its noise, so the band is wide."""
     ratios = []
-    for seed in range(100, 104):
+    for seed in range(100, 100 + runs):
         still = still_dwells(seed)
         ratios += [ratio for name in COVERED for ratio in ratios_of(name, seed, still).values()]
     assert not np.isnan(ratios).any()

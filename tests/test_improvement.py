@@ -168,8 +168,7 @@ def test_honest_errors_are_those_of_orientations_left_out() -> None:
     assert checked.expected_mps2 == pytest.approx(cured.held_out_floor_mps2, rel=0.02)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("runs", [20])
+@pytest.mark.parametrize("runs", [4, pytest.param(20, marks=pytest.mark.slow)])
 def test_sigmas_are_honest_after_improvement(runs: int) -> None:
     """NEES of the twelve over runs with a hidden effect: far outside its band before, inside after."""
     before, after = list[float](), list[float]()
