@@ -20,41 +20,51 @@ from kf_calib.prospect import Prospect
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 
-_POSES = 160
+_POSES = 640
 _STEP_DEG = 5.0
 _STEPS = 12
 _WAY_S = 10.0  # to the next orientation, where there has been none
+_WAITS = (0.0, 0.25, 1.0)  # of the run so far, that may be spent where it goes next
 
 
 @dataclass(frozen=True)
 class Advice:
-    """Gimbal angles of the next orientation, deg; separation: in sigma, before and after a dwell there."""
+    """Gimbal angles of the next orientation, deg; separation: in sigma, before and after a dwell there.
+
+    stay_s: how long to stay there, where it takes more than a dwell as they were so far.
+    """
 
     gimbal_deg: tuple[float, ...]
     before: float
     after: float
+    stay_s: float | None = None
 
 
 def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequence[Effect]) -> Advice | None:
     """The orientation after which the effect ``one`` of this size differs most from each of the ``others``.
 
     Separation: what is left of its signal, in sigma, when the model and the other have explained all they can; the
-    smallest over the others (no others: over the model alone).
+    smallest over the others (no others: over the model alone). What differs in time only is told apart by time: a
+    longer stay is advised where the square of the separation grows by more an hour with it.
     """
     poses = _poses(fitted)
     if poses is None:
         return None
-    before, after = math.inf, np.full(len(poses), np.inf)
+    waits_s = np.array(_WAITS) * fitted.dwells[-1].end_s
+    before, after = math.inf, np.full((len(waits_s), len(poses)), np.inf)
     for rival in [[other] for other in others] or [[]]:
-        factor, rows = _with_next(fitted, [*rival, one], poses)
+        factor, rows = _with_next(fitted, [*rival, one], poses, waits_s=waits_s)
         count = factor.shape[1] - len(coefficients)
         mix = np.zeros((factor.shape[1], count + 1))
         mix[:count, :count], mix[count:, count] = np.eye(count), coefficients
         before = min(before, abs(float(triangle(factor @ mix)[-1, -1])))
-        so_far = np.broadcast_to(factor @ mix, (len(rows), len(factor), count + 1))
-        after = np.minimum(after, np.abs(triangle(np.concatenate([so_far, rows @ mix], axis=1))[:, -1, -1]))
-    best = int(np.argmax(after))
-    return Advice(tuple(np.degrees(poses[best]).round(1).tolist()), before, float(after[best]))
+        so_far = np.broadcast_to(factor @ mix, (*rows.shape[:2], len(factor), count + 1))
+        after = np.minimum(after, np.abs(triangle(np.concatenate([so_far, rows @ mix], axis=2))[..., -1, -1]))
+    dwell_s = _each_s(fitted)
+    gain = (after**2 - before**2) / (dwell_s + waits_s)[:, None]
+    wait, best = np.unravel_index(int(np.argmax(gain)), gain.shape)
+    stay_s = float(waits_s[wait] + dwell_s) if wait else None
+    return Advice(tuple(np.degrees(poses[best]).round(1).tolist()), before, float(after[wait, best]), stay_s)
 
 
 def to_show(fitted: Fit, hidden: Sequence[Effect]) -> tuple[Advice, int] | None:
@@ -62,7 +72,7 @@ def to_show(fitted: Fit, hidden: Sequence[Effect]) -> tuple[Advice, int] | None:
     poses = _poses(fitted)
     if poses is None or not hidden:
         return None
-    factor, rows = _with_next(fitted, hidden, poses)
+    factor, (rows,) = _with_next(fitted, hidden, poses)
     width, shown = fitted.carried.model.count, np.zeros(len(poses))
     ends = np.cumsum([width, *(len(effect.coefficients) for effect in hidden)]).tolist()
     scales = np.array([coefficient.scale for effect in hidden for coefficient in effect.coefficients])
@@ -114,7 +124,7 @@ def course(fitted: Fit, sizes: Floats, count: int = _STEPS) -> Course | None:
     poses = _poses(fitted)
     if poses is None:
         return None
-    factor, rows = _with_next(fitted, [], poses, fitted.noise)
+    factor, (rows,) = _with_next(fitted, [], poses, fitted.noise)
     jacobian = paper.jacobian(fitted.carried.state[:STATE_COUNT])
     at_least = np.diag(1.0 / np.maximum(fitted.carried.sizes, 1.0))  # what is not seen at all: to the size of g
     factor = triangle(np.vstack([factor, at_least]))
@@ -126,10 +136,15 @@ def course(fitted: Fit, sizes: Floats, count: int = _STEPS) -> Course | None:
         first = first if number else best
         factor = after[best]
         sigmas.append(reached[best])
-    means, starts = fitted.carried.means, fitted.carried.means.ends_s[:, 0]
-    lengths = np.diff(starts) if len(starts) > 1 else np.ptp(means.ends_s, axis=1) + _WAY_S
     angles = tuple(np.degrees(poses[first]).round(1).tolist())
-    return Course(angles, np.array(sigmas), len(starts), float(np.median(lengths)))
+    return Course(angles, np.array(sigmas), len(fitted.dwells), _each_s(fitted))
+
+
+def _each_s(fitted: Fit) -> float:
+    """How long a dwell and the way to it take."""
+    ends_s = fitted.carried.means.ends_s
+    lengths = np.diff(ends_s[:, 0]) if len(ends_s) > 1 else np.ptp(ends_s, axis=1) + _WAY_S
+    return float(np.median(lengths))
 
 
 def _sigmas(factors: Floats, jacobian: Floats) -> Floats:
@@ -150,13 +165,18 @@ def _poses(fitted: Fit) -> Floats | None:
 
 
 def _with_next(
-    fitted: Fit, effects: Sequence[Effect], poses: Floats, noise: Noise | None = None
+    fitted: Fit,
+    effects: Sequence[Effect],
+    poses: Floats,
+    noise: Noise | None = None,
+    waits_s: Sequence[float] | Floats = (0.0,),
 ) -> tuple[Floats, Floats]:
-    """Triangle of the run so far over [H | G], and whitened rows (m, 3, p + q) of a dwell's mean at each pose."""
+    """Triangle of the run so far over [H | G], and whitened rows (w, m, 3, p + q) of a dwell's mean after each wait at
+    each pose."""
     carried, noise = fitted.carried, noise or fitted.noise.judging
     model, state = carried.model, carried.state
     added = candidate_columns(carried.dwells, effects, model.bench, state)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
     upper = accumulated(whitened(carried.dwells, columns, noise, state), steps(carried.dwells, noise))
     prospect = replace(Prospect.following(fitted), noise=noise)
-    return upper[:-1, :-1], prospect.columns(effects, poses)
+    return upper[:-1, :-1], np.array([prospect.columns(effects, poses, float(wait_s)) for wait_s in waits_s])

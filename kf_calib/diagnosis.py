@@ -35,6 +35,7 @@ from kf_calib.trace import band_hz
 
 LEVEL = 0.01
 """Chance of a false alarm a run."""
+_REFUSED = 0.002  # chance that what is really missing is turned down because noise beside it looks like something more
 
 _DRAWS = 4000
 _SHARE = 0.4  # of the chance of a false alarm: the misfit's and the scan's; lines have the rest
@@ -42,6 +43,7 @@ _LINES = 1.0 - 2.0 * _SHARE
 _EQUAL = 6.63  # suspects whose chi-squared is this close to the best cannot be told from it (1 %, 1 dof)
 _ALIKE = 0.5  # overlap above which two suspects may be taken for each other
 _PAIRS = 3  # pairs that are refitted
+_WALK = -1  # in a pair, in the place of a candidate's number: a walk has no columns
 _SHOWN = 6  # suspects that are refitted and shown
 _POWER = 0.9
 
@@ -150,12 +152,9 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
                 scores[name], p_values[name] = score, run_level(own, tests)
     name, as_scatter = _walking(fitted), False
     if name:
-        (fall, ratio), least = (2.0 * gain for gain in walk_gain(fitted)), _threshold(1, tests)
-        # more scatter than was stated is less likely than a walk that explains as much
-        fall = fall if ratio > (0.0 if fitted.noise.scatter_stated else least) else ratio
-        as_scatter = ratio < least
+        fall, as_scatter = _walk_fall(fitted, tests)
         p_values[name] = run_level(0.5 * float(chdtrc(1, max(fall, 0.0))), tests)
-        scores[name] = fall - least
+        scores[name] = fall - _threshold(1, tests)
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
     test = Test(found, best, scores, p_values, misfit_p, name, tests, slewing, (), as_scatter=as_scatter)
     return _with_lines(test, fitted)
@@ -274,6 +273,15 @@ def _walking(fitted: Fit) -> str:
     return next((str(effect) for effect in kinds if effect.walks), "")
 
 
+def _walk_fall(fitted: Fit, tests: float) -> tuple[float, bool]:
+    """By how much a walk of the biases lowers -2 log-likelihood; whether it could as well be more scatter than stated.
+
+    Of two that explain as much, more scatter than was stated is less likely than a walk.
+    """
+    (fall, ratio), least = (2.0 * gain for gain in walk_gain(fitted)), _threshold(1, tests)
+    return fall if ratio > (0.0 if fitted.noise.scatter_stated else least) else ratio, ratio < least
+
+
 @dataclass(frozen=True)
 class Suspect:
     """An effect that would explain something: p-value of the run, whether the model fits with it, its refit.
@@ -301,6 +309,8 @@ class Diagnosis:
 
     ambiguity: every single effect that fits as well as the first, and those that do together; overlaps: of each with
     it. together: the pairs among them that explain as much, and are no exchange of one effect for one that is alike.
+    alone: a single effect that would do in the place of two. as_scatter: the walk that is missing could as well be
+    dwells that scatter by more than is stated.
     """
 
     before: Calibration
@@ -313,6 +323,8 @@ class Diagnosis:
     after: Calibration | None
     verdict: str
     together: tuple[tuple[str, str], ...] = ()
+    alone: str = ""
+    as_scatter: bool = False
 
     @property
     def residual_ratios(self) -> Floats:
@@ -361,7 +373,7 @@ def _explained(before: Calibration, test: Test) -> Diagnosis:
         least = test.scores[first] + (2.0 if first == test.walking else 1.0) * _EQUAL
         clearly = {pair: score for pair, score in pairs.items() if score > least}
         return _two(found, clearly, explaining[0].name) or _one(found, explaining[0], pairs)
-    several = _two(found, pairs) or _beside_lines(found)
+    several = _two(found, pairs | _pairs_with_walk(before, test)) or _beside_lines(found)
     return several or replace(found, unknown=not _may_scatter(before))
 
 
@@ -431,6 +443,7 @@ def _one(found: Diagnosis, first: Suspect, pairs: dict[tuple[int, int], float]) 
     overlaps = {name: _overlap(test, first.name, name) for name in close if name != first.name}
     overlaps = {name: overlap for name, overlap in overlaps.items() if overlap > _ALIKE}
     single = replace(found, missing=(first.name,), ambiguity=(first.name, *overlaps), overlaps=overlaps)
+    single = replace(single, as_scatter=first.name == test.walking and test.as_scatter)
     together = _as_good(test, pairs, test.scores[first.name], {first.name})
     return replace(_beside(single, [pair for pair in together if _both_fit(found, pair)]), after=first.refit)
 
@@ -449,14 +462,23 @@ def _as_good(
     test: Test, pairs: dict[tuple[int, int], float], score: float, but: Collection[str]
 ) -> list[tuple[str, str]]:
     """Names of the best few pairs that explain as much as what scores so much, none of them in ``but``."""
-    near = sorted((pair for pair in pairs if pairs[pair] > score - _EQUAL), key=lambda pair: -pairs[pair])
+    near = sorted((pair for pair in pairs if _nearness(pairs, pair) > score - _EQUAL), key=lambda pair: -pairs[pair])
     named = dict.fromkeys(_names_of(test, pair) for pair in near)
     return [pair for pair in named if not set(pair) & set(but)][:_PAIRS]
 
 
+def _nearness(pairs: dict[tuple[int, int], float], pair: tuple[int, int]) -> float:
+    """The score of a pair; one of a walk is near a pair of something that looks like the path it took."""
+    return pairs[pair] + (_EQUAL if _WALK in pair else 0.0)
+
+
 def _names_of(test: Test, pair: tuple[int, int]) -> tuple[str, str]:
-    one, two = (str(test.scan.candidates[k].effect) for k in pair)
+    one, two = (_name_of(test, k) for k in pair)
     return one, two
+
+
+def _name_of(test: Test, k: int) -> str:
+    return test.walking if k == _WALK else str(test.scan.candidates[k].effect)
 
 
 def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool:
@@ -465,10 +487,12 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
     Formulas that are known effects themselves do not count: together they are no effect that is unknown.
     """
     fitted, tests = found.before.fit, found.test.effective_tests
-    effects = [effect for effect in refit.model.effects if str(effect) in names]
+    effects = [effect for effect in refit.model.effects if str(effect) in names and not effect.walks]
     scanned = scan(fitted.carried, fitted.noise.judging, effects)
     own, _ = scanned.explained(np.concatenate([each.basis for each in scanned.candidates], axis=1))
     own -= sum(price(each, tests) for each in scanned.candidates)
+    if found.test.walking in names:
+        own += _walk_fall(refit.fit, tests)[0] - _threshold(1, tests)
     return any(gain > own + _EQUAL for gain, _ in _formulas(found))
 
 
@@ -499,7 +523,7 @@ def _two(found: Diagnosis, pairs: dict[tuple[int, int], float], alone: str = "")
 
     alone: a single one that would do, if not as well; a walk can take any path, so it stays in the set.
     """
-    test, candidates = found.test, found.test.scan.candidates
+    test = found.test
     likeliest = dict[tuple[str, str], tuple[int, int]]()  # of the values of their constants
     for pair in sorted(pairs, key=lambda pair: -pairs[pair]):
         likeliest.setdefault(_names_of(test, pair), pair)
@@ -511,15 +535,19 @@ def _two(found: Diagnosis, pairs: dict[tuple[int, int], float], alone: str = "")
             continue
         if _outdone(found, refit, both):
             return None
-        overlaps = {alone: 1.0} if alone and alone == test.walking else dict[str, float]()
-        for other, score in pairs.items():
+        walks = alone and alone == test.walking
+        overlaps = {alone: 1.0} if walks else dict[str, float]()
+        for other in pairs:
             shared = set(pair) & set(other)
-            if score > pairs[pair] - _EQUAL and len(shared) == 1:
+            if _nearness(pairs, other) > pairs[pair] - _EQUAL and len(shared) == 1:
                 (lost,), (new,) = set(pair) - shared, set(other) - shared
-                name, alike = str(candidates[new].effect), candidates[lost].overlap(candidates[new])
+                name, alike = _name_of(test, new), _alike(test, lost, new)
                 if alike > max(_ALIKE, overlaps.get(name, 0.0)) and name not in both:
                     overlaps[name] = alike
         named = replace(found, missing=both, ambiguity=(*both, *overlaps), overlaps=overlaps, after=refit)
+        named = replace(named, alone=alone if walks else "")
+        if _WALK in pair:
+            named = replace(named, as_scatter=_walk_fall(refit.fit, test.effective_tests)[1])
         return _beside(named, _as_good(test, pairs, pairs[pair], both))
     return None
 
@@ -539,6 +567,24 @@ def _pairs(test: Test) -> dict[tuple[int, int], float]:
     return out
 
 
+def _pairs_with_walk(before: Calibration, test: Test) -> dict[tuple[int, int], float]:
+    """The same of an effect and a walk of the biases, for those effects that are likeliest beside a walk.
+
+    The walk beside the effect is judged by its likelihood, after a refit with both.
+    """
+    if not test.walking:
+        return {}
+    candidates, tests, out = test.scan.candidates, test.effective_tests, dict[tuple[int, int], float]()
+    beside = assessed(with_effects(before, (test.walking,)).fit, tests)
+    for name in [name for name in beside.ranked if name in test.best][:_PAIRS]:
+        k = test.best[name]
+        own = float(test.scan.statistics[k]) - price(candidates[k], tests)
+        walk = _walk_fall(with_effects(before, (name, test.walking)).fit, tests)[0] - _threshold(1, tests)
+        if walk > 0.0 and own + walk > test.scores[test.walking]:
+            out[k, _WALK] = own + walk
+    return out
+
+
 def _suspects(before: Calibration, test: Test) -> tuple[Suspect, ...]:
     """The likeliest candidates, each refitted and judged anew."""
     out = list[Suspect]()
@@ -554,9 +600,10 @@ def _suspects(before: Calibration, test: Test) -> tuple[Suspect, ...]:
 def _fits(refit: Calibration, before: Test) -> bool:
     """Whether nothing is left that noise would not leave, by means an effect of that kind has."""
     misfit = refit.consistency.p_value
-    if (misfit is not None and misfit < 0.5 * LEVEL) or _leaps(refit) or _at_an_end(refit):
+    if (misfit is not None and misfit < _SHARE * _REFUSED) or _leaps(refit) or _at_an_end(refit):
         return False
-    return assessed(refit.fit, before.effective_tests).consistent is not False
+    left = assessed(refit.fit, before.effective_tests).p_value
+    return left is None or left >= _REFUSED
 
 
 def _at_an_end(refit: Calibration) -> bool:
@@ -582,9 +629,13 @@ def with_effects(before: Calibration, added: Sequence[str]) -> Calibration:
 
 
 def _overlap(test: Test, one: str, other: str) -> float:
-    if one not in test.best or other not in test.best:
-        return 1.0  # process noise has no column to compare
-    return test.candidate(one).overlap(test.candidate(other))
+    return _alike(test, test.best.get(one, _WALK), test.best.get(other, _WALK))
+
+
+def _alike(test: Test, one: int, other: int) -> float:
+    """The overlap of two candidates; 1 with a walk, which can take any path."""
+    candidates = test.scan.candidates
+    return 1.0 if _WALK in (one, other) else candidates[one].overlap(candidates[other])
 
 
 @dataclass(frozen=True)
@@ -630,7 +681,8 @@ def next_orientation(found: Diagnosis) -> tuple[Advice, str] | None:
         if advice is None:
             return None
         words = f"tells {named[0]} from {', '.join(named[1:5])}" if rivals else f"shows {named[0]} best"
-        return advice, f"{words}: separation {advice.before:.1f} -> {advice.after:.1f} sigma"
+        stay = "" if advice.stay_s is None else f" in {advice.stay_s / 60.0:.0f} min there"
+        return advice, f"{words}: separation {advice.before:.1f} -> {advice.after:.1f} sigma{stay}"
     hidden = [test.candidate(name).effect for name in test.invisible if name in test.best]
     shown = advise.to_show(fitted, hidden)
     if shown is None or not shown[1]:
@@ -654,17 +706,17 @@ def _verdict(found: Diagnosis) -> str:
             named = f"{' and '.join(found.missing)} together explain it; no single known effect does as well"
         else:
             named = f"Missing: {first}{_size(found)}"
-            if len(found.ambiguity) > 1 or (first == test.walking and test.as_scatter):
+            if len(found.ambiguity) > 1 or found.as_scatter:
                 named = f"Best: {first}{_size(found)}"
         instead = "" if len(found.missing) == 1 else "in the place of one of them, "
         told = [
-            f"{name} alone" if instead and name == test.walking else f"{name} ({instead}overlap {overlap:.2f})"
+            f"{name} alone" if name == found.alone else f"{name} ({instead}overlap {overlap:.2f})"
             for name, overlap in found.overlaps.items()
         ]
         told = [
             *told,
             *(f"{' and '.join(pair)} together" for pair in found.together),
-            *(["dwells that scatter by more than is stated"] if first == test.walking and test.as_scatter else []),
+            *(["dwells that scatter by more than is stated"] if found.as_scatter else []),
         ]
         if told:
             named += f". Cannot yet be told from {', '.join(told)}"

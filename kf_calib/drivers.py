@@ -145,7 +145,7 @@ def _of_gimbals(count: int) -> Iterator[tuple[str, list[str]]]:
             if n > 2:
                 yield f"angle of gimbal {k}, {n} a turn", [f":{k} = {text}" for text in both]
                 yield f"angle of gimbal {k}, {n} a turn", [f"{text}*{axis}" for text in both for axis in ("p", "o")]
-        yield f"angle of gimbal {k} in the dwell before", [f"sin(q{k}_before)", f"cos(q{k}_before)"]
+        yield f"previous orientation (angle of gimbal {k})", [f"sin(q{k}_before)", f"cos(q{k}_before)"]
 
 
 def _of_time(dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:

@@ -148,9 +148,14 @@ class Prospect:
         rows = self.whitened(self.model.columns(stimulus, self.state), stimulus) @ self.transform
         return math.sqrt(count / len(_ICOSAHEDRON)) * rows
 
-    def columns(self, effects: Sequence[Effect], poses: Floats) -> Floats:
-        """Whitened columns (n, 3, p + q) of the affine model and further effects, of the next dwell at each pose."""
+    def columns(self, effects: Sequence[Effect], poses: Floats, wait_s: float = 0.0) -> Floats:
+        """Whitened columns (n, 3, p + q) of the affine model and further effects, of the next dwell at each pose.
+
+        wait_s: of the usual length, but so long after the arrival.
+        """
         stimulus = self.stimulus(poses)
+        since_arrival_s = stimulus.since_arrival_s + wait_s
+        stimulus = replace(stimulus, elapsed_s=stimulus.elapsed_s + wait_s, since_arrival_s=since_arrival_s)
         own = self.model.columns(stimulus, self.state), effect_columns(effects, stimulus)
         return self.whitened(np.concatenate(own, axis=2), stimulus)
 

@@ -76,6 +76,7 @@ _APART = 0.7
 _LIKE = 0.9  # overlap of what may be taken for each other at 8 sigma
 _FEW = 12  # orientations
 _LARGE = 100  # sigma, or times
+_DWELL_S = 60.0
 _POWER = (0.86, 0.94)
 _SECOND = 5_000_000  # from the seed of a run to that of its second run
 _ENOUGH = 20  # trials; fewer are shown and not judged
@@ -456,13 +457,18 @@ def advice(task: Task, advised: int = 4, random: int = 12) -> Outcome:
     if said["missing"] in (None, "unknown") or not rivals or truth["name"] not in said["ambiguity_set"]:
         return Outcome(task, task.names, said["missing"], error="not ambiguous to begin with")
     fixed, here, more = _sized(task, truth, 1.0), said, list(rows)
-    while len(more) < len(rows) + advised and here["next_orientation"] is not None:
-        more.append(tuple(here["next_orientation"]["gimbal_deg"]))
+    count = 0
+    while count < advised and here["next_orientation"] is not None:
+        next_ = here["next_orientation"]
+        more += [tuple(next_["gimbal_deg"])] * max(1, round((next_["stay_s"] or 0.0) / _DWELL_S))
+        count += 1
         _, here = _on_plan(fixed, more)
     others = [visit.gimbal_deg for visit in spread_plan(random, seed=task.seed + _SECOND)]
     plans = {"before": rows, "advised": more, "random": [*rows, *others]}
     apart = {which: _separation(task, truth, rivals, plan) for which, plan in plans.items()}
-    extra = {**apart, "rivals": rivals, "count": len(more) - len(rows)}
+    if not apart["random"]:
+        return Outcome(task, task.names, said["missing"], error="only process noise to be told from: it has no columns")
+    extra = {**apart, "rivals": rivals, "count": count, "dwells": len(more) - len(rows)}
     return Outcome(task, task.names, said["missing"], ambiguity=tuple(said["ambiguity_set"]), extra=extra)
 
 
@@ -795,6 +801,12 @@ def _advice(_: str, own: list[Outcome]) -> Iterator[Figure]:
     median, (low, high) = float(np.median(ratios)), np.percentile(ratios, [2.5, 97.5])
     meets = median >= 1.0 if len(own) >= _ENOUGH else None
     yield Figure("separation, 4 advised / 12 random, median", median, low, high, len(own), ">= 1", meets)
+    times = [each.extra["dwells"] / 12.0 for each in own if "dwells" in each.extra]
+    if times:
+        low, high = np.percentile(times, [2.5, 97.5])
+        yield Figure(
+            "time the 4 advised take, in that of 12 random, median", float(np.median(times)), low, high, len(times)
+        )
 
 
 _FIGURES: dict[str, Callable[[str, list[Outcome]], Iterator[Figure]]] = {

@@ -9,6 +9,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from kf_calib.advice import Advice
 from kf_calib.calibration import format_p
 from kf_calib.diagnosis import Detectable, Diagnosis, Suspect, detectable, next_orientation
 from kf_calib.drivers import Description, described
@@ -45,13 +46,18 @@ def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
                 {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in detectable(found.test)
             ],
             "unknown": description_object(unknown),
-            "next_orientation": None if going is None else {"gimbal_deg": list(going[0].gimbal_deg), "why": going[1]},
+            "next_orientation": None if going is None else orientation_object(*going),
             "held_out_rms_mps2": found.before.held_out_rms_mps2,
             "held_out_floor_mps2": found.before.held_out_floor_mps2,
             "readings": readings_object(found.before.readings),
             "warnings": list(found.before.warnings),
         }
     )
+
+
+def orientation_object(advice: Advice, why: str) -> dict[str, Any]:
+    """stay_s: how long to stay there, where that is longer than the dwells so far."""
+    return {"gimbal_deg": list(advice.gimbal_deg), "stay_s": advice.stay_s, "why": why}
 
 
 def description_object(unknown: Description | None) -> dict[str, Any] | None:

@@ -16,7 +16,7 @@ from kf_calib.diagnosis import Diagnosis, next_orientation
 from kf_calib.errors import InputError
 from kf_calib.improvement import Honest, Improvement, Removal, Spread, Step, extended, stepped, undone
 from kf_calib.views.console import effect_table, parameter_table, rounded, symbol
-from kf_calib.views.diagnosis import description, description_object
+from kf_calib.views.diagnosis import description, description_object, orientation_object
 from kf_calib.views.json import clean
 
 _WIDTH = 30  # characters of the longest bar
@@ -68,7 +68,7 @@ def improvement_object(
                 for each in state.spreads
             ],
             "unknown": description_object(unknown),
-            "next_orientation": None if going is None else {"gimbal_deg": list(going[0].gimbal_deg), "why": going[1]},
+            "next_orientation": None if going is None else orientation_object(*going),
             "honest": None if honest is None else vars(honest),
             "replay_difference": replay_difference,
             **{key: None if path is None else str(path) for key, path in files.items()},
