@@ -46,6 +46,7 @@ _PAIRS = 3  # pairs that are refitted
 _WALK = -1  # in a pair, in the place of a candidate's number: a walk has no columns
 _SHOWN = 6  # suspects that are refitted and shown
 _POWER = 0.9
+_FEWEST_WALKED = 8  # dwells: a walk of the biases is looked for in that many
 
 
 @dataclass(frozen=True)
@@ -267,8 +268,13 @@ def _smallest_p(found: Scan, seen: NDArray[np.intp], seed: int) -> Floats:
 def _walking(fitted: Fit) -> str:
     """The name of the effect that lets the biases walk; empty where it is in the model, or cannot be looked for."""
     model = fitted.carried.model
-    if model.walks or len(fitted.dwells) < 8 or fitted.noise.walk_mps2_per_sqrt_s:
+    if model.walks or len(fitted.dwells) < _FEWEST_WALKED or fitted.noise.walk_mps2_per_sqrt_s:
         return ""
+    return _walk_of(model)
+
+
+def _walk_of(model: Model) -> str:
+    """The name of the effect that lets the biases walk."""
     kinds = (effect_named(name, model.bench) for name in names(model.bench) if ":" not in name)
     return next((str(effect) for effect in kinds if effect.walks), "")
 
@@ -357,7 +363,12 @@ def _diagnosed(before: Calibration) -> Diagnosis:
 
 
 def _explained(before: Calibration, test: Test) -> Diagnosis:
-    """What explains the misfit, one effect or two; or nothing does."""
+    """What explains the misfit, one effect or two, and what could as well; or nothing does."""
+    return _or_walk(_likeliest(before, test))
+
+
+def _likeliest(before: Calibration, test: Test) -> Diagnosis:
+    """One effect or two that explain the misfit, and those that look like them."""
     nothing = Diagnosis(before, test, (), (), False, (), {}, None, "")
     if test.consistent is not False:
         return nothing
@@ -375,6 +386,18 @@ def _explained(before: Calibration, test: Test) -> Diagnosis:
         return _two(found, clearly, explaining[0].name) or _one(found, explaining[0], pairs)
     several = _two(found, pairs | _pairs_with_walk(before, test)) or _beside_lines(found)
     return several or replace(found, unknown=not _may_scatter(before))
+
+
+def _or_walk(found: Diagnosis) -> Diagnosis:
+    """With a walk of the biases in the set, where the dwells are too few to tell its path from what was named."""
+    model = found.before.fit.carried.model
+    walk = _walk_of(model)
+    if not walk or not found.missing or model.walks or walk in found.ambiguity:
+        return found
+    if _beyond_any_path(found.before, found.test, found.missing):
+        return found
+    alone = walk if len(found.missing) > 1 else ""
+    return replace(found, ambiguity=(*found.ambiguity, walk), overlaps={**found.overlaps, walk: 1.0}, alone=alone)
 
 
 def _beside_lines(found: Diagnosis) -> Diagnosis | None:
@@ -405,10 +428,15 @@ def _beyond_scatter(before: Calibration, test: Test, names: Sequence[str]) -> bo
     F = (fall / q) / (rest / (dof - q)), q coefficients: a scatter as large as it needs to be is in fall and rest alike.
     What shows within dwells is no matter of scatter between them.
     """
+    return (before.noise.scatter_stated and before.noise.setting_stated) or _beyond_any_path(before, test, names)
+
+
+def _beyond_any_path(before: Calibration, test: Test, names: Sequence[str]) -> bool:
+    """The same of whatever may be from dwell to dwell, a walk of the biases too: few dwells cannot show it."""
     from scipy.special import fdtrc
 
-    noise, misfit = before.noise, before.consistency
-    if (noise.scatter_stated and noise.setting_stated) or any(name not in test.best for name in names):
+    misfit = before.consistency
+    if any(name not in test.best for name in names):
         return True
     fall, dof = test.scan.explained(np.concatenate([test.candidate(name).basis for name in names], axis=1))
     freedom = misfit.dof - dof

@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
+import math
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.special import ndtr
 from scipy.stats import beta
 
 from kf_calib.errors import KfCalibError
+from kf_calib.scan import Candidate
 
 TOOL = Path(__file__).resolve().parents[1] / "tools" / "blind_trial.py"
 
 
 @pytest.fixture(scope="module")
 def trial() -> Any:
-    spec = importlib.util.spec_from_file_location("blind_trial", TOOL)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["blind_trial"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+    sys.path.insert(0, str(TOOL.parent))
+    return importlib.import_module("blind_trial")
 
 
 def outcome(trial: Any, figure: str, first: str | None, truth: tuple[str, ...] = (), **more: Any) -> Any:
@@ -53,6 +53,34 @@ def test_limits_are_those_of_clopper_and_pearson(trial: Any) -> None:
     assert found.value == 0.03 and found.meets is False
     assert trial.rate("", [True] * 5, least=0.5).meets is None  # too few to judge
     assert trial.rate("", [True] * 86 + [False] * 14, 0.86, 0.94).meets
+
+
+def test_the_best_chooser_is_right_as_often_as_theory_has_it(trial: Any) -> None:
+    """Of two effects of one coefficient: |w1| > |w2|, where w1 - w2 and w1 + w2 are independent."""
+    overlap, sigmas = 0.9, 4.0
+    bases = {"one": [[1.0], [0.0]], "two": [[overlap], [math.sqrt(1.0 - overlap**2)]]}
+    spaces = {
+        name: [Candidate(None, basis, basis, np.eye(1), np.zeros(1, bool), 1.0)]  # type: ignore[arg-type]
+        for name, basis in ((name, np.array(basis)) for name, basis in bases.items())
+    }
+    found = trial.best_possible(spaces, {name: {name} for name in spaces}, sigmas, draws=20_000)
+    apart, along = ndtr(sigmas * np.sqrt(0.5 * (1.0 - overlap))), ndtr(sigmas * np.sqrt(0.5 * (1.0 + overlap)))
+    expected = apart * along + (1.0 - apart) * (1.0 - along)
+    assert list(found.values()) == pytest.approx([expected] * 2, abs=4.0 * math.sqrt(0.25 / 20_000))
+    assert 0.8 < expected < 0.85
+    assert set(trial.best_possible(spaces, {name: {"one", "two"} for name in spaces}, sigmas).values()) == {1.0}
+
+
+def test_the_most_there_can_be_is_a_mean_over_runs_and_effects(trial: Any) -> None:
+    own = [
+        trial.Outcome(
+            trial.Task("ideal@any", "ideal", k), extra={size: {"a": 1.0, "b": low} for size in ("8", "10", "15")}
+        )
+        for k, low in enumerate((0.5, 0.7))
+    ]
+    found = by_name(trial, own)
+    assert found["right name first, n = 8: the most there can be"].value == pytest.approx(0.8)
+    assert found["worst effect, n = 15, the most there can be: b"].value == pytest.approx(0.6)
 
 
 def test_false_alarms_are_judged_by_the_upper_limit_of_1000(trial: Any) -> None:

@@ -34,10 +34,11 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 import numpy as np
+from best_possible import best_possible
 
 from kf_calib.errors import KfCalibError
 from kf_calib.samples import Floats
@@ -63,10 +64,10 @@ PLANS: dict[str, tuple[str, ...]] = {
     "monotone": ("--plan", "monotone"),
     "six dwells": ("--orientations", "6"),
 }
-FIGURES = ("noise", "name", "unstated", "power", "invisible", "outside", "pair", "plans", "improve", "advice")
+FIGURES = ("noise", "name", "unstated", "power", "invisible", "outside", "pair", "plans", "improve", "advice", "ideal")
 COUNTS: dict[str, float] = {
     "noise@white": 250, "noise": 60, "name": 1, "unstated": 0.25, "power": 4, "invisible": 0.2, "outside": 2,
-    "pair": 40, "plans@nothing": 8, "plans": 0.2, "improve": 0.4, "advice": 1,
+    "pair": 40, "plans@nothing": 8, "plans": 0.2, "improve": 0.4, "advice": 1, "ideal": 2,
 }  # fmt: skip
 """Trials a unit of ``--runs``: in all, or for each effect (and size, and plan) that is hidden; at least one."""
 
@@ -75,11 +76,14 @@ _SAME = 1.0 - 1e-6
 _APART = 0.7
 _LIKE = 0.9  # overlap of what may be taken for each other at 8 sigma
 _FEW = 12  # orientations
+_SIZES = (8, 10, 15)  # sigma
 _LARGE = 100  # sigma, or times
 _DWELL_S = 60.0
 _POWER = (0.86, 0.94)
 _SECOND = 5_000_000  # from the seed of a run to that of its second run
 _ENOUGH = 20  # trials; fewer are shown and not judged
+
+Hit = TypeVar("Hit", bool, float)
 
 
 @dataclass(frozen=True)
@@ -472,6 +476,22 @@ def advice(task: Task, advised: int = 4, random: int = 12) -> Outcome:
     return Outcome(task, task.names, said["missing"], ambiguity=tuple(said["ambiguity_set"]), extra=extra)
 
 
+def ideal(task: Task) -> Outcome:
+    """How often the likeliest effect is the right one where all but the readings is known beforehand."""
+    simulated(task, Path("clean.mcap"))
+    spaces = {name: [each for each in own if each.dof] for name, own in candidates(Path("clean.mcap")).items()}
+    spaces = {name: own for name, own in spaces.items() if own}
+    pairs = itertools.product(spaces, spaces)
+    alike = {
+        (a, b)
+        for a, b in pairs
+        if a == b or any(itertools.starmap(_one_space, itertools.product(spaces[a], spaces[b])))
+    }
+    same = {name: {b for a, b in alike if a == name} for name in spaces}
+    extra = {str(size): best_possible(spaces, same, size, seed=task.seed) for size in _SIZES}
+    return Outcome(task, extra=extra)
+
+
 def _on_plan(task: Task, rows: Sequence[Sequence[float]]) -> tuple[dict[str, Any], dict[str, Any]]:
     """The one hidden effect and the diagnosis of a run through these orientations."""
     truth = _through(task, rows, Path("few.mcap"))
@@ -519,7 +539,7 @@ _BESIDE_THE_TWELVE = {"magnetic": ";up=0"}
 
 PLAYS: dict[str, Callable[[Task], Outcome]] = {
     "diagnose": diagnosed, "outside": outside, "pair": pair, "power": power, "invisible": invisible,
-    "improve": improve, "advice": advice,
+    "improve": improve, "advice": advice, "ideal": ideal,
 }  # fmt: skip
 
 
@@ -581,6 +601,9 @@ def _family_tasks(
     elif family == "power":  # the sizes stated for one run serve all effects
         for round_, name in itertools.product(_count(family, runs), visible):
             add("stated", [name], number=first + round_)
+    elif family == "ideal":
+        for _ in _count(family, runs):
+            add("any")
     elif family == "invisible":
         for name, _ in itertools.product(PLANS, _count(family, runs)):
             add(name, options=PLANS[name])
@@ -595,7 +618,7 @@ def _family_tasks(
             for effect, _ in itertools.product(shown, _count(family, runs)):
                 add(f"{plan}, one hidden", [f"{effect}=10sigma"], PLANS[plan])
     else:
-        sizes = {"name": (8, 10, 15), "unstated": (10,), "outside": (15,), "improve": (15,), "advice": (8,)}[family]
+        sizes = {"name": _SIZES, "unstated": (10,), "outside": (15,), "improve": (15,), "advice": (8,)}[family]
         kinds = {"outside": outside_effects, "advice": lambda: list(effects) or confusable(visible)}
         hidden = kinds.get(family, lambda: visible)()
         options = NOISES["unstated"] if family == "unstated" else ()
@@ -691,15 +714,15 @@ def _name(which: str, own: list[Outcome]) -> Iterator[Figure]:
     yield rate(f"wrong name, n = {which}{stated}", [each.wrong for each in own])
 
 
-def _worst(found: Iterable[tuple[str, bool]]) -> tuple[str, list[bool]]:
+def _worst(found: Iterable[tuple[str, Hit]]) -> tuple[str, list[Hit]]:
     """The effect with the smallest share of hits, and its hits."""
     by_effect = _by_effect(found)
     lowest = min(by_effect, key=lambda name: (np.mean(by_effect[name]), name))
     return lowest, by_effect[lowest]
 
 
-def _by_effect(found: Iterable[tuple[str, bool]]) -> dict[str, list[bool]]:
-    out = dict[str, list[bool]]()
+def _by_effect(found: Iterable[tuple[str, Hit]]) -> dict[str, list[Hit]]:
+    out = dict[str, list[Hit]]()
     for name, hit in found:
         out.setdefault(name, []).append(hit)
     return out
@@ -809,9 +832,26 @@ def _advice(_: str, own: list[Outcome]) -> Iterator[Figure]:
         )
 
 
+def _ideal(_: str, own: list[Outcome]) -> Iterator[Figure]:
+    for size in map(str, _SIZES):
+        runs = [float(np.mean(list(each.extra[size].values()))) for each in own if not each.error]
+        if runs:
+            low, high = np.percentile(runs, [2.5, 97.5])
+            yield Figure(
+                f"right name first, n = {size}: the most there can be", float(np.mean(runs)), low, high, len(runs)
+            )
+            lowest, hits = _worst((name, share) for each in own for name, share in each.extra[size].items())
+            yield Figure(
+                f"worst effect, n = {size}, the most there can be: {lowest}",
+                float(np.mean(hits)),
+                *np.percentile(hits, [2.5, 97.5]),
+                len(hits),
+            )
+
+
 _FIGURES: dict[str, Callable[[str, list[Outcome]], Iterator[Figure]]] = {
     "noise": _noise, "name": _name, "unstated": _name, "power": _power, "invisible": _invisible, "outside": _outside,
-    "pair": _pair, "plans": _plans, "improve": _improve, "advice": _advice,
+    "pair": _pair, "plans": _plans, "improve": _improve, "advice": _advice, "ideal": _ideal,
 }  # fmt: skip
 
 
