@@ -22,7 +22,7 @@ from kf_calib import averaging
 from kf_calib.advice import Advice
 from kf_calib.calibration import Calibration, Parameter, consistency, format_p, refitted
 from kf_calib.drivers import JUMP, Family, families
-from kf_calib.effects import Effect, effect_named, names
+from kf_calib.effects import Effect, effect_named, names, walk_named
 from kf_calib.fitting import WALK, Fit, walk_gain
 from kf_calib.folding import DwellFactor, lines_of, stimulus_of
 from kf_calib.likelihood import FEWEST
@@ -270,13 +270,7 @@ def _walking(fitted: Fit) -> str:
     model = fitted.carried.model
     if model.walks or len(fitted.dwells) < _FEWEST_WALKED or fitted.noise.walk_mps2_per_sqrt_s:
         return ""
-    return _walk_of(model)
-
-
-def _walk_of(model: Model) -> str:
-    """The name of the effect that lets the biases walk."""
-    kinds = (effect_named(name, model.bench) for name in names(model.bench) if ":" not in name)
-    return next((str(effect) for effect in kinds if effect.walks), "")
+    return walk_named(model.bench)
 
 
 def _walk_fall(fitted: Fit, tests: float) -> tuple[float, bool]:
@@ -391,7 +385,7 @@ def _likeliest(before: Calibration, test: Test) -> Diagnosis:
 def _or_walk(found: Diagnosis) -> Diagnosis:
     """With a walk of the biases in the set, where the dwells are too few to tell its path from what was named."""
     model = found.before.fit.carried.model
-    walk = _walk_of(model)
+    walk = walk_named(model.bench)
     if not walk or not found.missing or model.walks or walk in found.ambiguity:
         return found
     if _beyond_any_path(found.before, found.test, found.missing):
@@ -628,10 +622,11 @@ def _suspects(before: Calibration, test: Test) -> tuple[Suspect, ...]:
 def _fits(refit: Calibration, before: Test) -> bool:
     """Whether nothing is left that noise would not leave, by means an effect of that kind has."""
     misfit = refit.consistency.p_value
-    if (misfit is not None and misfit < _SHARE * _REFUSED) or _leaps(refit) or _at_an_end(refit):
+    least = LEVEL if refit.noise.walk_mps2_per_sqrt_s else _REFUSED  # a walk explains much that is none
+    if (misfit is not None and misfit < _SHARE * least) or _leaps(refit) or _at_an_end(refit):
         return False
     left = assessed(refit.fit, before.effective_tests).p_value
-    return left is None or left >= _REFUSED
+    return left is None or left >= least
 
 
 def _at_an_end(refit: Calibration) -> bool:

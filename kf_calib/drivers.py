@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench import Bench
-from kf_calib.effects import Effect, effect_named
+from kf_calib.effects import Effect, effect_named, walk_named
 from kf_calib.errors import InputError
-from kf_calib.fitting import Fit
+from kf_calib.fitting import Fit, walk_gain
 from kf_calib.folding import DwellFactor
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
@@ -22,6 +22,7 @@ _DECAYS_S = (10, 30, 100, 300)
 _JUMPS = 100  # at most
 
 JUMP = "time (a jump)"
+IRREGULAR = "nothing that was recorded (irregular from dwell to dwell)"
 
 
 @dataclass(frozen=True)
@@ -68,10 +69,18 @@ class Family:
 def described(fitted: Fit, residuals: Floats) -> Description | None:
     """The family of formulas that explains most of what the model leaves, if any explains more than chance would.
 
+    None of them does where the dwells are likelier to scatter or their biases to walk: to try is the walk, then.
     residuals: of the dwells, (D, 3).
     """
+    from scipy.special import chdtri
+
     found, excess = families(fitted)
     best = max(found, key=lambda family: family.score)
+    walk, ratio = walk_gain(fitted)
+    irregular = 2.0 * max(walk, walk - ratio)  # a walk's gain, a scatter's
+    name = "" if fitted.carried.model.walks else walk_named(fitted.carried.model.bench)
+    if name and irregular - float(chdtri(1, _CHANCE)) > max(best.score, 0.0):
+        return Description(_channel(residuals), IRREGULAR, irregular / max(excess, irregular), (name,))
     if best.score <= 0.0:
         return None
     order = np.argsort(best.falls)[::-1]

@@ -183,3 +183,19 @@ def test_few_dwells_name_nothing_that_unstated_scatter_could_be(dwells: int, see
     found = diagnose(calibrate(Run(seed=seed, dwells=dwells, setting_deg=0.002, stated=False)))
     assert not found.missing and not found.unknown, found.verdict
     assert "state angle_sigma_deg and scatter_sigma_mps2" in found.verdict
+
+
+@pytest.mark.parametrize("name", ["hysteresis", "second-order"])
+def test_a_walk_and_another_effect_are_both_found(name: str) -> None:
+    """The walk is no column to be paired: it is judged by its likelihood beside the other."""
+    found = diagnose(run("bias-walk=15sigma", f"{name}=15sigma", seed=2))
+    assert set(found.missing) == {name, "bias-walk"}, found.verdict
+    assert found.after is not None and found.after.consistency.consistent
+
+
+def test_in_a_few_dwells_a_walk_could_explain_what_an_effect_does() -> None:
+    """Three coefficients of six degrees of freedom: what is left is no proof. In 24 dwells it is."""
+    few = diagnose(run("hysteresis=12sigma", plan=spread_plan(6, dwell_s=8.0, seed=3)))
+    assert few.missing and {"hysteresis", "bias-walk"} <= set(few.ambiguity), few.verdict
+    assert "bias-walk" in few.verdict
+    assert "bias-walk" not in diagnose(run("hysteresis=12sigma")).ambiguity

@@ -70,6 +70,12 @@ def names(bench: Bench) -> list[str]:
     return [*plain, *(f"{name}:{variant}" for name in _OF_A_GIMBAL for variant in variants), *_registered]
 
 
+def walk_named(bench: Bench) -> str:
+    """The name of the effect that lets the biases walk."""
+    kinds = (effect_named(name, bench) for name in names(bench) if ":" not in name)
+    return next((str(effect) for effect in kinds if effect.walks), "")
+
+
 def effect_named(text: str, bench: Bench) -> Effect:
     """The effect of that name, or that ``NAME = FORMULA``; raises InputError, with near names, where there is none."""
     name, _, variant = text.partition(":")
