@@ -7,6 +7,7 @@ of the dwell (``noise.mean_covariances``).
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +27,7 @@ from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 
 PAUSE_S = 60.0
-"""When the next dwell would begin, after a run so far."""
+"""Until a plan begins that goes on with a run; or the next dwell, where there were no two that would tell."""
 
 _SINCE_ARRIVAL_S = 15.0
 
@@ -61,6 +62,7 @@ class Prospect:
     """model, state (p,): what is estimated, and where it is linearised. noise, readings: of a dwell of ``dwell_s``.
 
     known (p, p): factor of what is known already, of the states; zeros: nothing. last: the dwell before; None: none.
+    pause_s: from its end until the next dwell begins.
     """
 
     model: Model
@@ -70,6 +72,7 @@ class Prospect:
     dwell_s: float
     known: Floats
     last: Last | None = None
+    pause_s: float = PAUSE_S
 
     @classmethod
     def of_bench(cls, bench: Bench, sigma_mps2: float, readings: float, dwell_s: float) -> Prospect:
@@ -88,15 +91,17 @@ class Prospect:
         temperature_c = float(last.pieces[-1].nodes.temperature_c[-1])
         before = Last(last.end_s, last.pose, last.means[1:4], temperature_c, last.variances[-1])
         readings, nothing = float(np.median(carried.means.counts)), np.zeros((carried.model.count,) * 2)
-        return cls(carried.model, carried.state, fitted.noise, readings, dwell_s, nothing, before)
+        pauses_s = [after.start_s - dwell.end_s for dwell, after in itertools.pairwise(fitted.dwells)]
+        pause_s = float(np.median(pauses_s)) if pauses_s else PAUSE_S
+        return cls(carried.model, carried.state, fitted.noise, readings, dwell_s, nothing, before, pause_s)
 
     @classmethod
     def after(cls, fitted: Fit, prior: Prior | None = None) -> Prospect:
         """Of a run so far, with what is known by it: the filter's own factor."""
-        carried, noise, made = fitted.carried, fitted.noise, cls.following(fitted)
+        carried, noise, made = fitted.carried, fitted.noise, replace(cls.following(fitted), pause_s=PAUSE_S)
         first = information.start(prior or Prior(), carried.model)
         steps = information.run(first, fitted.rows(), fitted.steps, fitted.following)
-        waited = noise.walk_mps2_per_sqrt_s**2 * (PAUSE_S + made.dwell_s / 3.0)
+        waited = noise.walk_mps2_per_sqrt_s**2 * (made.pause_s + made.dwell_s / 3.0)
         known = walk.predicted(steps[-1].factor, waited)[:, :-1]
         more = considered(noise, carried.means, carried.state).sum(axis=0) + fitted.considered
         return replace(made, known=_less(known, more))
@@ -171,8 +176,8 @@ class Prospect:
         bench, count, last = self.model.bench, len(poses), self.last
         following = at_s is not None
         if at_s is None:
-            begin = last.end_s + PAUSE_S if last else 0.5 * self.dwell_s
-            at_s = np.linspace(begin, begin + 0.1, count)
+            middle_s = (last.end_s + self.pause_s if last else 0.0) + 0.5 * self.dwell_s
+            at_s = np.linspace(middle_s, middle_s + 0.1, count)
         force = bench.specific_force(at_s, poses)
         before = last or Last(0.0, poses[0], force[0])
         earlier = [

@@ -16,7 +16,7 @@ from kf_calib.sources.live.feed import IDLE_S, Feed, Lost, Regained, nothing
 from kf_calib.sources.live.links import Link
 from kf_calib.sources.live.protocols import Protocol
 
-_PACE_S = 0.008  # between reads: many small ones cost more than they bring; a serial port holds 4 KB meanwhile
+_PACE_S = 0.012  # between reads: many small ones cost more than they bring; a serial port holds 4 KB meanwhile
 _INBOX_BYTES = 1 << 25
 _PUSHED_BYTES = 1 << 20
 _TICK_S = 0.1
