@@ -7,279 +7,29 @@ the model with it fits; where several fit equally well they are all named; where
 
 from __future__ import annotations
 
-import functools
-import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from kf_calib import advice as advise
 from kf_calib import averaging
 from kf_calib.advice import Advice
-from kf_calib.calibration import Calibration, Parameter, consistency, format_p, refitted
+from kf_calib.assessment import EQUAL, LEVEL, SHARE, Test, assessed, price, run_level, threshold, walk_fall
+from kf_calib.calibration import Calibration, Parameter, format_p, refitted
 from kf_calib.drivers import JUMP, Family, families
-from kf_calib.effects import Effect, effect_named, names, walk_named
-from kf_calib.fitting import WALK, Fit, walk_gain
-from kf_calib.folding import DwellFactor, lines_of, stimulus_of
+from kf_calib.effects import walk_named
+from kf_calib.fitting import WALK
 from kf_calib.likelihood import FEWEST
-from kf_calib.model import Model
 from kf_calib.noise import mean_covariances
+from kf_calib.pairs import MOST, WALKS, Pair, Pairs, alike, as_good, exchanged, likeliest, names_of, pairs_of
 from kf_calib.samples import Floats
-from kf_calib.scan import Candidate, Scan, falls, scan
-from kf_calib.spectrum import Line, lowest_hz
-from kf_calib.trace import band_hz
+from kf_calib.scan import scan
 
-LEVEL = 0.01
-"""Chance of a false alarm a run."""
 _REFUSED = 0.002  # chance that what is really missing is turned down because noise beside it looks like something more
-
-_DRAWS = 4000
-_SHARE = 0.4  # of the chance of a false alarm: the misfit's and the scan's; lines have the rest
-_LINES = 1.0 - 2.0 * _SHARE
-_EQUAL = 6.63  # suspects whose chi-squared is this close to the best cannot be told from it (1 %, 1 dof)
 _ALIKE = 0.5  # overlap above which two suspects may be taken for each other
-_PAIRS = 3  # pairs that are refitted
-_WALK = -1  # in a pair, in the place of a candidate's number: a walk has no columns
 _SHOWN = 6  # suspects that are refitted and shown
-_POWER = 0.9
-_FEWEST_WALKED = 8  # dwells: a walk of the biases is looked for in that many
-
-
-@dataclass(frozen=True)
-class Test:
-    """All candidates against one fit: a candidate an effect, the best of the values where it has an unknown.
-
-    scores: chi-squared falls less the threshold of their degrees of freedom: above zero is beyond chance.
-    p_values: of the run. misfit_p: of the sum of squares as a whole (None: nothing left over to judge by).
-    lines: in the spectrum of the readings within dwells, and the name of the effect they speak for. vibration: those
-    that are no oscillation of one amplitude, and count as noise. without_lines: the test with its lines as vibration.
-    between: in words, of an oscillation what is too fast for the scan and too slow for a line. as_scatter: what could
-    be a walk of the biases could as well be scatter from dwell to dwell, of more than is stated.
-    """
-
-    scan: Scan
-    best: dict[str, int]
-    scores: dict[str, float]
-    p_values: dict[str, float]
-    misfit_p: float | None
-    walking: str
-    effective_tests: float
-    in_slews_only: tuple[str, ...]
-    lines: tuple[Line, ...]
-    oscillating: str = ""
-    vibration: tuple[Line, ...] = ()
-    without_lines: Test | None = None
-    between: str = ""
-    as_scatter: bool = False
-
-    @property
-    def p_value(self) -> float | None:
-        """Of the run: the smallest of the misfit's, the best suspect's and the best line's, each at its share."""
-        found = [*self.p_values.values(), *([self.misfit_p] if self.misfit_p is not None else [])]
-        return min(1.0, min(found) / _SHARE) if found else None
-
-    @property
-    def consistent(self) -> bool | None:
-        return None if self.p_value is None else self.p_value >= LEVEL
-
-    @property
-    def count(self) -> int:
-        """How many effects were looked for or could not be."""
-        return len(self.best) + len(self.in_slews_only) + bool(self.walking)
-
-    @property
-    def ranked(self) -> list[str]:
-        """Names, the likeliest first."""
-        return sorted(self.scores, key=lambda name: -self.scores[name])
-
-    @cached_property
-    def invisible(self) -> list[str]:
-        """Effects of which these orientations show nothing, and those that only slews could show."""
-        return [*self.unseen, *([self.between] if self.between else [])]
-
-    @cached_property
-    def unseen(self) -> list[str]:
-        """The effects among them of which nothing at all shows."""
-        return [*(name for name, k in self.best.items() if not self.scan.candidates[k].dof), *self.in_slews_only]
-
-    def nearness(self, name: str) -> float:
-        """The score without what many values of a constant cost: that speaks against chance, not for a rival.
-
-        A walk is judged over all its paths: an effect that happens to look like the one it took has gained on it.
-        """
-        if name not in self.best:
-            return self.scores[name] + (_EQUAL if name == self.walking else 0.0)
-        own, tests = self.candidate(name), self.effective_tests
-        return self.scores[name] + price(own, tests) - price(replace(own, tried=1), tests)
-
-    def candidate(self, name: str) -> Candidate:
-        return self.scan.candidates[self.best[name]]
-
-
-def candidates(model: Model) -> list[Effect]:
-    """The effects of the catalogue that are not in the model; one with an unknown at every value of a coarse grid."""
-    inside, out = {str(effect) for effect in model.effects}, list[Effect]()
-    for name in names(model.bench):
-        effect = effect_named(name, model.bench)
-        if name in inside or effect.dynamic or effect.walks or effect.oscillates:
-            continue
-        out += [effect] if effect.unknown is None else [effect.at(value) for value in effect.unknown.grid(2.0)]
-    return out
-
-
-def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
-    """Score tests of all candidates, calibrated on their own columns by drawing residuals as noise alone makes them.
-
-    tests: as how many independent ones they count, where that is known from nearly the same columns.
-    """
-    from scipy.special import chdtrc
-
-    model, misfit_p = fitted.carried.model, consistency(fitted).p_value
-    found = _scanned(fitted)
-    statistics = found.statistics
-    tests = tests or independent_tests(found, seed)
-    best, scores, p_values = dict[str, int](), dict[str, float](), dict[str, float]()
-    for k, candidate in enumerate(found.candidates):
-        name = str(candidate.effect)
-        score = float(statistics[k]) - price(candidate, tests) if candidate.dof else -np.inf
-        if name not in best or score > scores.get(name, -np.inf):
-            best[name] = k
-            if candidate.dof:
-                own = run_level(float(chdtrc(candidate.dof, statistics[k])), candidate.tried)
-                scores[name], p_values[name] = score, run_level(own, tests)
-    name, as_scatter = _walking(fitted), False
-    if name:
-        fall, as_scatter = _walk_fall(fitted, tests)
-        p_values[name] = run_level(0.5 * float(chdtrc(1, max(fall, 0.0))), tests)
-        scores[name] = fall - _threshold(1, tests)
-    slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
-    test = Test(found, best, scores, p_values, misfit_p, name, tests, slewing, (), as_scatter=as_scatter)
-    return _with_lines(test, fitted)
-
-
-def _scanned(fitted: Fit) -> Scan:
-    """The scan of all candidates, and of an oscillation at the frequency, below those of lines, that explains most."""
-    carried, noise = fitted.carried, fitted.noise.judging
-    effect = _oscillation(carried.model)
-    if effect is None or carried.model.oscillates:
-        return scan(carried, noise, candidates(carried.model))
-    values = _slow(fitted, effect)
-    if not len(values):
-        return scan(carried, noise, candidates(carried.model))
-    coarse = falls(carried, noise, [effect.at(value) for value in values])
-    near = values[np.argmax(coarse)] + 0.125 * values[0] * np.arange(-3, 4)
-    slow = [effect.at(value) for value in near]
-    swinging = slow[int(np.argmax(falls(carried, noise, slow)))]
-    found = scan(carried, noise, [*candidates(carried.model), swinging])
-    *others, last = found.candidates
-    return replace(found, candidates=(*others, replace(last, tried=len(values))))
-
-
-def _oscillation(model: Model) -> Effect | None:
-    every = (effect_named(name, model.bench) for name in names(model.bench))
-    return next((effect for effect in every if effect.oscillates), None)
-
-
-def _slow(fitted: Fit, effect: Effect) -> Floats:
-    """Frequencies of oscillations too slow to show within dwells, in halves of 1/run: from a cycle a run up."""
-    stimulus = stimulus_of(fitted.dwells, fitted.carried.model.bench, fitted.carried.state)
-    values = effect.grid(stimulus)[2::2]
-    return values[values < min(_searched_hz(fitted.dwells))]
-
-
-def _searched_hz(dwells: Sequence[DwellFactor]) -> tuple[float, float, float]:
-    """From which frequency to which a steady oscillation is looked for, and from which on lines; infinite: not."""
-    steady, first = band_hz([dwell.trace for dwell in dwells]), lowest_hz(dwell.spectrum for dwell in dwells)
-    return *steady, first
-
-
-def _with_lines(test: Test, fitted: Fit) -> Test:
-    """The test with the lines of the spectrum: they speak for an oscillation, whatever of it is slow."""
-    from scipy.special import chdtri
-
-    effect = _oscillation(fitted.carried.model)
-    if effect is None or fitted.carried.model.oscillates:
-        return test
-    name, slow, (low, high, first) = str(effect), _slow(fitted, effect), _searched_hz(fitted.dwells)
-    top = float(slow[-1]) if len(slow) else low
-    gaps = [(top, low), (high, first)] if np.isfinite(low) else [(top, first)]
-    bands = [f"of {a:.2g} to {b:.2g} Hz" if np.isfinite(b) else f"above {a:.2g} Hz" for a, b in gaps if b > 1.5 * a]
-    if bands:
-        test = replace(test, between=f"{name} {' and '.join(bands)}")
-    seen = lines_of(fitted.dwells, LEVEL * _LINES)
-    if not seen:
-        return test
-    p_value = seen[0].p_value
-    return replace(
-        test,
-        best={key: k for key, k in test.best.items() if key != name},
-        scores=test.scores | {name: float(chdtri(1, max(p_value, 1e-300))) - _threshold(1, 1.0)},
-        p_values=test.p_values | {name: p_value * _SHARE / _LINES},
-        lines=seen,
-        oscillating=name,
-        without_lines=replace(test, vibration=seen),
-    )
-
-
-def price(candidate: Candidate, tests: float) -> float:
-    """The fall of chi-squared that chance gives one of so many candidates.
-
-    A constant looked for counts as one degree of freedom more, or, where it takes many tests, as these.
-    """
-    looked_for = candidate.effect.unknown is not None and candidate.tried == 1
-    return _threshold(candidate.dof + looked_for, tests * candidate.tried)
-
-
-@functools.cache
-def _threshold(dof: int, tests: float) -> float:
-    from scipy.special import chdtri
-
-    return float(chdtri(dof, LEVEL / tests))
-
-
-def independent_tests(found: Scan, seed: int = 0) -> float:
-    """As many independent tests would reach the smallest p-value that one run in 100 reaches."""
-    seen = np.flatnonzero([each.dof for each in found.candidates])
-    if not len(seen):
-        return 1.0
-    return LEVEL / max(float(np.quantile(_smallest_p(found, seen, seed), LEVEL)), 1e-12)
-
-
-def run_level(p_value: float, tests: float) -> float:
-    """The chance that any of ``tests`` independent tests shows a p-value as small: 1 - (1 - p)^n."""
-    return float(-np.expm1(tests * np.log1p(-min(p_value, 1.0 - 1e-16))))
-
-
-def _smallest_p(found: Scan, seen: NDArray[np.intp], seed: int) -> Floats:
-    """The smallest p-value among all candidates in each of many runs in which nothing is missing."""
-    from scipy.special import chdtrc
-
-    draws = np.random.default_rng(seed).standard_normal((_DRAWS, len(found.residual)))
-    bases = [found.candidates[k].basis for k in seen]
-    starts = np.cumsum([0, *(basis.shape[1] for basis in bases[:-1])])
-    squares = np.add.reduceat((draws @ np.concatenate(bases, axis=1)) ** 2, starts, axis=1)
-    return chdtrc(np.array([basis.shape[1] for basis in bases], float), squares).min(axis=1)
-
-
-def _walking(fitted: Fit) -> str:
-    """The name of the effect that lets the biases walk; empty where it is in the model, or cannot be looked for."""
-    model = fitted.carried.model
-    if model.walks or len(fitted.dwells) < _FEWEST_WALKED or fitted.noise.walk_mps2_per_sqrt_s:
-        return ""
-    return walk_named(model.bench)
-
-
-def _walk_fall(fitted: Fit, tests: float) -> tuple[float, bool]:
-    """By how much a walk of the biases lowers -2 log-likelihood; whether it could as well be more scatter than stated.
-
-    Of two that explain as much, more scatter than was stated is less likely than a walk.
-    """
-    (fall, ratio), least = (2.0 * gain for gain in walk_gain(fitted)), _threshold(1, tests)
-    return fall if ratio > (0.0 if fitted.noise.scatter_stated else least) else ratio, ratio < least
 
 
 @dataclass(frozen=True)
@@ -368,14 +118,14 @@ def _likeliest(before: Calibration, test: Test) -> Diagnosis:
         return nothing
     suspects = _suspects(before, test)
     # what explains all of it explains most: one that fits far behind the first has only made the noise large enough
-    least = test.scores[test.ranked[0]] - 2.0 * _EQUAL if test.ranked else 0.0
+    least = test.scores[test.ranked[0]] - 2.0 * EQUAL if test.ranked else 0.0
     explaining = [each for each in suspects if each.fits and test.scores[each.name] > least]
     explaining = [each for each in explaining if _beyond_scatter(before, test, (each.name,))]
     found = replace(nothing, suspects=suspects)
-    pairs = _pairs(test) if not explaining or explaining[0].name in (*test.best, test.walking) else {}
+    pairs = pairs_of(test) if not explaining or explaining[0].name in (*test.best, test.walking) else {}
     if explaining:
         first = explaining[0].name
-        least = test.scores[first] + (2.0 if first == test.walking else 1.0) * _EQUAL
+        least = test.scores[first] + (2.0 if first == test.walking else 1.0) * EQUAL
         clearly = {pair: score for pair, score in pairs.items() if score > least}
         return _two(found, clearly, explaining[0].name) or _one(found, explaining[0], pairs)
     several = _two(found, pairs | _pairs_with_walk(before, test)) or _beside_lines(found)
@@ -452,7 +202,7 @@ def _without_vibration(before: Calibration, test: Test) -> Test:
     return test if share > 0.5 else test.without_lines
 
 
-def _one(found: Diagnosis, first: Suspect, pairs: dict[tuple[int, int], float]) -> Diagnosis:
+def _one(found: Diagnosis, first: Suspect, pairs: Pairs) -> Diagnosis:
     """One effect explains the misfit; with it, all that explain it as well and look like it, alone or in pairs.
 
     Unless a formula that is no known effect explains it better: then the effect is not the one that is missing.
@@ -461,12 +211,13 @@ def _one(found: Diagnosis, first: Suspect, pairs: dict[tuple[int, int], float]) 
     outdone = _outdone(found, first.refit, (first.name,)) if first.name in test.best else _walks_not(found, first)
     if outdone:
         return replace(found, unknown=True)
-    close = [name for name in test.ranked if test.nearness(name) > test.scores[first.name] - _EQUAL]
-    overlaps = {name: _overlap(test, first.name, name) for name in close if name != first.name}
+    close = [name for name in test.ranked if test.nearness(name) > test.scores[first.name] - EQUAL]
+    numbers = {name: test.best.get(name, WALKS) for name in (first.name, *close)}  # a walk, a line: no columns
+    overlaps = {name: alike(test, numbers[first.name], numbers[name]) for name in close if name != first.name}
     overlaps = {name: overlap for name, overlap in overlaps.items() if overlap > _ALIKE}
     single = replace(found, missing=(first.name,), ambiguity=(first.name, *overlaps), overlaps=overlaps)
     single = replace(single, as_scatter=first.name == test.walking and test.as_scatter)
-    together = _as_good(test, pairs, test.scores[first.name], {first.name})
+    together = as_good(test, pairs, test.scores[first.name], {first.name})
     return replace(_beside(single, [pair for pair in together if _both_fit(found, pair)]), after=first.refit)
 
 
@@ -480,29 +231,6 @@ def _beside(found: Diagnosis, together: Sequence[tuple[str, str]]) -> Diagnosis:
     return replace(found, together=tuple(together), ambiguity=(*found.ambiguity, *added))
 
 
-def _as_good(
-    test: Test, pairs: dict[tuple[int, int], float], score: float, but: Collection[str]
-) -> list[tuple[str, str]]:
-    """Names of the best few pairs that explain as much as what scores so much, none of them in ``but``."""
-    near = sorted((pair for pair in pairs if _nearness(pairs, pair) > score - _EQUAL), key=lambda pair: -pairs[pair])
-    named = dict.fromkeys(_names_of(test, pair) for pair in near)
-    return [pair for pair in named if not set(pair) & set(but)][:_PAIRS]
-
-
-def _nearness(pairs: dict[tuple[int, int], float], pair: tuple[int, int]) -> float:
-    """The score of a pair; one of a walk is near a pair of something that looks like the path it took."""
-    return pairs[pair] + (_EQUAL if _WALK in pair else 0.0)
-
-
-def _names_of(test: Test, pair: tuple[int, int]) -> tuple[str, str]:
-    one, two = (_name_of(test, k) for k in pair)
-    return one, two
-
-
-def _name_of(test: Test, k: int) -> str:
-    return test.walking if k == _WALK else str(test.scan.candidates[k].effect)
-
-
 def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool:
     """Whether some formula explains the misfit better than the effects at the constants that were found for them.
 
@@ -514,8 +242,8 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
     own, _ = scanned.explained(np.concatenate([each.basis for each in scanned.candidates], axis=1))
     own -= sum(price(each, tests) for each in scanned.candidates)
     if found.test.walking in names:
-        own += _walk_fall(refit.fit, tests)[0] - _threshold(1, tests)
-    return any(gain > own + _EQUAL for gain, _ in _formulas(found))
+        own += walk_fall(refit.fit, tests)[0] - threshold(1, tests)
+    return any(gain > own + EQUAL for gain, _ in _formulas(found))
 
 
 def _formulas(found: Diagnosis) -> list[tuple[float, Family]]:
@@ -523,7 +251,7 @@ def _formulas(found: Diagnosis) -> list[tuple[float, Family]]:
     test = found.test
     known = [test.candidate(name).effect for name in test.best]
     tried = [each for each in families(found.before.fit, known)[0] if each.dof and not each.known]
-    return [(each.fall - _threshold(each.dof, test.effective_tests), each) for each in tried]
+    return [(each.fall - threshold(each.dof, test.effective_tests), each) for each in tried]
 
 
 def _walks_not(found: Diagnosis, first: Suspect) -> bool:
@@ -535,21 +263,19 @@ def _walks_not(found: Diagnosis, first: Suspect) -> bool:
         return False
     simpler = [each for each in _formulas(found) if each[1].driver == JUMP or not each[1].driver.startswith("time")]
     gain, formula = max(simpler, key=lambda each: each[0], default=(-np.inf, None))
-    if formula is None or gain < found.test.nearness(first.name) + _EQUAL:
+    if formula is None or gain < found.test.nearness(first.name) + EQUAL:
         return False
     return _fits(with_effects(found.before, formula.formulas), found.test)
 
 
-def _two(found: Diagnosis, pairs: dict[tuple[int, int], float], alone: str = "") -> Diagnosis | None:
+def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:
     """Two effects explain the misfit where no single one does: they may mask each other. The best few are refitted.
 
     alone: a single one that would do, if not as well; a walk can take any path, so it stays in the set.
     """
     test = found.test
-    likeliest = dict[tuple[str, str], tuple[int, int]]()  # of the values of their constants
-    for pair in sorted(pairs, key=lambda pair: -pairs[pair]):
-        likeliest.setdefault(_names_of(test, pair), pair)
-    for both, pair in list(likeliest.items())[:_PAIRS]:
+    for pair in likeliest(test, pairs):
+        both = names_of(test, pair)
         if not _beyond_scatter(found.before, test, both):
             continue
         refit = with_effects(found.before, both)
@@ -557,53 +283,31 @@ def _two(found: Diagnosis, pairs: dict[tuple[int, int], float], alone: str = "")
             continue
         if _outdone(found, refit, both):
             return None
-        walks = alone and alone == test.walking
-        overlaps = {alone: 1.0} if walks else dict[str, float]()
-        for other in pairs:
-            shared = set(pair) & set(other)
-            if _nearness(pairs, other) > pairs[pair] - _EQUAL and len(shared) == 1:
-                (lost,), (new,) = set(pair) - shared, set(other) - shared
-                name, alike = _name_of(test, new), _alike(test, lost, new)
-                if alike > max(_ALIKE, overlaps.get(name, 0.0)) and name not in both:
-                    overlaps[name] = alike
+        walks = bool(alone) and alone == test.walking
+        overlaps = ({alone: 1.0} if walks else {}) | exchanged(test, pairs, pair, _ALIKE)
         named = replace(found, missing=both, ambiguity=(*both, *overlaps), overlaps=overlaps, after=refit)
         named = replace(named, alone=alone if walks else "")
-        if _WALK in pair:
-            named = replace(named, as_scatter=_walk_fall(refit.fit, test.effective_tests)[1])
-        return _beside(named, _as_good(test, pairs, pairs[pair], both))
+        if WALKS in pair:
+            named = replace(named, as_scatter=walk_fall(refit.fit, test.effective_tests)[1])
+        return _beside(named, as_good(test, pairs, pairs[pair], both))
     return None
 
 
-def _pairs(test: Test) -> dict[tuple[int, int], float]:
-    """Pairs of which each is beyond chance beside the other: the fall of chi-squared less the prices of both."""
-    candidates, falls = test.scan.candidates, test.scan.statistics
-    prices = [price(each, test.effective_tests) if each.dof else 0.0 for each in candidates]
-    out = dict[tuple[int, int], float]()
-    for j, k in itertools.combinations([k for k, each in enumerate(candidates) if each.dof], 2):
-        one, two = candidates[j], candidates[k]
-        if str(one.effect) == str(two.effect):
-            continue
-        fall = falls[j] + test.scan.explained(two.basis - one.basis @ (one.basis.T @ two.basis))[0]
-        if fall - falls[j] > prices[k] and fall - falls[k] > prices[j]:
-            out[j, k] = float(fall - prices[j] - prices[k])
-    return out
-
-
-def _pairs_with_walk(before: Calibration, test: Test) -> dict[tuple[int, int], float]:
-    """The same of an effect and a walk of the biases, for those effects that are likeliest beside a walk.
+def _pairs_with_walk(before: Calibration, test: Test) -> dict[Pair, float]:
+    """Pairs of an effect and a walk of the biases, for those effects that are likeliest beside a walk.
 
     The walk beside the effect is judged by its likelihood, after a refit with both.
     """
     if not test.walking:
         return {}
-    candidates, tests, out = test.scan.candidates, test.effective_tests, dict[tuple[int, int], float]()
+    candidates, tests, out = test.scan.candidates, test.effective_tests, dict[Pair, float]()
     beside = assessed(with_effects(before, (test.walking,)).fit, tests)
-    for name in [name for name in beside.ranked if name in test.best][:_PAIRS]:
+    for name in [name for name in beside.ranked if name in test.best][:MOST]:
         k = test.best[name]
         own = float(test.scan.statistics[k]) - price(candidates[k], tests)
-        walk = _walk_fall(with_effects(before, (name, test.walking)).fit, tests)[0] - _threshold(1, tests)
+        walk = walk_fall(with_effects(before, (name, test.walking)).fit, tests)[0] - threshold(1, tests)
         if walk > 0.0 and own + walk > test.scores[test.walking]:
-            out[k, _WALK] = own + walk
+            out[k, WALKS] = own + walk
     return out
 
 
@@ -623,7 +327,7 @@ def _fits(refit: Calibration, before: Test) -> bool:
     """Whether nothing is left that noise would not leave, by means an effect of that kind has."""
     misfit = refit.consistency.p_value
     least = LEVEL if refit.noise.walk_mps2_per_sqrt_s else _REFUSED  # a walk explains much that is none
-    if (misfit is not None and misfit < _SHARE * least) or _leaps(refit) or _at_an_end(refit):
+    if (misfit is not None and misfit < SHARE * least) or _leaps(refit) or _at_an_end(refit):
         return False
     left = assessed(refit.fit, before.effective_tests).p_value
     return left is None or left >= least
@@ -649,48 +353,6 @@ def _leaps(refit: Calibration) -> bool:
 def with_effects(before: Calibration, added: Sequence[str]) -> Calibration:
     """The same run with further effects in the model."""
     return refitted(before, (*before.settings.effects, *added))
-
-
-def _overlap(test: Test, one: str, other: str) -> float:
-    return _alike(test, test.best.get(one, _WALK), test.best.get(other, _WALK))
-
-
-def _alike(test: Test, one: int, other: int) -> float:
-    """The overlap of two candidates; 1 with a walk, which can take any path."""
-    candidates = test.scan.candidates
-    return 1.0 if _WALK in (one, other) else candidates[one].overlap(candidates[other])
-
-
-@dataclass(frozen=True)
-class Detectable:
-    """The size of one coefficient at which an effect is found in 90 of 100 runs, the largest over its coefficients."""
-
-    name: str
-    minimum: float
-    unit: str
-    shown_minimum: float
-    shown_unit: str
-
-
-def detectable(test: Test) -> list[Detectable]:
-    """Of every visible effect, from the columns alone."""
-    from scipy.special import chdtri, chndtrinc
-
-    out = list[Detectable]()
-    for name, k in test.best.items():
-        candidate = test.scan.candidates[k]
-        if not candidate.dof or name in test.invisible:
-            continue
-        threshold = float(chdtri(candidate.dof, _SHARE * LEVEL / test.effective_tests))
-        needed = float(np.sqrt(chndtrinc(threshold, candidate.dof, 1.0 - _POWER)))
-        sizes = np.linalg.norm(candidate.columns, axis=0)
-        seen = ~candidate.hidden & (sizes > 0)
-        if not seen.any():
-            continue
-        worst = int(np.argmax(np.where(seen, needed / np.where(seen, sizes, 1.0), 0.0)))
-        minimum, own = needed / float(sizes[worst]), candidate.effect.coefficients[worst]
-        out.append(Detectable(name, minimum, own.unit, minimum * own.per_si, own.shown_unit))
-    return out
 
 
 def next_orientation(found: Diagnosis) -> tuple[Advice, str] | None:

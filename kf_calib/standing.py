@@ -16,8 +16,9 @@ from threadpoolctl import threadpool_limits
 
 from kf_calib import paper
 from kf_calib.advice import Course, course
+from kf_calib.assessment import LEVEL, assessed
 from kf_calib.calibration import Calibration, Pass, concluded, evaluate, format_p, refuse_unusable, told, usable
-from kf_calib.diagnosis import LEVEL, Diagnosis, assessed, diagnose, next_orientation
+from kf_calib.diagnosis import Diagnosis, diagnose, next_orientation
 from kf_calib.folding import DwellFactor
 from kf_calib.noise import mean_covariances
 from kf_calib.samples import Floats, Source

@@ -18,9 +18,9 @@ from functools import cached_property
 
 from threadpoolctl import threadpool_limits
 
+from kf_calib.assessment import LEVEL, candidates, independent_tests, price, run_level
 from kf_calib.bench import Bench
 from kf_calib.calibration import Settings
-from kf_calib.diagnosis import LEVEL, candidates, independent_tests, price, run_level
 from kf_calib.effects import Effect
 from kf_calib.fitting import Fit, fit
 from kf_calib.folding import DwellFactor

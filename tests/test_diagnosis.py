@@ -11,10 +11,11 @@ import pytest
 from click.testing import CliRunner
 from synthetic import Run
 
+from kf_calib.assessment import assessed, detectable
 from kf_calib.bench import Bench, axes_of
 from kf_calib.calibration import Calibration, calibrate
 from kf_calib.cli import cli
-from kf_calib.diagnosis import assessed, detectable, diagnose, next_orientation, with_effects
+from kf_calib.diagnosis import diagnose, next_orientation, with_effects
 from kf_calib.effects import effect_named
 from kf_calib.scan import scan
 from kf_calib.sources.hidden import parse

@@ -9,8 +9,9 @@ import pytest
 from synthetic import Run
 from test_diagnosis import BENCH
 
+from kf_calib.assessment import assessed
 from kf_calib.calibration import Calibration, calibrate
-from kf_calib.diagnosis import Diagnosis, assessed, diagnose
+from kf_calib.diagnosis import Diagnosis, diagnose
 from kf_calib.sources.hidden import parse
 from kf_calib.sources.hidden.detectability import sized
 from kf_calib.sources.noise_sources import Noise

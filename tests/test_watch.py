@@ -7,8 +7,8 @@ import pytest
 from synthetic import Run
 from test_diagnosis import run
 
+from kf_calib.assessment import candidates
 from kf_calib.calibration import Calibration, calibrate
-from kf_calib.diagnosis import candidates
 from kf_calib.running import Running
 from kf_calib.scan import scan
 from kf_calib.watch import Watch

@@ -381,8 +381,8 @@ def power(task: Task) -> Outcome:
 
     By the test that ``diagnose`` begins with; to name what it has noticed takes it most of its time.
     """
+    from kf_calib.assessment import assessed
     from kf_calib.calibration import calibrate
-    from kf_calib.diagnosis import assessed
     from kf_calib.sources.recording import Recording
 
     (name,) = task.hidden

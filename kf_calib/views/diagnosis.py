@@ -10,8 +10,9 @@ from rich.table import Table
 from rich.text import Text
 
 from kf_calib.advice import Advice
+from kf_calib.assessment import Detectable, detectable
 from kf_calib.calibration import format_p
-from kf_calib.diagnosis import Detectable, Diagnosis, Suspect, detectable, next_orientation
+from kf_calib.diagnosis import Diagnosis, Suspect, next_orientation
 from kf_calib.drivers import Description, described
 from kf_calib.views.console import rounded, symbol
 from kf_calib.views.json import clean, readings_object

@@ -1,0 +1,300 @@
+"""All candidates against one fit: which explain more than chance would, and how small an effect would be found."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kf_calib.calibration import consistency
+from kf_calib.effects import Effect, effect_named, names, walk_named
+from kf_calib.fitting import Fit, walk_gain
+from kf_calib.folding import DwellFactor, lines_of, stimulus_of
+from kf_calib.model import Model
+from kf_calib.samples import Floats
+from kf_calib.scan import Candidate, Scan, falls, scan
+from kf_calib.spectrum import Line, lowest_hz
+from kf_calib.trace import band_hz
+
+LEVEL = 0.01
+"""Chance of a false alarm a run."""
+
+SHARE = 0.4
+"""Of the chance of a false alarm: the misfit's and the scan's; lines have the rest."""
+
+EQUAL = 6.63
+"""Suspects whose chi-squared is this close to the best cannot be told from it (1 %, 1 dof)."""
+
+_LINES = 1.0 - 2.0 * SHARE
+_DRAWS = 4000
+_POWER = 0.9
+_FEWEST_WALKED = 8  # dwells: a walk of the biases is looked for in that many
+
+
+@dataclass(frozen=True)
+class Test:
+    """All candidates against one fit: a candidate an effect, the best of the values where it has an unknown.
+
+    scores: chi-squared falls less the threshold of their degrees of freedom: above zero is beyond chance.
+    p_values: of the run. misfit_p: of the sum of squares as a whole (None: nothing left over to judge by).
+    lines: in the spectrum of the readings within dwells, and the name of the effect they speak for. vibration: those
+    that are no oscillation of one amplitude, and count as noise. without_lines: the test with its lines as vibration.
+    between: in words, of an oscillation what is too fast for the scan and too slow for a line. as_scatter: what could
+    be a walk of the biases could as well be scatter from dwell to dwell, of more than is stated.
+    """
+
+    scan: Scan
+    best: dict[str, int]
+    scores: dict[str, float]
+    p_values: dict[str, float]
+    misfit_p: float | None
+    walking: str
+    effective_tests: float
+    in_slews_only: tuple[str, ...]
+    lines: tuple[Line, ...]
+    oscillating: str = ""
+    vibration: tuple[Line, ...] = ()
+    without_lines: Test | None = None
+    between: str = ""
+    as_scatter: bool = False
+
+    @property
+    def p_value(self) -> float | None:
+        """Of the run: the smallest of the misfit's, the best suspect's and the best line's, each at its share."""
+        found = [*self.p_values.values(), *([self.misfit_p] if self.misfit_p is not None else [])]
+        return min(1.0, min(found) / SHARE) if found else None
+
+    @property
+    def consistent(self) -> bool | None:
+        return None if self.p_value is None else self.p_value >= LEVEL
+
+    @property
+    def count(self) -> int:
+        """How many effects were looked for or could not be."""
+        return len(self.best) + len(self.in_slews_only) + bool(self.walking)
+
+    @property
+    def ranked(self) -> list[str]:
+        """Names, the likeliest first."""
+        return sorted(self.scores, key=lambda name: -self.scores[name])
+
+    @cached_property
+    def invisible(self) -> list[str]:
+        """Effects of which these orientations show nothing, and those that only slews could show."""
+        return [*self.unseen, *([self.between] if self.between else [])]
+
+    @cached_property
+    def unseen(self) -> list[str]:
+        """The effects among them of which nothing at all shows."""
+        return [*(name for name, k in self.best.items() if not self.scan.candidates[k].dof), *self.in_slews_only]
+
+    def nearness(self, name: str) -> float:
+        """The score without what many values of a constant cost: that speaks against chance, not for a rival.
+
+        A walk is judged over all its paths: an effect that happens to look like the one it took has gained on it.
+        """
+        if name not in self.best:
+            return self.scores[name] + (EQUAL if name == self.walking else 0.0)
+        own, tests = self.candidate(name), self.effective_tests
+        return self.scores[name] + price(own, tests) - price(replace(own, tried=1), tests)
+
+    def candidate(self, name: str) -> Candidate:
+        return self.scan.candidates[self.best[name]]
+
+
+def candidates(model: Model) -> list[Effect]:
+    """The effects of the catalogue that are not in the model; one with an unknown at every value of a coarse grid."""
+    inside, out = {str(effect) for effect in model.effects}, list[Effect]()
+    for name in names(model.bench):
+        effect = effect_named(name, model.bench)
+        if name in inside or effect.dynamic or effect.walks or effect.oscillates:
+            continue
+        out += [effect] if effect.unknown is None else [effect.at(value) for value in effect.unknown.grid(2.0)]
+    return out
+
+
+def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
+    """Score tests of all candidates, calibrated on their own columns by drawing residuals as noise alone makes them.
+
+    tests: as how many independent ones they count, where that is known from nearly the same columns.
+    """
+    from scipy.special import chdtrc
+
+    model, misfit_p = fitted.carried.model, consistency(fitted).p_value
+    found = _scanned(fitted)
+    statistics = found.statistics
+    tests = tests or independent_tests(found, seed)
+    best, scores, p_values = dict[str, int](), dict[str, float](), dict[str, float]()
+    for k, candidate in enumerate(found.candidates):
+        name = str(candidate.effect)
+        score = float(statistics[k]) - price(candidate, tests) if candidate.dof else -np.inf
+        if name not in best or score > scores.get(name, -np.inf):
+            best[name] = k
+            if candidate.dof:
+                own = run_level(float(chdtrc(candidate.dof, statistics[k])), candidate.tried)
+                scores[name], p_values[name] = score, run_level(own, tests)
+    name, as_scatter = _walking(fitted), False
+    if name:
+        fall, as_scatter = walk_fall(fitted, tests)
+        p_values[name] = run_level(0.5 * float(chdtrc(1, max(fall, 0.0))), tests)
+        scores[name] = fall - threshold(1, tests)
+    slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
+    test = Test(found, best, scores, p_values, misfit_p, name, tests, slewing, (), as_scatter=as_scatter)
+    return _with_lines(test, fitted)
+
+
+def _scanned(fitted: Fit) -> Scan:
+    """The scan of all candidates, and of an oscillation at the frequency, below those of lines, that explains most."""
+    carried, noise = fitted.carried, fitted.noise.judging
+    effect = _oscillation(carried.model)
+    if effect is None or carried.model.oscillates:
+        return scan(carried, noise, candidates(carried.model))
+    values = _slow(fitted, effect)
+    if not len(values):
+        return scan(carried, noise, candidates(carried.model))
+    coarse = falls(carried, noise, [effect.at(value) for value in values])
+    near = values[np.argmax(coarse)] + 0.125 * values[0] * np.arange(-3, 4)
+    slow = [effect.at(value) for value in near]
+    swinging = slow[int(np.argmax(falls(carried, noise, slow)))]
+    found = scan(carried, noise, [*candidates(carried.model), swinging])
+    *others, last = found.candidates
+    return replace(found, candidates=(*others, replace(last, tried=len(values))))
+
+
+def _oscillation(model: Model) -> Effect | None:
+    every = (effect_named(name, model.bench) for name in names(model.bench))
+    return next((effect for effect in every if effect.oscillates), None)
+
+
+def _slow(fitted: Fit, effect: Effect) -> Floats:
+    """Frequencies of oscillations too slow to show within dwells, in halves of 1/run: from a cycle a run up."""
+    stimulus = stimulus_of(fitted.dwells, fitted.carried.model.bench, fitted.carried.state)
+    values = effect.grid(stimulus)[2::2]
+    return values[values < min(_searched_hz(fitted.dwells))]
+
+
+def _searched_hz(dwells: Sequence[DwellFactor]) -> tuple[float, float, float]:
+    """From which frequency to which a steady oscillation is looked for, and from which on lines; infinite: not."""
+    steady, first = band_hz([dwell.trace for dwell in dwells]), lowest_hz(dwell.spectrum for dwell in dwells)
+    return *steady, first
+
+
+def _with_lines(test: Test, fitted: Fit) -> Test:
+    """The test with the lines of the spectrum: they speak for an oscillation, whatever of it is slow."""
+    from scipy.special import chdtri
+
+    effect = _oscillation(fitted.carried.model)
+    if effect is None or fitted.carried.model.oscillates:
+        return test
+    name, slow, (low, high, first) = str(effect), _slow(fitted, effect), _searched_hz(fitted.dwells)
+    top = float(slow[-1]) if len(slow) else low
+    gaps = [(top, low), (high, first)] if np.isfinite(low) else [(top, first)]
+    bands = [f"of {a:.2g} to {b:.2g} Hz" if np.isfinite(b) else f"above {a:.2g} Hz" for a, b in gaps if b > 1.5 * a]
+    if bands:
+        test = replace(test, between=f"{name} {' and '.join(bands)}")
+    seen = lines_of(fitted.dwells, LEVEL * _LINES)
+    if not seen:
+        return test
+    p_value = seen[0].p_value
+    return replace(
+        test,
+        best={key: k for key, k in test.best.items() if key != name},
+        scores=test.scores | {name: float(chdtri(1, max(p_value, 1e-300))) - threshold(1, 1.0)},
+        p_values=test.p_values | {name: p_value * SHARE / _LINES},
+        lines=seen,
+        oscillating=name,
+        without_lines=replace(test, vibration=seen),
+    )
+
+
+def price(candidate: Candidate, tests: float) -> float:
+    """The fall of chi-squared that chance gives one of so many candidates.
+
+    A constant looked for counts as one degree of freedom more, or, where it takes many tests, as these.
+    """
+    looked_for = candidate.effect.unknown is not None and candidate.tried == 1
+    return threshold(candidate.dof + looked_for, tests * candidate.tried)
+
+
+@functools.cache
+def threshold(dof: int, tests: float) -> float:
+    from scipy.special import chdtri
+
+    return float(chdtri(dof, LEVEL / tests))
+
+
+def independent_tests(found: Scan, seed: int = 0) -> float:
+    """As many independent tests would reach the smallest p-value that one run in 100 reaches."""
+    seen = np.flatnonzero([each.dof for each in found.candidates])
+    if not len(seen):
+        return 1.0
+    return LEVEL / max(float(np.quantile(_smallest_p(found, seen, seed), LEVEL)), 1e-12)
+
+
+def run_level(p_value: float, tests: float) -> float:
+    """The chance that any of ``tests`` independent tests shows a p-value as small: 1 - (1 - p)^n."""
+    return float(-np.expm1(tests * np.log1p(-min(p_value, 1.0 - 1e-16))))
+
+
+def _smallest_p(found: Scan, seen: NDArray[np.intp], seed: int) -> Floats:
+    """The smallest p-value among all candidates in each of many runs in which nothing is missing."""
+    from scipy.special import chdtrc
+
+    draws = np.random.default_rng(seed).standard_normal((_DRAWS, len(found.residual)))
+    bases = [found.candidates[k].basis for k in seen]
+    starts = np.cumsum([0, *(basis.shape[1] for basis in bases[:-1])])
+    squares = np.add.reduceat((draws @ np.concatenate(bases, axis=1)) ** 2, starts, axis=1)
+    return chdtrc(np.array([basis.shape[1] for basis in bases], float), squares).min(axis=1)
+
+
+def _walking(fitted: Fit) -> str:
+    """The name of the effect that lets the biases walk; empty where it is in the model, or cannot be looked for."""
+    model = fitted.carried.model
+    if model.walks or len(fitted.dwells) < _FEWEST_WALKED or fitted.noise.walk_mps2_per_sqrt_s:
+        return ""
+    return walk_named(model.bench)
+
+
+def walk_fall(fitted: Fit, tests: float) -> tuple[float, bool]:
+    """By how much a walk of the biases lowers -2 log-likelihood; whether it could as well be more scatter than stated.
+
+    Of two that explain as much, more scatter than was stated is less likely than a walk.
+    """
+    (fall, ratio), least = (2.0 * gain for gain in walk_gain(fitted)), threshold(1, tests)
+    return fall if ratio > (0.0 if fitted.noise.scatter_stated else least) else ratio, ratio < least
+
+
+@dataclass(frozen=True)
+class Detectable:
+    """The size of one coefficient at which an effect is found in 90 of 100 runs, the largest over its coefficients."""
+
+    name: str
+    minimum: float
+    unit: str
+    shown_minimum: float
+    shown_unit: str
+
+
+def detectable(test: Test) -> list[Detectable]:
+    """Of every visible effect, from the columns alone."""
+    from scipy.special import chdtri, chndtrinc
+
+    out = list[Detectable]()
+    for name, k in test.best.items():
+        candidate = test.scan.candidates[k]
+        if not candidate.dof or name in test.invisible:
+            continue
+        threshold = float(chdtri(candidate.dof, SHARE * LEVEL / test.effective_tests))
+        needed = float(np.sqrt(chndtrinc(threshold, candidate.dof, 1.0 - _POWER)))
+        sizes = np.linalg.norm(candidate.columns, axis=0)
+        seen = ~candidate.hidden & (sizes > 0)
+        if not seen.any():
+            continue
+        worst = int(np.argmax(np.where(seen, needed / np.where(seen, sizes, 1.0), 0.0)))
+        minimum, own = needed / float(sizes[worst]), candidate.effect.coefficients[worst]
+        out.append(Detectable(name, minimum, own.unit, minimum * own.per_si, own.shown_unit))
+    return out

@@ -1,0 +1,84 @@
+"""Two effects at once: they may mask each other, or explain together what neither does alone.
+
+A pair is two numbers of candidates of a test, or one and WALKS: a walk of the biases has no columns.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Mapping
+
+from kf_calib.assessment import EQUAL, Test, price
+
+WALKS = -1
+"""In a pair, in the place of a candidate's number."""
+
+MOST = 3
+"""Pairs that are refitted, and that are said."""
+
+Pair = tuple[int, int]
+Pairs = Mapping[Pair, float]
+"""The scores of pairs: by how much they lower chi-squared, less the prices of both."""
+
+
+def pairs_of(test: Test) -> dict[Pair, float]:
+    """Pairs of candidates of which each is beyond chance beside the other."""
+    candidates, falls = test.scan.candidates, test.scan.statistics
+    prices = [price(each, test.effective_tests) if each.dof else 0.0 for each in candidates]
+    out = dict[Pair, float]()
+    for j, k in itertools.combinations([k for k, each in enumerate(candidates) if each.dof], 2):
+        one, two = candidates[j], candidates[k]
+        if str(one.effect) == str(two.effect):
+            continue
+        fall = falls[j] + test.scan.explained(two.basis - one.basis @ (one.basis.T @ two.basis))[0]
+        if fall - falls[j] > prices[k] and fall - falls[k] > prices[j]:
+            out[j, k] = float(fall - prices[j] - prices[k])
+    return out
+
+
+def nearness_of(pairs: Pairs, pair: Pair) -> float:
+    """The score of a pair; one of a walk is near a pair of something that looks like the path it took."""
+    return pairs[pair] + (EQUAL if WALKS in pair else 0.0)
+
+
+def likeliest(test: Test, pairs: Pairs) -> list[Pair]:
+    """The best few pairs, of those of the same two effects the one of the best constants."""
+    named = dict[tuple[str, str], Pair]()
+    for pair in sorted(pairs, key=lambda pair: -pairs[pair]):
+        named.setdefault(names_of(test, pair), pair)
+    return list(named.values())[:MOST]
+
+
+def as_good(test: Test, pairs: Pairs, score: float, but: Collection[str]) -> list[tuple[str, str]]:
+    """Names of the best few pairs that explain as much as what scores so much, none of them in ``but``."""
+    near = sorted((pair for pair in pairs if nearness_of(pairs, pair) > score - EQUAL), key=lambda pair: -pairs[pair])
+    named = dict.fromkeys(names_of(test, pair) for pair in near)
+    return [pair for pair in named if not set(pair) & set(but)][:MOST]
+
+
+def exchanged(test: Test, pairs: Pairs, pair: Pair, least: float) -> dict[str, float]:
+    """Effects that do as well in the place of one of a pair, and the overlap with it, where that is above ``least``."""
+    both, out = names_of(test, pair), dict[str, float]()
+    for other in pairs:
+        shared = set(pair) & set(other)
+        if nearness_of(pairs, other) > pairs[pair] - EQUAL and len(shared) == 1:
+            (lost,), (new,) = set(pair) - shared, set(other) - shared
+            name, overlap = name_of(test, new), alike(test, lost, new)
+            if overlap > max(least, out.get(name, 0.0)) and name not in both:
+                out[name] = overlap
+    return out
+
+
+def names_of(test: Test, pair: Pair) -> tuple[str, str]:
+    one, two = (name_of(test, k) for k in pair)
+    return one, two
+
+
+def name_of(test: Test, k: int) -> str:
+    return test.walking if k == WALKS else str(test.scan.candidates[k].effect)
+
+
+def alike(test: Test, one: int, other: int) -> float:
+    """The overlap of two candidates; 1 with a walk, which can take any path."""
+    candidates = test.scan.candidates
+    return 1.0 if WALKS in (one, other) else candidates[one].overlap(candidates[other])
