@@ -182,7 +182,9 @@ def _beyond_any_path(before: Calibration, test: Test, names: Sequence[str]) -> b
     misfit = before.consistency
     if any(name not in test.best for name in names):
         return True
-    fall, dof = test.scan.explained(np.concatenate([test.candidate(name).basis for name in names], axis=1))
+    own = [test.candidate(name) for name in names]
+    fall, dof = test.scan.explained(np.concatenate([each.basis for each in own], axis=1))
+    dof += sum(each.effect.unknown is not None for each in own)  # a constant that was looked for
     freedom = misfit.dof - dof
     if freedom <= 0:
         return False
