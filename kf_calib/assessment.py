@@ -288,8 +288,8 @@ def detectable(test: Test) -> list[Detectable]:
         candidate = test.scan.candidates[k]
         if not candidate.dof or name in test.invisible:
             continue
-        threshold = float(chdtri(candidate.dof, SHARE * LEVEL / test.effective_tests))
-        needed = float(np.sqrt(chndtrinc(threshold, candidate.dof, 1.0 - _POWER)))
+        least = float(chdtri(candidate.dof, SHARE * LEVEL / test.effective_tests))
+        needed = float(np.sqrt(chndtrinc(least, candidate.dof, 1.0 - _POWER)))
         sizes = np.linalg.norm(candidate.columns, axis=0)
         seen = ~candidate.hidden & (sizes > 0)
         if not seen.any():

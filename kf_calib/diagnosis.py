@@ -84,6 +84,11 @@ class Diagnosis:
         residuals = np.array([visit.residual_mps2 for visit in self.before.visits])
         return residuals / np.sqrt(np.einsum("dii->di", spread))
 
+    def refit_with(self, name: str) -> Calibration:
+        """The run with this effect, too: of a suspect it is there already."""
+        own = (suspect.refit for suspect in self.suspects if suspect.name == name)
+        return next(own, None) or with_effects(self.before, (name,))
+
 
 def diagnose(before: Calibration) -> Diagnosis:
     """What is missing in the model of a calibration, from its dwell factors alone."""
@@ -128,7 +133,7 @@ def _likeliest(before: Calibration, test: Test) -> Diagnosis:
         least = test.scores[first] + (2.0 if first == test.walking else 1.0) * EQUAL
         clearly = {pair: score for pair, score in pairs.items() if score > least}
         return _two(found, clearly, explaining[0].name) or _one(found, explaining[0], pairs)
-    several = _two(found, pairs | _pairs_with_walk(before, test)) or _beside_lines(found)
+    several = _two(found, pairs | _pairs_with_walk(found)) or _beside_lines(found)
     return several or replace(found, unknown=not _may_scatter(before))
 
 
@@ -149,15 +154,13 @@ def _beside_lines(found: Diagnosis) -> Diagnosis | None:
     test = found.test
     if not test.oscillating:
         return None
-    known = with_effects(found.before, (test.oscillating,))
+    known = found.refit_with(test.oscillating)
     rest = _explained(known, assessed(known.fit, test.effective_tests))
     if not rest.missing:
         return None
     both = (*rest.missing, test.oscillating)
     ambiguity = (*both, *(name for name in rest.ambiguity if name not in both))
-    return replace(
-        found, missing=both, ambiguity=ambiguity, overlaps=rest.overlaps, together=rest.together, after=rest.after
-    )
+    return replace(rest, before=found.before, test=test, suspects=found.suspects, missing=both, ambiguity=ambiguity)
 
 
 def _may_scatter(before: Calibration) -> bool:
@@ -295,15 +298,16 @@ def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:
     return None
 
 
-def _pairs_with_walk(before: Calibration, test: Test) -> dict[Pair, float]:
+def _pairs_with_walk(found: Diagnosis) -> dict[Pair, float]:
     """Pairs of an effect and a walk of the biases, for those effects that are likeliest beside a walk.
 
     The walk beside the effect is judged by its likelihood, after a refit with both.
     """
+    before, test = found.before, found.test
     if not test.walking:
         return {}
     candidates, tests, out = test.scan.candidates, test.effective_tests, dict[Pair, float]()
-    beside = assessed(with_effects(before, (test.walking,)).fit, tests)
+    beside = assessed(found.refit_with(test.walking).fit, tests)
     for name in [name for name in beside.ranked if name in test.best][:MOST]:
         k = test.best[name]
         own = float(test.scan.statistics[k]) - price(candidates[k], tests)

@@ -189,12 +189,7 @@ class Improvement:
         """The effects among which this run cannot choose, each refitted beside the model as it stands."""
         if not _rivals(self.found):
             return ()
-        refits = {suspect.name: suspect.refit for suspect in self.found.suspects}
-        own = (name for name in self.found.ambiguity)
-        return tuple(
-            Alternative(name, refits[name] if name in refits else refitted(self.result, (*self.effects, name)))
-            for name in own
-        )
+        return tuple(Alternative(name, self.found.refit_with(name)) for name in self.found.ambiguity)
 
     @cached_property
     def spreads(self) -> tuple[Spread, ...]:
