@@ -2,7 +2,8 @@
 
 Stillness is judged on the platform angles: an interval between two pose messages is still when it lies in a window of
 ``window_s`` over which the pose moves by no more than ``tolerance_deg``. Where angles are absent during a motion
-(two messages far apart in time and in angle) the readings decide where the one dwell ended and the next began.
+(two messages far apart in time and in angle) the readings decide where the one dwell ended and the next began, if
+they rest at all: a slew may be slow for messages that are seldom.
 Samples of a slew stay in the recording and out of the static fit; so do ``settle_s`` after each arrival and
 ``lead_s`` before each departure (of short dwells no more than a third and a tenth). What comes out does not depend on
 how the streams were chopped into batches.
@@ -30,6 +31,11 @@ _SECOND_NS = 1_000_000_000
 _HOLD_NS = _SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
 _LEAP_NS = 10 * _SECOND_NS  # a stamp this far ahead, with the next one behind it, is a damaged stamp
 _SLEW_READINGS = 8  # of a slew, at least
+_LAST, _BEFORE = 3, 4  # messages at the end of a dwell that may have crept away, and before them: at least
+_CREEPING_NS = 15 * _SECOND_NS  # from when on a platform that still creeps is taken as one that goes on so
+_REST_NS = (
+    2 * _SECOND_NS
+)  # a dwell that only readings tell of, between two angles that differ, lasts that long at least
 _PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
 
 
@@ -41,6 +47,11 @@ class Stillness:
     window_s: float = 0.5
     settle_s: float = 1.0
     lead_s: float = 0.25
+
+    @property
+    def rest_rad(self) -> float:
+        """Within which a platform is at rest, as far as a good encoder can tell: a fiftieth of the tolerance."""
+        return math.radians(self.tolerance_deg) / 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,8 +296,9 @@ class Segmenter:
             return
         if self._dwell is not None:
             yield from self._emit(horizon, closing=final)
-        elif final or not self._slewing():
-            self._discard(horizon)
+        elif final or not self._slewing():  # an arrival may be felt since the last angle before it
+            before = int(np.searchsorted(self._pose.time_ns, self._decided_ns or horizon)) - 1
+            self._discard(horizon if final or before < 0 else min(horizon, int(self._pose.time_ns[before])))
         self._forget()
         if final:
             self.tally.without_pose += len(self._accel)
@@ -332,6 +344,7 @@ class Segmenter:
     def _events(self, times: Times, still: Mask) -> list[tuple[int, _Event, bool]]:
         window_ns = round(self.stillness.window_s * _SECOND_NS)
         in_dwell, events = self._dwell is not None, list[tuple[int, _Event, bool]]()
+        arrived_ns = self._dwell.arrival_ns if self._dwell else 0
         unresolved = ~still & (np.diff(times[: len(still) + 1]) > window_ns)
         after_unresolved = np.concatenate([[False], unresolved[:-1]])
         changes = np.flatnonzero(np.diff(still, prepend=in_dwell) | unresolved | after_unresolved)
@@ -339,47 +352,54 @@ class Segmenter:
             begin, end = int(times[j]), int(times[j + 1])
             if still[j] and not in_dwell:
                 first = not self._begun
-                events.append((begin - (_HOLD_NS if first else 0), _Event.ARRIVE, not first))
-                in_dwell = True
+                arrived_ns, in_dwell = begin - (_HOLD_NS if first else 0), True
+                events.append((arrived_ns, _Event.ARRIVE, not first))
             elif unresolved[j]:
                 leave, arrive = self._resolve_by_readings(begin, end)
-                if not in_dwell and leave > begin:
-                    events.append((begin - (0 if self._begun else _HOLD_NS), _Event.ARRIVE, False))
-                    in_dwell = True
+                if not in_dwell and leave - begin >= _REST_NS:
+                    arrived_ns, in_dwell = begin - (0 if self._begun else _HOLD_NS), True
+                    events.append((arrived_ns, _Event.ARRIVE, False))
                 if in_dwell:
-                    events.append((self._departure_ns(leave), _Event.LEAVE, False))
-                events.append((arrive, _Event.ARRIVE, True))
-                in_dwell = True
+                    events.append((self._departure_ns(arrived_ns, leave), _Event.LEAVE, False))
+                arrived_ns, in_dwell = arrive, end - arrive >= _REST_NS
+                if in_dwell:
+                    events.append((arrive, _Event.ARRIVE, True))
             elif not still[j] and in_dwell:
-                events.append((self._departure_ns(begin), _Event.LEAVE, False))
+                events.append((self._departure_ns(arrived_ns, begin), _Event.LEAVE, False))
                 in_dwell = False
             self._begun = True
         return events
 
-    def _departure_ns(self, end_ns: int) -> int:
-        """When, in the last window of a dwell that ends at ``end_ns``, the platform began to creep away.
+    def _departure_ns(self, arrived_ns: int, end_ns: int) -> int:
+        """When, in the last window of a dwell from ``arrived_ns`` to ``end_ns``, the platform began to creep away.
 
         A slew starts gently: within the tolerance it still counts as standing. The last messages are held against the
-        mean of the two windows before them, to a fiftieth of the tolerance or four sigma of the encoder.
+        mean of the two windows before them, to a fiftieth of the tolerance or four sigma of the encoder. Where messages
+        are seldom, a few count and not a window.
         """
         window_ns = round(self.stillness.window_s * _SECOND_NS)
         times, poses = self._pose.time_ns, self._pose.values
-        first, middle, last = np.searchsorted(times, (end_ns - 3 * window_ns, end_ns - window_ns, end_ns + 1))
-        if self._dwell is not None:
-            first = max(first, int(np.searchsorted(times, self._dwell.first_pose_ns)))
+        first, middle, last = np.searchsorted(times, (end_ns - 3 * window_ns, end_ns - window_ns, end_ns + 1)).tolist()
+        middle = min(middle, max(last - _LAST, 0))
+        first = max(min(first, middle - _BEFORE), int(np.searchsorted(times, arrived_ns)))
         if middle - first < 2 or last <= middle:
             return end_ns
         reference = poses[first:middle]
         apart = pose_distance(poses[middle:last], mean_pose(reference), not self.bench.axes)
         noise = 4.0 * float(reference.std(axis=0).max())
-        away = np.flatnonzero(apart > max(np.radians(self.stillness.tolerance_deg) / 50.0, noise))
-        return int(times[max(middle + away[0] - 1, first)]) if away.size else end_ns
+        away = np.flatnonzero(apart > max(self.stillness.rest_rad, noise))
+        if not away.size:
+            return end_ns
+        standing_ns, moving_ns = times[max(middle + away[0] - 1, first) :][:2].tolist()
+        # it may have left, by what angles cannot tell, as long before as messages lie apart
+        return max(standing_ns - max(moving_ns - standing_ns - self._lead_ns, 0), arrived_ns)
 
     def _resolve_by_readings(self, begin_ns: int, end_ns: int) -> tuple[int, int]:
         """When a motion without angles began and ended, from the readings between two poses.
 
         The readings are averaged over windows of a quarter of a second; the old dwell lasts while they stay at its
-        level, the new one reaches back as far as they are at the level they end on.
+        level, the new one reaches back as far as they are at the level they end on; then as far as they are there to
+        three sigma, for a motion may begin and end gently.
         """
         part = slice(*np.searchsorted(self._accel.time_ns, (begin_ns, end_ns)))
         times, values = self._accel.time_ns[part], self._accel.values[part]
@@ -392,10 +412,17 @@ class Segmenter:
         allowed = 6.0 * scatter + 1e-3 * self.bench.gravity_mps2
         near_old = np.all(np.abs(means - means[0]) <= allowed, axis=1)
         near_new = np.all(np.abs(means - means[-1]) <= allowed, axis=1)
-        kept_old = int(np.argmin(near_old)) if not near_old.all() else 0
-        kept_new = int(np.argmin(near_new[::-1])) if not near_new.all() else 0
-        leave = begin_ns if kept_old < 2 else int(times[(kept_old - 1) * size])
-        arrive = end_ns if kept_new < 2 else int(times[(count - kept_new + 1) * size])
+        fine = 3.0 * scatter / math.sqrt(size) + self.stillness.rest_rad * self.bench.gravity_mps2
+
+        def standing(near: Mask, own: Floats) -> int:
+            """In how many windows (n, 3), from the first on, the platform stood where it did."""
+            own = own[: 0 if near.all() else int(np.argmin(near))]
+            still = np.all(np.abs(own - np.median(own, axis=0)) <= fine, axis=1) if len(own) else np.zeros(0, bool)
+            return int(np.flatnonzero(still)[-1]) + 1 if still.any() else 0
+
+        old, new = standing(near_old, means), standing(near_new[::-1], means[::-1])
+        leave = begin_ns if old < 2 else int(times[(old - 1) * size])
+        arrive = end_ns if new < 2 else int(times[(count - new + 1) * size])
         return leave, max(arrive, leave)
 
     def _felt_ns(self, arrival_ns: int) -> int:
@@ -413,7 +440,7 @@ class Segmenter:
         if there == end:
             return arrival_ns
         settled = self._accel.values[there:end]
-        resting = np.radians(self.stillness.tolerance_deg) / 50.0 * self.bench.gravity_mps2
+        resting = self.stillness.rest_rad * self.bench.gravity_mps2
         allowed = 6.0 * float(settled.std(axis=0).max()) + resting
         apart = np.abs(self._accel.values[first:there] - settled.mean(axis=0)).max(axis=1, initial=0.0)
         away = np.flatnonzero(apart > allowed)
@@ -479,10 +506,11 @@ class Segmenter:
         assert self._dwell is not None
         dwell, settle_ns = self._dwell, round(self.stillness.settle_s * _SECOND_NS)
         if dwell.settling_ns is None:
-            length_ns = until_ns - dwell.arrival_ns
+            rest_ns = self._rest_ns(dwell, until_ns, settle_ns)
+            length_ns = until_ns - rest_ns
             if length_ns < 3 * settle_ns and not closing:
                 return
-            dwell.settling_ns = min(settle_ns, length_ns // 3)
+            dwell.settling_ns = rest_ns - dwell.arrival_ns + min(settle_ns, length_ns // 3)
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
         first = min(int(np.searchsorted(self._accel.time_ns, dwell.arrival_ns + dwell.settling_ns)), count)
         self.tally.settling += first
@@ -491,6 +519,26 @@ class Segmenter:
             yield self._block(self._accel[first : first + size])
             first += size
         self._accel = self._accel[first:]
+
+    def _rest_ns(self, dwell: _Dwell, until_ns: int, settle_ns: int) -> int:
+        """When the platform had come to rest as well as angles can tell, at the latest two margins before ``until_ns``.
+
+        A slew that ends gently is within the tolerance some time before. A message is of a platform at rest where it
+        agrees with the mean of those of the next two margins, to a fiftieth of the tolerance or four sigma of them.
+        """
+        first, last = np.searchsorted(self._pose.time_ns, (dwell.first_pose_ns, until_ns)).tolist()
+        times, poses = self._pose.time_ns[first:last], self._pose.values[first:last]
+        for k, end in enumerate(np.searchsorted(times, times + 2 * settle_ns, side="right").tolist()):
+            coming = poses[k + 1 : end]
+            if not len(coming) or times[k] > dwell.arrival_ns + _CREEPING_NS:
+                break
+            apart = float(pose_distance(poses[k : k + 1], mean_pose(coming), not self.bench.axes)[0])
+            if (
+                apart <= max(self.stillness.rest_rad, 4.0 * float(coming.std(axis=0).max()))
+                or times[k] + 2 * settle_ns > until_ns
+            ):
+                return max(int(times[k]), dwell.arrival_ns)
+        return dwell.arrival_ns
 
     def _block(self, accel: Stream) -> Block:
         assert self._dwell is not None and self.first_ns is not None
@@ -519,11 +567,22 @@ class Segmenter:
             first = max(first - 1, own)
             last = first + 1
         inside = poses[first:last]
-        spread = np.ptp(inside, axis=0).max()
-        if spread <= np.radians(self.stillness.tolerance_deg):
+        if not self._creeps(inside):
             return self._standing_pose(inside)
         around = slice(max(first - 1, own), last + 1)
         return interpolate_pose(accel_ns, times[around], poses[around], not self.bench.axes)
+
+    def _creeps(self, inside: Floats) -> bool:
+        """Whether messages (n, k) of a block tell of more than noise about one pose: by the means of eight parts."""
+        rest_rad, count = self.stillness.rest_rad, len(inside)
+        if count < 2 or np.ptp(inside, axis=0).max() <= rest_rad:
+            return False
+        if np.ptp(inside, axis=0).max() > np.radians(self.stillness.tolerance_deg):
+            return True
+        parts = np.array_split(inside, min(8, count))
+        means = np.array([part.mean(axis=0) for part in parts])
+        sigma = np.sqrt(np.mean(np.diff(inside, axis=0) ** 2, axis=0) / 2.0 * len(parts) / count)
+        return bool((np.abs(means - np.median(means, axis=0)) > np.maximum(rest_rad, 5.0 * sigma)).any())
 
     def _standing_pose(self, inside: Floats) -> Floats:
         """The dwell's pose (1, k); taken anew only where a block's mean has left it by more than the encoder's noise.
@@ -545,7 +604,7 @@ class Segmenter:
         oldest = min(oldest, (self._decided_ns or oldest) - round(4 * self.stillness.window_s * _SECOND_NS))
         if self.slews:  # a slew's curve begins a window before it
             oldest -= round(self.stillness.window_s * _SECOND_NS) + self._lead_ns
-        self._pose = self._pose[max(int(np.searchsorted(self._pose.time_ns, oldest)) - 2, 0) :]
+        self._pose = self._pose[max(int(np.searchsorted(self._pose.time_ns, oldest)) - _LAST - _BEFORE, 0) :]
         self._temperature = self._temperature[max(int(np.searchsorted(self._temperature.time_ns, oldest)) - 2, 0) :]
 
 

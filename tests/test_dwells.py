@@ -71,6 +71,40 @@ def test_a_slow_slew_is_no_dwell() -> None:
     assert len(spans(Given(Batch(readings(pose, 120), pose)))) == 2
 
 
+def gentle(rate_hz: float, slew_s: float = 60.0, noise_deg: float = 0.0) -> tuple[Stream, Stream]:
+    """Three dwells of 30 s and slews of 90 deg that begin and end gently; angles, and readings of the true motion."""
+    share = np.linspace(0, 1, 601)
+    rise = share**3 * (10 - 15 * share + 6 * share**2)
+    knots = [(0.0, 0.0)]
+    for k in range(3):
+        start = knots[-1][0] + 30.0
+        knots += [(start, 90.0 * k)]
+        knots += [(start + slew_s * x, 90.0 * (k + y)) for x, y in zip(share, rise, strict=True)] if k < 2 else []
+    points = sorted(set(knots))
+    return path(*points, rate_hz=rate_hz, noise_deg=noise_deg), readings(path(*points, rate_hz=200), points[-1][0])
+
+
+@pytest.mark.parametrize("rate_hz", [0.5, 1, 1.7, 4, 20])
+@pytest.mark.parametrize("slew_s", [20.0, 60.0, 200.0])
+def test_a_gentle_slew_spoils_no_dwell_however_seldom_angles_come(rate_hz: float, slew_s: float) -> None:
+    """Three dwells, and in each block the platform is where the block says: to a few thousandths of a degree."""
+    pose, accel = gentle(rate_hz, slew_s)
+    truth, _ = gentle(200.0, slew_s)
+    blocks = list(dwell_blocks(Given(Batch(accel, pose)), Segmenter(BENCH)))
+    assert {block.dwell for block in blocks} == {0, 1, 2}
+    assert sum(len(block.elapsed_s) for block in blocks) > 0.8 * 90 * 100
+    for block in blocks:
+        was = np.degrees(np.interp(block.elapsed_s * S, truth.time_ns, truth.values[:, 0]))
+        assert np.abs(was - np.degrees(block.pose[:, 0])).max() < 0.012
+        assert abs(was.mean() - np.degrees(block.pose[:, 0]).mean()) < 0.001
+
+
+def test_a_creeping_platform_is_used_though_it_never_rests() -> None:
+    pose = path((0, 0), (60, 0.24), (64, 40), (124, 40.24), rate_hz=10)
+    got = spans(Given(Batch(readings(pose, 124), pose)))
+    assert [round(end - start) for start, end in got] == [60, 59]
+
+
 def test_settling_is_left_out() -> None:
     pose = path(*SLEWS, rate_hz=10)
     assert spans(Given(Batch(readings(pose, 35), pose)), settle_s=3.0)[1][0] == pytest.approx(17.0, abs=0.2)
@@ -86,11 +120,15 @@ def test_angles_absent_during_motion_readings_decide() -> None:
         assert low - 0.01 <= start <= low + 2.0 and high - 1.0 <= end <= high + 0.01
 
 
-def test_what_comes_out_does_not_depend_on_batches() -> None:
-    pose = path(*SLEWS, rate_hz=10, noise_deg=0.003)
+@pytest.mark.parametrize("angle_hz", [0.9, 10.0])
+@pytest.mark.parametrize("slew_s", [0.0, 8.0, 40.0])
+def test_what_comes_out_does_not_depend_on_batches(angle_hz: float, slew_s: float) -> None:
+    pose = path(*SLEWS, rate_hz=angle_hz, noise_deg=0.003)
     accel = readings(pose, 35)
+    if slew_s:
+        pose, accel = gentle(angle_hz, slew_s, noise_deg=0.003)
     whole = list(dwell_blocks(Given(Batch(accel, pose)), Segmenter(BENCH)))
-    edges = np.arange(0, 36, 0.37)
+    edges = np.arange(0, 180, 0.37)
     pieces = [
         Batch(
             accel[(accel.time_ns >= a * S) & (accel.time_ns < b * S)],
