@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from kf_calib import averaging, information, kalman, paper
 from kf_calib.bench import Bench
-from kf_calib.dwells import Block, Segmenter, Stillness, Tally, dwell_blocks
+from kf_calib.dwells import Block, Segmenter, Tally, dwell_blocks
 from kf_calib.effects import of_the_users, remarks_of
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.fitting import WALK, Fit, fit
@@ -29,6 +29,7 @@ from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
 from kf_calib.noise import Noise, considered, mean_covariances, steps
 from kf_calib.readings import Readings, Watch
 from kf_calib.samples import Floats, Mask, Source
+from kf_calib.stillness import Stillness
 from kf_calib.visibility import sights
 from kf_calib.walk import predicted, to_mean
 

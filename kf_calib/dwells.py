@@ -1,12 +1,10 @@
 """Dwells: the stretches in which the platform stands still, cut from the raw streams as they arrive.
 
-Stillness is judged on the platform angles: an interval between two pose messages is still when it lies in a window of
-``window_s`` over which the pose moves by no more than ``tolerance_deg``. Where angles are absent during a motion
-(two messages far apart in time and in angle) the readings decide where the one dwell ended and the next began, if
-they rest at all: a slew may be slow for messages that are seldom.
-Samples of a slew stay in the recording and out of the static fit; so do ``settle_s`` after each arrival and
-``lead_s`` before each departure (of short dwells no more than a third and a tenth). What comes out does not depend on
-how the streams were chopped into batches.
+What is still is judged on the platform angles (``stillness``). Where angles are absent during a motion (two messages
+far apart in time and in angle) the readings decide where the one dwell ended and the next began, if they rest at all: a
+slew may be slow for messages that are seldom. Samples of a slew stay in the recording and out of the static fit; so do
+``settle_s`` after each arrival and ``lead_s`` before each departure (of short dwells no more than a third and a tenth).
+What comes out does not depend on how the streams were chopped into batches.
 """
 
 from __future__ import annotations
@@ -19,10 +17,11 @@ from enum import Enum
 
 import numpy as np
 
-from kf_calib.bench import Bench, interpolate_pose, mean_pose, pose_distance, unwrap_pose
+from kf_calib.bench import Bench, interpolate_pose, mean_pose, unwrap_pose
 from kf_calib.errors import InputError
 from kf_calib.samples import Batch, Floats, Mask, Source, Stream, Times
 from kf_calib.slews import Curve
+from kf_calib.stillness import HISTORY, Stillness
 
 BLOCK_SAMPLES = 4000
 """Samples of one block at the most: few enough for the cache; no power of two, whose columns would evict each other."""
@@ -31,27 +30,10 @@ _SECOND_NS = 1_000_000_000
 _HOLD_NS = _SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
 _LEAP_NS = 10 * _SECOND_NS  # a stamp this far ahead, with the next one behind it, is a damaged stamp
 _SLEW_READINGS = 8  # of a slew, at least
-_LAST, _BEFORE = 3, 4  # messages at the end of a dwell that may have crept away, and before them: at least
-_CREEPING_NS = 15 * _SECOND_NS  # from when on a platform that still creeps is taken as one that goes on so
 _REST_NS = (
     2 * _SECOND_NS
 )  # a dwell that only readings tell of, between two angles that differ, lasts that long at least
 _PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
-
-
-@dataclass(frozen=True)
-class Stillness:
-    """When the platform counts as still."""
-
-    tolerance_deg: float = 0.05
-    window_s: float = 0.5
-    settle_s: float = 1.0
-    lead_s: float = 0.25
-
-    @property
-    def rest_rad(self) -> float:
-        """Within which a platform is at rest, as far as a good encoder can tell: a fiftieth of the tolerance."""
-        return math.radians(self.tolerance_deg) / 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +195,6 @@ class Segmenter:
         self._cover_ns = -(1 << 62)  # a still window judged earlier reaches to here
         self._dwell: _Dwell | None = None
         self._begun = False
-        self._lead_ns = round(self.stillness.lead_s * _SECOND_NS)
 
     def push(self, batch: Batch) -> Iterator[Block]:
         """Blocks that are complete once this batch is known."""
@@ -288,7 +269,7 @@ class Segmenter:
                 number, settling_ns = self.dwell_count - 1, None if settles else 0
                 self._dwell = _Dwell(number, stamp, felt_ns, self._next_pose_ns(stamp), settling_ns)
             else:
-                lead_ns = min(self._lead_ns, (stamp - self._dwell.arrival_ns) // 10) if self._dwell else 0
+                lead_ns = min(self.stillness.lead_ns, (stamp - self._dwell.arrival_ns) // 10) if self._dwell else 0
                 yield from self._emit(stamp - lead_ns, closing=True)
                 self._dwell = None
         horizon = self._horizon(final)
@@ -311,14 +292,13 @@ class Segmenter:
         times, poses = times[start:], poses[start:]
         if len(times) < 2:
             return self._lone_pose(times) if final else []
-        window_ns = round(self.stillness.window_s * _SECOND_NS)
-        ends = np.searchsorted(times, times + window_ns)
-        known = ends < len(times)
-        ends = np.minimum(ends, len(times) - 1)
+        known = times + self.stillness.window_ns <= times[-1]
         count = len(times) - 1 if final else int(known[:-1].sum())
         if count == 0:
             return []
-        still = self._still(times, poses, ends, known | final)[:count]
+        known |= final
+        still, self._cover_ns = self.stillness.intervals(times, poses, not self.bench.axes, known, self._cover_ns)
+        still = still[:count]
         events = self._events(times, still)
         self._decided_ns = int(times[count])
         return events
@@ -330,22 +310,10 @@ class Segmenter:
         self._begun, self._decided_ns = True, int(times[0])
         return [(int(min(self._accel.time_ns[0], times[0])), _Event.ARRIVE, False)]
 
-    def _still(self, times: Times, poses: Floats, ends: Times, known: Mask) -> Mask:
-        """Which intervals between consecutive poses are still, (m - 1,) bool."""
-        tolerance = np.radians(self.stillness.tolerance_deg)
-        steps = pose_distance(poses[1:], poses[:-1], not self.bench.axes) <= tolerance
-        broken = np.concatenate([[0], np.cumsum(~steps)])
-        rest = pose_distance(poses[ends], poses, not self.bench.axes) <= tolerance
-        rest &= (broken[ends] == broken) & known & (ends > np.arange(len(ends)))
-        reach = np.maximum.accumulate(np.where(rest, times[ends], self._cover_ns))
-        self._cover_ns = int(reach[-1])
-        return (reach[:-1] > times[:-1]) & steps
-
     def _events(self, times: Times, still: Mask) -> list[tuple[int, _Event, bool]]:
-        window_ns = round(self.stillness.window_s * _SECOND_NS)
         in_dwell, events = self._dwell is not None, list[tuple[int, _Event, bool]]()
         arrived_ns = self._dwell.arrival_ns if self._dwell else 0
-        unresolved = ~still & (np.diff(times[: len(still) + 1]) > window_ns)
+        unresolved = ~still & (np.diff(times[: len(still) + 1]) > self.stillness.window_ns)
         after_unresolved = np.concatenate([[False], unresolved[:-1]])
         changes = np.flatnonzero(np.diff(still, prepend=in_dwell) | unresolved | after_unresolved)
         for j in changes:
@@ -355,99 +323,31 @@ class Segmenter:
                 arrived_ns, in_dwell = begin - (_HOLD_NS if first else 0), True
                 events.append((arrived_ns, _Event.ARRIVE, not first))
             elif unresolved[j]:
-                leave, arrive = self._resolve_by_readings(begin, end)
+                leave, arrive = self.stillness.moved_between(self._accel, begin, end, self.bench.gravity_mps2)
                 if not in_dwell and leave - begin >= _REST_NS:
                     arrived_ns, in_dwell = begin - (0 if self._begun else _HOLD_NS), True
                     events.append((arrived_ns, _Event.ARRIVE, False))
                 if in_dwell:
-                    events.append((self._departure_ns(arrived_ns, leave), _Event.LEAVE, False))
+                    events.append((self._departed_ns(arrived_ns, leave), _Event.LEAVE, False))
                 arrived_ns, in_dwell = arrive, end - arrive >= _REST_NS
                 if in_dwell:
                     events.append((arrive, _Event.ARRIVE, True))
             elif not still[j] and in_dwell:
-                events.append((self._departure_ns(arrived_ns, begin), _Event.LEAVE, False))
+                events.append((self._departed_ns(arrived_ns, begin), _Event.LEAVE, False))
                 in_dwell = False
             self._begun = True
         return events
 
-    def _departure_ns(self, arrived_ns: int, end_ns: int) -> int:
-        """When, in the last window of a dwell from ``arrived_ns`` to ``end_ns``, the platform began to creep away.
-
-        A slew starts gently: within the tolerance it still counts as standing. The last messages are held against the
-        mean of the two windows before them, to a fiftieth of the tolerance or four sigma of the encoder. Where messages
-        are seldom, a few count and not a window.
-        """
-        window_ns = round(self.stillness.window_s * _SECOND_NS)
-        times, poses = self._pose.time_ns, self._pose.values
-        first, middle, last = np.searchsorted(times, (end_ns - 3 * window_ns, end_ns - window_ns, end_ns + 1)).tolist()
-        middle = min(middle, max(last - _LAST, 0))
-        first = max(min(first, middle - _BEFORE), int(np.searchsorted(times, arrived_ns)))
-        if middle - first < 2 or last <= middle:
-            return end_ns
-        reference = poses[first:middle]
-        apart = pose_distance(poses[middle:last], mean_pose(reference), not self.bench.axes)
-        noise = 4.0 * float(reference.std(axis=0).max())
-        away = np.flatnonzero(apart > max(self.stillness.rest_rad, noise))
-        if not away.size:
-            return end_ns
-        standing_ns, moving_ns = times[max(middle + away[0] - 1, first) :][:2].tolist()
-        # it may have left, by what angles cannot tell, as long before as messages lie apart
-        return max(standing_ns - max(moving_ns - standing_ns - self._lead_ns, 0), arrived_ns)
-
-    def _resolve_by_readings(self, begin_ns: int, end_ns: int) -> tuple[int, int]:
-        """When a motion without angles began and ended, from the readings between two poses.
-
-        The readings are averaged over windows of a quarter of a second; the old dwell lasts while they stay at its
-        level, the new one reaches back as far as they are at the level they end on; then as far as they are there to
-        three sigma, for a motion may begin and end gently.
-        """
-        part = slice(*np.searchsorted(self._accel.time_ns, (begin_ns, end_ns)))
-        times, values = self._accel.time_ns[part], self._accel.values[part]
-        size = max(4, int(np.searchsorted(times, begin_ns + _SECOND_NS // 4)))
-        count = len(times) // size
-        if count < 4:
-            return begin_ns, end_ns
-        shaped = values[: count * size].reshape(count, size, 3)
-        means, scatter = shaped.mean(axis=1), np.median(shaped.std(axis=1), axis=0)
-        allowed = 6.0 * scatter + 1e-3 * self.bench.gravity_mps2
-        near_old = np.all(np.abs(means - means[0]) <= allowed, axis=1)
-        near_new = np.all(np.abs(means - means[-1]) <= allowed, axis=1)
-        fine = 3.0 * scatter / math.sqrt(size) + self.stillness.rest_rad * self.bench.gravity_mps2
-
-        def standing(near: Mask, own: Floats) -> int:
-            """In how many windows (n, 3), from the first on, the platform stood where it did."""
-            own = own[: 0 if near.all() else int(np.argmin(near))]
-            still = np.all(np.abs(own - np.median(own, axis=0)) <= fine, axis=1) if len(own) else np.zeros(0, bool)
-            return int(np.flatnonzero(still)[-1]) + 1 if still.any() else 0
-
-        old, new = standing(near_old, means), standing(near_new[::-1], means[::-1])
-        leave = begin_ns if old < 2 else int(times[(old - 1) * size])
-        arrive = end_ns if new < 2 else int(times[(count - new + 1) * size])
-        return leave, max(arrive, leave)
+    def _departed_ns(self, arrived_ns: int, end_ns: int) -> int:
+        return self.stillness.departure_ns(self._pose, not self.bench.axes, arrived_ns, end_ns)
 
     def _felt_ns(self, arrival_ns: int) -> int:
-        """When, since the last angle before an arrival, the readings came to the level they have just after it.
-
-        Angles tell an arrival to their period only, and a slew that ends gently seems over before it is. The level is
-        that of half a window, which begins a quarter of it after the arrival and is over before this is judged.
-        """
+        """When an arrival was felt: angles tell it to their period only, and too early where a slew ends gently."""
         last = int(np.searchsorted(self._pose.time_ns, arrival_ns)) - 1
         if last < 0:
             return arrival_ns
-        quarter_ns = round(self.stillness.window_s * _SECOND_NS) // 4
-        stamps = int(self._pose.time_ns[last]), arrival_ns + quarter_ns, arrival_ns + 3 * quarter_ns
-        first, there, end = np.searchsorted(self._accel.time_ns, stamps)
-        if there == end:
-            return arrival_ns
-        settled = self._accel.values[there:end]
-        resting = self.stillness.rest_rad * self.bench.gravity_mps2
-        allowed = 6.0 * float(settled.std(axis=0).max()) + resting
-        apart = np.abs(self._accel.values[first:there] - settled.mean(axis=0)).max(axis=1, initial=0.0)
-        away = np.flatnonzero(apart > allowed)
-        if not away.size:
-            return arrival_ns
-        moving_ns, standing_ns = self._accel.time_ns[first + away[-1] :][:2].tolist()
-        return (moving_ns + standing_ns) // 2
+        since_ns = int(self._pose.time_ns[last])
+        return self.stillness.felt_ns(self._accel, since_ns, arrival_ns, self.bench.gravity_mps2)
 
     def _next_pose_ns(self, stamp: int) -> int:
         """The first pose message at or after an arrival: the dwell's own poses start there."""
@@ -462,7 +362,7 @@ class Segmenter:
             return int(self._accel.time_ns[-1]) + 1 if len(self._accel) else None
         if final:
             return int(self._pose.time_ns[-1]) + _HOLD_NS if len(self._pose) > 1 else 1 << 62
-        return self._decided_ns - self._lead_ns - round(self.stillness.window_s * _SECOND_NS)
+        return self._decided_ns - self.stillness.lead_ns - self.stillness.window_ns
 
     def _discard(self, until_ns: int) -> None:
         """Drop the readings before ``until_ns``: the platform was moving, or no angle was known."""
@@ -483,7 +383,7 @@ class Segmenter:
         count = int(np.searchsorted(self._accel.time_ns, arrival_ns))
         if not self._slewing() or count < _SLEW_READINGS or self.first_ns is None:
             return
-        accel, window_ns = self._accel[:count], round(self.stillness.window_s * _SECOND_NS)
+        accel, window_ns = self._accel[:count], self.stillness.window_ns
         begin_ns, end_ns = int(accel.time_ns[0]), int(accel.time_ns[-1])
         around = slice(*np.searchsorted(self._pose.time_ns, (begin_ns - window_ns, arrival_ns + window_ns + 1)))
         times, poses = self._pose.time_ns[around], self._pose.values[around]
@@ -504,9 +404,9 @@ class Segmenter:
     def _emit(self, until_ns: int, closing: bool) -> Iterator[Block]:
         """Blocks of the open dwell from the readings before ``until_ns``; a last short one when it closes."""
         assert self._dwell is not None
-        dwell, settle_ns = self._dwell, round(self.stillness.settle_s * _SECOND_NS)
+        dwell, settle_ns = self._dwell, self.stillness.settle_ns
         if dwell.settling_ns is None:
-            rest_ns = self._rest_ns(dwell, until_ns, settle_ns)
+            rest_ns = self.stillness.rest_ns(self._pose, not self.bench.axes, dwell.arrival_ns, until_ns)
             length_ns = until_ns - rest_ns
             if length_ns < 3 * settle_ns and not closing:
                 return
@@ -519,26 +419,6 @@ class Segmenter:
             yield self._block(self._accel[first : first + size])
             first += size
         self._accel = self._accel[first:]
-
-    def _rest_ns(self, dwell: _Dwell, until_ns: int, settle_ns: int) -> int:
-        """When the platform had come to rest as well as angles can tell, at the latest two margins before ``until_ns``.
-
-        A slew that ends gently is within the tolerance some time before. A message is of a platform at rest where it
-        agrees with the mean of those of the next two margins, to a fiftieth of the tolerance or four sigma of them.
-        """
-        first, last = np.searchsorted(self._pose.time_ns, (dwell.first_pose_ns, until_ns)).tolist()
-        times, poses = self._pose.time_ns[first:last], self._pose.values[first:last]
-        for k, end in enumerate(np.searchsorted(times, times + 2 * settle_ns, side="right").tolist()):
-            coming = poses[k + 1 : end]
-            if not len(coming) or times[k] > dwell.arrival_ns + _CREEPING_NS:
-                break
-            apart = float(pose_distance(poses[k : k + 1], mean_pose(coming), not self.bench.axes)[0])
-            if (
-                apart <= max(self.stillness.rest_rad, 4.0 * float(coming.std(axis=0).max()))
-                or times[k] + 2 * settle_ns > until_ns
-            ):
-                return max(int(times[k]), dwell.arrival_ns)
-        return dwell.arrival_ns
 
     def _block(self, accel: Stream) -> Block:
         assert self._dwell is not None and self.first_ns is not None
@@ -567,22 +447,10 @@ class Segmenter:
             first = max(first - 1, own)
             last = first + 1
         inside = poses[first:last]
-        if not self._creeps(inside):
+        if not self.stillness.creeps(inside):
             return self._standing_pose(inside)
         around = slice(max(first - 1, own), last + 1)
         return interpolate_pose(accel_ns, times[around], poses[around], not self.bench.axes)
-
-    def _creeps(self, inside: Floats) -> bool:
-        """Whether messages (n, k) of a block tell of more than noise about one pose: by the means of eight parts."""
-        rest_rad, count = self.stillness.rest_rad, len(inside)
-        if count < 2 or np.ptp(inside, axis=0).max() <= rest_rad:
-            return False
-        if np.ptp(inside, axis=0).max() > np.radians(self.stillness.tolerance_deg):
-            return True
-        parts = np.array_split(inside, min(8, count))
-        means = np.array([part.mean(axis=0) for part in parts])
-        sigma = np.sqrt(np.mean(np.diff(inside, axis=0) ** 2, axis=0) / 2.0 * len(parts) / count)
-        return bool((np.abs(means - np.median(means, axis=0)) > np.maximum(rest_rad, 5.0 * sigma)).any())
 
     def _standing_pose(self, inside: Floats) -> Floats:
         """The dwell's pose (1, k); taken anew only where a block's mean has left it by more than the encoder's noise.
@@ -601,10 +469,10 @@ class Segmenter:
     def _forget(self) -> None:
         """Drop poses and temperatures that no pending reading needs."""
         oldest = int(self._accel.time_ns[0]) if len(self._accel) else (self._decided_ns or 0)
-        oldest = min(oldest, (self._decided_ns or oldest) - round(4 * self.stillness.window_s * _SECOND_NS))
+        oldest = min(oldest, (self._decided_ns or oldest) - 4 * self.stillness.window_ns)
         if self.slews:  # a slew's curve begins a window before it
-            oldest -= round(self.stillness.window_s * _SECOND_NS) + self._lead_ns
-        self._pose = self._pose[max(int(np.searchsorted(self._pose.time_ns, oldest)) - _LAST - _BEFORE, 0) :]
+            oldest -= self.stillness.window_ns + self.stillness.lead_ns
+        self._pose = self._pose[max(int(np.searchsorted(self._pose.time_ns, oldest)) - HISTORY, 0) :]
         self._temperature = self._temperature[max(int(np.searchsorted(self._temperature.time_ns, oldest)) - 2, 0) :]
 
 

@@ -17,13 +17,13 @@ import numpy as np
 
 from kf_calib import information, paper, walk
 from kf_calib.bench import Bench
-from kf_calib.dwells import Stillness
 from kf_calib.effects import Effect, Stimulus
 from kf_calib.fitting import Fit
 from kf_calib.folding import Means
 from kf_calib.model import STATE_COUNT, Model, Prior, effect_columns
 from kf_calib.noise import Noise, considered, mean_covariances
 from kf_calib.samples import Floats
+from kf_calib.stillness import Stillness
 from kf_calib.triangle import triangle
 
 PAUSE_S = 60.0

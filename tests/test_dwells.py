@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from kf_calib.bench import Bench, axes_of
-from kf_calib.dwells import Segmenter, Stillness, dwell_blocks
+from kf_calib.dwells import Segmenter, dwell_blocks
 from kf_calib.samples import Batch, Stream
+from kf_calib.stillness import Stillness
 
 S = 1_000_000_000
 BENCH = Bench(axes_of("zx"), 9.81)

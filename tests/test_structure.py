@@ -14,7 +14,7 @@ LEVELS = [
     ["errors"],
     ["samples"],
     ["bench"],
-    ["effects", "slews"],
+    ["effects", "slews", "stillness"],
     ["triangle", "dwells", "paper", "gate", "spectrum"],
     ["averaging", "trace", "walk"],
     ["model"],

@@ -141,8 +141,8 @@ def recording_of(path: Path, options: Mapping[str, Any]) -> Recording:
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
     from kf_calib.calibration import Settings
-    from kf_calib.dwells import Stillness
     from kf_calib.model import PRIORS
+    from kf_calib.stillness import Stillness
 
     return Settings(
         engine=options["engine"],
