@@ -276,7 +276,7 @@ class Segmenter:
         if horizon is None:
             return
         if self._dwell is not None:
-            yield from self._emit(horizon, closing=final)
+            yield from self._emit(horizon if final else min(horizon, self._resting_ns()), closing=final)
         elif final or not self._slewing():  # an arrival may be felt since the last angle before it
             before = int(np.searchsorted(self._pose.time_ns, self._decided_ns or horizon)) - 1
             self._discard(horizon if final or before < 0 else min(horizon, int(self._pose.time_ns[before])))
@@ -364,6 +364,13 @@ class Segmenter:
             return int(self._pose.time_ns[-1]) + _HOLD_NS if len(self._pose) > 1 else 1 << 62
         return self._decided_ns - self.stillness.lead_ns - self.stillness.window_ns
 
+    def _resting_ns(self) -> int:
+        """Readings of the open dwell before this stamp are not those of a slew that may have begun."""
+        assert self._dwell is not None and self._decided_ns is not None
+        last = int(np.searchsorted(self._pose.time_ns, self._decided_ns))
+        until_ns = self._departed_ns(self._dwell.arrival_ns, self._decided_ns)
+        return min(until_ns, int(self._pose.time_ns[max(last - 1, 0)])) - self.stillness.lead_ns
+
     def _discard(self, until_ns: int) -> None:
         """Drop the readings before ``until_ns``: the platform was moving, or no angle was known."""
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
@@ -406,9 +413,9 @@ class Segmenter:
         assert self._dwell is not None
         dwell, settle_ns = self._dwell, self.stillness.settle_ns
         if dwell.settling_ns is None:
-            rest_ns = self.stillness.rest_ns(self._pose, not self.bench.axes, dwell.arrival_ns, until_ns)
+            rest_ns, judged = self.stillness.rest_ns(self._pose, not self.bench.axes, dwell.arrival_ns, until_ns)
             length_ns = until_ns - rest_ns
-            if length_ns < 3 * settle_ns and not closing:
+            if not closing and (not judged or length_ns < 3 * settle_ns):
                 return
             dwell.settling_ns = rest_ns - dwell.arrival_ns + min(settle_ns, length_ns // 3)
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
@@ -469,7 +476,7 @@ class Segmenter:
     def _forget(self) -> None:
         """Drop poses and temperatures that no pending reading needs."""
         oldest = int(self._accel.time_ns[0]) if len(self._accel) else (self._decided_ns or 0)
-        oldest = min(oldest, (self._decided_ns or oldest) - 4 * self.stillness.window_ns)
+        oldest = min(oldest, (self._decided_ns or oldest) - self.stillness.history_ns)
         if self.slews:  # a slew's curve begins a window before it
             oldest -= self.stillness.window_ns + self.stillness.lead_ns
         self._pose = self._pose[max(int(np.searchsorted(self._pose.time_ns, oldest)) - HISTORY, 0) :]

@@ -1,7 +1,8 @@
 """When the platform counts as still, and when exactly it came to rest and left: from its angles, and from the readings.
 
 Angles tell of a motion to their period only, and a slew that begins and ends gently is within any tolerance for some
-time: what is left over is looked for in the messages of the dwell itself, and in the readings.
+time: what is left over is looked for in the messages of the dwell itself, and in the readings. The noise of an encoder
+is taken from second differences of its messages, in which a platform that creeps does not show: sigma^2 = <d^2> / 6.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ from kf_calib.bench import mean_pose, pose_distance
 from kf_calib.samples import Floats, Mask, Stream, Times
 
 _SECOND_NS = 1_000_000_000
-_LAST, _BEFORE = 3, 4  # messages at the end of a dwell that may have crept away, and before them: at least
-_CREEPING_NS = 15 * _SECOND_NS  # from when on a platform that still creeps is taken as one that goes on so
+_BEFORE = 3  # messages, at least, that one is held against
+_APART_NS = 2 * _SECOND_NS  # messages that lie farther apart tell no departure
+_CREEPING_NS = 10 * _SECOND_NS  # from when on a platform that still creeps is taken as one that goes on so
 _PARTS = 8  # of a block, whose mean poses are compared
 
-HISTORY = _LAST + _BEFORE
-"""Messages before the last ones judged that a departure may be held against."""
+HISTORY = _BEFORE + 2
+"""Messages before those of ``Stillness.history_ns`` that are of use, where they are seldom."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,11 @@ class Stillness:
     def lead_ns(self) -> int:
         return round(self.lead_s * _SECOND_NS)
 
+    @property
+    def history_ns(self) -> int:
+        """How long before an interval messages are of use."""
+        return _CREEPING_NS + 6 * self.window_ns
+
     def intervals(
         self, times: Times, poses: Floats, is_quaternion: bool, known: Mask, covered_ns: int
     ) -> tuple[Mask, int]:
@@ -71,45 +78,78 @@ class Stillness:
         return (reach[:-1] > times[:-1]) & steps, int(reach[-1])
 
     def departure_ns(self, pose: Stream, is_quaternion: bool, arrived_ns: int, end_ns: int) -> int:
-        """When, in the last window of a dwell from ``arrived_ns`` to ``end_ns``, the platform began to creep away.
+        """When, in a dwell from ``arrived_ns`` to ``end_ns``, the platform began to creep away.
 
-        The last messages are held against the mean of the two windows before them, to ``rest_rad`` or four sigma of
-        the encoder. Where messages are seldom, a few count and not a window.
+        It may have left, by what angles cannot tell, as long before as messages lie apart.
         """
-        times, poses, window_ns = pose.time_ns, pose.values, self.window_ns
-        first, middle, last = np.searchsorted(times, (end_ns - 3 * window_ns, end_ns - window_ns, end_ns + 1)).tolist()
-        middle = min(middle, max(last - _LAST, 0))
-        first = max(min(first, middle - _BEFORE), int(np.searchsorted(times, arrived_ns)))
-        if middle - first < 2 or last <= middle:
+        away = self.creeping_from(pose, is_quaternion, arrived_ns, end_ns)
+        if away is None:
             return end_ns
-        away = np.flatnonzero(~self._alike(poses[middle:last], poses[first:middle], is_quaternion))
-        if not away.size:
-            return end_ns
-        standing_ns, moving_ns = times[max(middle + away[0] - 1, first) :][:2].tolist()
-        # it may have left, by what angles cannot tell, as long before as messages lie apart
-        return max(standing_ns - max(moving_ns - standing_ns - self.lead_ns, 0), arrived_ns)
+        early_ns, standing_ns = pose.time_ns[max(away - 2, 0)], pose.time_ns[max(away - 1, 0)]
+        apart_ns = min(int(standing_ns - early_ns), _APART_NS)
+        return max(int(standing_ns) - max(apart_ns - self.lead_ns, 0), arrived_ns)
 
-    def rest_ns(self, pose: Stream, is_quaternion: bool, arrived_ns: int, until_ns: int) -> int:
-        """When, in a dwell from ``arrived_ns`` on that is known until ``until_ns``, the platform had come to rest.
+    def creeping_from(self, pose: Stream, is_quaternion: bool, arrived_ns: int, until_ns: int) -> int | None:
+        """Since which message the platform, in a dwell from ``arrived_ns`` on, has been creeping by ``until_ns``.
+
+        None: it rests, or creeps for so long that it is taken as one that goes on so.
+        """
+        arrived, last = np.searchsorted(pose.time_ns, (arrived_ns, until_ns + 1)).tolist()
+        begin = last
+        for span_ns in (self.window_ns, _CREEPING_NS + self.window_ns):  # most of the time nothing moves
+            judged = max(int(np.searchsorted(pose.time_ns, until_ns - span_ns)), arrived)
+            first = int(np.searchsorted(pose.time_ns, until_ns - span_ns - 4 * self.window_ns))
+            first = max(min(first, judged - HISTORY), arrived)
+            if last - judged < 1 or last - first < HISTORY:
+                return None
+            away = judged + np.flatnonzero(self._away(pose[first:last], is_quaternion)[judged - first :])
+            step = max(
+                1, round(self.window_ns * (last - 1 - first) / int(pose.time_ns[last - 1] - pose.time_ns[first]))
+            )
+            if not away.size or last - 1 - away[-1] > step:
+                return None
+            breaks = np.flatnonzero(np.diff(away) > step)
+            begin = int(away[breaks[-1] + 1 if breaks.size else 0])
+        return begin if pose.time_ns[last - 1] - pose.time_ns[begin] <= _CREEPING_NS else None
+
+    def _away(self, pose: Stream, is_quaternion: bool) -> Mask:
+        """Which messages are away from rest: not the mean of those half a window to two windows before, (m,) bool.
+
+        To ``rest_rad`` or four sigma of the encoder; where messages are seldom, of a few. The first are not judged.
+        """
+        times, own = pose.time_ns, pose.values - pose.values[0]
+        ends = np.minimum(np.searchsorted(times, times - self.window_ns), np.maximum(np.arange(len(times)) - 1, 0))
+        starts = np.minimum(np.searchsorted(times, times - 4 * self.window_ns), np.maximum(ends - _BEFORE, 0))
+        sums, counts = _summed(own), (ends - starts)[:, None]
+        means = (sums[ends] - sums[starts]) / np.maximum(counts, 1)
+        bent, bends = _summed(np.diff(own, 2, axis=0) ** 2), np.maximum(ends - starts - 2, 0)[:, None]
+        variance = (bent[starts + bends[:, 0]] - bent[starts]) / (6.0 * np.maximum(bends, 1))
+        allowed = np.maximum(self.rest_rad, 4.0 * np.sqrt(np.maximum(variance, 0.0).max(axis=1)))
+        apart = pose_distance(pose.values, means + pose.values[0], is_quaternion)
+        return (apart > allowed) & (bends[:, 0] > 0)
+
+    def rest_ns(self, pose: Stream, is_quaternion: bool, arrived_ns: int, until_ns: int) -> tuple[int, bool]:
+        """When, in a dwell from ``arrived_ns`` on, the platform had come to rest; whether what is known until
+        ``until_ns`` is enough to tell.
 
         A message is of a platform at rest where it agrees with the mean of those of the next two margins for settling,
-        to ``rest_rad`` or four sigma of them; the last two margins cannot be judged. A dwell that creeps all along is
-        used from its arrival.
+        a few at least, to ``rest_rad`` or four sigma of them. A dwell that creeps all along is used from its arrival,
+        and so is one whose messages are farther apart than that.
         """
         first, last = np.searchsorted(pose.time_ns, (arrived_ns, until_ns)).tolist()
-        times, poses = pose.time_ns[first:last], pose.values[first:last]
-        for k, end in enumerate(np.searchsorted(times, times + 2 * self.settle_ns, side="right").tolist()):
-            if end == k + 1 or times[k] > arrived_ns + _CREEPING_NS:
+        times, poses, span_ns = pose.time_ns[first:last], pose.values[first:last], 2 * self.settle_ns
+        for k, within in enumerate(np.searchsorted(times, times + span_ns, side="right").tolist()):
+            if times[k] > arrived_ns + _CREEPING_NS:
                 break
-            judged = times[k] + 2 * self.settle_ns <= until_ns
-            if not judged or self._alike(poses[k : k + 1], poses[k + 1 : end], is_quaternion)[0]:
-                return int(times[k]) if k else arrived_ns
-        return arrived_ns
-
-    def _alike(self, poses: Floats, resting: Floats, is_quaternion: bool) -> Mask:
-        """Which poses (m, k) are the mean of those (n, k) of a platform at rest."""
-        allowed = max(self.rest_rad, 4.0 * float(resting.std(axis=0).max()))
-        return pose_distance(poses, mean_pose(resting), is_quaternion) <= allowed
+            at_ns, end = int(times[k]) if k else arrived_ns, max(within, k + 1 + _BEFORE)
+            if times[k] + span_ns > until_ns or end > len(times):
+                return at_ns, False
+            coming = poses[k + 1 : end]
+            allowed = max(self.rest_rad, 4.0 * math.sqrt(np.mean(np.diff(coming, 2, axis=0) ** 2, axis=0).max() / 6.0))
+            apart = pose_distance(poses[k], mean_pose(coming), is_quaternion)
+            if apart <= allowed or np.diff(times[k:end]).max() > span_ns:
+                return at_ns, True
+        return arrived_ns, True
 
     def creeps(self, poses: Floats) -> bool:
         """Whether the messages (n, k) of a block tell of more than noise about one pose: by the means of its parts."""
@@ -165,6 +205,11 @@ class Stillness:
             return arrival_ns
         moving_ns, standing_ns = accel.time_ns[first + away[-1] :][:2].tolist()
         return (moving_ns + standing_ns) // 2
+
+
+def _summed(values: Floats) -> Floats:
+    """Sums (n + 1, k) of the first values (n, k), of none at first."""
+    return np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
 
 
 def _standing(means: Floats, coarse: Floats, fine: Floats) -> int:
