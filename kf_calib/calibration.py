@@ -638,6 +638,12 @@ def _remarks(
             f"sensors: dwells are weighted alike and their whole misfit ({noise.scatter_mps2[0]:.2g} m/s^2) counts in "
             "every sigma; at least 12 spread orientations would tell."
         )
+    stated_deg = model.bench.angle_sigma_deg
+    if stated_deg is not None and np.degrees(noise.setting_rad) > 1.1 * stated_deg:
+        yield (
+            f"the angles' own noise leaves {np.degrees(noise.setting_rad):.2g} deg uncertain of a pose, with the "
+            f"{stated_deg:g} deg stated for its setting: that is what dwells are weighted by."
+        )
     if not noise.setting_stated and noise.setting_rad > 0:
         yield (
             f"angle_sigma_deg was not stated; {np.degrees(noise.setting_rad):.2g} deg was estimated from the misfit "

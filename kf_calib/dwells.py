@@ -21,7 +21,7 @@ from kf_calib.bench import Bench, interpolate_pose, mean_pose, unwrap_pose
 from kf_calib.errors import InputError
 from kf_calib.samples import Batch, Floats, Mask, Source, Stream, Times
 from kf_calib.slews import Curve
-from kf_calib.stillness import HISTORY, Stillness
+from kf_calib.stillness import HISTORY, Stillness, encoder_sigma
 
 BLOCK_SAMPLES = 4000
 """Samples of one block at the most: few enough for the cache; no power of two, whose columns would evict each other."""
@@ -58,6 +58,8 @@ class Block:
     taken: int = 1
     """How many readings each new one stands for."""
     felt_s: float | None = None
+    pose_sigma_rad: float = 0.0
+    """What the noise of the angles leaves uncertain of the pose, 1 sigma."""
 
 
 @dataclass
@@ -156,7 +158,7 @@ class _Dwell:
 
     felt_ns: the arrival as the readings tell it; what settles counts from there.
     settling_ns: what is left out after the arrival; None while the dwell may still be too short for the whole margin.
-    pose (1, k): where the platform stands, from the messages of the dwell's first block.
+    pose (1, k): where the platform stands, from the messages of the dwell's first block; pose_sigma_rad: of these.
     """
 
     number: int
@@ -165,6 +167,7 @@ class _Dwell:
     first_pose_ns: int
     settling_ns: int | None
     pose: Floats | None = None
+    pose_sigma_rad: float = 0.0
 
 
 @dataclass
@@ -434,15 +437,11 @@ class Segmenter:
         arrival_s, felt_s = (
             max((stamp - self.first_ns) / _SECOND_NS, 0.0) for stamp in (self._dwell.arrival_ns, self._dwell.felt_ns)
         )
+        pose, warm = self._block_pose(accel.time_ns), _carried_on(self._temperature, accel.time_ns)
         return Block(
-            self._dwell.number,
-            arrival_s,
-            elapsed_s,
-            accel.values,
-            self._block_pose(accel.time_ns),
-            _carried_on(self._temperature, accel.time_ns),
-            felt_s=felt_s,
-        )
+            self._dwell.number, arrival_s, elapsed_s, accel.values, pose, warm, felt_s=felt_s,
+            pose_sigma_rad=self._dwell.pose_sigma_rad,
+        )  # fmt: skip
 
     def _block_pose(self, accel_ns: Times) -> Floats:
         assert self._dwell is not None
@@ -469,7 +468,8 @@ class Segmenter:
         known = self._dwell.pose
         allowed = 6.0 * inside.std(axis=0) / np.sqrt(len(inside)) + 1e-9
         if known is None or (np.abs(mean - known) > allowed).any():
-            self._dwell.pose = mean
+            sigma = float(np.sqrt(np.mean(encoder_sigma(inside) ** 2) / len(inside)))
+            self._dwell.pose, self._dwell.pose_sigma_rad = mean, sigma
             return mean
         return known
 

@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib import information
+from kf_calib.bench import Bench
 from kf_calib.effects import Coefficient, Effect
 from kf_calib.folding import Carried, DwellFactor, candidate_columns, stimulus_of
 from kf_calib.likelihood import gain_of, wandering, with_dwell_parts
@@ -29,6 +30,7 @@ WALK = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5, "µg/√s", 1e6 / 9.80665)
 
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
+_EXACT_RAD = 1e-9
 _STILL = 2.5e-4  # a step of ln(value), in reaches, that ends the search
 
 
@@ -127,7 +129,7 @@ def fit(
         if searching:
             model = model.moved(np.clip(moved, -reach, reach))
         carried = Carried(dwells, model, state, slews)
-        stated = bench.angle_sigma_deg, bench.scatter_sigma_mps2
+        stated = setting_deg(dwells, bench), bench.scatter_sigma_mps2
         noise = with_dwell_parts(within, carried.means, state, *stated, walks=model.walks)
         noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
         fitted = replace(fitted, carried=carried, noise=noise)
@@ -137,6 +139,14 @@ def fit(
         if number >= _PASSES - 1 and (np.abs(moved) <= _STILL * reach).all() and not model.stepped:
             break
     return fitted
+
+
+def setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:
+    """The setting error that is stated, and beside it what the angles' noise leaves uncertain of the dwells' poses."""
+    pose_rad = float(np.sqrt(np.mean([dwell.pose_sigma_rad**2 for dwell in dwells])))
+    if bench.angle_sigma_deg is None or pose_rad < _EXACT_RAD:
+        return bench.angle_sigma_deg
+    return math.hypot(bench.angle_sigma_deg, math.degrees(pose_rad))
 
 
 def _solved(fitted: Fit) -> tuple[Floats, Floats]:

@@ -85,7 +85,7 @@ class DwellFactor:
     spectrum of its first readings.
 
     moving: it is the slew after the dwell of that number, folded like a dwell. came_from: the dwell before it, where
-    that one is left out (None: it is there, or there was none).
+    that one is left out (None: it is there, or there was none). pose_sigma_rad: of its pose, by noise of the angles.
     """
 
     number: int
@@ -95,6 +95,7 @@ class DwellFactor:
     trace: Trace = field(default_factory=Trace)
     moving: bool = False
     came_from: DwellFactor | None = None
+    pose_sigma_rad: float = 0.0
 
     @property
     def carrier_hz(self) -> float:
@@ -460,7 +461,8 @@ class Folder:
         folded = self.slews if rows.moving else self.dwells
         current = folded[-1] if folded and folded[-1].number == rows.dwell else None
         fresh = not rows.moving and (current is None or current.autocovariance.count < _CORRELATED_SAMPLES)
-        block = DwellFactor(rows.dwell, fold(rows, self.carrier_hz), moving=rows.moving)
+        folded_rows = fold(rows, self.carrier_hz)
+        block = DwellFactor(rows.dwell, folded_rows, moving=rows.moving, pose_sigma_rad=rows.pose_sigma_rad)
         if fresh:
             left = less_curve(rows.innovation, rows.elapsed_s, self.carrier_hz)
             own, spectrum = Autocovariance.of(left), Spectrum.of(left, rows.elapsed_s)

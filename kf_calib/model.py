@@ -84,6 +84,7 @@ class Rows:
     pieces: parts of the rows, u (n',) from -1 to 1 over each, and its nodes. moving: of the slew after the dwell.
     gated: in which channels each reading lay out that is not among them, (3, m) bool; None: there were none.
     raw: the rows before they were averaged, where they were; taken: how many readings a row then stands for.
+    pose_sigma_rad: of the pose, by the noise of the angles.
     """
 
     dwell: int
@@ -97,6 +98,7 @@ class Rows:
     gated: Mask | None = None
     raw: Rows | None = None
     taken: int = 1
+    pose_sigma_rad: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -314,7 +316,10 @@ def _rows(block: Block, bench: Bench, force: Floats | None) -> Rows:
     else:
         columns = np.concatenate([basis(u).T @ parabola(nodes.regressors) for _, u, nodes in pieces])
     innovation = gate.innovations(columns, block.accel_mps2, force is not None)
-    return Rows(block.dwell, block.elapsed_s, columns, block.accel_mps2, innovation, force is not None, pieces)
+    return Rows(
+        block.dwell, block.elapsed_s, columns, block.accel_mps2, innovation, force is not None, pieces,
+        pose_sigma_rad=block.pose_sigma_rad,
+    )  # fmt: skip
 
 
 def _slew_rows(block: Block, bench: Bench, curve: Curve) -> Rows:

@@ -145,7 +145,7 @@ class Stillness:
             if times[k] + span_ns > until_ns or end > len(times):
                 return at_ns, False
             coming = poses[k + 1 : end]
-            allowed = max(self.rest_rad, 4.0 * math.sqrt(np.mean(np.diff(coming, 2, axis=0) ** 2, axis=0).max() / 6.0))
+            allowed = max(self.rest_rad, 4.0 * float(encoder_sigma(coming).max()))
             apart = pose_distance(poses[k], mean_pose(coming), is_quaternion)
             if apart <= allowed or np.diff(times[k:end]).max() > span_ns:
                 return at_ns, True
@@ -156,13 +156,13 @@ class Stillness:
         count, spread = len(poses), np.ptp(poses, axis=0).max()
         if count < 2 or spread <= self.rest_rad:
             return False
-        if spread > self.tolerance_rad:
+        if spread > max(self.tolerance_rad, 8.0 * float(encoder_sigma(poses).max())):
             return True
         parts = np.array_split(poses, min(_PARTS, count))
         means = np.array([part.mean(axis=0) for part in parts])
         sigma = np.sqrt(np.mean(np.diff(poses, axis=0) ** 2, axis=0) / 2.0 * len(parts) / count)
         apart = np.abs(means - np.median(means, axis=0))
-        return bool((apart > np.maximum(self.rest_rad, 5.0 * sigma)).any())
+        return bool((apart > np.maximum(self.rest_rad, 8.0 * sigma)).any())
 
     def moved_between(self, accel: Stream, begin_ns: int, end_ns: int, gravity_mps2: float) -> tuple[int, int]:
         """When a motion without angles began and ended, from the readings between two poses.
@@ -205,6 +205,13 @@ class Stillness:
             return arrival_ns
         moving_ns, standing_ns = accel.time_ns[first + away[-1] :][:2].tolist()
         return (moving_ns + standing_ns) // 2
+
+
+def encoder_sigma(poses: Floats) -> Floats:
+    """Noise of a message, 1 sigma (k,), rad, from poses (n, k); 0 for fewer than three."""
+    return (
+        np.sqrt(np.mean(np.diff(poses, 2, axis=0) ** 2, axis=0) / 6.0) if len(poses) > 2 else np.zeros(poses.shape[1])
+    )
 
 
 def _summed(values: Floats) -> Floats:

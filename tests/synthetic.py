@@ -43,6 +43,7 @@ class Run:
     phi: float = 0.0
     scatter_mps2: float = 0.0
     setting_deg: float = 0.0
+    encoder_deg: float = 0.0
     stated: bool = True
     spread: tuple[float, float, float] = (1e-3, 1e-3, 1e-3)  # of angles (rad), K, b
     gap_s: float = 3.0
@@ -73,7 +74,9 @@ class Run:
             times.append(stamps)
             readings.append(level + self._noise(rng))
             pose_times.append(stamps[::10])
-            pose_values.append(np.repeat(pose[None], len(stamps[::10]), axis=0))
+            told = np.repeat(pose[None], len(stamps[::10]), axis=0)
+            encoders = np.random.default_rng([self.seed, len(pose_values)])
+            pose_values.append(told + encoders.normal(size=told.shape) * np.radians(self.encoder_deg))
             start = int(stamps[-1]) + round(self.gap_s * 1e9)
         self.accel = Stream(np.concatenate(times), np.concatenate(readings))
         self.pose = Stream(np.concatenate(pose_times), np.concatenate(pose_values))

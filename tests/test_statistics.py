@@ -16,6 +16,7 @@ CASES = {
     "scatter": ({"scatter_mps2": 2e-4}, 0.92, 0.98),
     "setting stated": ({"setting_deg": 0.01}, 0.92, 0.98),
     "setting estimated": ({"setting_deg": 0.01, "stated": False}, 0.92, 0.98),
+    "encoders": ({"encoder_deg": 0.01}, 0.92, 0.98),
     "mems": ({"white_mps2": 0.02, "spread": (0.05, 0.05, 0.5)}, 0.93, 0.97),
 }
 
@@ -50,7 +51,7 @@ def test_coverage_of_1000_runs(name: str) -> None:
         assert np.mean(p_values < 0.01) <= 0.02
 
 
-@pytest.mark.parametrize("name", ["white", "ar1", "scatter", "setting stated"])
+@pytest.mark.parametrize("name", ["white", "ar1", "scatter", "setting stated", "encoders"])
 def test_coverage_pooled_over_parameters(name: str) -> None:
     """The same over 25 runs, the twelve parameters pooled; a sigma wrong by a quarter fails it."""
     case, _, _ = CASES[name]
