@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kf_calib import walk
+from kf_calib.autoregression import unbiased
 from kf_calib.folding import Autocovariance, DwellFactor, Means
 from kf_calib.samples import Floats
 
@@ -22,6 +23,7 @@ FLOOR_MPS2 = 1e-9
 """Readings that are exactly constant get this sigma: the rounding of a double is 1e-15 m/s^2."""
 
 _MAX_ORDER = 20
+_LONGEST = 2.0  # kappa at most, as a part of a block
 _WANDER = 6
 
 
@@ -119,41 +121,17 @@ def _lagged(dwells: Sequence[DwellFactor]) -> Floats:
 
 
 def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
-    """kappa, and the variance, from an autoregression fitted to the autocovariance (Yule-Walker), its order by BIC.
+    """kappa, and the variance, from an autoregression fitted to the autocovariance (``autoregression``).
 
-    kappa = v / (gamma_0 (1 - sum a)^2), v the variance of the autoregression's innovations (Percival and Walden, 1993,
-    ch. 9). The autocovariance of readings less their block's parabola is low by about 3 kappa gamma_0 / n at every lag;
-    that is put back by iteration. Never below 1: a noise that averages faster than white is not relied on.
+    Never below 1: a noise that averages faster than white is not relied on; and no larger than a block can tell.
     """
     if total.count < 64 or total.products[0, channel] <= 0:
         return 1.0, 0.0
-    mean_block = total.count / total.blocks
-    lags = min(_MAX_ORDER, total.count // 16, int(mean_block) // 4)
+    size = round(total.count / total.blocks)
+    lags = min(_MAX_ORDER, total.count // 16, size // 4)
     raw = total.products[: lags + 1, channel] / np.maximum(total.pairs[: lags + 1], 1.0)
-    kappa, gamma = 1.0, raw
-    for _ in range(10):
-        gamma = raw + 3.0 * kappa * raw[0] / max(mean_block - 3.0 * kappa, 1.0)
-        before, kappa = kappa, min(_autoregressive_inflation(gamma, total.count), mean_block / 12)
-        if abs(kappa - before) < 1e-3 * kappa:
-            break
-    return max(kappa, 1.0), float(gamma[0])
-
-
-def _autoregressive_inflation(gamma: Floats, count: int) -> float:
-    """Levinson-Durbin over all orders; kappa of the order with the least BIC."""
-    a, variance = np.zeros(0), float(gamma[0])
-    best = (count * np.log(variance), 1.0)
-    for order in range(1, len(gamma)):
-        reflection = (gamma[order] - a @ gamma[order - 1 : 0 : -1]) / variance
-        if not abs(reflection) < 1:
-            break
-        a = np.append(a - reflection * a[::-1], reflection)
-        variance *= 1 - reflection**2
-        score = count * np.log(variance) + order * np.log(count)
-        gain = float((1 - a.sum()) ** 2)
-        if score < best[0] and gain > 0:
-            best = (score, variance / gamma[0] / gain)
-    return best[1]
+    model, variance = unbiased(raw, total.count, size)
+    return min(max(model.inflation, 1.0), max(size / _LONGEST, 1.0)), variance
 
 
 def wander(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floats], Floats]:

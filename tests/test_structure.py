@@ -15,7 +15,7 @@ LEVELS = [
     ["samples"],
     ["bench"],
     ["effects", "slews", "stillness"],
-    ["triangle", "dwells", "paper", "gate", "spectrum"],
+    ["triangle", "autoregression", "dwells", "paper", "gate", "spectrum"],
     ["averaging", "trace", "walk"],
     ["model"],
     ["folding"],
