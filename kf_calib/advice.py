@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -24,6 +23,7 @@ _POSES = 640
 _STEP_DEG = 5.0
 _STEPS = 12
 _WAY_S = 10.0  # to the next orientation, where there has been none
+_TOLD = 0.1  # sigma: effects that are less apart after any next dwell are told apart by none
 _WAITS = (0.0, 0.25, 1.0)  # of the run so far, that may be spent where it goes next
 
 
@@ -32,12 +32,14 @@ class Advice:
     """Gimbal angles of the next orientation, deg; separation: in sigma, before and after a dwell there.
 
     stay_s: how long to stay there, where it takes more than a dwell as they were so far.
+    told: what it tells apart.
     """
 
     gimbal_deg: tuple[float, ...]
     before: float
     after: float
     stay_s: float | None = None
+    told: tuple[str, ...] = ()
 
 
 def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequence[Effect]) -> Advice | None:
@@ -45,26 +47,37 @@ def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequen
 
     Separation: what is left of its signal, in sigma, when the model and the other have explained all they can; the
     smallest over the others (no others: over the model alone). What differs in time only is told apart by time: a
-    longer stay is advised where the square of the separation grows by more an hour with it.
+    longer stay is advised where the square of the separation grows by more an hour with it. An effect that holds this
+    one as a special case is told apart nowhere, and left out.
     """
     poses = _poses(fitted)
     if poses is None:
         return None
     waits_s = np.array(_WAITS) * fitted.dwells[-1].end_s
-    before, after = math.inf, np.full((len(waits_s), len(poses)), np.inf)
-    for rival in [[other] for other in others] or [[]]:
-        factor, rows = _with_next(fitted, [*rival, one], poses, waits_s=waits_s)
-        count = factor.shape[1] - len(coefficients)
-        mix = np.zeros((factor.shape[1], count + 1))
-        mix[:count, :count], mix[count:, count] = np.eye(count), coefficients
-        before = min(before, abs(float(triangle(factor @ mix)[-1, -1])))
-        so_far = np.broadcast_to(factor @ mix, (*rows.shape[:2], len(factor), count + 1))
-        after = np.minimum(after, np.abs(triangle(np.concatenate([so_far, rows @ mix], axis=2))[..., -1, -1]))
+    each = {str(other): _separations(fitted, one, coefficients, [other], poses, waits_s) for other in others}
+    each = {name: own for name, own in each.items() if own[1].max() > _TOLD}
+    every = list(each.values()) or [_separations(fitted, one, coefficients, [], poses, waits_s)]
+    before, after = min(own[0] for own in every), np.min([own[1] for own in every], axis=0)
     dwell_s = _each_s(fitted)
     gain = (after**2 - before**2) / (dwell_s + waits_s)[:, None]
     wait, best = np.unravel_index(int(np.argmax(gain)), gain.shape)
     stay_s = float(waits_s[wait] + dwell_s) if wait else None
-    return Advice(tuple(np.degrees(poses[best]).round(1).tolist()), before, float(after[wait, best]), stay_s)
+    angles = tuple(np.degrees(poses[best]).round(1).tolist())
+    return Advice(angles, before, float(after[wait, best]), stay_s, tuple(each))
+
+
+def _separations(
+    fitted: Fit, one: Effect, coefficients: Floats, others: Sequence[Effect], poses: Floats, waits_s: Floats
+) -> tuple[float, Floats]:
+    """What is left of an effect, in sigma, when the model and others have explained all they can: now, and after a
+    dwell at each pose after each wait (w, m)."""
+    factor, rows = _with_next(fitted, [*others, one], poses, waits_s=waits_s)
+    count = factor.shape[1] - len(coefficients)
+    mix = np.zeros((factor.shape[1], count + 1))
+    mix[:count, :count], mix[count:, count] = np.eye(count), coefficients
+    so_far = np.broadcast_to(factor @ mix, (*rows.shape[:2], len(factor), count + 1))
+    after = np.abs(triangle(np.concatenate([so_far, rows @ mix], axis=2))[..., -1, -1])
+    return abs(float(triangle(factor @ mix)[-1, -1])), after
 
 
 def to_show(fitted: Fit, hidden: Sequence[Effect]) -> tuple[Advice, int] | None:

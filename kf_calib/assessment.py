@@ -102,6 +102,15 @@ class Test:
         own, tests = self.candidate(name), self.effective_tests
         return self.scores[name] + price(own, tests) - price(replace(own, tried=1), tests)
 
+    def holding(self, name: str) -> list[str]:
+        """Effects that can do all that this one can in this run, and more: no reading speaks against them."""
+        if name not in self.best:
+            return []
+        own = self.candidate(name)
+        return [
+            other for other in self.ranked if other != name and other in self.best and own.within(self.candidate(other))
+        ]
+
     def candidate(self, name: str) -> Candidate:
         return self.scan.candidates[self.best[name]]
 

@@ -20,15 +20,28 @@ from kf_calib.assessment import EQUAL, LEVEL, SHARE, Test, assessed, price, run_
 from kf_calib.calibration import Calibration, Parameter, format_p, refitted
 from kf_calib.drivers import JUMP, Family, families
 from kf_calib.effects import walk_named
-from kf_calib.fitting import WALK
+from kf_calib.fitting import WALK, behind_within
 from kf_calib.likelihood import FEWEST
 from kf_calib.noise import mean_covariances
-from kf_calib.pairs import MOST, WALKS, Pair, Pairs, alike, as_good, exchanged, likeliest, names_of, pairs_of
+from kf_calib.pairs import (
+    EQUAL_PAIR,
+    MOST,
+    WALKS,
+    Pair,
+    Pairs,
+    alike,
+    as_good,
+    exchanged,
+    likeliest,
+    names_of,
+    pairs_of,
+)
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
 
 _REFUSED = 0.002  # chance that what is really missing is turned down because noise beside it looks like something more
 _ALIKE = 0.5  # overlap above which two suspects may be taken for each other
+_NEARLY = 2.71  # of chi-squared, of one constant: 10 %
 _SHOWN = 6  # suspects that are refitted and shown
 
 
@@ -160,7 +173,11 @@ def _beside_lines(found: Diagnosis) -> Diagnosis | None:
         return None
     both = (*rest.missing, test.oscillating)
     ambiguity = (*both, *(name for name in rest.ambiguity if name not in both))
-    return replace(rest, before=found.before, test=test, suspects=found.suspects, missing=both, ambiguity=ambiguity)
+    after = with_effects(found.before, both)  # alone, an oscillation may have been drawn to what the others explain
+    return replace(
+        rest, before=found.before, test=test, suspects=found.suspects, missing=both, ambiguity=ambiguity,
+        after=after if _fits(after, test) else rest.after,
+    )  # fmt: skip
 
 
 def _may_scatter(before: Calibration) -> bool:
@@ -217,6 +234,7 @@ def _one(found: Diagnosis, first: Suspect, pairs: Pairs) -> Diagnosis:
     if outdone:
         return replace(found, unknown=True)
     close = [name for name in test.ranked if test.nearness(name) > test.scores[first.name] - EQUAL]
+    close += [name for name in test.holding(first.name) if name not in close]
     numbers = {name: test.best.get(name, WALKS) for name in (first.name, *close)}  # a walk, a line: no columns
     overlaps = {name: alike(test, numbers[first.name], numbers[name]) for name in close if name != first.name}
     overlaps = {name: overlap for name, overlap in overlaps.items() if overlap > _ALIKE}
@@ -294,7 +312,7 @@ def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:
         named = replace(named, alone=alone if walks else "")
         if WALKS in pair:
             named = replace(named, as_scatter=walk_fall(refit.fit, test.effective_tests)[1])
-        return _beside(named, as_good(test, pairs, pairs[pair], both))
+        return _beside(named, as_good(test, pairs, pairs[pair], both, EQUAL_PAIR))
     return None
 
 
@@ -340,9 +358,13 @@ def _fits(refit: Calibration, before: Test) -> bool:
 
 
 def _at_an_end(refit: Calibration) -> bool:
-    """Whether a constant was looked for and ran to an end of its range: another, simpler effect is meant then."""
-    ranges = [(effect.value, effect.unknown) for effect in refit.model.effects if effect.unknown is not None]
-    return any(not unknown.low * 1.01 < value < unknown.high * 0.99 for value, unknown in ranges)
+    """Whether a constant was looked for and ran to an end of its range, and none well within does nearly as well:
+    another, simpler effect is meant then."""
+    for effect in refit.model.effects:
+        known = effect.unknown is None or effect.unknown.low * 1.01 < effect.value < effect.unknown.high * 0.99
+        if not known and behind_within(refit.fit, effect) > _NEARLY:
+            return True
+    return False
 
 
 def _leaps(refit: Calibration) -> bool:
@@ -371,7 +393,7 @@ def next_orientation(found: Diagnosis) -> tuple[Advice, str] | None:
         advice = advise.to_tell_apart(fitted, first.effect, test.scan.coefficients(first), rivals)
         if advice is None:
             return None
-        words = f"tells {named[0]} from {', '.join(named[1:5])}" if rivals else f"shows {named[0]} best"
+        words = f"tells {named[0]} from {', '.join(advice.told)}" if advice.told else f"shows {named[0]} best"
         stay = "" if advice.stay_s is None else f" in {advice.stay_s / 60.0:.0f} min there"
         return advice, f"{words}: separation {advice.before:.1f} -> {advice.after:.1f} sigma{stay}"
     hidden = [test.candidate(name).effect for name in test.invisible if name in test.best]

@@ -230,6 +230,16 @@ def _falls(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> Floats:
     return falls(Carried(fitted.dwells, rest, state), fitted.noise.weights, grid)
 
 
+def behind_within(fitted: Fit, effect: Effect) -> float:
+    """By how much chi-squared is larger with the constant of an effect at the best value well within its range, by a
+    factor of two, than where it is."""
+    assert effect.unknown is not None
+    stimulus = stimulus_of(fitted.dwells, fitted.carried.model.bench, fitted.carried.state)
+    within = [v for v in effect.grid(stimulus) if 2.0 * effect.unknown.low < v < 0.5 * effect.unknown.high]
+    falls = _falls(fitted, fitted.carried.model - effect, [effect, *(effect.at(value) for value in within)])
+    return float(falls[0] - falls[1:].max(initial=-np.inf))
+
+
 def walk_gain(fitted: Fit) -> tuple[float, float]:
     """What a walk of the biases gains in log-likelihood over none, and over a mere scatter from dwell to dwell.
 

@@ -24,6 +24,9 @@ from kf_calib.walk import unfolded
 _SEEN = 1e-6
 """A candidate of which the model leaves less than this share is invisible."""
 
+_SAME = 1.0 - 1e-6
+"""Cosine above which two directions are one."""
+
 _TOGETHER = 200  # of many effects, so many are held at a time
 
 
@@ -53,6 +56,12 @@ class Candidate:
     def sigma(self) -> Floats:
         """Of the coefficients (q,), were it the only effect added; infinite where not determined."""
         return np.where(self.hidden, np.inf, np.linalg.norm(self.inverse, axis=1))
+
+    def within(self, other: Candidate) -> bool:
+        """Whether all that it can do the other can do, too: then no reading can speak for it and against the other."""
+        if not 0 < self.dof <= other.dof:
+            return False
+        return float(np.linalg.svd(self.basis.T @ other.basis, compute_uv=False)[-1]) > _SAME
 
     def overlap(self, other: Candidate) -> float:
         """Cosine of the smallest principal angle: 1 where some combination of the one mimics one of the other."""
