@@ -24,7 +24,6 @@ from kf_calib.fitting import WALK, behind_within
 from kf_calib.likelihood import FEWEST
 from kf_calib.noise import mean_covariances
 from kf_calib.pairs import (
-    EQUAL_PAIR,
     MOST,
     WALKS,
     Pair,
@@ -312,7 +311,7 @@ def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:
         named = replace(named, alone=alone if walks else "")
         if WALKS in pair:
             named = replace(named, as_scatter=walk_fall(refit.fit, test.effective_tests)[1])
-        return _beside(named, as_good(test, pairs, pairs[pair], both, EQUAL_PAIR))
+        return _beside(named, as_good(test, pairs, pairs[pair], both))
     return None
 
 

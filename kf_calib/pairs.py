@@ -13,8 +13,7 @@ from kf_calib.assessment import EQUAL, Test, price
 WALKS = -1
 """In a pair, in the place of a candidate's number."""
 
-EQUAL_PAIR = 9.21
-"""Pairs that have neither effect in common and whose chi-squared is this close cannot be told apart (1 %, 2 dof)."""
+_EQUAL_PAIR = 9.21  # as EQUAL, of pairs with neither effect in common: 1 %, 2 dof
 
 MOST = 3
 """Pairs that are refitted, and that are said."""
@@ -52,10 +51,9 @@ def likeliest(test: Test, pairs: Pairs) -> list[Pair]:
     return list(named.values())[:MOST]
 
 
-def as_good(
-    test: Test, pairs: Pairs, score: float, but: Collection[str], equal: float = EQUAL
-) -> list[tuple[str, str]]:
-    """Names of the best few pairs that explain as much as what scores so much, none of them in ``but``."""
+def as_good(test: Test, pairs: Pairs, score: float, but: Collection[str]) -> list[tuple[str, str]]:
+    """Names of the best few pairs that explain as much as what scores so much, none of them in ``but``: one or two."""
+    equal = EQUAL if len(but) == 1 else _EQUAL_PAIR
     near = sorted((pair for pair in pairs if nearness_of(pairs, pair) > score - equal), key=lambda pair: -pairs[pair])
     named = dict.fromkeys(names_of(test, pair) for pair in near)
     return [pair for pair in named if not set(pair) & set(but)][:MOST]

@@ -153,12 +153,13 @@ def test_a_walk_of_the_biases_is_found_with_its_sigma() -> None:
 
 
 def test_vibration_rectification_is_found_at_the_size_white_noise_allows() -> None:
-    """Vibration of 3 m/s^2, 60 000 times the noise, leaves nothing in averages over smooth windows: sigma is 2e-7."""
+    """Vibration of 3 m/s^2, 60 000 times the noise, leaves nothing in averages over smooth windows: sigma is 2e-7
+    to 4e-7, how these are correlated being known from 14 a dwell."""
     for seed in (5, 6):
         source = run(["vibration-rectification=4e-6,-3e-6,2e-6"], 5e-5, seed, CHEAP, sample_hz=50.0)
         result, bare = with_effect("vibration-rectification", source), calibrate(source)
         for (value, sigma), truth in zip(values(result).values(), source.hidden[0].sizes, strict=True):
-            assert abs(value - truth) < 4.0 * sigma < 1.2e-6
+            assert abs(value - truth) < 4.0 * sigma < 1.6e-6
         assert result.consistency.p_value > 1e-3 and result.noise.effective_sigma_mps2.max() < 2e-5
         assert bare.noise.effective_sigma_mps2.min() > 1.0  # where the readings themselves are folded
 

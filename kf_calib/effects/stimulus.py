@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
+from numpy.typing import NDArray
 
 from kf_calib.bench import Bench, turn
 from kf_calib.samples import Floats
@@ -18,7 +19,8 @@ REFERENCE_TEMPERATURE_C = 25.0
 _POINTS, _WEIGHTS = legendre.leggauss(10)
 _INTEGRALS = legendre.legvander(_POINTS, 2).T * _WEIGHTS  # (3, n): of Legendre's polynomials times a function
 
-_RATE_WINDOW_S = 5.0  # a thermometer of 0.01 K noise then shows rates of 1e-3 K/s
+_RATE_WINDOW_S = 5.0  # at least: a thermometer of 0.01 K noise then shows rates of 1e-3 K/s
+_RATE_STILL = 0.02
 
 
 @dataclass(frozen=True)
@@ -119,10 +121,30 @@ class Stimulus:
 
     @cached_property
     def warming(self) -> Floats:
-        """dT/dt (m,), K/s: the change of temperature from 5 s before to 5 s after."""
+        """dT/dt (m,), K/s: the change of temperature over so long that its noise matters little.
+
+        From 5 s before to 5 s after, and twice as long until that changes the rate by no more than 2 % (rms): what a
+        rate that is mostly noise leaves of an effect another one explains. At the longest an eighth of the run.
+        """
         times, first = np.unique(self.elapsed_s, return_index=True)
-        before = np.maximum(self.elapsed_s - _RATE_WINDOW_S, times[0])
-        after = np.minimum(self.elapsed_s + _RATE_WINDOW_S, times[-1])
+        window_s, best, best_change = _RATE_WINDOW_S, self._change(times, first, _RATE_WINDOW_S), np.inf
+        rate = best
+        while 2.0 * window_s <= max((times[-1] - times[0]) / 8.0, _RATE_WINDOW_S):
+            window_s *= 2.0
+            longer = self._change(times, first, window_s)
+            size = float(np.mean(longer**2))
+            change = float(np.mean((longer - rate) ** 2)) / size if size > 0.0 else 0.0
+            if change < best_change:
+                best, best_change = rate, change
+            if change < _RATE_STILL**2:
+                break
+            rate = longer
+        return best
+
+    def _change(self, times: Floats, first: NDArray[np.intp], window_s: float) -> Floats:
+        """The change of temperature per second over a window to either side of each instant, shorter at the ends."""
+        before = np.maximum(self.elapsed_s - window_s, times[0])
+        after = np.minimum(self.elapsed_s + window_s, times[-1])
         change = np.interp(after, times, self.warmth[first]) - np.interp(before, times, self.warmth[first])
         return change / np.maximum(after - before, 1e-9)
 
