@@ -64,10 +64,13 @@ PLANS: dict[str, tuple[str, ...]] = {
     "monotone": ("--plan", "monotone"),
     "six dwells": ("--orientations", "6"),
 }
-FIGURES = ("noise", "name", "unstated", "power", "invisible", "outside", "pair", "plans", "improve", "advice", "ideal")
+FIGURES = (
+    "noise", "name", "unstated", "power", "invisible", "outside", "pair", "plans", "improve", "advice", "ideal",
+    "benches",
+)  # fmt: skip
 COUNTS: dict[str, float] = {
     "noise@white": 250, "noise": 60, "name": 1, "unstated": 0.25, "power": 4, "invisible": 0.2, "outside": 2,
-    "pair": 40, "plans@nothing": 8, "plans": 0.2, "improve": 0.4, "advice": 1, "ideal": 2,
+    "pair": 40, "plans@nothing": 8, "plans": 0.2, "improve": 0.4, "advice": 1, "ideal": 2, "benches": 30,
 }  # fmt: skip
 """Trials a unit of ``--runs``: in all, or for each effect (and size, and plan) that is hidden; at least one."""
 
@@ -81,6 +84,7 @@ _LARGE = 100  # sigma, or times
 _DWELL_S = float(BENCH[BENCH.index("--dwell-s") + 1])
 _POWER = (0.86, 0.94)
 _SECOND = 5_000_000  # from the seed of a run to that of its second run
+_BENCH_SIZES = (10, 15, 30)  # sigma
 _ENOUGH = 20  # trials; fewer are shown and not judged
 
 Hit = TypeVar("Hit", bool, float)
@@ -579,6 +583,37 @@ def tasks(
     return [task for each in families for task in _family_tasks(each, runs, seed, effects, visible, setting)]
 
 
+def _any_bench(drawn: np.random.Generator) -> tuple[tuple[str, ...], str, list[str]]:
+    """Options of a bench unlike that of the other trials, its setting error, and its axes; its noise is stated."""
+
+    def one(*values: str) -> str:
+        return values[drawn.integers(len(values))]
+
+    mems = drawn.random() < 0.5
+    count, dwell_s, rate_hz, size = (
+        one("12", "18", "24", "36"),
+        one("10", "20", "60", "120"),
+        one("4", "10", "40"),
+        5e-5,
+    )
+    if float(count) * float(dwell_s) * float(rate_hz) > 90_000:
+        rate_hz = "10"
+    size *= 100.0 if mems else 1.0
+    noises = (), (), ("--ar1", "0.5"), ("--ar1", "0.9"), ("--flicker", repr(size / 5)), ("--scatter", repr(size))
+    axes = one("y z x", "y z x", "x y z", "z x", "y x")
+    options = [
+        "--grade", "mems" if mems else "navigation", "--orientations", count, "--dwell-s", dwell_s,
+        "--sample-hz", rate_hz, "--angle-hz", one("1", "4", "10"), "--slew-degps", one("5", "20", "60"),
+        "--temperature-swing", one("0", "2", "5", "10"), "--temperature-period-s", one("700", "3600"),
+        "--warm-up-c", one("0", "4"), "--axes", axes, *noises[drawn.integers(len(noises))],
+    ]  # fmt: skip
+    if drawn.random() < 0.3:
+        options += ["--encoder-sigma", one("0.0001", "0.001")]
+    if drawn.random() < 0.2:
+        options += ["--outlier-rate", "0.001", "--outlier-size", repr(100 * size)]
+    return tuple(options), one("0", "0.002", "0.02") if mems else one("0", "0.0002", "0.002"), axes.split()
+
+
 def _count(of: str, runs: int) -> range:
     return range(max(1, round(COUNTS[of] * runs)))
 
@@ -589,7 +624,10 @@ def _family_tasks(
     drawn, first = np.random.default_rng(seed), 10_000_000 * seed + 100_000 * FIGURES.index(family)
     made, numbers = list[Task](), itertools.count(first)
 
-    def add(which: str, hidden: Sequence[str] = (), options: tuple[str, ...] = (), number: int | None = None) -> None:
+    def add(
+        which: str, hidden: Sequence[str] = (), options: tuple[str, ...] = (), number: int | None = None,
+        setting: str = setting,
+    ) -> None:  # fmt: skip
         play = family if family in PLAYS else "diagnose"
         seed = next(numbers) if number is None else number
         made.append(Task(f"{family}@{which}", play, seed, tuple(hidden), options, setting))
@@ -610,6 +648,13 @@ def _family_tasks(
     elif family == "pair":
         for _ in _count(family, runs) if len(visible) > 1 else ():
             add("10", [f"{name}=10sigma" for name in drawn.choice(visible, 2, replace=False)])
+    elif family == "benches":
+        for number in _count(family, runs):
+            options, own_setting, axes = _any_bench(drawn)
+            name, _, place = str(drawn.choice(visible)).partition(":")
+            hidden = f"{name}{f':{drawn.choice(axes)}' if place else ''}={drawn.choice(_BENCH_SIZES)}sigma"
+            what, hides = ("nothing", []) if number % 3 == 0 else ("one", [hidden])
+            add(f"other benches, {what} hidden", hides, options, setting=own_setting)
     elif family == "plans":
         for plan in ("six faces", "monotone", "six dwells"):
             for _ in _count("plans@nothing", runs):
@@ -852,6 +897,7 @@ def _ideal(_: str, own: list[Outcome]) -> Iterator[Figure]:
 _FIGURES: dict[str, Callable[[str, list[Outcome]], Iterator[Figure]]] = {
     "noise": _noise, "name": _name, "unstated": _name, "power": _power, "invisible": _invisible, "outside": _outside,
     "pair": _pair, "plans": _plans, "improve": _improve, "advice": _advice, "ideal": _ideal,
+    "benches": _plans,
 }  # fmt: skip
 
 
@@ -860,10 +906,11 @@ def failed(each: Outcome) -> bool:
     family, close = each.task.family, overlap_of(each) >= _APART
     if each.error:
         return each.refused
-    if family in ("noise", "plans") and not each.truth:
+    if family in ("noise", "plans", "benches") and not each.truth:
         return alarmed(each)
     return {
-        "name": not each.right, "unstated": not each.right, "plans": each.wrong, "power": False,
+        "name": not each.right, "unstated": not each.right, "plans": each.wrong, "benches": each.wrong,
+        "power": False,
         "invisible": bool(each.extra.get("differ")),
         "outside": not close and not (each.first == "unknown" and driver_right(each)),
         "pair": not close and not (each.found and each.nothing_else), "improve": not each.right,
