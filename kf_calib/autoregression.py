@@ -15,6 +15,7 @@ from kf_calib.samples import Floats
 
 _ITERATIONS = 60
 _STILL = 1e-3  # of kappa
+_LONG = 500  # readings of a block
 _GONE = 1e-9  # of the variance
 
 
@@ -91,6 +92,8 @@ def unbiased(raw: Floats, count: int, size: int) -> tuple[Autoregression, float]
 def _unbiased(raw_bytes: bytes, count: int, size: int) -> tuple[Autoregression, float]:
     raw = np.frombuffer(raw_bytes)
     gamma, kappa, lags, model = raw, 0.0, len(raw) - 1, Autoregression.of(raw, count)
+    if not len(model.coefficients) and size > _LONG:  # white, and a parabola takes next to nothing of it
+        return model, float(raw[0])
     for _ in range(_ITERATIONS):
         if abs(model.inflation - kappa) < _STILL * model.inflation:
             break

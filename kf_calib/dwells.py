@@ -279,7 +279,10 @@ class Segmenter:
         if horizon is None:
             return
         if self._dwell is not None:
-            yield from self._emit(horizon if final else min(horizon, self._resting_ns()), closing=final)
+            if final:
+                yield from self._emit(horizon, closing=True)
+            elif self._dwell.settling_ns is None or len(self._accel) >= BLOCK_SAMPLES:  # else there is nothing to do
+                yield from self._emit(min(horizon, self._resting_ns()), closing=False)
         elif final or not self._slewing():  # an arrival may be felt since the last angle before it
             before = int(np.searchsorted(self._pose.time_ns, self._decided_ns or horizon)) - 1
             self._discard(horizon if final or before < 0 else min(horizon, int(self._pose.time_ns[before])))
