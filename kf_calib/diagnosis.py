@@ -23,18 +23,7 @@ from kf_calib.effects import walk_named
 from kf_calib.fitting import WALK, behind_within
 from kf_calib.likelihood import FEWEST
 from kf_calib.noise import mean_covariances
-from kf_calib.pairs import (
-    MOST,
-    WALKS,
-    Pair,
-    Pairs,
-    alike,
-    as_good,
-    exchanged,
-    likeliest,
-    names_of,
-    pairs_of,
-)
+from kf_calib.pairs import MOST, WALKS, Pair, Pairs, alike, as_good, exchanged, likeliest, names_of, pairs_of
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
 

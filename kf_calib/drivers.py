@@ -99,21 +99,15 @@ def families(fitted: Fit, known: Sequence[Effect] = ()) -> tuple[list[Family], f
             effects += [effect_named(_named(text), bench) for text in texts]
             listed.append((driver, texts))
     scanned = scan(fitted.carried, fitted.noise.judging, [*effects, *known])
-    bases = [each.basis for each in scanned.candidates[len(effects) :]]
+    beside = scanned.candidates[len(effects) :]
     out, place = list[Family](), 0
     for driver, texts in listed:
         own, place = slice(place, place + len(texts)), place + len(texts)
-        parts = [each.basis for each in scanned.candidates[own]]
-        same = all(any(_within(part, each) for each in bases) for part in parts)
-        fall, dof = scanned.explained(np.concatenate(parts, axis=1))
+        parts = scanned.candidates[own]
+        same = all(any(part.within(each, _SAME) for each in beside) for part in parts)
+        fall, dof = scanned.explained(np.concatenate([part.basis for part in parts], axis=1))
         out.append(Family(driver, tuple(texts), fall, dof, tuple(scanned.statistics[own].tolist()), same))
     return out, float(scanned.residual @ scanned.residual) - len(scanned.residual)
-
-
-def _within(one: Floats, other: Floats) -> bool:
-    """Whether some combination of ``other`` (d, q) mimics any of ``one`` (d, k): by the largest principal angle."""
-    cosines = np.linalg.svd(other.T @ one, compute_uv=False) if 0 < one.shape[1] <= other.shape[1] else np.zeros(1)
-    return bool(cosines[-1] > _SAME)
 
 
 def _named(text: str, number: int = 0) -> str:

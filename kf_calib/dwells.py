@@ -30,9 +30,7 @@ _SECOND_NS = 1_000_000_000
 _HOLD_NS = _SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
 _LEAP_NS = 10 * _SECOND_NS  # a stamp this far ahead, with the next one behind it, is a damaged stamp
 _SLEW_READINGS = 8  # of a slew, at least
-_REST_NS = (
-    2 * _SECOND_NS
-)  # a dwell that only readings tell of, between two angles that differ, lasts that long at least
+_REST_NS = 2 * _SECOND_NS  # a dwell that readings alone tell of, between angles that differ, lasts at least
 _PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
 
 

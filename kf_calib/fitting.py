@@ -129,7 +129,7 @@ def fit(
         if searching:
             model = model.moved(np.clip(moved, -reach, reach))
         carried = Carried(dwells, model, state, slews)
-        stated = setting_deg(dwells, bench), bench.scatter_sigma_mps2
+        stated = _setting_deg(dwells, bench), bench.scatter_sigma_mps2
         noise = with_dwell_parts(within, carried.means, state, *stated, walks=model.walks)
         noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
         fitted = replace(fitted, carried=carried, noise=noise)
@@ -141,7 +141,7 @@ def fit(
     return fitted
 
 
-def setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:
+def _setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:
     """The setting error that is stated, and beside it what the angles' noise leaves uncertain of the dwells' poses."""
     pose_rad = float(np.sqrt(np.mean([dwell.pose_sigma_rad**2 for dwell in dwells])))
     if bench.angle_sigma_deg is None or pose_rad < _EXACT_RAD:

@@ -57,11 +57,12 @@ class Candidate:
         """Of the coefficients (q,), were it the only effect added; infinite where not determined."""
         return np.where(self.hidden, np.inf, np.linalg.norm(self.inverse, axis=1))
 
-    def within(self, other: Candidate) -> bool:
-        """Whether all that it can do the other can do, too: then no reading can speak for it and against the other."""
+    def within(self, other: Candidate, cosine: float = _SAME) -> bool:
+        """Whether all that it can do the other can do, too, by the largest principal angle: then no reading can speak
+        for it and against the other."""
         if not 0 < self.dof <= other.dof:
             return False
-        return float(np.linalg.svd(self.basis.T @ other.basis, compute_uv=False)[-1]) > _SAME
+        return float(np.linalg.svd(self.basis.T @ other.basis, compute_uv=False)[-1]) > cosine
 
     def overlap(self, other: Candidate) -> float:
         """Cosine of the smallest principal angle: 1 where some combination of the one mimics one of the other."""

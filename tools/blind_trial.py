@@ -301,9 +301,7 @@ def _meaning_the_same(path: Path, truth: Sequence[str], said: Iterable[str]) -> 
 
 
 def _one_space(one: Candidate, other: Candidate) -> bool:
-    if one.dof != other.dof or not one.dof:
-        return False
-    return float(np.linalg.svd(one.basis.T @ other.basis, compute_uv=False).min()) > _SAME
+    return one.dof == other.dof and one.within(other)
 
 
 def candidates(path: Path, wanted: Sequence[str] | None = None) -> dict[str, list[Candidate]]:
