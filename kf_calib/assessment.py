@@ -250,14 +250,20 @@ def run_level(p_value: float, tests: float) -> float:
 
 
 def _smallest_p(found: Scan, seen: NDArray[np.intp], seed: int) -> Floats:
-    """The smallest p-value among all candidates in each of many runs in which nothing is missing."""
+    """The smallest p-value among all candidates in each of many runs in which nothing is missing.
+
+    Drawn by the symmetric root of the covariance of all scores: which way the frame and the bases in it are turned is
+    up to rounding, and the draws would be those of the machine.
+    """
     from scipy.special import chdtrc
 
-    draws = np.random.default_rng(seed).standard_normal((_DRAWS, len(found.residual)))
-    bases = [found.candidates[k].basis for k in seen]
-    starts = np.cumsum([0, *(basis.shape[1] for basis in bases[:-1])])
-    squares = np.add.reduceat((draws @ np.concatenate(bases, axis=1)) ** 2, starts, axis=1)
-    return chdtrc(np.array([basis.shape[1] for basis in bases], float), squares).min(axis=1)
+    scores = [found.candidates[k].directions for k in seen]
+    stacked, starts = np.concatenate(scores, axis=1), np.cumsum([0, *(own.shape[1] for own in scores[:-1])])
+    values, vectors = np.linalg.eigh(stacked.T @ stacked)
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    draws = np.random.default_rng(seed).standard_normal((_DRAWS, len(root)))
+    squares = np.add.reduceat((draws @ root) ** 2, starts, axis=1)
+    return chdtrc(np.array([found.candidates[k].dof for k in seen], float), squares).min(axis=1)
 
 
 def _walking(fitted: Fit) -> str:

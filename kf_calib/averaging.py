@@ -7,8 +7,10 @@ that rise and fall smoothly cut nothing off, and what remains of the readings in
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -35,22 +37,31 @@ def window_s(lines: Iterable[Line]) -> float:
     return WINDOW_S if strongest is None else max(WINDOW_S, _CYCLES / strongest.frequency_hz)
 
 
+@cache
+def correlations() -> Floats:
+    """Of an average with itself and the next two, (3,): windows overlap, and white noise makes averages alike."""
+    weights = np.sin(np.pi * (np.arange(3000) + 0.5) / 3000.0) ** 4
+    shifted = [weights[: len(weights) - k * len(weights) // _OVERLAP] for k in range(_OVERLAP)]
+    return np.array([own @ weights[-len(own) :] for own in shifted]) / (weights @ weights)
+
+
 def averaged(block: Block, length_s: float = WINDOW_S) -> Block | None:
     """A block of averages over windows cos^4, with the variance of the readings in each; None: it is too short.
 
     Side lobes of the window fall as the fifth power of the frequency: at 30 cycles a window 1e-7 of an oscillation is
-    left. A window is no longer than a quarter of the block. Variances are about a parabola over the block: what shakes
+    left. A window is hardly longer than a quarter of the block. Variances are about a parabola over the block: what shakes
     has no mean in a window as short.
     """
     count, span_s = len(block.elapsed_s), float(block.elapsed_s[-1] - block.elapsed_s[0])
-    length = int(min(length_s / max(span_s, 1e-9), 1.0 / _WINDOWS) * count)
-    if span_s < _SHORTEST_S or length < _OVERLAP:
+    step = math.ceil(min(length_s / max(span_s, 1e-9), 1.0 / _WINDOWS) * count / _OVERLAP)
+    length = step * _OVERLAP
+    if span_s < _SHORTEST_S or step < 2 or length > count:
         return None
     weights = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 4
     weights /= weights.sum()
 
     def means(values: Floats) -> Floats:
-        return np.asarray(sliding_window_view(values, length, axis=0)[:: length // _OVERLAP] @ weights)
+        return np.asarray(sliding_window_view(values, length, axis=0)[::step] @ weights)
 
     u = np.linspace(-1.0, 1.0, count)
     curve = np.linalg.qr(np.column_stack([np.ones(count), u, u * u]))[0]
@@ -64,5 +75,5 @@ def averaged(block: Block, length_s: float = WINDOW_S) -> Block | None:
         pose=block.pose if len(block.pose) == 1 else means(block.pose),
         temperature_c=means(block.temperature_c),
         variance_mps2_2=means(shaking**2),
-        taken=length // _OVERLAP,
+        taken=step,
     )

@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kf_calib import walk
-from kf_calib.autoregression import unbiased
+from kf_calib.autoregression import expected_products, unbiased
+from kf_calib.averaging import correlations
 from kf_calib.folding import Autocovariance, DwellFactor, Means
 from kf_calib.samples import Floats
 
@@ -24,6 +25,7 @@ FLOOR_MPS2 = 1e-9
 
 _MAX_ORDER = 20
 _LONGEST = 2.0  # kappa at most, as a part of a block
+_AVERAGES = 60  # of a block, at least, from which their own correlation is taken
 _WANDER = 6
 
 
@@ -98,7 +100,8 @@ def within_dwells(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float = 0
         total += dwell.autocovariance
     if walk_mps2_per_sqrt_s:
         total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _lagged(dwells))
-    inflation, variance = np.array([_inflation(total, i) for i in range(3)]).T
+    known = _of_averages if dwells[0].averaged else _inflation
+    inflation, variance = np.array([known(total, i) for i in range(3)]).T
     squares, counts = (np.concatenate([getattr(each, key) for each in dwells]) for key in ("squares", "counts"))
     if walk_mps2_per_sqrt_s:
         rest = np.concatenate([dwell.walk.rest for dwell in dwells])
@@ -132,6 +135,19 @@ def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
     raw = total.products[: lags + 1, channel] / np.maximum(total.pairs[: lags + 1], 1.0)
     model, variance = unbiased(raw, total.count, size)
     return min(max(model.inflation, 1.0), max(size / _LONGEST, 1.0)), variance
+
+
+def _of_averages(total: Autocovariance, channel: int) -> tuple[float, float]:
+    """The same of averages over windows that overlap: of few what white noise makes, of many no less."""
+    if not total.count:
+        return 1.0, 0.0
+    size, lags = round(total.count / total.blocks), correlations()
+    kappa = float(2.0 * lags.sum() - 1.0)
+    if size >= _AVERAGES:
+        found, variance = _inflation(total, channel)
+        return max(found, kappa), variance
+    kept = expected_products(np.append(lags, np.zeros(size))[:size], 0)[0] / size
+    return kappa, float(total.products[0, channel] / total.pairs[0] / max(kept, 1e-3))
 
 
 def wander(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floats], Floats]:

@@ -34,7 +34,8 @@ _TOGETHER = 200  # of many effects, so many are held at a time
 class Candidate:
     """One effect (its unknown at one value) as far as the model does not explain it.
 
-    basis (d, k): orthonormal, of what is left of its columns; inverse (q, k): coefficients = inverse @ basis^T r;
+    basis (d, k): orthonormal, of what is left of its columns; directions (d, q): those of the basis that are nearest to
+    the columns, whichever way the basis is turned; inverse (q, k): coefficients = inverse @ basis^T r;
     columns (d, q): what is left of the columns, per unit of the coefficients; hidden (q,): which of these are not
     determined; visibility: the largest share of a column that is left; tried: the best of so many values of its
     constant, each a test of its own.
@@ -43,6 +44,7 @@ class Candidate:
     effect: Effect
     columns: Floats
     basis: Floats
+    directions: Floats
     inverse: Floats
     hidden: Mask
     visibility: float
@@ -157,5 +159,7 @@ def _candidate(effect: Effect, columns: Floats, units: Floats) -> Candidate:
     seen = singular > _SEEN
     lost = np.eye(len(units)) - right[seen].T @ right[seen]
     inverse = (right[seen].T / singular[seen]) / units[:, None]
-    hidden = np.asarray(np.diag(lost) > 1e-6)
-    return Candidate(effect, columns * units, left[:, seen], inverse, hidden, float(singular.max(initial=0.0)))
+    hidden, basis = np.asarray(np.diag(lost) > 1e-6), left[:, seen]
+    return Candidate(
+        effect, columns * units, basis, basis @ right[seen], inverse, hidden, float(singular.max(initial=0.0))
+    )

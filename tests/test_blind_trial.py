@@ -60,7 +60,7 @@ def test_the_best_chooser_is_right_as_often_as_theory_has_it(trial: Any) -> None
     overlap, sigmas = 0.9, 4.0
     bases = {"one": [[1.0], [0.0]], "two": [[overlap], [math.sqrt(1.0 - overlap**2)]]}
     spaces = {
-        name: [Candidate(None, basis, basis, np.eye(1), np.zeros(1, bool), 1.0)]  # type: ignore[arg-type]
+        name: [Candidate(None, basis, basis, basis, np.eye(1), np.zeros(1, bool), 1.0)]  # type: ignore[arg-type]
         for name, basis in ((name, np.array(basis)) for name, basis in bases.items())
     }
     found = trial.best_possible(spaces, {name: {name} for name in spaces}, sigmas, draws=20_000)

@@ -137,11 +137,17 @@ def test_an_oscillation_and_another_effect_are_both_found() -> None:
 
 
 def test_vibration_is_no_oscillation_of_one_amplitude_and_what_it_rectifies_is_named() -> None:
-    """With a line of 3 m/s^2 in the readings; of vibration alone nothing is said but that it is there."""
+    """With a line of 3 m/s^2 in the readings."""
     found = diagnose(run("vibration-rectification=15sigma"))
     assert found.missing == ("vibration-rectification",) and found.test.vibration, found.verdict
-    quiet = diagnose(run("vibration-rectification=1e-12"))
-    assert not quiet.missing and quiet.test.consistent and quiet.test.vibration
+
+
+@pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 44), marks=pytest.mark.slow)])
+def test_of_vibration_alone_nothing_is_said_but_that_it_is_there(seeds: range) -> None:
+    """Averages are few in short dwells: their noise is that of white readings in windows that overlap."""
+    quiet = [diagnose(run("vibration-rectification=1e-12", seed=seed)) for seed in seeds]
+    assert all(found.test.vibration for found in quiet)
+    assert sum(not found.test.consistent for found in quiet) <= 0.05 * len(quiet)
 
 
 @pytest.mark.parametrize(
@@ -196,7 +202,8 @@ def test_a_walk_and_another_effect_are_both_found(name: str) -> None:
 
 def test_in_a_few_dwells_a_walk_could_explain_what_an_effect_does() -> None:
     """Three coefficients of six degrees of freedom: what is left is no proof. In 24 dwells it is."""
-    few = diagnose(run("hysteresis=12sigma", plan=spread_plan(6, dwell_s=8.0, seed=3)))
-    assert few.missing and {"hysteresis", "bias-walk"} <= set(few.ambiguity), few.verdict
-    assert "bias-walk" in few.verdict
+    few = [diagnose(run("hysteresis=12sigma", plan=spread_plan(6, dwell_s=8.0, seed=seed))) for seed in range(3, 8)]
+    kept = [found for found in few if {"hysteresis", "bias-walk"} <= set(found.ambiguity)]
+    assert len(kept) >= 4  # now and then the effect fits so closely that it is a proof
+    assert all(found.missing and "bias-walk" in found.verdict for found in kept)
     assert "bias-walk" not in diagnose(run("hysteresis=12sigma")).ambiguity

@@ -22,6 +22,7 @@ YZX: tuple[Vector, ...] = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
 
 _STARTS = 4
 _REACHED = 1e-9
+_PULL = 1e-4  # towards the start of a search, per rad, against a miss of 1
 
 
 @dataclass(frozen=True)
@@ -109,16 +110,22 @@ def _fibonacci_lattice(count: int) -> Floats:
 
 
 def _angles_towards(direction: Floats, axes: Sequence[Vector], rng: np.random.Generator) -> Floats:
-    """Gimbal angles (k,), rad in [-pi, pi), that point the vertical along ``direction``, from random starts."""
+    """Gimbal angles (k,), rad in [-pi, pi), that point the vertical along ``direction``, from random starts.
 
-    def miss(angles_rad: Floats) -> Floats:
-        return up_directions(axes, angles_rad[None])[0] - direction
+    Angles that do not move gravity stay where they start: left to rounding, each machine would have a plan of its own.
+    """
+
+    def miss(angles_rad: Floats, start_rad: Floats) -> Floats:
+        apart = up_directions(axes, angles_rad[None])[0] - direction
+        return np.append(apart, _PULL * (angles_rad - start_rad))
 
     best, cost = np.zeros(len(axes)), math.inf
     for _ in range(_STARTS):
-        found = least_squares(miss, rng.uniform(-np.pi, np.pi, len(axes)), xtol=1e-12)
-        if found.cost < cost:
-            best, cost = found.x, found.cost
+        start = rng.uniform(-np.pi, np.pi, len(axes))
+        found = least_squares(miss, start, xtol=1e-12, args=(start,))
+        own = float(np.sum(found.fun[:3] ** 2))
+        if own < cost:
+            best, cost = found.x, own
         if cost < _REACHED:
             break
     return (best + np.pi) % (2.0 * np.pi) - np.pi
