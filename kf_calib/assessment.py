@@ -19,17 +19,18 @@ from kf_calib.samples import Floats
 from kf_calib.scan import Candidate, Scan, falls, scan
 from kf_calib.spectrum import Line, lowest_hz
 from kf_calib.trace import band_hz
+from kf_calib.trend import Trend, trend
 
 LEVEL = 0.01
 """Chance of a false alarm a run."""
 
 SHARE = 0.4
-"""Of the chance of a false alarm: the misfit's and the scan's; lines have the rest."""
+"""Of the chance of a false alarm: the misfit's and the scan's; lines and trends within dwells halve the rest."""
 
 EQUAL = 6.63
 """Suspects whose chi-squared is this close to the best cannot be told from it (1 %, 1 dof)."""
 
-_LINES = 1.0 - 2.0 * SHARE
+_LINES = _TRENDS = 0.5 * (1.0 - 2.0 * SHARE)
 _DRAWS = 4000
 _POWER = 0.9
 _FEWEST_WALKED = 8  # dwells: a walk of the biases is looked for in that many
@@ -41,6 +42,7 @@ class Test:
 
     scores: chi-squared falls less the threshold of their degrees of freedom: above zero is beyond chance.
     p_values: of the run. misfit_p: of the sum of squares as a whole (None: nothing left over to judge by).
+    trend: what goes on within dwells beside the model and the noise (None: not to be judged, as where there are lines).
     lines: in the spectrum of the readings within dwells, and the name of the effect they speak for. vibration: those
     that are no oscillation of one amplitude, and count as noise. without_lines: the test with its lines as vibration.
     between: in words, of an oscillation what is too fast for the scan and too slow for a line. as_scatter: what could
@@ -61,11 +63,14 @@ class Test:
     without_lines: Test | None = None
     between: str = ""
     as_scatter: bool = False
+    trend: Trend | None = None
 
     @property
     def p_value(self) -> float | None:
-        """Of the run: the smallest of the misfit's, the best suspect's and the best line's, each at its share."""
+        """Of the run: the smallest of the misfit's, the best suspect's, the best line's and the trends', each at its
+        share."""
         found = [*self.p_values.values(), *([self.misfit_p] if self.misfit_p is not None else [])]
+        found += [self.trend.p_value * SHARE / _TRENDS] if self.trend else []
         return min(1.0, min(found) / SHARE) if found else None
 
     @property
@@ -198,7 +203,7 @@ def _with_lines(test: Test, fitted: Fit) -> Test:
 
     effect = _oscillation(fitted.carried.model)
     if effect is None or fitted.carried.model.oscillates:
-        return test
+        return replace(test, trend=trend(fitted))
     name, slow, (low, high, first) = str(effect), _slow(fitted, effect), _searched_hz(fitted.dwells)
     top = float(slow[-1]) if len(slow) else low
     gaps = [(top, low), (high, first)] if np.isfinite(low) else [(top, first)]
@@ -207,7 +212,7 @@ def _with_lines(test: Test, fitted: Fit) -> Test:
         test = replace(test, between=f"{name} {' and '.join(bands)}")
     seen = lines_of(fitted.dwells, LEVEL * _LINES)
     if not seen:
-        return test
+        return replace(test, trend=trend(fitted))
     p_value = seen[0].p_value
     return replace(
         test,

@@ -49,8 +49,8 @@ def averaged(block: Block, length_s: float = WINDOW_S) -> Block | None:
     """A block of averages over windows cos^4, with the variance of the readings in each; None: it is too short.
 
     Side lobes of the window fall as the fifth power of the frequency: at 30 cycles a window 1e-7 of an oscillation is
-    left. A window is hardly longer than a quarter of the block. Variances are about a parabola over the block: what shakes
-    has no mean in a window as short.
+    left. A window is hardly longer than a quarter of the block. Variances are about a parabola over the block: what
+    shakes has no mean in a window as short.
     """
     count, span_s = len(block.elapsed_s), float(block.elapsed_s[-1] - block.elapsed_s[0])
     step = math.ceil(min(length_s / max(span_s, 1e-9), 1.0 / _WINDOWS) * count / _OVERLAP)

@@ -7,6 +7,7 @@ the model with it fits; where several fit equally well they are all named; where
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -341,8 +342,17 @@ def _fits(refit: Calibration, before: Test) -> bool:
     least = LEVEL if refit.noise.walk_mps2_per_sqrt_s else _REFUSED  # a walk explains much that is none
     if (misfit is not None and misfit < SHARE * least) or _leaps(refit) or _at_an_end(refit):
         return False
-    left = assessed(refit.fit, before.effective_tests).p_value
-    return left is None or left >= least
+    left = assessed(refit.fit, before.effective_tests)
+    if left.trend and misfit is not None and _together(misfit, left.trend.p_value) < SHARE * least:
+        return False
+    return left.p_value is None or left.p_value >= least
+
+
+def _together(*p_values: float) -> float:
+    """The p-value of independent tests, none of which need be beyond chance alone (Fisher, 1932)."""
+    from scipy.special import chdtrc
+
+    return float(chdtrc(2 * len(p_values), -2.0 * sum(math.log(max(p, 1e-300)) for p in p_values)))
 
 
 def _at_an_end(refit: Calibration) -> bool:

@@ -11,18 +11,22 @@ import numpy as np
 from kf_calib.bench import Bench
 from kf_calib.effects import Effect, effect_named, walk_named
 from kf_calib.errors import InputError
-from kf_calib.fitting import Fit, walk_gain
+from kf_calib.fitting import Fit, fit, walk_gain
 from kf_calib.folding import DwellFactor
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
+from kf_calib.trend import Trend
+from kf_calib.trend import trend as trend_of
 
 _CHANCE = 1e-4  # of a family to fall as much where nothing is missing: there are about a hundred
+_WITHIN = 0.01  # of trends within dwells
 _SAME = 0.99  # cosine above which a formula is a known effect
 _DECAYS_S = (10, 30, 100, 300)
 _JUMPS = 100  # at most
 
 JUMP = "time (a jump)"
 IRREGULAR = "nothing that was recorded (irregular from dwell to dwell)"
+WITHIN = "time (irregular, within dwells too)"
 
 
 @dataclass(frozen=True)
@@ -66,11 +70,11 @@ class Family:
         return self.fall - float(chdtri(self.dof, _CHANCE)) if self.dof else 0.0
 
 
-def described(fitted: Fit, residuals: Floats) -> Description | None:
+def described(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Description | None:
     """The family of formulas that explains most of what the model leaves, if any explains more than chance would.
 
-    None of them does where the dwells are likelier to scatter or their biases to walk: to try is the walk, then.
-    residuals: of the dwells, (D, 3).
+    None of them does where the dwells are likelier to scatter or their biases to walk: to try is the walk, then. What
+    goes on within dwells, too, is a matter of time. residuals: of the dwells, (D, 3).
     """
     from scipy.special import chdtri
 
@@ -79,8 +83,10 @@ def described(fitted: Fit, residuals: Floats) -> Description | None:
     walk, ratio = walk_gain(fitted)
     irregular = 2.0 * max(walk, walk - ratio)  # a walk's gain, a scatter's
     name = "" if fitted.carried.model.walks else walk_named(fitted.carried.model.bench)
-    if name and irregular - float(chdtri(1, _CHANCE)) > max(best.score, 0.0):
-        return Description(_channel(residuals), IRREGULAR, irregular / max(excess, irregular), (name,))
+    within = name and _goes_on(trend) and (best.score <= 0.0 or _goes_on(_trend_beside(fitted, best)))
+    if name and (within or irregular - float(chdtri(1, _CHANCE)) > max(best.score, 0.0)):
+        share = irregular / max(excess, irregular, 1.0)
+        return Description(_channel(residuals), WITHIN if within else IRREGULAR, share, (name,))
     if best.score <= 0.0:
         return None
     order = np.argsort(best.falls)[::-1]
@@ -88,6 +94,19 @@ def described(fitted: Fit, residuals: Floats) -> Description | None:
     formulas = tuple(_named(best.texts[k], number) for number, k in enumerate(order[:enough]))
     share = min((best.fall - best.dof) / excess, 1.0) if excess > 0.0 else 1.0
     return Description(_channel(residuals), best.driver, share, formulas)
+
+
+def _goes_on(trend: Trend | None) -> bool:
+    """Whether what is left goes on within dwells."""
+    return trend is not None and trend.p_value < _WITHIN
+
+
+def _trend_beside(fitted: Fit, family: Family) -> Trend | None:
+    """What is left of the trends with a family in the model."""
+    model = fitted.carried.model
+    for formula in family.formulas:
+        model += effect_named(formula, model.bench)
+    return trend_of(fit(fitted.dwells, model))
 
 
 def families(fitted: Fit, known: Sequence[Effect] = ()) -> tuple[list[Family], float]:

@@ -55,6 +55,12 @@ class Fit:
         return steps(self.dwells, self.noise)
 
     @cached_property
+    def state(self) -> Floats:
+        """The estimate (p,) by these columns; where biases walk, those after the last dwell."""
+        factor = information.accumulated(self.all_rows(), self.steps)[:-1]
+        return information.solve(factor, self.carried.model.nominal_state())[0]
+
+    @cached_property
     def judged(self) -> list[Floats]:
         """Rows [H | W | z] by which the misfit is judged."""
         carried = self.carried
@@ -151,8 +157,7 @@ def _setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:
 
 def _solved(fitted: Fit) -> tuple[Floats, Floats]:
     """The estimate (p,) with unknowns at zero, and how far these would move (p,), zeros elsewhere."""
-    factor = information.accumulated(fitted.all_rows(), fitted.steps)[:-1]
-    state = information.solve(factor, fitted.carried.model.nominal_state())[0]
+    state = fitted.state.copy()
     moved = np.zeros_like(state)
     places = list(fitted.carried.model.unknowns)
     moved[places], state[places] = state[places], 0.0

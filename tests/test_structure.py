@@ -23,7 +23,7 @@ LEVELS = [
     ["information", "kalman", "batch", "readings", "likelihood"],
     ["aims", "scan", "experiment"],
     ["fitting", "inferred"],
-    ["prospect", "reach"],
+    ["prospect", "reach", "trend"],
     ["designs", "tour"],
     ["planner"],
     ["advice", "drivers", "held_out", "running", "visibility"],

@@ -10,10 +10,11 @@ from rich.table import Table
 from rich.text import Text
 
 from kf_calib.advice import Advice
-from kf_calib.assessment import Detectable, detectable
+from kf_calib.assessment import LEVEL, Detectable, detectable
 from kf_calib.calibration import format_p
 from kf_calib.diagnosis import Diagnosis, Suspect, next_orientation
 from kf_calib.drivers import Description, described
+from kf_calib.trend import Trend
 from kf_calib.views.console import rounded, symbol
 from kf_calib.views.json import clean, readings_object
 
@@ -22,7 +23,8 @@ def description(found: Diagnosis) -> Description | None:
     """What an unknown misfit looks like; None where the misfit is known, or there is none."""
     if not found.unknown:
         return None
-    return described(found.before.fit, np.array([visit.residual_mps2 for visit in found.before.visits]))
+    residuals = np.array([visit.residual_mps2 for visit in found.before.visits])
+    return described(found.before.fit, residuals, found.test.trend)
 
 
 def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
@@ -43,6 +45,7 @@ def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
             "together": [list(pair) for pair in found.together],
             "invisible": found.test.invisible,
             "vibration_hz": [line.frequency_hz for line in found.test.vibration],
+            "trend": _trend_object(found.test.trend),
             "detectable": [
                 {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in detectable(found.test)
             ],
@@ -54,6 +57,13 @@ def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
             "warnings": list(found.before.warnings),
         }
     )
+
+
+def _trend_object(trend: Trend | None) -> dict[str, Any] | None:
+    if trend is None:
+        return None
+    dwell, channel = trend.most
+    return {"ratio": trend.ratio, "p_value": trend.p_value, "dwell": dwell, "channel": channel}
 
 
 def orientation_object(advice: Advice, why: str) -> dict[str, Any]:
@@ -103,6 +113,15 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
         parts.append(_suspect_table(found))
     if found.test.consistent is False:
         parts.append(_dwell_table(found))
+    trend = found.test.trend
+    if found.test.consistent is False and trend and trend.p_value < LEVEL:
+        dwell, channel = trend.most
+        parts.append(
+            Text(
+                f"Within dwells, too, the readings go where noise does not: slopes and bends of {trend.ratio:.2f} "
+                f"times its power (p {format_p(trend.p_value)}), most in dwell {dwell}, accelerometer {channel}."
+            )
+        )
     unknown, going = description(found), next_orientation(found)
     if unknown is not None:
         to_try = " ".join(f"--with '{formula}'" for formula in unknown.formulas)

@@ -1,0 +1,95 @@
+"""Trends within dwells: whether what is left of the readings goes on in a dwell as noise does.
+
+An effect that no column describes need not show in the means of dwells more than scatter would; but what jumps or turns
+in the course of a dwell leaves it with a slope and a bend. Of each dwell and channel the residual is taken along the
+Legendre polynomials of degree 1 to 3 over the dwell: of noise of density kappa sigma^2 each has that variance, a random
+walk of the biases adds q^2 T / (4 (2k + 1)) (1 / (2k + 3) + 1 / (2k - 1)), and 1/f noise of density h / f adds
+h (2k + 1) / (2k (k + 1)), whatever the length T of the dwell (mean square of the polynomial 1; Dutta and Horn, 1981).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kf_calib.fitting import Fit
+from kf_calib.folding import DwellFactor
+from kf_calib.model import on_basis
+from kf_calib.noise import flicker_sigma
+from kf_calib.samples import Floats, Mask
+
+_DEGREES = np.arange(1, 4)
+_WALK = (1.0 / (2 * _DEGREES + 3) + 1.0 / (2 * _DEGREES - 1)) / (4.0 * (2 * _DEGREES + 1))
+_FLICKER = (2 * _DEGREES + 1) / (2.0 * _DEGREES * (_DEGREES + 1))
+_FEWEST = 8  # readings of a dwell
+
+
+@dataclass(frozen=True)
+class Trend:
+    """Mean square of all trends over what noise makes of them, its p-value, and the sums of dwells and channels (D, 3)
+    in that measure."""
+
+    ratio: float
+    p_value: float
+    sums: Floats
+
+    @property
+    def most(self) -> tuple[int, int]:
+        """The dwell and the channel, counted from 1, that show most."""
+        dwell, channel = np.unravel_index(int(self.sums.argmax()), self.sums.shape)
+        return int(dwell) + 1, int(channel) + 1
+
+
+def trend(fitted: Fit) -> Trend | None:
+    """The test of all trends of a fit together; None where there is nothing to judge or to judge by.
+
+    F distributed: kappa of n readings is known to 4 kappa / n of its square, a walk's intensity to its own spread.
+    """
+    from scipy.special import fdtrc
+
+    noise, dwells = fitted.noise.judging, fitted.dwells
+    if dwells[0].averaged or not noise.scatter_stated:
+        return None
+    sigma, lengths_s = noise.effective_sigma_mps2, np.array([dwell.end_s - dwell.start_s for dwell in dwells])
+    squares, seen = _squares(fitted)
+    own = (sigma**2 / np.array([[dwell.count] for dwell in dwells]))[:, :, None]
+    walked = noise.walk_mps2_per_sqrt_s**2 * lengths_s[:, None, None] * _WALK
+    allowed = own + walked + flicker_sigma(noise, len(dwells))[:, None] ** 2 * _FLICKER
+    ratios = np.where(seen[:, None, :], squares / allowed, 0.0)
+    count = 3 * int(seen.sum())
+    if not count:
+        return None
+    readings = sum(dwell.count for dwell in dwells)
+    unsure = float(np.mean((4.0 * noise.inflation - 2.0) / readings)) / 3.0
+    unsure += (2.0 * (noise.walk_spread or 0.0) * float(np.mean(walked / allowed))) ** 2
+    ratio = float(ratios.sum() / count)
+    return Trend(ratio, float(fdtrc(count, 2.0 / unsure, ratio)), ratios.sum(axis=2))
+
+
+def _squares(fitted: Fit) -> tuple[Floats, Mask]:
+    """Squares of the residuals' coefficients (D, 3, degrees) on polynomials of mean square 1, and which degrees (D,
+    degrees) a dwell has readings for."""
+    carried = fitted.carried
+    out, seen = np.zeros((len(carried.dwells), 3, len(_DEGREES))), np.zeros((len(carried.dwells), len(_DEGREES)), bool)
+    for k, (dwell, columns) in enumerate(zip(carried.dwells, carried.columns, strict=True)):
+        polynomials, degrees = _polynomials(dwell)
+        width, triangles = dwell.width, dwell.triangles
+        left = triangles[:, :width, width:] - triangles[:, :width, :width] @ on_basis(columns @ fitted.state)
+        out[k, :, degrees] = (polynomials.T @ left.reshape(-1, 3)) ** 2 / dwell.count
+        seen[k, degrees] = True
+    return out, seen
+
+
+def _polynomials(dwell: DwellFactor) -> tuple[Floats, NDArray[np.intp]]:
+    """Orthonormal columns (r, k) on the rows of a dwell's triangles, and the degree of each less one (k,)."""
+    if dwell.count < _FEWEST or dwell.end_s <= dwell.start_s:
+        return np.zeros((dwell.width * len(dwell.pieces), 0)), np.zeros(0, np.intp)
+    at = np.array([piece.nodes.elapsed_s for piece in dwell.pieces])
+    u = 2.0 * (at - dwell.start_s) / (dwell.end_s - dwell.start_s) - 1.0
+    values: Floats = np.polynomial.legendre.legvander(u, len(_DEGREES)).astype(float)
+    rows = (dwell.triangles[:, : dwell.width, :3] @ on_basis(values)).reshape(-1, values.shape[2])
+    frame, upper = np.linalg.qr(rows)
+    known = np.abs(np.diag(upper)) > 1e-6 * np.sqrt(dwell.count)
+    return frame[:, known][:, 1:], np.flatnonzero(known)[1:] - 1

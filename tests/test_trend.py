@@ -1,0 +1,85 @@
+"""Trends within dwells: what noise, a walk and 1/f noise make of them, and what shows in them alone."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.integrate import quad
+from scipy.special import eval_legendre, spherical_jn
+from test_diagnosis_cases import run
+
+from kf_calib import trend as module
+from kf_calib.calibration import Calibration
+from kf_calib.diagnosis import diagnose, with_effects
+from kf_calib.drivers import WITHIN
+from kf_calib.sources.plans import spread_plan
+from kf_calib.trend import Trend, trend
+from kf_calib.views.console import plain
+from kf_calib.views.diagnosis import description, diagnosis_object, diagnosis_report
+
+
+def found_in(result: Calibration) -> Trend:
+    found = trend(result.fit)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_variances_of_a_walk_and_of_flicker_are_those_of_their_integrals(degree: int) -> None:
+    """A walk moves a coefficient by the integral of the polynomial from each step on; 1/f noise by its spectrum."""
+    size = np.sqrt(2 * degree + 1)
+
+    def later(at: float) -> float:
+        return quad(lambda s: size * float(eval_legendre(degree, 2.0 * s - 1.0)), at, 1.0)[0]
+
+    walk = quad(lambda at: later(at) ** 2, 0.0, 1.0)[0]
+    flicker = quad(lambda x: (2 * degree + 1) * float(spherical_jn(degree, x)) ** 2 / x, 0.0, 200.0, limit=2000)[0]
+    assert module._WALK[degree - 1] == pytest.approx(walk, rel=1e-6)
+    assert module._FLICKER[degree - 1] == pytest.approx(flicker, rel=1e-3)
+
+
+@pytest.mark.parametrize("count", [24, pytest.param(200, marks=pytest.mark.slow)])
+def test_of_white_noise_the_p_value_is_uniform(count: int) -> None:
+    plan = spread_plan(12, dwell_s=6.0, seed=1)
+    found = [found_in(run(seed=seed, plan=plan)) for seed in range(count)]
+    assert stats.kstest([each.p_value for each in found], "uniform").pvalue > 0.01
+    freedom = 3 * 12 * 3 * count
+    assert stats.chi2.cdf(freedom * np.mean([each.ratio for each in found]), freedom) == pytest.approx(0.5, abs=0.495)
+
+
+@pytest.mark.parametrize("noise", [{"ar1_phi": 0.9}, {"flicker_mps2": 2e-5}, {"scatter_mps2": 5e-5}], ids=str)
+def test_coloured_noise_and_stated_scatter_make_no_trend(noise: dict[str, float]) -> None:
+    assert min(found_in(run(seed=seed, **noise)).p_value for seed in range(6)) > 0.01
+
+
+def test_a_walk_in_the_model_is_expected_within_dwells_too() -> None:
+    """Of a walk as strong as the noise of a dwell: without it in the model its slopes are no noise."""
+    plan = spread_plan(24, dwell_s=20.0, seed=3)
+    for seed in range(1, 4):
+        before = run("bias-walk=60sigma", seed=seed, plan=plan)
+        assert found_in(before).p_value < 1e-6
+        assert found_in(with_effects(before, ("bias-walk",))).p_value > 0.001
+
+
+def test_what_dwells_hide_shows_within_them() -> None:
+    """A period that falls below a dwell's length: no column follows it, and it is no line."""
+    before = run("chirp=25sigma;frequency=0.02;chirp=2e-4", seed=4)
+    found = diagnose(before)
+    assert found.unknown and found.test.trend is not None and found.test.trend.p_value < 1e-6, found.verdict
+    told = description(found)
+    assert told is not None and told.driver == WITHIN and told.formula == "bias-walk"
+    dwell, channel = found.test.trend.most
+    assert diagnosis_object(found)["trend"] == {
+        "ratio": found.test.trend.ratio, "p_value": found.test.trend.p_value, "dwell": dwell, "channel": channel,
+    }  # fmt: skip
+    assert f"most in dwell {dwell}, accelerometer {channel}" in " ".join(plain(diagnosis_report(found)).split())
+
+
+def test_nothing_is_judged_where_scatter_may_be_anything() -> None:
+    """1/f noise that is not stated goes on within dwells."""
+    before = run()
+    bench = dataclasses.replace(before.fit.noise, scatter_stated=False)
+    assert trend(dataclasses.replace(before.fit, noise=bench)) is None
