@@ -24,6 +24,8 @@ _STEP_DEG = 5.0
 _STEPS = 12
 _WAY_S = 10.0  # to the next orientation, where there has been none
 _TOLD = 0.1  # sigma: effects that are less apart after any next dwell are told apart by none
+_ENOUGH = 6.0  # sigma apart: of two equally likely the wrong one is taken once in a thousand
+_MOVE = 3.0  # dwells: what it costs to go somewhere and stay for one
 _WAITS = (0.0, 0.25, 1.0)  # of the run so far, that may be spent where it goes next
 
 
@@ -46,9 +48,10 @@ def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequen
     """The orientation after which the effect ``one`` of this size differs most from each of the ``others``.
 
     Separation: what is left of its signal, in sigma, when the model and the other have explained all they can; the
-    smallest over the others (no others: over the model alone). What differs in time only is told apart by time: a
-    longer stay is advised where the square of the separation grows by more an hour with it. An effect that holds this
-    one as a special case is told apart nowhere, and left out.
+    smallest over the others (no others: over the model alone); 6 sigma tell as much as more. What differs in time only
+    is told apart by time: a longer stay is advised where the square of the separation grows by more an hour with it, to
+    go somewhere being worth three dwells. An effect that holds this one as a special case is told apart nowhere, and
+    left out.
     """
     poses = _poses(fitted)
     if poses is None:
@@ -59,7 +62,8 @@ def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequen
     every = list(each.values()) or [_separations(fitted, one, coefficients, [], poses, waits_s)]
     before, after = min(own[0] for own in every), np.min([own[1] for own in every], axis=0)
     dwell_s = _each_s(fitted)
-    gain = (after**2 - before**2) / (dwell_s + waits_s)[:, None]
+    useful = np.minimum(after, _ENOUGH) if before < _ENOUGH else after[:1]
+    gain = (useful**2 - before**2) / (_MOVE * dwell_s + waits_s[: len(useful)])[:, None]
     wait, best = np.unravel_index(int(np.argmax(gain)), gain.shape)
     stay_s = float(waits_s[wait] + dwell_s) if wait else None
     angles = tuple(np.degrees(poses[best]).round(1).tolist())

@@ -39,7 +39,7 @@ def advised(one: Effect, other: Effect) -> tuple[Calibration, Floats, Advice]:
     [
         (("second-order", "scale-asymmetry"), (None, None), False),
         (("odd-quadratic", "third-order"), (None, None), False),
-        (("warm-up", "bias-drift"), (100.0, None), False),
+        (("warm-up", "bias-drift"), (100.0, None), True),
         (("bias-drift", "warm-up"), (None, 150.0), True),
     ],
 )
