@@ -445,6 +445,41 @@ def test_a_source_left_alone_is_recorded_all_the_same(tmp_path: Path) -> None:
     assert len(read(Recording(tmp_path / "a.mcap")).accel) == 5000
 
 
+class Gated(Script):
+    """A link whose last piece comes when ``gate`` is set."""
+
+    gate: threading.Event
+
+    def read(self) -> bytes:
+        if len(self._pieces) == 1:
+            self.gate.wait(0.02)
+            if not self.gate.is_set():
+                return b""
+        return super().read()
+
+
+@pytest.mark.parametrize("kind", ["json", "frames"])
+def test_readings_are_recorded_though_no_angles_have_come_yet(tmp_path: Path, kind: str) -> None:
+    """The stated axes say how many angles there will be; an hour before the first pose is not only in memory."""
+    accel = [{"time_ns": START_NS + i * 1_000_000, "accel_mps2": [i, 9.8, -0.25]} for i in range(1500)]
+    early = "".join(json.dumps(entry) + "\n" for entry in accel).encode()
+    late = json_rows(1500, 1502)
+    if kind == "frames":
+        early = b"".join(
+            frames.sample(frames.ACCEL, i, START_NS + i * 1_000_000, (float(i), 9.8, -0.25)) for i in range(1500)
+        )
+        late = frame_rows(1500, 1502)
+    link = Gated(early[: len(early) // 2], early[len(early) // 2 :], late)
+    link.gate = threading.Event()
+    out = tmp_path / "a.mcap"
+    with LiveSource(StreamedFeed("gated", link, KEYS, {}, "", 1.0, float("inf")), out) as source:
+        wait_for(lambda: source.status.recorded >= 1400)
+        link.gate.set()
+        got = joined(list(source))
+    assert len(got.accel) == 1502 and len(got.pose) == 2 and got.pose.values.shape[1] == 3
+    assert_equal(read(Recording(out)), got)
+
+
 CHILD = """
 import sys
 from kf_calib.sources.live import open_live

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -9,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from kf_calib.bench import Bench
-from kf_calib.errors import InputError
+from kf_calib.errors import BenchError, InputError
 from kf_calib.samples import Batch, Stream
 from kf_calib.sources.lines import described
 from kf_calib.sources.live.feed import IDLE_S, Feed, Lost, Regained, nothing
@@ -22,6 +23,7 @@ _PUSHED_BYTES = 1 << 20
 _TICK_S = 0.1
 _FIRST_WAIT_S = 0.1
 _LONGEST_WAIT_S = 5.0
+_POSE_WAIT_S = 0.5  # how long readings wait for the first angles, not recorded, where the axes are stated
 _MOST_AHEAD = 1_000_000  # samples that may come before it is known how the platform is described
 
 
@@ -68,17 +70,29 @@ class StreamedFeed(Feed):
 
     def begin(self) -> Bench:
         self._reader.start()
-        ahead = 0
+        ahead, first_s = 0, math.inf
         for item in self._understood():
             if isinstance(item, Batch):
                 ahead += len(item.accel) + len(item.temperature)
+                first_s = min(first_s, time.monotonic()) if ahead else first_s
             self._ahead.append(item)
             reader = self._protocol.reader
-            if reader is not None and reader.pose_width:
+            if reader is None:
+                continue
+            if not reader.pose_width and time.monotonic() - first_s > _POSE_WAIT_S:
+                reader.pose_width = self._stated_width(reader.metadata)
+            if reader.pose_width:
                 return described(self.name, reader, self._overrides)
             if ahead > _MOST_AHEAD:
                 break
         raise self._protocol.unusable("no platform angles")
+
+    def _stated_width(self, metadata: Mapping[str, str]) -> int:
+        """How many angles a pose will have, by the axes that are stated; 0 where they are not."""
+        try:
+            return Bench.from_metadata({**metadata, **self._overrides}).pose_width
+        except BenchError:
+            return 0
 
     def __iter__(self) -> Iterator[Batch | Lost | Regained]:
         reader = self._protocol.reader
