@@ -615,7 +615,7 @@ def _remarks(
             yield f"{exact}."
     if judged.dof == 0:
         yield (
-            f"{len(dwells)} dwell{'s' * (len(dwells) > 1)} leave nothing over to judge the model by: "
+            f"{len(dwells)} dwell{'s leave' if len(dwells) > 1 else ' leaves'} nothing over to judge the model by: "
             "visit at least five spread orientations."
         )
     rms = float(np.sqrt(np.mean(residuals**2)))
