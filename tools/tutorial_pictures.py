@@ -74,7 +74,7 @@ def draw_residuals(found: Sequence[Diagnosis], png: Path) -> None:
                 send(stream, f"{path}/value", values[:, i], points)
                 bounds = np.tile([-2.0, 2.0], (len(values), 1))
                 send(stream, f"{path}/bound", bounds, rr.SeriesLines(colors=[GREY] * 2, widths=[1.0] * 2))
-                name = f"E{i + 1}: residual / σ by dwell, with ±2; {each.before.model}"
+                name = f"E{i + 1}: residual / σ by dwell, with ±2; {each.before.model.sum}"
                 panels.append(panel(path, name, len(values), (-reach, reach)))
             columns.append(rrb.Vertical(*panels))
         take(stream, rrb.Horizontal(*columns), Path(folder, "residuals.rrd"), png, (1200, 720))

@@ -121,7 +121,8 @@ def obituary(log: str) -> str:
             "the Rerun viewer found no graphics driver: install Vulkan's software driver "
             "(Debian and Ubuntu: apt-get install mesa-vulkan-drivers)."
         )
-    said = next((line.strip() for line in log.splitlines() if line.strip()), "it said nothing")
+    lines = [line.strip() for line in log.splitlines() if line.strip() and "XDG_RUNTIME_DIR" not in line]
+    said = next((line for line in lines if "panicked" in line), lines[0] if lines else "it said nothing")
     return f"the Rerun viewer ended before it drew anything ({said[:200]}): open the .rrd file with `rerun` to see why."
 
 
