@@ -20,12 +20,15 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from bench_emulator import Emulator, Tcp
 
+from kf_calib.live import Session
+from kf_calib.samples import Batch
 from kf_calib.sources.live import LiveSource, frames, open_live
 from kf_calib.sources.live.links import Link
 from kf_calib.sources.live.streamed import StreamedFeed
@@ -44,24 +47,54 @@ def resident_mb() -> float:
 # -- the process under test --
 
 
-def acquire(url: str, out: Path) -> dict[str, Any]:
+@dataclass
+class Timed:
+    """A live source that notes when its consumer asks for more: by then it is through with the last batch.
+
+    late_ms: of each reading, its stamp being wall time; ``cpu_share``: of a core, of the whole process meanwhile.
+    """
+
+    source: LiveSource
+    late_ms: list[float] = field(default_factory=list[float])
+    marks: list[tuple[float, float]] = field(default_factory=list[tuple[float, float]])
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.source, name)
+
+    def __iter__(self) -> Iterator[Batch]:
+        self._mark()
+        for batch in self.source:
+            yield batch
+            self.late_ms += ((time.time_ns() - batch.accel.time_ns) / 1e6).tolist()
+        self._mark()
+
+    def _mark(self) -> None:
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        self.marks.append((time.monotonic(), used.ru_utime + used.ru_stime))
+
+    @property
+    def cpu_share(self) -> float:
+        (began_s, before_s), (ended_s, after_s) = self.marks
+        return (after_s - before_s) / (ended_s - began_s)
+
+
+def evaluate(url: str, out: Path) -> dict[str, Any]:
+    """The same with a session that evaluates it: late is when the estimate has taken a reading in."""
+    return acquire(url, out, lambda source: Session(source, every=False).run())
+
+
+def acquire(url: str, out: Path, consume: Callable[[Timed], object] = list) -> dict[str, Any]:
     """Reads a source to its end, recording it; what it took, and how late each reading was (stamps are wall time)."""
-    late_ms, samples = list[float](), 0
-    with open_live(url, KEYS, out) as source:
-        _ = source.bench
+    with open_live(url, KEYS, out) as live:
+        _ = live.bench
         print(json.dumps({"ready": True}), flush=True)
-        before, began_s = resource.getrusage(resource.RUSAGE_SELF), time.monotonic()
-        for batch in source:
-            now_ns = time.time_ns()
-            samples += len(batch.accel)
-            late_ms += ((now_ns - batch.accel.time_ns) / 1e6).tolist()
-            after, ended_s = resource.getrusage(resource.RUSAGE_SELF), time.monotonic()
-    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    status = source.status
-    settled = np.array(late_ms[len(late_ms) // 20 :])
+        source = Timed(live)
+        consume(source)
+    status, samples = live.status, len(source.late_ms)
+    settled = np.array(source.late_ms[samples // 20 :])
     return {
         "samples": samples,
-        "cpu_share": cpu_s / (ended_s - began_s),
+        "cpu_share": source.cpu_share,
         "late_ms": np.percentile(settled, [50, 99, 100]).round(2).tolist(),
         "missing": status.missing,
         "refused": status.refused,
@@ -153,10 +186,12 @@ def child(*arguments: object) -> subprocess.Popen[str]:
 
 def answer(process: subprocess.Popen[str]) -> dict[str, Any]:
     out, _ = process.communicate(timeout=1200)
+    if process.returncode:
+        raise SystemExit(process.returncode)  # it has said why
     return json.loads(out.splitlines()[-1])
 
 
-def steady(form: str, rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
+def steady(form: str, rate_hz: float, seconds: float, folder: Path, role: str = "acquire") -> dict[str, Any]:
     """A run without faults in real time: what was sent must be there to the last reading."""
     dwell_s = seconds / 8
     bench, url = emulator(
@@ -164,7 +199,11 @@ def steady(form: str, rate_hz: float, seconds: float, folder: Path) -> dict[str,
         f"sample_hz={rate_hz:g}&angle_hz=100&dwell_s={dwell_s:g}&orientations=8&slew_degps=inf",
     )  # fmt: skip
     with bench:
-        found = answer(child("acquire", f"{url}?give_up=0.5", folder / f"{form}{rate_hz:g}.mcap"))
+        try:
+            found = answer(child(role, f"{url}?give_up=0.5", folder / f"{role}_{form}{rate_hz:g}.mcap"))
+        except BaseException:
+            bench.kill()  # it would wait for ever
+            raise
         sent = json.loads((bench.stdout.read() if bench.stdout else "").splitlines()[-1])
     return {
         "rate_hz": rate_hz,
@@ -240,6 +279,7 @@ def measurements(quick: bool, folder: Path) -> dict[str, Callable[[], dict[str, 
     return {
         "json_1khz": lambda: steady("json", 1000.0, 8.0 if quick else 30.0, folder),
         "frames_1khz": lambda: steady("frames", 1000.0, 8.0 if quick else 30.0, folder),
+        "evaluated_1khz": lambda: steady("json", 1000.0, 16.0 if quick else 60.0, folder, "evaluate"),
         "frames_10khz": lambda: steady("frames", 10_000.0, 8.0 if quick else 60.0, folder),
         "memory": lambda: answer(child("gorge", millions, folder / "memory.mcap")),
         "random_bytes": lambda: answer(child("random_bytes", (10 if quick else 100) << 20, folder / "noise.mcap")),
@@ -251,6 +291,7 @@ def measurements(quick: bool, folder: Path) -> dict[str, Callable[[], dict[str, 
 
 CHILDREN: dict[str, Callable[[str, Path], dict[str, Any]]] = {
     "acquire": acquire,
+    "evaluate": evaluate,
     "gorge": lambda count, out: gorge(int(count), out),
     "random_bytes": lambda size, out: random_bytes(int(size), out),
 }
