@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -11,13 +12,13 @@ import pytest
 from click.testing import CliRunner
 from synthetic import Run
 
-from kf_calib.assessment import assessed, detectable
+from kf_calib.assessment import assessed, detectable, independent_tests
 from kf_calib.bench import Bench, axes_of
 from kf_calib.calibration import Calibration, calibrate
 from kf_calib.cli import cli
 from kf_calib.diagnosis import diagnose, next_orientation, with_effects
 from kf_calib.effects import effect_named
-from kf_calib.scan import scan
+from kf_calib.scan import Candidate, Scan, scan
 from kf_calib.sources.hidden import parse
 from kf_calib.sources.hidden.detectability import sized
 from kf_calib.sources.noise_sources import Noise
@@ -141,3 +142,16 @@ def test_a_hand_placed_run_claims_nothing() -> None:
 
     found = diagnose(calibrate(Recording(HAND)))
     assert not found.missing and not found.unknown and "third-order" in found.test.invisible
+
+
+def test_the_p_value_of_a_run_does_not_depend_on_how_its_frame_is_turned() -> None:
+    """Which way it is turned is up to rounding: draws in it would be those of the machine."""
+    found = assessed(run().fit).scan
+    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((len(found.residual),) * 2))[0]
+
+    def turned(each: Candidate) -> Candidate:
+        around = np.linalg.qr(np.random.default_rng(1).standard_normal((each.dof, each.dof)))[0]
+        return replace(each, basis=turn @ each.basis @ around, directions=turn @ each.directions)
+
+    other = Scan(tuple(map(turned, found.candidates)), turn @ found.residual)
+    assert independent_tests(other) == pytest.approx(independent_tests(found), rel=1e-6)
