@@ -27,10 +27,11 @@ LEVEL = 0.01
 SHARE = 0.4
 """Of the chance of a false alarm: the misfit's and the scan's; lines and trends within dwells halve the rest."""
 
+REST = 0.5 * (1.0 - 2.0 * SHARE)
+
 EQUAL = 6.63
 """Suspects whose chi-squared is this close to the best cannot be told from it (1 %, 1 dof)."""
 
-_LINES = _TRENDS = 0.5 * (1.0 - 2.0 * SHARE)
 _DRAWS = 4000
 _POWER = 0.9
 _FEWEST_WALKED = 8  # dwells: a walk of the biases is looked for in that many
@@ -70,7 +71,7 @@ class Test:
         """Of the run: the smallest of the misfit's, the best suspect's, the best line's and the trends', each at its
         share."""
         found = [*self.p_values.values(), *([self.misfit_p] if self.misfit_p is not None else [])]
-        found += [self.trend.p_value * SHARE / _TRENDS] if self.trend else []
+        found += [self.trend.p_value * SHARE / REST] if self.trend else []
         return min(1.0, min(found) / SHARE) if found else None
 
     @property
@@ -210,7 +211,7 @@ def _with_lines(test: Test, fitted: Fit) -> Test:
     bands = [f"of {a:.2g} to {b:.2g} Hz" if np.isfinite(b) else f"above {a:.2g} Hz" for a, b in gaps if b > 1.5 * a]
     if bands:
         test = replace(test, between=f"{name} {' and '.join(bands)}")
-    seen = lines_of(fitted.dwells, LEVEL * _LINES)
+    seen = lines_of(fitted.dwells, LEVEL * REST)
     if not seen:
         return replace(test, trend=trend(fitted))
     p_value = seen[0].p_value
@@ -218,7 +219,7 @@ def _with_lines(test: Test, fitted: Fit) -> Test:
         test,
         best={key: k for key, k in test.best.items() if key != name},
         scores=test.scores | {name: float(chdtri(1, max(p_value, 1e-300))) - threshold(1, 1.0)},
-        p_values=test.p_values | {name: p_value * SHARE / _LINES},
+        p_values=test.p_values | {name: p_value * SHARE / REST},
         lines=seen,
         oscillating=name,
         without_lines=replace(test, vibration=seen),

@@ -117,6 +117,13 @@ class Running:
         moved, covariance, undetermined = information.solve(information.restricted(self.factor, kept), around)
         return self.about[kept] + moved, covariance, undetermined
 
+    @property
+    def state(self) -> Floats:
+        """The state (P,) of all columns: the estimate of the model, zero for what is only carried."""
+        out = np.zeros(len(self.about))
+        out[self._kept] = self.solved()[0]
+        return out
+
     @cached_property
     def scan(self) -> Scan:
         """What each effect that is carried and not in the model would explain."""

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.fitting import Fit
-from kf_calib.folding import DwellFactor
+from kf_calib.folding import Carried, DwellFactor
 from kf_calib.model import on_basis
-from kf_calib.noise import flicker_sigma
+from kf_calib.noise import Noise, flicker_sigma
 from kf_calib.samples import Floats, Mask
 
 _DEGREES = np.arange(1, 4)
@@ -43,17 +43,22 @@ class Trend:
 
 
 def trend(fitted: Fit) -> Trend | None:
-    """The test of all trends of a fit together; None where there is nothing to judge or to judge by.
+    """The test of all trends that a fit leaves; None where there is nothing to judge or to judge by."""
+    return trend_beside(fitted.carried, fitted.noise.judging, fitted.state)
+
+
+def trend_beside(carried: Carried, noise: Noise, state: Floats) -> Trend | None:
+    """The same beside the columns that are carried, of the model at ``state`` (p,).
 
     F distributed: kappa of n readings is known to 4 kappa / n of its square, a walk's intensity to its own spread.
     """
     from scipy.special import fdtrc
 
-    noise, dwells = fitted.noise.judging, fitted.dwells
+    dwells = carried.dwells
     if dwells[0].averaged or not noise.scatter_stated:
         return None
     sigma, lengths_s = noise.effective_sigma_mps2, np.array([dwell.end_s - dwell.start_s for dwell in dwells])
-    squares, seen = _squares(fitted)
+    squares, seen = _squares(carried, state)
     own = (sigma**2 / np.array([[dwell.count] for dwell in dwells]))[:, :, None]
     walked = noise.walk_mps2_per_sqrt_s**2 * lengths_s[:, None, None] * _WALK
     allowed = own + walked + flicker_sigma(noise, len(dwells))[:, None] ** 2 * _FLICKER
@@ -68,15 +73,14 @@ def trend(fitted: Fit) -> Trend | None:
     return Trend(ratio, float(fdtrc(count, 2.0 / unsure, ratio)), ratios.sum(axis=2))
 
 
-def _squares(fitted: Fit) -> tuple[Floats, Mask]:
+def _squares(carried: Carried, state: Floats) -> tuple[Floats, Mask]:
     """Squares of the residuals' coefficients (D, 3, degrees) on polynomials of mean square 1, and which degrees (D,
     degrees) a dwell has readings for."""
-    carried = fitted.carried
     out, seen = np.zeros((len(carried.dwells), 3, len(_DEGREES))), np.zeros((len(carried.dwells), len(_DEGREES)), bool)
     for k, (dwell, columns) in enumerate(zip(carried.dwells, carried.columns, strict=True)):
         polynomials, degrees = _polynomials(dwell)
         width, triangles = dwell.width, dwell.triangles
-        left = triangles[:, :width, width:] - triangles[:, :width, :width] @ on_basis(columns @ fitted.state)
+        left = triangles[:, :width, width:] - triangles[:, :width, :width] @ on_basis(columns @ state)
         out[k, :, degrees] = (polynomials.T @ left.reshape(-1, 3)) ** 2 / dwell.count
         seen[k, degrees] = True
     return out, seen

@@ -18,14 +18,15 @@ from functools import cached_property
 
 from threadpoolctl import threadpool_limits
 
-from kf_calib.assessment import LEVEL, candidates, independent_tests, price, run_level
+from kf_calib.assessment import LEVEL, REST, SHARE, candidates, independent_tests, price, run_level
 from kf_calib.bench import Bench
 from kf_calib.calibration import Settings
 from kf_calib.effects import Effect
 from kf_calib.fitting import Fit, fit
-from kf_calib.folding import DwellFactor
+from kf_calib.folding import DwellFactor, lines_of
 from kf_calib.model import Model
 from kf_calib.running import Running
+from kf_calib.trend import Trend, trend_beside
 
 _GROWN = 1.25
 _FEWEST = 4
@@ -72,7 +73,8 @@ class Watch:
 
     @cached_property
     def p_value(self) -> float | None:
-        """Of this look alone, as ``diagnose`` has it: the misfit's or the best candidate's; None: nothing to judge."""
+        """Of this look alone, as ``diagnose`` has it: the misfit's, the best candidate's or the trends' within dwells;
+        None: nothing to judge."""
         from scipy.special import chdtrc
 
         statistic, dof = self.running.misfit
@@ -81,7 +83,16 @@ class Watch:
         scan = self.running.scan
         own = [float(chdtrc(c.dof, x)) for c, x in zip(scan.candidates, scan.statistics, strict=True) if c.dof]
         found = [float(chdtrc(dof, statistic)), *([run_level(min(own), self.tests)] if own else [])]
-        return min(1.0, len(found) * min(found))
+        going = self.trend
+        found += [going.p_value * SHARE / REST] if going else []
+        return min(1.0, min(found) / SHARE)
+
+    @cached_property
+    def trend(self) -> Trend | None:
+        """What goes on within dwells; None where lines would, too."""
+        found = trend_beside(self.running.carried, self.running.noise, self.running.state)
+        shown = found is not None and found.p_value < LEVEL
+        return None if shown and lines_of(self.dwells, LEVEL * REST) else found
 
     @property
     def suspects(self) -> list[str]:

@@ -19,6 +19,7 @@ from kf_calib.sources.plans import spread_plan
 from kf_calib.trend import Trend, trend
 from kf_calib.views.console import plain
 from kf_calib.views.diagnosis import description, diagnosis_object, diagnosis_report
+from kf_calib.watch import Watch
 
 
 def found_in(result: Calibration) -> Trend:
@@ -76,6 +77,16 @@ def test_what_dwells_hide_shows_within_them() -> None:
         "ratio": found.test.trend.ratio, "p_value": found.test.trend.p_value, "dwell": dwell, "channel": channel,
     }  # fmt: skip
     assert f"most in dwell {dwell}, accelerometer {channel}" in " ".join(plain(diagnosis_report(found)).split())
+
+
+def test_a_watch_sees_it_while_the_run_goes_on() -> None:
+    """Dwell by dwell, as the diagnosis does in the end, but for noise found a quarter of the run earlier."""
+    before = run("chirp=25sigma;frequency=0.02;chirp=2e-4", seed=4)
+    watch = Watch.over(before.fit.dwells[:4], before.bench, before.settings)
+    for dwell in before.fit.dwells[4:]:
+        watch = watch.after(dwell)
+    assert watch.trend is not None and watch.alarmed is not None
+    assert np.log(watch.trend.p_value) == pytest.approx(np.log(found_in(before).p_value), rel=0.1)
 
 
 def test_nothing_is_judged_where_scatter_may_be_anything() -> None:
