@@ -26,7 +26,7 @@ from kf_calib.folding import Carried, DwellFactor, Folder, columns_of, lines_of,
 from kf_calib.held_out import held_out, orientations
 from kf_calib.information import Step
 from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
-from kf_calib.noise import Noise, considered, mean_covariances, steps
+from kf_calib.noise import TOO_SHORT, Noise, considered, mean_covariances, steps
 from kf_calib.readings import Readings, Watch
 from kf_calib.samples import Floats, Mask, Source
 from kf_calib.stillness import Stillness
@@ -631,7 +631,10 @@ def _remarks(
         )
     if noise.inflation.max() > 1.5:
         kappa = ", ".join(f"{value:.3g}" for value in noise.inflation)
-        yield f"the noise within a dwell is correlated: sigmas allow for it by inflating its variance by {kappa}."
+        usual = float(np.median([dwell.count for dwell in dwells]))
+        short = not dwells[0].averaged and usual < TOO_SHORT * noise.inflation.max()
+        slow = "; dwells are too short to tell how slow it is: stay longer in each" if short else ""
+        yield f"the noise within a dwell is correlated: sigmas allow for it by inflating its variance by {kappa}{slow}."
     if not noise.checked and noise.scatter_mps2.any() and not noise.scatter_stated:
         yield (
             f"{len(orientations(dwells))} orientations cannot tell a setting error of the angles from scatter of the "

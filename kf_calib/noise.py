@@ -25,6 +25,10 @@ FLOOR_MPS2 = 1e-9
 
 _MAX_ORDER = 20
 _LONGEST = 2.0  # kappa at most, as a part of a block
+_SHORT = 8.0  # kappa: in blocks no longer than that one correlation is found for the three channels
+TOO_SHORT = 4.0
+"""Kappa: blocks no longer than that do not tell how slow their noise is."""
+
 _AVERAGES = 60  # of a block, at least, from which their own correlation is taken
 _WANDER = 6
 
@@ -102,6 +106,8 @@ def within_dwells(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float = 0
         total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _lagged(dwells))
     known = _of_averages if dwells[0].averaged else _inflation
     inflation, variance = np.array([known(total, i) for i in range(3)]).T
+    if not dwells[0].averaged and total.count < _SHORT * inflation.max() * total.blocks:
+        inflation, variance = _alike(total)
     squares, counts = (np.concatenate([getattr(each, key) for each in dwells]) for key in ("squares", "counts"))
     if walk_mps2_per_sqrt_s:
         rest = np.concatenate([dwell.walk.rest for dwell in dwells])
@@ -135,6 +141,22 @@ def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
     raw = total.products[: lags + 1, channel] / np.maximum(total.pairs[: lags + 1], 1.0)
     model, variance = unbiased(raw, total.count, size)
     return min(max(model.inflation, 1.0), max(size / _LONGEST, 1.0)), variance
+
+
+def _alike(total: Autocovariance) -> tuple[Floats, Floats]:
+    """The same of blocks that are short for their correlation, of which a channel alone tells little: one for all.
+
+    Where they are too short to tell, it is taken to be as slow as they allow.
+    """
+    varying = total.products[0] > 0
+    shapes = total.products[:, varying] / total.products[0, varying]
+    pooled = replace(total, products=shapes.mean(axis=1, keepdims=True), count=total.count * int(varying.sum()))
+    pooled = replace(pooled, blocks=total.blocks * int(varying.sum()))
+    scaled = replace(pooled, products=pooled.products * total.pairs[0])
+    kappa, variance = _inflation(scaled, 0)
+    size = total.count / total.blocks
+    kappa = max(kappa, size / _LONGEST) if size < TOO_SHORT * kappa else kappa
+    return np.where(varying, kappa, 1.0), variance * total.products[0] / total.pairs[0]
 
 
 def _of_averages(total: Autocovariance, channel: int) -> tuple[float, float]:

@@ -9,9 +9,14 @@ import pytest
 from scipy.signal import lfilter
 from synthetic import Run
 
+from kf_calib.bench import Bench, axes_of
 from kf_calib.calibration import calibrate
 from kf_calib.folding import Autocovariance, less_curve
 from kf_calib.likelihood import restricted_log_likelihood
+from kf_calib.sources.noise_sources import Noise as SimulatedNoise
+from kf_calib.sources.plans import spread_plan
+from kf_calib.sources.sensors import GRADES
+from kf_calib.sources.simulator import Simulation
 
 
 def test_autocovariance_is_the_sum_of_lagged_products() -> None:
@@ -80,3 +85,19 @@ def test_no_other_size_of_the_dwell_parts_is_likelier(seed: int, kind: dict[str,
     others = [likelihood(*pair) for x in (0.5, 0.9, 0.98, 1.02, 1.1, 2.0) for pair in ((x, 1.0), (1.0, x))]
     assert noise.setting_rad + noise.scatter_mps2.max() > 0
     assert max(others) <= likelihood(1.0, 1.0) + 1e-6
+
+
+def test_dwells_too_short_for_their_noise_raise_no_alarm_and_are_told() -> None:
+    """Forty readings, correlated over ten: their parabola takes all that would tell how slow they are."""
+    low = 0
+    for seed in range(40):
+        bench = Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+        source = Simulation(
+            bench, GRADES["mems"].sensors(seed), SimulatedNoise(white_mps2=0.02, ar1_phi=0.9),
+            spread_plan(16, dwell_s=10.0, seed=seed), sample_hz=4.0, angle_hz=4.0, slew_rate_degps=90.0, seed=seed,
+        )  # fmt: skip
+        result = calibrate(source)
+        assert result.consistency.p_value is not None
+        low += result.consistency.p_value < 0.05
+        assert "too short to tell" in " ".join(result.warnings)
+    assert low <= 2  # of 40; one in five would be were each channel's correlation taken as it is found
