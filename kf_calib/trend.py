@@ -1,15 +1,17 @@
 """Trends within dwells: whether what is left of the readings goes on in a dwell as noise does.
 
 An effect that no column describes need not show in the means of dwells more than scatter would; but what jumps or turns
-in the course of a dwell leaves it with a slope and a bend. Of each dwell and channel the residual is taken along the
-Legendre polynomials of degree 1 to 3 over the dwell: of noise of density kappa sigma^2 each has that variance, a random
-walk of the biases adds q^2 T / (4 (2k + 1)) (1 / (2k + 3) + 1 / (2k - 1)), and 1/f noise of density h / f adds
-h (2k + 1) / (2k (k + 1)), whatever the length T of the dwell (mean square of the polynomial 1; Dutta and Horn, 1981).
+in the course of a dwell leaves it with a slope and a bend. Of each dwell and channel the residual is taken along smooth
+shapes over it, Legendre's polynomials of degree 1 to 3 times 1 - u^2, less their mean: what shakes the platform as it
+arrives and leaves is no trend. Of noise of density kappa sigma^2 each has that variance; a random walk of the biases
+adds q^2 T times a constant, and 1/f noise of density h / f adds h times one, whatever the length T of the dwell
+(covariances min(s, t) and -ln |s - t|).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +22,33 @@ from kf_calib.model import on_basis
 from kf_calib.noise import Noise, flicker_sigma
 from kf_calib.samples import Floats, Mask
 
-_DEGREES = np.arange(1, 4)
-_WALK = (1.0 / (2 * _DEGREES + 3) + 1.0 / (2 * _DEGREES - 1)) / (4.0 * (2 * _DEGREES + 1))
-_FLICKER = (2 * _DEGREES + 1) / (2.0 * _DEGREES * (_DEGREES + 1))
+_DEGREE = 3
+_GRID = 600
 _FEWEST = 8  # readings of a dwell
+
+
+def shapes(u: Floats) -> Floats:
+    """A constant, and the shapes at places u from -1 to 1 in a dwell, (..., 1 + degrees), not yet orthogonal."""
+    values: Floats = np.polynomial.legendre.legvander(u, _DEGREE).astype(float)
+    values[..., 1:] *= (1.0 - u**2)[..., None]
+    return values
+
+
+def variances(values: Floats) -> tuple[Floats, Floats]:
+    """What a walk of q^2 T = 1 and 1/f noise of h = 1 add to the coefficients on functions (n, k) over a dwell, made
+    orthogonal to those before them and of mean square 1; (k - 1,) each, the first function being constant."""
+    count = len(values)
+    frame = np.linalg.qr(values)[0][:, 1:] * np.sqrt(count)
+    at = (np.arange(count) + 0.5) / count
+    apart = np.abs(at[:, None] - at)
+    np.fill_diagonal(apart, np.exp(-1.5) / count)  # the mean of -ln |s - t| over a cell
+    walk = np.mean((np.cumsum(frame, axis=0) / count) ** 2, axis=0)
+    return walk, np.einsum("sk,st,tk->k", frame, -np.log(apart), frame) / count**2
+
+
+@cache
+def _of_shapes() -> tuple[Floats, Floats]:
+    return variances(shapes((2.0 * np.arange(_GRID) + 1.0) / _GRID - 1.0))
 
 
 @dataclass(frozen=True)
@@ -60,8 +85,9 @@ def trend_beside(carried: Carried, noise: Noise, state: Floats) -> Trend | None:
     sigma, lengths_s = noise.effective_sigma_mps2, np.array([dwell.end_s - dwell.start_s for dwell in dwells])
     squares, seen = _squares(carried, state)
     own = (sigma**2 / np.array([[dwell.count] for dwell in dwells]))[:, :, None]
-    walked = noise.walk_mps2_per_sqrt_s**2 * lengths_s[:, None, None] * _WALK
-    allowed = own + walked + flicker_sigma(noise, len(dwells))[:, None] ** 2 * _FLICKER
+    by_walk, by_flicker = _of_shapes()
+    walked = noise.walk_mps2_per_sqrt_s**2 * lengths_s[:, None, None] * by_walk
+    allowed = own + walked + flicker_sigma(noise, len(dwells))[:, None] ** 2 * by_flicker
     ratios = np.where(seen[:, None, :], squares / allowed, 0.0)
     count = 3 * int(seen.sum())
     if not count:
@@ -74,25 +100,25 @@ def trend_beside(carried: Carried, noise: Noise, state: Floats) -> Trend | None:
 
 
 def _squares(carried: Carried, state: Floats) -> tuple[Floats, Mask]:
-    """Squares of the residuals' coefficients (D, 3, degrees) on polynomials of mean square 1, and which degrees (D,
-    degrees) a dwell has readings for."""
-    out, seen = np.zeros((len(carried.dwells), 3, len(_DEGREES))), np.zeros((len(carried.dwells), len(_DEGREES)), bool)
+    """Squares of the residuals' coefficients (D, 3, degrees) on shapes of mean square 1, and which degrees (D, degrees)
+    a dwell has readings for."""
+    out, seen = np.zeros((len(carried.dwells), 3, _DEGREE)), np.zeros((len(carried.dwells), _DEGREE), bool)
     for k, (dwell, columns) in enumerate(zip(carried.dwells, carried.columns, strict=True)):
-        polynomials, degrees = _polynomials(dwell)
+        columns_of_shapes, degrees = _shapes_in(dwell)
         width, triangles = dwell.width, dwell.triangles
         left = triangles[:, :width, width:] - triangles[:, :width, :width] @ on_basis(columns @ state)
-        out[k, :, degrees] = (polynomials.T @ left.reshape(-1, 3)) ** 2 / dwell.count
+        out[k, :, degrees] = (columns_of_shapes.T @ left.reshape(-1, 3)) ** 2 / dwell.count
         seen[k, degrees] = True
     return out, seen
 
 
-def _polynomials(dwell: DwellFactor) -> tuple[Floats, NDArray[np.intp]]:
+def _shapes_in(dwell: DwellFactor) -> tuple[Floats, NDArray[np.intp]]:
     """Orthonormal columns (r, k) on the rows of a dwell's triangles, and the degree of each less one (k,)."""
     if dwell.count < _FEWEST or dwell.end_s <= dwell.start_s:
         return np.zeros((dwell.width * len(dwell.pieces), 0)), np.zeros(0, np.intp)
     at = np.array([piece.nodes.elapsed_s for piece in dwell.pieces])
     u = 2.0 * (at - dwell.start_s) / (dwell.end_s - dwell.start_s) - 1.0
-    values: Floats = np.polynomial.legendre.legvander(u, len(_DEGREES)).astype(float)
+    values = shapes(u)
     rows = (dwell.triangles[:, : dwell.width, :3] @ on_basis(values)).reshape(-1, values.shape[2])
     frame, upper = np.linalg.qr(rows)
     known = np.abs(np.diag(upper)) > 1e-6 * np.sqrt(dwell.count)
