@@ -868,7 +868,7 @@ def _advice(_: str, own: list[Outcome]) -> Iterator[Figure]:
         ratios = [advised / max(random, 1e-9) for advised, random in pairs]
         yield rate(f"4 advised separate an ambiguous pair as well as 12 random{words}", [x >= 1.0 for x in ratios])
         median, (low, high) = float(np.median(ratios)), np.percentile(ratios, [2.5, 97.5])
-        bar = (">= 1", median >= 1.0 if len(own) >= _ENOUGH else None) if most < math.inf else ("", None)
+        bar = (">= 1", median >= 1.0 if len(own) >= _ENOUGH else None) if most == math.inf else ("", None)
         yield Figure(f"separation, 4 advised / 12 random, median{words}", median, low, high, len(own), *bar)
     times = [each.extra["dwells"] / 12.0 for each in own if "dwells" in each.extra]
     if times:
