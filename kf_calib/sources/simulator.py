@@ -25,6 +25,7 @@ from kf_calib.errors import InputError, KfCalibError
 from kf_calib.samples import Batch, Floats, Stream, Times
 from kf_calib.sources.gimbals import Motion, attitude
 from kf_calib.sources.hidden import Hidden, Rig, Stage, sizes_in_sigma, steps_of
+from kf_calib.sources.hidden.drift import walking
 from kf_calib.sources.noise_sources import Noise, generator
 from kf_calib.sources.physics import (
     Ambient,
@@ -121,10 +122,25 @@ class Simulation:
             "grade": self.grade,
             "seed": self.seed,
             "parameters": dict(self.sensors.parameters),
+            **self._at_the_end(),
             "noise": asdict(self.noise),
             "ambient": asdict(self.ambient),
             "effects": [effect.truth | {"size_sigma": n} for effect, n in zip(self.hidden, sizes, strict=True)],
         }
+
+    def _at_the_end(self) -> dict[str, Any]:
+        """The parameters at the last reading, where the biases have walked there."""
+        rig, noise = self._rig, Noise(walk_mps2_per_sqrt_s=self.noise.walk_mps2_per_sqrt_s)
+        processes = noise.processes(self.seed, rig.period_s, rig.duration_s)
+        processes += [walking(np.array(each.sizes), rig) for each in self.hidden if each.kind.name == "bias-walk"]
+        if not processes:
+            return {}
+        counts = [min(self._batch_samples, len(self) - first) for first in range(0, len(self), self._batch_samples)]
+        ends = [[process(count)[-1] for count in counts][-1] for process in processes]
+        there = dict(self.sensors.parameters)
+        for k, walked in enumerate(np.sum(ends, axis=0).tolist(), start=1):
+            there[f"b{k}"] += walked
+        return {"parameters_at_end": there}
 
     def write_truth(self, recording: str | PathLike[str]) -> Path:
         """Writes ``NAME.truth.json`` beside the recording ``NAME.mcap``; returns its path."""
@@ -144,9 +160,12 @@ class Simulation:
         return [*platform, *force, *response, *self._noise_steps(), *hidden["record"]]
 
     def _hidden_steps(self) -> dict[Stage, list[Step]]:
+        return steps_of(self.hidden, self._rig)
+
+    @property
+    def _rig(self) -> Rig:
         period_s = self._accel.period_ns * 1e-9
-        rig = Rig(self.bench, self._axes, self.sensors, self.motion, period_s, len(self) * period_s, self.seed)
-        return steps_of(self.hidden, rig)
+        return Rig(self.bench, self._axes, self.sensors, self.motion, period_s, len(self) * period_s, self.seed)
 
     def _setting_steps(self) -> list[Step]:
         if not self.noise.setting_sigma_deg:

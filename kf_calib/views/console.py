@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from rich.console import Console, Group, RenderableType
@@ -51,12 +50,13 @@ def _row(parameter: Parameter) -> tuple[str, str, str, str, str]:
     return symbol(parameter.symbol), value, f"{sign}{deviation}", f"± {sigma}", parameter.shown_unit
 
 
-def parameter_table(parameters: Sequence[Parameter]) -> Table:
+def parameter_table(result: Calibration) -> Table:
     """Value, deviation from nominal and sigma (1 sigma) of the twelve."""
-    table = Table(title="Parameters (1σ)", title_justify="left")
+    walking = "; the biases walk: those at the end of the run" if result.noise.walk_mps2_per_sqrt_s else ""
+    table = Table(title=f"Parameters (1σ{walking})", title_justify="left")
     for heading in ("parameter", "value", "less nominal", "sigma", "unit"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    for k, parameter in enumerate(parameters):
+    for k, parameter in enumerate(list(result.parameters.values())[:12]):
         table.add_row(*_row(parameter), end_section=k % 4 == 3)
     return table
 
@@ -154,7 +154,7 @@ def summary(result: Calibration) -> RenderableType:
         f"{len(orientations(dwells))} orientations ({tally.moving} readings moving, {tally.settling} settling)"
     )
     parts: list[RenderableType] = [
-        head, parameter_table(list(result.parameters.values())[:12]),
+        head, parameter_table(result),
         *([effect_table(result)] if result.model.effects else []), noise_table(result),
         Text(verdict(result), style="bold green" if result.consistency.consistent else "bold yellow"),
     ]  # fmt: skip

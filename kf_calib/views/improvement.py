@@ -135,7 +135,7 @@ def improvement_report(
     if state.spreads:
         parts.append(_spread_table(state))
     else:
-        parts.append(parameter_table(list(state.result.parameters.values())[:12]))
+        parts.append(parameter_table(state.result))
     if state.result.model.effects:
         parts.append(effect_table(state.result))
     if honest is not None:

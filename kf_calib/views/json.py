@@ -27,6 +27,7 @@ def replay_object(result: Calibration) -> dict[str, Any]:
                 {"symbol": p.symbol, "value": p.value, "sigma": p.sigma, "unit": p.unit, "nominal": p.nominal}
                 for p in result.parameters.values()
             ],
+            "biases_at_s": dwells[-1].end_s if noise.walk_mps2_per_sqrt_s else None,
             "noise": {
                 "sigma_mps2": noise.sigma_mps2,
                 "inflation": noise.inflation,

@@ -215,6 +215,18 @@ def test_bias_walk_grows_by_the_square_root_of_time():
     assert abs(np.corrcoef(paths[399], paths[1599])[0, 1] - 0.5) < 0.15
 
 
+@pytest.mark.parametrize("noise", [QUIET, Noise(walk_mps2_per_sqrt_s=1e-3)])
+def test_the_truth_says_where_biases_have_walked_to(noise):
+    plan, hidden = explicit_plan([(0, 0, 0)], 300.0), parse(["bias-walk=1e-3,0,2e-3"], BENCH.axes)
+    run = Simulation(BENCH, ORTHOGONAL, noise, plan, sample_hz=4.0, seed=3, hidden=hidden, batch_samples=500)
+    still = run.hiding((), QUIET)
+    truth = run.truth
+    moved = np.array([truth["parameters_at_end"][name] - truth["parameters"][name] for name in ("b1", "b2", "b3")])
+    np.testing.assert_allclose(read(run).accel.values[-1] - read(still).accel.values[-1], moved, atol=1e-12)
+    assert np.all(moved[[0, 2]] != 0.0) and bool(moved[1]) == bool(noise.walk_mps2_per_sqrt_s)
+    assert "parameters_at_end" not in still.truth
+
+
 def test_vibration_is_seen_and_rectified():
     text = "vibration-rectification=0.01,0.02,0;rms=2;period=100"
     found = contribution(text, [(0, 0, 0)], dwell_s=100.0, sample_hz=100.0)
