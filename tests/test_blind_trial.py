@@ -164,9 +164,22 @@ def test_the_picture_is_small_and_the_tables_hold_only_what_there_is(trial: Any,
 def test_what_means_the_same_is_read_from_the_run(trial: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On six faces the zero of one encoder is the skewness of the axis it carries; a cubic term is not a square one."""
     monkeypatch.chdir(tmp_path)
-    trial.simulated(trial.Task("", "", 1, (), ("--plan", "faces")), Path("t.mcap"))
-    same = trial._meaning_the_same(Path("t.mcap"), ["encoder-offset:z"], ["axis-nonorthogonality:x", "second-order"])
+    task = trial.Task("", "", 1, ("encoder-offset:z=1e-4",), ("--plan", "faces"))
+    told = trial.simulated(task, Path("t.mcap"))["effects"]
+    same = trial._meaning_the_same(task, Path("t.mcap"), told, ["axis-nonorthogonality:x", "second-order"])
     assert set(same) == {(name, other) for name in ["encoder-offset:z"] for other in [name, "axis-nonorthogonality:x"]}
+
+
+def test_what_is_another_effect_reading_for_reading_means_the_same(
+    trial: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A magnetic sensitivity that all three accelerometers share is a tilt of the base; others are not."""
+    monkeypatch.chdir(tmp_path)
+    for sizes, others in (("4e-2,4e-2,4e-2", {"base-tilt"}), ("4e-2,-4e-2,4e-2", set[str]())):
+        task = trial.Task("", "", 1, (f"magnetic={sizes}",), ("--orientations", "12"))
+        told = trial.simulated(task, Path("t.mcap"))["effects"]
+        same = trial._meaning_the_same(task, Path("t.mcap"), told, ["base-tilt", "second-order", "earth-rotation"])
+        assert {said for _, said in same} == {"magnetic"} | others
 
 
 def test_a_trial_that_cannot_be_made_says_why(trial: Any) -> None:

@@ -81,6 +81,7 @@ _LIKE = 0.9  # overlap of what may be taken for each other at 8 sigma
 _FEW = 12  # orientations
 _SIZES = (8, 10, 15)  # sigma
 _LARGE = 100  # sigma, or times
+_ALONE, _EXACT = 1000, 0.01  # sigma; the part of what is hidden that a name may leave
 _DWELL_S = float(BENCH[BENCH.index("--dwell-s") + 1])
 _POWER = (0.86, 0.94)
 _SECOND = 5_000_000  # from the seed of a run to that of its second run
@@ -266,7 +267,7 @@ def diagnosed(task: Task) -> Outcome:
     names = tuple(said.get("all_missing") or ([missing] if missing and missing != "unknown" else []))
     known = tuple(effect["name"] for effect in effects)
     with _timed(times, "judge"):
-        same = _meaning_the_same(path, known, {*names, *said["ambiguity_set"]})
+        same = _meaning_the_same(task, path, effects, {*names, *said["ambiguity_set"]})
     return Outcome(
         task, known, missing, names, tuple(said["ambiguity_set"]), same, said["consistent"], said["p_value"],
         tuple(said["invisible"]),
@@ -287,8 +288,15 @@ def _timed(times: dict[str, float], part: str) -> Iterator[None]:
     times[part] = time.process_time() - start
 
 
-def _meaning_the_same(path: Path, truth: Sequence[str], said: Iterable[str]) -> tuple[tuple[str, str], ...]:
-    """Pairs of a hidden name and a name said that span the same readings beside the twelve parameters."""
+def _meaning_the_same(
+    task: Task, path: Path, effects: Sequence[dict[str, Any]], said: Iterable[str]
+) -> tuple[tuple[str, str], ...]:
+    """Pairs of a hidden name and a name said that mean the same readings beside the twelve parameters.
+
+    They span the same space in this run, or what was hidden is, reading for reading, what the other name means, and
+    that is the simpler one: a magnetic sensitivity that is the same of all three accelerometers is a tilt of the base.
+    """
+    truth = [effect["name"] for effect in effects]
     others = sorted(set(said) - set(truth))
     pairs = {(name, name) for name in truth}
     if truth and others:
@@ -298,7 +306,21 @@ def _meaning_the_same(path: Path, truth: Sequence[str], said: Iterable[str]) -> 
             for true, other in itertools.product(truth, others)
             if any(_one_space(a, b) for a, b in itertools.product(spaces.get(true, []), spaces.get(other, [])))
         }
+        for effect in effects:
+            most = max((each.dof for each in spaces.get(effect["name"], [])), default=0)
+            simpler = [name for name in others if any(each.dof < most for each in spaces.get(name, []))]
+            if simpler and effect["size_sigma"]:
+                pairs |= {(effect["name"], other) for other in _reading_for_reading(task, effect, simpler)}
     return tuple(sorted(pairs))
+
+
+def _reading_for_reading(task: Task, effect: dict[str, Any], others: Sequence[str]) -> list[str]:
+    """Those names that explain all of a hidden effect, to a hundredth of its size; of one of a thousand sigma alone."""
+    path = Path("alone.mcap")
+    simulated(_sized(task, effect, _ALONE / effect["size_sigma"]), path)
+    spaces, residual = _scanned(path, [effect["name"], *others])
+    falls = {name: max(float(np.sum((each.basis.T @ residual) ** 2)) for each in own) for name, own in spaces.items()}
+    return [name for name in others if falls[name] > (1.0 - _EXACT**2) * falls[effect["name"]]]
 
 
 def _one_space(one: Candidate, other: Candidate) -> bool:
@@ -436,7 +458,7 @@ def improve(task: Task) -> Outcome:
     with _timed(times, "improve"):
         said = run("improve", str(path), "--json")
     known, model = tuple(effect["name"] for effect in effects), tuple(said["model"])
-    same = _meaning_the_same(path, known, model)
+    same = _meaning_the_same(task, path, effects, model)
     told = simulated(dataclasses.replace(task, seed=task.seed + _SECOND), again)
     truth = told.get("parameters_at_end", told["parameters"])  # where biases walk, theirs are those at the end
     estimate = calibrate(Recording(again), Settings(effects=model)).estimate
