@@ -241,6 +241,9 @@ class Calibration:
 
         return plain_summary(self)
 
+    def __repr__(self) -> str:  # of all arrays in it, it would be megabytes
+        return f"<Calibration: {self.model.sum}, {len(self.visits)} dwells, p {format_p(self.consistency.p_value)}>"
+
     def trace(self) -> Iterator[tuple[float, int, Estimate]]:
         """(elapsed_s, dwell index, estimate) within and after every dwell: after a second, two, four ..."""
         model, state, around = self.model, self.carried.state, self.model.nominal_state()

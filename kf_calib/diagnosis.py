@@ -78,6 +78,14 @@ class Diagnosis:
     alone: str = ""
     as_scatter: bool = False
 
+    def __repr__(self) -> str:
+        return f"<Diagnosis: {self.verdict}>"
+
+    def __str__(self) -> str:
+        from kf_calib.views.diagnosis import plain_report
+
+        return plain_report(self)
+
     @property
     def residual_ratios(self) -> Floats:
         """Residuals of the dwells (D, 3) over the sigma of their means."""

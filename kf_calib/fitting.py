@@ -34,7 +34,7 @@ _EXACT_RAD = 1e-9
 _STILL = 2.5e-4  # a step of ln(value), in reaches, that ends the search
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Fit:
     """Dwells with the fitted model's columns, and the noise they are weighted by.
 

@@ -79,7 +79,7 @@ class Piece:
     taken: int = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class DwellFactor:
     """One dwell: its pieces in order of time, its readings in cells of the run's clock, and the autocovariance and the
     spectrum of its first readings.
@@ -356,7 +356,7 @@ def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Float
     return np.split(shaped, np.cumsum([len(dwell.pieces) for dwell in dwells])[:-1])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Means:
     """Of D dwells: mean model columns (D, 3, p), readings (D, 3), specific force (D, 3); counts of readings (D,), when
     each begins and ends (D, 2)."""

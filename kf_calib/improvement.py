@@ -124,6 +124,9 @@ class Improvement:
     history: tuple[Step, ...] = ()
     asked: bool = False
 
+    def __repr__(self) -> str:
+        return f"<Improvement: {self.result.model.sum}, {self.because}>"
+
     @property
     def steps(self) -> tuple[Step, ...]:
         """Those that hold."""

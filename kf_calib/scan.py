@@ -30,7 +30,7 @@ _SAME = 1.0 - 1e-6
 _TOGETHER = 200  # of many effects, so many are held at a time
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Candidate:
     """One effect (its unknown at one value) as far as the model does not explain it.
 
@@ -73,7 +73,7 @@ class Candidate:
         return float(np.linalg.svd(self.basis.T @ other.basis, compute_uv=False)[0])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Scan:
     """Candidates in a common orthonormal frame of d dimensions, and the residual (d,) there, of unit noise."""
 

@@ -123,6 +123,14 @@ def test_what_is_not_needed_goes_unless_it_was_asked_for(improved: Improvement) 
     assert figures(found.found) == figures(improved.found)
 
 
+def test_a_result_shows_what_it_is_and_not_its_arrays(improved: Improvement) -> None:
+    found = improved.found
+    assert repr(found.before).startswith("<Calibration: twelve parameters + second-order, ")
+    assert repr(improved) == "<Improvement: twelve parameters + second-order, consistent>"
+    assert repr(found) == f"<Diagnosis: {found.verdict}>" and str(found).startswith(found.verdict[:80])
+    assert max(len(repr(each)) for each in (found, improved, found.before, found.before.visits[0], found.test)) < 20_000
+
+
 def test_undo_and_drop(improved: Improvement) -> None:
     start = Improvement(improved.start)
     taken = stepped(stepped(start, "mine = fx*fz", None, "user"), "second-order", None, "user")

@@ -15,7 +15,7 @@ from kf_calib.calibration import format_p
 from kf_calib.diagnosis import Diagnosis, Suspect, next_orientation
 from kf_calib.drivers import Description, described
 from kf_calib.trend import Trend
-from kf_calib.views.console import rounded, symbol
+from kf_calib.views.console import plain, rounded, symbol
 from kf_calib.views.json import clean, readings_object
 
 
@@ -143,6 +143,11 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
     parts.append(_detectable_table(detectable(found.test)))
     parts += [Text(f"Note: {warning}", style="yellow") for warning in _notes(found)]
     return Group(*parts)
+
+
+def plain_report(found: Diagnosis) -> str:
+    """The same as plain text."""
+    return plain(diagnosis_report(found))
 
 
 def _suspect_table(found: Diagnosis) -> Table:
