@@ -32,6 +32,19 @@ REST = 0.5 * (1.0 - 2.0 * SHARE)
 EQUAL = 6.63
 """Suspects whose chi-squared is this close to the best cannot be told from it (1 %, 1 dof)."""
 
+
+@functools.cache
+def lead(dof: int) -> float:
+    """By so much noise lets an effect explain more than the one that is really missing, in 1 of 100 runs at most.
+
+    Where the missing effect's space and the other's make angles a, the other's fall less its own is the sum over them
+    of (x cos a + n sin a)^2 - x^2, which is largest at x = n / tan a, and n^2 there: chi-squared of the other's dof.
+    """
+    from scipy.special import chdtri
+
+    return float(chdtri(dof, 0.01))
+
+
 _DRAWS = 4000
 _POWER = 0.9
 _FEWEST_WALKED = 8  # dwells: a walk of the biases is looked for in that many
@@ -107,6 +120,19 @@ class Test:
             return self.scores[name] + (EQUAL if name == self.walking else 0.0)
         own, tests = self.candidate(name), self.effective_tests
         return self.scores[name] + price(own, tests) - price(replace(own, tried=1), tests)
+
+    def rivals(self, first: str) -> list[str]:
+        """Effects that noise could have let the first get ahead of, the likeliest first."""
+        ahead = lead(self.candidate(first).dof if first in self.best else 1)
+        out = list[str]()
+        for name in self.ranked:
+            behind = self.scores[first] - self.nearness(name)
+            if first in self.best and name in self.best:  # more coefficients cost what chance gives them, at most
+                falls = (float(self.scan.statistics[self.best[each]]) for each in (first, name))
+                behind = max(behind, next(falls) - next(falls))
+            if behind < ahead and name != first:
+                out.append(name)
+        return out
 
     def holding(self, name: str) -> list[str]:
         """Effects that can do all that this one can in this run, and more: no reading speaks against them."""
@@ -283,7 +309,8 @@ def _walking(fitted: Fit) -> str:
 def walk_fall(fitted: Fit, tests: float) -> tuple[float, bool]:
     """By how much a walk of the biases lowers -2 log-likelihood; whether it could as well be more scatter than stated.
 
-    Of two that explain as much, more scatter than was stated is less likely than a walk.
+    Of two that explain as much, more scatter than was stated is less likely than a walk; where it was not stated, it
+    is likelier.
     """
     (fall, ratio), least = (2.0 * gain for gain in walk_gain(fitted)), threshold(1, tests)
     return fall if ratio > (0.0 if fitted.noise.scatter_stated else least) else ratio, ratio < least

@@ -230,7 +230,7 @@ def _one(found: Diagnosis, first: Suspect, pairs: Pairs) -> Diagnosis:
     outdone = _outdone(found, first.refit, (first.name,)) if first.name in test.best else _walks_not(found, first)
     if outdone:
         return replace(found, unknown=True)
-    close = [name for name in test.ranked if test.nearness(name) > test.scores[first.name] - EQUAL]
+    close = test.rivals(first.name)
     close += [name for name in test.holding(first.name) if name not in close]
     numbers = {name: test.best.get(name, WALKS) for name in (first.name, *close)}  # a walk, a line: no columns
     overlaps = {name: alike(test, numbers[first.name], numbers[name]) for name in close if name != first.name}

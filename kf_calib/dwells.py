@@ -32,6 +32,7 @@ _LEAP_NS = 10 * _SECOND_NS  # a stamp this far ahead, with the next one behind i
 _SLEW_READINGS = 8  # of a slew, at least
 _REST_NS = 2 * _SECOND_NS  # a dwell that readings alone tell of, between angles that differ, lasts at least
 _PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
+_SURE = 3  # messages: of fewer the noise of an encoder cannot be taken
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,6 +196,7 @@ class Segmenter:
         self._decided_ns: int | None = None  # intervals of poses before this stamp have been judged
         self._cover_ns = -(1 << 62)  # a still window judged earlier reaches to here
         self._dwell: _Dwell | None = None
+        self._encoder_rad = 0.0  # noise of a message, as the dwell before showed it
         self._begun = False
 
     def push(self, batch: Batch) -> Iterator[Block]:
@@ -424,12 +426,20 @@ class Segmenter:
             dwell.settling_ns = rest_ns - dwell.arrival_ns + min(settle_ns, length_ns // 3)
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
         first = min(int(np.searchsorted(self._accel.time_ns, dwell.arrival_ns + dwell.settling_ns)), count)
+        if closing and dwell.pose is None and self._is_unsure(self._accel.time_ns[first:count]):
+            first = count
         self.tally.settling += first
         while count - first >= BLOCK_SAMPLES or (closing and count > first):
             size = min(BLOCK_SAMPLES, count - first)
             yield self._block(self._accel[first : first + size])
             first += size
         self._accel = self._accel[first:]
+
+    def _is_unsure(self, times: Times) -> bool:
+        """Whether there are so few messages of a noisy encoder to these readings that they do not tell its noise."""
+        if not len(times) or self._encoder_rad <= self.stillness.rest_rad:
+            return False
+        return int(np.diff(np.searchsorted(self._pose.time_ns, (times[0], times[-1])))[0]) < _SURE
 
     def _block(self, accel: Stream) -> Block:
         assert self._dwell is not None and self.first_ns is not None
@@ -469,8 +479,9 @@ class Segmenter:
         known = self._dwell.pose
         allowed = 6.0 * inside.std(axis=0) / np.sqrt(len(inside)) + 1e-9
         if known is None or (np.abs(mean - known) > allowed).any():
-            sigma = float(np.sqrt(np.mean(encoder_sigma(inside) ** 2) / len(inside)))
-            self._dwell.pose, self._dwell.pose_sigma_rad = mean, sigma
+            sigma = float(np.sqrt(np.mean(encoder_sigma(inside) ** 2)))
+            self._dwell.pose, self._dwell.pose_sigma_rad = mean, sigma / math.sqrt(len(inside))
+            self._encoder_rad = sigma or self._encoder_rad
             return mean
         return known
 

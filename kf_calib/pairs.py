@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Mapping
 
-from kf_calib.assessment import EQUAL, Test, price
+from kf_calib.assessment import EQUAL, Test, lead, price
 
 WALKS = -1
 """In a pair, in the place of a candidate's number."""
@@ -64,8 +64,10 @@ def exchanged(test: Test, pairs: Pairs, pair: Pair, least: float) -> dict[str, f
     both, out = names_of(test, pair), dict[str, float]()
     for other in pairs:
         shared = set(pair) & set(other)
-        if nearness_of(pairs, other) > pairs[pair] - EQUAL and len(shared) == 1:
-            (lost,), (new,) = set(pair) - shared, set(other) - shared
+        if len(shared) != 1:
+            continue
+        (lost,), (new,) = set(pair) - shared, set(other) - shared
+        if nearness_of(pairs, other) > pairs[pair] - lead(1 if lost == WALKS else test.scan.candidates[lost].dof):
             name, overlap = name_of(test, new), alike(test, lost, new)
             if overlap > max(least, out.get(name, 0.0)) and name not in both:
                 out[name] = overlap

@@ -166,3 +166,14 @@ def test_an_attitude_in_place_of_angles(reference: str) -> None:
     result = calibrate(run)
     assert len(result.visits) == 12 and result.consistency.consistent
     assert np.abs((result.estimate.parameters - run.truth) / result.estimate.sigma).max() < 4
+
+
+@pytest.mark.parametrize("seed", [20090, 20216, 20372])
+def test_a_dwell_on_one_or_two_messages_of_a_noisy_encoder_is_left_out(seed: int) -> None:
+    """Where noise breaks a dwell in two, the shorter part may have too few angles to know where it stands."""
+    run = Run(seed=seed, dwells=24, count=200, encoder_deg=0.01)
+    result = calibrate(run)
+    assert all(visit.dwell.pose_sigma_rad > 0.0 for visit in result.visits)
+    assert result.consistency.p_value is not None and result.consistency.p_value > 0.01
+    exact = calibrate(Run(seed=seed, dwells=24, count=50))  # every dwell of an encoder without noise is used
+    assert len(exact.visits) == 24

@@ -12,7 +12,8 @@ import pytest
 from click.testing import CliRunner
 from synthetic import Run
 
-from kf_calib.assessment import assessed, detectable, independent_tests
+from kf_calib import assessment
+from kf_calib.assessment import EQUAL, assessed, detectable, independent_tests, price
 from kf_calib.bench import Bench, axes_of
 from kf_calib.calibration import Calibration, calibrate
 from kf_calib.cli import cli
@@ -120,6 +121,27 @@ def test_smallest_sizes_are_met(runs: int) -> None:
         test = assessed(run(f"second-order={sizes['second-order']},0,0", seed=seed).fit)
         seen += test.consistent is False
     assert seen >= 0.7 * runs
+
+
+def test_noise_rarely_puts_a_rival_so_far_ahead_that_the_truth_is_out() -> None:
+    """Three coefficients each, spaces 0.1 rad apart, the truth of the size at which noise helps the rival most."""
+    angle, effects = 0.1, [effect_named(name, BENCH) for name in ("second-order", "scale-asymmetry")]
+    true = np.vstack([np.eye(3), np.zeros((3, 3))])
+    other = np.vstack([np.cos(angle) * np.eye(3), np.sin(angle) * np.eye(3)])
+    candidates = tuple(
+        Candidate(effect, basis, basis, basis, np.eye(3), np.zeros(3, bool), 1.0)
+        for effect, basis in zip(effects, (true, other), strict=True)
+    )
+    rng, out, ahead = np.random.default_rng(1), 0, 0
+    for _ in range(4000):
+        readings = rng.standard_normal(6)
+        readings[:3] = readings[3:] / np.tan(angle)  # no signal helps it more
+        found = Scan(candidates, readings)
+        scores = {str(c.effect): float(x) - price(c, 30.0) for c, x in zip(candidates, found.statistics, strict=True)}
+        test = assessment.Test(found, {"second-order": 0, "scale-asymmetry": 1}, scores, {}, None, "", 30.0, (), ())
+        out += "second-order" not in test.rivals("scale-asymmetry")
+        ahead += scores["scale-asymmetry"] - scores["second-order"] > EQUAL
+    assert out < 0.01 * 4000 + 3.0 * np.sqrt(40.0) and ahead > 0.05 * 4000
 
 
 def test_command_line(tmp_path: Path) -> None:
