@@ -175,12 +175,16 @@ class Improvement:
         verdict = self.found.verdict
         if self.because == "asked":
             return f"Ended by you. {verdict}"
+        far = max(self.spreads, key=lambda spread: spread.sigmas, default=None)
+        differ = f"; the twelve differ by up to {far.sigmas:.1f} sigma ({far.parameter.symbol})" if far else ""
         if self.because == "consistent":
-            return f"Nothing is left that noise would not leave (p {format_p(self.found.test.p_value)})."
+            settled = f"Nothing is left that noise would not leave (p {format_p(self.found.test.p_value)})."
+            if not self.alternatives:
+                return settled
+            names = " and ".join(each.name for each in self.alternatives)
+            return f"{settled} But {names} explain it equally well, and one was taken{differ}."
         if self.because == "ambiguous" and self.alternatives:
             names = " and ".join(each.name for each in self.alternatives)
-            far = max(self.spreads, key=lambda spread: spread.sigmas, default=None)
-            differ = f"; the twelve differ by up to {far.sigmas:.1f} sigma ({far.parameter.symbol})" if far else ""
             taken = "none was added (--accept-first takes the first)"
             return f"{names} explain what is left equally well: {taken}{differ}. {verdict}"
         if self.found.missing and self.because == "ambiguous":
@@ -189,10 +193,26 @@ class Improvement:
 
     @cached_property
     def alternatives(self) -> tuple[Alternative, ...]:
-        """The effects among which this run cannot choose, each refitted beside the model as it stands."""
-        if not _rivals(self.found):
-            return ()
-        return tuple(Alternative(name, self.found.refit_with(name)) for name in self.found.ambiguity)
+        """The effects among which this run cannot choose, each refitted beside the model as it stands.
+
+        Where one of them was taken: the model as it stands, then with each of the others in its place.
+        """
+        if _rivals(self.found):
+            return tuple(Alternative(name, self.found.refit_with(name)) for name in self.found.ambiguity)
+        out, inside = list[Alternative](), {str(effect): k for k, effect in enumerate(self.result.model.effects)}
+        for before, step in zip([self.start, *(step.found for step in self.steps)], self.steps, strict=False):
+            if step.name not in inside or step.name not in before.ambiguity:
+                continue
+            others = [name for name in before.ambiguity if name not in inside]
+            own = [Alternative(name, self._with_instead(inside[step.name], name)) for name in others]
+            own = [each for each in own if each.result.consistency.consistent is not False]
+            out += [Alternative(step.name, self.result), *own] if own else []
+        return tuple(out)
+
+    def _with_instead(self, place: int, name: str) -> Calibration:
+        effects = list(self.effects)
+        effects[place] = name
+        return refitted(self.result, tuple(effects))
 
     @cached_property
     def spreads(self) -> tuple[Spread, ...]:

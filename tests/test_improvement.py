@@ -97,6 +97,11 @@ def test_equal_explanations_are_left_to_a_person() -> None:
     first = improve(before, accept_first=True)
     assert [step.added for step in first.steps] == ["second-order"] and first.because == "consistent"
     assert "come out high" in first.steps[0].remarks[0]
+    assert [each.name for each in first.alternatives] == [each.name for each in state.alternatives]
+    assert [each.sigmas for each in first.spreads] == pytest.approx([each.sigmas for each in state.spreads], rel=0.01)
+    assert "second-order and scale-asymmetry" in first.reason and f"{widest.sigmas:.1f} sigma" in first.reason
+    other = stepped(state, "scale-asymmetry", None, "user")
+    assert other.alternatives[0].name == "scale-asymmetry" and other.alternatives[1].name == "second-order"
 
 
 def test_removals_are_the_rise_of_chi_squared(improved: Improvement) -> None:
@@ -180,7 +185,7 @@ def test_honest_errors_are_those_of_orientations_left_out() -> None:
 def test_sigmas_are_honest_after_improvement(runs: int) -> None:
     """NEES of the twelve over runs with a hidden effect: far outside its band before, inside after.
 
-    One in 20 may stop at unknown: of a hundred formulas one may explain more by chance.
+    Where another effect explains as much it stops and says by how much the twelve differ: no sigma covers that.
     """
     before, after = list[float](), list[float]()
     for seed in range(runs):
@@ -190,14 +195,14 @@ def test_sigmas_are_honest_after_improvement(runs: int) -> None:
         )  # fmt: skip
         source = source.hiding(parse(["second-order=15sigma"], BENCH.axes, seed=seed, sized=partial(sized, source)))
         truth = np.array(list(source.sensors.parameters.values()))
-        state = improve(calibrate(source), accept_first=True)
-        assert state.because in ("consistent", "unknown")
-        if state.because == "unknown":
+        state = improve(calibrate(source))
+        if state.because != "consistent":
+            assert state.because == "unknown" or "second-order" in state.found.ambiguity
             continue
         for nees, result in ((before, state.start.before), (after, state.result)):
             error = result.estimate.parameters - truth
             nees.append(float(error @ np.linalg.solve(result.estimate.parameter_covariance, error)))
-    assert len(after) >= 0.95 * runs
+    assert len(after) >= 0.5 * runs
     low, high = chi2.ppf([0.005, 0.995], 12 * len(after)) / len(after)
     print(f"NEES before {np.mean(before):.1f}, after {np.mean(after):.2f}, band {low:.2f}-{high:.2f}")
     assert np.mean(before) > 2.0 * high and low < np.mean(after) < high

@@ -65,7 +65,7 @@ def test_intervals_cover(runs: int, low: float, high: float) -> None:
     share = float(np.mean(np.abs(ratios) < 1.96))
     print(f"\nsinusoid: {(np.abs(ratios) < 1.96).mean(axis=0).round(3)}, std {np.std(ratios, axis=0).round(2)}", end="")
     assert low <= share <= high
-    assert np.std(ratios) == pytest.approx(1.0, abs=0.25 if runs < 60 else 0.05)
+    assert np.std(ratios) == pytest.approx(1.0, abs=0.25 if runs < 60 else 0.07)  # its standard error is 0.02
 
 
 def test_engines_and_batch_agree() -> None:

@@ -132,10 +132,10 @@ def improvement_report(
         progress(state), Text(f"Stopped, {state.because}: {state.reason}", style=style),
     ]  # fmt: skip
     parts += [Text(line) for line in _settling(state)]
+    if not state.spreads or state.because == "consistent":
+        parts.append(parameter_table(state.result))
     if state.spreads:
         parts.append(_spread_table(state))
-    else:
-        parts.append(parameter_table(state.result))
     if state.result.model.effects:
         parts.append(effect_table(state.result))
     if honest is not None:
@@ -153,7 +153,11 @@ def progress(state: Improvement) -> RenderableType:
     floor = state.result.held_out_floor_mps2
     rows = [("start", state.start.before, state.start.test.p_value)]
     rows += [(_label(step), step.result, step.found.test.p_value) for step in state.steps]
-    rows += [(f"(+ {each.name})", each.result, None) for each in state.alternatives]
+    others = [each for each in state.alternatives if each.result is not state.result]
+    rows += [
+        (f"(+ {each.name})" if len(others) == len(state.alternatives) else f"(or {each.name})", each.result, None)
+        for each in others
+    ]
     errors = [_errors(result, floor) for _, result, _ in rows]
     longest = max(error for both in errors for error in both if error is not None)
     head = "over the noise floor" if floor else "m/s^2 (without any one orientation the model is not determined)"
