@@ -198,3 +198,7 @@ class Disturbance:
     def __call__(self, state: State) -> None:
         if state.moving or not self.when_moving:
             state.reading_mps2 = state.reading_mps2 + self.process(len(state.time_s))
+
+
+class BiasWalk(Disturbance):
+    """One that moves the biases: where it ends, they are then."""

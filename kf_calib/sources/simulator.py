@@ -13,7 +13,7 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -25,10 +25,10 @@ from kf_calib.errors import InputError, KfCalibError
 from kf_calib.samples import Batch, Floats, Stream, Times
 from kf_calib.sources.gimbals import Motion, attitude
 from kf_calib.sources.hidden import Hidden, Rig, Stage, sizes_in_sigma, steps_of
-from kf_calib.sources.hidden.drift import walking
 from kf_calib.sources.noise_sources import Noise, generator
 from kf_calib.sources.physics import (
     Ambient,
+    BiasWalk,
     Disturbance,
     Gravity,
     Inputs,
@@ -132,7 +132,8 @@ class Simulation:
         """The parameters at the last reading, where the biases have walked there."""
         rig, noise = self._rig, Noise(walk_mps2_per_sqrt_s=self.noise.walk_mps2_per_sqrt_s)
         processes = noise.processes(self.seed, rig.period_s, rig.duration_s)
-        processes += [walking(np.array(each.sizes), rig) for each in self.hidden if each.kind.name == "bias-walk"]
+        hidden = chain.from_iterable(self._hidden_steps().values())
+        processes += [step.process for step in hidden if isinstance(step, BiasWalk)]
         if not processes:
             return {}
         counts = [min(self._batch_samples, len(self) - first) for first in range(0, len(self), self._batch_samples)]

@@ -9,8 +9,8 @@ import numpy as np
 from kf_calib.samples import Floats
 from kf_calib.sources.hidden.kinds import Rig, added, made
 from kf_calib.sources.hidden.terms import column
-from kf_calib.sources.noise_sources import FirstOrder, Process
-from kf_calib.sources.physics import Disturbance, State, Step
+from kf_calib.sources.noise_sources import FirstOrder
+from kf_calib.sources.physics import BiasWalk, State, Step
 
 
 @added("bias-drift", "m/s^2/s", ("1ug/h", "10ug/h"), ("10ug/min", "1mg/min"))
@@ -40,13 +40,8 @@ def sinusoid(k: Floats, state: State, *, frequency: float = 0.15, phase: float =
 @made("bias-walk", "m/s^2/s^(1/2)", ("0.01ug", "1ug"), ("1ug", "100ug"), signed=False)
 def bias_walk(q: Floats, rig: Rig) -> Step:
     """Random walk of the bias: q times the integral of white noise, q sqrt(t) after a time t (IEEE Std 952, K)."""
-    return Disturbance(walking(q, rig))
-
-
-def walking(q: Floats, rig: Rig) -> Process:
-    """The path of ``bias-walk``, fresh from its start."""
     walk = FirstOrder(rig.generator("bias-walk"), 1.0, math.sqrt(rig.period_s), 0.0)
-    return lambda count: q * walk(count)
+    return BiasWalk(lambda count: q * walk(count))
 
 
 @made("vibration-rectification", "1/(m/s^2)", ("10ug/g^2", "50ug/g^2"), ("0.1mg/g^2", "3mg/g^2"), accompanied=True)
