@@ -19,12 +19,14 @@ from kf_calib.prospect import Prospect
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 
+ENOUGH = 6.0
+"""Sigma apart: of two equally likely the wrong one is taken once in a thousand, and more tells no more."""
+
 _POSES = 640
 _STEP_DEG = 5.0
 _STEPS = 12
 _WAY_S = 10.0  # to the next orientation, where there has been none
 _TOLD = 0.1  # sigma: effects that are less apart after any next dwell are told apart by none
-_ENOUGH = 6.0  # sigma apart: of two equally likely the wrong one is taken once in a thousand
 _MOVE = 3.0  # dwells: what it costs to go somewhere and stay for one
 _WAITS = (0.0, 0.25, 1.0)  # of the run so far, that may be spent where it goes next
 
@@ -62,7 +64,7 @@ def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequen
     every = list(each.values()) or [_separations(fitted, one, coefficients, [], poses, waits_s)]
     before, after = min(own[0] for own in every), np.min([own[1] for own in every], axis=0)
     dwell_s = _each_s(fitted)
-    useful = np.minimum(after, _ENOUGH) if before < _ENOUGH else after[:1]
+    useful = np.minimum(after, ENOUGH) if before < ENOUGH else after[:1]
     gain = (useful**2 - before**2) / (_MOVE * dwell_s + waits_s[: len(useful)])[:, None]
     wait, best = np.unravel_index(int(np.argmax(gain)), gain.shape)
     stay_s = float(waits_s[wait] + dwell_s) if wait else None

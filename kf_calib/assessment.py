@@ -25,9 +25,10 @@ LEVEL = 0.01
 """Chance of a false alarm a run."""
 
 SHARE = 0.4
-"""Of the chance of a false alarm: the misfit's and the scan's; lines and trends within dwells halve the rest."""
+"""Of the chance of a false alarm: the misfit's, and the scan's."""
 
 REST = 0.5 * (1.0 - 2.0 * SHARE)
+"""The lines', and the trends'."""
 
 EQUAL = 6.63
 """Suspects whose chi-squared is this close to the best cannot be told from it (1 %, 1 dof)."""

@@ -106,7 +106,7 @@ def _trend_beside(fitted: Fit, family: Family) -> Trend | None:
     model = fitted.carried.model
     for formula in family.formulas:
         model += effect_named(formula, model.bench)
-    return trend_of(fit(fitted.dwells, model))
+    return trend_of(fit(fitted.dwells, model, fitted.noise.walk_mps2_per_sqrt_s, fitted.carried.slews))
 
 
 def families(fitted: Fit, known: Sequence[Effect] = ()) -> tuple[list[Family], float]:

@@ -149,12 +149,10 @@ def _alike(total: Autocovariance) -> tuple[Floats, Floats]:
     Where they are too short to tell, it is taken to be as slow as they allow.
     """
     varying = total.products[0] > 0
-    shapes = total.products[:, varying] / total.products[0, varying]
-    pooled = replace(total, products=shapes.mean(axis=1, keepdims=True), count=total.count * int(varying.sum()))
-    pooled = replace(pooled, blocks=total.blocks * int(varying.sum()))
-    scaled = replace(pooled, products=pooled.products * total.pairs[0])
-    kappa, variance = _inflation(scaled, 0)
-    size = total.count / total.blocks
+    channels, size = int(varying.sum()), total.count / total.blocks
+    shape = np.mean(total.products[:, varying] / total.products[0, varying], axis=1, keepdims=True)
+    pooled = Autocovariance(shape * total.pairs[0], total.pairs, total.count * channels, total.blocks * channels)
+    kappa, variance = _inflation(pooled, 0)
     kappa = max(kappa, size / _LONGEST) if size < TOO_SHORT * kappa else kappa
     return np.where(varying, kappa, 1.0), variance * total.products[0] / total.pairs[0]
 

@@ -40,6 +40,7 @@ import click
 import numpy as np
 from best_possible import best_possible
 
+from kf_calib.advice import ENOUGH
 from kf_calib.errors import KfCalibError
 from kf_calib.samples import Floats
 from kf_calib.scan import Candidate
@@ -86,7 +87,6 @@ _DWELL_S = float(BENCH[BENCH.index("--dwell-s") + 1])
 _POWER = (0.86, 0.94)
 _SECOND = 5_000_000  # from the seed of a run to that of its second run
 _BENCH_SIZES = (10, 15, 30)  # sigma
-_TOLD = 6.0  # sigma apart: of two the wrong one is taken once in a thousand, and more tells no more
 _ENOUGH = 20  # trials; fewer are shown and not judged
 
 Hit = TypeVar("Hit", bool, float)
@@ -886,7 +886,7 @@ def _covered(where: str, own: list[Outcome], judged: bool = True) -> Iterator[Fi
 
 
 def _advice(_: str, own: list[Outcome]) -> Iterator[Figure]:
-    for most, words in ((_TOLD, f", up to {_TOLD:g} sigma"), (math.inf, "")):
+    for most, words in ((ENOUGH, f", up to {ENOUGH:g} sigma"), (math.inf, "")):
         pairs = [[min(each.extra.get(key, 0.0), most) for key in ("advised", "random")] for each in own]
         ratios = [advised / max(random, 1e-9) for advised, random in pairs]
         yield rate(f"4 advised separate an ambiguous pair as well as 12 random{words}", [x >= 1.0 for x in ratios])
