@@ -108,6 +108,20 @@ def test_lines_round_trip(run, recording: Path, tmp_path: Path) -> None:
         assert one["value"] == pytest.approx(other["value"], abs=1e-3 * one["sigma"])
 
 
+def test_recording_says_how_long_it_is_and_what_will_not_be_used(run, tmp_path: Path) -> None:
+    """Stamps begin at zero, and one jumps back."""
+    table, out = tmp_path / "lines.csv", tmp_path / "lines.mcap"
+    stamps = [0.1 * k if k != 150 else 2.0 for k in range(300)]
+    rows = [f"{stamp:.2f},0,0,1,0,0,0" for stamp in stamps]
+    table.write_text("\n".join(["time_s,ax_g,ay_g,az_g,outer_deg,middle_deg,inner_deg", *rows]) + "\n")
+    words = "record", out, table, "--axes", "y z x", "--gravity", "9.81"
+    code, said, err = run(*words)
+    assert code == 0, err
+    assert "300 readings, 1 dwell, 30 s" in said and "stamps jumped back (first at 14.900 s), dropped: 1" in said
+    told = json.loads(run(*words, "--overwrite", "--json")[1])
+    assert told["duration_s"] == pytest.approx(29.9) and len(told["warnings"]) == 2
+
+
 def test_the_bench_from_a_toml_file(run, recording: Path, tmp_path: Path) -> None:
     toml = tmp_path / "bench.toml"
     toml.write_text("gravity_mps2 = 9.9\nangle_sigma_deg = 0.5\n[nominal]\ntheta1 = 0.25\n")

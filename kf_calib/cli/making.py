@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -116,8 +116,24 @@ def simulation_options(command: F) -> F:
     return command
 
 
-def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], None]) -> tuple[int, int, float]:
-    """Write a source to a recording, a chunk closed at the end of each dwell; readings, dwells, seconds."""
+class _Recorded(NamedTuple):
+    """notes: what an evaluation will not use of it."""
+
+    readings: int
+    dwells: int
+    duration_s: float
+    notes: list[str]
+
+    def __str__(self) -> str:
+        return f"{self.readings} readings, {self.dwells} dwell{'s' * (self.dwells != 1)}, {self.duration_s:.0f} s"
+
+    @property
+    def keys(self) -> dict[str, Any]:
+        return {"samples": self.readings, "dwells": self.dwells, "duration_s": self.duration_s}
+
+
+def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], None]) -> _Recorded:
+    """Write a source to a recording as it is, a chunk closed at the end of each dwell."""
     from kf_calib.dwells import Segmenter
     from kf_calib.sources.recorder import Recorder
 
@@ -137,7 +153,9 @@ def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], 
             tick(source.fraction)
         for _ in segmenter.finish():
             pass
-    return readings, segmenter.dwell_count, (last_ns - (first_ns or last_ns)) / 1e9
+    duration_s = 0.0 if first_ns is None else (last_ns - first_ns) / 1e9
+    notes = [f"recorded, and not used when it is evaluated: {text}" for text in segmenter.tally.sentences()]
+    return _Recorded(readings, segmenter.dwell_count, duration_s, notes)
 
 
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace the file if it exists.")
@@ -155,19 +173,12 @@ def simulate(out: Path, overwrite: bool, as_json: bool, **options: Any) -> None:
 
     source = simulation(options, overrides(options))
     with progress(f"simulating {out.name}", as_json) as tick:
-        readings, dwells, duration_s = _record(source, out, overwrite, tick)
+        made = _record(source, out, overwrite, tick)
     truth = source.write_truth(out)
-    content = {
-        "recording": str(out),
-        "truth": str(truth),
-        "samples": readings,
-        "dwells": dwells,
-        "duration_s": duration_s,
-    }
     if as_json:
-        print_json(content)
+        print_json({"recording": str(out), "truth": str(truth), **made.keys})
     else:
-        click.echo(f"{out}: {readings} readings, {dwells} dwells, {duration_s:.0f} s; truth in {truth}")
+        click.echo(f"{out}: {made}; truth in {truth}")
 
 
 @click.command()
@@ -186,16 +197,13 @@ def record(
     renamed = dict(pair(text) for text in columns)
     source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, overrides(options), renamed)
     with progress(f"recording {out.name}", as_json or str(lines) == "-") as tick:
-        readings, dwells, duration_s = _record(source, out, overwrite, tick)
-    content = {
-        "recording": str(out), "samples": readings, "dwells": dwells, "duration_s": duration_s,
-        "warnings": source.warnings,
-    }  # fmt: skip
+        made = _record(source, out, overwrite, tick)
+    warnings = [*source.warnings, *made.notes]
     if as_json:
-        print_json(content)
+        print_json({"recording": str(out), **made.keys, "warnings": warnings})
         return
-    click.echo(f"{out}: {readings} readings, {dwells} dwells, {duration_s:.0f} s")
-    for warning in source.warnings:
+    click.echo(f"{out}: {made}")
+    for warning in warnings:
         click.echo(f"Note: {warning}")
 
 
@@ -220,7 +228,7 @@ def demo(folder: Path, as_json: bool) -> None:
     options = simulate.make_context("simulate", [str(recording)]).params
     source = simulation(options | {"dwell_s": 15.0, "slew_degps": 90.0, "seed": 2019}, overrides(options))
     with progress("recording a simulated run", as_json) as tick:
-        readings, dwells, duration_s = _record(source, recording, True, tick)
+        made = _record(source, recording, True, tick)
         truth = source.write_truth(recording)
     with progress("replaying and comparing", as_json):
         compared = run(Recording(recording))
@@ -233,9 +241,7 @@ def demo(folder: Path, as_json: bool) -> None:
         return
     from kf_calib.views.console import comparison_table, summary
 
-    click.echo(
-        f"Recorded a simulated bench run to {recording}: {readings} readings, {dwells} dwells, {duration_s:.0f} s.\n"
-    )
+    click.echo(f"Recorded a simulated bench run to {recording}: {made}.\n")
     show(summary(compared.result))
     click.echo()
     show(comparison_table(compared))

@@ -207,7 +207,10 @@ class McapFile:
             if not self.size:
                 raise InputError(f"{path} is empty: nothing was recorded in it.")
             if file.read(len(MAGIC)) != MAGIC:
-                raise InputError(f"{path} is not an MCAP file (its first bytes differ): give a .mcap recording.")
+                raise InputError(
+                    f"{path} is not an MCAP file (its first bytes differ): give one, or have kf-calib record make one "
+                    "of CSV or JSON lines."
+                )
             try:
                 self.summary = Summary.read(file, self.size)
             except DamagedError as damage:
