@@ -172,24 +172,22 @@ class Improvement:
     @cached_property
     def reason(self) -> str:
         """The same in a sentence or two."""
-        verdict = self.found.verdict
-        if self.because == "asked":
-            return f"Ended by you. {verdict}"
+        verdict, names = self.found.verdict, " and ".join(each.name for each in self.alternatives)
         far = max(self.spreads, key=lambda spread: spread.sigmas, default=None)
         differ = f"; the twelve differ by up to {far.sigmas:.1f} sigma ({far.parameter.symbol})" if far else ""
-        if self.because == "consistent":
-            settled = f"Nothing is left that noise would not leave (p {format_p(self.found.test.p_value)})."
-            if not self.alternatives:
-                return settled
-            names = " and ".join(each.name for each in self.alternatives)
-            return f"{settled} But {names} explain it equally well, and one was taken{differ}."
-        if self.because == "ambiguous" and self.alternatives:
-            names = " and ".join(each.name for each in self.alternatives)
+        rivals = _rivals(self.found)
+        if rivals and self.because == "ambiguous":
             taken = "none was added (--accept-first takes the first)"
             return f"{names} explain what is left equally well: {taken}{differ}. {verdict}"
+        equals = f" But {names} explain it equally well, and one was taken{differ}." if names and not rivals else ""
+        if self.because == "asked":
+            return f"Ended by you. {verdict}{equals}"
+        if self.because == "consistent":
+            p_value = format_p(self.found.test.p_value)
+            return f"Nothing is left that noise would not leave (p {p_value}).{equals}"
         if self.found.missing and self.because == "ambiguous":
-            return f"{verdict} Others would do as well: none was added (--accept-first takes the first)."
-        return verdict
+            return f"{verdict} Others would do as well: none was added (--accept-first takes the first).{equals}"
+        return f"{verdict}{equals}"
 
     @cached_property
     def alternatives(self) -> tuple[Alternative, ...]:

@@ -132,7 +132,7 @@ def improvement_report(
         progress(state), Text(f"Stopped, {state.because}: {state.reason}", style=style),
     ]  # fmt: skip
     parts += [Text(line) for line in _settling(state)]
-    if not state.spreads or state.because == "consistent":
+    if not state.spreads or state.because != "ambiguous":
         parts.append(parameter_table(state.result))
     if state.spreads:
         parts.append(_spread_table(state))
