@@ -35,15 +35,17 @@ EQUAL = 6.63
 
 
 @functools.cache
-def lead(dof: int) -> float:
+def lead(dof: int, tried: int = 1) -> float:
     """By so much noise lets an effect explain more than the one that is really missing, in 1 of 100 runs at most.
+
+    tried: it is the best of so many values of its constant.
 
     Where the missing effect's space and the other's make angles a, the other's fall less its own is the sum over them
     of (x cos a + n sin a)^2 - x^2, which is largest at x = n / tan a, and n^2 there: chi-squared of the other's dof.
     """
     from scipy.special import chdtri
 
-    return float(chdtri(dof, 0.01))
+    return float(chdtri(dof, 0.01 / tried))
 
 
 _DRAWS = 4000
@@ -124,7 +126,8 @@ class Test:
 
     def rivals(self, first: str) -> list[str]:
         """Effects that noise could have let the first get ahead of, the likeliest first."""
-        ahead = lead(self.candidate(first).dof if first in self.best else 1)
+        own = self.candidate(first) if first in self.best else None
+        ahead = lead(own.dof + (own.effect.unknown is not None), own.tried) if own else lead(1)
         out = list[str]()
         for name in self.ranked:
             behind = self.scores[first] - self.nearness(name)

@@ -28,7 +28,7 @@ from kf_calib.trace import Cells, Trace, tone
 from kf_calib.triangle import triangle
 from kf_calib.walk import Path, path
 
-_VIBRATING = 25.0  # mean squared deviation of the variances in their own sigma; autocorrelation alone makes up to 10
+_VIBRATING = 15.0  # mean squared deviation of the variances in their own sigma; autocorrelation alone makes up to 10
 _LAGS = 64
 _CORRELATED_SAMPLES = 8192  # readings of a dwell whose autocovariance is accumulated
 
