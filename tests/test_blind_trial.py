@@ -257,3 +257,15 @@ def test_trials_go_on_where_they_stopped_and_are_pooled(
     table = run(every, "--no-trials", "--pool", str(kept), "--pool", str(other), "--markdown", str(tmp_path / "t.md"))
     assert not played and "right name first, n = 8" in table
     assert "| right name first, n = 8 | 1.000 | 0.398 to 1.000 | 4 |" in (tmp_path / "t.md").read_text()
+
+
+def test_a_rival_of_the_best_of_many_frequencies_is_not_left_out(trial: Any) -> None:
+    """The temperature swings, and a sinusoid of just its period explains a little more than the rate of temperature."""
+    options = (
+        "--grade", "mems", "--orientations", "36", "--dwell-s", "120", "--sample-hz", "10", "--angle-hz", "4",
+        "--slew-degps", "60", "--temperature-swing", "10", "--temperature-period-s", "700", "--warm-up-c", "0",
+        "--axes", "y x", "--ar1", "0.5",
+    )  # fmt: skip
+    task = trial.Task("benches@one", "diagnose", 2611311100044, ("thermal-rate=15sigma",), options, "0.002")
+    told = trial.played(task)
+    assert told.first == "sinusoid" and told.held, told.ambiguity
