@@ -632,8 +632,11 @@ def _remarks(
             f"the dwells scatter about the model by more than the noise (p {format_p(judged.p_value)}): an effect is "
             "missing in the model, or noise from dwell to dwell was not stated (angle_sigma_deg, scatter_sigma_mps2)."
         )
-    if noise.inflation.max() > 1.5:
-        kappa = ", ".join(f"{value:.3g}" for value in noise.inflation)
+    windows = (
+        2.0 * float(averaging.correlations().sum()) - 1.0 if dwells[0].averaged else 1.0
+    )  # of averages of white noise
+    if noise.inflation.max() > 1.5 * windows:
+        kappa = ", ".join(f"{value / windows:.3g}" for value in noise.inflation)
         usual = float(np.median([dwell.count for dwell in dwells]))
         short = not dwells[0].averaged and usual < TOO_SHORT * noise.inflation.max()
         slow = "; dwells are too short to tell how slow it is: stay longer in each" if short else ""
