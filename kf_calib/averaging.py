@@ -45,6 +45,12 @@ def correlations() -> Floats:
     return np.array([own @ weights[-len(own) :] for own in shifted]) / (weights @ weights)
 
 
+@cache
+def inflation() -> float:
+    """kappa of averages of white noise: their spectral density at zero frequency over that of their variance."""
+    return float(2.0 * correlations().sum() - 1.0)
+
+
 def averaged(block: Block, length_s: float = WINDOW_S) -> Block | None:
     """A block of averages over windows cos^4, with the variance of the readings in each; None: it is too short.
 

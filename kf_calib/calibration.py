@@ -632,9 +632,7 @@ def _remarks(
             f"the dwells scatter about the model by more than the noise (p {format_p(judged.p_value)}): an effect is "
             "missing in the model, or noise from dwell to dwell was not stated (angle_sigma_deg, scatter_sigma_mps2)."
         )
-    windows = (
-        2.0 * float(averaging.correlations().sum()) - 1.0 if dwells[0].averaged else 1.0
-    )  # of averages of white noise
+    windows = averaging.inflation() if dwells[0].averaged else 1.0
     if noise.inflation.max() > 1.5 * windows:
         kappa = ", ".join(f"{value / windows:.3g}" for value in noise.inflation)
         usual = float(np.median([dwell.count for dwell in dwells]))

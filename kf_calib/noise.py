@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kf_calib import walk
+from kf_calib import averaging, walk
 from kf_calib.autoregression import expected_products, unbiased
-from kf_calib.averaging import correlations
 from kf_calib.folding import Autocovariance, DwellFactor, Means
 from kf_calib.samples import Floats
 
@@ -161,12 +160,11 @@ def _of_averages(total: Autocovariance, channel: int) -> tuple[float, float]:
     """The same of averages over windows that overlap: of few what white noise makes, of many no less."""
     if not total.count:
         return 1.0, 0.0
-    size, lags = round(total.count / total.blocks), correlations()
-    kappa = float(2.0 * lags.sum() - 1.0)
+    size, kappa = round(total.count / total.blocks), averaging.inflation()
     if size >= _AVERAGES:
         found, variance = _inflation(total, channel)
         return max(found, kappa), variance
-    kept = expected_products(np.append(lags, np.zeros(size))[:size], 0)[0] / size
+    kept = expected_products(np.append(averaging.correlations(), np.zeros(size))[:size], 0)[0] / size
     return kappa, float(total.products[0, channel] / total.pairs[0] / max(kept, 1e-3))
 
 

@@ -154,10 +154,8 @@ def progress(state: Improvement) -> RenderableType:
     rows = [("start", state.start.before, state.start.test.p_value)]
     rows += [(_label(step), step.result, step.found.test.p_value) for step in state.steps]
     others = [each for each in state.alternatives if each.result is not state.result]
-    rows += [
-        (f"(+ {each.name})" if len(others) == len(state.alternatives) else f"(or {each.name})", each.result, None)
-        for each in others
-    ]
+    word = "+" if len(others) == len(state.alternatives) else "or"  # to add one, or in the place of the one taken
+    rows += [(f"({word} {each.name})", each.result, None) for each in others]
     errors = [_errors(result, floor) for _, result, _ in rows]
     longest = max(error for both in errors for error in both if error is not None)
     head = "over the noise floor" if floor else "m/s^2 (without any one orientation the model is not determined)"
