@@ -12,6 +12,7 @@ from kf_calib import paper
 from kf_calib.effects import Effect
 from kf_calib.fitting import Fit
 from kf_calib.folding import candidate_columns
+from kf_calib.held_out import SAME_POSE_DEG
 from kf_calib.information import accumulated, whitened
 from kf_calib.model import STATE_COUNT
 from kf_calib.noise import Noise, steps
@@ -173,14 +174,18 @@ def _sigmas(factors: Floats, jacobian: Floats) -> Floats:
 
 
 def _poses(fitted: Fit) -> Floats | None:
-    """Gimbal angles (m, k) to choose from, rad: multiples of 45 deg and a spread of others; None without gimbals."""
+    """Gimbal angles (m, k) to choose from, rad: multiples of 45 deg and a spread of others, but not where the platform
+    is, which would not be set anew; None without gimbals."""
     count = len(fitted.carried.model.bench.axes)
     if not count:
         return None
     rng = np.random.default_rng(0)
     coarse = rng.integers(-4, 4, (_POSES // 2, count)) * 45.0
     fine = np.round(rng.uniform(-180.0, 180.0, (_POSES // 2, count)) / _STEP_DEG) * _STEP_DEG
-    return np.radians(np.concatenate([coarse, fine]))
+    poses = np.radians(np.concatenate([coarse, fine]))
+    turn = poses - fitted.dwells[-1].pose
+    apart = np.abs((turn + np.pi) % (2.0 * np.pi) - np.pi).max(axis=1)
+    return poses[apart > np.radians(SAME_POSE_DEG)]
 
 
 def _with_next(

@@ -48,6 +48,13 @@ def lead(dof: int, tried: int = 1) -> float:
     return float(chdtri(dof, 0.01 / tried))
 
 
+def ahead_of(candidate: Candidate | None) -> float:
+    """The lead of a candidate, its constant being looked for, too; None: a walk, a line, of one number."""
+    if candidate is None:
+        return lead(1)
+    return lead(candidate.dof + (candidate.effect.unknown is not None), candidate.tried)
+
+
 _DRAWS = 4000
 _POWER = 0.9
 _FEWEST_WALKED = 8  # dwells: a walk of the biases is looked for in that many
@@ -126,9 +133,7 @@ class Test:
 
     def rivals(self, first: str) -> list[str]:
         """Effects that noise could have let the first get ahead of, the likeliest first."""
-        own = self.candidate(first) if first in self.best else None
-        ahead = lead(own.dof + (own.effect.unknown is not None), own.tried) if own else lead(1)
-        out = list[str]()
+        ahead, out = ahead_of(self.candidate(first) if first in self.best else None), list[str]()
         for name in self.ranked:
             behind = self.scores[first] - self.nearness(name)
             if first in self.best and name in self.best:  # more coefficients cost what chance gives them, at most
@@ -198,7 +203,7 @@ def _scanned(fitted: Fit) -> Scan:
     effect = _oscillation(carried.model)
     if effect is None or carried.model.oscillates:
         return scan(carried, noise, candidates(carried.model))
-    values = _slow(fitted, effect)
+    values = slow_hz(fitted, effect)
     if not len(values):
         return scan(carried, noise, candidates(carried.model))
     coarse = falls(carried, noise, [effect.at(value) for value in values])
@@ -215,7 +220,7 @@ def _oscillation(model: Model) -> Effect | None:
     return next((effect for effect in every if effect.oscillates), None)
 
 
-def _slow(fitted: Fit, effect: Effect) -> Floats:
+def slow_hz(fitted: Fit, effect: Effect) -> Floats:
     """Frequencies of oscillations too slow to show within dwells, in halves of 1/run: from a cycle a run up."""
     stimulus = stimulus_of(fitted.dwells, fitted.carried.model.bench, fitted.carried.state)
     values = effect.grid(stimulus)[2::2]
@@ -235,7 +240,7 @@ def _with_lines(test: Test, fitted: Fit) -> Test:
     effect = _oscillation(fitted.carried.model)
     if effect is None or fitted.carried.model.oscillates:
         return replace(test, trend=trend(fitted))
-    name, slow, (low, high, first) = str(effect), _slow(fitted, effect), _searched_hz(fitted.dwells)
+    name, slow, (low, high, first) = str(effect), slow_hz(fitted, effect), _searched_hz(fitted.dwells)
     top = float(slow[-1]) if len(slow) else low
     gaps = [(top, low), (high, first)] if np.isfinite(low) else [(top, first)]
     bands = [f"of {a:.2g} to {b:.2g} Hz" if np.isfinite(b) else f"above {a:.2g} Hz" for a, b in gaps if b > 1.5 * a]

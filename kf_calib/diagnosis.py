@@ -21,7 +21,7 @@ from kf_calib.assessment import EQUAL, LEVEL, SHARE, Test, assessed, price, run_
 from kf_calib.calibration import Calibration, Parameter, format_p, refitted
 from kf_calib.drivers import JUMP, Family, families
 from kf_calib.effects import walk_named
-from kf_calib.fitting import WALK, behind_within
+from kf_calib.fitting import WALK, back_gain, behind_within
 from kf_calib.likelihood import FEWEST
 from kf_calib.noise import mean_covariances
 from kf_calib.pairs import MOST, WALKS, Pair, Pairs, alike, as_good, exchanged, likeliest, names_of, pairs_of
@@ -173,7 +173,7 @@ def _beside_lines(found: Diagnosis) -> Diagnosis | None:
     after = with_effects(found.before, both)  # alone, an oscillation may have been drawn to what the others explain
     return replace(
         rest, before=found.before, test=test, suspects=found.suspects, missing=both, ambiguity=ambiguity,
-        after=after if _fits(after, test) else rest.after,
+        after=after if _fits(after, test, len(both)) else rest.after,
     )  # fmt: skip
 
 
@@ -242,7 +242,7 @@ def _one(found: Diagnosis, first: Suspect, pairs: Pairs) -> Diagnosis:
 
 
 def _both_fit(found: Diagnosis, names: tuple[str, str]) -> bool:
-    return _fits(with_effects(found.before, names), found.test)
+    return _fits(with_effects(found.before, names), found.test, len(names))
 
 
 def _beside(found: Diagnosis, together: Sequence[tuple[str, str]]) -> Diagnosis:
@@ -299,7 +299,7 @@ def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:
         if not _beyond_scatter(found.before, test, both):
             continue
         refit = with_effects(found.before, both)
-        if not _fits(refit, test):
+        if not _fits(refit, test, len(both)):
             continue
         if _outdone(found, refit, both):
             return None
@@ -344,15 +344,20 @@ def _suspects(before: Calibration, test: Test) -> tuple[Suspect, ...]:
     return tuple(out)
 
 
-def _fits(refit: Calibration, before: Test) -> bool:
-    """Whether nothing is left that noise would not leave, by means an effect of that kind has."""
-    misfit = refit.consistency.p_value
-    least = LEVEL if refit.noise.walk_mps2_per_sqrt_s else _REFUSED  # a walk explains much that is none
-    if (misfit is not None and misfit < SHARE * least) or _leaps(refit) or _at_an_end(refit):
+def _fits(refit: Calibration, before: Test, added: int = 1) -> bool:
+    """Whether nothing is left that noise would not leave, by means an effect of that kind has.
+
+    A walk, or two effects ``added`` at once, can take up most of what is neither: what is left is judged more strictly.
+    """
+    misfit, walks = refit.consistency.p_value, bool(refit.noise.walk_mps2_per_sqrt_s)
+    least = LEVEL if walks else _REFUSED
+    if (misfit is not None and misfit < SHARE * least) or (walks and _no_walk(refit)) or _at_an_end(refit):
         return False
     left = assessed(refit.fit, before.effective_tests)
-    if left.trend and misfit is not None and _together(misfit, left.trend.p_value) < SHARE * least:
-        return False
+    if left.trend and misfit is not None:
+        free = walks or added > 1
+        if _together(misfit, left.trend.p_value) < SHARE * (LEVEL if free else _REFUSED):
+            return False
     return left.p_value is None or left.p_value >= least
 
 
@@ -373,15 +378,15 @@ def _at_an_end(refit: Calibration) -> bool:
     return False
 
 
-def _leaps(refit: Calibration) -> bool:
-    """Whether walking biases take a step no walk would: one jump is not a walk."""
+def _no_walk(refit: Calibration) -> bool:
+    """Whether walking biases take a step no walk would, as in one jump, or come back as none does: what goes to and fro
+    between bounds is none."""
     from scipy.special import ndtr
 
-    if not refit.noise.walk_mps2_per_sqrt_s:
-        return False
     steps = np.array([visit.innovation_mps2 / visit.innovation_sigma_mps2 for visit in refit.visits])
     steps = np.abs(steps[np.isfinite(steps)])
-    return bool(steps.size and run_level(2.0 * float(ndtr(-steps.max())), steps.size) < LEVEL)
+    leaps = bool(steps.size and run_level(2.0 * float(ndtr(-steps.max())), steps.size) < LEVEL)
+    return leaps or 2.0 * back_gain(refit.fit)[0] > EQUAL
 
 
 def with_effects(before: Calibration, added: Sequence[str]) -> Calibration:

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kf_calib.assessment import EQUAL
 from kf_calib.bench import Bench
 from kf_calib.effects import Effect, effect_named, walk_named
 from kf_calib.errors import InputError
-from kf_calib.fitting import Fit, fit, walk_gain
+from kf_calib.fitting import Fit, back_gain, fit, walk_gain
 from kf_calib.folding import DwellFactor
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
@@ -25,6 +26,9 @@ _DECAYS_S = (10, 30, 100, 300)
 _JUMPS = 100  # at most
 
 JUMP = "time (a jump)"
+DECAY = "time (a decay)"
+ARRIVAL = "time since arrival"
+PERIODIC = "time (periodic)"
 IRREGULAR = "nothing that was recorded (irregular from dwell to dwell)"
 WITHIN = "time (irregular, within dwells too)"
 
@@ -45,7 +49,8 @@ class Description:
 
 @dataclass(frozen=True)
 class Family:
-    """Formulas with one driver, as a candidate of its own; fall: of chi-squared, with all of them; dof: what they see.
+    """Formulas with one driver, as a candidate of its own; fall: of chi-squared, with all of them; dof: what they see,
+    and one where the moment of a jump, a time constant or a period is looked for, as an effect's constant (``price``).
 
     falls: with each of them alone; formulas: as they can be added. known: each of them is what some known effect is,
     or nearly.
@@ -85,8 +90,9 @@ def described(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Des
     name = "" if fitted.carried.model.walks else walk_named(fitted.carried.model.bench)
     within = name and _goes_on(trend) and (best.score <= 0.0 or _goes_on(_trend_beside(fitted, best)))
     if name and (within or irregular - float(chdtri(1, _CHANCE)) > max(best.score, 0.0)):
-        share = irregular / max(excess, irregular, 1.0)
-        return Description(_channel(residuals), WITHIN if within else IRREGULAR, share, (name,))
+        share, back_s = irregular / max(excess, irregular, 1.0), _back_s(fitted, name)
+        driver = f"time (irregular, back within about {float(f'{back_s:.1g}'):g} s)" if back_s else IRREGULAR
+        return Description(_channel(residuals), WITHIN if within and not back_s else driver, share, (name,))
     if best.score <= 0.0:
         return None
     order = np.argsort(best.falls)[::-1]
@@ -94,6 +100,17 @@ def described(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Des
     formulas = tuple(_named(best.texts[k], number) for number, k in enumerate(order[:enough]))
     share = min((best.fall - best.dof) / excess, 1.0) if excess > 0.0 else 1.0
     return Description(_channel(residuals), best.driver, share, formulas)
+
+
+def _back_s(fitted: Fit, walk: str) -> float | None:
+    """With which time constant what goes to and fro comes back, s; None where it does so at random from dwell to dwell,
+    or as a walk of the biases does."""
+    model = fitted.carried.model
+    walked = fit(fitted.dwells, model + effect_named(walk, model.bench), 0.0, fitted.carried.slews)
+    if 2.0 * walk_gain(fitted)[1] < EQUAL or not walked.noise.walk_mps2_per_sqrt_s:
+        return None
+    gain, back_s = back_gain(walked)
+    return back_s if 2.0 * gain > EQUAL else None
 
 
 def _goes_on(trend: Trend | None) -> bool:
@@ -125,6 +142,7 @@ def families(fitted: Fit, known: Sequence[Effect] = ()) -> tuple[list[Family], f
         parts = scanned.candidates[own]
         same = all(any(part.within(each, _SAME) for each in beside) for part in parts)
         fall, dof = scanned.explained(np.concatenate([part.basis for part in parts], axis=1))
+        dof += dof > 0 and driver in (JUMP, DECAY, ARRIVAL, PERIODIC)
         out.append(Family(driver, tuple(texts), fall, dof, tuple(scanned.statistics[own].tolist()), same))
     return out, float(scanned.residual @ scanned.residual) - len(scanned.residual)
 
@@ -178,12 +196,12 @@ def _of_time(dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
         yield JUMP, [f"t > {moment_s:.6g}*s"]
     duration_s = dwells[-1].end_s
     for decay_s in _DECAYS_S:
-        yield "time (a decay)", [f"exp(-t/({10 * decay_s}*s))"]
-        yield "time since arrival", [f"exp(-tau/({decay_s}*s))"]
-        yield "time since arrival", [f"{axis}*exp(-tau/({decay_s}*s))" for axis in ("fx", "fy", "fz")]
+        yield DECAY, [f"exp(-t/({10 * decay_s}*s))"]
+        yield ARRIVAL, [f"exp(-tau/({decay_s}*s))"]
+        yield ARRIVAL, [f"{axis}*exp(-tau/({decay_s}*s))" for axis in ("fx", "fy", "fz")]
     for turns in (0.5, 1, 1.5, 2, 3, 4, 6, 8):
         waves = [f"{wave}({turns}*2*pi*t/({duration_s:.0f}*s))" for wave in ("sin", "cos")]
-        yield "time (periodic)", waves
+        yield PERIODIC, waves
 
 
 def _of_surroundings(bench: Bench) -> Iterator[tuple[str, list[str]]]:

@@ -19,7 +19,7 @@ from kf_calib import information
 from kf_calib.bench import Bench
 from kf_calib.effects import Coefficient, Effect
 from kf_calib.folding import Carried, DwellFactor, candidate_columns, stimulus_of
-from kf_calib.likelihood import gain_of, wandering, with_dwell_parts
+from kf_calib.likelihood import gain_of, held_gain, wandering, with_dwell_parts
 from kf_calib.model import Model, on_basis
 from kf_calib.noise import FLOOR_MPS2, Noise, steps, within_dwells
 from kf_calib.samples import Floats
@@ -254,3 +254,11 @@ def walk_gain(fitted: Fit) -> tuple[float, float]:
     means, prior = wandering(carried.dwells, noise, carried.means)
     walk, scatter = (gain_of(part, noise, means, carried.state, prior) for part in ("walk", "scatter"))
     return walk, walk - scatter
+
+
+def back_gain(fitted: Fit) -> tuple[float, float]:
+    """What a walk that comes back gains in log-likelihood over the walk of the biases that the fit has, beside what a
+    stated scatter may be; and the time constant with which it comes back, s."""
+    noise, carried = fitted.noise.judging, fitted.carried
+    means, prior = wandering(carried.dwells, noise, carried.means)
+    return held_gain(noise, means, carried.state, prior)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -23,6 +23,7 @@ FEWEST = 6
 """Degrees of freedom between dwells; with fewer nothing is estimated."""
 
 _SIGNIFICANT = 5.41  # 1 % point of the likelihood ratio of a variance against zero: half of chi2 with 1 dof
+_HELD = 12  # time constants of a walk that is held back
 _RANGE = (-9.0, 3.0)  # of the logarithm of a part's size, about the size of the misfit
 
 Part = Literal["setting", "common", "scatter", "walk"]
@@ -187,6 +188,32 @@ def gain_of(part: Literal["scatter", "walk"], noise: Noise, means: Means, state:
     return max(-float(found.fun) - restricted_log_likelihood(noise, means, state, prior), 0.0)
 
 
+def held_gain(noise: Noise, means: Means, state: Floats, prior: Floats) -> tuple[float, float]:
+    """What a walk that is held back gains in log-likelihood over the walk that is in the noise, and the time constant
+    with which it comes back, s (a Gauss-Markov process of any variance; that of infinite time constant is the walk).
+
+    ``means`` and ``prior`` as ``wandering`` has them.
+    """
+    from scipy.optimize import minimize_scalar
+
+    begin, spans_s = math.log(noise.walk_mps2_per_sqrt_s), means.ends_s[:, 1] - means.ends_s[:, 0]
+
+    def best(held_s: float) -> float:
+        def cost(log_size: float) -> float:
+            other = replace(noise, walk_mps2_per_sqrt_s=math.exp(log_size))
+            return -restricted_log_likelihood(other, means, state, prior, held_s)
+
+        # a process of one variance moves the faster the sooner it is back
+        bounds = begin - 1.0, begin + 2.0 + 0.5 * max(math.log(run_s / held_s), 0.0)
+        return -float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-2}).fun)
+
+    run_s = float(means.ends_s[-1, 1] - means.ends_s[0, 0])
+    times_s = np.geomspace(max(float(np.median(spans_s)) / 4.0, run_s * 1e-4), 2.0 * run_s, _HELD).tolist()
+    gains = [best(held_s) for held_s in times_s]
+    most = int(np.argmax(gains))
+    return max(gains[most] - restricted_log_likelihood(noise, means, state, prior), 0.0), times_s[most]
+
+
 def wandering(dwells: Sequence[DwellFactor], noise: Noise, means: Means) -> tuple[Means, Floats]:
     """Means with the columns of what a stated scatter may have in common in dwells that follow each other, and the
     rows of their prior (q, p + q + 1)."""
@@ -254,12 +281,14 @@ def _misfit(noise: Noise, means: Means, state: Floats) -> float:
     return float(triangle(_rows(noise, means, state)[0])[-1, -1] ** 2)
 
 
-def restricted_log_likelihood(noise: Noise, means: Means, state: Floats, prior: Floats | None = None) -> float:
+def restricted_log_likelihood(
+    noise: Noise, means: Means, state: Floats, prior: Floats | None = None, held_s: float = math.inf
+) -> float:
     """REML of the dwell means: -1/2 (log|V| + log|A' V^-1 A| + r' V^-1 r), up to a constant.
 
-    ``prior`` (q, p + 1): rows of what is known of the coefficients.
+    ``prior`` (q, p + 1): rows of what is known of the coefficients. held_s: with which a walk of the biases comes back.
     """
-    rows, log_root = _rows(noise, means, state)
+    rows, log_root = _rows(noise, means, state, held_s)
     upper = triangle(rows if prior is None else np.vstack([prior, rows]))
     width = upper.shape[1] - 1
     scale = np.linalg.norm(upper[:width, :-1], axis=0)
@@ -269,32 +298,61 @@ def restricted_log_likelihood(noise: Noise, means: Means, state: Floats, prior: 
     return -log_root - float(np.log(size[size > 1e-9]).sum() + np.log(scale).sum()) - 0.5 * left
 
 
-def _rows(noise: Noise, means: Means, state: Floats) -> tuple[Floats, float]:
+def _rows(noise: Noise, means: Means, state: Floats, held_s: float = math.inf) -> tuple[Floats, float]:
     """Whitened dwell means [A | z] (3 D, p + 1), and log|V|^(1/2) of their covariance V."""
     own = mean_covariances(noise, means, state)
     stacked = np.concatenate([means.design, means.readings[:, :, None]], axis=2)
     if noise.walk_mps2_per_sqrt_s:
-        return _walked_rows(own, means.ends_s, noise.walk_mps2_per_sqrt_s, stacked)
+        links = _walk(means.ends_s) if math.isinf(held_s) else _held_walk(means.ends_s, held_s)
+        return _linked_rows(own, noise.walk_mps2_per_sqrt_s, links, stacked)
     root = np.linalg.cholesky(own)
     rows = np.linalg.solve(root, stacked).reshape(-1, stacked.shape[2])
     return np.asarray(rows, float), float(np.log(np.einsum("dii->di", root)).sum())
 
 
-def _walked_rows(own: Floats, ends_s: Floats, intensity: float, stacked: Floats) -> tuple[Floats, float]:
-    """The same where the biases walk: of the means' differences from dwell to dwell, whose covariance is banded.
+@dataclass(frozen=True)
+class Links:
+    """Of the means of a path over D dwells, per q^2: each less ``share`` (D - 1,) of the one before has the variance
+    ``alone`` (D,), and with the next of these the covariance ``beside`` (D - 1,), with others none."""
 
-    A path's mean over a dwell of T is T / 3 from its beginning and its end, in variance per q^2, the two T / 6 alike.
-    """
-    from scipy.linalg import cholesky_banded, solve_banded
+    share: Floats
+    alone: Floats
+    beside: Floats
 
+
+def _walk(ends_s: Floats) -> Links:
+    """Of a walk: its mean over a dwell of T is T / 3 from its beginning and its end, the two T / 6 alike."""
     spans, pauses = ends_s[:, 1] - ends_s[:, 0], np.append(0.0, np.maximum(ends_s[1:, 0] - ends_s[:-1, 1], 0.0))
-    rows = stacked.copy()
-    rows[1:] -= stacked[:-1]
     alone = pauses + spans / 3.0
     alone[1:] += spans[:-1] / 3.0
-    diagonal = own + intensity**2 * alone[:, None, None] * np.eye(3)
-    diagonal[1:] += own[:-1]
-    beside = intensity**2 * (spans[:-1] / 6.0)[:, None, None] * np.eye(3) - own[:-1]
+    return Links(np.ones(len(spans) - 1), alone, spans[:-1] / 6.0)
+
+
+def _held_walk(ends_s: Floats, held_s: float) -> Links:
+    """Of a walk that comes back with a time constant tau: covariance tau / 2 exp(-|t - s| / tau).
+
+    Its mean over a dwell of T has covariance a = tau / T (1 - exp(-T / tau)) with either end, over tau / 2.
+    """
+    spans = np.maximum(ends_s[:, 1] - ends_s[:, 0], 1e-6 * held_s) / held_s
+    near = -np.expm1(-spans) / spans
+    own = held_s * (1.0 - near) / spans
+    share = near[1:] / near[:-1] * np.exp(-np.diff(ends_s[:, 0]) / held_s)
+    pauses = np.maximum(ends_s[1:, 0] - ends_s[:-1, 1], 0.0) / held_s
+    across = 0.5 * held_s * near[1:] * near[:-1] * np.exp(-pauses)
+    alone = own.copy()
+    alone[1:] += share**2 * own[:-1] - 2.0 * share * across
+    return Links(share, alone, across - share * own[:-1])
+
+
+def _linked_rows(own: Floats, intensity: float, links: Links, stacked: Floats) -> tuple[Floats, float]:
+    """The same where the biases walk: of the means less a share of those before, whose covariance is banded."""
+    from scipy.linalg import cholesky_banded, solve_banded
+
+    share, rows = links.share[:, None, None], stacked.copy()
+    rows[1:] -= share * stacked[:-1]
+    diagonal = own + intensity**2 * links.alone[:, None, None] * np.eye(3)
+    diagonal[1:] += share**2 * own[:-1]
+    beside = intensity**2 * links.beside[:, None, None] * np.eye(3) - share * own[:-1]
     bands = np.zeros((6, len(own), 3))
     for i in range(3):
         for j in range(3):

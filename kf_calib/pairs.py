@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Mapping
 
-from kf_calib.assessment import EQUAL, Test, lead, price
+from kf_calib.assessment import EQUAL, Test, ahead_of, price
 
 WALKS = -1
 """In a pair, in the place of a candidate's number."""
@@ -67,7 +67,7 @@ def exchanged(test: Test, pairs: Pairs, pair: Pair, least: float) -> dict[str, f
         if len(shared) != 1:
             continue
         (lost,), (new,) = set(pair) - shared, set(other) - shared
-        if nearness_of(pairs, other) > pairs[pair] - lead(1 if lost == WALKS else test.scan.candidates[lost].dof):
+        if nearness_of(pairs, other) > pairs[pair] - ahead_of(None if lost == WALKS else test.scan.candidates[lost]):
             name, overlap = name_of(test, new), alike(test, lost, new)
             if overlap > max(least, out.get(name, 0.0)) and name not in both:
                 out[name] = overlap

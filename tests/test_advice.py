@@ -63,3 +63,18 @@ def test_the_separation_predicted_is_that_of_the_run_that_goes_there(
         assert found.after == pytest.approx(reached, rel=0.05)
     elsewhere = run(plan=[*PLAN, Visit((0.0, 0.0, 0.0), 8.0)])
     assert reached >= separation(elsewhere, one, size, other)
+
+
+@pytest.mark.parametrize("names", [("cross-coupling-ip", "settling"), ("settling", "bias-drift")])
+def test_where_the_platform_is_already_is_no_next_orientation(names: tuple[str, str]) -> None:
+    """It is not set anew by staying: another dwell there would tell less than is predicted of it."""
+    bench = run(plan=PLAN).bench
+    one, other = (effect_named(name, bench) for name in names)
+    size = np.full(len(one.coefficients), 1e-4)
+    first = to_tell_apart(run(plan=PLAN, setting_sigma_deg=1e-3).fit, one, size, [other])
+    assert first is not None
+    going_on = run(plan=[*PLAN, Visit(first.gimbal_deg, 8.0)], setting_sigma_deg=1e-3)
+    then = to_tell_apart(going_on.fit, one, size, [other])
+    assert then is not None
+    turn = np.subtract(then.gimbal_deg, first.gimbal_deg)
+    assert np.abs((turn + 180.0) % 360.0 - 180.0).max() > 1.0

@@ -9,9 +9,10 @@ import pytest
 from synthetic import Run
 from test_diagnosis import BENCH
 
-from kf_calib.assessment import assessed
+from kf_calib.assessment import EQUAL, assessed
 from kf_calib.calibration import Calibration, calibrate
-from kf_calib.diagnosis import Diagnosis, diagnose
+from kf_calib.diagnosis import Diagnosis, diagnose, with_effects
+from kf_calib.fitting import back_gain
 from kf_calib.sources.hidden import parse
 from kf_calib.sources.hidden.detectability import sized
 from kf_calib.sources.noise_sources import Noise
@@ -19,6 +20,7 @@ from kf_calib.sources.physics import Ambient
 from kf_calib.sources.plans import Visit, six_faces, spread_plan
 from kf_calib.sources.sensors import GRADES
 from kf_calib.sources.simulator import Simulation
+from kf_calib.views.diagnosis import description
 
 WHITE = 5e-5
 
@@ -207,3 +209,22 @@ def test_in_a_few_dwells_a_walk_could_explain_what_an_effect_does() -> None:
     assert len(kept) >= 4  # now and then the effect fits so closely that it is a proof
     assert all(found.missing and "bias-walk" in found.verdict for found in kept)
     assert "bias-walk" not in diagnose(run("hysteresis=12sigma")).ambiguity
+
+
+def test_a_bias_that_goes_to_and_fro_is_no_walk() -> None:
+    """Telegraph noise of many switches a run: what a walk explains of it comes back as no walk does."""
+    found = [diagnose(run("telegraph=15sigma;tau=30", seed=seed)) for seed in range(12, 18)]
+    assert sum("bias-walk" in each.missing for each in found) <= 1  # 5 where nothing asks whether it comes back
+
+
+def test_a_walk_rarely_looks_as_if_it_came_back() -> None:
+    gains = [
+        2.0 * back_gain(with_effects(run("bias-walk=15sigma", seed=seed), ("bias-walk",)).fit)[0] for seed in range(24)
+    ]
+    assert sum(gain > EQUAL for gain in gains) <= 1
+    assert sum(gain > 0.5 for gain in gains) > 2  # they do differ
+
+
+def test_what_comes_back_is_described_as_such() -> None:
+    said = description(diagnose(run("telegraph=15sigma;tau=30", seed=6)))
+    assert said is not None and "back within about" in said.driver and said.formula == "bias-walk"

@@ -68,18 +68,22 @@ def test_a_path_has_the_covariance_of_its_readings() -> None:
     np.testing.assert_allclose(path.rest, np.array(left) - inside, rtol=1e-9)
 
 
-def test_the_likelihood_is_that_of_a_dense_covariance() -> None:
-    """Against scipy's density of the residuals of the dwell means, the coefficients integrated out."""
+@pytest.mark.parametrize("held_s", [np.inf, 1000.0, 100.0, 3.0])
+def test_the_likelihood_is_that_of_a_dense_covariance(held_s: float) -> None:
+    """Against scipy's density of the residuals of the dwell means, the coefficients integrated out; of a walk, and of
+    one that comes back."""
     result = fitted(walking(3, dwells=9, setting_deg=1e-4))
     means, state = result.carried.means, result.carried.state
     times, which = [], []
     for k, (begin, end) in enumerate(means.ends_s):
-        times.append(np.linspace(begin, end, 2001))
-        which.append(np.full(2001, k))
+        times.append(begin + (end - begin) * (np.arange(2000) + 0.5) / 2000)
+        which.append(np.full(2000, k))
     instants, kernel = np.concatenate(times), np.zeros((9, 9))
     for i in range(9):
         for j in range(9):
-            kernel[i, j] = np.minimum(times[i][:, None], times[j][None, :]).mean() - instants[0]
+            apart = np.abs(times[i][:, None] - times[j][None, :])
+            back = 0.5 * held_s * np.exp(-apart / held_s) if np.isfinite(held_s) else -0.5 * apart + instants[-1]
+            kernel[i, j] = back.mean()
     design = means.design.reshape(27, -1)
     rest = np.linalg.svd(design / np.linalg.norm(design, axis=0))[0][:, design.shape[1] :]
     values = []
@@ -89,7 +93,7 @@ def test_the_likelihood_is_that_of_a_dense_covariance() -> None:
         for k, own in enumerate(mean_covariances(noise, means, state)):
             full[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own
         expected = multivariate_normal(cov=rest.T @ full @ rest).logpdf(rest.T @ means.readings.ravel())
-        found = restricted_log_likelihood(replace(noise, walk_mps2_per_sqrt_s=q), means, state)
+        found = restricted_log_likelihood(replace(noise, walk_mps2_per_sqrt_s=q), means, state, held_s=held_s)
         values.append((expected, found))
     differences = np.diff(np.array(values), axis=0)
     np.testing.assert_allclose(differences[:, 0], differences[:, 1], atol=2e-3)

@@ -70,7 +70,7 @@ FIGURES = (
     "benches",
 )  # fmt: skip
 COUNTS: dict[str, float] = {
-    "noise@white": 250, "noise": 60, "name": 1, "unstated": 0.25, "power": 4, "invisible": 0.2, "outside": 2,
+    "noise@white": 500, "noise": 60, "name": 1, "unstated": 0.25, "power": 4, "invisible": 0.2, "outside": 2,
     "pair": 40, "plans@nothing": 8, "plans": 0.2, "improve": 0.4, "advice": 1, "ideal": 2, "benches": 30,
 }  # fmt: skip
 """Trials a unit of ``--runs``: in all, or for each effect (and size, and plan) that is hidden; at least one."""
@@ -333,9 +333,13 @@ def candidates(path: Path, wanted: Sequence[str] | None = None) -> dict[str, lis
 
 
 def _scanned(
-    path: Path, wanted: Sequence[str] | None = None, white_mps2: float | None = None
+    path: Path, wanted: Sequence[str] | None = None, white_mps2: float | None = None, looked_for: bool = False
 ) -> tuple[dict[str, list[Candidate]], Floats]:
-    """Candidates by name, and the residual in their frame; in white noise, where that is given."""
+    """Candidates by name, and the residual in their frame; in white noise, where that is given.
+
+    looked_for: of an oscillation the frequencies at which the program looks for a slow one.
+    """
+    from kf_calib.assessment import slow_hz
     from kf_calib.calibration import calibrate
     from kf_calib.effects import effect_named, names
     from kf_calib.scan import scan
@@ -351,7 +355,11 @@ def _scanned(
         if wanted is None and effect.oscillates:  # known by its line in the spectrum: a slow one mimics whatever drifts
             continue
         if (wanted is None or name in wanted) and not effect.dynamic and not effect.walks:
-            effects += [effect] if effect.unknown is None else [effect.at(value) for value in effect.unknown.grid(2.0)]
+            if effect.unknown is None:
+                effects.append(effect)
+            else:
+                slow = effect.oscillates and looked_for
+                effects += [effect.at(v) for v in (slow_hz(fitted, effect) if slow else effect.unknown.grid(2.0))]
     found = scan(fitted.carried, noise, effects)
     spaces = dict[str, list[Candidate]]()
     for candidate in found.candidates:
@@ -541,7 +549,7 @@ def _separation(task: Task, truth: dict[str, Any], rivals: Sequence[str], rows: 
     Of an effect a hundred times as large, so that noise does not matter.
     """
     noise = _through(_sized(task, truth, _LARGE), rows, Path("large.mcap"))["noise"]
-    spaces, signal = _scanned(Path("large.mcap"), [truth["name"], *rivals], noise["white_mps2"])
+    spaces, signal = _scanned(Path("large.mcap"), [truth["name"], *rivals], noise["white_mps2"], looked_for=True)
     others = [each.basis for name in rivals for each in spaces.get(name, [])]  # none of a random walk
     return min((float(np.linalg.norm(signal - basis @ (basis.T @ signal))) for basis in others), default=0.0) / _LARGE
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,18 @@ class Visit:
 def explicit_plan(gimbal_deg: Iterable[Sequence[float]], dwell_s: float = 60.0) -> list[Visit]:
     """The orientations given, one row of gimbal angles each, in that order."""
     return [Visit(tuple(float(angle) for angle in row), dwell_s) for row in gimbal_deg]
+
+
+def stays(plan: Sequence[Visit]) -> tuple[Visit, ...]:
+    """The plan with visits that follow each other at the same angles as one: a platform that is not moved is not set
+    anew."""
+    out = list[Visit]()
+    for visit in plan:
+        if out and out[-1].gimbal_deg == visit.gimbal_deg:
+            out[-1] = replace(out[-1], dwell_s=out[-1].dwell_s + visit.dwell_s)
+        else:
+            out.append(visit)
+    return tuple(out)
 
 
 def angles_from_csv(path: Path, width: int) -> list[list[float]]:

@@ -39,7 +39,7 @@ from kf_calib.sources.physics import (
     Step,
     gimbals,
 )
-from kf_calib.sources.plans import YZX, Visit
+from kf_calib.sources.plans import YZX, Visit, stays
 from kf_calib.sources.sensors import Sensors
 
 START_NS = 1_750_000_000_000_000_000
@@ -74,7 +74,7 @@ class Simulation:
         grade: str = "",
         hidden: Sequence[Hidden] = (),
     ) -> None:
-        self.bench, self.sensors, self.noise, self.plan = bench, sensors, noise, tuple(plan)
+        self.bench, self.sensors, self.noise, self.plan = bench, sensors, noise, stays(plan)
         self.ambient, self.seed, self.grade = ambient or Ambient(), seed, grade
         self.hidden = tuple(hidden)
         self.warnings = list[str]()

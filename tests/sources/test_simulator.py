@@ -268,6 +268,19 @@ def test_setting_error_turns_the_force_and_keeps_its_size():
     np.testing.assert_array_equal(batch.pose.values, read(quiet).pose.values)  # the encoders do not see it
 
 
+def test_a_platform_that_is_not_moved_is_not_set_anew():
+    """Visits in a row at the same angles are one dwell, whatever is drawn for each dwell."""
+    noise = Noise(setting_sigma_deg=0.05, scatter_mps2=1e-3)
+    rows, settings = [(0, 0, 0), (0, 90, 0), (0, 90, 0), (0, 90, 0), (0, 0, 0)], {"sample_hz": 2.0, "seed": 2}
+    again = Simulation(BENCH, ORTHOGONAL, noise, explicit_plan(rows, dwell_s=5.0), **settings)
+    once = [
+        Visit(tuple(map(float, row)), dwell_s) for row, dwell_s in ((rows[0], 5.0), (rows[1], 15.0), (rows[0], 5.0))
+    ]
+    np.testing.assert_array_equal(
+        read(again).accel.values, read(Simulation(BENCH, ORTHOGONAL, noise, once, **settings)).accel.values
+    )
+
+
 def test_encoders_err_and_round_without_moving_the_platform():
     noise = Noise(encoder_sigma_deg=0.01, encoder_step_deg=0.002)
     batch = read(Simulation(BENCH, ORTHOGONAL, noise, explicit_plan([(10, 20, 30)], 1000.0)))
