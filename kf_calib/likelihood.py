@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ from kf_calib.folding import DwellFactor, Means
 from kf_calib.noise import FLOOR_MPS2, Noise, mean_covariances, wander
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
+from kf_calib.walk import Links, links
 
 FEWEST = 6
 """Degrees of freedom between dwells; with fewer nothing is estimated."""
@@ -303,56 +304,21 @@ def _rows(noise: Noise, means: Means, state: Floats, held_s: float = math.inf) -
     own = mean_covariances(noise, means, state)
     stacked = np.concatenate([means.design, means.readings[:, :, None]], axis=2)
     if noise.walk_mps2_per_sqrt_s:
-        links = _walk(means.ends_s) if math.isinf(held_s) else _held_walk(means.ends_s, held_s)
-        return _linked_rows(own, noise.walk_mps2_per_sqrt_s, links, stacked)
+        return _linked_rows(own, noise.walk_mps2_per_sqrt_s, links(means.ends_s, held_s), stacked)
     root = np.linalg.cholesky(own)
     rows = np.linalg.solve(root, stacked).reshape(-1, stacked.shape[2])
     return np.asarray(rows, float), float(np.log(np.einsum("dii->di", root)).sum())
 
 
-@dataclass(frozen=True)
-class Links:
-    """Of the means of a path over D dwells, per q^2: each less ``share`` (D - 1,) of the one before has the variance
-    ``alone`` (D,), and with the next of these the covariance ``beside`` (D - 1,), with others none."""
-
-    share: Floats
-    alone: Floats
-    beside: Floats
-
-
-def _walk(ends_s: Floats) -> Links:
-    """Of a walk: its mean over a dwell of T is T / 3 from its beginning and its end, the two T / 6 alike."""
-    spans, pauses = ends_s[:, 1] - ends_s[:, 0], np.append(0.0, np.maximum(ends_s[1:, 0] - ends_s[:-1, 1], 0.0))
-    alone = pauses + spans / 3.0
-    alone[1:] += spans[:-1] / 3.0
-    return Links(np.ones(len(spans) - 1), alone, spans[:-1] / 6.0)
-
-
-def _held_walk(ends_s: Floats, held_s: float) -> Links:
-    """Of a walk that comes back with a time constant tau: covariance tau / 2 exp(-|t - s| / tau).
-
-    Its mean over a dwell of T has covariance a = tau / T (1 - exp(-T / tau)) with either end, over tau / 2.
-    """
-    spans = np.maximum(ends_s[:, 1] - ends_s[:, 0], 1e-6 * held_s) / held_s
-    near = -np.expm1(-spans) / spans
-    own = held_s * (1.0 - near) / spans
-    share = near[1:] / near[:-1] * np.exp(-np.diff(ends_s[:, 0]) / held_s)
-    pauses = np.maximum(ends_s[1:, 0] - ends_s[:-1, 1], 0.0) / held_s
-    across = 0.5 * held_s * near[1:] * near[:-1] * np.exp(-pauses)
-    alone = own.copy()
-    alone[1:] += share**2 * own[:-1] - 2.0 * share * across
-    return Links(share, alone, across - share * own[:-1])
-
-
-def _linked_rows(own: Floats, intensity: float, links: Links, stacked: Floats) -> tuple[Floats, float]:
+def _linked_rows(own: Floats, intensity: float, path: Links, stacked: Floats) -> tuple[Floats, float]:
     """The same where the biases walk: of the means less a share of those before, whose covariance is banded."""
     from scipy.linalg import cholesky_banded, solve_banded
 
-    share, rows = links.share[:, None, None], stacked.copy()
+    share, rows = path.share[:, None, None], stacked.copy()
     rows[1:] -= share * stacked[:-1]
-    diagonal = own + intensity**2 * links.alone[:, None, None] * np.eye(3)
+    diagonal = own + intensity**2 * path.alone[:, None, None] * np.eye(3)
     diagonal[1:] += share**2 * own[:-1]
-    beside = intensity**2 * links.beside[:, None, None] * np.eye(3) - share * own[:-1]
+    beside = intensity**2 * path.beside[:, None, None] * np.eye(3) - share * own[:-1]
     bands = np.zeros((6, len(own), 3))
     for i in range(3):
         for j in range(3):

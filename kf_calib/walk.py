@@ -9,6 +9,7 @@ is taken out of the noise of a reading.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -100,6 +101,45 @@ def lagged(period_s: float, size: int, pairs: Floats) -> Floats:
     The residual has its mean square at lag 0 and loses half of q^2 times the lag, as the walk does.
     """
     return period_s * pairs * np.maximum(_moments(size)[1] / size - 0.5 * np.arange(len(pairs)), 0.0)
+
+
+@dataclass(frozen=True)
+class Links:
+    """Of the means of a path over D dwells, per q^2: each less ``share`` (D - 1,) of the one before has the variance
+    ``alone`` (D,), and with the next of these the covariance ``beside`` (D - 1,), with others none."""
+
+    share: Floats
+    alone: Floats
+    beside: Floats
+
+
+def links(ends_s: Floats, held_s: float = math.inf) -> Links:
+    """Of dwells from ``ends_s`` (D, 2), of a walk that comes back with the time constant ``held_s``."""
+    return _free(ends_s) if math.isinf(held_s) else _held(ends_s, held_s)
+
+
+def _free(ends_s: Floats) -> Links:
+    """Of a walk: its mean over a dwell of T is T / 3 from its beginning and its end, the two T / 6 alike."""
+    spans, pauses = ends_s[:, 1] - ends_s[:, 0], np.append(0.0, np.maximum(ends_s[1:, 0] - ends_s[:-1, 1], 0.0))
+    alone = pauses + spans / 3.0
+    alone[1:] += spans[:-1] / 3.0
+    return Links(np.ones(len(spans) - 1), alone, spans[:-1] / 6.0)
+
+
+def _held(ends_s: Floats, held_s: float) -> Links:
+    """Of a walk that comes back with a time constant tau: covariance tau / 2 exp(-|t - s| / tau).
+
+    Its mean over a dwell of T has covariance a = tau / T (1 - exp(-T / tau)) with either end, over tau / 2.
+    """
+    spans = np.maximum(ends_s[:, 1] - ends_s[:, 0], 1e-6 * held_s) / held_s
+    near = -np.expm1(-spans) / spans
+    own = held_s * (1.0 - near) / spans
+    share = near[1:] / near[:-1] * np.exp(-np.diff(ends_s[:, 0]) / held_s)
+    pauses = np.maximum(ends_s[1:, 0] - ends_s[:-1, 1], 0.0) / held_s
+    across = 0.5 * held_s * near[1:] * near[:-1] * np.exp(-pauses)
+    alone = own.copy()
+    alone[1:] += share**2 * own[:-1] - 2.0 * share * across
+    return Links(share, alone, across - share * own[:-1])
 
 
 def variances(begins_s: Floats, ends_s: Floats, intensity: float) -> Floats:
