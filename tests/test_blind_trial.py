@@ -71,6 +71,47 @@ def test_the_best_chooser_is_right_as_often_as_theory_has_it(trial: Any) -> None
     assert set(trial.best_possible(spaces, {name: {"one", "two"} for name in spaces}, sigmas).values()) == {1.0}
 
 
+@pytest.mark.parametrize("dofs", [(3, 3), (2, 3), (3, 1)])
+def test_the_odds_of_a_pair_are_those_of_a_plain_average(trial: Any, dofs: tuple[int, int]) -> None:
+    """exp(s r - s s / 2), s of two signals of 2 sigma each, over directions drawn evenly."""
+    rng = np.random.default_rng(4)
+    one, other = (np.linalg.qr(rng.standard_normal((6, dof)))[0] for dof in dofs)
+    readings = one[:, 0] + 2.0 * other[:, -1] + rng.standard_normal(6)
+    drawn = [rng.standard_normal((400_000, dof)) for dof in dofs]
+    signals = sum(
+        2.0 * own / np.linalg.norm(own, axis=1)[:, None] @ basis.T
+        for own, basis in zip(drawn, (one, other), strict=True)
+    )
+    expected = np.log(np.mean(np.exp(signals @ readings - 0.5 * np.sum(signals**2, axis=1))))
+    odds = sys.modules["best_possible"]._sphere_log_odds
+    found = np.exp([odds(one, other, readings, 2.0, np.random.default_rng(seed)) - expected for seed in range(100)])
+    assert found.mean() == pytest.approx(1.0, abs=0.02 + 0.4 * found.std()) and found.std() < 0.15
+
+
+def test_the_best_chooser_of_pairs_is_right_as_often_as_it_thinks(trial: Any) -> None:
+    """Three effects of one coefficient: which is not there, of three pairs, by the sum over the signs."""
+    overlap, sigmas, rng = 0.9, 3.0, np.random.default_rng(2)
+    third = np.array([0.0, 0.0, 1.0])
+    bases = [np.array([1.0, 0.0, 0.0]), np.array([overlap, math.sqrt(1.0 - overlap**2), 0.0]), third]
+    spaces = {
+        name: [Candidate(None, own[:, None], own[:, None], own[:, None], np.eye(1), np.zeros(1, bool), 1.0)]  # type: ignore[arg-type]
+        for name, own in zip("abc", bases, strict=True)
+    }
+    most = sys.modules["best_possible"].best_possible_pairs
+    found = most(spaces, {name: {name} for name in spaces}, sigmas, 0.7, draws=4000)
+    right, signs = 0, [(s, t) for s in (-1, 1) for t in (-1, 1)]
+    for _ in range(4000):  # a and b overlap too much to be a pair
+        true, own = rng.integers(2), sigmas * (rng.choice([-1, 1], 2))
+        readings = own[0] * bases[true] + own[1] * third + rng.standard_normal(3)
+        odds = [
+            sum(math.exp(-0.5 * np.sum((readings - sigmas * (s * bases[k] + t * third)) ** 2)) for s, t in signs)
+            for k in (0, 1)
+        ]
+        right += int(np.argmax(odds)) == true
+    assert 0.6 < found < 0.95 and found == pytest.approx(right / 4000, abs=4.0 * math.sqrt(0.5 / 4000))
+    assert most(spaces, {"a": {"a", "b"}, "b": {"a", "b"}, "c": {"c"}}, sigmas, 0.7, draws=50) == 1.0
+
+
 def test_the_most_there_can_be_is_a_mean_over_runs_and_effects(trial: Any) -> None:
     own = [
         trial.Outcome(

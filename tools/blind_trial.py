@@ -38,7 +38,7 @@ from typing import Any, TypeVar
 
 import click
 import numpy as np
-from best_possible import best_possible
+from best_possible import best_possible, best_possible_pairs
 
 from kf_calib.advice import ENOUGH
 from kf_calib.errors import KfCalibError
@@ -81,6 +81,7 @@ _APART = 0.7
 _LIKE = 0.9  # overlap of what may be taken for each other at 8 sigma
 _FEW = 12  # orientations
 _SIZES = (8, 10, 15)  # sigma
+_PAIR_SIZE = 10  # sigma, of each
 _LARGE = 100  # sigma, or times
 _ALONE, _EXACT = 1000, 0.01  # sigma; the part of what is hidden that a name may leave
 _DWELL_S = float(BENCH[BENCH.index("--dwell-s") + 1])
@@ -522,7 +523,8 @@ def ideal(task: Task) -> Outcome:
         if a == b or any(itertools.starmap(_one_space, itertools.product(spaces[a], spaces[b])))
     }
     same = {name: {b for a, b in alike if a == name} for name in spaces}
-    extra = {str(size): best_possible(spaces, same, size, seed=task.seed) for size in _SIZES}
+    extra: dict[str, Any] = {str(size): best_possible(spaces, same, size, seed=task.seed) for size in _SIZES}
+    extra["pair"] = best_possible_pairs(spaces, same, _PAIR_SIZE, _APART, seed=task.seed)
     return Outcome(task, extra=extra)
 
 
@@ -677,7 +679,7 @@ def _family_tasks(
             add(name, options=PLANS[name])
     elif family == "pair":
         for _ in _count(family, runs) if len(visible) > 1 else ():
-            add("10", [f"{name}=10sigma" for name in drawn.choice(visible, 2, replace=False)])
+            add(f"{_PAIR_SIZE}", [f"{name}={_PAIR_SIZE}sigma" for name in drawn.choice(visible, 2, replace=False)])
     elif family == "benches":
         for number in _count(family, runs):
             options, own_setting, axes = _any_bench(drawn)
@@ -924,6 +926,10 @@ def _ideal(_: str, own: list[Outcome]) -> Iterator[Figure]:
                 *np.percentile(hits, [2.5, 97.5]),
                 len(hits),
             )
+    pairs = [float(each.extra["pair"]) for each in own if "pair" in each.extra]
+    if pairs:
+        name = "two at once, both found and nothing else: the most there can be"
+        yield Figure(name, float(np.mean(pairs)), *np.percentile(pairs, [2.5, 97.5]), len(pairs))
 
 
 _FIGURES: dict[str, Callable[[str, list[Outcome]], Iterator[Figure]]] = {
