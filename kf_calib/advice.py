@@ -51,10 +51,10 @@ def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequen
     """The orientation after which the effect ``one`` of this size differs most from each of the ``others``.
 
     Separation: what is left of its signal, in sigma, when the model and the other have explained all they can; the
-    smallest over the others (no others: over the model alone); 6 sigma tell as much as more. What differs in time only
-    is told apart by time: a longer stay is advised where the square of the separation grows by more an hour with it, to
-    go somewhere being worth three dwells. An effect that holds this one as a special case is told apart nowhere, and
-    left out.
+    smallest over the others (no others: over the model alone). What differs in time only is told apart by time: a
+    longer stay is advised where the square of the separation grows by more an hour with it, to go somewhere being worth
+    three dwells, and 6 sigma as much as more. An effect that holds this one as a special case is told apart nowhere,
+    and left out.
     """
     poses = _poses(fitted)
     if poses is None:
@@ -65,9 +65,10 @@ def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequen
     every = list(each.values()) or [_separations(fitted, one, coefficients, [], poses, waits_s)]
     before, after = min(own[0] for own in every), np.min([own[1] for own in every], axis=0)
     dwell_s = _each_s(fitted)
-    useful = np.minimum(after, ENOUGH) if before < ENOUGH else after[:1]
-    gain = (useful**2 - before**2) / (_MOVE * dwell_s + waits_s[: len(useful)])[:, None]
-    wait, best = np.unravel_index(int(np.argmax(gain)), gain.shape)
+    farthest = after.max(axis=1)
+    useful = np.minimum(farthest, ENOUGH) if before < ENOUGH else farthest[:1]
+    wait = int(np.argmax((useful**2 - before**2) / (_MOVE * dwell_s + waits_s[: len(useful)])))
+    best = int(np.argmax(after[wait]))
     stay_s = float(waits_s[wait] + dwell_s) if wait else None
     angles = tuple(np.degrees(poses[best]).round(1).tolist())
     return Advice(angles, before, float(after[wait, best]), stay_s, tuple(each))
