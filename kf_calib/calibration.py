@@ -569,7 +569,8 @@ def _visits(fitted: Fit, steps: list[Step], residuals: Floats, extra: Floats, se
         if not known.undetermined.size:
             rows = means.design[k]
             innovation = means.readings[k] - rows @ known.state
-            sigma = np.sqrt(np.diag(rows @ known.covariance @ rows.T + own[k]))
+            predicted_by = np.maximum(np.diag(rows @ known.covariance @ rows.T), 0.0)  # rounding, where little is known
+            sigma = np.sqrt(predicted_by + np.diag(own[k]))
         estimate = _estimate(step.factor, around, extra[k])
         visits.append(Visit(dwell, estimate, step.nis, step.dof, innovation, sigma, residuals[k]))
         before = step.factor

@@ -310,3 +310,8 @@ def test_a_rival_of_the_best_of_many_frequencies_is_not_left_out(trial: Any) -> 
     task = trial.Task("benches@one", "diagnose", 2611311100044, ("thermal-rate=15sigma",), options, "0.002")
     told = trial.played(task)
     assert told.first == "sinusoid" and told.held, told.ambiguity
+
+
+def test_what_ended_unknown_in_improve_is_to_be_looked_at(trial: Any) -> None:
+    assert trial.failed(trial.Outcome(trial.Task("improve@15", "improve", 1), ("a",), "unknown"))
+    assert not trial.failed(trial.Outcome(trial.Task("improve@15", "improve", 1), ("a",), "a", same=(("a", "a"),)))

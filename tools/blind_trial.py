@@ -441,12 +441,19 @@ def invisible(task: Task) -> Outcome:
     simulated(task, path)
     said = run("diagnose", str(path), "--json")
     kinds = [kind for kind in known_kinds() if not kind.accompanied]
-    texts = tuple(f"{kind.name}={kind.typical('navigation')[1]!r}" for kind in kinds)
+    texts = tuple(f"{kind.name}={_largest(kind)!r}" for kind in kinds)
     truth = simulated(dataclasses.replace(task, hidden=texts), Path("all.mcap"))["effects"]
     unseen = {effect["name"] for effect in truth if effect["size_sigma"] is None}
     known = {each["effect"] for each in run("effects", "--json")["effects"]} & {effect["name"] for effect in truth}
     differ = sorted((unseen & known) ^ (set(said["invisible"]) & known))
     return Outcome(task, invisible=tuple(said["invisible"]), extra={"differ": differ, "unseen": sorted(unseen)})
+
+
+def _largest(kind: Kind) -> float:
+    """A size at which it shows where it ever does: of a dead zone the widest that is looked for."""
+    from kf_calib.effects.sensor import DeadZone
+
+    return DeadZone.unknown.high if kind.name == DeadZone.name else kind.typical("navigation")[1]
 
 
 def known_kinds() -> list[Kind]:
@@ -946,11 +953,12 @@ def failed(each: Outcome) -> bool:
         return each.refused
     if family in ("noise", "plans", "benches") and not each.truth:
         return alarmed(each)
+    if family == "outside":
+        return not close and not (each.first == "unknown" and driver_right(each))
     return {
         "name": not each.right, "unstated": not each.right, "plans": each.wrong, "benches": each.wrong,
         "power": False,
         "invisible": bool(each.extra.get("differ")),
-        "outside": not close and not (each.first == "unknown" and driver_right(each)),
         "pair": not close and not (each.found and each.nothing_else), "improve": not each.right,
         "advice": each.extra.get("advised", 1.0) < each.extra.get("random", 0.0),
     }.get(family, False)  # fmt: skip
