@@ -19,7 +19,7 @@ from kf_calib import averaging
 from kf_calib.advice import Advice
 from kf_calib.assessment import EQUAL, LEVEL, SHARE, Test, assessed, price, run_level, threshold, walk_fall
 from kf_calib.calibration import Calibration, Parameter, format_p, refitted
-from kf_calib.drivers import JUMP, Family, families
+from kf_calib.drivers import JUMP, Family, families, roughly
 from kf_calib.effects import walk_named
 from kf_calib.fitting import WALK, back_gain, behind_within
 from kf_calib.likelihood import FEWEST
@@ -62,7 +62,7 @@ class Diagnosis:
     ambiguity: every single effect that fits as well as the first, and those that do together; overlaps: of each with
     it. together: the pairs among them that explain as much, and are no exchange of one effect for one that is alike.
     alone: a single effect that would do in the place of two. as_scatter: the walk that is missing could as well be
-    dwells that scatter by more than is stated.
+    dwells that scatter by more than is stated; back_s: or go to and fro with this time constant (None: not as well).
     """
 
     before: Calibration
@@ -77,6 +77,7 @@ class Diagnosis:
     together: tuple[tuple[str, str], ...] = ()
     alone: str = ""
     as_scatter: bool = False
+    back_s: float | None = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis: {self.verdict}>"
@@ -118,6 +119,7 @@ def _diagnosed(before: Calibration) -> Diagnosis:
         still = assessed(rested.fit)
         still = still.without_lines or still  # what the windows let through is vibration, too
         found = _explained(rested, replace(still, vibration=test.vibration))
+    found = replace(found, back_s=_back_s(found))
     return replace(found, verdict=_verdict(found))
 
 
@@ -389,6 +391,15 @@ def _no_walk(refit: Calibration) -> bool:
     return leaps or 2.0 * back_gain(refit.fit)[0] > EQUAL
 
 
+def _back_s(found: Diagnosis) -> float | None:
+    """The time constant with which what is taken for a walk more likely comes back, s, where that is not too likely for
+    a walk: of walks one in twenty looks so."""
+    if found.after is None or not found.after.noise.walk_mps2_per_sqrt_s or found.test.walking not in found.missing:
+        return None
+    gain, back_s = back_gain(found.after.fit)
+    return back_s if 2.0 * gain > _NEARLY else None
+
+
 def with_effects(before: Calibration, added: Sequence[str]) -> Calibration:
     """The same run with further effects in the model."""
     return refitted(before, (*before.settings.effects, *added))
@@ -430,7 +441,7 @@ def _verdict(found: Diagnosis) -> str:
             named = f"{' and '.join(found.missing)} together explain it; no single known effect does as well"
         else:
             named = f"Missing: {first}{_size(found)}"
-            if len(found.ambiguity) > 1 or found.as_scatter:
+            if len(found.ambiguity) > 1 or found.as_scatter or found.back_s:
                 named = f"Best: {first}{_size(found)}"
         instead = "" if len(found.missing) == 1 else "in the place of one of them, "
         told = [
@@ -441,6 +452,7 @@ def _verdict(found: Diagnosis) -> str:
             *told,
             *(f"{' and '.join(pair)} together" for pair in found.together),
             *(["dwells that scatter by more than is stated"] if found.as_scatter else []),
+            *([f"biases that come back within about {roughly(found.back_s)}"] if found.back_s else []),
         ]
         if told:
             named += f". Cannot yet be told from {', '.join(told)}"

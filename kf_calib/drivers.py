@@ -91,7 +91,7 @@ def described(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Des
     within = name and _goes_on(trend) and (best.score <= 0.0 or _goes_on(_trend_beside(fitted, best)))
     if name and (within or irregular - float(chdtri(1, _CHANCE)) > max(best.score, 0.0)):
         share, back_s = irregular / max(excess, irregular, 1.0), _back_s(fitted, name)
-        driver = f"time (irregular, back within about {float(f'{back_s:.1g}'):g} s)" if back_s else IRREGULAR
+        driver = f"time (irregular, back within about {roughly(back_s)})" if back_s else IRREGULAR
         return Description(_channel(residuals), WITHIN if within and not back_s else driver, share, (name,))
     if best.score <= 0.0:
         return None
@@ -100,6 +100,11 @@ def described(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Des
     formulas = tuple(_named(best.texts[k], number) for number, k in enumerate(order[:enough]))
     share = min((best.fall - best.dof) / excess, 1.0) if excess > 0.0 else 1.0
     return Description(_channel(residuals), best.driver, share, formulas)
+
+
+def roughly(duration_s: float) -> str:
+    """To one digit, as 30 s."""
+    return f"{float(f'{duration_s:.1g}'):g} s"
 
 
 def _back_s(fitted: Fit, walk: str) -> float | None:

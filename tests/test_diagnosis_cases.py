@@ -228,3 +228,12 @@ def test_a_walk_rarely_looks_as_if_it_came_back() -> None:
 def test_what_comes_back_is_described_as_such() -> None:
     said = description(diagnose(run("telegraph=15sigma;tau=30", seed=6)))
     assert said is not None and "back within about" in said.driver and said.formula == "bias-walk"
+
+
+def test_a_walk_that_may_come_back_is_said_to() -> None:
+    """Telegraph noise that is not unlikely enough for a walk to be none."""
+    found = diagnose(run("telegraph=15sigma;tau=30", seed=21))
+    assert found.missing == ("bias-walk",) and found.back_s is not None and 5.0 < found.back_s < 100.0
+    assert "Best: bias-walk" in found.verdict and "come back within about" in found.verdict
+    walks = [diagnose(run("bias-walk=15sigma", seed=seed)) for seed in range(4)]
+    assert not any(each.back_s for each in walks) and any("bias-walk" in each.missing for each in walks)
