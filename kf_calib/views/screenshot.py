@@ -110,6 +110,11 @@ def _loaded(process: subprocess.Popen[bytes], port: int, log: Path) -> ViewerCli
         elif state.recordings:
             return client
         elif clock.monotonic() > idle_since + _IDLE_S:
+            try:
+                client.take_screenshot()
+            except Exception:  # it listens before it has found a graphics driver, or ends for want of one
+                idle_since = clock.monotonic()
+                continue
             raise ScreenshotError("the file holds nothing that Rerun can show: write it again with --rrd.")
     raise ScreenshotError(f"the Rerun viewer did not load the recording within {_PATIENCE_S:g} s: try again.")
 
