@@ -17,6 +17,7 @@ from kf_calib.information import accumulated, whitened
 from kf_calib.model import STATE_COUNT
 from kf_calib.noise import Noise, steps
 from kf_calib.prospect import Prospect
+from kf_calib.reach import wrapped
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 
@@ -184,9 +185,8 @@ def _poses(fitted: Fit) -> Floats | None:
     coarse = rng.integers(-4, 4, (_POSES // 2, count)) * 45.0
     fine = np.round(rng.uniform(-180.0, 180.0, (_POSES // 2, count)) / _STEP_DEG) * _STEP_DEG
     poses = np.radians(np.concatenate([coarse, fine]))
-    turn = poses - fitted.dwells[-1].pose
-    apart = np.abs((turn + np.pi) % (2.0 * np.pi) - np.pi).max(axis=1)
-    return poses[apart > np.radians(SAME_POSE_DEG)]
+    turn = np.abs(wrapped(poses - fitted.dwells[-1].pose)).max(axis=1)
+    return poses[turn > np.radians(SAME_POSE_DEG)]
 
 
 def _with_next(

@@ -90,7 +90,7 @@ def described(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Des
     name = "" if fitted.carried.model.walks else walk_named(fitted.carried.model.bench)
     within = name and _goes_on(trend) and (best.score <= 0.0 or _goes_on(_trend_beside(fitted, best)))
     if name and (within or irregular - float(chdtri(1, _CHANCE)) > max(best.score, 0.0)):
-        share, back_s = irregular / max(excess, irregular, 1.0), _back_s(fitted, name)
+        share, back_s = irregular / max(excess, irregular, 1.0), _back_s(fitted, name) if 2.0 * ratio > EQUAL else None
         driver = f"time (irregular, back within about {roughly(back_s)})" if back_s else IRREGULAR
         return Description(_channel(residuals), WITHIN if within and not back_s else driver, share, (name,))
     if best.score <= 0.0:
@@ -108,11 +108,10 @@ def roughly(duration_s: float) -> str:
 
 
 def _back_s(fitted: Fit, walk: str) -> float | None:
-    """With which time constant what goes to and fro comes back, s; None where it does so at random from dwell to dwell,
-    or as a walk of the biases does."""
+    """With which time constant what goes to and fro comes back, s; None where it does so as a walk does."""
     model = fitted.carried.model
     walked = fit(fitted.dwells, model + effect_named(walk, model.bench), 0.0, fitted.carried.slews)
-    if 2.0 * walk_gain(fitted)[1] < EQUAL or not walked.noise.walk_mps2_per_sqrt_s:
+    if not walked.noise.walk_mps2_per_sqrt_s:
         return None
     gain, back_s = back_gain(walked)
     return back_s if 2.0 * gain > EQUAL else None

@@ -89,7 +89,7 @@ def test_the_odds_of_a_pair_are_those_of_a_plain_average(trial: Any, dofs: tuple
 
 
 def test_the_best_chooser_of_pairs_is_right_as_often_as_it_thinks(trial: Any) -> None:
-    """Three effects of one coefficient: which is not there, of three pairs, by the sum over the signs."""
+    """Three effects of one coefficient, two of them alike: which is beside the third, by the sum over the signs."""
     overlap, sigmas, rng = 0.9, 3.0, np.random.default_rng(2)
     third = np.array([0.0, 0.0, 1.0])
     bases = [np.array([1.0, 0.0, 0.0]), np.array([overlap, math.sqrt(1.0 - overlap**2), 0.0]), third]

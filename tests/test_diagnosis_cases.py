@@ -214,7 +214,7 @@ def test_in_a_few_dwells_a_walk_could_explain_what_an_effect_does() -> None:
 def test_a_bias_that_goes_to_and_fro_is_no_walk() -> None:
     """Telegraph noise of many switches a run: what a walk explains of it comes back as no walk does."""
     found = [diagnose(run("telegraph=15sigma;tau=30", seed=seed)) for seed in range(12, 18)]
-    assert sum("bias-walk" in each.missing for each in found) <= 1  # 5 where nothing asks whether it comes back
+    assert sum("bias-walk" in each.missing for each in found) <= 1  # 4 where nothing asks whether it comes back
 
 
 def test_a_walk_rarely_looks_as_if_it_came_back() -> None:

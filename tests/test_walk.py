@@ -74,10 +74,9 @@ def test_the_likelihood_is_that_of_a_dense_covariance(held_s: float) -> None:
     one that comes back."""
     result = fitted(walking(3, dwells=9, setting_deg=1e-4))
     means, state = result.carried.means, result.carried.state
-    times, which = [], []
-    for k, (begin, end) in enumerate(means.ends_s):
+    times = []
+    for begin, end in means.ends_s:
         times.append(begin + (end - begin) * (np.arange(2000) + 0.5) / 2000)
-        which.append(np.full(2000, k))
     instants, kernel = np.concatenate(times), np.zeros((9, 9))
     for i in range(9):
         for j in range(9):
