@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,6 +15,7 @@ from kf_calib.effects import Effect, effect_named, names, walk_named
 from kf_calib.fitting import Fit, walk_gain
 from kf_calib.folding import DwellFactor, lines_of, stimulus_of
 from kf_calib.model import Model
+from kf_calib.odds import as_fall
 from kf_calib.samples import Floats
 from kf_calib.scan import Candidate, Scan, falls, scan
 from kf_calib.spectrum import Line, lowest_hz
@@ -70,7 +71,9 @@ class Test:
     lines: in the spectrum of the readings within dwells, and the name of the effect they speak for. vibration: those
     that are no oscillation of one amplitude, and count as noise. without_lines: the test with its lines as vibration.
     between: in words, of an oscillation what is too fast for the scan and too slow for a line. as_scatter: what could
-    be a walk of the biases could as well be scatter from dwell to dwell, of more than is stated.
+    be a walk of the biases could as well be scatter from dwell to dwell, of more than is stated. paths: what a walk's
+    score gains on that of columns, whose falls are those of their best directions, as its likelihood is not of its best
+    path.
     """
 
     scan: Scan
@@ -87,6 +90,7 @@ class Test:
     without_lines: Test | None = None
     between: str = ""
     as_scatter: bool = False
+    paths: float = 0.0
     trend: Trend | None = None
 
     @property
@@ -187,13 +191,15 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
             if candidate.dof:
                 own = run_level(float(chdtrc(candidate.dof, statistics[k])), candidate.tried)
                 scores[name], p_values[name] = score, run_level(own, tests)
-    name, as_scatter = _walking(fitted), False
+    name, as_scatter, paths = _walking(fitted), False, 0.0
     if name:
         fall, as_scatter = walk_fall(fitted, tests)
         p_values[name] = run_level(0.5 * float(chdtrc(1, max(fall, 0.0))), tests)
+        paths = _for_all_paths(found, scores, tests)
         scores[name] = fall - threshold(1, tests)
+        scores[name] += paths if scores[name] > 0.0 else 0.0
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
-    test = Test(found, best, scores, p_values, misfit_p, name, tests, slewing, (), as_scatter=as_scatter)
+    test = Test(found, best, scores, p_values, misfit_p, name, tests, slewing, (), as_scatter=as_scatter, paths=paths)
     return _with_lines(test, fitted)
 
 
@@ -313,6 +319,21 @@ def _walking(fitted: Fit) -> str:
     if model.walks or len(fitted.dwells) < _FEWEST_WALKED or fitted.noise.walk_mps2_per_sqrt_s:
         return ""
     return walk_named(model.bench)
+
+
+def _for_all_paths(found: Scan, scores: Mapping[str, float], tests: float) -> float:
+    """So much more than its fall less its threshold is the score of a walk, to be ahead of the best column where its
+    likelihood is.
+
+    That is over all paths; the likelihood of a column is its mean over all directions and values of its constant.
+    """
+    best = max(scores, key=lambda name: scores[name], default="")
+    if not best or scores[best] <= 0.0:
+        return 0.0
+    own = [k for k, each in enumerate(found.candidates) if str(each.effect) == best and each.dof]
+    dofs = np.array([found.candidates[k].dof for k in own])
+    worth = as_fall(dofs, found.statistics[own], max(found.candidates[k].tried for k in own))
+    return scores[best] + threshold(1, tests) - worth
 
 
 def walk_fall(fitted: Fit, tests: float) -> tuple[float, bool]:

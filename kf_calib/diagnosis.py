@@ -144,7 +144,9 @@ def _likeliest(before: Calibration, test: Test) -> Diagnosis:
         first = explaining[0].name
         least = test.scores[first] + (2.0 if first == test.walking else 1.0) * EQUAL
         clearly = {pair: score for pair, score in pairs.items() if score > least}
-        return _two(found, clearly, explaining[0].name) or _one(found, explaining[0], pairs)
+        walks = [each for each in explaining[1:] if each.name == test.walking]
+        standing = (each for each in (explaining[0], *walks) if not _is_outdone(found, each))
+        return _two(found, clearly, first) or _one(found, next(standing, None), pairs)
     several = _two(found, pairs | _pairs_with_walk(found)) or _beside_lines(found)
     return several or replace(found, unknown=not _may_scatter(before))
 
@@ -223,14 +225,20 @@ def _without_vibration(before: Calibration, test: Test) -> Test:
     return test if share > 0.5 else test.without_lines
 
 
-def _one(found: Diagnosis, first: Suspect, pairs: Pairs) -> Diagnosis:
+def _is_outdone(found: Diagnosis, suspect: Suspect) -> bool:
+    """Whether a formula that is no known effect explains the misfit better."""
+    if suspect.name in found.test.best:
+        return _outdone(found, suspect.refit, (suspect.name,))
+    return _walks_not(found, suspect)
+
+
+def _one(found: Diagnosis, first: Suspect | None, pairs: Pairs) -> Diagnosis:
     """One effect explains the misfit; with it, all that explain it as well and look like it, alone or in pairs.
 
-    Unless a formula that is no known effect explains it better: then the effect is not the one that is missing.
+    None: a formula that is no known effect explains it better than any, and than a walk, which could take its path.
     """
     test = found.test
-    outdone = _outdone(found, first.refit, (first.name,)) if first.name in test.best else _walks_not(found, first)
-    if outdone:
+    if first is None:
         return replace(found, unknown=True)
     close = test.rivals(first.name)
     close += [name for name in test.holding(first.name) if name not in close]
@@ -264,7 +272,7 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
     own, _ = scanned.explained(np.concatenate([each.basis for each in scanned.candidates], axis=1))
     own -= sum(price(each, tests) for each in scanned.candidates)
     if found.test.walking in names:
-        own += walk_fall(refit.fit, tests)[0] - threshold(1, tests)
+        own += walk_fall(refit.fit, tests)[0] - threshold(1, tests) + found.test.paths
     return any(gain > own + EQUAL for gain, _ in _formulas(found))
 
 
@@ -329,8 +337,8 @@ def _pairs_with_walk(found: Diagnosis) -> dict[Pair, float]:
         k = test.best[name]
         own = float(test.scan.statistics[k]) - price(candidates[k], tests)
         walk = walk_fall(with_effects(before, (name, test.walking)).fit, tests)[0] - threshold(1, tests)
-        if walk > 0.0 and own + walk > test.scores[test.walking]:
-            out[k, WALKS] = own + walk
+        if walk > 0.0 and own + walk + test.paths > test.scores[test.walking]:
+            out[k, WALKS] = own + walk + test.paths
     return out
 
 

@@ -20,7 +20,7 @@ LEVELS = [
     ["model"],
     ["folding"],
     ["noise"],
-    ["information", "kalman", "batch", "readings", "likelihood"],
+    ["information", "kalman", "batch", "readings", "likelihood", "odds"],
     ["aims", "scan", "experiment"],
     ["fitting", "inferred"],
     ["prospect", "reach", "trend"],
