@@ -126,12 +126,9 @@ class Test:
         return [*(name for name, k in self.best.items() if not self.scan.candidates[k].dof), *self.in_slews_only]
 
     def nearness(self, name: str) -> float:
-        """The score without what many values of a constant cost: that speaks against chance, not for a rival.
-
-        A walk is judged over all its paths: an effect that happens to look like the one it took has gained on it.
-        """
+        """The score without what many values of a constant cost: that speaks against chance, not for a rival."""
         if name not in self.best:
-            return self.scores[name] + (EQUAL if name == self.walking else 0.0)
+            return self.scores[name]
         own, tests = self.candidate(name), self.effective_tests
         return self.scores[name] + price(own, tests) - price(replace(own, tried=1), tests)
 

@@ -293,7 +293,7 @@ def _walks_not(found: Diagnosis, first: Suspect) -> bool:
         return False
     simpler = [each for each in _formulas(found) if each[1].driver == JUMP or not each[1].driver.startswith("time")]
     gain, formula = max(simpler, key=lambda each: each[0], default=(-np.inf, None))
-    if formula is None or gain < found.test.nearness(first.name) + EQUAL:
+    if formula is None or gain < found.test.scores[first.name] + EQUAL:
         return False
     return _fits(with_effects(found.before, formula.formulas), found.test)
 

@@ -38,11 +38,6 @@ def pairs_of(test: Test) -> dict[Pair, float]:
     return out
 
 
-def nearness_of(pairs: Pairs, pair: Pair) -> float:
-    """The score of a pair; one of a walk is near a pair of something that looks like the path it took."""
-    return pairs[pair] + (EQUAL if WALKS in pair else 0.0)
-
-
 def likeliest(test: Test, pairs: Pairs) -> list[Pair]:
     """The best few pairs, of those of the same two effects the one of the best constants."""
     named = dict[tuple[str, str], Pair]()
@@ -54,7 +49,7 @@ def likeliest(test: Test, pairs: Pairs) -> list[Pair]:
 def as_good(test: Test, pairs: Pairs, score: float, but: Collection[str]) -> list[tuple[str, str]]:
     """Names of the best few pairs that explain as much as what scores so much, none of them in ``but``: one or two."""
     equal = EQUAL if len(but) == 1 else _EQUAL_PAIR
-    near = sorted((pair for pair in pairs if nearness_of(pairs, pair) > score - equal), key=lambda pair: -pairs[pair])
+    near = sorted((pair for pair in pairs if pairs[pair] > score - equal), key=lambda pair: -pairs[pair])
     named = dict.fromkeys(names_of(test, pair) for pair in near)
     return [pair for pair in named if not set(pair) & set(but)][:MOST]
 
@@ -67,7 +62,7 @@ def exchanged(test: Test, pairs: Pairs, pair: Pair, least: float) -> dict[str, f
         if len(shared) != 1:
             continue
         (lost,), (new,) = set(pair) - shared, set(other) - shared
-        if nearness_of(pairs, other) > pairs[pair] - ahead_of(None if lost == WALKS else test.scan.candidates[lost]):
+        if pairs[other] > pairs[pair] - ahead_of(None if lost == WALKS else test.scan.candidates[lost]):
             name, overlap = name_of(test, new), alike(test, lost, new)
             if overlap > max(least, out.get(name, 0.0)) and name not in both:
                 out[name] = overlap

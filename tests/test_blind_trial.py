@@ -16,7 +16,6 @@ from scipy.special import ndtr
 from scipy.stats import beta
 
 from kf_calib.errors import KfCalibError
-from kf_calib.scan import Candidate
 
 TOOL = Path(__file__).resolve().parents[1] / "tools" / "blind_trial.py"
 
@@ -59,10 +58,7 @@ def test_the_best_chooser_is_right_as_often_as_theory_has_it(trial: Any) -> None
     """Of two effects of one coefficient: |w1| > |w2|, where w1 - w2 and w1 + w2 are independent."""
     overlap, sigmas = 0.9, 4.0
     bases = {"one": [[1.0], [0.0]], "two": [[overlap], [math.sqrt(1.0 - overlap**2)]]}
-    spaces = {
-        name: [Candidate(None, basis, basis, basis, np.eye(1), np.zeros(1, bool), 1.0)]  # type: ignore[arg-type]
-        for name, basis in ((name, np.array(basis)) for name, basis in bases.items())
-    }
+    spaces = {name: trial.Columns([np.array(basis)]) for name, basis in bases.items()}
     found = trial.best_possible(spaces, {name: {name} for name in spaces}, sigmas, draws=20_000)
     apart, along = ndtr(sigmas * np.sqrt(0.5 * (1.0 - overlap))), ndtr(sigmas * np.sqrt(0.5 * (1.0 + overlap)))
     expected = apart * along + (1.0 - apart) * (1.0 - along)
@@ -83,8 +79,11 @@ def test_the_odds_of_a_pair_are_those_of_a_plain_average(trial: Any, dofs: tuple
         for own, basis in zip(drawn, (one, other), strict=True)
     )
     expected = np.log(np.mean(np.exp(signals @ readings - 0.5 * np.sum(signals**2, axis=1))))
-    odds = sys.modules["best_possible"]._sphere_log_odds
-    found = np.exp([odds(one, other, readings, 2.0, np.random.default_rng(seed)) - expected for seed in range(100)])
+    tool = sys.modules["best_possible"]
+    both = tool.Sphere(one), tool.Sphere(other)
+    found = np.exp(
+        [tool._pair_log_odds(*both, readings, 2.0, np.random.default_rng(seed)) - expected for seed in range(100)]
+    )
     assert found.mean() == pytest.approx(1.0, abs=0.02 + 0.4 * found.std()) and found.std() < 0.15
 
 
@@ -93,12 +92,10 @@ def test_the_best_chooser_of_pairs_is_right_as_often_as_it_thinks(trial: Any) ->
     overlap, sigmas, rng = 0.9, 3.0, np.random.default_rng(2)
     third = np.array([0.0, 0.0, 1.0])
     bases = [np.array([1.0, 0.0, 0.0]), np.array([overlap, math.sqrt(1.0 - overlap**2), 0.0]), third]
-    spaces = {
-        name: [Candidate(None, own[:, None], own[:, None], own[:, None], np.eye(1), np.zeros(1, bool), 1.0)]  # type: ignore[arg-type]
-        for name, own in zip("abc", bases, strict=True)
-    }
-    most = sys.modules["best_possible"].best_possible_pairs
-    found = most(spaces, {name: {name} for name in spaces}, sigmas, 0.7, draws=4000)
+    spaces = {name: trial.Columns([own[:, None]]) for name, own in zip("abc", bases, strict=True)}
+    most, pairs = trial.best_possible_pairs, [("a", "c"), ("b", "c")]
+    hits = most(spaces, {name: {name} for name in spaces}, sigmas, pairs, draws=4000)
+    found = float(np.mean([right for _, right in hits]))
     right, signs = 0, [(s, t) for s in (-1, 1) for t in (-1, 1)]
     for _ in range(4000):  # a and b overlap too much to be a pair
         true, own = rng.integers(2), sigmas * (rng.choice([-1, 1], 2))
@@ -109,7 +106,48 @@ def test_the_best_chooser_of_pairs_is_right_as_often_as_it_thinks(trial: Any) ->
         ]
         right += int(np.argmax(odds)) == true
     assert 0.6 < found < 0.95 and found == pytest.approx(right / 4000, abs=4.0 * math.sqrt(0.5 / 4000))
-    assert most(spaces, {"a": {"a", "b"}, "b": {"a", "b"}, "c": {"c"}}, sigmas, 0.7, draws=50) == 1.0
+    alike = most(spaces, {"a": {"a", "b"}, "b": {"a", "b"}, "c": {"c"}}, sigmas, pairs, draws=50)
+    assert {pair for pair, _ in alike} == set(pairs) and all(right for _, right in alike)
+
+
+@pytest.mark.parametrize("dof", [1, 3])
+def test_the_odds_of_a_walk_and_beside_it_are_those_of_a_plain_average(trial: Any, dof: int) -> None:
+    """exp(s r - s s / 2), s of a normal path and of a signal of 2 sigma drawn evenly."""
+    tool, rng = sys.modules["best_possible"], np.random.default_rng(5)
+    basis = np.linalg.qr(rng.standard_normal((6, dof)))[0]
+    axes, variances = np.linalg.qr(rng.standard_normal((6, 2)))[0], np.array([2.0, 0.5])
+    readings = 2.0 * basis[:, 0] + axes[:, 0] + rng.standard_normal(6)
+    drawn = rng.standard_normal((400_000, dof))
+    paths = rng.standard_normal((400_000, 2)) * np.sqrt(variances) @ axes.T
+    expected = []
+    for signals in (paths, paths + 2.0 * drawn / np.linalg.norm(drawn, axis=1)[:, None] @ basis.T):
+        expected.append(np.log(np.mean(np.exp(signals @ readings - 0.5 * np.sum(signals**2, axis=1)))))
+    walk, other = tool.Normal(axes, variances), tool.Sphere(basis)
+    assert walk.log_odds(readings, 2.0) == pytest.approx(expected[0], abs=0.02)
+    odds = [tool._pair_log_odds(other, walk, readings, 2.0, np.random.default_rng(seed)) for seed in range(50)]
+    found = np.exp(np.array(odds) - expected[1])
+    assert found.mean() == pytest.approx(1.0, abs=0.03 + 0.4 * found.std()) and found.std() < 0.15
+
+
+def test_paths_of_a_walk_of_one_size_are_told_as_well_as_by_a_plain_average(trial: Any) -> None:
+    """Against the path that most look like; the mean of exp(s r - s s / 2) over paths drawn to one size."""
+    times, sigmas = np.arange(6.0), 3.0
+    walk = trial.Walk(np.linalg.cholesky(np.minimum.outer(times + 1.0, times + 1.0)))
+    column = walk.parts(sigmas)[0].basis[:, :1]
+    effects = {"bias-walk": walk, "other": trial.Columns([column])}
+    found = trial.best_possible(effects, {name: {name} for name in effects}, sigmas, draws=4000)
+    rng, right = np.random.default_rng(7), []
+    paths = sigmas * walk.signals(20_000, rng)
+    np.testing.assert_allclose(np.linalg.norm(paths, axis=1), sigmas)
+    for true in effects:
+        readings = sigmas * effects[true].signals(1000, rng) + rng.standard_normal((1000, 6))
+        walks = np.mean(np.exp(readings @ paths.T - 0.5 * sigmas**2), axis=1)
+        others = np.mean(
+            [np.exp(sign * sigmas * readings @ column[:, 0] - 0.5 * sigmas**2) for sign in (-1, 1)], axis=0
+        )
+        right.append(np.mean((walks > others) == (true == "bias-walk")))
+    assert 0.6 < np.mean(right) < 0.9
+    assert np.mean(list(found.values())) == pytest.approx(np.mean(right), abs=4.0 * math.sqrt(0.25 / 2000))
 
 
 def test_the_most_there_can_be_is_a_mean_over_runs_and_effects(trial: Any) -> None:

@@ -1,140 +1,213 @@
 """How often anyone could name the right effect: the chooser that knows all that can be known before the readings.
 
-An effect of n sigma is drawn evenly over the directions its coefficients can take and the values of its constant, and
-white noise is added; the chooser knows n, these odds, and the noise, and takes the effect that is likeliest after the
-readings (Bayes). No rule is right more often, so what a diagnosis lacks of it is what better rules could gain. Of two
-effects at once, each of n sigma, it takes the likeliest pair.
+An effect of n sigma is drawn evenly over the directions its coefficients can take, or over the paths of a random walk,
+and white noise is added; the chooser knows n, these odds, and the noise, and takes the effect that is likeliest after
+the readings (Bayes). Of a constant within an effect it knows the range, not the value. No rule is right more often, so
+what a diagnosis lacks of it is what better rules could gain. Of two effects at once, each of n sigma, it takes the
+likeliest pair.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
 
 import numpy as np
-from scipy.special import gammaln, ive
 
+from kf_calib import odds
 from kf_calib.samples import Floats
-from kf_calib.scan import Candidate
 
 _NEAR = 12.0  # of the logarithm of the odds: of pairs further behind none is the likeliest
 _DRAWN = 400
+_INTENSITIES, _PATHS = 8, 2000
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """Signals of n sigma, evenly over the directions of an orthonormal basis (d, k)."""
+
+    basis: Floats
+
+    def log_odds(self, readings: Floats, sigmas: float) -> Floats:
+        """log of the mean likelihood ratio (m,) against none, readings (m, d)."""
+        return odds.log_odds(self.basis.shape[1], np.sum((readings @ self.basis) ** 2, axis=1), sigmas)
+
+    def spread(self, sigmas: float) -> Floats:
+        """Root (d, k) of the covariance of normal signals of the same mean square."""
+        return self.basis * sigmas / np.sqrt(self.basis.shape[1])
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal signals of ``variances`` (k,) along an orthonormal basis (d, k)."""
+
+    basis: Floats
+    variances: Floats
+
+    def log_odds(self, readings: Floats, _: float) -> Floats:
+        wider, along = 1.0 + self.variances, readings @ self.basis
+        return 0.5 * np.sum(along**2 * (1.0 - 1.0 / wider) - np.log(wider), axis=-1)
+
+    def spread(self, _: float) -> Floats:
+        return self.basis * np.sqrt(self.variances)
+
+    def whitened(self, rows: Floats) -> Floats:
+        """Rows (d, c) times the inverse root of 1 + the covariance."""
+        shrunk = 1.0 - 1.0 / np.sqrt(1.0 + self.variances)
+        return rows - self.basis @ (shrunk[:, None] * (self.basis.T @ rows))
+
+
+class Effect(Protocol):
+    """What an effect can do in an orthonormal frame of d dimensions."""
+
+    def signals(self, count: int, rng: np.random.Generator) -> Floats:
+        """(count, d), of one sigma each."""
+        ...
+
+    def parts(self, sigmas: float) -> Sequence[Sphere | Normal]:
+        """Equally likely."""
+        ...
+
+
+@dataclass(frozen=True)
+class Columns:
+    """bases: orthonormal (d, k), one for each value of its constant; hidden: those that it is hidden with, where these
+    are others."""
+
+    bases: Sequence[Floats]
+    hidden: Sequence[Floats] = ()
+
+    def signals(self, count: int, rng: np.random.Generator) -> Floats:
+        own = self.hidden or self.bases
+        return np.array([_along(own[k], rng) for k in rng.integers(len(own), size=count)])
+
+    def parts(self, _: float) -> Sequence[Sphere]:
+        return [Sphere(basis) for basis in self.bases]
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A random walk of covariance ``root`` root^T, root (d, k), all paths of one size: normal ones, the intensity
+    spread as theirs is."""
+
+    root: Floats
+
+    def signals(self, count: int, rng: np.random.Generator) -> Floats:
+        paths = self._paths(count, rng)
+        return paths / np.linalg.norm(paths, axis=1)[:, None]
+
+    def parts(self, sigmas: float) -> Sequence[Normal]:
+        basis, variances, intensities = self._modes
+        return [Normal(basis, (sigmas * each) ** 2 * variances) for each in intensities]
+
+    @cached_property
+    def _modes(self) -> tuple[Floats, Floats, Floats]:
+        basis, sizes, _ = np.linalg.svd(self.root, full_matrices=False)
+        kept = sizes > 1e-6 * sizes[0]
+        lengths = np.linalg.norm(self._paths(_PATHS, np.random.default_rng(0)), axis=1)
+        shares = (np.arange(_INTENSITIES) + 0.5) / _INTENSITIES
+        return basis[:, kept], sizes[kept] ** 2, np.quantile(1.0 / lengths, shares)
+
+    def _paths(self, count: int, rng: np.random.Generator) -> Floats:
+        return rng.standard_normal((count, self.root.shape[1])) @ self.root.T
 
 
 def best_possible(
-    spaces: Mapping[str, Sequence[Candidate]],
-    same: Mapping[str, set[str]],
-    sigmas: float,
-    draws: int = 100,
-    seed: int = 0,
+    effects: Mapping[str, Effect], same: Mapping[str, set[str]], sigmas: float, draws: int = 100, seed: int = 0
 ) -> dict[str, float]:
-    """Of each effect, the share of draws in which the likeliest one is it, or means the ``same`` as it.
-
-    spaces: candidates of each effect, one for each value of its constant, in one orthonormal frame.
-    """
-    rng, names = np.random.default_rng(seed), list(spaces)
-    out = dict[str, float]()
+    """Of each effect, the share of draws in which the likeliest one is it, or means the ``same`` as it."""
+    rng, names, out = np.random.default_rng(seed), list(effects), dict[str, float]()
     for name in names:
-        bases = [spaces[name][k].basis for k in rng.integers(len(spaces[name]), size=draws)]
-        signals = np.array([sigmas * basis @ _direction(basis.shape[1], rng) for basis in bases])
-        readings = signals + rng.standard_normal(signals.shape)
-        likeliest = np.argmax([_log_odds(spaces[other], readings, sigmas) for other in names], axis=0)
+        readings = sigmas * effects[name].signals(draws, rng)
+        readings = readings + rng.standard_normal(readings.shape)
+        likeliest = np.argmax([_log_odds(each, readings, sigmas) for each in effects.values()], axis=0)
         out[name] = float(np.mean([names[k] in same[name] for k in likeliest]))
     return out
 
 
 def best_possible_pairs(
-    spaces: Mapping[str, Sequence[Candidate]],
+    effects: Mapping[str, Effect],
     same: Mapping[str, set[str]],
     sigmas: float,
-    apart: float,
+    pairs: Sequence[tuple[str, str]],
     draws: int = 100,
     seed: int = 0,
-) -> float:
-    """The share of draws in which the likeliest pair means both effects that are hidden, of which none overlaps the
-    other by ``apart`` or more."""
-    rng = np.random.default_rng(seed)
-    pairs = [
-        (one, other)
-        for one, other in itertools.combinations(spaces, 2)
-        if max(a.overlap(b) for a, b in itertools.product(spaces[one], spaces[other])) < apart
-    ]
-    right = 0
+) -> list[tuple[tuple[str, str], bool]]:
+    """In each draw the pair that is hidden, of those that can be, and whether the likeliest pair means both."""
+    rng, out = np.random.default_rng(seed), list[tuple[tuple[str, str], bool]]()
     for _ in range(draws):
         true = pairs[rng.integers(len(pairs))]
-        bases = [spaces[name][rng.integers(len(spaces[name]))].basis for name in true]
-        readings = sum(sigmas * basis @ _direction(basis.shape[1], rng) for basis in bases)
-        readings = readings + rng.standard_normal(len(bases[0]))
-        rough = [_pair_log_odds(spaces, pair, readings, sigmas, None) for pair in pairs]
+        signal = sigmas * np.sum([effects[name].signals(1, rng)[0] for name in true], axis=0)
+        readings = signal + rng.standard_normal(signal.shape)
+
+        def likely(pair: tuple[str, str], of: Callable[..., float], readings: Floats = readings) -> float:
+            both = itertools.product(*(effects[name].parts(sigmas) for name in pair))
+            parts = [of(one, other, readings, sigmas, rng) for one, other in both]
+            return float(np.logaddexp.reduce(parts) - np.log(len(parts)))
+
+        rough = [likely(pair, _roughly) for pair in pairs]
         near = [pairs[k] for k in np.argsort(rough)[::-1] if rough[k] > max(rough) - _NEAR]
-        said = max(near, key=lambda pair: _pair_log_odds(spaces, pair, readings, sigmas, rng))
-        right += any(a in same[true[0]] and b in same[true[1]] for a, b in (said, said[::-1]))
-    return right / draws
+        said = max(near, key=lambda pair: likely(pair, _pair_log_odds))
+        out.append((true, any(a in same[true[0]] and b in same[true[1]] for a, b in (said, said[::-1]))))
+    return out
 
 
-def _pair_log_odds(
-    spaces: Mapping[str, Sequence[Candidate]],
-    pair: tuple[str, str],
-    readings: Floats,
-    sigmas: float,
-    rng: np.random.Generator | None,
-) -> float:
-    """log of the mean likelihood ratio of two effects against none, over their directions and constants.
+def _along(basis: Floats, rng: np.random.Generator) -> Floats:
+    made = basis @ rng.standard_normal(basis.shape[1])
+    return made / np.linalg.norm(made)
 
-    Without ``rng``: of coefficients that are normal, of the same mean square.
+
+def _log_odds(effect: Effect, readings: Floats, sigmas: float) -> Floats:
+    parts = [each.log_odds(readings, sigmas) for each in effect.parts(sigmas)]
+    return np.logaddexp.reduce(parts, axis=0) - np.log(len(parts))
+
+
+def _roughly(one: Sphere | Normal, other: Sphere | Normal, readings: Floats, sigmas: float, _: object) -> float:
+    """log of the mean likelihood ratio of two effects against none, both taken as normal.
+
+    r^T M (1 + M^T M)^-1 M^T r / 2 - log|1 + M^T M| / 2, M M^T their covariance.
     """
-    of = _normal_log_odds if rng is None else _sphere_log_odds
-    both = itertools.product(spaces[pair[0]], spaces[pair[1]])
-    parts = [of(one.basis, other.basis, readings, sigmas, rng) for one, other in both]
-    return float(np.logaddexp.reduce(parts) - np.log(len(parts)))
-
-
-def _normal_log_odds(one: Floats, other: Floats, readings: Floats, sigmas: float, _: object = None) -> float:
-    """r^T M (1 + M^T M)^-1 M^T r / 2 - log|1 + M^T M| / 2, M the bases times n / sqrt(k)."""
-    spread = np.hstack([basis * sigmas / np.sqrt(basis.shape[1]) for basis in (one, other)])
+    spread = np.hstack([one.spread(sigmas), other.spread(sigmas)])
     inner, along = np.eye(spread.shape[1]) + spread.T @ spread, spread.T @ readings
     return float(0.5 * along @ np.linalg.solve(inner, along) - 0.5 * np.linalg.slogdet(inner)[1])
 
 
-def _sphere_log_odds(one: Floats, other: Floats, readings: Floats, sigmas: float, rng: np.random.Generator) -> float:
-    """The same of effects of n sigma each: over the directions of the larger one in closed form, given that of the
-    smaller, which is drawn about where it is likeliest (von Mises, Fisher) and weighted by its odds."""
-    from scipy.stats import vonmises_fisher
-
-    one, other = sorted((one, other), key=lambda basis: -basis.shape[1])
-    dof = other.shape[1]
-    if dof == 1:
-        drawn, weights = np.array([[-1.0], [1.0]]), np.log([0.5, 0.5])
+def _pair_log_odds(
+    one: Sphere | Normal, other: Sphere | Normal, readings: Floats, sigmas: float, rng: np.random.Generator
+) -> float:
+    """The same of effects of n sigma each: over the directions of the larger one, or the paths of a walk, in closed
+    form, given the direction of the smaller, which is drawn about where it is likeliest and weighted by its odds."""
+    if isinstance(other, Normal) or (isinstance(one, Sphere) and one.basis.shape[1] < other.basis.shape[1]):
+        one, other = other, one
+    assert isinstance(other, Sphere)
+    if isinstance(one, Normal):
+        basis, left = one.whitened(other.basis), one.whitened(readings[:, None])[:, 0]
+        directions, weights = _directions(basis, left, sigmas, rng)
+        signals = sigmas * directions @ basis.T
+        parts = weights + signals @ left - 0.5 * np.sum(signals**2, axis=1) + one.log_odds(readings, sigmas)
     else:
-        spread = np.hstack([one, other])
-        most = np.linalg.lstsq(spread, readings, rcond=1e-6)[0][-dof:]
-        closeness = 1.0 - float(np.linalg.svd(one.T @ other, compute_uv=False)[0]) ** 2
-        proposal = vonmises_fisher(most / np.linalg.norm(most), 1.0 + 0.5 * sigmas**2 * closeness)
-        drawn = proposal.rvs(_DRAWN, random_state=rng)
-        even = gammaln(0.5 * dof) - np.log(2.0) - 0.5 * dof * np.log(np.pi)  # over the sphere's surface
-        weights = even - proposal.logpdf(drawn) - np.log(_DRAWN)
-    given = readings - sigmas * drawn @ other.T
-    parts = weights + sigmas * drawn @ (other.T @ readings) - 0.5 * sigmas**2 + _even_log_odds(one, given, sigmas)
+        beside = other.basis - one.basis @ (one.basis.T @ other.basis)
+        directions, weights = _directions(beside, readings, sigmas, rng)
+        signals = sigmas * directions @ other.basis.T
+        parts = weights + signals @ readings - 0.5 * sigmas**2 + one.log_odds(readings - signals, sigmas)
     return float(np.logaddexp.reduce(parts))
 
 
-def _direction(dof: int, rng: np.random.Generator) -> Floats:
-    made = rng.standard_normal(dof)
-    return made / np.linalg.norm(made)
+def _directions(basis: Floats, readings: Floats, sigmas: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Directions (m, k) about the likeliest of those that are drawn evenly, and the log of their weights (m,), which
+    add up to one in the mean (von Mises, Fisher)."""
+    from scipy.special import gammaln
+    from scipy.stats import vonmises_fisher
 
-
-def _log_odds(own: Sequence[Candidate], readings: Floats, sigmas: float) -> Floats:
-    """log of the mean likelihood ratio (m,) of an effect against none, over its directions and constants.
-
-    Over the sphere of k dimensions, w the part of the readings in the effect's space: the mean of exp(n u w - n^2 / 2)
-    is Gamma(k/2) (2 / x)^v I_v(x) exp(-n^2 / 2), v = k/2 - 1, x = n |w| (von Mises, Fisher).
-    """
-    parts = [_even_log_odds(each.basis, readings, sigmas) for each in own]
-    return np.logaddexp.reduce(parts, axis=0) - np.log(len(own))
-
-
-def _even_log_odds(basis: Floats, readings: Floats, sigmas: float) -> Floats:
-    """The same (m,) at one value of its constant."""
     dof = basis.shape[1]
-    order, x = 0.5 * dof - 1.0, sigmas * np.linalg.norm(readings @ basis, axis=1)
-    return gammaln(0.5 * dof) + order * np.log(2.0 / x) + np.log(ive(order, x)) + x - 0.5 * sigmas**2
+    if dof == 1:
+        return np.array([[-1.0], [1.0]]), np.log([0.5, 0.5])
+    most = np.linalg.lstsq(basis, readings, rcond=1e-6)[0]
+    closeness = float(np.linalg.svd(basis, compute_uv=False)[-1]) ** 2
+    proposal = vonmises_fisher(most / np.linalg.norm(most), 1.0 + 0.5 * sigmas**2 * closeness)
+    drawn = proposal.rvs(_DRAWN, random_state=rng)
+    even = gammaln(0.5 * dof) - np.log(2.0) - 0.5 * dof * np.log(np.pi)  # over the sphere's surface
+    return drawn, even - proposal.logpdf(drawn) - np.log(_DRAWN)

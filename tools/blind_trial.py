@@ -38,7 +38,7 @@ from typing import Any, TypeVar
 
 import click
 import numpy as np
-from best_possible import best_possible, best_possible_pairs
+from best_possible import Columns, Effect, Walk, best_possible, best_possible_pairs
 
 from kf_calib.advice import ENOUGH
 from kf_calib.errors import KfCalibError
@@ -87,6 +87,7 @@ _ALONE, _EXACT = 1000, 0.01  # sigma; the part of what is hidden that a name may
 _DWELL_S = float(BENCH[BENCH.index("--dwell-s") + 1])
 _POWER = (0.86, 0.94)
 _SECOND = 5_000_000  # from the seed of a run to that of its second run
+_WALK = "bias-walk"
 _BENCH_SIZES = (10, 15, 30)  # sigma
 _ENOUGH = 20  # trials; fewer are shown and not judged
 
@@ -440,7 +441,7 @@ def invisible(task: Task) -> Outcome:
     path = Path("clean.mcap")
     simulated(task, path)
     said = run("diagnose", str(path), "--json")
-    kinds = [kind for kind in known_kinds() if not kind.accompanied]
+    kinds = [kind for kind in known_kinds() if kind.counted is None]
     texts = tuple(f"{kind.name}={_largest(kind)!r}" for kind in kinds)
     truth = simulated(dataclasses.replace(task, hidden=texts), Path("all.mcap"))["effects"]
     unseen = {effect["name"] for effect in truth if effect["size_sigma"] is None}
@@ -520,19 +521,52 @@ def advice(task: Task, advised: int = 4, random: int = 12) -> Outcome:
 
 def ideal(task: Task) -> Outcome:
     """How often the likeliest effect is the right one where all but the readings is known beforehand."""
-    simulated(task, Path("clean.mcap"))
-    spaces = {name: [each for each in own if each.dof] for name, own in candidates(Path("clean.mcap")).items()}
-    spaces = {name: own for name, own in spaces.items() if own}
-    pairs = itertools.product(spaces, spaces)
+    path = Path("clean.mcap")
+    simulated(task, path)
+    spaces, constants, walk = _possible(path)
     alike = {
         (a, b)
-        for a, b in pairs
+        for a, b in itertools.product(spaces, spaces)
         if a == b or any(itertools.starmap(_one_space, itertools.product(spaces[a], spaces[b])))
     }
-    same = {name: {b for a, b in alike if a == name} for name in spaces}
-    extra: dict[str, Any] = {str(size): best_possible(spaces, same, size, seed=task.seed) for size in _SIZES}
-    extra["pair"] = best_possible_pairs(spaces, same, _PAIR_SIZE, _APART, seed=task.seed)
+    same = {name: {b for a, b in alike if a == name} for name in spaces} | {_WALK: {_WALK}}
+    effects: dict[str, Effect] = {
+        name: Columns([each.basis for each in own], [constants[name].basis] if name in constants else [])
+        for name, own in spaces.items()
+    }
+    effects[_WALK] = Walk(walk)
+    apart = [
+        (a, b)
+        for a, b in itertools.combinations(spaces, 2)
+        if max(itertools.starmap(Candidate.overlap, itertools.product(spaces[a], spaces[b]))) < _APART
+    ]
+    apart += [(name, _WALK) for name in spaces]
+    extra: dict[str, Any] = {str(size): best_possible(effects, same, size, seed=task.seed) for size in _SIZES}
+    extra["pairs"] = best_possible_pairs(effects, same, _PAIR_SIZE, apart, seed=task.seed)
     return Outcome(task, extra=extra)
+
+
+def _possible(path: Path) -> tuple[dict[str, list[Candidate]], dict[str, Candidate], Floats]:
+    """Columns of the visible effects of a run; those of them at the constant they are hidden with, where they have one;
+    and a root (d, k) of the covariance of a random walk of the biases from dwell to dwell, in the same frame."""
+    from kf_calib.calibration import calibrate
+    from kf_calib.effects import effect_named
+    from kf_calib.scan import scan
+    from kf_calib.sources.recording import Recording
+
+    spaces = {name: own for name, own in candidates(path).items() if any(each.dof for each in own)}
+    hidden = {name: catalogue()[name].inner["tau"] for name in spaces if "tau" in catalogue()[name.split(":")[0]].inner}
+    result = calibrate(Recording(path))
+    bench, middles_s = result.model.bench, np.array([0.5 * (d.start_s + d.end_s) for d in result.fit.dwells])
+    steps = [effect_named(f"step = t > {at:.3f}*s", bench) for at in 0.5 * (middles_s[1:] + middles_s[:-1])]
+    constants = [effect_named(name, bench).at(value) for name, value in hidden.items()]
+    grids = [each.effect for own in spaces.values() for each in own if each.dof]
+    found = scan(result.fit.carried, result.noise.judging, [*grids, *constants, *steps]).candidates
+    framed = dict[str, list[Candidate]]()
+    for candidate in found[: len(grids)]:
+        framed.setdefault(str(candidate.effect), []).append(candidate)
+    walk = [each.columns * math.sqrt(gap) for each, gap in zip(found[-len(steps) :], np.diff(middles_s), strict=True)]
+    return framed, dict(zip(hidden, found[len(grids) :], strict=False)), np.concatenate(walk, axis=1)
 
 
 def _on_plan(task: Task, rows: Sequence[Sequence[float]]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -598,7 +632,7 @@ def visible_effects(options: tuple[str, ...] = ()) -> list[str]:
     hideable = {kind.name: kind for kind in known_kinds()}
     names = [each["effect"] for each in run("effects", "--json")["effects"]]
     kinds = {name: hideable[name.split(":")[0]] for name in names if name.split(":")[0] in hideable}
-    return [n for n, kind in kinds.items() if n not in unseen or (kind.accompanied and _has_size(clean, n))]
+    return [n for n, kind in kinds.items() if n not in unseen or (kind.counted and _has_size(clean, n))]
 
 
 def _has_size(task: Task, name: str) -> bool:
@@ -933,10 +967,11 @@ def _ideal(_: str, own: list[Outcome]) -> Iterator[Figure]:
                 *np.percentile(hits, [2.5, 97.5]),
                 len(hits),
             )
-    pairs = [float(each.extra["pair"]) for each in own if "pair" in each.extra]
-    if pairs:
-        name = "two at once, both found and nothing else: the most there can be"
-        yield Figure(name, float(np.mean(pairs)), *np.percentile(pairs, [2.5, 97.5]), len(pairs))
+    hits = [(pair, right) for each in own for pair, right in each.extra.get("pairs", [])]
+    for walks, words in ((False, ""), (True, ", a walk of the biases being one")):
+        shown = [right for pair, right in hits if _WALK in pair or not walks]
+        if shown:
+            yield rate(f"two at once{words}, both found and nothing else: the most there can be", shown)
 
 
 _FIGURES: dict[str, Callable[[str, list[Outcome]], Iterator[Figure]]] = {

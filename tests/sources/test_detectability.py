@@ -217,6 +217,15 @@ def test_vibration_itself_does_not_count_to_its_rectification():
     assert one is not None and one < 5 and ten == pytest.approx(10 * one, rel=1e-6)
 
 
+def test_of_a_rectified_vibration_its_mean_over_a_cycle_counts():
+    """K2 rms^2 sin^4(pi t / T), beside what a bias absorbs; as much is at twice its frequency."""
+    run = simulation(sample_hz=100.0, plan=[Visit((0, 0, 0), 400.0)])
+    found = size(run, "vibration-rectification=1e-6,0,0;rms=2;period=20")
+    t = np.arange(100.0, 39_975.0) / 100.0
+    mean = 1e-6 * 4.0 * np.sin(np.pi * t / 20.0) ** 4
+    assert found == pytest.approx(float(np.linalg.norm(mean - mean.mean())) / run.noise.white_mps2, rel=1e-3)
+
+
 def test_size_does_not_depend_on_batches_nor_on_what_else_is_hidden():
     texts = ["settling=1e-4", "thermal-lag=1e-4;tau=30", "telegraph=1e-4;tau=20", "vibration-rectification=1e-5"]
     options = {"sample_hz": 20.0, "slew_rate_degps": 90.0}

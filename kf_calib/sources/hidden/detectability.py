@@ -16,8 +16,8 @@ white noise, for AR(1) times kappa = (1 + phi) / (1 - phi), and offsets of the w
 S the rows of sensitivities, f the specific force. So the mean of a dwell, of covariance D + kappa sigma^2 / N, and what
 departs from it, of covariance kappa sigma^2, are independent: sums over each dwell suffice, and memory stays flat.
 Random walk, outliers and errors of the encoders are not in V, nor is vibration: it is at its own frequency, far above
-what an effect is sought by. Of the rectification of a sinusoid, K2 v^2, half of n^2 is at twice that frequency, so that
-an evaluation which averages the vibration away sees about 0.7 n of it.
+what an effect is sought by. Of the rectification K2 v^2 of a sinusoid what counts is its mean over a cycle: the rest is
+at twice its frequency, where no reading tells it from a vibration that is not quite a sinusoid.
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 _SETTLE_NS, _LEAD_NS = 1_000_000_000, 250_000_000
 _SEEN = 1e-6  # of the effect before projection; below it is what absorbing leaves by rounding
 _ROUNDING = 1e-14  # of gravity, in the difference of two readings
-_ABSENT = 1e-20  # times the size: too small to be felt, and what comes with the effect is still there
 _TOLERANCE = 2e-3
 _ROUNDS = 12
 _RANK = 1e-12
@@ -156,17 +155,12 @@ def _rows(simulation: Simulation, effects: Sequence[Hidden]) -> Iterator[tuple[T
 
     The runs go side by side, at the full rate and through the slews: effects remember what was before.
     """
-    hidden = [[], *([effect] for effect in effects)]
-    references = list[int]()  # the run that each effect is compared with
-    for effect in effects:
-        references.append(len(hidden) if effect.kind.accompanied else 0)
-        hidden += [[effect.scaled(_ABSENT)]] if effect.kind.accompanied else []
+    hidden = [[], *([effect.counted] for effect in effects)]
     first_ns: int | None = None
     for batches in zip(*(simulation.hiding(one, Noise()) for one in hidden), strict=True):
         time_ns, values = batches[0].accel.time_ns, [batch.accel.values for batch in batches]
         first_ns = int(time_ns[0]) if first_ns is None else first_ns
-        added = [values[run] - values[reference] for run, reference in enumerate(references, start=1)]
-        yield time_ns - first_ns, np.hstack([values[0], *added])
+        yield time_ns - first_ns, np.hstack([values[0], *(own - values[0] for own in values[1:])])
 
 
 def _departures(dwell: _Moments, sigma: float) -> tuple[Floats, Floats]:

@@ -76,9 +76,9 @@ class Kind:
 
     unit: of a coefficient. coefficients: their names, one for each size. navigation, mems: typical sizes, from ... to,
     in units of data sheets. make: (coefficients, rig, gimbal axis where ``per_axis``, inner constants) -> step.
-    signed: false where a coefficient cannot be negative. known: it is in the catalogue of the diagnosis. accompanied:
-    something comes with the effect whatever its size, and does not count to its size in sigma. driver: of an effect
-    outside the catalogue, the quantity it goes with.
+    signed: false where a coefficient cannot be negative. known: it is in the catalogue of the diagnosis. counted: makes
+    the part that counts to its size in sigma, where something comes with the effect whatever its size. driver: of an
+    effect outside the catalogue, the quantity it goes with.
     """
 
     name: str
@@ -94,7 +94,7 @@ class Kind:
     signed: bool = True
     per_axis: bool = False
     known: bool = True
-    accompanied: bool = False
+    counted: Callable[..., Step] | None = field(default=None, repr=False)
     driver: str = ""
 
     def typical(self, grade: str) -> tuple[float, float]:
@@ -143,6 +143,11 @@ class Hidden:
         return self.kind.make(np.array(self.sizes), rig, *axis, **self._inner)
 
     @property
+    def counted(self) -> Hidden:
+        """Of it, what counts to its size in sigma."""
+        return self if self.kind.counted is None else replace(self, kind=replace(self.kind, make=self.kind.counted))
+
+    @property
     def _inner(self) -> dict[str, float]:
         return {**self.kind.inner, **self.inner}
 
@@ -176,7 +181,7 @@ def made(
     signed: bool = True,
     per_axis: bool = False,
     known: bool = True,
-    accompanied: bool = False,
+    counted: Callable[..., Step] | None = None,
     driver: str = "",
 ) -> Callable[[Callable[..., Step]], Callable[..., Step]]:
     """Registers a maker of steps. Its docstring is "Title: physics (source)."; its keyword-only arguments are the inner
@@ -190,7 +195,7 @@ def made(
         typical = navigation, mems or navigation
         _KINDS[name] = Kind(
             name, unit, stage, coefficients, *typical, make, inner, title, physics, signed, per_axis, known,
-            accompanied, driver,
+            counted, driver,
         )  # fmt: skip
         return make
 
