@@ -24,6 +24,7 @@ from kf_calib.effects import walk_named
 from kf_calib.fitting import WALK, back_gain, behind_within
 from kf_calib.likelihood import FEWEST
 from kf_calib.noise import mean_covariances
+from kf_calib.odds import as_fall
 from kf_calib.pairs import MOST, WALKS, Pair, Pairs, alike, as_good, exchanged, likeliest, names_of, pairs_of
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
@@ -287,15 +288,20 @@ def _formulas(found: Diagnosis) -> list[tuple[float, Family]]:
 def _walks_not(found: Diagnosis, first: Suspect) -> bool:
     """Whether what could be a walk of the biases is one jump, or follows what the platform does rather than time.
 
-    A walk may take any path: what is simpler, explains more and leaves nothing goes before it.
+    A walk may take any path: what is simpler, likelier at whatever moment or of whatever shape it is, and leaves
+    nothing goes before it.
     """
     if not first.refit.noise.walk_mps2_per_sqrt_s:
         return False
-    simpler = [each for each in _formulas(found) if each[1].driver == JUMP or not each[1].driver.startswith("time")]
-    gain, formula = max(simpler, key=lambda each: each[0], default=(-np.inf, None))
-    if formula is None or gain < found.test.scores[first.name] + EQUAL:
-        return False
-    return _fits(with_effects(found.before, formula.formulas), found.test)
+    tried, test = [each for _, each in _formulas(found)], found.test
+    jumps, moved = ([each for each in tried if each.driver == JUMP], [each for each in tried if not each.of_time])
+    walk = test.scores[first.name] - test.paths + threshold(1, test.effective_tests)
+    for simpler in filter(None, (jumps, moved)):
+        ranks, falls = np.array([each.rank for each in simpler]), np.array([each.fall for each in simpler])
+        best = simpler[int(np.argmax(falls - ranks))]
+        if as_fall(ranks, falls) > walk + EQUAL and _fits(with_effects(found.before, best.formulas), test):
+            return True
+    return False
 
 
 def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:

@@ -49,8 +49,8 @@ class Description:
 
 @dataclass(frozen=True)
 class Family:
-    """Formulas with one driver, as a candidate of its own; fall: of chi-squared, with all of them; dof: what they see,
-    and one where the moment of a jump, a time constant or a period is looked for, as an effect's constant (``price``).
+    """Formulas with one driver, as a candidate of its own; fall: of chi-squared, with all of them; rank: of what they
+    see.
 
     falls: with each of them alone; formulas: as they can be added. known: each of them is what some known effect is,
     or nearly.
@@ -59,13 +59,23 @@ class Family:
     driver: str
     texts: tuple[str, ...]
     fall: float
-    dof: int
+    rank: int
     falls: tuple[float, ...]
     known: bool = False
 
     @property
     def formulas(self) -> tuple[str, ...]:
         return tuple(_named(text, number) for number, text in enumerate(self.texts))
+
+    @property
+    def dof(self) -> int:
+        """One more where the moment of a jump, a time constant or a period is looked for, as an effect's constant
+        (``price``)."""
+        return self.rank + (self.rank > 0 and self.driver in (JUMP, DECAY, ARRIVAL, PERIODIC))
+
+    @property
+    def of_time(self) -> bool:
+        return self.driver.startswith("time")
 
     @property
     def score(self) -> float:
@@ -145,9 +155,8 @@ def families(fitted: Fit, known: Sequence[Effect] = ()) -> tuple[list[Family], f
         own, place = slice(place, place + len(texts)), place + len(texts)
         parts = scanned.candidates[own]
         same = all(any(part.within(each, _SAME) for each in beside) for part in parts)
-        fall, dof = scanned.explained(np.concatenate([part.basis for part in parts], axis=1))
-        dof += dof > 0 and driver in (JUMP, DECAY, ARRIVAL, PERIODIC)
-        out.append(Family(driver, tuple(texts), fall, dof, tuple(scanned.statistics[own].tolist()), same))
+        fall, rank = scanned.explained(np.concatenate([part.basis for part in parts], axis=1))
+        out.append(Family(driver, tuple(texts), fall, rank, tuple(scanned.statistics[own].tolist()), same))
     return out, float(scanned.residual @ scanned.residual) - len(scanned.residual)
 
 
