@@ -273,7 +273,7 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
     own, _ = scanned.explained(np.concatenate([each.basis for each in scanned.candidates], axis=1))
     own -= sum(price(each, tests) for each in scanned.candidates)
     if found.test.walking in names:
-        own += walk_fall(refit.fit, tests)[0] - threshold(1, tests) + found.test.paths
+        own += walk_fall(refit.fit, tests)[0] - threshold(1, tests)
     return any(gain > own + EQUAL for gain, _ in _formulas(found))
 
 
