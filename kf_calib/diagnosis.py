@@ -21,7 +21,7 @@ from kf_calib.assessment import EQUAL, LEVEL, SHARE, Test, assessed, price, run_
 from kf_calib.calibration import Calibration, Parameter, format_p, refitted
 from kf_calib.drivers import JUMP, Family, families, roughly
 from kf_calib.effects import walk_named
-from kf_calib.fitting import WALK, back_gain, behind_within
+from kf_calib.fitting import WALK, behind_within
 from kf_calib.likelihood import FEWEST
 from kf_calib.noise import mean_covariances
 from kf_calib.odds import as_fall
@@ -402,7 +402,7 @@ def _no_walk(refit: Calibration) -> bool:
     steps = np.array([visit.innovation_mps2 / visit.innovation_sigma_mps2 for visit in refit.visits])
     steps = np.abs(steps[np.isfinite(steps)])
     leaps = bool(steps.size and run_level(2.0 * float(ndtr(-steps.max())), steps.size) < LEVEL)
-    return leaps or 2.0 * back_gain(refit.fit)[0] > EQUAL
+    return leaps or 2.0 * refit.fit.back_gain[0] > EQUAL
 
 
 def _back_s(found: Diagnosis) -> float | None:
@@ -410,7 +410,7 @@ def _back_s(found: Diagnosis) -> float | None:
     a walk: of walks one in twenty looks so."""
     if found.after is None or not found.after.noise.walk_mps2_per_sqrt_s or found.test.walking not in found.missing:
         return None
-    gain, back_s = back_gain(found.after.fit)
+    gain, back_s = found.after.fit.back_gain
     return back_s if 2.0 * gain > _NEARLY else None
 
 

@@ -12,7 +12,7 @@ from kf_calib.assessment import EQUAL
 from kf_calib.bench import Bench
 from kf_calib.effects import Effect, effect_named, walk_named
 from kf_calib.errors import InputError
-from kf_calib.fitting import Fit, back_gain, fit, walk_gain
+from kf_calib.fitting import Fit, fit, walk_gain
 from kf_calib.folding import DwellFactor
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
@@ -123,7 +123,7 @@ def _back_s(fitted: Fit, walk: str) -> float | None:
     walked = fit(fitted.dwells, model + effect_named(walk, model.bench), 0.0, fitted.carried.slews)
     if not walked.noise.walk_mps2_per_sqrt_s:
         return None
-    gain, back_s = back_gain(walked)
+    gain, back_s = walked.back_gain
     return back_s if 2.0 * gain > EQUAL else None
 
 

@@ -109,6 +109,14 @@ class Fit:
             out += np.outer(gain, gain)
         return out
 
+    @cached_property
+    def back_gain(self) -> tuple[float, float]:
+        """What a walk that comes back gains in log-likelihood over the walk of the biases that the fit has, beside what
+        a stated scatter may be; and the time constant with which it comes back, s."""
+        noise, carried = self.noise.judging, self.carried
+        means, prior = wandering(carried.dwells, noise, carried.means)
+        return held_gain(noise, means, carried.state, prior)
+
     def rows(self, noise: Noise | None = None) -> list[Floats]:
         """Whitened rows [H | z] of each dwell, by the weights of the fit or by another noise."""
         return information.whitened(self.dwells, self.carried.columns, noise or self.noise.weights, self.carried.state)
@@ -254,11 +262,3 @@ def walk_gain(fitted: Fit) -> tuple[float, float]:
     means, prior = wandering(carried.dwells, noise, carried.means)
     walk, scatter = (gain_of(part, noise, means, carried.state, prior) for part in ("walk", "scatter"))
     return walk, walk - scatter
-
-
-def back_gain(fitted: Fit) -> tuple[float, float]:
-    """What a walk that comes back gains in log-likelihood over the walk of the biases that the fit has, beside what a
-    stated scatter may be; and the time constant with which it comes back, s."""
-    noise, carried = fitted.noise.judging, fitted.carried
-    means, prior = wandering(carried.dwells, noise, carried.means)
-    return held_gain(noise, means, carried.state, prior)

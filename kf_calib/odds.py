@@ -10,6 +10,8 @@ import numpy as np
 
 from kf_calib.samples import Floats
 
+_LEAST = 1e-12  # of a fall: the odds of none are their limit
+
 
 def log_odds(dof: int, falls: Floats | float, sigmas: float) -> Floats:
     """log of the likelihood ratio of an effect of ``sigmas`` against none, averaged over its directions.
@@ -19,7 +21,7 @@ def log_odds(dof: int, falls: Floats | float, sigmas: float) -> Floats:
     """
     from scipy.special import gammaln, ive
 
-    order, x = 0.5 * dof - 1.0, sigmas * np.sqrt(falls)
+    order, x = 0.5 * dof - 1.0, sigmas * np.sqrt(np.maximum(falls, _LEAST))
     return gammaln(0.5 * dof) + order * np.log(2.0 / x) + np.log(ive(order, x)) + x - 0.5 * sigmas**2
 
 

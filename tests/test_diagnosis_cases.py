@@ -12,7 +12,7 @@ from test_diagnosis import BENCH
 from kf_calib.assessment import EQUAL, assessed
 from kf_calib.calibration import Calibration, calibrate
 from kf_calib.diagnosis import Diagnosis, diagnose, with_effects
-from kf_calib.fitting import back_gain
+from kf_calib.drivers import JUMP
 from kf_calib.sources.hidden import parse
 from kf_calib.sources.hidden.detectability import sized
 from kf_calib.sources.noise_sources import Noise
@@ -202,6 +202,23 @@ def test_a_walk_and_another_effect_are_both_found(name: str) -> None:
     assert found.after is not None and found.after.consistency.consistent
 
 
+@pytest.mark.parametrize("seeds", [range(6), pytest.param(range(6, 36), marks=pytest.mark.slow)])
+def test_a_walk_is_named_before_what_its_path_happens_to_look_like(seeds: range) -> None:
+    """By their odds: a line through a path is the best of many, and the likelihood of a walk is over all its paths."""
+    first = [diagnose(run("bias-walk=10sigma", seed=seed)).missing[:1] for seed in seeds]
+    assert sum(each == ("bias-walk",) for each in first) >= 0.75 * len(first)  # a half of them by chi-squared alone
+    drifts = [diagnose(run("bias-drift=10sigma", seed=seed)).missing for seed in seeds[:3]]
+    assert ("bias-walk",) not in drifts
+
+
+def test_a_jump_is_not_called_a_walk() -> None:
+    """A walk could take that path, and any other: at whatever moment it is, the jump is likelier."""
+    found = [diagnose(run("bias-jump=20sigma", seed=seed)) for seed in range(3)]
+    assert all(each.unknown for each in found), [each.verdict for each in found]
+    said = [description(each) for each in found]
+    assert all(each is not None and each.driver == JUMP for each in said)
+
+
 def test_in_a_few_dwells_a_walk_could_explain_what_an_effect_does() -> None:
     """Three coefficients of six degrees of freedom: what is left is no proof. In 24 dwells it is."""
     few = [diagnose(run("hysteresis=12sigma", plan=spread_plan(6, dwell_s=8.0, seed=seed))) for seed in range(3, 8)]
@@ -219,7 +236,7 @@ def test_a_bias_that_goes_to_and_fro_is_no_walk() -> None:
 
 def test_a_walk_rarely_looks_as_if_it_came_back() -> None:
     gains = [
-        2.0 * back_gain(with_effects(run("bias-walk=15sigma", seed=seed), ("bias-walk",)).fit)[0] for seed in range(24)
+        2.0 * with_effects(run("bias-walk=15sigma", seed=seed), ("bias-walk",)).fit.back_gain[0] for seed in range(24)
     ]
     assert sum(gain > EQUAL for gain in gains) <= 1
     assert sum(gain > 0.5 for gain in gains) > 2  # they do differ
