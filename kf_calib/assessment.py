@@ -328,9 +328,16 @@ def _for_all_paths(found: Scan, scores: Mapping[str, float], tests: float) -> fl
     if not best or scores[best] <= 0.0:
         return 0.0
     own = [k for k, each in enumerate(found.candidates) if str(each.effect) == best and each.dof]
-    dofs = np.array([found.candidates[k].dof for k in own])
-    worth = as_fall(dofs, found.statistics[own], max(found.candidates[k].tried for k in own))
-    return scores[best] + threshold(1, tests) - worth
+    return for_all_paths(found, own, found.statistics[own], scores[best], tests)
+
+
+def for_all_paths(found: Scan, own: Sequence[int], falls: Floats, score: float, tests: float) -> float:
+    """The same against the candidates ``own`` of one effect, by what each lowers chi-squared and the best one's score,
+    alone or beside another effect."""
+    each = [found.candidates[k] for k in own]
+    values = sum(str(other.effect) == str(each[0].effect) for other in found.candidates)
+    worth = as_fall(np.array([one.dof for one in each]), falls, max(values, *(one.tried for one in each)))
+    return score + threshold(1, tests) - worth
 
 
 def walk_fall(fitted: Fit, tests: float) -> tuple[float, bool]:

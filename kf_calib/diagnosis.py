@@ -25,7 +25,19 @@ from kf_calib.fitting import WALK, behind_within
 from kf_calib.likelihood import FEWEST
 from kf_calib.noise import mean_covariances
 from kf_calib.odds import as_fall
-from kf_calib.pairs import MOST, WALKS, Pair, Pairs, alike, as_good, exchanged, likeliest, names_of, pairs_of
+from kf_calib.pairs import (
+    MOST,
+    WALKS,
+    Pair,
+    Pairs,
+    alike,
+    as_good,
+    exchanged,
+    likeliest,
+    names_of,
+    pairs_of,
+    paths_beside,
+)
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
 
@@ -143,12 +155,17 @@ def _likeliest(before: Calibration, test: Test) -> Diagnosis:
     pairs = pairs_of(test) if not explaining or explaining[0].name in (*test.best, test.walking) else {}
     if explaining:
         first = explaining[0].name
-        least = test.scores[first] + (2.0 if first == test.walking else 1.0) * EQUAL
-        clearly = {pair: score for pair, score in pairs.items() if score > least}
+        walks_first, least = first == test.walking, test.scores[first] + EQUAL
+        # columns have another direction to choose in a pair, which a walk has not
+        clearly = {pair: score for pair, score in pairs.items() if score > least + walks_first * EQUAL}
+        if walks_first:
+            clearly |= _pairs_with_walk(found, pairs, beyond=True)
+        elif clearly:
+            clearly |= {pair: score for pair, score in _pairs_with_walk(found, pairs).items() if score > least}
         walks = [each for each in explaining[1:] if each.name == test.walking]
         standing = (each for each in (explaining[0], *walks) if not _is_outdone(found, each))
         return _two(found, clearly, first) or _one(found, next(standing, None), pairs)
-    several = _two(found, pairs | _pairs_with_walk(found)) or _beside_lines(found)
+    several = _two(found, pairs | _pairs_with_walk(found, pairs)) or _beside_lines(found)
     return several or replace(found, unknown=not _may_scatter(before))
 
 
@@ -319,7 +336,7 @@ def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:
             continue
         if _outdone(found, refit, both):
             return None
-        walks = bool(alone) and alone == test.walking
+        walks = bool(alone) and alone == test.walking and alone not in both
         overlaps = ({alone: 1.0} if walks else {}) | exchanged(test, pairs, pair, _ALIKE)
         named = replace(found, missing=both, ambiguity=(*both, *overlaps), overlaps=overlaps, after=refit)
         named = replace(named, alone=alone if walks else "")
@@ -329,22 +346,26 @@ def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:
     return None
 
 
-def _pairs_with_walk(found: Diagnosis) -> dict[Pair, float]:
-    """Pairs of an effect and a walk of the biases, for those effects that are likeliest beside a walk.
+def _pairs_with_walk(found: Diagnosis, pairs: Pairs, beyond: bool = False) -> dict[Pair, float]:
+    """Pairs of an effect and a walk of the biases, for those effects that are likeliest beside a walk, where both do
+    better than the walk alone; ``beyond``: clearly so, and the effect is beyond chance beside the walk.
 
-    The walk beside the effect is judged by its likelihood, after a refit with both.
+    The walk beside the effect is judged by its likelihood, after a refit with both, against the ``pairs`` of columns.
     """
     before, test = found.before, found.test
     if not test.walking:
         return {}
     candidates, tests, out = test.scan.candidates, test.effective_tests, dict[Pair, float]()
     beside = assessed(found.refit_with(test.walking).fit, tests)
-    for name in [name for name in beside.ranked if name in test.best][:MOST]:
+    least = test.scores[test.walking] - test.paths + (EQUAL if beyond else 0.0)
+    for name in [each for each in beside.ranked if each in test.best and (beside.scores[each] > 0 or not beyond)][
+        :MOST
+    ]:
         k = test.best[name]
         own = float(test.scan.statistics[k]) - price(candidates[k], tests)
         walk = walk_fall(with_effects(before, (name, test.walking)).fit, tests)[0] - threshold(1, tests)
-        if walk > 0.0 and own + walk + test.paths > test.scores[test.walking]:
-            out[k, WALKS] = own + walk + test.paths
+        if walk > 0.0 and own + walk > least:
+            out[k, WALKS] = own + walk + paths_beside(test, pairs, k)
     return out
 
 

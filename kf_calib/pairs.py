@@ -8,7 +8,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Mapping
 
-from kf_calib.assessment import EQUAL, Test, ahead_of, price
+import numpy as np
+
+from kf_calib.assessment import EQUAL, Test, ahead_of, for_all_paths, price
 
 WALKS = -1
 """In a pair, in the place of a candidate's number."""
@@ -36,6 +38,20 @@ def pairs_of(test: Test) -> dict[Pair, float]:
         if fall - falls[j] > prices[k] and fall - falls[k] > prices[j]:
             out[j, k] = float(fall - prices[j] - prices[k])
     return out
+
+
+def paths_beside(test: Test, pairs: Pairs, k: int) -> float:
+    """So much more than its fall less its threshold is the score of a walk beside a candidate, to be ahead of the best
+    column beside it where its likelihood is."""
+    candidates, tests = test.scan.candidates, test.effective_tests
+    scores = {j if i == k else i: score for (i, j), score in pairs.items() if k in (i, j)}
+    if not scores:
+        return 0.0
+    best = str(candidates[max(scores, key=lambda j: scores[j])].effect)
+    beside = [j for j in scores if str(candidates[j].effect) == best]
+    own = float(test.scan.statistics[k]) - price(candidates[k], tests)
+    falls = np.array([scores[j] - own + price(candidates[j], tests) for j in beside])
+    return for_all_paths(test.scan, beside, falls, max(scores[j] for j in beside) - own, tests)
 
 
 def likeliest(test: Test, pairs: Pairs) -> list[Pair]:
