@@ -155,18 +155,25 @@ def _likeliest(before: Calibration, test: Test) -> Diagnosis:
     pairs = pairs_of(test) if not explaining or explaining[0].name in (*test.best, test.walking) else {}
     if explaining:
         first = explaining[0].name
-        walks_first, least = first == test.walking, test.scores[first] + EQUAL
-        # columns have another direction to choose in a pair, which a walk has not
-        clearly = {pair: score for pair, score in pairs.items() if score > least + walks_first * EQUAL}
-        if walks_first:
-            clearly |= _pairs_with_walk(found, pairs, beyond=True)
-        elif clearly:
-            clearly |= {pair: score for pair, score in _pairs_with_walk(found, pairs).items() if score > least}
+        clearly = _clearly_better(found, pairs, first)
         walks = [each for each in explaining[1:] if each.name == test.walking]
         standing = (each for each in (explaining[0], *walks) if not _is_outdone(found, each))
         return _two(found, clearly, first) or _one(found, next(standing, None), pairs)
     several = _two(found, pairs | _pairs_with_walk(found, pairs)) or _beside_lines(found)
     return several or replace(found, unknown=not _may_scatter(before))
+
+
+def _clearly_better(found: Diagnosis, pairs: Pairs, first: str) -> Pairs:
+    """Pairs that do clearly better than the one effect that explains the misfit alone; those with a walk of the biases
+    where that is the one, or where two columns do."""
+    test = found.test
+    least = test.scores[first] + EQUAL
+    if first == test.walking:  # two columns have more directions to choose, which a path has not
+        columns = {pair: score for pair, score in pairs.items() if score > least + EQUAL}
+        return columns | _pairs_with_walk(found, pairs, beyond=True)
+    columns = {pair: score for pair, score in pairs.items() if score > least}
+    walks = _pairs_with_walk(found, pairs) if columns else {}
+    return columns | {pair: score for pair, score in walks.items() if score > least}
 
 
 def _or_walk(found: Diagnosis) -> Diagnosis:
@@ -358,9 +365,8 @@ def _pairs_with_walk(found: Diagnosis, pairs: Pairs, beyond: bool = False) -> di
     candidates, tests, out = test.scan.candidates, test.effective_tests, dict[Pair, float]()
     beside = assessed(found.refit_with(test.walking).fit, tests)
     least = test.scores[test.walking] - test.paths + (EQUAL if beyond else 0.0)
-    for name in [each for each in beside.ranked if each in test.best and (beside.scores[each] > 0 or not beyond)][
-        :MOST
-    ]:
+    likely = [name for name in beside.ranked if name in test.best and (beside.scores[name] > 0.0 or not beyond)]
+    for name in likely[:MOST]:
         k = test.best[name]
         own = float(test.scan.statistics[k]) - price(candidates[k], tests)
         walk = walk_fall(with_effects(before, (name, test.walking)).fit, tests)[0] - threshold(1, tests)

@@ -202,6 +202,11 @@ def test_a_walk_and_another_effect_are_both_found(name: str) -> None:
     assert found.after is not None and found.after.consistency.consistent
 
 
+def test_a_walk_that_explains_all_gets_no_companion_by_chance() -> None:
+    found = [diagnose(run("bias-walk=15sigma", seed=seed)) for seed in range(5)]
+    assert not any(len(each.missing) > 1 for each in found), [each.missing for each in found]
+
+
 @pytest.mark.parametrize("seeds", [range(6), pytest.param(range(6, 36), marks=pytest.mark.slow)])
 def test_a_walk_is_named_before_what_its_path_happens_to_look_like(seeds: range) -> None:
     """By their odds: a line through a path is the best of many, and the likelihood of a walk is over all its paths."""
