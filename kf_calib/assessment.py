@@ -192,9 +192,9 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
     if name:
         fall, as_scatter = walk_fall(fitted, tests)
         p_values[name] = run_level(0.5 * float(chdtrc(1, max(fall, 0.0))), tests)
-        paths = _for_all_paths(found, scores, tests)
-        scores[name] = fall - threshold(1, tests)
-        scores[name] += paths if scores[name] > 0.0 else 0.0
+        beyond = fall - threshold(1, tests)
+        paths = _for_all_paths(found, scores, tests) if beyond > 0.0 else 0.0
+        scores[name] = beyond + paths
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
     test = Test(found, best, scores, p_values, misfit_p, name, tests, slewing, (), as_scatter=as_scatter, paths=paths)
     return _with_lines(test, fitted)
