@@ -132,7 +132,7 @@ def test_the_odds_of_a_walk_and_beside_it_are_those_of_a_plain_average(trial: An
 def test_paths_of_a_walk_of_one_size_are_told_as_well_as_by_a_plain_average(trial: Any) -> None:
     """Against the path that most look like; the mean of exp(s r - s s / 2) over paths drawn to one size."""
     times, sigmas = np.arange(6.0), 3.0
-    walk = trial.Walk(np.linalg.cholesky(np.minimum.outer(times + 1.0, times + 1.0)))
+    walk = trial.Process(np.linalg.cholesky(np.minimum.outer(times + 1.0, times + 1.0)))
     column = walk.parts(sigmas)[0].basis[:, :1]
     effects = {"bias-walk": walk, "other": trial.Columns([column])}
     found = trial.best_possible(effects, {name: {name} for name in effects}, sigmas, draws=4000)

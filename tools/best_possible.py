@@ -4,7 +4,7 @@ An effect of n sigma is drawn evenly over the directions its coefficients can ta
 and white noise is added; the chooser knows n, these odds, and the noise, and takes the effect that is likeliest after
 the readings (Bayes). Of a constant within an effect it knows the range, not the value. No rule is right more often, so
 what a diagnosis lacks of it is what better rules could gain. Of two effects at once, each of n sigma, it takes the
-likeliest pair.
+likeliest pair. Rivals are what may be, too, and has no name.
 """
 
 from __future__ import annotations
@@ -89,9 +89,9 @@ class Columns:
 
 
 @dataclass(frozen=True)
-class Walk:
-    """A random walk of covariance ``root`` root^T, root (d, k), all paths of one size: normal ones, the intensity
-    spread as theirs is."""
+class Process:
+    """A random process of covariance ``root`` root^T, root (d, k), as a walk of the biases, all its paths of one size:
+    normal ones, the intensity spread as theirs is."""
 
     root: Floats
 
@@ -116,14 +116,21 @@ class Walk:
 
 
 def best_possible(
-    effects: Mapping[str, Effect], same: Mapping[str, set[str]], sigmas: float, draws: int = 100, seed: int = 0
+    effects: Mapping[str, Effect],
+    same: Mapping[str, set[str]],
+    sigmas: float,
+    draws: int = 100,
+    seed: int = 0,
+    rivals: Mapping[str, Effect] | None = None,
 ) -> dict[str, float]:
-    """Of each effect, the share of draws in which the likeliest one is it, or means the ``same`` as it."""
-    rng, names, out = np.random.default_rng(seed), list(effects), dict[str, float]()
-    for name in names:
+    """Of each effect, the share of draws in which the likeliest of all and the ``rivals`` is it, or means the ``same``
+    as it."""
+    every = {**effects, **(rivals or {})}
+    rng, names, out = np.random.default_rng(seed), list(every), dict[str, float]()
+    for name in effects:
         readings = sigmas * effects[name].signals(draws, rng)
         readings = readings + rng.standard_normal(readings.shape)
-        likeliest = np.argmax([_log_odds(each, readings, sigmas) for each in effects.values()], axis=0)
+        likeliest = np.argmax([_log_odds(each, readings, sigmas) for each in every.values()], axis=0)
         out[name] = float(np.mean([names[k] in same[name] for k in likeliest]))
     return out
 

@@ -38,13 +38,17 @@ from typing import Any, TypeVar
 
 import click
 import numpy as np
-from best_possible import Columns, Effect, Walk, best_possible, best_possible_pairs
+from best_possible import Columns, Effect, Process, best_possible, best_possible_pairs
 
 from kf_calib.advice import ENOUGH
+from kf_calib.calibration import Calibration, calibrate
+from kf_calib.effects import Effect as Known
+from kf_calib.effects import effect_named, names
 from kf_calib.errors import KfCalibError
 from kf_calib.samples import Floats
-from kf_calib.scan import Candidate
+from kf_calib.scan import Candidate, scan
 from kf_calib.sources.hidden import Kind, NoSizeError, catalogue
+from kf_calib.sources.recording import Recording
 
 # Few readings, and time enough for drifts and time constants to show: half an hour in about a second of computing.
 BENCH = (
@@ -88,6 +92,7 @@ _DWELL_S = float(BENCH[BENCH.index("--dwell-s") + 1])
 _POWER = (0.86, 0.94)
 _SECOND = 5_000_000  # from the seed of a run to that of its second run
 _WALK = "bias-walk"
+_SCATTERING = ", where dwells may scatter, too"
 _BENCH_SIZES = (10, 15, 30)  # sigma
 _ENOUGH = 20  # trials; fewer are shown and not judged
 
@@ -341,32 +346,44 @@ def _scanned(
 
     looked_for: of an oscillation the frequencies at which the program looks for a slow one.
     """
-    from kf_calib.assessment import slow_hz
-    from kf_calib.calibration import calibrate
-    from kf_calib.effects import effect_named, names
-    from kf_calib.scan import scan
-    from kf_calib.sources.recording import Recording
 
-    result = calibrate(Recording(path))
-    fitted, bench, noise = result.fit, result.model.bench, result.noise.judging
+    result = _calibrated(path)
+    noise = result.noise.judging
     if white_mps2 is not None:
         noise = dataclasses.replace(noise, sigma_mps2=np.full(3, white_mps2), inflation=np.ones(3))
-    effects = list[Any]()
+    found = scan(result.fit.carried, noise, _with_columns(result, wanted, looked_for))
+    return _by_name(found.candidates), found.residual
+
+
+def _calibrated(path: Path) -> Calibration:
+
+    return calibrate(Recording(path))
+
+
+def _with_columns(result: Calibration, wanted: Sequence[str] | None = None, looked_for: bool = False) -> list[Known]:
+    """Effects of the program that are columns, one with an unknown at the values of a grid."""
+    from kf_calib.assessment import slow_hz
+
+    bench, out = result.model.bench, list[Known]()
     for name in names(bench):
         effect = effect_named(name, bench)
         if wanted is None and effect.oscillates:  # known by its line in the spectrum: a slow one mimics whatever drifts
             continue
         if (wanted is None or name in wanted) and not effect.dynamic and not effect.walks:
             if effect.unknown is None:
-                effects.append(effect)
+                out.append(effect)
             else:
                 slow = effect.oscillates and looked_for
-                effects += [effect.at(v) for v in (slow_hz(fitted, effect) if slow else effect.unknown.grid(2.0))]
-    found = scan(fitted.carried, noise, effects)
+                values = slow_hz(result.fit, effect) if slow else effect.unknown.grid(2.0)
+                out += [effect.at(value) for value in values]
+    return out
+
+
+def _by_name(found: Iterable[Candidate]) -> dict[str, list[Candidate]]:
     spaces = dict[str, list[Candidate]]()
-    for candidate in found.candidates:
+    for candidate in found:
         spaces.setdefault(str(candidate.effect), []).append(candidate)
-    return spaces, found.residual
+    return spaces
 
 
 def outside(task: Task) -> Outcome:
@@ -417,8 +434,6 @@ def power(task: Task) -> Outcome:
     By the test that ``diagnose`` begins with; to name what it has noticed takes it most of its time.
     """
     from kf_calib.assessment import assessed
-    from kf_calib.calibration import calibrate
-    from kf_calib.sources.recording import Recording
 
     (name,) = task.hidden
     stated = stated_sizes(dataclasses.replace(task, hidden=()))
@@ -468,7 +483,6 @@ def improve(task: Task) -> Outcome:
     In the second run, of which the selection knows nothing, sensors, orientations and noise are other ones.
     """
     from kf_calib.calibration import Settings, calibrate
-    from kf_calib.sources.recording import Recording
 
     path, again, times = Path("trial.mcap"), Path("again.mcap"), dict[str, float]()
     effects = simulated(task, path, times)["effects"]
@@ -520,10 +534,11 @@ def advice(task: Task, advised: int = 4, random: int = 12) -> Outcome:
 
 
 def ideal(task: Task) -> Outcome:
-    """How often the likeliest effect is the right one where all but the readings is known beforehand."""
+    """How often the likeliest effect is the right one where all but the readings is known beforehand; and where, beside
+    that, dwells may scatter by more than is stated."""
     path = Path("clean.mcap")
     simulated(task, path)
-    spaces, constants, walk = _possible(path)
+    spaces, constants, walk, scatter = _possible(path)
     alike = {
         (a, b)
         for a, b in itertools.product(spaces, spaces)
@@ -534,39 +549,41 @@ def ideal(task: Task) -> Outcome:
         name: Columns([each.basis for each in own], [constants[name].basis] if name in constants else [])
         for name, own in spaces.items()
     }
-    effects[_WALK] = Walk(walk)
+    effects[_WALK] = walk
     apart = [
         (a, b)
         for a, b in itertools.combinations(spaces, 2)
         if max(itertools.starmap(Candidate.overlap, itertools.product(spaces[a], spaces[b]))) < _APART
     ]
     apart += [(name, _WALK) for name in spaces]
-    extra: dict[str, Any] = {str(size): best_possible(effects, same, size, seed=task.seed) for size in _SIZES}
+    extra: dict[str, Any] = {
+        f"{size}{words}": best_possible(effects, same, size, seed=task.seed, rivals=rivals)
+        for size in _SIZES
+        for words, rivals in (("", {}), (_SCATTERING, {"scatter": scatter}))
+    }
     extra["pairs"] = best_possible_pairs(effects, same, _PAIR_SIZE, apart, seed=task.seed)
     return Outcome(task, extra=extra)
 
 
-def _possible(path: Path) -> tuple[dict[str, list[Candidate]], dict[str, Candidate], Floats]:
+def _possible(path: Path) -> tuple[dict[str, list[Candidate]], dict[str, Candidate], Process, Process]:
     """Columns of the visible effects of a run; those of them at the constant they are hidden with, where they have one;
-    and a root (d, k) of the covariance of a random walk of the biases from dwell to dwell, in the same frame."""
-    from kf_calib.calibration import calibrate
-    from kf_calib.effects import effect_named
-    from kf_calib.scan import scan
-    from kf_calib.sources.recording import Recording
+    a random walk of the biases from dwell to dwell, and scatter of dwells, in the same frame."""
 
-    spaces = {name: own for name, own in candidates(path).items() if any(each.dof for each in own)}
-    hidden = {name: catalogue()[name].inner["tau"] for name in spaces if "tau" in catalogue()[name.split(":")[0]].inner}
-    result = calibrate(Recording(path))
+    result = _calibrated(path)
     bench, middles_s = result.model.bench, np.array([0.5 * (d.start_s + d.end_s) for d in result.fit.dwells])
     steps = [effect_named(f"step = t > {at:.3f}*s", bench) for at in 0.5 * (middles_s[1:] + middles_s[:-1])]
-    constants = [effect_named(name, bench).at(value) for name, value in hidden.items()]
-    grids = [each.effect for own in spaces.values() for each in own if each.dof]
+    grids = _with_columns(result)
+    inner = {name: catalogue()[name.split(":")[0]].inner for name in {str(each) for each in grids}}
+    constants = [effect_named(name, bench).at(own["tau"]) for name, own in inner.items() if "tau" in own]
     found = scan(result.fit.carried, result.noise.judging, [*grids, *constants, *steps]).candidates
-    framed = dict[str, list[Candidate]]()
-    for candidate in found[: len(grids)]:
-        framed.setdefault(str(candidate.effect), []).append(candidate)
-    walk = [each.columns * math.sqrt(gap) for each, gap in zip(found[-len(steps) :], np.diff(middles_s), strict=True)]
-    return framed, dict(zip(hidden, found[len(grids) :], strict=False)), np.concatenate(walk, axis=1)
+    seen = [each for each in found[: len(grids)] if each.dof]
+    hidden = {str(each.effect): each for each in found[len(grids) : -len(steps)] if each.dof}
+    after = np.array([each.columns for each in found[-len(steps) :]])  # (D - 1, d, 3), of each channel from a dwell on
+    walk = after * np.sqrt(np.diff(middles_s))[:, None, None]
+    none = np.zeros_like(after[:1])  # of all dwells: a bias
+    alone = np.concatenate([none, after]) - np.concatenate([after, none])
+    walks, scatters = (Process(np.concatenate(list(each), axis=1)) for each in (walk, alone))
+    return _by_name(seen), hidden, walks, scatters
 
 
 def _on_plan(task: Task, rows: Sequence[Sequence[float]]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -953,25 +970,27 @@ def _advice(_: str, own: list[Outcome]) -> Iterator[Figure]:
 
 
 def _ideal(_: str, own: list[Outcome]) -> Iterator[Figure]:
-    for size in map(str, _SIZES):
-        runs = [float(np.mean(list(each.extra[size].values()))) for each in own if not each.error]
-        if runs:
-            low, high = np.percentile(runs, [2.5, 97.5])
-            yield Figure(
-                f"right name first, n = {size}: the most there can be", float(np.mean(runs)), low, high, len(runs)
-            )
-            lowest, hits = _worst((name, share) for each in own for name, share in each.extra[size].items())
-            yield Figure(
-                f"worst effect, n = {size}, the most there can be: {lowest}",
-                float(np.mean(hits)),
-                *np.percentile(hits, [2.5, 97.5]),
-                len(hits),
-            )
+    for size, words in itertools.product(map(str, _SIZES), ("", _SCATTERING)):
+        shares = [each.extra[size + words] for each in own if size + words in each.extra]
+        if not shares:
+            continue
+        said = f"n = {size}{words}"
+        runs = [float(np.mean(list(each.values()))) for each in shares]
+        yield Figure(f"right name first, {said}: the most there can be", *_mean_and_range(runs), len(runs))
+        lowest, hits = _worst((name, share) for each in shares for name, share in each.items())
+        yield Figure(f"worst effect, {said}, the most there can be: {lowest}", *_mean_and_range(hits), len(hits))
+        walks = [each[_WALK] for each in shares]
+        yield Figure(f"{_WALK}, {said}: the most there can be", *_mean_and_range(walks), len(walks))
     hits = [(pair, right) for each in own for pair, right in each.extra.get("pairs", [])]
     for walks, words in ((False, ""), (True, ", a walk of the biases being one")):
         shown = [right for pair, right in hits if _WALK in pair or not walks]
         if shown:
             yield rate(f"two at once{words}, both found and nothing else: the most there can be", shown)
+
+
+def _mean_and_range(values: Sequence[float]) -> tuple[float, float, float]:
+    low, high = np.percentile(values, [2.5, 97.5])
+    return float(np.mean(values)), float(low), float(high)
 
 
 _FIGURES: dict[str, Callable[[str, list[Outcome]], Iterator[Figure]]] = {
