@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kf_calib.calibration import consistency
 from kf_calib.effects import Effect, effect_named, names, walk_named
-from kf_calib.fitting import Fit, walk_gain
+from kf_calib.fitting import Fit
 from kf_calib.folding import DwellFactor, lines_of, stimulus_of
 from kf_calib.model import Model
 from kf_calib.odds import as_fall
@@ -70,8 +70,7 @@ class Test:
     trend: what goes on within dwells beside the model and the noise (None: not to be judged, as where there are lines).
     lines: in the spectrum of the readings within dwells, and the name of the effect they speak for. vibration: those
     that are no oscillation of one amplitude, and count as noise. without_lines: the test with its lines as vibration.
-    between: in words, of an oscillation what is too fast for the scan and too slow for a line. as_scatter: what could
-    be a walk of the biases could as well be scatter from dwell to dwell, of more than is stated. paths: what a walk's
+    between: in words, of an oscillation what is too fast for the scan and too slow for a line. paths: what a walk's
     score gains on that of columns, whose falls are those of their best directions, as its likelihood is not of its best
     path.
     """
@@ -89,7 +88,6 @@ class Test:
     vibration: tuple[Line, ...] = ()
     without_lines: Test | None = None
     between: str = ""
-    as_scatter: bool = False
     paths: float = 0.0
     trend: Trend | None = None
 
@@ -188,15 +186,15 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
             if candidate.dof:
                 own = run_level(float(chdtrc(candidate.dof, statistics[k])), candidate.tried)
                 scores[name], p_values[name] = score, run_level(own, tests)
-    name, as_scatter, paths = _walking(fitted), False, 0.0
+    name, paths = _walking(fitted), 0.0
     if name:
-        fall, as_scatter = walk_fall(fitted, tests)
-        p_values[name] = run_level(0.5 * float(chdtrc(1, max(fall, 0.0))), tests)
+        fall = 2.0 * fitted.walk_gain
+        p_values[name] = run_level(0.5 * float(chdtrc(1, fall)), tests)
         beyond = fall - threshold(1, tests)
-        paths = _for_all_paths(found, scores, tests) if beyond > 0.0 else 0.0
+        paths = _beside_best(found, scores, tests) if beyond > 0.0 else 0.0
         scores[name] = beyond + paths
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
-    test = Test(found, best, scores, p_values, misfit_p, name, tests, slewing, (), as_scatter=as_scatter, paths=paths)
+    test = Test(found, best, scores, p_values, misfit_p, name, tests, slewing, (), paths=paths)
     return _with_lines(test, fitted)
 
 
@@ -318,7 +316,7 @@ def _walking(fitted: Fit) -> str:
     return walk_named(model.bench)
 
 
-def _for_all_paths(found: Scan, scores: Mapping[str, float], tests: float) -> float:
+def _beside_best(found: Scan, scores: Mapping[str, float], tests: float) -> float:
     """So much more than its fall less its threshold is the score of a walk, to be ahead of the best column where its
     likelihood is.
 
@@ -334,20 +332,27 @@ def _for_all_paths(found: Scan, scores: Mapping[str, float], tests: float) -> fl
 def for_all_paths(found: Scan, own: Sequence[int], falls: Floats, score: float, tests: float) -> float:
     """The same against the candidates ``own`` of one effect, by what each lowers chi-squared and the best one's score,
     alone or beside another effect."""
+    return score + threshold(1, tests) - worth(found, own, falls)
+
+
+def worth(found: Scan, own: Sequence[int], falls: Floats) -> float:
+    """What it is worth beside a likelihood (``as_fall``) that the candidates ``own`` of one effect, at values of its
+    constant, lower chi-squared by ``falls``."""
     each = [found.candidates[k] for k in own]
-    values = sum(str(other.effect) == str(each[0].effect) for other in found.candidates)
-    worth = as_fall(np.array([one.dof for one in each]), falls, max(values, *(one.tried for one in each)))
-    return score + threshold(1, tests) - worth
+    tried = max(_values(found, each[0]), *(one.tried for one in each))
+    return as_fall(np.array([one.dof for one in each]), falls, tried)
 
 
-def walk_fall(fitted: Fit, tests: float) -> tuple[float, bool]:
-    """By how much a walk of the biases lowers -2 log-likelihood; whether it could as well be more scatter than stated.
+def worth_together(found: Scan, own: Sequence[int]) -> float:
+    """The same of effects together, each at one value of its constant, the best of all of them."""
+    each = [found.candidates[k] for k in own]
+    fall, dof = found.explained(np.concatenate([one.basis for one in each], axis=1))
+    tried = int(np.prod([max(_values(found, one), one.tried) for one in each]))
+    return as_fall(np.array([dof]), np.array([fall]), tried)
 
-    Of two that explain as much, more scatter than was stated is less likely than a walk; where it was not stated, it
-    is likelier.
-    """
-    (fall, ratio), least = (2.0 * gain for gain in walk_gain(fitted)), threshold(1, tests)
-    return fall if ratio > (0.0 if fitted.noise.scatter_stated else least) else ratio, ratio < least
+
+def _values(found: Scan, candidate: Candidate) -> int:
+    return sum(str(other.effect) == str(candidate.effect) for other in found.candidates)
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,11 @@ from threadpoolctl import threadpool_limits
 from kf_calib import advice as advise
 from kf_calib import averaging
 from kf_calib.advice import Advice
-from kf_calib.assessment import EQUAL, LEVEL, SHARE, Test, assessed, price, run_level, threshold, walk_fall
+from kf_calib.assessment import EQUAL, LEVEL, SHARE, Test, assessed, price, run_level, threshold
 from kf_calib.calibration import Calibration, Parameter, format_p, refitted
 from kf_calib.drivers import JUMP, Family, families, roughly
 from kf_calib.effects import walk_named
 from kf_calib.fitting import WALK, behind_within
-from kf_calib.likelihood import FEWEST
 from kf_calib.noise import mean_covariances
 from kf_calib.odds import as_fall
 from kf_calib.pairs import (
@@ -40,6 +39,7 @@ from kf_calib.pairs import (
 )
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
+from kf_calib.scattering import as_scatter, beyond_any_path, beyond_scatter, may_scatter
 
 _REFUSED = 0.002  # chance that what is really missing is turned down because noise beside it looks like something more
 _ALIKE = 0.5  # overlap above which two suspects may be taken for each other
@@ -74,8 +74,9 @@ class Diagnosis:
 
     ambiguity: every single effect that fits as well as the first, and those that do together; overlaps: of each with
     it. together: the pairs among them that explain as much, and are no exchange of one effect for one that is alike.
-    alone: a single effect that would do in the place of two. as_scatter: the walk that is missing could as well be
-    dwells that scatter by more than is stated; back_s: or go to and fro with this time constant (None: not as well).
+    alone: a single effect that would do in the place of two. as_scatter: what is missing could as well be dwells that
+    scatter by more than is stated, or, where nothing is named, what would fit is less likely than that; back_s: the
+    walk that is missing could go to and fro with this time constant (None: not as well).
     """
 
     before: Calibration
@@ -149,9 +150,9 @@ def _likeliest(before: Calibration, test: Test) -> Diagnosis:
     suspects = _suspects(before, test)
     # what explains all of it explains most: one that fits far behind the first has only made the noise large enough
     least = test.scores[test.ranked[0]] - 2.0 * EQUAL if test.ranked else 0.0
-    explaining = [each for each in suspects if each.fits and test.scores[each.name] > least]
-    explaining = [each for each in explaining if _beyond_scatter(before, test, (each.name,))]
-    found = replace(nothing, suspects=suspects)
+    fitting = [each for each in suspects if each.fits and test.scores[each.name] > least]
+    explaining = [each for each in fitting if beyond_scatter(before, test, (each.name,), each.refit)]
+    found = replace(nothing, suspects=suspects, as_scatter=bool(fitting) and not explaining)
     pairs = pairs_of(test) if not explaining or explaining[0].name in (*test.best, test.walking) else {}
     if explaining:
         first = explaining[0].name
@@ -160,7 +161,7 @@ def _likeliest(before: Calibration, test: Test) -> Diagnosis:
         standing = (each for each in (explaining[0], *walks) if not _is_outdone(found, each))
         return _two(found, clearly, first) or _one(found, next(standing, None), pairs)
     several = _two(found, pairs | _pairs_with_walk(found, pairs)) or _beside_lines(found)
-    return several or replace(found, unknown=not _may_scatter(before))
+    return several or replace(found, unknown=not may_scatter(before))
 
 
 def _clearly_better(found: Diagnosis, pairs: Pairs, first: str) -> Pairs:
@@ -182,7 +183,7 @@ def _or_walk(found: Diagnosis) -> Diagnosis:
     walk = walk_named(model.bench)
     if not walk or not found.missing or model.walks or walk in found.ambiguity:
         return found
-    if _beyond_any_path(found.before, found.test, found.missing):
+    if beyond_any_path(found.before, found.test, found.missing):
         return found
     alone = walk if len(found.missing) > 1 else ""
     return replace(found, ambiguity=(*found.ambiguity, walk), overlaps={**found.overlaps, walk: 1.0}, alone=alone)
@@ -204,38 +205,6 @@ def _beside_lines(found: Diagnosis) -> Diagnosis | None:
         rest, before=found.before, test=test, suspects=found.suspects, missing=both, ambiguity=ambiguity,
         after=after if _fits(after, test, len(both)) else rest.after,
     )  # fmt: skip
-
-
-def _may_scatter(before: Calibration) -> bool:
-    """Whether dwells may scatter by more than was stated: it was found that they do, or so few cannot show it."""
-    noise, few = before.noise, before.consistency.dof < FEWEST
-    return (not noise.scatter_stated and (few or bool(noise.scatter_mps2.any()))) or (not noise.setting_stated and few)
-
-
-def _beyond_scatter(before: Calibration, test: Test, names: Sequence[str]) -> bool:
-    """Whether effects explain more than they would of scatter from dwell to dwell, where that was not all stated.
-
-    F = (fall / q) / (rest / (dof - q)), q coefficients: a scatter as large as it needs to be is in fall and rest alike.
-    What shows within dwells is no matter of scatter between them.
-    """
-    return (before.noise.scatter_stated and before.noise.setting_stated) or _beyond_any_path(before, test, names)
-
-
-def _beyond_any_path(before: Calibration, test: Test, names: Sequence[str]) -> bool:
-    """The same of whatever may be from dwell to dwell, a walk of the biases too: few dwells cannot show it."""
-    from scipy.special import fdtrc
-
-    misfit = before.consistency
-    if any(name not in test.best for name in names):
-        return True
-    own = [test.candidate(name) for name in names]
-    fall, dof = test.scan.explained(np.concatenate([each.basis for each in own], axis=1))
-    dof += sum(each.effect.unknown is not None for each in own)  # a constant that was looked for
-    freedom = misfit.dof - dof
-    if freedom <= 0:
-        return False
-    rest = max(misfit.statistic - fall, 1e-9 * misfit.statistic)
-    return run_level(float(fdtrc(dof, freedom, fall / dof / (rest / freedom))), test.effective_tests) < LEVEL
 
 
 def _without_vibration(before: Calibration, test: Test) -> Test:
@@ -271,7 +240,7 @@ def _one(found: Diagnosis, first: Suspect | None, pairs: Pairs) -> Diagnosis:
     overlaps = {name: alike(test, numbers[first.name], numbers[name]) for name in close if name != first.name}
     overlaps = {name: overlap for name, overlap in overlaps.items() if overlap > _ALIKE}
     single = replace(found, missing=(first.name,), ambiguity=(first.name, *overlaps), overlaps=overlaps)
-    single = replace(single, as_scatter=first.name == test.walking and test.as_scatter)
+    single = replace(single, as_scatter=as_scatter(found.before, test, (first.name,), first.refit))
     together = as_good(test, pairs, test.scores[first.name], {first.name})
     return replace(_beside(single, [pair for pair in together if _both_fit(found, pair)]), after=first.refit)
 
@@ -297,7 +266,7 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
     own, _ = scanned.explained(np.concatenate([each.basis for each in scanned.candidates], axis=1))
     own -= sum(price(each, tests) for each in scanned.candidates)
     if found.test.walking in names:
-        own += walk_fall(refit.fit, tests)[0] - threshold(1, tests)
+        own += 2.0 * refit.fit.walk_gain - threshold(1, tests)
     return any(gain > own + EQUAL for gain, _ in _formulas(found))
 
 
@@ -336,19 +305,15 @@ def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:
     test = found.test
     for pair in likeliest(test, pairs):
         both = names_of(test, pair)
-        if not _beyond_scatter(found.before, test, both):
-            continue
         refit = with_effects(found.before, both)
-        if not _fits(refit, test, len(both)):
+        if not (beyond_scatter(found.before, test, both, refit) and _fits(refit, test, len(both))):
             continue
         if _outdone(found, refit, both):
             return None
         walks = bool(alone) and alone == test.walking and alone not in both
         overlaps = ({alone: 1.0} if walks else {}) | exchanged(test, pairs, pair, _ALIKE)
         named = replace(found, missing=both, ambiguity=(*both, *overlaps), overlaps=overlaps, after=refit)
-        named = replace(named, alone=alone if walks else "")
-        if WALKS in pair:
-            named = replace(named, as_scatter=walk_fall(refit.fit, test.effective_tests)[1])
+        named = replace(named, alone=alone if walks else "", as_scatter=as_scatter(found.before, test, both, refit))
         return _beside(named, as_good(test, pairs, pairs[pair], both))
     return None
 
@@ -369,7 +334,7 @@ def _pairs_with_walk(found: Diagnosis, pairs: Pairs, beyond: bool = False) -> di
     for name in likely[:MOST]:
         k = test.best[name]
         own = float(test.scan.statistics[k]) - price(candidates[k], tests)
-        walk = walk_fall(with_effects(before, (name, test.walking)).fit, tests)[0] - threshold(1, tests)
+        walk = 2.0 * with_effects(before, (name, test.walking)).fit.walk_gain - threshold(1, tests)
         if walk > 0.0 and own + walk > least:
             out[k, WALKS] = own + walk + paths_beside(test, pairs, k)
     return out
@@ -500,6 +465,11 @@ def _verdict(found: Diagnosis) -> str:
         return f"{start} {named}.{_held_out(found)}"
     if found.unknown:
         nearest = next((each.name for each in found.suspects if each.fits), None)
+        if nearest and found.as_scatter:
+            return (
+                f"{start} {nearest} would fit, but dwells that scatter by more than is stated are likelier: unknown. "
+                "Visit an orientation again to tell."
+            )
         if nearest:
             return f"{start} {nearest} would fit, but what no known effect is explains it better: unknown."
         return f"{start} No known effect explains it, alone or in pairs: unknown."

@@ -12,7 +12,7 @@ from kf_calib.assessment import EQUAL
 from kf_calib.bench import Bench
 from kf_calib.effects import Effect, effect_named, walk_named
 from kf_calib.errors import InputError
-from kf_calib.fitting import Fit, fit, walk_gain
+from kf_calib.fitting import Fit, fit
 from kf_calib.folding import DwellFactor
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
@@ -95,12 +95,13 @@ def described(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Des
 
     found, excess = families(fitted)
     best = max(found, key=lambda family: family.score)
-    walk, ratio = walk_gain(fitted)
-    irregular = 2.0 * max(walk, walk - ratio)  # a walk's gain, a scatter's
+    walk, scatter = fitted.walk_gain, fitted.scatter_gain
+    irregular = 2.0 * max(walk, scatter)
     name = "" if fitted.carried.model.walks else walk_named(fitted.carried.model.bench)
     within = name and _goes_on(trend) and (best.score <= 0.0 or _goes_on(_trend_beside(fitted, best)))
     if name and (within or irregular - float(chdtri(1, _CHANCE)) > max(best.score, 0.0)):
-        share, back_s = irregular / max(excess, irregular, 1.0), _back_s(fitted, name) if 2.0 * ratio > EQUAL else None
+        share = irregular / max(excess, irregular, 1.0)
+        back_s = _back_s(fitted, name) if 2.0 * (walk - scatter) > EQUAL else None
         driver = f"time (irregular, back within about {roughly(back_s)})" if back_s else IRREGULAR
         return Description(_channel(residuals), WITHIN if within and not back_s else driver, share, (name,))
     if best.score <= 0.0:

@@ -19,7 +19,7 @@ from kf_calib import information
 from kf_calib.bench import Bench
 from kf_calib.effects import Coefficient, Effect
 from kf_calib.folding import Carried, DwellFactor, candidate_columns, stimulus_of
-from kf_calib.likelihood import gain_of, held_gain, wandering, with_dwell_parts
+from kf_calib.likelihood import Part, gain_of, held_gain, wandering, with_dwell_parts
 from kf_calib.model import Model, on_basis
 from kf_calib.noise import FLOOR_MPS2, Noise, steps, within_dwells
 from kf_calib.samples import Floats
@@ -108,6 +108,24 @@ class Fit:
             gain = upper[: len(out), : len(out)].T @ upper[: len(out), len(out)]
             out += np.outer(gain, gain)
         return out
+
+    @cached_property
+    def walk_gain(self) -> float:
+        """What a walk of the biases gains in log-likelihood over none, beside what a stated scatter may be.
+
+        Scatter that was estimated from the same misfit is left out.
+        """
+        return self._gain_of("walk")
+
+    @cached_property
+    def scatter_gain(self) -> float:
+        """The same of more than is stated of what is anew in every dwell: scatter of the sensors, or setting error."""
+        return max(self._gain_of("common"), self._gain_of("setting"))
+
+    def _gain_of(self, part: Part) -> float:
+        noise, carried = replace(self.noise.judging, walk_mps2_per_sqrt_s=0.0), self.carried
+        means, prior = wandering(carried.dwells, noise, carried.means)
+        return gain_of(part, noise, means, carried.state, prior)
 
     @cached_property
     def back_gain(self) -> tuple[float, float]:
@@ -251,14 +269,3 @@ def behind_within(fitted: Fit, effect: Effect) -> float:
     within = [v for v in effect.grid(stimulus) if 2.0 * effect.unknown.low < v < 0.5 * effect.unknown.high]
     falls = _falls(fitted, fitted.carried.model - effect, [effect, *(effect.at(value) for value in within)])
     return float(falls[0] - falls[1:].max(initial=-np.inf))
-
-
-def walk_gain(fitted: Fit) -> tuple[float, float]:
-    """What a walk of the biases gains in log-likelihood over none, and over a mere scatter from dwell to dwell.
-
-    Both beside what a stated scatter may be; scatter that was estimated from the same misfit is left out.
-    """
-    noise, carried = replace(fitted.noise.judging, walk_mps2_per_sqrt_s=0.0), fitted.carried
-    means, prior = wandering(carried.dwells, noise, carried.means)
-    walk, scatter = (gain_of(part, noise, means, carried.state, prior) for part in ("walk", "scatter"))
-    return walk, walk - scatter

@@ -24,7 +24,7 @@ from kf_calib.calibration import Calibration, Parameter, evaluate, format_p, ref
 from kf_calib.diagnosis import Diagnosis, diagnose
 from kf_calib.effects import as_text, effect_named, merged, refuse_unknown
 from kf_calib.errors import InputError, UnobservableError
-from kf_calib.fitting import Fit, walk_gain
+from kf_calib.fitting import Fit
 from kf_calib.folding import Carried, without
 from kf_calib.held_out import orientations
 from kf_calib.noise import mean_covariances
@@ -249,8 +249,8 @@ def next_effect(found: Diagnosis, accept_first: bool = False) -> str | None:
         return None
     if accept_first:
         return found.missing[0]
-    if _rivals(found):
-        return None
+    if _rivals(found) or (found.as_scatter and found.test.walking not in found.missing):
+        return None  # of a walk that may be scatter the noise is as large either way
     return found.missing[0] if len(found.missing) == 1 else _only_choice(found)
 
 
@@ -315,7 +315,7 @@ def removals(fitted: Fit) -> tuple[Removal, ...]:
     rank, least, out = information.rank(upper[:-1]), upper[-1, -1] ** 2, list[Removal]()
     for effect in carried.model.effects:
         if effect.walks:
-            gain = 2.0 * walk_gain(fitted)[0]
+            gain = 2.0 * fitted.walk_gain
             out.append(Removal(str(effect), gain, 1, 0.5 * float(chdtrc(1, max(gain, 0.0)))))
             continue
         rest = np.delete(upper, carried.model.parts[str(effect)], axis=1)

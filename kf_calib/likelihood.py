@@ -25,6 +25,7 @@ FEWEST = 6
 
 _SIGNIFICANT = 5.41  # 1 % point of the likelihood ratio of a variance against zero: half of chi2 with 1 dof
 _HELD = 12  # time constants of a walk that is held back
+_ROUNDING = 1e-14
 _RANGE = (-9.0, 3.0)  # of the logarithm of a part's size, about the size of the misfit
 
 Part = Literal["setting", "common", "scatter", "walk"]
@@ -141,7 +142,7 @@ def _cost_and_slope(
     stacked = np.concatenate([means.design, means.readings[:, :, None]], axis=2)
 
     def cost(squares: Floats) -> tuple[float, Floats]:
-        root = np.linalg.cholesky(fixed + np.tensordot(squares, shapes, 1))
+        root = _root(fixed + np.tensordot(squares, shapes, 1))
         back = np.linalg.inv(root)
         whitened = back @ stacked
         basis, upper = np.linalg.qr(whitened.reshape(-1, width + 1)[:, :width])
@@ -168,7 +169,7 @@ def _walk_spread(stated: Noise, found: Noise, parts: tuple[Part, ...], means: Me
     return float(np.sqrt(np.sum(vectors[-1, seen] ** 2 / values[seen])))
 
 
-def gain_of(part: Literal["scatter", "walk"], noise: Noise, means: Means, state: Floats, prior: Floats) -> float:
+def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats) -> float:
     """What more of a part of the noise, as much as is likeliest, gains in log-likelihood.
 
     ``means`` and ``prior`` as ``wandering`` has them.
@@ -179,11 +180,13 @@ def gain_of(part: Literal["scatter", "walk"], noise: Noise, means: Means, state:
         more = math.exp(log_size)
         if part == "walk":
             wider = replace(noise, walk_mps2_per_sqrt_s=math.hypot(noise.walk_mps2_per_sqrt_s, more))
+        elif part == "setting":
+            wider = replace(noise, setting_rad=math.hypot(noise.setting_rad, more))
         else:
             wider = replace(noise, scatter_mps2=np.hypot(noise.scatter_mps2, more))
         return -restricted_log_likelihood(wider, means, state, prior)
 
-    begin = math.log(_sizes(_reduced(means), ("walk" if part == "walk" else "common",))[0])
+    begin = math.log(_sizes(_reduced(means), (part,))[0])
     bounds = begin + _RANGE[0], begin + _RANGE[1]
     found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-2})
     return max(-float(found.fun) - restricted_log_likelihood(noise, means, state, prior), 0.0)
@@ -305,9 +308,16 @@ def _rows(noise: Noise, means: Means, state: Floats, held_s: float = math.inf) -
     stacked = np.concatenate([means.design, means.readings[:, :, None]], axis=2)
     if noise.walk_mps2_per_sqrt_s:
         return _linked_rows(own, noise.walk_mps2_per_sqrt_s, links(means.ends_s, held_s), stacked)
-    root = np.linalg.cholesky(own)
+    root = _root(own)
     rows = np.linalg.solve(root, stacked).reshape(-1, stacked.shape[2])
     return np.asarray(rows, float), float(np.log(np.einsum("dii->di", root)).sum())
+
+
+def _root(covariances: Floats) -> Floats:
+    """Triangular roots (D, 3, 3) of covariances; a setting error alone does not turn the force along itself, and noise
+    far below it is rounding."""
+    least = _ROUNDING * np.einsum("dii->d", covariances)
+    return np.linalg.cholesky(covariances + least[:, None, None] * np.eye(3))
 
 
 def _linked_rows(own: Floats, intensity: float, path: Links, stacked: Floats) -> tuple[Floats, float]:

@@ -56,9 +56,9 @@ def test_a_walk_is_ahead_of_a_column_where_its_likelihood_is() -> None:
     own = [SimpleNamespace(effect="drift", dof=3, tried=1)]
     found: Any = SimpleNamespace(candidates=own, statistics=np.array([60.0]))
     scores = {"drift": 60.0 - assessment.threshold(3, 30.0)}
-    paths = assessment._for_all_paths(found, scores, 30.0)
+    paths = assessment._beside_best(found, scores, 30.0)
     worth = as_fall(np.array([3]), np.array([60.0]))
     assert worth - assessment.threshold(1, 30.0) + paths == pytest.approx(scores["drift"])
     assert 2.0 < paths < 8.0
-    assert assessment._for_all_paths(found, {"drift": -1.0}, 30.0) == 0.0
-    assert assessment._for_all_paths(found, {}, 30.0) == 0.0
+    assert assessment._beside_best(found, {"drift": -1.0}, 30.0) == 0.0
+    assert assessment._beside_best(found, {}, 30.0) == 0.0

@@ -30,7 +30,7 @@ LEVELS = [
     ["calibration"],
     ["comparison", "model_file"],
     ["assessment"],
-    ["drivers", "pairs", "watch"],
+    ["drivers", "pairs", "scattering", "watch"],
     ["diagnosis"],
     ["improvement"],
     ["journal", "standing"],

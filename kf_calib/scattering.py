@@ -1,0 +1,88 @@
+"""Scatter from dwell to dwell as the rival of every name: what raises a misfit may be no effect at all.
+
+Scatter that was stated too small, or an orientation that was set worse than stated, looks like whatever effect comes
+nearest, and of many effects one comes near. Likelihoods say which of the two it is: that of scatter of any size against
+that of the effect, averaged over the directions and constants that it could have (``odds``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from kf_calib.assessment import LEVEL, Test, run_level, threshold, worth, worth_together
+from kf_calib.calibration import Calibration
+from kf_calib.likelihood import FEWEST
+
+
+def beyond_scatter(before: Calibration, test: Test, names: Sequence[str], refit: Calibration) -> bool:
+    """Whether effects, with which the run was refitted, explain more than scatter from dwell to dwell would.
+
+    Where not all of it was stated, it is there in any case: effects have to stand out of it. Of a walk of the biases
+    and scatter that explain as much the scatter is likelier where none was stated.
+    """
+    noise, walks = before.noise, test.walking in names
+    if not (noise.scatter_stated and noise.setting_stated) and not beyond_any_path(before, test, names):
+        return False
+    if not noise.scatter_stated:
+        least = threshold(1, test.effective_tests)
+        return not walks or ahead_of_scatter(before, test, names, refit) > least
+    return ahead_of_scatter(before, test, names, refit) > 0.0
+
+
+def as_scatter(before: Calibration, test: Test, names: Sequence[str], refit: Calibration) -> bool:
+    """Whether effects, with which the run was refitted, are not so much likelier than scatter from dwell to dwell of
+    more than is stated, that the best of many effects could not be by chance."""
+    return ahead_of_scatter(before, test, names, refit) < len(names) * threshold(1, test.effective_tests)
+
+
+def ahead_of_scatter(before: Calibration, test: Test, names: Sequence[str], refit: Calibration) -> float:
+    """By how much -2 log-likelihood is lower with effects than with scatter from dwell to dwell, or with setting error,
+    of more than is stated; infinite for what shows within dwells.
+
+    A walk of the biases beside other effects has to be likelier than scatter beside them, too.
+    """
+    columns, walks = [test.best[name] for name in names if name in test.best], test.walking in names
+    scatter = 2.0 * before.fit.scatter_gain
+    if not columns:
+        return 2.0 * before.fit.walk_gain - scatter if walks else math.inf
+    if len(columns) == 1:
+        name = str(test.scan.candidates[columns[0]].effect)
+        columns = [k for k, each in enumerate(test.scan.candidates) if str(each.effect) == name and each.dof]
+        own = worth(test.scan, columns, test.scan.statistics[columns])
+    else:
+        own = worth_together(test.scan, columns)
+    if not walks:
+        return own - scatter
+    walk = 2.0 * refit.fit.walk_gain
+    return min(own + walk - scatter, walk - 2.0 * refit.fit.scatter_gain)
+
+
+def beyond_any_path(before: Calibration, test: Test, names: Sequence[str]) -> bool:
+    """Whether effects explain more than they would of whatever goes on from dwell to dwell, by however much: scatter, a
+    walk of the biases; few dwells cannot show it.
+
+    F = (fall / q) / (rest / (dof - q)), q coefficients: a scatter as large as it needs to be is in fall and rest alike.
+    What shows within dwells is no matter of scatter between them.
+    """
+    from scipy.special import fdtrc
+
+    misfit = before.consistency
+    if any(name not in test.best for name in names):
+        return True
+    own = [test.candidate(name) for name in names]
+    fall, dof = test.scan.explained(np.concatenate([each.basis for each in own], axis=1))
+    dof += sum(each.effect.unknown is not None for each in own)  # a constant that was looked for
+    freedom = misfit.dof - dof
+    if freedom <= 0:
+        return False
+    rest = max(misfit.statistic - fall, 1e-9 * misfit.statistic)
+    return run_level(float(fdtrc(dof, freedom, fall / dof / (rest / freedom))), test.effective_tests) < LEVEL
+
+
+def may_scatter(before: Calibration) -> bool:
+    """Whether dwells may scatter by more than was stated: it was found that they do, or so few cannot show it."""
+    noise, few = before.noise, before.consistency.dof < FEWEST
+    return (not noise.scatter_stated and (few or bool(noise.scatter_mps2.any()))) or (not noise.setting_stated and few)
