@@ -188,7 +188,8 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
                 scores[name], p_values[name] = score, run_level(own, tests)
     name, paths = _walking(fitted), 0.0
     if name:
-        fall = 2.0 * fitted.walk_gain
+        # of a million, chi-squared of the dwells' means is not that of the scan to a part in a hundred
+        fall = max(2.0 * fitted.walk_gain - max(fitted.misfit - consistency(fitted).statistic, 0.0), 0.0)
         p_values[name] = run_level(0.5 * float(chdtrc(1, fall)), tests)
         beyond = fall - threshold(1, tests)
         paths = _beside_best(found, scores, tests) if beyond > 0.0 else 0.0

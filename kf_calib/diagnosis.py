@@ -39,7 +39,15 @@ from kf_calib.pairs import (
 )
 from kf_calib.samples import Floats
 from kf_calib.scan import scan
-from kf_calib.scattering import as_scatter, beyond_any_path, beyond_scatter, may_scatter
+from kf_calib.scattering import (
+    as_if_stated,
+    as_scatter,
+    beyond_any_path,
+    beyond_scatter,
+    is_stated,
+    may_scatter,
+    quietest,
+)
 
 _REFUSED = 0.002  # chance that what is really missing is turned down because noise beside it looks like something more
 _ALIKE = 0.5  # overlap above which two suspects may be taken for each other
@@ -92,6 +100,7 @@ class Diagnosis:
     alone: str = ""
     as_scatter: bool = False
     back_s: float | None = None
+    judged: Calibration | None = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis: {self.verdict}>"
@@ -139,7 +148,30 @@ def _diagnosed(before: Calibration) -> Diagnosis:
 
 def _explained(before: Calibration, test: Test) -> Diagnosis:
     """What explains the misfit, one effect or two, and what could as well; or nothing does."""
-    return _or_walk(_likeliest(before, test))
+    found = _or_walk(_likeliest(before, test))
+    if test.consistent is not False or is_stated(before):
+        return found
+    return _told_in_its_noise(found)
+
+
+def _told_in_its_noise(found: Diagnosis) -> Diagnosis:
+    """The same where noise from dwell to dwell was estimated: by the noise that is left beside what explains most.
+
+    Estimated without it, or left out, the noise is another, and what is little in one is much in the other.
+    """
+    before, test = found.before, found.test
+    fitting = [s.refit for s in found.suspects if s.fits and beyond_scatter(before, test, (s.name,), s.refit)]
+    formulas = [with_effects(before, each.formulas) for _, each in _formulas(found)[:1]]
+    refit = quietest([*([found.after] if found.after else []), *fitting, *formulas])
+    if refit is None or not (found.missing or found.unknown or fitting):
+        return found
+    stated = as_if_stated(before, refit)
+    again = _or_walk(_likeliest(stated, _without_vibration(stated, assessed(stated.fit))))
+    if not (again.missing or again.unknown):
+        return found
+    suspects = tuple(replace(each, refit=found.refit_with(each.name)) for each in again.suspects)
+    after = with_effects(before, again.missing) if again.missing else None
+    return replace(again, before=before, judged=stated, suspects=suspects, after=after)
 
 
 def _likeliest(before: Calibration, test: Test) -> Diagnosis:
@@ -148,8 +180,10 @@ def _likeliest(before: Calibration, test: Test) -> Diagnosis:
     if test.consistent is not False:
         return nothing
     suspects = _suspects(before, test)
-    # what explains all of it explains most: one that fits far behind the first has only made the noise large enough
-    least = test.scores[test.ranked[0]] - 2.0 * EQUAL if test.ranked else 0.0
+    # what explains all of it explains most: one that fits far behind the first has only made the noise large enough,
+    # but not one behind a walk that does not fit, which may take any path
+    leading = [test.scores[each.name] for each in suspects if each.fits or each.name != test.walking]
+    least = max(leading, default=0.0) - 2.0 * EQUAL
     fitting = [each for each in suspects if each.fits and test.scores[each.name] > least]
     explaining = [each for each in fitting if beyond_scatter(before, test, (each.name,), each.refit)]
     found = replace(nothing, suspects=suspects, as_scatter=bool(fitting) and not explaining)
@@ -267,15 +301,41 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
     own -= sum(price(each, tests) for each in scanned.candidates)
     if found.test.walking in names:
         own += 2.0 * refit.fit.walk_gain - threshold(1, tests)
-    return any(gain > own + EQUAL for gain, _ in _formulas(found))
+    better = [each for gain, each in _formulas(found) if gain > own + EQUAL]
+    if not _refits_compare(found, names):
+        return bool(better)
+    least = _left(found, refit, names) - EQUAL
+    return any(_left(found, with_effects(found.before, each.formulas), (), each.dof) < least for each in better[:MOST])
+
+
+def _refits_compare(found: Diagnosis, names: Sequence[str]) -> bool:
+    """Whether refits have one noise, so that it can be said what each leaves: what is large is not linear, and a scan
+    that says what each would lower chi-squared by is off by many times what noise does."""
+    return is_stated(found.before) and all(name in found.test.best for name in names)
+
+
+def _clearly_less_left(found: Diagnosis, refit: Calibration, names: Sequence[str], alone: str) -> bool:
+    """Whether effects leave clearly less than one of them alone, or another, as far as refits can say that."""
+    if not _refits_compare(found, (*names, alone)):
+        return True
+    return _left(found, refit, names) < _left(found, found.refit_with(alone), (alone,)) - EQUAL
+
+
+def _left(found: Diagnosis, refit: Calibration, names: Sequence[str], dof: int = 0) -> float:
+    """Chi-squared that effects, and a formula of ``dof``, leave, and what chance would have lowered it by."""
+    test = found.test
+    prices = [price(test.candidate(name), test.effective_tests) for name in names]
+    return refit.consistency.statistic + sum(prices) + (threshold(dof, test.effective_tests) if dof else 0.0)
 
 
 def _formulas(found: Diagnosis) -> list[tuple[float, Family]]:
-    """Formulas that are no known effects, each with its fall of chi-squared less what chance would give it."""
+    """Formulas that are no known effects, each with its fall of chi-squared less what chance would give it, the best
+    first."""
     test = found.test
     known = [test.candidate(name).effect for name in test.best]
     tried = [each for each in families(found.before.fit, known)[0] if each.dof and not each.known]
-    return [(each.fall - threshold(each.dof, test.effective_tests), each) for each in tried]
+    out = [(each.fall - threshold(each.dof, test.effective_tests), each) for each in tried]
+    return sorted(out, key=lambda each: -each[0])
 
 
 def _walks_not(found: Diagnosis, first: Suspect) -> bool:
@@ -306,6 +366,8 @@ def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:
     for pair in likeliest(test, pairs):
         both = names_of(test, pair)
         refit = with_effects(found.before, both)
+        if alone and not _clearly_less_left(found, refit, both, alone):
+            continue
         if not (beyond_scatter(found.before, test, both, refit) and _fits(refit, test, len(both))):
             continue
         if _outdone(found, refit, both):
@@ -413,7 +475,7 @@ def with_effects(before: Calibration, added: Sequence[str]) -> Calibration:
 
 def next_orientation(found: Diagnosis) -> tuple[Advice, str] | None:
     """Where to go next, and why: to tell equal suspects apart, to size the one there is, or to show what is hidden."""
-    fitted, test = found.before.fit, found.test
+    fitted, test = (found.judged or found.before).fit, found.test
     named = [name for name in found.ambiguity if name in test.best]
     if named and not found.unknown:
         first = test.candidate(named[0])

@@ -18,8 +18,8 @@ import numpy as np
 from kf_calib import information
 from kf_calib.bench import Bench
 from kf_calib.effects import Coefficient, Effect
-from kf_calib.folding import Carried, DwellFactor, candidate_columns, stimulus_of
-from kf_calib.likelihood import Part, gain_of, held_gain, wandering, with_dwell_parts
+from kf_calib.folding import Carried, DwellFactor, Means, candidate_columns, stimulus_of
+from kf_calib.likelihood import Part, gain_of, held_gain, misfit, wandering, with_dwell_parts
 from kf_calib.model import Model, on_basis
 from kf_calib.noise import FLOOR_MPS2, Noise, steps, within_dwells
 from kf_calib.samples import Floats
@@ -122,10 +122,20 @@ class Fit:
         """The same of more than is stated of what is anew in every dwell: scatter of the sensors, or setting error."""
         return max(self._gain_of("common"), self._gain_of("setting"))
 
+    @cached_property
+    def misfit(self) -> float:
+        """Chi-squared of the dwells' means, in the likelihood that these are gains in."""
+        noise, means, prior = self._wandering
+        return misfit(noise, means, self.carried.state, prior)
+
     def _gain_of(self, part: Part) -> float:
+        noise, means, prior = self._wandering
+        return gain_of(part, noise, means, self.carried.state, prior)
+
+    @cached_property
+    def _wandering(self) -> tuple[Noise, Means, Floats]:
         noise, carried = replace(self.noise.judging, walk_mps2_per_sqrt_s=0.0), self.carried
-        means, prior = wandering(carried.dwells, noise, carried.means)
-        return gain_of(part, noise, means, carried.state, prior)
+        return noise, *wandering(carried.dwells, noise, carried.means)
 
     @cached_property
     def back_gain(self) -> tuple[float, float]:

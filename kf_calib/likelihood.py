@@ -61,7 +61,7 @@ def with_dwell_parts(
     freedom = means.readings.size - means.design.shape[2]
     if freedom < FEWEST or (stated.setting_stated and stated.scatter_stated and not walks):
         return stated
-    if not walks and chdtrc(freedom, _misfit(stated.weights, means, state)) > 0.1:  # spares the search
+    if not walks and chdtrc(freedom, misfit(stated.weights, means, state)) > 0.1:  # spares the search
         return stated
     settings: list[tuple[Part, ...]] = [()] if stated.setting_stated or not stated.checked else [(), ("setting",)]
     scatters: list[tuple[Part, ...]] = [()] if stated.scatter_stated else [(), ("common",)]
@@ -280,9 +280,11 @@ def _with(noise: Noise, parts: tuple[Part, ...], sizes: Floats) -> Noise:
     return noise
 
 
-def _misfit(noise: Noise, means: Means, state: Floats) -> float:
-    """Chi-squared of the dwell means about their generalised least-squares fit."""
-    return float(triangle(_rows(noise, means, state)[0])[-1, -1] ** 2)
+def misfit(noise: Noise, means: Means, state: Floats, prior: Floats | None = None) -> float:
+    """Chi-squared of the dwell means about their generalised least-squares fit; ``prior`` (q, p + 1): rows of what is
+    known of the coefficients."""
+    rows, _ = _rows(noise, means, state)
+    return float(triangle(rows if prior is None else np.vstack([prior, rows]))[-1, -1] ** 2)
 
 
 def restricted_log_likelihood(

@@ -11,6 +11,7 @@ import numpy as np
 from kf_calib.samples import Floats
 
 _LEAST = 1e-12  # of a fall: the odds of none are their limit
+_LARGE = 1e8  # where the Bessel function is its limit, and from 1e9 on unknown to the library
 
 
 def log_odds(dof: int, falls: Floats | float, sigmas: float) -> Floats:
@@ -22,7 +23,8 @@ def log_odds(dof: int, falls: Floats | float, sigmas: float) -> Floats:
     from scipy.special import gammaln, ive
 
     order, x = 0.5 * dof - 1.0, sigmas * np.sqrt(np.maximum(falls, _LEAST))
-    return gammaln(0.5 * dof) + order * np.log(2.0 / x) + np.log(ive(order, x)) + x - 0.5 * sigmas**2
+    bessel = np.where(x < _LARGE, ive(order, np.minimum(x, _LARGE)), 1.0 / np.sqrt(2.0 * np.pi * x))
+    return gammaln(0.5 * dof) + order * np.log(2.0 / x) + np.log(bessel) + x - 0.5 * sigmas**2
 
 
 def as_fall(dofs: Floats, falls: Floats, tried: int = 1) -> float:

@@ -8,13 +8,15 @@ that of the effect, averaged over the directions and constants that it could hav
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from kf_calib.assessment import LEVEL, Test, run_level, threshold, worth, worth_together
-from kf_calib.calibration import Calibration
+from kf_calib.calibration import Calibration, refitted
 from kf_calib.likelihood import FEWEST
+from kf_calib.noise import mean_covariances
 
 
 def beyond_scatter(before: Calibration, test: Test, names: Sequence[str], refit: Calibration) -> bool:
@@ -24,7 +26,7 @@ def beyond_scatter(before: Calibration, test: Test, names: Sequence[str], refit:
     and scatter that explain as much the scatter is likelier where none was stated.
     """
     noise, walks = before.noise, test.walking in names
-    if not (noise.scatter_stated and noise.setting_stated) and not beyond_any_path(before, test, names):
+    if not is_stated(before) and not beyond_any_path(before, test, names):
         return False
     if not noise.scatter_stated:
         least = threshold(1, test.effective_tests)
@@ -44,20 +46,33 @@ def ahead_of_scatter(before: Calibration, test: Test, names: Sequence[str], refi
 
     A walk of the biases beside other effects has to be likelier than scatter beside them, too.
     """
-    columns, walks = [test.best[name] for name in names if name in test.best], test.walking in names
+    columns, walks = [name for name in names if name in test.best], test.walking in names
     scatter = 2.0 * before.fit.scatter_gain
     if not columns:
         return 2.0 * before.fit.walk_gain - scatter if walks else math.inf
-    if len(columns) == 1:
-        name = str(test.scan.candidates[columns[0]].effect)
-        columns = [k for k, each in enumerate(test.scan.candidates) if str(each.effect) == name and each.dof]
-        own = worth(test.scan, columns, test.scan.statistics[columns])
-    else:
-        own = worth_together(test.scan, columns)
+    own = _worth(test, columns) - scatter
     if not walks:
-        return own - scatter
+        return own + _beyond_linear(before, test, columns, refit)
     walk = 2.0 * refit.fit.walk_gain
-    return min(own + walk - scatter, walk - 2.0 * refit.fit.scatter_gain)
+    return min(own + walk, walk - 2.0 * refit.fit.scatter_gain)
+
+
+def _worth(test: Test, columns: Sequence[str]) -> float:
+    own = [test.best[name] for name in columns]
+    if len(own) > 1:
+        return worth_together(test.scan, own)
+    values = [k for k, each in enumerate(test.scan.candidates) if str(each.effect) == columns[0] and each.dof]
+    return worth(test.scan, values, test.scan.statistics[values])
+
+
+def _beyond_linear(before: Calibration, test: Test, columns: Sequence[str], refit: Calibration) -> float:
+    """What a refit lowers chi-squared of the dwells' means by, beyond what the scan says: what is large is not linear,
+    and its chi-squared is not that of the means to a part in a hundred."""
+    if not is_stated(before):
+        return 0.0  # a noise of its own
+    bases = [test.candidate(name).basis for name in columns]
+    linear, _ = test.scan.explained(np.concatenate(bases, axis=1))
+    return max(before.fit.misfit - refit.fit.misfit - linear, 0.0)
 
 
 def beyond_any_path(before: Calibration, test: Test, names: Sequence[str]) -> bool:
@@ -80,6 +95,32 @@ def beyond_any_path(before: Calibration, test: Test, names: Sequence[str]) -> bo
         return False
     rest = max(misfit.statistic - fall, 1e-9 * misfit.statistic)
     return run_level(float(fdtrc(dof, freedom, fall / dof / (rest / freedom))), test.effective_tests) < LEVEL
+
+
+def is_stated(before: Calibration) -> bool:
+    """Whether all noise from dwell to dwell was stated."""
+    return before.noise.scatter_stated and before.noise.setting_stated
+
+
+def as_if_stated(before: Calibration, refit: Calibration) -> Calibration:
+    """The run without the effects that a refit has, as if the bench had stated the noise from dwell to dwell that was
+    estimated with them: without them it would be estimated from what they explain."""
+    noise, bench = refit.noise, before.bench
+    if not noise.setting_stated:
+        bench = replace(bench, angle_sigma_deg=float(np.degrees(noise.setting_rad)))
+    if not noise.scatter_stated:
+        bench = replace(bench, scatter_sigma_mps2=float(np.sqrt(np.mean(noise.scatter_mps2**2))))
+    return refitted(replace(before, bench=bench), before.settings.effects)
+
+
+def quietest(refits: Iterable[Calibration]) -> Calibration | None:
+    """Of fits of a run that with the least noise, by the determinants of its dwells' covariances."""
+
+    def size(refit: Calibration) -> float:
+        covariances = mean_covariances(refit.noise, refit.carried.means, refit.carried.state)
+        return float(np.linalg.slogdet(covariances)[1].sum())
+
+    return min(refits, key=size, default=None)
 
 
 def may_scatter(before: Calibration) -> bool:
