@@ -150,16 +150,34 @@ def test_paths_of_a_walk_of_one_size_are_told_as_well_as_by_a_plain_average(tria
     assert np.mean(list(found.values())) == pytest.approx(np.mean(right), abs=4.0 * math.sqrt(0.25 / 2000))
 
 
+def test_a_rival_can_be_taken_for_the_effect(trial: Any) -> None:
+    """A line of four sigma, and noise of the same size evenly in six dimensions: Bayes' rule by plain averages."""
+    rng, sigmas = np.random.default_rng(11), 4.0
+    effects, rivals = {"a": trial.Columns([np.eye(6)[:, :1]])}, {"scatter": trial.Process(np.eye(6))}
+    alone, beside = (
+        trial.best_possible(effects, {"a": {"a"}}, sigmas, draws=4000, rivals=own)["a"] for own in (None, rivals)
+    )
+    spread = rng.standard_normal((20_000, 6))
+    spread *= sigmas / np.linalg.norm(spread, axis=1)[:, None]
+    readings = sigmas * rng.choice([-1.0, 1.0], 2000)[:, None] * np.eye(6)[0] + rng.standard_normal((2000, 6))
+    odds = np.cosh(sigmas * readings[:, 0]) > np.mean(np.exp(readings @ spread.T), axis=1)
+    assert alone == 1.0 and 0.8 < beside < 1.0
+    assert beside == pytest.approx(odds.mean(), abs=0.03)
+
+
 def test_the_most_there_can_be_is_a_mean_over_runs_and_effects(trial: Any) -> None:
     own = [
         trial.Outcome(
-            trial.Task("ideal@any", "ideal", k), extra={size: {"a": 1.0, "b": low} for size in ("8", "10", "15")}
+            trial.Task("ideal@any", "ideal", k),
+            extra={size: {"bias-walk": 1.0, "b": low} for size in ("8", "10", "15", f"8{trial._SCATTERING}")},
         )
         for k, low in enumerate((0.5, 0.7))
     ]
     found = by_name(trial, own)
     assert found["right name first, n = 8: the most there can be"].value == pytest.approx(0.8)
     assert found["worst effect, n = 15, the most there can be: b"].value == pytest.approx(0.6)
+    assert found["bias-walk, n = 10: the most there can be"].value == 1.0
+    assert found["right name first, n = 8, where dwells may scatter, too: the most there can be"].value == 0.8
 
 
 def test_false_alarms_are_judged_by_the_upper_limit_of_1000(trial: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import pytest
 from synthetic import Run
@@ -12,7 +13,7 @@ from test_diagnosis import BENCH
 from kf_calib.assessment import EQUAL, assessed
 from kf_calib.calibration import Calibration, calibrate
 from kf_calib.diagnosis import Diagnosis, diagnose, with_effects
-from kf_calib.drivers import JUMP
+from kf_calib.drivers import IRREGULAR, JUMP
 from kf_calib.sources.hidden import parse
 from kf_calib.sources.hidden.detectability import sized
 from kf_calib.sources.noise_sources import Noise
@@ -25,12 +26,16 @@ from kf_calib.views.diagnosis import description
 WHITE = 5e-5
 
 
-def run(*hidden: str, seed: int = 5, plan: list[Visit] | None = None, **noise: float) -> Calibration:
-    """A calibration without the hidden effects in its model, on a bench that states its noise."""
+def run(
+    *hidden: str, seed: int = 5, plan: list[Visit] | None = None, states: dict[str, float | None] | None = None,
+    **noise: float,
+) -> Calibration:  # fmt: skip
+    """A calibration without the hidden effects in its model, on a bench that states its noise, or ``states``."""
     made = Noise(**{"white_mps2": WHITE, **noise})
     visits = plan or spread_plan(24, dwell_s=8.0, seed=seed)
     scatter = made.dwell_sigma_mps2(len(visits))
-    bench = replace(BENCH, angle_sigma_deg=made.setting_sigma_deg, scatter_sigma_mps2=scatter)
+    stated: dict[str, Any] = {"angle_sigma_deg": made.setting_sigma_deg, "scatter_sigma_mps2": scatter} | (states or {})
+    bench = replace(BENCH, **stated)
     base = Simulation(
         bench, GRADES["navigation"].sensors(seed), made, visits, sample_hz=50.0, angle_hz=20.0, slew_rate_degps=90.0,
         seed=seed, ambient=Ambient(swing_c=5.0, period_s=300.0, sigma_c=0.0),
@@ -231,6 +236,42 @@ def test_in_a_few_dwells_a_walk_could_explain_what_an_effect_does() -> None:
     assert len(kept) >= 4  # now and then the effect fits so closely that it is a proof
     assert all(found.missing and "bias-walk" in found.verdict for found in kept)
     assert "bias-walk" not in diagnose(run("hysteresis=12sigma")).ambiguity
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [
+        ({"scatter_mps2": 3e-6}, {"scatter_sigma_mps2": 0.0}),
+        ({"scatter_mps2": 6e-6}, {"scatter_sigma_mps2": 2.5e-6}),
+        ({"setting_sigma_deg": 3e-5}, {"angle_sigma_deg": 1e-5}),
+    ],
+    ids=["scatter", "scatter-twice", "setting"],
+)
+def test_scatter_of_more_than_is_stated_is_no_effect(noise: tuple[dict[str, float], dict[str, float | None]]) -> None:
+    """Of some forty effects one comes near whatever dwells scatter by: it is never named without saying so."""
+    found = [diagnose(run(seed=seed, states=noise[1], **noise[0])) for seed in range(40, 52)]
+    noticed = [each for each in found if each.test.consistent is False]
+    named = [each for each in noticed if each.missing]
+    assert len(noticed) > 4 and len(named) < len(noticed)
+    assert all("dwells that scatter by more than is stated" in each.verdict for each in named)
+    said = [description(each) for each in noticed if each.unknown]
+    assert sum(each is not None and each.driver == IRREGULAR for each in said) > 0.7 * len(said)
+
+
+def test_an_effect_of_some_size_is_no_scatter() -> None:
+    for name in ("second-order", "thermal-bias", "bias-asymmetry", "scale-drift"):
+        found = diagnose(run(f"{name}=8sigma", seed=6))
+        assert name in found.ambiguity and not found.as_scatter, found.verdict
+
+
+@pytest.mark.parametrize("name", ["second-order", "thermal-scale", "cross-coupling-ip"])
+def test_a_large_effect_in_noise_that_is_not_stated_is_named_alone(name: str) -> None:
+    """Scatter that is estimated without it is its own; where it is left out, what is little counts as much."""
+    unstated = {"angle_sigma_deg": None, "scatter_sigma_mps2": None}
+    found = diagnose(run(f"{name}=40sigma", seed=7, states=unstated, setting_sigma_deg=2e-4))
+    assert found.missing == (name,) and found.before.noise.setting_stated is False, found.verdict
+    assert found.after is not None and not found.after.noise.setting_stated
+    assert found.after.consistency.consistent
 
 
 def test_a_bias_that_goes_to_and_fro_is_no_walk() -> None:

@@ -32,6 +32,10 @@ def test_a_fall_is_worth_less_the_more_there_was_to_choose() -> None:
     assert worth(3) - worth(3, values=20) == pytest.approx(2.0 * np.log(20.0), abs=1e-6)
     assert worth(3, tried=20) == pytest.approx(worth(3, values=20), abs=1e-6)
     assert np.isfinite(as_fall(np.array([3.0]), np.array([0.5])))
+    for dof in (1, 3):  # beyond what the library's Bessel functions know
+        lost = [fall - as_fall(np.array([dof]), np.array([fall])) for fall in (0.9e8, 1.1e8, 1e10)]
+        expected = [lost[0] + (dof - 1) * np.log(fall / 0.9e8) for fall in (0.9e8, 1.1e8, 1e10)]
+        assert lost == pytest.approx(expected, abs=1e-4)
 
 
 def test_what_is_worth_more_at_its_likeliest_size_is_more_often_the_truth() -> None:
