@@ -35,9 +35,14 @@ def beyond_scatter(before: Calibration, test: Test, names: Sequence[str], refit:
 
 
 def as_scatter(before: Calibration, test: Test, names: Sequence[str], refit: Calibration) -> bool:
-    """Whether effects, with which the run was refitted, are not so much likelier than scatter from dwell to dwell of
-    more than is stated, that the best of many effects could not be by chance."""
-    return ahead_of_scatter(before, test, names, refit) < len(names) * threshold(1, test.effective_tests)
+    """Whether the odds of effects, with which the run was refitted, against scatter from dwell to dwell of more than is
+    stated are less than 99 to 1, where one of the effects is as likely to be missing as that.
+
+    Of n effects each is then the one in 1 of n runs; a walk of the biases, of which there is one, takes no such share.
+    """
+    columns = sum(name in test.best for name in names)
+    least = columns * math.log(len(test.scores)) - math.log(LEVEL)
+    return ahead_of_scatter(before, test, names, refit) < 2.0 * least
 
 
 def ahead_of_scatter(before: Calibration, test: Test, names: Sequence[str], refit: Calibration) -> float:

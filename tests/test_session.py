@@ -241,8 +241,8 @@ def test_screen_lines_and_objects_of_a_standing() -> None:
 
 REPLAY_KEYS = {"samples", "dwells", "model", "parameters", "noise", "consistency", "residual_rms_mps2",
                "held_out_rms_mps2", "held_out_floor_mps2", "warnings"}  # fmt: skip
-DIAGNOSE_KEYS = {"consistent", "p_value", "verdict", "missing", "suspects", "ambiguity_set", "invisible", "detectable",
-                 "unknown", "next_orientation"}  # fmt: skip
+DIAGNOSE_KEYS = {"consistent", "p_value", "verdict", "missing", "suspects", "ambiguity_set", "may_be_scatter",
+                 "invisible", "detectable", "unknown", "next_orientation"}  # fmt: skip
 URL = "sim://?speed=500&orientations=6&dwell_s=5&sample_hz=50&slew_degps=180&seed=3"
 SLOW = URL.replace("speed=500", "speed=10").replace("orientations=6", "orientations=60")
 

@@ -63,6 +63,11 @@ NOISES: dict[str, tuple[str, ...]] = {
     "scatter": ("--scatter", "5e-5"),
     "unstated": ("--unstated",),
 }
+UNDERSTATED: dict[str, tuple[tuple[str, ...], str]] = {
+    "scatter": (("--scatter", "4e-6", "--scatter-sigma", "0"), "0.0002"),
+    "setting error": (("--angle-sigma", "0.0002"), "0.0004"),
+}
+"""Options, and the setting error in deg, of runs whose dwells scatter by more than the recording states."""
 PLANS: dict[str, tuple[str, ...]] = {
     "spread": (),
     "six faces": ("--plan", "faces"),
@@ -71,11 +76,12 @@ PLANS: dict[str, tuple[str, ...]] = {
 }
 FIGURES = (
     "noise", "name", "unstated", "power", "invisible", "outside", "pair", "plans", "improve", "advice", "ideal",
-    "benches",
+    "benches", "understated",
 )  # fmt: skip
 COUNTS: dict[str, float] = {
     "noise@white": 500, "noise": 60, "name": 1, "unstated": 0.25, "power": 4, "invisible": 0.2, "outside": 2,
     "pair": 40, "plans@nothing": 8, "plans": 0.2, "improve": 0.4, "advice": 1, "ideal": 2, "benches": 30,
+    "understated": 15,
 }  # fmt: skip
 """Trials a unit of ``--runs``: in all, or for each effect (and size, and plan) that is hidden; at least one."""
 
@@ -85,6 +91,7 @@ _APART = 0.7
 _LIKE = 0.9  # overlap of what may be taken for each other at 8 sigma
 _FEW = 12  # orientations
 _SIZES = (8, 10, 15)  # sigma
+_FAR = 40  # sigma: the misfit is many times the noise
 _PAIR_SIZE = 10  # sigma, of each
 _LARGE = 100  # sigma, or times
 _ALONE, _EXACT = 1000, 0.01  # sigma; the part of what is hidden that a name may leave
@@ -281,6 +288,7 @@ def diagnosed(task: Task) -> Outcome:
         {
             "verdict": said["verdict"],
             "driver": (said["unknown"] or {}).get("driver"),
+            "may_be_scatter": said["may_be_scatter"],
             "true_drivers": [effect["driver"] for effect in effects],
             "sizes": [effect["size_sigma"] for effect in effects],
         },
@@ -732,6 +740,10 @@ def _family_tasks(
     elif family == "ideal":
         for _ in _count(family, runs):
             add("any")
+    elif family == "understated":
+        for what, (options, own_setting) in UNDERSTATED.items():
+            for _ in _count(family, runs):
+                add(what, options=options, setting=own_setting)
     elif family == "invisible":
         for name, _ in itertools.product(PLANS, _count(family, runs)):
             add(name, options=PLANS[name])
@@ -753,7 +765,7 @@ def _family_tasks(
             for effect, _ in itertools.product(shown, _count(family, runs)):
                 add(f"{plan}, one hidden", [f"{effect}=10sigma"], PLANS[plan])
     else:
-        sizes = {"name": _SIZES, "unstated": (10,), "outside": (15,), "improve": (15,), "advice": (8,)}[family]
+        sizes = {"name": _SIZES, "unstated": (10, _FAR), "outside": (15,), "improve": (15,), "advice": (8,)}[family]
         kinds = {"outside": outside_effects, "advice": lambda: list(effects) or confusable(visible)}
         hidden = kinds.get(family, lambda: visible)()
         options = NOISES["unstated"] if family == "unstated" else ()
@@ -847,6 +859,14 @@ def _name(which: str, own: list[Outcome]) -> Iterator[Figure]:
         size, (low, high) = float(np.median(sizes)), np.percentile(sizes, [2.5, 97.5])
         yield Figure(f"median size of the set, n = {which}{stated}", size, low, high, len(sizes), "1", size == 1.0)
     yield rate(f"wrong name, n = {which}{stated}", [each.wrong for each in own])
+
+
+def _understated(which: str, own: list[Outcome]) -> Iterator[Figure]:
+    said = f"{which} stated too small"
+    yield rate(f"{said}: noticed", [each.consistent is False for each in own])
+    yield rate(f"{said}: a name", [each.named is not None for each in own])
+    silent = [each.refused or (each.named is not None and not each.extra["may_be_scatter"]) for each in own]
+    yield rate(f"{said}: a name without saying that it may be scatter", silent, most=0.05)
 
 
 def _worst(found: Iterable[tuple[str, Hit]]) -> tuple[str, list[Hit]]:
@@ -996,7 +1016,7 @@ def _mean_and_range(values: Sequence[float]) -> tuple[float, float, float]:
 _FIGURES: dict[str, Callable[[str, list[Outcome]], Iterator[Figure]]] = {
     "noise": _noise, "name": _name, "unstated": _name, "power": _power, "invisible": _invisible, "outside": _outside,
     "pair": _pair, "plans": _plans, "improve": _improve, "advice": _advice, "ideal": _ideal,
-    "benches": _plans,
+    "benches": _plans, "understated": _understated,
 }  # fmt: skip
 
 
@@ -1011,7 +1031,7 @@ def failed(each: Outcome) -> bool:
         return not close and not (each.first == "unknown" and driver_right(each))
     return {
         "name": not each.right, "unstated": not each.right, "plans": each.wrong, "benches": each.wrong,
-        "power": False,
+        "power": False, "understated": each.named is not None and not each.extra["may_be_scatter"],
         "invisible": bool(each.extra.get("differ")),
         "pair": not close and not (each.found and each.nothing_else), "improve": not each.right,
         "advice": each.extra.get("advised", 1.0) < each.extra.get("random", 0.0),
@@ -1042,7 +1062,14 @@ def confusion(outcomes: Sequence[Outcome], figure: str | None = None) -> dict[st
 def effect_rows(outcomes: Sequence[Outcome]) -> list[list[str]]:
     """Of each effect that was hidden, in words: trials, what was right of them, and what was named instead."""
     judged = [each for each in outcomes if (each.refused or not each.error) and len(each.truth) == 1]
-    heads = {"name@8": "8", "name@10": "10", "name@15": "15", "unstated@10": "nothing stated", "outside@15": "unknown"}
+    heads = {
+        "name@8": "8",
+        "name@10": "10",
+        "name@15": "15",
+        "unstated@10": "nothing stated, 10",
+        f"unstated@{_FAR}": f"nothing stated, {_FAR}",
+        "outside@15": "unknown",
+    }
     rows = [["hidden", *(f"right, {head}" for head in heads.values()), "set holds it", "power", "named instead"]]
     said = confusion([each for each in judged if each.task.family != "outside" or overlap_of(each) < _APART])
     for true in dict.fromkeys(each.truth[0] for each in judged):

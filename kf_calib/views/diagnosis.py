@@ -43,6 +43,7 @@ def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
             "ambiguity_set": list(found.ambiguity),
             "overlaps": found.overlaps,
             "together": [list(pair) for pair in found.together],
+            "may_be_scatter": found.as_scatter,
             "invisible": found.test.invisible,
             "vibration_hz": [line.frequency_hz for line in found.test.vibration],
             "trend": _trend_object(found.test.trend),
