@@ -519,7 +519,7 @@ def _verdict(found: Diagnosis) -> str:
         told = [
             *told,
             *(f"{' and '.join(pair)} together" for pair in found.together),
-            *(["dwells that scatter by more than is stated"] if found.as_scatter else []),
+            *([_scattering(found)] if found.as_scatter else []),
             *([f"biases that come back within about {roughly(found.back_s)}"] if found.back_s else []),
         ]
         if told:
@@ -529,7 +529,7 @@ def _verdict(found: Diagnosis) -> str:
         nearest = next((each.name for each in found.suspects if each.fits), None)
         if nearest and found.as_scatter:
             return (
-                f"{start} {nearest} would fit, but dwells that scatter by more than is stated are likelier: unknown. "
+                f"{start} {nearest} would fit, but {_scattering(found)} are likelier: unknown. "
                 "Visit an orientation again to tell."
             )
         if nearest:
@@ -544,6 +544,10 @@ def _verdict(found: Diagnosis) -> str:
         f"{start} Either dwells scatter by what was not stated or an effect {missing}: state {keys}, or visit an "
         "orientation again to tell."
     )
+
+
+def _scattering(found: Diagnosis) -> str:
+    return f"dwells that scatter by more than is {'stated' if is_stated(found.before) else 'estimated'}"
 
 
 def _size(found: Diagnosis) -> str:
