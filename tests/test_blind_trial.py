@@ -180,6 +180,16 @@ def test_the_most_there_can_be_is_a_mean_over_runs_and_effects(trial: Any) -> No
     assert found["right name first, n = 8, where dwells may scatter, too: the most there can be"].value == 0.8
 
 
+def test_a_name_for_scatter_counts_where_it_is_given_without_the_doubt(trial: Any) -> None:
+    doubted = outcome(trial, "understated@scatter", "a", extra={"may_be_scatter": True})
+    sure = outcome(trial, "understated@scatter", "a", extra={"may_be_scatter": False})
+    found = by_name(trial, [doubted] * 19 + [sure])
+    assert found["scatter stated too small: a name"].value == 1.0
+    silent = found["scatter stated too small: a name without saying that it may be scatter"]
+    assert silent.value == 0.05 and silent.meets
+    assert [trial.failed(each) for each in (doubted, sure)] == [False, True]
+
+
 def test_false_alarms_are_judged_by_the_upper_limit_of_1000(trial: Any) -> None:
     quiet = [outcome(trial, "noise@white", None)] * 990
     alarm = [outcome(trial, "noise@white", "unknown")]

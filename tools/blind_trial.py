@@ -865,8 +865,11 @@ def _understated(which: str, own: list[Outcome]) -> Iterator[Figure]:
     said = f"{which} stated too small"
     yield rate(f"{said}: noticed", [each.consistent is False for each in own])
     yield rate(f"{said}: a name", [each.named is not None for each in own])
-    silent = [each.refused or (each.named is not None and not each.extra["may_be_scatter"]) for each in own]
-    yield rate(f"{said}: a name without saying that it may be scatter", silent, most=0.05)
+    yield rate(f"{said}: a name without saying that it may be scatter", [_undoubted(each) for each in own], most=0.05)
+
+
+def _undoubted(each: Outcome) -> bool:
+    return each.refused or (each.named is not None and not each.extra.get("may_be_scatter", False))
 
 
 def _worst(found: Iterable[tuple[str, Hit]]) -> tuple[str, list[Hit]]:
@@ -1031,7 +1034,7 @@ def failed(each: Outcome) -> bool:
         return not close and not (each.first == "unknown" and driver_right(each))
     return {
         "name": not each.right, "unstated": not each.right, "plans": each.wrong, "benches": each.wrong,
-        "power": False, "understated": each.named is not None and not each.extra["may_be_scatter"],
+        "power": False, "understated": _undoubted(each),
         "invisible": bool(each.extra.get("differ")),
         "pair": not close and not (each.found and each.nothing_else), "improve": not each.right,
         "advice": each.extra.get("advised", 1.0) < each.extra.get("random", 0.0),
