@@ -173,7 +173,7 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
     """
     from scipy.special import chdtrc
 
-    model, misfit_p = fitted.carried.model, consistency(fitted).p_value
+    model, agreed = fitted.carried.model, consistency(fitted)
     found = _scanned(fitted)
     statistics = found.statistics
     tests = tests or independent_tests(found, seed)
@@ -189,13 +189,13 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
     name, paths = _walking(fitted), 0.0
     if name:
         # of a million, chi-squared of the dwells' means is not that of the scan to a part in a hundred
-        fall = max(2.0 * fitted.walk_gain - max(fitted.misfit - consistency(fitted).statistic, 0.0), 0.0)
+        fall = max(2.0 * fitted.walk_gain - max(fitted.misfit - agreed.statistic, 0.0), 0.0)
         p_values[name] = run_level(0.5 * float(chdtrc(1, fall)), tests)
         beyond = fall - threshold(1, tests)
         paths = _beside_best(found, scores, tests) if beyond > 0.0 else 0.0
         scores[name] = beyond + paths
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
-    test = Test(found, best, scores, p_values, misfit_p, name, tests, slewing, (), paths=paths)
+    test = Test(found, best, scores, p_values, agreed.p_value, name, tests, slewing, (), paths=paths)
     return _with_lines(test, fitted)
 
 
@@ -326,7 +326,7 @@ def _beside_best(found: Scan, scores: Mapping[str, float], tests: float) -> floa
     best = max(scores, key=lambda name: scores[name], default="")
     if not best or scores[best] <= 0.0:
         return 0.0
-    own = [k for k, each in enumerate(found.candidates) if str(each.effect) == best and each.dof]
+    own = values_of(found, best)
     return for_all_paths(found, own, found.statistics[own], scores[best], tests)
 
 
@@ -334,6 +334,11 @@ def for_all_paths(found: Scan, own: Sequence[int], falls: Floats, score: float, 
     """The same against the candidates ``own`` of one effect, by what each lowers chi-squared and the best one's score,
     alone or beside another effect."""
     return score + threshold(1, tests) - worth(found, own, falls)
+
+
+def values_of(found: Scan, name: str) -> list[int]:
+    """Candidates of one effect, one for each value of its constant at which anything shows."""
+    return [k for k, each in enumerate(found.candidates) if str(each.effect) == name and each.dof]
 
 
 def worth(found: Scan, own: Sequence[int], falls: Floats) -> float:

@@ -84,7 +84,8 @@ class Diagnosis:
     it. together: the pairs among them that explain as much, and are no exchange of one effect for one that is alike.
     alone: a single effect that would do in the place of two. as_scatter: what is missing could as well be dwells that
     scatter by more than is stated, or, where nothing is named, what would fit is less likely than that; back_s: the
-    walk that is missing could go to and fro with this time constant (None: not as well).
+    walk that is missing could go to and fro with this time constant (None: not as well). judged: the run by whose noise
+    effects were told from each other, where that was estimated (None: by that of ``before``).
     """
 
     before: Calibration

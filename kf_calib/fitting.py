@@ -141,9 +141,8 @@ class Fit:
     def back_gain(self) -> tuple[float, float]:
         """What a walk that comes back gains in log-likelihood over the walk of the biases that the fit has, beside what
         a stated scatter may be; and the time constant with which it comes back, s."""
-        noise, carried = self.noise.judging, self.carried
-        means, prior = wandering(carried.dwells, noise, carried.means)
-        return held_gain(noise, means, carried.state, prior)
+        _, means, prior = self._wandering
+        return held_gain(self.noise.judging, means, self.carried.state, prior)
 
     def rows(self, noise: Noise | None = None) -> list[Floats]:
         """Whitened rows [H | z] of each dwell, by the weights of the fit or by another noise."""

@@ -25,7 +25,7 @@ FEWEST = 6
 
 _SIGNIFICANT = 5.41  # 1 % point of the likelihood ratio of a variance against zero: half of chi2 with 1 dof
 _HELD = 12  # time constants of a walk that is held back
-_ROUNDING = 1e-14
+_ROUNDING = 1e-14  # of a dwell's variance
 _RANGE = (-9.0, 3.0)  # of the logarithm of a part's size, about the size of the misfit
 
 Part = Literal["setting", "common", "scatter", "walk"]

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kf_calib.assessment import LEVEL, Test, run_level, threshold, worth, worth_together
+from kf_calib.assessment import LEVEL, Test, run_level, threshold, values_of, worth, worth_together
 from kf_calib.calibration import Calibration, refitted
 from kf_calib.likelihood import FEWEST
 from kf_calib.noise import mean_covariances
@@ -66,7 +66,7 @@ def _worth(test: Test, columns: Sequence[str]) -> float:
     own = [test.best[name] for name in columns]
     if len(own) > 1:
         return worth_together(test.scan, own)
-    values = [k for k, each in enumerate(test.scan.candidates) if str(each.effect) == columns[0] and each.dof]
+    values = values_of(test.scan, columns[0])
     return worth(test.scan, values, test.scan.statistics[values])
 
 

@@ -41,7 +41,7 @@ import numpy as np
 from best_possible import Columns, Effect, Process, best_possible, best_possible_pairs
 
 from kf_calib.advice import ENOUGH
-from kf_calib.calibration import Calibration, calibrate
+from kf_calib.calibration import Calibration, Settings, calibrate
 from kf_calib.effects import Effect as Known
 from kf_calib.effects import effect_named, names
 from kf_calib.errors import KfCalibError
@@ -354,7 +354,6 @@ def _scanned(
 
     looked_for: of an oscillation the frequencies at which the program looks for a slow one.
     """
-
     result = _calibrated(path)
     noise = result.noise.judging
     if white_mps2 is not None:
@@ -364,7 +363,6 @@ def _scanned(
 
 
 def _calibrated(path: Path) -> Calibration:
-
     return calibrate(Recording(path))
 
 
@@ -490,7 +488,6 @@ def improve(task: Task) -> Outcome:
 
     In the second run, of which the selection knows nothing, sensors, orientations and noise are other ones.
     """
-    from kf_calib.calibration import Settings, calibrate
 
     path, again, times = Path("trial.mcap"), Path("again.mcap"), dict[str, float]()
     effects = simulated(task, path, times)["effects"]
@@ -576,7 +573,6 @@ def ideal(task: Task) -> Outcome:
 def _possible(path: Path) -> tuple[dict[str, list[Candidate]], dict[str, Candidate], Process, Process]:
     """Columns of the visible effects of a run; those of them at the constant they are hidden with, where they have one;
     a random walk of the biases from dwell to dwell, and scatter of dwells, in the same frame."""
-
     result = _calibrated(path)
     bench, middles_s = result.model.bench, np.array([0.5 * (d.start_s + d.end_s) for d in result.fit.dwells])
     steps = [effect_named(f"step = t > {at:.3f}*s", bench) for at in 0.5 * (middles_s[1:] + middles_s[:-1])]
