@@ -22,6 +22,10 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 BENCH_OPTIONS = {
     "axes": ("--axes", 'Gimbal axes, outer to inner, for example "y z x".'),
+    "up": ("--up", "Axis that points up when all angles are zero: y (accelerometer 2 reads +g; the default), z as in "
+                   "ROS, or x, -x, -y, -z."),
+    "channels": ("--channels", "Which channel accelerometer 1, 2, 3 is, with a minus where its sign is reversed, for "
+                               "example 1,-2,3."),
     "reference": ("--reference", "base (angles relative to the bench) or inertial (stabilised platform)."),
     "gravity_mps2": ("--gravity", "Local gravity, m/s^2."),
     "latitude_deg": ("--latitude", "Latitude, deg; gives normal gravity where --gravity is not stated."),
@@ -30,7 +34,7 @@ BENCH_OPTIONS = {
     "angle_sigma_deg": ("--angle-sigma", "Repeatability of setting an orientation, 1 sigma, deg (0: exact)."),
     "scatter_sigma_mps2": ("--scatter-sigma", "Scatter of each sensor from dwell to dwell, 1 sigma, m/s^2."),
     "nominal": ("--nominal", "Nominal parameters that differ, JSON, for example '{\"theta1\": 0}'."),
-}
+}  # fmt: skip
 _ACCEL_UNITS = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "ug": 9.80665e-6}
 
 

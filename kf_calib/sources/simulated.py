@@ -60,7 +60,7 @@ def simulation(options: Mapping[str, Any], bench_keys: Mapping[str, str], batch_
     names = {field.name for field in fields(grade.noise)}
     noise = replace(grade.noise, **{key: options[key] for key in names if key in options})
     axes = parse_axes(keys["axes"])
-    visits = _visits(options, axes)
+    visits = _visits(options, axes, keys.get("up", "y"))
     if not options["unstated"]:
         keys.setdefault("angle_sigma_deg", repr(noise.setting_sigma_deg))
         keys.setdefault("scatter_sigma_mps2", repr(noise.dwell_sigma_mps2(len(visits))))
@@ -75,9 +75,9 @@ def simulation(options: Mapping[str, Any], bench_keys: Mapping[str, str], batch_
     )
 
 
-def _visits(options: Mapping[str, Any], axes: tuple[Vector, ...]) -> list[Visit]:
+def _visits(options: Mapping[str, Any], axes: tuple[Vector, ...], up: str) -> list[Visit]:
     if options["plan"] == "spread":
-        return spread_plan(options["count"], axes, options["dwell_s"], options["seed"])
+        return spread_plan(options["count"], axes, options["dwell_s"], options["seed"], up)
     if options["plan"] == "faces":
-        return six_faces(axes, options["dwell_s"])
+        return six_faces(axes, options["dwell_s"], up)
     return explicit_plan(angles_from_csv(Path(options["plan"]), len(axes)), options["dwell_s"])

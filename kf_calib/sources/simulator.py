@@ -30,6 +30,7 @@ from kf_calib.sources.physics import (
     Ambient,
     BiasWalk,
     Disturbance,
+    Gimbals,
     Gravity,
     Inputs,
     Response,
@@ -37,7 +38,6 @@ from kf_calib.sources.physics import (
     SettingError,
     State,
     Step,
-    gimbals,
 )
 from kf_calib.sources.plans import YZX, Visit, stays
 from kf_calib.sources.sensors import Sensors
@@ -155,7 +155,7 @@ class Simulation:
     def _steps(self) -> list[Step]:
         """The chain, fresh from its start."""
         hidden = self._hidden_steps()
-        platform: list[Step] = [*hidden["angles"], gimbals, *hidden["attitude"], *self._setting_steps()]
+        platform: list[Step] = [*hidden["angles"], Gimbals(self.bench.up), *hidden["attitude"], *self._setting_steps()]
         response: list[Step] = [Inputs(self.sensors), *hidden["input"], Response(self.sensors), *hidden["reading"]]
         force: list[Step] = [Gravity(self.bench), *hidden["force"]]
         return [*platform, *force, *response, *self._noise_steps(), *hidden["record"]]
@@ -197,7 +197,7 @@ class Simulation:
             for step in steps:
                 step(state)
             values[start:end] = state.reading_mps2
-        return Stream(START_NS + time_ns, values)
+        return Stream(START_NS + time_ns, _channels(values, self.bench.channels))
 
     def _state(self, time_ns: Times) -> State:
         dwell = int(self.motion.locate(time_ns[:1])[0][0])
@@ -247,6 +247,14 @@ class _Clock:
     def between(self, start_ns: int, end_ns: int) -> Times:
         """The stamps from ``start_ns`` on that lie before ``end_ns``."""
         return np.arange(self.first_at(start_ns), self.first_at(end_ns)) * self.period_ns
+
+
+def _channels(readings: Floats, wired: tuple[int, int, int]) -> Floats:
+    """What comes out of the three channels (n, 3) where accelerometer i is wired to channel |wired[i]|, by its sign."""
+    out = np.empty_like(readings)
+    for accelerometer, channel in enumerate(wired):
+        out[:, abs(channel) - 1] = readings[:, accelerometer] if channel > 0 else -readings[:, accelerometer]
+    return out
 
 
 def _refuse_impossible(
