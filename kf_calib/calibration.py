@@ -16,17 +16,18 @@ from typing import Literal
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from kf_calib import averaging, information, kalman, paper
+from kf_calib import averaging, blunders, information, kalman, paper
 from kf_calib.bench import Bench
 from kf_calib.dwells import Block, Segmenter, Tally, dwell_blocks
 from kf_calib.effects import of_the_users, remarks_of
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.fitting import WALK, Fit, fit
-from kf_calib.folding import Carried, DwellFactor, Folder, columns_of, lines_of, means_of, samples_of
-from kf_calib.held_out import held_out, orientations
+from kf_calib.folding import Carried, DwellFactor, Folder, columns_of, lines_of, means_of, samples_of, without
+from kf_calib.held_out import HeldOut, held_out, orientations
 from kf_calib.information import Step
 from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
 from kf_calib.noise import TOO_SHORT, Noise, considered, mean_covariances, steps
+from kf_calib.outlying import OutlyingDwell, outlying_dwells
 from kf_calib.readings import Readings, Watch
 from kf_calib.samples import Floats, Mask, Source
 from kf_calib.stillness import Stillness
@@ -48,7 +49,8 @@ class Settings:
 
     walk_mps2_per_sqrt_s: random walk of the biases (process noise), 0: none. effects: names of those in the model.
     window_s: readings are averaged over windows of that length first; 0: only for effects that go with vibration, then
-    over windows of a second, or as long as the vibration needs that is seen.
+    over windows of a second, or as long as the vibration needs that is seen. left_out: numbers of dwells (from 1) that
+    are not used.
     """
 
     engine: Engine = "block"
@@ -58,6 +60,7 @@ class Settings:
     walk_mps2_per_sqrt_s: float = 0.0
     effects: tuple[str, ...] = ()
     window_s: float = 0.0
+    left_out: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -176,14 +179,25 @@ class Calibration:
     estimate: Estimate
     consistency: Consistency
     residual_rms_mps2: float
-    held_out_rms_mps2: float | None
-    held_out_floor_mps2: float | None
+    held_out: HeldOut | None
     tally: Tally
     warnings: tuple[str, ...]
     reread: Callable[..., Calibration] | None = field(default=None, repr=False, compare=False)
     """The same source evaluated anew: for models that need its readings folded otherwise."""
     readings: Readings = field(default_factory=Readings)
     """What the readings themselves show, whatever the model."""
+    outlying: tuple[OutlyingDwell, ...] = ()
+    """The dwell that alone does not fit, or those of which any one could be it."""
+
+    @property
+    def held_out_rms_mps2(self) -> float | None:
+        """Rms error of the mean readings of orientations that were left out."""
+        return None if self.held_out is None else self.held_out.rms_mps2
+
+    @property
+    def held_out_floor_mps2(self) -> float | None:
+        """What noise alone would give."""
+        return None if self.held_out is None else self.held_out.floor_mps2
 
     @property
     def noise(self) -> Noise:
@@ -316,12 +330,17 @@ class Pass:
             self.add(rows)
             if on_progress is not None:
                 on_progress(self.source.fraction)
-        return usable(self.folder.dwells)
+        return self.dwells
 
-
-def usable(dwells: list[DwellFactor]) -> list[DwellFactor]:
-    """Dwells of at least 8 readings: fewer cannot show their own noise."""
-    return [dwell for dwell in dwells if dwell.count >= 8]
+    @property
+    def dwells(self) -> list[DwellFactor]:
+        """Those folded so far that are used: of at least 8 readings, fewer cannot show their own noise, and not left
+        out by the settings."""
+        left_out = self.settings.left_out
+        if not left_out:
+            return [dwell for dwell in self.folder.dwells if dwell.count >= 8]
+        unused = {k for k, each in enumerate(self.folder.dwells) if each.count < 8 or each.number + 1 in left_out}
+        return without(self.folder.dwells, unused)
 
 
 def calibrate(
@@ -348,7 +367,7 @@ def calibrate(
 def _window_s(source: Source, settings: Settings) -> float:
     """Length of the windows that average the vibration in a source away: from a pass of its own."""
     plain = Pass(source, replace(settings, effects=()))
-    return averaging.window_s(lines_of(usable(plain.fold())))
+    return averaging.window_s(lines_of(plain.fold()))
 
 
 def concluded(
@@ -363,7 +382,7 @@ def concluded(
     plain: the pass has not begun, since its fit is known, and does not do.
     """
     settings, bench = passed.settings, passed.source.bench
-    dwells = usable(passed.folder.dwells) if plain is None else plain.dwells
+    dwells = passed.dwells if plain is None else plain.dwells
     if plain is None:
         refuse_unusable(dwells, passed.tally, bench)
     if again is not None and Model.of(bench, settings.effects).oscillates:
@@ -380,11 +399,19 @@ def concluded(
 
 def told(result: Calibration, passed: Pass) -> Calibration:
     """The result with what its pass counted and saw, and a sentence on each thing that a user must know."""
+    outlying = outlying_dwells(result, lambda some: evaluated(_fit_again(result, some), result.settings))
     own = [effect for effect in result.model.effects if of_the_users(effect)]
     notes = [f"{sight}." for sight in sights(result.fit, own)]
     readings = passed.watch.judged(result.fit.dwells, result.noise)
-    said = [*passed.source.warnings, *passed.tally.sentences(), *readings.warnings, *result.warnings, *notes]
-    return replace(result, tally=passed.tally, readings=readings, warnings=tuple(said))
+    found = [" Or ".join(map(str, outlying))] if outlying else []
+    usual = [each for each in result.warnings if not (outlying and each == _misfit(result.consistency))]
+    said = [*passed.source.warnings, *passed.tally.sentences(), *readings.warnings, *found, *usual, *notes]
+    return replace(result, tally=passed.tally, readings=readings, warnings=tuple(said), outlying=outlying)
+
+
+def _fit_again(result: Calibration, dwells: list[DwellFactor]) -> Fit:
+    """The same model fitted to some of the dwells."""
+    return fit(dwells, result.model, result.settings.walk_mps2_per_sqrt_s, result.carried.slews)
 
 
 def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
@@ -481,10 +508,9 @@ def evaluated(fitted: Fit, settings: Settings) -> Calibration:
     final = _estimate(steps[-1].factor, model.nominal_state(), extra.sum(axis=0) + fitted.considered)
     residuals = carried.means.readings - carried.means.design @ final.state
     visits = _visits(fitted, steps, residuals, extra, settings)
-    left_out, floor = held_out(fitted)
     judged = consistency(fitted)
     return Calibration(
-        model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), left_out, floor,
+        model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), held_out(fitted),
         Tally(), tuple(_remarks(carried, noise, final, judged, residuals)),
     )  # fmt: skip
 
@@ -524,6 +550,7 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
         )
     level = float(np.median([np.linalg.norm(dwell.means[4:]) for dwell in dwells])) / bench.gravity_mps2
     if 0.5 <= level <= 2.0:
+        blunders.refuse(dwells, bench)
         return
     units = {"g": 1 / 9.80665, "mg": 1e3 / 9.80665, "ug": 1e6 / 9.80665}
     measured = level * bench.gravity_mps2
@@ -598,6 +625,13 @@ def format_p(p_value: float | None) -> str:
     return "= -" if p_value is None else "< 1e-300" if p_value < 1e-300 else f"= {p_value:.2g}"
 
 
+def _misfit(judged: Consistency) -> str:
+    return (
+        f"the dwells scatter about the model by more than the noise (p {format_p(judged.p_value)}): an effect is "
+        "missing in the model, or noise from dwell to dwell was not stated (angle_sigma_deg, scatter_sigma_mps2)."
+    )
+
+
 def _remarks(
     carried: Carried, noise: Noise, estimate: Estimate, judged: Consistency, residuals: Floats
 ) -> Iterator[str]:
@@ -629,10 +663,12 @@ def _remarks(
             "and sign of the axes, the unit of the angles, and which channel is which."
         )
     elif judged.consistent is False:
-        yield (
-            f"the dwells scatter about the model by more than the noise (p {format_p(judged.p_value)}): an effect is "
-            "missing in the model, or noise from dwell to dwell was not stated (angle_sigma_deg, scatter_sigma_mps2)."
-        )
+        yield _misfit(judged)
+    scales, expected = estimate.parameters[2::4], paper.nominal(model.bench.nominal)[2::4]
+    if not estimate.unseen[2::4].any() and (
+        common := blunders.common_scale(scales / expected, estimate.sigma[2::4] / np.abs(expected), model.bench)
+    ):
+        yield common
     windows = averaging.inflation() if dwells[0].averaged else 1.0
     if noise.inflation.max() > 1.5 * windows:
         kappa = ", ".join(f"{value / windows:.3g}" for value in noise.inflation)

@@ -132,6 +132,11 @@ def diagnose(before: Calibration) -> Diagnosis:
 
 
 def _diagnosed(before: Calibration) -> Diagnosis:
+    if before.outlying:  # a dwell that is wrong is no effect, and looks like many
+        test = assessed(before.fit)
+        said = " Or ".join(map(str, before.outlying))
+        verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {said}"
+        return Diagnosis(before, test, (), (), test.consistent is False, (), {}, None, verdict)
     test = _without_vibration(before, assessed(before.fit))
     found = _explained(before, test)
     if found.unknown and test.without_lines:  # of one phase all along and not of one amplitude

@@ -59,6 +59,8 @@ class Block:
     felt_s: float | None = None
     pose_sigma_rad: float = 0.0
     """What the noise of the angles leaves uncertain of the pose, 1 sigma."""
+    turns: tuple[int, ...] = ()
+    """Whole turns of each gimbal by which ``pose`` goes beyond the angles as they were recorded; () of quaternions."""
 
 
 @dataclass
@@ -158,6 +160,7 @@ class _Dwell:
     felt_ns: the arrival as the readings tell it; what settles counts from there.
     settling_ns: what is left out after the arrival; None while the dwell may still be too short for the whole margin.
     pose (1, k): where the platform stands, from the messages of the dwell's first block; pose_sigma_rad: of these.
+    turns: by which its poses go beyond the angles as they were recorded.
     """
 
     number: int
@@ -167,6 +170,7 @@ class _Dwell:
     settling_ns: int | None
     pose: Floats | None = None
     pose_sigma_rad: float = 0.0
+    turns: tuple[int, ...] | None = None
 
 
 @dataclass
@@ -191,6 +195,7 @@ class Segmenter:
         self.dwell_count = 0
         self._accel = Stream.empty(3)
         self._pose = Stream.empty(self.bench.pose_width)
+        self._turns = np.empty((0, len(self.bench.axes)))  # by which each pose goes beyond what was recorded
         self._temperature = Stream.empty(1)
         self._orders = (_Order(), _Order(), _Order())
         self._decided_ns: int | None = None  # intervals of poses before this stamp have been judged
@@ -251,7 +256,10 @@ class Segmenter:
             self.tally.poses += len(pose)
             self.tally.poses_dropped += int((~sound).sum()) + counts.repeated + counts.backward + counts.leaping
             previous = self._pose.values[-1:] if len(self._pose) else None
-            self._pose += Stream(pose.time_ns, unwrap_pose(pose.values, not self.bench.axes, previous))
+            continuous = unwrap_pose(pose.values, not self.bench.axes, previous)
+            self._pose += Stream(pose.time_ns, continuous)
+            if self.bench.axes:
+                self._turns = np.concatenate([self._turns, np.rint((continuous - pose.values) / (2.0 * np.pi))])
         if len(batch.temperature):
             warm = batch.temperature
             self._temperature += self._orders[2](warm[np.isfinite(warm.values[:, 0])])
@@ -452,8 +460,16 @@ class Segmenter:
         pose, warm = self._block_pose(accel.time_ns), _carried_on(self._temperature, accel.time_ns)
         return Block(
             self._dwell.number, arrival_s, elapsed_s, accel.values, pose, warm, felt_s=felt_s,
-            pose_sigma_rad=self._dwell.pose_sigma_rad,
+            pose_sigma_rad=self._dwell.pose_sigma_rad, turns=self._dwell_turns(),
         )  # fmt: skip
+
+    def _dwell_turns(self) -> tuple[int, ...]:
+        """Of the open dwell, by its first pose."""
+        assert self._dwell is not None
+        if self._dwell.turns is None:
+            first = int(np.searchsorted(self._pose.time_ns, self._dwell.first_pose_ns))
+            self._dwell.turns = tuple(map(int, self._turns[first])) if self.bench.axes else ()
+        return self._dwell.turns
 
     def _block_pose(self, accel_ns: Times) -> Floats:
         assert self._dwell is not None
@@ -492,7 +508,8 @@ class Segmenter:
         oldest = min(oldest, (self._decided_ns or oldest) - self.stillness.history_ns)
         if self.slews:  # a slew's curve begins a window before it
             oldest -= self.stillness.window_ns + self.stillness.lead_ns
-        self._pose = self._pose[max(int(np.searchsorted(self._pose.time_ns, oldest)) - HISTORY, 0) :]
+        kept = slice(max(int(np.searchsorted(self._pose.time_ns, oldest)) - HISTORY, 0), None)
+        self._pose, self._turns = self._pose[kept], self._turns[kept]
         self._temperature = self._temperature[max(int(np.searchsorted(self._temperature.time_ns, oldest)) - 2, 0) :]
 
 

@@ -17,3 +17,7 @@ class BenchError(InputError):
 
 class UnobservableError(KfCalibError):
     """The orientations so far leave some parameters undetermined; the message names them."""
+
+
+class BlunderError(InputError):
+    """The run is no calibration of the bench as it is stated: a channel reversed, a gimbal's sense, a unit ..."""

@@ -98,6 +98,8 @@ def filter_options(command: F) -> F:
                      help="Where the gate stands, robust sigma."),
         click.option("--still-deg", type=click.FloatRange(min=0, min_open=True), default=0.05, show_default=True,
                      help="Motion within a second that still counts as standing still, deg."),
+        click.option("--leave-out", "left_out", type=click.IntRange(min=1), multiple=True, metavar="DWELL",
+                     help="Number of a dwell that is not to be used; repeatable."),
         click.option("--settle-s", type=click.FloatRange(min=0), default=1.0, show_default=True,
                      help="Seconds left out after each arrival."),
     ]  # fmt: skip
@@ -155,6 +157,7 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
         gate_sigma=options["gate_sigma"] if options["gate"] else None,
         walk_mps2_per_sqrt_s=options["bias_walk"],
         effects=effects_of(options),
+        left_out=tuple(options["left_out"]),
     )
 
 

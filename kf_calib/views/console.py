@@ -17,6 +17,7 @@ from kf_calib.effects import Effect, as_text
 from kf_calib.fitting import WALK
 from kf_calib.held_out import orientations
 from kf_calib.model import Model
+from kf_calib.outlying import OutlyingDwell
 
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
 
@@ -58,6 +59,20 @@ def parameter_table(result: Calibration) -> Table:
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for k, parameter in enumerate(list(result.parameters.values())[:12]):
         table.add_row(*_row(parameter), end_section=k % 4 == 3)
+    return table
+
+
+def without_table(result: Calibration, found: OutlyingDwell) -> Table:
+    """The parameters as a fit without an outlying dwell has them, and by how much they differ from those with it."""
+    table = Table(title=f"Without dwell {found.number} (1σ)", title_justify="left")
+    for heading in ("parameter", "value", "sigma", "unit", "less with it"):
+        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
+    pairs = zip(result.parameters.values(), found.without.parameters.values(), strict=True)
+    for k, (before, parameter) in enumerate(pairs):
+        name, value, _, sigma, unit = _row(parameter)
+        known = parameter.value is not None and before.value is not None
+        moved = f"{(parameter.value - before.value) * parameter.per_si:+.3g}" if known else ""  # type: ignore[operator]
+        table.add_row(name, value, sigma, unit, moved, end_section=k % 4 == 3)
     return table
 
 
@@ -159,6 +174,7 @@ def summary(result: Calibration) -> RenderableType:
         Text(verdict(result), style="bold green" if result.consistency.consistent else "bold yellow"),
     ]  # fmt: skip
     parts += [Text(f"Note: {warning}", style="yellow") for warning in result.warnings]
+    parts += [without_table(result, found) for found in result.outlying]
     return Group(*parts)
 
 

@@ -16,12 +16,12 @@ from kf_calib.diagnosis import Diagnosis, Suspect, next_orientation
 from kf_calib.drivers import Description, described
 from kf_calib.trend import Trend
 from kf_calib.views.console import plain, rounded, symbol
-from kf_calib.views.json import clean, readings_object
+from kf_calib.views.json import clean, outlying_object, readings_object
 
 
 def description(found: Diagnosis) -> Description | None:
-    """What an unknown misfit looks like; None where the misfit is known, or there is none."""
-    if not found.unknown:
+    """What an unknown misfit looks like; None where the misfit is known (one dwell, too), or there is none."""
+    if not found.unknown or found.before.outlying:
         return None
     residuals = np.array([visit.residual_mps2 for visit in found.before.visits])
     return described(found.before.fit, residuals, found.test.trend)
@@ -55,6 +55,7 @@ def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
             "held_out_rms_mps2": found.before.held_out_rms_mps2,
             "held_out_floor_mps2": found.before.held_out_floor_mps2,
             "readings": readings_object(found.before.readings),
+            "outlying_dwells": [outlying_object(each) for each in found.before.outlying],
             "warnings": list(found.before.warnings),
         }
     )
@@ -98,8 +99,8 @@ def verdict(found: Diagnosis) -> str:
 
 
 def _notes(found: Diagnosis) -> list[str]:
-    """Warnings that the verdict does not begin with."""
-    said = found.before.readings.biasing if found.test.consistent is False else []
+    """Warnings that the verdict does not hold."""
+    said = verdict(found)
     return [warning for warning in found.before.warnings if warning not in said]
 
 
@@ -180,7 +181,7 @@ def _dwell_table(found: Diagnosis) -> Table:
     ratios = found.residual_ratios
     for k in np.argsort(-np.abs(ratios).max(axis=1))[:5].tolist():
         dwell = found.before.visits[k].dwell
-        angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(dwell.pose))
+        angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(dwell.recorded_pose))
         table.add_row(str(k + 1), f"{dwell.start_s:.0f}", angles, *(f"{ratio:+.1f}" for ratio in ratios[k]))
     return table
 

@@ -190,8 +190,8 @@ def log_bench(result: Calibration, stream: rr.RecordingStream, before: int = 0) 
     edge = done[-1] + EDGE * (done[-1] - begun[0])
     over = rr.StateChange.columns(state=[""] * (len(dwells) + 1))
     rr.send_columns("bench/dwell", times(np.append(done, edge)), over, recording=stream)
-    poses = np.array([dwell.pose for dwell in dwells])
-    poses = (np.degrees(poses) + 180) % 360 - 180 if result.bench.axes else poses
+    poses = np.array([dwell.recorded_pose for dwell in dwells])
+    poses = np.degrees(poses) if result.bench.axes else poses
     for k, (name, angle) in enumerate(zip(pose_names(result), poses.T, strict=True)):
         colour = GIMBALS[k % len(GIMBALS)]
         step = rr.SeriesLines(names=name.replace("_", " "), colors=colour, widths=1.5, interpolation_mode="StepMid")
