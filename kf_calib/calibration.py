@@ -245,6 +245,11 @@ class Calibration:
             for (symbol, value, sigma, expected, unit), own in zip(found, shown, strict=True)
         }
 
+    @property
+    def residuals_mps2(self) -> Floats:
+        """Mean readings of the dwells less the final estimate, (D, 3)."""
+        return np.array([visit.residual_mps2 for visit in self.visits])
+
     def considering(self, state: Floats, covariance: Floats) -> Estimate:
         """Another engine's state and covariance, the latter enlarged by what is considered only."""
         extra = considered(self.noise, self.carried.means, self.carried.state).sum(axis=0) + self.fit.considered
@@ -404,7 +409,8 @@ def told(result: Calibration, passed: Pass) -> Calibration:
     notes = [f"{sight}." for sight in sights(result.fit, own)]
     readings = passed.watch.judged(result.fit.dwells, result.noise)
     found = [" Or ".join(map(str, outlying))] if outlying else []
-    usual = [each for each in result.warnings if not (outlying and each == _misfit(result.consistency))]
+    misfit = _misfit(result.consistency, result.residuals_mps2, result.bench)
+    usual = [each for each in result.warnings if each != misfit or not (outlying or readings.saturation)]
     said = [*passed.source.warnings, *passed.tally.sentences(), *readings.warnings, *found, *usual, *notes]
     return replace(result, tally=passed.tally, readings=readings, warnings=tuple(said), outlying=outlying)
 
@@ -625,11 +631,20 @@ def format_p(p_value: float | None) -> str:
     return "= -" if p_value is None else "< 1e-300" if p_value < 1e-300 else f"= {p_value:.2g}"
 
 
-def _misfit(judged: Consistency) -> str:
-    return (
-        f"the dwells scatter about the model by more than the noise (p {format_p(judged.p_value)}): an effect is "
-        "missing in the model, or noise from dwell to dwell was not stated (angle_sigma_deg, scatter_sigma_mps2)."
-    )
+def _misfit(judged: Consistency, residuals: Floats, bench: Bench) -> str:
+    """What may be the matter where the dwells do not fit the model, from residuals (D, 3); '' where they fit."""
+    rms = float(np.sqrt(np.mean(residuals**2)))
+    if rms > 0.03 * bench.gravity_mps2:
+        return (
+            f"the angles do not explain the readings (residual {rms:.2g} m/s^2 rms between dwells): check the order "
+            "and sign of the axes, the unit of the angles, and which channel is which."
+        )
+    if judged.consistent is False:
+        return (
+            f"the dwells scatter about the model by more than the noise (p {format_p(judged.p_value)}): an effect is "
+            "missing in the model, or noise from dwell to dwell was not stated (angle_sigma_deg, scatter_sigma_mps2)."
+        )
+    return ""
 
 
 def _remarks(
@@ -656,14 +671,8 @@ def _remarks(
             f"{len(dwells)} dwell{'s leave' if len(dwells) > 1 else ' leaves'} nothing over to judge the model by: "
             "visit at least five spread orientations."
         )
-    rms = float(np.sqrt(np.mean(residuals**2)))
-    if rms > 0.03 * model.bench.gravity_mps2:
-        yield (
-            f"the angles do not explain the readings (residual {rms:.2g} m/s^2 rms between dwells): check the order "
-            "and sign of the axes, the unit of the angles, and which channel is which."
-        )
-    elif judged.consistent is False:
-        yield _misfit(judged)
+    if misfit := _misfit(judged, residuals, model.bench):
+        yield misfit
     scales, expected = estimate.parameters[2::4], paper.nominal(model.bench.nominal)[2::4]
     if not estimate.unseen[2::4].any() and (
         common := blunders.common_scale(scales / expected, estimate.sigma[2::4] / np.abs(expected), model.bench)

@@ -116,8 +116,7 @@ class Diagnosis:
         """Residuals of the dwells (D, 3) over the sigma of their means."""
         carried = self.before.carried
         spread = mean_covariances(self.before.noise.judging, carried.means, carried.state)
-        residuals = np.array([visit.residual_mps2 for visit in self.before.visits])
-        return residuals / np.sqrt(np.einsum("dii->di", spread))
+        return self.before.residuals_mps2 / np.sqrt(np.einsum("dii->di", spread))
 
     def refit_with(self, name: str) -> Calibration:
         """The run with this effect, too: of a suspect it is there already."""

@@ -23,8 +23,7 @@ def description(found: Diagnosis) -> Description | None:
     """What an unknown misfit looks like; None where the misfit is known (one dwell, too), or there is none."""
     if not found.unknown or found.before.outlying:
         return None
-    residuals = np.array([visit.residual_mps2 for visit in found.before.visits])
-    return described(found.before.fit, residuals, found.test.trend)
+    return described(found.before.fit, found.before.residuals_mps2, found.test.trend)
 
 
 def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
