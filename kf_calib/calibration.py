@@ -245,7 +245,7 @@ class Calibration:
         return f"<Calibration: {self.model.sum}, {len(self.visits)} dwells, p {format_p(self.consistency.p_value)}>"
 
     def trace(self) -> Iterator[tuple[float, int, Estimate]]:
-        """(elapsed_s, dwell index, estimate) within and after every dwell: after a second, two, four ..."""
+        """(elapsed_s, number of the dwell, estimate) within and after every dwell: after a second, two, four ..."""
         model, state, around = self.model, self.carried.state, self.model.nominal_state()
         factor = information.start(self.settings.prior, model)
         extra = np.zeros((model.count, model.count))
@@ -259,7 +259,7 @@ class Calibration:
                 walked = np.array([pause, steps([part], self.noise)[0, 1]])
                 factor = information.update(before, rows, walked).factor
                 extra = extra_before + considered(self.noise, means_of([part], own), state)[0]
-                yield part.end_s, index, _estimate(factor, around, extra)
+                yield part.end_s, dwell.number, _estimate(factor, around, extra)
             if len(self.fit.following[index]):
                 factor = information.update(factor, self.fit.following[index]).factor
 

@@ -226,7 +226,7 @@ def _sizes(result: Calibration, wanted: Floats) -> Floats:
 def current(dwell: DwellFactor, judgement: Judgement | None) -> Current:
     """The open dwell, as far as it is folded, beside the judgement of those before it."""
     seconds, unknown = dwell.end_s - dwell.start_s, np.full(12, np.nan)
-    here = Current(dwell.number + 1, dwell.pose, dwell.count, seconds, unknown, None, unknown)
+    here = Current(dwell.number, dwell.pose, dwell.count, seconds, unknown, None, unknown)
     if judgement is None:
         return here
     result, wanted = judgement.result, judgement.wanted
