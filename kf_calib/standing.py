@@ -7,7 +7,7 @@ alarm the model counts as consistent. The last judgement is that of ``diagnose``
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -143,7 +143,7 @@ class Standing:
     judged_s: float = 0.0
     problem: str = ""
     notice: str = ""
-    model: tuple[str, ...] = ()
+    model: Sequence[str] = ()
 
     @property
     def sigma(self) -> Floats:

@@ -1,4 +1,4 @@
-"""A dwell has one number, counted from 1, wherever a person or a program reads it; one that is not used keeps its own."""
+"""A dwell has one number, from 1, wherever a person or a program reads it; one that is not used keeps its own."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_the_table_of_a_diagnosis_names_dwells_by_these_numbers() -> None:
 
 
 def test_a_live_run_numbers_its_dwells_from_one() -> None:
-    session, lines, standing = Session(run(), Settings()), list[str](), set[int]()
+    session, lines = Session(run(), Settings()), list[str]()
     session.listeners.append(lambda judgement: lines.append(live_view.line(judgement)))
     session.run()
     assert [int(line.split()[1]) for line in lines] == [*USED, USED[-1]]
