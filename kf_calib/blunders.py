@@ -63,7 +63,7 @@ class Means:
             np.array([dwell.recorded_pose for dwell in dwells]),
             np.array([dwell.means[4:] for dwell in dwells]),
             np.array([0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells]),
-            tuple(dwell.number + 1 for dwell in dwells),
+            tuple(dwell.number for dwell in dwells),
         )
 
     def __getitem__(self, part: Mask) -> Means:

@@ -11,7 +11,8 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Literal
+from os import PathLike
+from typing import Literal, get_args
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -20,7 +21,7 @@ from kf_calib import averaging, blunders, information, kalman, paper
 from kf_calib.bench import Bench
 from kf_calib.dwells import Block, Segmenter, Tally, dwell_blocks
 from kf_calib.effects import of_the_users, remarks_of
-from kf_calib.errors import InputError, UnobservableError
+from kf_calib.errors import InputError, UnobservableError, check_number
 from kf_calib.fitting import WALK, Fit, fit
 from kf_calib.folding import Carried, DwellFactor, Folder, columns_of, lines_of, means_of, samples_of, without
 from kf_calib.held_out import HeldOut, held_out, orientations
@@ -30,6 +31,7 @@ from kf_calib.noise import TOO_SHORT, Noise, considered, mean_covariances, steps
 from kf_calib.outlying import OutlyingDwell, outlying_dwells
 from kf_calib.readings import Readings, Watch
 from kf_calib.samples import Floats, Mask, Source
+from kf_calib.sources.recording import opened
 from kf_calib.stillness import Stillness
 from kf_calib.visibility import sights
 from kf_calib.walk import predicted, to_mean
@@ -45,9 +47,10 @@ Engine = Literal["block", "filterpy"]
 
 @dataclass(frozen=True)
 class Settings:
-    """How a run is evaluated.
+    """How a run is evaluated. Raises InputError where a value cannot be.
 
-    walk_mps2_per_sqrt_s: random walk of the biases (process noise), 0: none. effects: names of those in the model.
+    walk_mps2_per_sqrt_s: random walk of the biases (process noise), 0: none. effects: names of those in the model, or
+    the name of one.
     window_s: readings are averaged over windows of that length first; 0: only for effects that go with vibration, then
     over windows of a second, or as long as the vibration needs that is seen. left_out: numbers of dwells (from 1) that
     are not used.
@@ -58,9 +61,22 @@ class Settings:
     stillness: Stillness = field(default_factory=Stillness)
     gate_sigma: float | None = 6.0
     walk_mps2_per_sqrt_s: float = 0.0
-    effects: tuple[str, ...] = ()
+    effects: Sequence[str] = ()
     window_s: float = 0.0
     left_out: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "effects", (self.effects,) if isinstance(self.effects, str) else tuple(self.effects))
+        if self.engine not in get_args(Engine):
+            raise InputError(f"engine {self.engine!r} is not known: use {' or '.join(get_args(Engine))}.")
+        if not isinstance(self.prior, Prior):
+            raise InputError(f'prior is {self.prior!r}: give a Prior, for example kf_calib.model.PRIORS["navigation"].')
+        if not isinstance(self.stillness, Stillness):
+            raise InputError(f"stillness is {self.stillness!r}: give a kf_calib.stillness.Stillness.")
+        if self.gate_sigma is not None:
+            check_number("gate_sigma (--gate-sigma)", self.gate_sigma, 3.0)
+        check_number("walk_mps2_per_sqrt_s (--bias-walk)", self.walk_mps2_per_sqrt_s)
+        check_number("window_s", self.window_s)
 
 
 @dataclass(frozen=True)
@@ -111,6 +127,11 @@ class Estimate:
     @cached_property
     def _lost(self) -> Floats:
         return self.undetermined / np.linalg.norm(self.undetermined, axis=0)
+
+    @cached_property
+    def determined(self) -> Mask:
+        """Which numbers of the state the orientations determine, (p,) bool."""
+        return np.asarray(np.linalg.norm(self._lost, axis=1) < 1e-9)
 
     @cached_property
     def sigma(self) -> Floats:
@@ -264,7 +285,7 @@ class Calibration:
         return f"<Calibration: {self.model.sum}, {len(self.visits)} dwells, p {format_p(self.consistency.p_value)}>"
 
     def trace(self) -> Iterator[tuple[float, int, Estimate]]:
-        """(elapsed_s, dwell index, estimate) within and after every dwell: after a second, two, four ..."""
+        """(elapsed_s, number of the dwell, estimate) within and after every dwell: after a second, two, four ..."""
         model, state, around = self.model, self.carried.state, self.model.nominal_state()
         factor = information.start(self.settings.prior, model)
         extra = np.zeros((model.count, model.count))
@@ -278,7 +299,7 @@ class Calibration:
                 walked = np.array([pause, steps([part], self.noise)[0, 1]])
                 factor = information.update(before, rows, walked).factor
                 extra = extra_before + considered(self.noise, means_of([part], own), state)[0]
-                yield part.end_s, index, _estimate(factor, around, extra)
+                yield part.end_s, dwell.number, _estimate(factor, around, extra)
             if len(self.fit.following[index]):
                 factor = information.update(factor, self.fit.following[index]).factor
 
@@ -344,22 +365,22 @@ class Pass:
         left_out = self.settings.left_out
         if not left_out:
             return [dwell for dwell in self.folder.dwells if dwell.count >= 8]
-        unused = {k for k, each in enumerate(self.folder.dwells) if each.count < 8 or each.number + 1 in left_out}
+        unused = {k for k, each in enumerate(self.folder.dwells) if each.count < 8 or each.number in left_out}
         return without(self.folder.dwells, unused)
 
 
 def calibrate(
-    source: Source,
+    source: Source | str | PathLike[str],
     settings: Settings | None = None,
     on_progress: Callable[[float], None] | None = None,
     plain: Fit | None = None,
 ) -> Calibration:
-    """Evaluate a source: fold its dwells, model the noise, run the filter, judge the misfit.
+    """Evaluate a source (or the recording at a path): fold dwells, model the noise, run the filter, judge the misfit.
 
     plain: the fit of the same model to the dwells as they are, which is known to need them folded on a carrier.
     Raises InputError where the source holds nothing usable, UnobservableError where one orientation was visited only.
     """
-    settings = settings or Settings()
+    source, settings = opened(source), settings or Settings()
     with threadpool_limits(1, user_api="blas"):  # small decompositions: with threads they take three times as long
         if Model.of(source.bench, settings.effects).averages and not settings.window_s:
             settings = replace(settings, window_s=_window_s(source, settings))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -18,7 +19,7 @@ from kf_calib import advice as advise
 from kf_calib import averaging
 from kf_calib.advice import Advice
 from kf_calib.assessment import EQUAL, LEVEL, SHARE, Test, assessed, price, run_level, threshold
-from kf_calib.calibration import Calibration, Parameter, format_p, refitted
+from kf_calib.calibration import Calibration, Parameter, calibrate, format_p, refitted
 from kf_calib.drivers import JUMP, Family, families, roughly
 from kf_calib.effects import walk_named
 from kf_calib.fitting import WALK, behind_within
@@ -37,7 +38,7 @@ from kf_calib.pairs import (
     pairs_of,
     paths_beside,
 )
-from kf_calib.samples import Floats
+from kf_calib.samples import Floats, Source
 from kf_calib.scan import scan
 from kf_calib.scattering import (
     as_if_stated,
@@ -124,8 +125,9 @@ class Diagnosis:
         return next(own, None) or with_effects(self.before, (name,))
 
 
-def diagnose(before: Calibration) -> Diagnosis:
-    """What is missing in the model of a calibration, from its dwell factors alone."""
+def diagnose(run: Calibration | Source | str | PathLike[str]) -> Diagnosis:
+    """What is missing in the model of a calibration, from its dwell factors alone; a recording is calibrated first."""
+    before = run if isinstance(run, Calibration) else calibrate(run)
     with threadpool_limits(1, user_api="blas"):  # small decompositions
         return _diagnosed(before)
 

@@ -39,6 +39,7 @@ _SURE = 3  # messages: of fewer the noise of an encoder cannot be taken
 class Block:
     """Up to 4000 consecutive readings of one dwell, which began at ``arrival_s``, or of the slew that ended it.
 
+    dwell: its number, counted from 1.
     arrival_s: as the angles tell it; felt_s: as the readings do, from which on they settle (None: not known better).
     elapsed_s (n,) since the first sample of the recording; accel_mps2 (n, 3); pose (1, k): the mean of the angle
     messages while the platform stands still, or (n, k) where it creeps; temperature_c (n,), NaN where not measured.
@@ -192,7 +193,7 @@ class Segmenter:
                 "/platform/angles, or leave out the effects that show in slews only."
             )
         self.first_ns: int | None = None
-        self.dwell_count = 0
+        self.dwell_count = 0  # so many have begun; that is also the number of the latest
         self._accel = Stream.empty(3)
         self._pose = Stream.empty(self.bench.pose_width)
         self._turns = np.empty((0, len(self.bench.axes)))  # by which each pose goes beyond what was recorded
@@ -278,8 +279,8 @@ class Segmenter:
                 yield from self._slew(stamp)
                 self._discard(stamp)
                 self.dwell_count += 1
-                number, settling_ns = self.dwell_count - 1, None if settles else 0
-                self._dwell = _Dwell(number, stamp, felt_ns, self._next_pose_ns(stamp), settling_ns)
+                settling_ns = None if settles else 0
+                self._dwell = _Dwell(self.dwell_count, stamp, felt_ns, self._next_pose_ns(stamp), settling_ns)
             else:
                 lead_ns = min(self.stillness.lead_ns, (stamp - self._dwell.arrival_ns) // 10) if self._dwell else 0
                 yield from self._emit(stamp - lead_ns, closing=True)
@@ -418,7 +419,7 @@ class Segmenter:
         for part in np.array_split(np.arange(count), -(-count // BLOCK_SAMPLES)):
             own = elapsed_s[part]
             yield Block(
-                self.dwell_count - 1, float(elapsed_s[0]), own, accel.values[part], curve.angles(own), warm[part], curve
+                self.dwell_count, float(elapsed_s[0]), own, accel.values[part], curve.angles(own), warm[part], curve
             )
         self.tally.slewing += count
         self._accel = self._accel[count:]

@@ -11,7 +11,7 @@ from kf_calib import information, walk
 from kf_calib.fitting import Fit
 from kf_calib.folding import DwellFactor
 from kf_calib.model import Prior
-from kf_calib.noise import considered, mean_covariances
+from kf_calib.noise import considered, lifted, mean_covariances
 from kf_calib.samples import Floats
 
 SAME_POSE_DEG = 1.0
@@ -53,7 +53,7 @@ class HeldOut:
     @property
     def statistics(self) -> Floats:
         """Chi-squared (D,) of each dwell's error, of 3 degrees of freedom."""
-        solved = np.linalg.solve(self.covariance, self.errors_mps2[:, :, None])[:, :, 0]
+        solved = np.linalg.solve(lifted(self.covariance), self.errors_mps2[:, :, None])[:, :, 0]
         return np.asarray(np.einsum("di,di->d", self.errors_mps2, solved))
 
 

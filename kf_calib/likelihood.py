@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from kf_calib.folding import DwellFactor, Means
-from kf_calib.noise import FLOOR_MPS2, Noise, mean_covariances, wander
+from kf_calib.noise import FLOOR_MPS2, Noise, lifted, mean_covariances, wander
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 from kf_calib.walk import Links, links
@@ -25,7 +25,6 @@ FEWEST = 6
 
 _SIGNIFICANT = 5.41  # 1 % point of the likelihood ratio of a variance against zero: half of chi2 with 1 dof
 _HELD = 12  # time constants of a walk that is held back
-_ROUNDING = 1e-14  # of a dwell's variance
 _RANGE = (-9.0, 3.0)  # of the logarithm of a part's size, about the size of the misfit
 
 Part = Literal["setting", "common", "scatter", "walk"]
@@ -316,10 +315,8 @@ def _rows(noise: Noise, means: Means, state: Floats, held_s: float = math.inf) -
 
 
 def _root(covariances: Floats) -> Floats:
-    """Triangular roots (D, 3, 3) of covariances; a setting error alone does not turn the force along itself, and noise
-    far below it is rounding."""
-    least = _ROUNDING * np.einsum("dii->d", covariances)
-    return np.linalg.cholesky(covariances + least[:, None, None] * np.eye(3))
+    """Triangular roots (D, 3, 3) of covariances."""
+    return np.linalg.cholesky(lifted(covariances))
 
 
 def _linked_rows(own: Floats, intensity: float, path: Links, stacked: Floats) -> tuple[Floats, float]:
@@ -330,6 +327,7 @@ def _linked_rows(own: Floats, intensity: float, path: Links, stacked: Floats) ->
     rows[1:] -= share * stacked[:-1]
     diagonal = own + intensity**2 * path.alone[:, None, None] * np.eye(3)
     diagonal[1:] += share**2 * own[:-1]
+    diagonal = lifted(diagonal)
     beside = intensity**2 * path.beside[:, None, None] * np.eye(3) - share * own[:-1]
     bands = np.zeros((6, len(own), 3))
     for i in range(3):

@@ -21,7 +21,7 @@ from kf_calib.averaging import averaged
 from kf_calib.bench import Bench
 from kf_calib.dwells import Block, Tally
 from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, check_number
 from kf_calib.samples import Floats, Mask
 from kf_calib.slews import Curve
 
@@ -403,6 +403,11 @@ class Prior:
     misalignment_rad: float | None = None
     scale: float | None = None
     bias_mps2: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value is not None:
+                check_number(f"the prior's {name}", value)
 
     @property
     def diffuse(self) -> bool:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kf_calib.folding import Carried, DwellFactor, Means, without
-from kf_calib.noise import mean_covariances
+from kf_calib.noise import lifted, mean_covariances
 from kf_calib.samples import Floats
 
 if TYPE_CHECKING:
@@ -113,13 +113,14 @@ def _judged(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell | N
     turns = tuple(_turns(dwells[k], means, rest))
     if not turns and np.linalg.norm(error) < _GROSS * result.bench.gravity_mps2:
         return None
-    return OutlyingDwell(dwells[k], dwells[k].number + 1, error, p_value, turns, rest)
+    return OutlyingDwell(dwells[k], dwells[k].number, error, p_value, turns, rest)
 
 
 def _covariance(rest: Calibration, means: Means) -> Floats:
     """Of the mean reading of one dwell less its prediction, (3, 3)."""
     design, estimate = means.design[0], rest.estimate
-    return mean_covariances(rest.noise, means, estimate.state)[0] + design @ estimate.covariance @ design.T
+    own = mean_covariances(rest.noise, means, estimate.state)
+    return lifted(own + design @ estimate.covariance @ design.T)[0]
 
 
 def _turns(dwell: DwellFactor, means: Means, rest: Calibration) -> Iterator[Turn]:

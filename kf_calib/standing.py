@@ -7,7 +7,7 @@ alarm the model counts as consistent. The last judgement is that of ``diagnose``
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -143,7 +143,7 @@ class Standing:
     judged_s: float = 0.0
     problem: str = ""
     notice: str = ""
-    model: tuple[str, ...] = ()
+    model: Sequence[str] = ()
 
     @property
     def sigma(self) -> Floats:
@@ -226,7 +226,7 @@ def _sizes(result: Calibration, wanted: Floats) -> Floats:
 def current(dwell: DwellFactor, judgement: Judgement | None) -> Current:
     """The open dwell, as far as it is folded, beside the judgement of those before it."""
     seconds, unknown = dwell.end_s - dwell.start_s, np.full(12, np.nan)
-    here = Current(dwell.number + 1, dwell.recorded_pose, dwell.count, seconds, unknown, None, unknown)
+    here = Current(dwell.number, dwell.recorded_pose, dwell.count, seconds, unknown, None, unknown)
     if judgement is None:
         return here
     result, wanted = judgement.result, judgement.wanted

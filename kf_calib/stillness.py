@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench import mean_pose, pose_distance
+from kf_calib.errors import check_number
 from kf_calib.samples import Floats, Mask, Stream, Times
 
 _SECOND_NS = 1_000_000_000
@@ -34,6 +35,12 @@ class Stillness:
     window_s: float = 0.5
     settle_s: float = 1.0
     lead_s: float = 0.25
+
+    def __post_init__(self) -> None:
+        check_number("tolerance_deg (--still-deg)", self.tolerance_deg, above=True)
+        check_number("window_s", self.window_s, above=True)
+        check_number("settle_s (--settle-s)", self.settle_s)
+        check_number("lead_s", self.lead_s)
 
     @property
     def tolerance_rad(self) -> float:

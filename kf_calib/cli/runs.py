@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -265,7 +265,7 @@ def _refuse_engine(options: Mapping[str, Any]) -> None:
         )
 
 
-def _for_journal(options: Mapping[str, Any], effects: tuple[str, ...]) -> dict[str, Any]:
+def _for_journal(options: Mapping[str, Any], effects: Sequence[str]) -> dict[str, Any]:
     """All options that numbers depend on; files of bench keys and of models by what they say."""
     from kf_calib import model_file
 

@@ -181,7 +181,7 @@ def _dwell_table(found: Diagnosis) -> Table:
     for k in np.argsort(-np.abs(ratios).max(axis=1))[:5].tolist():
         dwell = found.before.visits[k].dwell
         angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(dwell.recorded_pose))
-        table.add_row(str(k + 1), f"{dwell.start_s:.0f}", angles, *(f"{ratio:+.1f}" for ratio in ratios[k]))
+        table.add_row(str(dwell.number), f"{dwell.start_s:.0f}", angles, *(f"{ratio:+.1f}" for ratio in ratios[k]))
     return table
 
 

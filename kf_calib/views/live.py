@@ -69,7 +69,7 @@ def line(judgement: Judgement) -> str:
     per_dof = result.consistency.nis_per_dof
     nis = "" if per_dof is None else f"; NIS/dof {per_dof:.3g}"
     return (
-        f"dwell {len(result.visits)} to {dwell.end_s:.0f} s: {result.tally.read} readings; {seen}{nis}; "
+        f"dwell {dwell.number} to {dwell.end_s:.0f} s: {result.tally.read} readings; {seen}{nis}; "
         f"{judgement.verdict}{following}"
     )
 
