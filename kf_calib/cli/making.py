@@ -40,13 +40,13 @@ def _hidden_table() -> RenderableType:
     """Every kind of hidden effect, in two lines or more."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Group
-    from rich.table import Table
 
     from kf_calib.sources.hidden import INNER, catalogue
+    from kf_calib.views.tables import Table
 
     kinds = catalogue().values()
     table = Table(title=f"{len(kinds)} effects to hide", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("effect\nwhat it is", min_width=26)
+    table.add_column("effect\nwhat it is")
     for heading in ("in the\ncatalogue", "SI unit\ncoefficients", "constants", "navigation grade\nMEMS"):
         table.add_column(heading, no_wrap=True)
     for kind in kinds:

@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 from rich.console import Console, Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from kf_calib import paper
@@ -17,6 +16,7 @@ from kf_calib.effects import Effect, as_text
 from kf_calib.fitting import WALK
 from kf_calib.held_out import orientations
 from kf_calib.model import Model
+from kf_calib.views.tables import Table
 
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from kf_calib.advice import Advice
@@ -17,6 +16,7 @@ from kf_calib.drivers import Description, described
 from kf_calib.trend import Trend
 from kf_calib.views.console import plain, rounded, symbol
 from kf_calib.views.json import clean, readings_object
+from kf_calib.views.tables import Table
 
 
 def description(found: Diagnosis) -> Description | None:

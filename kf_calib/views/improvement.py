@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from kf_calib.calibration import Calibration, evaluated, format_p
@@ -18,6 +17,7 @@ from kf_calib.improvement import Honest, Improvement, Removal, Spread, Step, ext
 from kf_calib.views.console import effect_table, parameter_table, rounded, symbol
 from kf_calib.views.diagnosis import description, description_object, orientation_object
 from kf_calib.views.json import clean
+from kf_calib.views.tables import Bar, Table
 
 _WIDTH = 30  # characters of the longest bar
 _EIGHTHS = " ▏▎▍▌▋▊▉"
@@ -165,10 +165,10 @@ def progress(state: Improvement) -> RenderableType:
     for (label, _, p_value), (held_out, fitted) in zip(rows, errors, strict=True):
         p_text = "" if p_value is None else format_p(p_value).removeprefix("= ")
         if held_out is not None:
-            table.add_row(label, p_text, "held out", f"{held_out:.2f}", Text(bar(held_out, longest), style="cyan"))
+            table.add_row(label, p_text, "held out", f"{held_out:.2f}", Bar(bar(held_out, longest), style="cyan"))
             label = p_text = ""
         number = f"{fitted:.2f}" if floor else f"{fitted:.2g}"
-        table.add_row(label, p_text, "fitted", number, Text(bar(fitted, longest), style="dim"))
+        table.add_row(label, p_text, "fitted", number, Bar(bar(fitted, longest), style="dim"))
     said = [Text(line) for step in state.steps for line in (*map(_out, step.dropped), *step.remarks)]
     tests = [Text(f"Tested: {_test(each)}.") for each in state.removals]
     return Group(table, *said, *tests)
