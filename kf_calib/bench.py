@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kf_calib.errors import BenchError
+from kf_calib.errors import BenchError, how_to_write
 from kf_calib.samples import Floats, Times
 
 EARTH_RATE_RADPS = 7.292115e-5
@@ -216,15 +216,19 @@ def _number(key: str, text: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise BenchError(f"bench key {key} is {text!r}, which is not a number.")
+        raise BenchError(f"bench key {key} is {text!r}, which is not a finite number{how_to_write(text)}.")
     return value
 
 
 def _nominal(text: str) -> dict[str, float]:
     try:
-        return {str(symbol): float(value) for symbol, value in json.loads(text).items()}
+        found = {str(symbol): float(value) for symbol, value in json.loads(text).items()}
     except (ValueError, TypeError, AttributeError):
         raise BenchError(f'bench key nominal is {text!r}: it must be a JSON object such as {{"theta1": 0}}.') from None
+    for symbol, value in found.items():
+        if not math.isfinite(value):
+            raise BenchError(f"bench key nominal has {symbol} = {value}, which is not a finite number.")
+    return found
 
 
 def turn(vector: Floats, axis: Floats, angle_rad: Floats | float) -> Floats:

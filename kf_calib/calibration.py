@@ -383,7 +383,8 @@ def told(result: Calibration, passed: Pass) -> Calibration:
     own = [effect for effect in result.model.effects if of_the_users(effect)]
     notes = [f"{sight}." for sight in sights(result.fit, own)]
     readings = passed.watch.judged(result.fit.dwells, result.noise)
-    said = [*passed.source.warnings, *passed.tally.sentences(), *readings.warnings, *result.warnings, *notes]
+    counted = [*passed.tally.sentences(), *passed.tally.unmet(passed.settings.stillness)]
+    said = [*passed.source.warnings, *counted, *readings.warnings, *result.warnings, *notes]
     return replace(result, tally=passed.tally, readings=readings, warnings=tuple(said))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 
 class KfCalibError(Exception):
     """Anything kf_calib refuses to do; the command line prints it on stderr and exits with 2."""
@@ -17,3 +19,9 @@ class BenchError(InputError):
 
 class UnobservableError(KfCalibError):
     """The orientations so far leave some parameters undetermined; the message names them."""
+
+
+def how_to_write(number: str) -> str:
+    """`` (write 9.81 with a point)`` for what is written as 9,81; nothing for anything else."""
+    found = re.search(r"\d*,\d+", number)
+    return f" (write {number[: found.end()].replace(',', '.')} with a point)" if found else ""

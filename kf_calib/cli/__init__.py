@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 
-import click
+import rich_click as click
 
 from kf_calib.cli.live import live
 from kf_calib.cli.making import demo, record, simulate
@@ -18,7 +18,15 @@ from kf_calib.cli.runs import compare, diagnose, improve, list_effects, replay
 from kf_calib.errors import KfCalibError
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.rich_config(
+    help_config={
+        "theme": "default-slim",
+        "max_width": 110,
+        "force_terminal": None,  # colours on a terminal only, whatever the environment of a build says
+        "options_table_column_types": ["opt_all_metavar", "help"],
+    }
+)
 @click.version_option(package_name="kf_calib")
 def cli() -> None:
     """Calibrate accelerometers on a stationary gimballed bench with a Kalman filter."""

@@ -16,9 +16,10 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-import click
+import rich_click as click
 
 from kf_calib.cli.making import overwrite_option, pair
+from kf_calib.cli.numbers import NOT_NEGATIVE, POSITIVE
 from kf_calib.cli.options import (
     bench_options,
     columns_option,
@@ -32,7 +33,7 @@ from kf_calib.cli.options import (
     show,
     strict_option,
 )
-from kf_calib.errors import InputError, KfCalibError
+from kf_calib.errors import InputError, KfCalibError, how_to_write
 
 if TYPE_CHECKING:
     from kf_calib.calibration import Settings
@@ -56,14 +57,14 @@ _KINDS = {"rad": ("rad", "deg", "arcmin", "arcsec"), "1": ("1", "ppm"), "m/s^2":
 @click.option("--header", default="", metavar="NAMES", help="Names of the columns of CSV rows that come without any.")
 @click.option(
     "--give-up-s",
-    type=click.FloatRange(min=0),
+    type=NOT_NEGATIVE,
     default=600.0,
     show_default=True,
     help="Seconds for which a lost link is tried again.",
 )
 @click.option(
     "--idle-s",
-    type=click.FloatRange(min=0, min_open=True),
+    type=POSITIVE,
     default=math.inf,
     show_default="never",
     help="End the run when nothing has come for so long.",
@@ -403,7 +404,8 @@ def _targets(texts: tuple[str, ...]) -> dict[str, float]:
             value = math.nan
         if not 0.0 < value < math.inf:
             raise InputError(
-                f"--target {text!r}: give a sigma above zero in {', '.join(kinds)}, as {name}=1{kinds[-1]}."
+                f"--target {text!r}: give a sigma above zero in {', '.join(kinds)}, as {name}=1{kinds[-1]}"
+                f"{how_to_write(size)}."
             )
         out |= dict.fromkeys(symbols, value)
     return out

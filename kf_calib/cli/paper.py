@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import click
+import rich_click as click
 
+from kf_calib.cli.numbers import NumberInRange
 from kf_calib.cli.options import (
     json_option,
     png_option,
@@ -22,21 +23,21 @@ from kf_calib.cli.options import (
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the noise.")
 @click.option(
     "--period-s",
-    type=click.FloatRange(min=0, min_open=True, max=3600),
+    type=NumberInRange(min=0, min_open=True, max=3600),
     default=25.0,
     show_default=True,
     help="From reading to reading in the non-optimal set, s; inferred, not printed in the paper.",
 )
 @click.option(
     "--latitude",
-    type=click.FloatRange(-85, 85),
+    type=NumberInRange(-85, 85),
     default=55.75,
     show_default=True,
     help="Latitude of the bench, deg; inferred.",
 )
 @click.option(
     "--azimuth",
-    type=click.FloatRange(-360, 360),
+    type=NumberInRange(-360, 360),
     default=0.0,
     show_default=True,
     help="Azimuth of the bench's x axis, deg; inferred.",

@@ -7,8 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
+import rich_click as click
 
+from kf_calib.cli.numbers import POSITIVE, NumberInRange
 from kf_calib.cli.options import (
     F,
     filter_options,
@@ -36,7 +37,6 @@ _CRITERIA = ("D", "A", "E", "minimax", "condition")
 
 def _plan_options(command: F) -> F:
     """What is aimed at, what the bench can do, and what a dwell tells."""
-    positive = click.FloatRange(min=0, min_open=True)
     options = [
         click.option("--count", type=click.IntRange(min=1), help="Dwells; 12, and 1 where a recording is given."),
         click.option("--criterion", type=click.Choice(_CRITERIA), default="D", show_default=True,
@@ -46,7 +46,7 @@ def _plan_options(command: F) -> F:
                      help="Sigma wanted of a parameter or kind, as K=2ppm, b2=20ug, angles=0.1arcsec; repeatable: the "
                      "worst relative to its target is made least."),
         click.option("--fewest", is_flag=True, help="The fewest dwells that reach all targets."),
-        click.option("--grid-deg", type=positive, help="Angles are multiples of this."),
+        click.option("--grid-deg", type=POSITIVE, help="Angles are multiples of this."),
         click.option("--positions", type=click.Path(path_type=Path), metavar="FILE.csv",
                      help="Choose from these orientations, a line of gimbal angles in deg each."),
         click.option("--limit", "limits", multiple=True, metavar="AXIS=LOW:HIGH",
@@ -57,13 +57,13 @@ def _plan_options(command: F) -> F:
         click.option("--repeats", type=click.IntRange(min=1), default=1, show_default=True,
                      help="Visits to each orientation, coming from others: scatter and hysteresis show."),
         click.option("--antipodal", is_flag=True, help="Each orientation with its opposite, gravity turned over."),
-        click.option("--dwell-s", type=positive, help="Seconds in each orientation; 30, or as in the recording."),
-        click.option("--sample-hz", type=positive, default=100.0, show_default=True, help="Rate of the readings."),
-        click.option("--readings", type=positive, help="Readings of a dwell that are used, in place of the two above."),
-        click.option("--white", "white_mps2", type=positive, default=1e-4, show_default=True,
+        click.option("--dwell-s", type=POSITIVE, help="Seconds in each orientation; 30, or as in the recording."),
+        click.option("--sample-hz", type=POSITIVE, default=100.0, show_default=True, help="Rate of the readings."),
+        click.option("--readings", type=POSITIVE, help="Readings of a dwell that are used, in place of the two above."),
+        click.option("--white", "white_mps2", type=POSITIVE, default=1e-4, show_default=True,
                      help="White noise of a reading, m/s^2, where no recording tells it."),
-        click.option("--slew-degps", type=positive, default=20.0, show_default=True, help="Greatest speed, deg/s."),
-        click.option("--time-correlation", type=click.FloatRange(0, 1), default=0.1, show_default=True,
+        click.option("--slew-degps", type=POSITIVE, default=20.0, show_default=True, help="Greatest speed, deg/s."),
+        click.option("--time-correlation", type=NumberInRange(0, 1), default=0.1, show_default=True,
                      help="Correlation of time with the direction of gravity that the order may have; slews are the "
                      "shortest below it."),
         click.option("--recording", type=click.Path(path_type=Path), metavar="REC",

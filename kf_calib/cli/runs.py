@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import click
+import rich_click as click
 
 from kf_calib.cli.options import (
     BENCH_OPTIONS,

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from kf_calib.bench import Vector
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, how_to_write
 from kf_calib.sources.hidden.detectability import NoSizeError
 from kf_calib.sources.hidden.kinds import INNER, Hidden, Kind, catalogue
 from kf_calib.sources.hidden.units import si
@@ -79,7 +79,9 @@ def _sigmas(text: str) -> float | None:
     except ValueError:
         sigmas = math.nan
     if not 0.0 < sigmas < math.inf:
-        raise InputError(f"{text.strip()!r} is no size in sigma: give one positive number, for example 10sigma.")
+        raise InputError(
+            f"{text.strip()!r} is no size in sigma: give one positive number, for example 10sigma{how_to_write(text)}."
+        )
     return sigmas
 
 
@@ -128,8 +130,10 @@ def _sizes(kind: Kind, given: Sequence[float], seed: int, quantity: str) -> tupl
     if len(given) == count:
         return tuple(given)
     if len(given) > 1:
-        words = ", ".join(kind.coefficients)
-        raise InputError(f"{kind.name} has {count} coefficients ({words}), {len(given)} are given: give 1 or {count}.")
+        words, point = ", ".join(kind.coefficients), ", and decimals with a point" if len(given) == 2 else ""
+        raise InputError(
+            f"{kind.name} has {count} coefficients ({words}), {len(given)} are given: give 1 or {count}{point}."
+        )
     signs = generator(seed, f"hidden signs {quantity}").choice([-1.0, 1.0], count) if kind.signed else np.ones(count)
     return tuple((given[0] * signs + 0.0).tolist())
 
