@@ -132,7 +132,7 @@ def _here(standing: Standing) -> Text:
     return out
 
 
-def _sigmas(standing: Standing) -> Table:
+def _sigmas(standing: Standing) -> RenderableType:
     """The twelve, four a column group as in the paper: sigma, target and the time to it (or to half), and a bar."""
     table = Table.grid(padding=(0, 1))
     wanted = np.full(12, np.nan) if standing.judgement is None else standing.judgement.wanted
