@@ -137,15 +137,12 @@ class Bench:
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str], has_angles: bool = True) -> Bench:
         """The bench from the strings of a metadata record (FORMAT.md), or from options of the same names."""
-        unknown = sorted(set(metadata) - _KEYS)
-        if unknown:
-            raise BenchError(f"bench key {unknown[0]!r} is not known: use one of {', '.join(sorted(_KEYS))}.")
+        numbers = numbers_of(metadata)
         version = metadata.get("format_version", FORMAT_VERSION)
         if version != FORMAT_VERSION:
             raise BenchError(
                 f"the recording has format_version {version!r}, this program reads {FORMAT_VERSION}: update kf_calib."
             )
-        numbers = {key: _number(key, metadata[key]) for key in _NUMBERS if metadata.get(key, "") != ""}
         if has_angles and not metadata.get("axes", "").strip():
             raise BenchError(
                 "the gimbal axes are not stated, so the angles cannot be used: give them outer to inner, "
@@ -208,6 +205,14 @@ class Bench:
             speed = float(np.linalg.norm(rate))
             up = turn(up, rate / speed, speed * elapsed_s)
         return self.to_platform(up, np.asarray(pose, float))
+
+
+def numbers_of(metadata: Mapping[str, str]) -> dict[str, float]:
+    """The numbers among the keys of a bench; raises BenchError where one is none, or a key is not known."""
+    unknown = sorted(set(metadata) - _KEYS)
+    if unknown:
+        raise BenchError(f"bench key {unknown[0]!r} is not known: use one of {', '.join(sorted(_KEYS))}.")
+    return {key: _number(key, metadata[key]) for key in _NUMBERS if metadata.get(key, "") != ""}
 
 
 def _number(key: str, text: str) -> float:

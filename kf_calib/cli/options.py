@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import rich_click as click
 
 from kf_calib.cli.numbers import NOT_NEGATIVE, NUMBER, POSITIVE, NumberInRange
-from kf_calib.errors import InputError
+from kf_calib.errors import BenchError, InputError
 
 if TYPE_CHECKING:
     from kf_calib.calibration import Settings
@@ -159,7 +159,14 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
             f"{path}: is not TOML ({error}); write lines such as gravity_mps2 = 9.81, numbers with a point."
         ) from None
     table = table.get("bench", table)
-    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in table.items()}
+    keys = {key: value if isinstance(value, str) else json.dumps(value) for key, value in table.items()}
+    from kf_calib.bench import numbers_of
+
+    try:
+        numbers_of(keys)
+    except BenchError as error:
+        raise BenchError(f"{path}: {error}") from None
+    return keys
 
 
 def recording_of(path: Path, options: Mapping[str, Any]) -> Recording:

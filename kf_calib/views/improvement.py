@@ -15,7 +15,7 @@ from kf_calib.diagnosis import Diagnosis, next_orientation
 from kf_calib.errors import InputError
 from kf_calib.improvement import Honest, Improvement, Removal, Spread, Step, extended, stepped, undone
 from kf_calib.views.console import effect_table, parameter_table, rounded, symbol
-from kf_calib.views.diagnosis import description, description_object, orientation_object
+from kf_calib.views.diagnosis import description, description_object, of_what_p_is, orientation_object
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Bar, Table
 
@@ -131,7 +131,7 @@ def improvement_report(
     parts: list[RenderableType] = [
         progress(state), Text(f"Stopped, {state.because}: {state.reason}", style=style),
     ]  # fmt: skip
-    parts += [Text(line) for line in _settling(state)]
+    parts += [Text(line) for line in (*of_what_p_is(state.found), *_settling(state))]
     if not state.spreads or state.because != "ambiguous":
         parts.append(parameter_table(state.result))
     if state.spreads:

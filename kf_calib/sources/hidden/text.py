@@ -104,7 +104,7 @@ def _read(text: str, axes: Sequence[Vector], seed: int, grade: str, sized: Sizer
     if colon and not kind.per_axis:
         raise InputError(f"{name} belongs to no gimbal axis: leave out {':' + axis!r}.")
     resized = _resizing(_sigmas(numbers), sized)
-    given = [math.sqrt(math.prod(kind.typical(grade)))] if resized else [si(number) for number in numbers.split(",")]
+    given = [math.sqrt(math.prod(kind.typical(grade)))] if resized else _given(numbers)
     inner = _inner(kind, constants)
     if kind.per_axis:
         chosen, names = _axes_meant(axis, axes), axis_names(axes)
@@ -112,6 +112,15 @@ def _read(text: str, axes: Sequence[Vector], seed: int, grade: str, sized: Sizer
     else:
         effects = [Hidden(kind, _sizes(kind, given, seed, name), inner)]
     return [resized(effect) for effect in effects] if resized else effects
+
+
+def _given(text: str) -> list[float]:
+    """Sizes in SI; where one has a unit all have one, but for zeros: 4,1arcsec is no 4 rad and 1 arcsec."""
+    words = [word.strip() for word in text.split(",")]
+    sizes, bare = [si(word) for word in words], [word[-1:] in "0123456789." for word in words]
+    if not all(bare) and any(alone and size for alone, size in zip(bare, sizes, strict=True)):
+        raise InputError(f"{text.strip()!r} has sizes with a unit and without: give each its unit{how_to_write(text)}.")
+    return sizes
 
 
 def _kind(name: str) -> Kind:
