@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -30,8 +31,10 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from kf_calib.samples import Source
+    from kf_calib.sources.simulator import Simulation
 
 
+_LARGE_BYTES = 1e9  # of a recording: minutes of work
 _HOW_TO_HIDE = """\
 --hide NAME=SIZE: one size for all coefficients, with signs drawn from the seed, or SIZE,SIZE,... one for each;
 constants after semicolons: 'warm-up=20ug;tau=600'. Without :AXIS an effect is on every gimbal axis.
@@ -178,12 +181,13 @@ overwrite_option = click.option(
 @simulation_options
 @bench_options
 @overwrite_option
+@click.option("--large", is_flag=True, panel=OUTPUT, help="Begin even where the disk would not hold the recording.")
 @json_option
-def simulate(out: Path, overwrite: bool, as_json: bool, **options: Any) -> None:
+def simulate(out: Path, overwrite: bool, large: bool, as_json: bool, **options: Any) -> None:
     """Record a simulated bench run to OUT; its truth goes to a side file that no estimator opens."""
     from kf_calib.sources.simulated import simulation
 
-    source = simulation(options, overrides(options))
+    source = simulation(options, overrides(options), begin=partial(_foresee, out=out, large=large))
     with progress(f"simulating {out.name}", as_json) as tick:
         made = _record(source, out, overwrite, tick)
     truth = source.write_truth(out)
@@ -191,6 +195,23 @@ def simulate(out: Path, overwrite: bool, as_json: bool, **options: Any) -> None:
         print_json({"recording": str(out), "truth": str(truth), **made.keys})
     else:
         click.echo(f"{out}: {made}; truth in {truth}")
+
+
+def _foresee(run: Simulation, out: Path, large: bool) -> None:
+    """Say how large a large run becomes, before it begins; refuse what the disk does not hold."""
+    free = shutil.disk_usage(next(folder for folder in out.absolute().parents if folder.is_dir())).free
+    told = f"{len(run):.3g} readings, {run.duration_s / 3600:.3g} h of the bench, about {_size(run.file_bytes)}"
+    if run.file_bytes > free and not large:
+        raise InputError(
+            f"{out}: {told}, and the disk has {_size(free)} left: dwell shorter (--dwell-s), visit or read less "
+            "(--orientations, --sample-hz), or begin nevertheless with --large."
+        )
+    if run.file_bytes > _LARGE_BYTES:
+        click.echo(f"{out}: {told}.", err=True)
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e9:.3g} GB" if count < 1e12 else f"{count / 1e12:.3g} TB"
 
 
 @click.command(

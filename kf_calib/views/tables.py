@@ -74,7 +74,8 @@ class Table(rich.table.Table):
         for number, row in enumerate(self.rows):
             label, *said = [_said(column[number]) for column in cells]
             named = [f"{heading} {cell}".strip() for heading, cell in zip(headings[1:], said, strict=True) if cell]
-            text = f"{label}: {', '.join(part.replace(' ', _GLUE) for part in named)}".removeprefix(": ")
+            glued = [part.replace(" ", _GLUE) if cell_len(part) <= width // 2 else part for part in named]
+            text = f"{label}: {', '.join(glued)}".removeprefix(": ")
             wrapped = textwrap.wrap(
                 text, width, initial_indent="" if label else "  ", subsequent_indent="  ",
                 break_long_words=False, break_on_hyphens=False,
