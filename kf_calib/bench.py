@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kf_calib.errors import BenchError
+from kf_calib.errors import BenchError, how_to_write
 from kf_calib.samples import Floats, Times
 
 EARTH_RATE_RADPS = 7.292115e-5
@@ -85,7 +85,7 @@ def _parse_axis(word: str) -> Vector:
 
 def parse_channels(text: str) -> tuple[int, int, int]:
     """``"1,-2,3"``: which channel of the recording each accelerometer is, with a minus where its sign is reversed."""
-    words = text.replace(",", " ").split()
+    words = text.strip("[] ").replace(",", " ").split()
     try:
         first, second, third = (int(word) for word in words)
     except ValueError:
@@ -166,15 +166,12 @@ class Bench:
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str], has_angles: bool = True) -> Bench:
         """The bench from the strings of a metadata record (FORMAT.md), or from options of the same names."""
-        unknown = sorted(set(metadata) - _KEYS)
-        if unknown:
-            raise BenchError(f"bench key {unknown[0]!r} is not known: use one of {', '.join(sorted(_KEYS))}.")
+        numbers = numbers_of(metadata)
         version = metadata.get("format_version", FORMAT_VERSION)
         if version != FORMAT_VERSION:
             raise BenchError(
                 f"the recording has format_version {version!r}, this program reads {FORMAT_VERSION}: update kf_calib."
             )
-        numbers = {key: _number(key, metadata[key]) for key in _NUMBERS if metadata.get(key, "") != ""}
         if has_angles and not metadata.get("axes", "").strip():
             raise BenchError(
                 "the gimbal axes are not stated, so the angles cannot be used: give them outer to inner, "
@@ -252,21 +249,33 @@ class Bench:
         return self.to_platform(up, np.asarray(pose, float))
 
 
+def numbers_of(metadata: Mapping[str, str]) -> dict[str, float]:
+    """The numbers among the keys of a bench; raises BenchError where one is none, or a key is not known."""
+    unknown = sorted(set(metadata) - _KEYS)
+    if unknown:
+        raise BenchError(f"bench key {unknown[0]!r} is not known: use one of {', '.join(sorted(_KEYS))}.")
+    return {key: _number(key, metadata[key]) for key in _NUMBERS if metadata.get(key, "") != ""}
+
+
 def _number(key: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise BenchError(f"bench key {key} is {text!r}, which is not a number.")
+        raise BenchError(f"bench key {key} is {text!r}, which is not a finite number{how_to_write(text)}.")
     return value
 
 
 def _nominal(text: str) -> dict[str, float]:
     try:
-        return {str(symbol): float(value) for symbol, value in json.loads(text).items()}
+        found = {str(symbol): float(value) for symbol, value in json.loads(text).items()}
     except (ValueError, TypeError, AttributeError):
         raise BenchError(f'bench key nominal is {text!r}: it must be a JSON object such as {{"theta1": 0}}.') from None
+    for symbol, value in found.items():
+        if not math.isfinite(value):
+            raise BenchError(f"bench key nominal has {symbol} = {value}, which is not a finite number.")
+    return found
 
 
 def _frame_with_up(up: str) -> Floats:

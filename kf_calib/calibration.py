@@ -24,8 +24,9 @@ from kf_calib.effects import of_the_users, remarks_of
 from kf_calib.errors import InputError, UnobservableError, check_number
 from kf_calib.fitting import WALK, Fit, fit
 from kf_calib.folding import Carried, DwellFactor, Folder, columns_of, lines_of, means_of, samples_of, without
-from kf_calib.held_out import HeldOut, held_out, orientations
+from kf_calib.held_out import HeldOut, held_out
 from kf_calib.information import Step
+from kf_calib.likelihood import ENOUGH_DIRECTIONS, FEWEST, directions, freedom
 from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
 from kf_calib.noise import TOO_SHORT, Noise, considered, mean_covariances, steps
 from kf_calib.outlying import OutlyingDwell, outlying_dwells
@@ -430,9 +431,10 @@ def told(result: Calibration, passed: Pass) -> Calibration:
     notes = [f"{sight}." for sight in sights(result.fit, own)]
     readings = passed.watch.judged(result.fit.dwells, result.noise)
     found = [" Or ".join(map(str, outlying))] if outlying else []
-    misfit = _misfit(result.consistency, result.residuals_mps2, result.bench)
+    misfit = _misfit(result.consistency, result.residuals_mps2, result.bench, result.noise)
     usual = [each for each in result.warnings if each != misfit or not (outlying or readings.saturation)]
-    said = [*passed.source.warnings, *passed.tally.sentences(), *readings.warnings, *found, *usual, *notes]
+    counted = [*passed.tally.sentences(), *passed.tally.unmet(passed.settings.stillness)]
+    said = [*passed.source.warnings, *counted, *readings.warnings, *found, *usual, *notes]
     return replace(result, tally=passed.tally, readings=readings, warnings=tuple(said), outlying=outlying)
 
 
@@ -652,7 +654,7 @@ def format_p(p_value: float | None) -> str:
     return "= -" if p_value is None else "< 1e-300" if p_value < 1e-300 else f"= {p_value:.2g}"
 
 
-def _misfit(judged: Consistency, residuals: Floats, bench: Bench) -> str:
+def _misfit(judged: Consistency, residuals: Floats, bench: Bench, noise: Noise) -> str:
     """What may be the matter where the dwells do not fit the model, from residuals (D, 3); '' where they fit."""
     rms = float(np.sqrt(np.mean(residuals**2)))
     if rms > 0.03 * bench.gravity_mps2:
@@ -662,10 +664,29 @@ def _misfit(judged: Consistency, residuals: Floats, bench: Bench) -> str:
         )
     if judged.consistent is False:
         return (
-            f"the dwells scatter about the model by more than the noise (p {format_p(judged.p_value)}): an effect is "
-            "missing in the model, or noise from dwell to dwell was not stated (angle_sigma_deg, scatter_sigma_mps2)."
+            "the dwells scatter about the model by more than the noise: an effect is missing in the model, or "
+            f"{_beyond_noise(noise)}."
         )
     return ""
+
+
+def unstated(noise: Noise) -> list[str]:
+    """Bench keys of the noise from dwell to dwell that the recording does not state."""
+    known = {"angle_sigma_deg": noise.setting_stated, "scatter_sigma_mps2": noise.scatter_stated}
+    return [key for key, stated in known.items() if not stated]
+
+
+def beyond_stated(noise: Noise, bench: Bench) -> bool:
+    """Whether the setting error holds more than is stated: what the angles' own noise leaves uncertain of a pose."""
+    return bench.angle_sigma_deg is not None and np.degrees(noise.setting_rad) > 1.1 * bench.angle_sigma_deg
+
+
+def _beyond_noise(noise: Noise) -> str:
+    """What dwells may scatter by beside an effect."""
+    keys = " and ".join(unstated(noise))
+    if keys:
+        return f"there is noise from dwell to dwell, which was not stated ({keys})"
+    return "there is more noise from dwell to dwell than is stated (angle_sigma_deg, scatter_sigma_mps2)"
 
 
 def _remarks(
@@ -692,7 +713,7 @@ def _remarks(
             f"{len(dwells)} dwell{'s leave' if len(dwells) > 1 else ' leaves'} nothing over to judge the model by: "
             "visit at least five spread orientations."
         )
-    if misfit := _misfit(judged, residuals, model.bench):
+    if misfit := _misfit(judged, residuals, model.bench, noise):
         yield misfit
     scales, expected = estimate.parameters[2::4], paper.nominal(model.bench.nominal)[2::4]
     if not estimate.unseen[2::4].any() and (
@@ -707,13 +728,20 @@ def _remarks(
         slow = "; dwells are too short to tell how slow it is: stay longer in each" if short else ""
         yield f"the noise within a dwell is correlated: sigmas allow for it by inflating its variance by {kappa}{slow}."
     if not noise.checked and noise.scatter_mps2.any() and not noise.scatter_stated:
+        known = directions(carried.means.force_mps2)
         yield (
-            f"{len(orientations(dwells))} orientations cannot tell a setting error of the angles from scatter of the "
-            f"sensors: dwells are weighted alike and their whole misfit ({noise.scatter_mps2[0]:.2g} m/s^2) counts in "
-            "every sigma; at least 12 spread orientations would tell."
+            f"these orientations have gravity in {known} different direction{'s' * (known != 1)}, which cannot tell a "
+            "setting error of the angles from scatter of the sensors: dwells are weighted alike and their whole misfit "
+            f"({noise.scatter_mps2[0]:.2g} m/s^2) counts in every sigma; {ENOUGH_DIRECTIONS} directions, spread, would "
+            "tell."
+        )
+    if unstated(noise) and freedom(carried.means) < FEWEST:
+        yield (
+            f"{len(dwells)} dwell{'s are' if len(dwells) > 1 else ' is'} too few to estimate what was not stated "
+            f"({' and '.join(unstated(noise))}): it is taken as zero, and where it is not, sigmas are too small."
         )
     stated_deg = model.bench.angle_sigma_deg
-    if stated_deg is not None and np.degrees(noise.setting_rad) > 1.1 * stated_deg:
+    if stated_deg is not None and beyond_stated(noise, model.bench):
         yield (
             f"the angles' own noise leaves {np.degrees(noise.setting_rad):.2g} deg uncertain of a pose, with the "
             f"{stated_deg:g} deg stated for its setting: that is what dwells are weighted by."

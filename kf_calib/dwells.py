@@ -17,7 +17,7 @@ from enum import Enum
 
 import numpy as np
 
-from kf_calib.bench import Bench, interpolate_pose, mean_pose, unwrap_pose
+from kf_calib.bench import Bench, interpolate_pose, mean_pose, pose_distance, unwrap_pose
 from kf_calib.errors import InputError
 from kf_calib.samples import Batch, Floats, Mask, Source, Stream, Times
 from kf_calib.slews import Curve
@@ -32,6 +32,7 @@ _LEAP_NS = 10 * _SECOND_NS  # a stamp this far ahead, with the next one behind i
 _SLEW_READINGS = 8  # of a slew, at least
 _REST_NS = 2 * _SECOND_NS  # a dwell that readings alone tell of, between angles that differ, lasts at least
 _PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
+_TURNING_DEG = 1.0  # in a block: a platform that only creeps stays below
 _SURE = 3  # messages: of fewer the noise of an encoder cannot be taken
 
 
@@ -68,7 +69,9 @@ class Block:
 class Tally:
     """What became of every sample that was read; ``sentences`` says what a user should know of it.
 
-    slewing: used though the platform moved; moving: not used because it did.
+    slewing: used though the platform moved; moving: not used because it did. short_dwells: those too short for the
+    whole margin after their arrival, least_settling_s: what the shortest had. turned_deg: how far the platform turned,
+    at most, in a block that counts as still.
     """
 
     read: int = 0
@@ -85,6 +88,9 @@ class Tally:
     poses_dropped: int = 0
     gated: int = 0
     first_backward_s: float | None = None
+    short_dwells: int = 0
+    least_settling_s: float = math.inf
+    turned_deg: float = 0.0
 
     def sentences(self) -> list[str]:
         backward_s = self.first_backward_s or 0.0
@@ -98,6 +104,22 @@ class Tally:
             "gated": "outlying readings (innovation gate), rejected: {}; --no-gate keeps them.",
         }
         return [text.format(getattr(self, key)) for key, text in said.items() if getattr(self, key)]
+
+    def unmet(self, stillness: Stillness) -> list[str]:
+        """What was asked for and could not be done, one sentence each."""
+        said, one = list[str](), self.short_dwells == 1
+        if self.short_dwells:
+            said.append(
+                f"{self.short_dwells} dwell{' is' if one else 's are'} too short to leave out {stillness.settle_s:g} s "
+                f"after {'its' if one else 'each'} arrival (--settle-s): a third of {'it' if one else 'each'} was left "
+                f"out, {'' if one else 'of the shortest '}{self.least_settling_s:.3g} s."
+            )
+        if self.turned_deg > _TURNING_DEG:
+            said.append(
+                f"the platform turns by {self.turned_deg:.3g} deg in what counts as standing still (--still-deg "
+                f"{stillness.tolerance_deg:g}): where that is a slew, lower --still-deg."
+            )
+        return said
 
 
 class _Order:
@@ -434,6 +456,9 @@ class Segmenter:
             if not closing and (not judged or length_ns < 3 * settle_ns):
                 return
             dwell.settling_ns = rest_ns - dwell.arrival_ns + min(settle_ns, length_ns // 3)
+            if settle_ns > length_ns // 3:
+                self.tally.short_dwells += 1
+                self.tally.least_settling_s = min(self.tally.least_settling_s, length_ns // 3 / _SECOND_NS)
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
         first = min(int(np.searchsorted(self._accel.time_ns, dwell.arrival_ns + dwell.settling_ns)), count)
         if closing and dwell.pose is None and self._is_unsure(self._accel.time_ns[first:count]):
@@ -484,6 +509,8 @@ class Segmenter:
         inside = poses[first:last]
         if not self.stillness.creeps(inside):
             return self._standing_pose(inside)
+        turned_rad = float(pose_distance(inside[-1], inside[0], not self.bench.axes))
+        self.tally.turned_deg = max(self.tally.turned_deg, math.degrees(turned_rad))
         around = slice(max(first - 1, own), last + 1)
         return interpolate_pose(accel_ns, times[around], poses[around], not self.bench.axes)
 

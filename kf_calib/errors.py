@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 
 class KfCalibError(Exception):
@@ -34,3 +35,9 @@ def check_number(name: str, value: float, least: float = 0.0, *, above: bool = F
     if not fits:
         wanted = f"a number above {least:g}" if above else f"a number of at least {least:g}"
         raise InputError(f"{name} is {value!r}: give {wanted}.")
+
+
+def how_to_write(number: str) -> str:
+    """`` (write 9.81 with a point)`` for what is written as 9,81; nothing for anything else."""
+    found = re.search(r"\d*,\d+", number)
+    return f" (write {number[: found.end()].replace(',', '.')} with a point)" if found else ""

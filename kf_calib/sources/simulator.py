@@ -46,6 +46,8 @@ START_NS = 1_750_000_000_000_000_000
 """Stamp of the first sample: 15 June 2025, 15:06:40 UTC."""
 
 _TEMPERATURE_HZ = 1.0
+_READING_BYTES, _POSE_BYTES, _TEMPERATURE_BYTES = 50, 30, 35  # in a recording, compressed
+_LONGEST_S = 7e9  # the stamps of a recording end in 2262
 
 
 class Simulation:
@@ -89,6 +91,16 @@ class Simulation:
     def __len__(self) -> int:
         """Number of readings."""
         return self._accel.first_at(self.motion.end_ns)
+
+    @property
+    def duration_s(self) -> float:
+        return self.motion.end_ns * 1e-9
+
+    @property
+    def file_bytes(self) -> int:
+        """About as large its recording becomes."""
+        poses, temperatures = (clock.first_at(self.motion.end_ns) for clock in (self._pose, self._temperature))
+        return _READING_BYTES * len(self) + _POSE_BYTES * poses + _TEMPERATURE_BYTES * temperatures
 
     def __iter__(self) -> Iterator[Batch]:
         steps = self._steps()
@@ -267,6 +279,12 @@ def _refuse_impossible(
             raise InputError(f"visit {number} has angles {visit.gimbal_deg}: give one number for each of {axes} axes.")
         if not 0.0 < visit.dwell_s < math.inf:
             raise InputError(f"visit {number} lasts {visit.dwell_s:g} s: give a positive time.")
+    total_s = sum(visit.dwell_s for visit in plan)
+    if total_s > _LONGEST_S:
+        raise InputError(
+            f"the visits last {total_s:.3g} s in all, {total_s / 31557600:.3g} years: the stamps of a recording hold "
+            "220; dwell shorter."
+        )
     for name, rate_hz in (("sample_hz", sample_hz), ("angle_hz", angle_hz)):
         if not 0.0 < rate_hz <= 1e6:
             raise InputError(f"{name} is {rate_hz:g}: give a rate above 0 and up to 1e6 Hz.")

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from kf_calib.advice import Advice
@@ -17,6 +16,7 @@ from kf_calib.drivers import Description, described
 from kf_calib.trend import Trend
 from kf_calib.views.console import plain, rounded, symbol
 from kf_calib.views.json import clean, outlying_object, readings_object
+from kf_calib.views.tables import Table
 
 
 def description(found: Diagnosis) -> Description | None:
@@ -106,7 +106,7 @@ def _notes(found: Diagnosis) -> list[str]:
 def diagnosis_report(found: Diagnosis) -> RenderableType:
     """What ``diagnose`` prints: the verdict, then what it rests on."""
     style = {True: "bold green", False: "bold yellow", None: "bold"}[found.test.consistent]
-    parts: list[RenderableType] = [Text(verdict(found), style=style)]
+    parts: list[RenderableType] = [Text(verdict(found), style=style), *map(Text, of_what_p_is(found))]
     readings = found.before.readings
     if readings.findings:
         parts.append(Text(f"In the readings: {'; '.join(readings.findings)}."))
@@ -146,13 +146,26 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
     return Group(*parts)
 
 
+def of_what_p_is(found: Diagnosis) -> list[str]:
+    """What the p-value of a run is the probability of, and that of the misfit alone, which ``replay`` prints."""
+    if found.test.p_value is None:
+        return []
+    alone = found.before.consistency.p_value
+    beside = "" if alone is None else f"; of the misfit as a whole alone, which replay prints, p {format_p(alone)}"
+    return [
+        "p of the run is the probability that noise alone shows as much in any of the effects, in the misfit as a "
+        f"whole, or within dwells{beside}."
+    ]
+
+
 def plain_report(found: Diagnosis) -> str:
     """The same as plain text."""
     return plain(diagnosis_report(found))
 
 
 def _suspect_table(found: Diagnosis) -> Table:
-    table = Table(title="Suspects (1σ; p of the whole run; held-out rms over its floor)", title_justify="left")
+    title = "Suspects (1σ; p: that noise alone lets any effect explain as much; held-out rms over its floor)"
+    table = Table(title=title, title_justify="left")
     for heading in ("effect", "p", "χ² / dof", "fits", "symbol", "value", "sigma", "unit", "held out"):
         left = heading in ("effect", "fits", "symbol", "unit")
         table.add_column(heading, justify="left" if left else "right", no_wrap=heading == "effect")
