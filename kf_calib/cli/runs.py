@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.options import (
     BENCH_OPTIONS,
     effects_of,
@@ -16,6 +17,7 @@ from kf_calib.cli.options import (
     json_option,
     opened,
     overrides,
+    overwrite_option,
     png_option,
     print_json,
     progress,
@@ -23,7 +25,7 @@ from kf_calib.cli.options import (
     recording_options,
     rrd_option,
     save_model_option,
-    save_views,
+    save_view,
     settings_of,
     show,
     strict_option,
@@ -35,6 +37,7 @@ from kf_calib.cli.options import (
 @rrd_option
 @png_option
 @save_model_option
+@overwrite_option
 @recording_options
 @filter_options
 @strict_option
@@ -46,21 +49,19 @@ def replay(
     rrd: Path | None,
     png: Path | None,
     save_model: Path | None,
+    overwrite: bool,
     strict: bool,
     as_json: bool,
     **options: Any,
 ) -> None:
     """Run a recording through the filter: twelve parameters, their sigma, and whether the model fits."""
+    from kf_calib import model_file
     from kf_calib.calibration import calibrate
 
+    outputs = claimed(overwrite=overwrite)
     source, settings = opened(recording, options)
     with progress(f"replaying {recording.name}", as_json) as tick:
         result = calibrate(source, settings, tick)
-    save_views(result, rrd, png)
-    if save_model:
-        from kf_calib import model_file
-
-        model_file.write(save_model, result)
     if as_json:
         from kf_calib.views.json import replay_object
 
@@ -69,8 +70,9 @@ def replay(
         from kf_calib.views.console import summary
 
         show(summary(result))
-        for path in filter(None, (rrd, png, save_model)):
-            click.echo(f"saved {path}")
+    with delivery(outputs, as_json) as deliver:
+        deliver.file(save_model, lambda path: model_file.write(path, result))
+        deliver.view(lambda path: save_view(result, path), rrd, png)
     if strict and result.consistency.consistent is False:
         ctx.exit(1)
 
@@ -186,9 +188,10 @@ def diagnose(ctx: click.Context, recording: Path, strict: bool, as_json: bool, *
     is_flag=True,
     help="Held-out error with the choice of effects repeated without what is held out, in 6 folds.",
 )
-@click.option("--save-model", "--out-model", type=click.Path(path_type=Path), help="Save the last model here.")
-@click.option("--journal", "journal_file", type=click.Path(path_type=Path), help="Keep a journal of the steps here.")
+@output_option("--save-model", "--out-model", help="Save the last model here.")
+@output_option("--journal", "journal_file", help="Keep a journal of the steps here.")
 @click.option("--from-journal", type=click.Path(path_type=Path), help="First take the steps of this journal again.")
+@overwrite_option
 @recording_options
 @filter_options
 @strict_option
@@ -203,6 +206,7 @@ def improve(
     save_model: Path | None,
     journal_file: Path | None,
     from_journal: Path | None,
+    overwrite: bool,
     strict: bool,
     as_json: bool,
     **options: Any,
@@ -216,40 +220,42 @@ def improve(
         interactive = not as_json and sys.stdin.isatty() and sys.stdout.isatty()
     if interactive and as_json:
         raise click.UsageError("--interactive asks questions, --json prints one object and nothing else: choose one.")
+    outputs = claimed(overwrite=overwrite)
     earlier = journal.read(from_journal) if from_journal else None
     if earlier is not None:
         options |= _of_journal(ctx, options, earlier.origin.options)
+        outputs.spare(options["effects_from"])
     _refuse_engine(options)
     settings = settings_of(options)
     origin = journal.Origin.of(recording, _for_journal(options, settings.effects))
     if earlier is not None:
         earlier.refuse_other(origin, from_journal)
 
-    def keep(state: improvement.Improvement) -> None:
-        if journal_file:
-            journal.write(journal_file, state, origin)
+    with delivery(outputs, as_json) as deliver:
 
-    difference = None
-    with progress(f"improving on {recording.name}", as_json) as tick:
-        start = calibrate(recording_of(recording, options), settings, tick)
-        if earlier is not None:
-            state, difference = journal.replayed(earlier, start)
-        elif interactive:
-            state = improvement.begun(start)
+        def keep(state: improvement.Improvement) -> None:
+            deliver.keep(journal_file, lambda path: journal.write(path, state, origin))
+
+        difference = None
+        with progress(f"improving on {recording.name}", as_json) as tick:
+            start = calibrate(recording_of(recording, options), settings, tick)
+            if earlier is not None:
+                state, difference = journal.replayed(earlier, start)
+            elif interactive:
+                state = improvement.begun(start)
+            else:
+                state = improvement.improve(start, accept_first, keep)
+        if interactive:
+            state = views.session(state, lambda text, usual: click.prompt(text, default=usual or None), show, keep)
+        with progress("holding out orientations", as_json or not honest) as tick:
+            checked = improvement.honest(start, on_fold=tick) if honest else None
+        if as_json:
+            files = {"saved_model": save_model, "journal": journal_file}
+            print_json(views.improvement_object(state, checked, difference, files))
         else:
-            state = improvement.improve(start, accept_first, keep)
-    if interactive:
-        state = views.session(state, lambda text, usual: click.prompt(text, default=usual or None), show, keep)
-    with progress("holding out orientations", as_json or not honest) as tick:
-        checked = improvement.honest(start, on_fold=tick) if honest else None
-    keep(state)
-    if save_model:
-        model_file.write(save_model, state.result)
-    files = {"saved_model": save_model, "journal": journal_file}
-    if as_json:
-        print_json(views.improvement_object(state, checked, difference, files))
-    else:
-        show(views.improvement_report(state, checked, difference, files))
+            show(views.improvement_report(state, checked, difference))
+        deliver.file(save_model, lambda path: model_file.write(path, state.result))
+        deliver.file(journal_file, lambda path: journal.write(path, state, origin))
     if strict and state.found.test.consistent is False:
         ctx.exit(1)
 
