@@ -20,7 +20,7 @@ import secrets
 import shutil
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import combinations
 from pathlib import Path
 
@@ -77,11 +77,10 @@ def refuse(path: Path, overwrite: bool = False, name: str = "name") -> None:
     """Raise InputError, which asks for another ``name``, where no file can be written at ``path``."""
     target = target_of(path)
     try:
-        found = target.lstat() if os.path.lexists(target) else None
-        if found is None and not target.parent.is_dir():
+        if not target.parent.is_dir():
             raise InputError(f"{path} cannot be created, there is no folder {target.parent}: give another {name}.")
-        if found is not None:
-            _refuse_found(path, found, overwrite, name)
+        with suppress(FileNotFoundError):
+            _refuse_found(path, target.lstat(), overwrite, name)
         trial = beside(target)
         trial.open("xb").close()
         trial.unlink()

@@ -173,7 +173,7 @@ def simulate(out: Path, overwrite: bool, as_json: bool, **options: Any) -> None:
     from kf_calib.sources.simulated import simulation
     from kf_calib.sources.simulator import truth_file
 
-    claimed([Path(options["plan"])], {"the truth beside OUT": truth_file(out)}, overwrite)
+    claimed([Path(options["plan"])], {"OUT, whose truth goes there": truth_file(out)}, overwrite)
     source = simulation(options, overrides(options))
     with progress(f"simulating {out.name}", as_json) as tick:
         made = _record(source, out, overwrite, tick)

@@ -46,7 +46,7 @@ from kf_calib.sources.sensors import Sensors
 
 def truth_file(recording: Path) -> Path:
     """The side file with the truth of ``NAME.mcap``: ``NAME.truth.json``."""
-    return recording.with_suffix(".truth.json")
+    return recording.parent / f"{recording.stem}.truth.json"
 
 
 START_NS = 1_750_000_000_000_000_000
