@@ -36,7 +36,8 @@ from kf_calib.calibration import Calibration
 from kf_calib.diagnosis import Diagnosis
 from kf_calib.errors import InputError
 from kf_calib.improvement import By, Improvement, Step, begun, stepped
-from kf_calib.model_file import table_of, write_whole
+from kf_calib.model_file import table_of
+from kf_calib.outputs import write_whole
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ def write(path: Path, state: Improvement, origin: Origin) -> None:
         "steps": [_entry(step) for step in state.history],
     }
     head = "# Journal of kf_calib: kf-calib improve RECORDING --from-journal THIS_FILE\n"
-    write_whole(path, (head + tomli_w.dumps(table)).encode(), "the journal", "--journal")
+    write_whole(path, (head + tomli_w.dumps(table)).encode())
 
 
 def _entry(step: Step) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from typing import Any
 from kf_calib import effects
 from kf_calib.calibration import Calibration
 from kf_calib.errors import InputError
+from kf_calib.outputs import write_whole
 
 _KEYS = ("effects", "effects_from", "coefficients")
 
@@ -91,7 +92,7 @@ def write(path: Path, result: Calibration) -> None:
         table["effects_from"] = [_relative(file, path) for file in files]
     if found := list(_coefficients(result)):
         table["coefficients"] = found
-    write_whole(path, _toml(table), "the model", "--save-model")
+    write_whole(path, _toml(table))
 
 
 def _toml(table: dict[str, Any]) -> bytes:
@@ -113,17 +114,3 @@ def _relative(file: Path, path: Path) -> str:
         return Path(os.path.relpath(file, path.resolve().parent)).as_posix()
     except ValueError:  # another drive
         return file.as_posix()
-
-
-def write_whole(path: Path, content: bytes, what: str, option: str) -> None:
-    """Write beside the file and rename: whoever looks sees the old one or the new one.
-
-    Raises InputError, naming the ``option`` to give another path by, where ``what`` cannot be written.
-    """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(content)
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise InputError(f"{path}: {what} cannot be written ({error.strerror}): give another {option}.") from None

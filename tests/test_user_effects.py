@@ -424,8 +424,8 @@ def test_a_model_file_gives_the_same_again(run, recording: Path, tmp_path: Path)
 def test_a_model_that_cannot_be_saved_leaves_the_old_one(run, recording: Path, tmp_path: Path) -> None:
     saved = written(tmp_path, "effects = []\n", "model.toml")
     code, out, err = run("replay", recording, "--save-model", tmp_path / "absent" / "model.toml")
-    assert (code, out) == (2, "") and "cannot be written" in err and err.count("\n") == 1
-    code, _, err = run("replay", recording, "--with", "mine = a + T", "--save-model", saved)
+    assert (code, out) == (2, "") and "cannot be created" in err and err.count("\n") == 1
+    code, _, err = run("replay", recording, "--with", "mine = a + T", "--save-model", saved, "--overwrite")
     assert code == 2 and "mine: m/s^2 and K cannot be added" in err
     assert saved.read_text() == "effects = []\n" and list(tmp_path.iterdir()) == [saved]
 

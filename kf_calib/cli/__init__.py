@@ -1,7 +1,7 @@
 """The command line: options in, one call of the library, a view out.
 
 Every command with ``--json`` prints one JSON object on stdout and nothing else there. Exit 0: done; 1: the model is
-inconsistent and ``--strict`` asked; 2: bad usage or input, with one sentence on stderr.
+inconsistent and ``--strict`` asked; 2: anything else, with one sentence on stderr; 130: Ctrl-C.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ from itertools import chain
 import click
 import rich_click
 
+from kf_calib.cli.echo import fall_silent, open_streams
+from kf_calib.cli.failures import tell
 from kf_calib.cli.live import live
 from kf_calib.cli.making import demo, record, simulate
 from kf_calib.cli.paper import paper
 from kf_calib.cli.plan import plan
 from kf_calib.cli.runs import compare, diagnose, improve, list_effects, replay
-from kf_calib.errors import KfCalibError
 
 SECTIONS = {
     "Evaluate a recording": (replay, diagnose, improve, compare),
@@ -53,20 +54,24 @@ for command in chain.from_iterable(SECTIONS.values()):
 
 def main() -> None:
     """Entry point of ``kf-calib``."""
+    open_streams()
     try:
         code = cli.main(standalone_mode=False)
-    except click.exceptions.Abort:
-        sys.exit(130)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except click.ClickException as error:
-        ctx = getattr(error, "ctx", None)
-        hint = f" (see {ctx.command_path} --help)" if ctx is not None else ""
-        click.echo(f"kf-calib: {error.format_message().rstrip()}{hint}", err=True)
-        sys.exit(2)
-    except KfCalibError as error:
-        click.echo(f"kf-calib: {error}", err=True)
-        sys.exit(2)
-    except BrokenPipeError:
-        sys.exit(0)
+        sys.stdout.flush()
+    except (click.exceptions.Abort, KeyboardInterrupt):
+        code = 130
+    except (BrokenPipeError, SystemExit):  # click's and rich's way out where nobody reads any more
+        code = _unheard(0)
+    except Exception as error:
+        tell(error)
+        code = _unheard(2)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _unheard(code: int) -> int:
+    """The exit code, which Python would change at its end where what is left to print cannot be printed."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        fall_silent()
+    return code

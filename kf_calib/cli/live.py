@@ -18,7 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
-from kf_calib.cli.making import overwrite_option, pair
+from kf_calib.cli.echo import fall_silent
+from kf_calib.cli.files import claimed, delivery, output_option
+from kf_calib.cli.making import pair
 from kf_calib.cli.numbers import NOT_NEGATIVE, POSITIVE
 from kf_calib.cli.options import (
     INPUT,
@@ -26,11 +28,14 @@ from kf_calib.cli.options import (
     columns_option,
     examples,
     filter_options,
+    json_line,
     json_option,
     overrides,
+    overwrite_option,
     print_json,
     rrd_option,
     save_model_option,
+    save_view,
     settings_of,
     show,
     strict_option,
@@ -59,8 +64,7 @@ _KINDS = {"rad": ("rad", "deg", "arcmin", "arcsec"), "1": ("1", "ppm"), "m/s^2":
     )
 )
 @click.argument("source", metavar="SOURCE")
-@click.option("--record", type=click.Path(path_type=Path), metavar="OUT.mcap", panel=RUNNING,
-              help="Record the run here.")
+@output_option("--record", metavar="OUT.mcap", panel=RUNNING, help="Record the run here.")
 @click.option("--target", "targets", multiple=True, metavar="SYMBOL=SIGMA", panel=RUNNING,
               help="The sigma wanted of a parameter (theta1) or of a kind (theta, phi, nu, K, b), with a unit: "
               "theta1=2arcsec, K=5ppm, b=10ug; repeatable.")
@@ -113,8 +117,10 @@ def live(
     SOURCE: a serial port, socket://HOST:PORT, rfc2217://HOST:PORT, - (standard input), a file that grows, or sim://.
     Ctrl-C ends the run: the recording is finished and the summary printed.
     """
-    from kf_calib.sources.live import open_live
+    from kf_calib import model_file
+    from kf_calib.sources.live import files_of, open_live
 
+    outputs = claimed(files_of(source), overwrite=overwrite)
     settings, wanted = settings_of(options), _targets(targets)
     _refuse(settings)
     opening = open_live(
@@ -133,9 +139,13 @@ def live(
     final = _outcome(run, as_json)
     if final is None:
         return
-    _save(final, rrd, save_model, as_json)
     for said in _of_the_view(view):
         click.echo(said, err=True)
+    if rrd and view is not None and view.began:
+        outputs.own(rrd)
+    with delivery(outputs, as_json) as deliver:
+        deliver.file(save_model, lambda path: model_file.write(path, final.result))
+        deliver.file(rrd, lambda path: save_view(final.result, path))  # every point by the noise of the whole run
     if strict and final.consistent is False:
         ctx.exit(1)
 
@@ -236,7 +246,7 @@ def _print(run: _Run, judgement: Judgement, as_json: bool) -> None:
     assert run.session is not None
     if as_json:
         with _piped(run):
-            print_json(views.live_object(judgement, run.session.standing, run.source.status))
+            click.echo(json_line(views.live_object(judgement, run.session.standing, run.source.status)))
             sys.stdout.flush()
     elif not judgement.final:
         _echo(run, views.line(judgement))
@@ -254,7 +264,7 @@ def _piped(run: _Run) -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        fall_silent()
         if run.source.status.sync_age_s is None:
             run.stop()
         else:
@@ -345,23 +355,8 @@ def _outcome(run: _Run, as_json: bool) -> Judgement | None:
         from kf_calib.views.console import summary
 
         style = {True: "bold green", False: "bold yellow", None: "bold"}[final.consistent]
-        with _piped(run):
-            show(Group(summary(final.result), Text(diagnosis.verdict(final.found), style=style)))
+        show(Group(summary(final.result), Text(diagnosis.verdict(final.found), style=style)))
     return final
-
-
-def _save(final: Judgement, rrd: Path | None, save_model: Path | None, as_json: bool) -> None:
-    if rrd:
-        from kf_calib.views import rerun
-
-        rerun.save(final.result, rrd)  # in place of what grew there: every point by the noise of the whole run
-    if save_model:
-        from kf_calib import model_file
-
-        model_file.write(save_model, final.result)
-    for path in filter(None, (rrd, save_model)):
-        if not as_json:
-            click.echo(f"saved {path}")
 
 
 def _view(rrd: Path | None, port: int | None, bind: str) -> GrowingView | None:

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import rich_click as click
 
+from kf_calib.cli.echo import echo
+from kf_calib.cli.files import OutputFile, claimed, delivery
 from kf_calib.cli.numbers import NUMBER, POSITIVE
 from kf_calib.cli.options import (
     OUTPUT,
@@ -20,12 +22,14 @@ from kf_calib.cli.options import (
     examples,
     json_option,
     overrides,
+    overwrite_option,
     print_json,
     progress,
-    save_views,
+    save_view,
     show,
 )
 from kf_calib.errors import InputError
+from kf_calib.outputs import Outputs
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -169,15 +173,10 @@ def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], 
     return _Recorded(readings, segmenter.dwell_count, duration_s, notes)
 
 
-overwrite_option = click.option(
-    "--overwrite", is_flag=True, help="Replace the file if it exists.", panel=OUTPUT
-)
-
-
 @click.command(
     epilog=examples("simulate run.mcap", "simulate run.mcap --seed 3 --hide second-order=10sigma --temperature-swing 5")
 )
-@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("out", type=OutputFile())
 @simulation_options
 @bench_options
 @overwrite_option
@@ -186,7 +185,9 @@ overwrite_option = click.option(
 def simulate(out: Path, overwrite: bool, large: bool, as_json: bool, **options: Any) -> None:
     """Record a simulated bench run to OUT; its truth goes to a side file that no estimator opens."""
     from kf_calib.sources.simulated import simulation
+    from kf_calib.sources.simulator import truth_file
 
+    claimed([Path(options["plan"])], {"OUT, whose truth goes there": truth_file(out)}, overwrite)
     source = simulation(options, overrides(options), begin=partial(_foresee, out=out, large=large))
     with progress(f"simulating {out.name}", as_json) as tick:
         made = _record(source, out, overwrite, tick)
@@ -194,7 +195,7 @@ def simulate(out: Path, overwrite: bool, large: bool, as_json: bool, **options: 
     if as_json:
         print_json({"recording": str(out), "truth": str(truth), **made.keys})
     else:
-        click.echo(f"{out}: {made}; truth in {truth}")
+        echo(f"{out}: {made}; truth in {truth}")
 
 
 def _foresee(run: Simulation, out: Path, large: bool) -> None:
@@ -220,7 +221,7 @@ def _size(count: int) -> str:
         'record run.mcap - --bench bench.toml --column "acc x [g]=ax_g" < bench.csv',
     )
 )
-@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("out", type=OutputFile())
 @click.argument("lines", type=click.Path(path_type=Path, allow_dash=True), default="-")
 @columns_option
 @bench_options
@@ -232,6 +233,7 @@ def record(
     """Record CSV or JSON LINES (a file, or - for standard input) to the MCAP file OUT."""
     from kf_calib.sources.lines import Lines
 
+    claimed(overwrite=overwrite)
     renamed = dict(pair(text) for text in columns)
     source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, overrides(options), renamed)
     with progress(f"recording {out.name}", as_json or str(lines) == "-") as tick:
@@ -240,9 +242,9 @@ def record(
     if as_json:
         print_json({"recording": str(out), **made.keys, "warnings": warnings})
         return
-    click.echo(f"{out}: {made}")
+    echo(f"{out}: {made}")
     for warning in warnings:
-        click.echo(f"Note: {warning}")
+        echo(f"Note: {warning}")
 
 
 def pair(text: str) -> tuple[str, str]:
@@ -256,13 +258,18 @@ def pair(text: str) -> tuple[str, str]:
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default="out")
 @json_option
 def demo(folder: Path, as_json: bool) -> None:
-    """The main job on a simulated run: record, replay, compare with least squares, save the view; files in FOLDER."""
+    """The main job on a simulated run: record, replay, compare with least squares, save the view; files in FOLDER.
+
+    Files of an earlier demo there are replaced.
+    """
     from kf_calib.comparison import compare as run
     from kf_calib.sources.recording import Recording
     from kf_calib.sources.simulated import simulation
+    from kf_calib.sources.simulator import truth_file
 
     folder.mkdir(parents=True, exist_ok=True)
     recording, rrd = folder / "demo.mcap", folder / "demo.rrd"
+    outputs = Outputs({"FOLDER": recording, "the truth": truth_file(recording), "the view": rrd}, overwrite=True)
     options = simulate.make_context("simulate", [str(recording)]).params
     source = simulation(options | {"dwell_s": 15.0, "slew_degps": 90.0, "seed": 2019}, overrides(options))
     with progress("recording a simulated run", as_json) as tick:
@@ -270,17 +277,19 @@ def demo(folder: Path, as_json: bool) -> None:
         truth = source.write_truth(recording)
     with progress("replaying and comparing", as_json):
         compared = run(Recording(recording))
-        save_views(compared.result, rrd, None)
     if as_json:
         from kf_calib.views.json import compare_object, replay_object
 
         files = {"recording": str(recording), "truth": str(truth), "view": str(rrd)}
         print_json({**files, "replay": replay_object(compared.result), "compare": compare_object(compared)})
-        return
-    from kf_calib.views.console import comparison_table, summary
+    else:
+        from kf_calib.views.console import comparison_table, summary
 
-    click.echo(f"Recorded a simulated bench run to {recording}: {made}.\n")
-    show(summary(compared.result))
-    click.echo()
-    show(comparison_table(compared))
-    click.echo(f"\nTruth: {truth}. View: {rrd} (open it with .venv/bin/rerun {rrd}).")
+        echo(f"Recorded a simulated bench run to {recording}: {made}.\n")
+        show(summary(compared.result))
+        echo("")
+        show(comparison_table(compared))
+        echo(f"\nTruth: {truth}.")
+    with delivery(outputs, as_json) as deliver:
+        if deliver.keep(rrd, lambda path: save_view(compared.result, path)) and not as_json:
+            echo(f"View: {rrd} (open it with .venv/bin/rerun {rrd}).")

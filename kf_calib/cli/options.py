@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import rich_click as click
 
+from kf_calib.cli.echo import echo
+from kf_calib.cli.files import output_option
 from kf_calib.cli.numbers import NOT_NEGATIVE, NUMBER, POSITIVE, NumberInRange
 from kf_calib.errors import BenchError, InputError
 
 if TYPE_CHECKING:
-    from kf_calib.calibration import Settings
+    from kf_calib.calibration import Calibration, Settings
     from kf_calib.sources.recording import Recording
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -85,17 +87,12 @@ columns_option = click.option(
     "--column", "columns", multiple=True, metavar="THEIRS=OURS", panel=INPUT,
     help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.',
 )  # fmt: skip
-rrd_option = click.option(
-    "--rrd", type=click.Path(path_type=Path), metavar="FILE.rrd", help="Save the Rerun view here.", panel=OUTPUT
+rrd_option = output_option("--rrd", metavar="FILE.rrd", help="Save the Rerun view here.", panel=OUTPUT)
+png_option = output_option("--png", metavar="FILE.png", help="Save a picture of the Rerun view here.", panel=OUTPUT)
+save_model_option = output_option(
+    "--save-model", metavar="FILE.toml", help="Save the model here, for --model to read.", panel=OUTPUT
 )
-png_option = click.option(
-    "--png", type=click.Path(path_type=Path), metavar="FILE.png", help="Save a picture of the Rerun view here.",
-    panel=OUTPUT,
-)  # fmt: skip
-save_model_option = click.option(
-    "--save-model", type=click.Path(path_type=Path), metavar="FILE.toml", panel=OUTPUT,
-    help="Save the model here, for --model to read.",
-)  # fmt: skip
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist already.", panel=OUTPUT)
 effects_from_option = click.option(
     "--effects-from", "effects_from", multiple=True, type=click.Path(path_type=Path), metavar="FILE.py", panel=MODEL,
     help="A Python file with effect classes of your own, for --with to name; repeatable.",
@@ -229,8 +226,19 @@ def effects_of(options: Mapping[str, Any]) -> tuple[str, ...]:
     return merged(model_file.read(options["model_file"]).effects, options["effects"])
 
 
+def save_view(result: Calibration, path: Path) -> None:
+    """The Rerun view of a run; Rerun is imported when there is one to save."""
+    from kf_calib.views import rerun
+
+    rerun.save(result, path)
+
+
 def print_json(content: Mapping[str, Any]) -> None:
-    click.echo(json.dumps(content, ensure_ascii=False, allow_nan=False))
+    echo(json_line(content))
+
+
+def json_line(content: Mapping[str, Any]) -> str:
+    return json.dumps(content, ensure_ascii=False, allow_nan=False)
 
 
 def show(renderable: Any) -> None:
@@ -238,7 +246,9 @@ def show(renderable: Any) -> None:
 
     told = sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdigit()
     console = Console(width=None if told else 110, highlight=False, soft_wrap=not sys.stdout.isatty())
-    console.print(renderable)
+    with console.capture() as printed:
+        console.print(renderable)
+    echo(printed.get(), end=False)
 
 
 @contextlib.contextmanager
@@ -253,26 +263,3 @@ def progress(text: str, quiet: bool = False) -> Iterator[Callable[[float], None]
     with Progress(console=Console(stderr=True), transient=True) as bars:
         task = bars.add_task(text, total=1.0)
         yield lambda fraction: bars.update(task, completed=fraction if fraction == fraction else 0.0)
-
-
-def save_views(result: Any, rrd: Path | None, png: Path | None) -> None:
-    """The Rerun view of a run, and its picture."""
-    if rrd or png:
-        from kf_calib.views import rerun
-
-        save_pictures(lambda path: rerun.save(result, path), rrd, png)
-
-
-def save_pictures(save: Callable[[Path], object], rrd: Path | None, png: Path | None) -> None:
-    """What ``save`` writes as a Rerun recording, and a picture of it; either may be left out."""
-    if not (rrd or png):
-        return
-    import tempfile
-
-    from kf_calib.views import screenshot
-
-    with tempfile.TemporaryDirectory() as folder:
-        saved = rrd or Path(folder) / "view.rrd"
-        save(saved)
-        if png:
-            screenshot.screenshot(saved, png)

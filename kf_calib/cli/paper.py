@@ -4,20 +4,25 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import rich_click as click
 
+from kf_calib.cli.files import claimed, delivery
 from kf_calib.cli.numbers import NumberInRange
 from kf_calib.cli.options import (
     examples,
     json_option,
+    overwrite_option,
     png_option,
     print_json,
     progress,
     rrd_option,
-    save_pictures,
     show,
 )
+
+if TYPE_CHECKING:
+    from kf_calib.experiment import Experiment
 
 of_the_run = partial(click.option, panel="Run")
 inferred = partial(click.option, panel="Conditions that the paper does not print: inferred")
@@ -41,28 +46,32 @@ inferred = partial(click.option, panel="Conditions that the paper does not print
           help="Accelerometers read together, or in turn in each orientation: 123, 132 ... 321.")
 @rrd_option
 @png_option
+@overwrite_option
 @json_option
 def paper(
     repetitions: int, seed: int, period_s: float, latitude: float, azimuth: float, turns: str, sampled: str,
-    rrd: Path | None, png: Path | None, as_json: bool,
+    rrd: Path | None, png: Path | None, overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """The seed paper's experiment again: its Table 2, by least squares and by the filter, beside the print."""
     from kf_calib.experiment import Conditions, repeat
     from kf_calib.inferred import search
     from kf_calib.views import paper as views
 
+    outputs = claimed(overwrite=overwrite)
     conditions = Conditions(period_s, latitude, azimuth, turns, sampled)  # type: ignore[arg-type]  # click's choices
     with progress("repeating the experiment", as_json) as tick:
         found = repeat(conditions, repetitions, seed)
         tick(0.5)
         searched = search(latitude)
-    if rrd or png:
-        from kf_calib.views.rerun.experiment import save
-
-        save_pictures(lambda path: save(found, views.markdown(found, searched), path), rrd, png)
     if as_json:
         print_json(views.paper_object(found, searched))
-        return
-    show(views.paper_report(found, searched))
-    for path in filter(None, (rrd, png)):
-        click.echo(f"saved {path}")
+    else:
+        show(views.paper_report(found, searched))
+    with delivery(outputs, as_json) as deliver:
+        deliver.view(lambda path: _save_view(found, views.markdown(found, searched), path), rrd, png)
+
+
+def _save_view(found: Experiment, words: str, path: Path) -> None:
+    from kf_calib.views.rerun.experiment import save
+
+    save(found, words, path)

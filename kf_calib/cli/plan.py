@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
+from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.numbers import POSITIVE, NumberInRange
 from kf_calib.cli.options import (
     OUTPUT,
@@ -19,12 +20,12 @@ from kf_calib.cli.options import (
     json_option,
     opened,
     overrides,
+    overwrite_option,
     png_option,
     print_json,
     progress,
     recording_options,
     rrd_option,
-    save_pictures,
     show,
 )
 from kf_calib.errors import InputError
@@ -32,6 +33,7 @@ from kf_calib.errors import InputError
 if TYPE_CHECKING:
     from kf_calib.aims import Aim
     from kf_calib.bench import Bench
+    from kf_calib.planner import Plan
     from kf_calib.prospect import Prospect
     from kf_calib.reach import Reach
 
@@ -40,9 +42,9 @@ _CRITERIA = ("D", "A", "E", "minimax", "condition")
 
 def _plan_options(command: F) -> F:
     """What is aimed at, what the bench can do, and what a dwell tells."""
-    aim_option, reach_option, dwell_option, output_option = (
+    aim_option, reach_option, dwell_option = (
         partial(click.option, panel=panel)
-        for panel in ("What to aim at", "What the bench can do", "What a dwell tells", OUTPUT)
+        for panel in ("What to aim at", "What the bench can do", "What a dwell tells")
     )
     options = [
         aim_option("--count", type=click.IntRange(min=1), metavar="N",
@@ -80,10 +82,11 @@ def _plan_options(command: F) -> F:
         dwell_option("--readings", type=POSITIVE, help="Readings of a dwell that are used, in place of the two above."),
         dwell_option("--white", "white_mps2", type=POSITIVE, default=1e-4, show_default=True,
                      help="White noise of a reading, m/s^2, where no recording tells it."),
-        output_option("--csv", "csv_file", type=click.Path(path_type=Path), metavar="FILE.csv",
+        output_option("--csv", "csv_file", metavar="FILE.csv", panel=OUTPUT,
                       help="Save the angles, for simulate --plan."),
         rrd_option,
         png_option,
+        overwrite_option,
     ]  # fmt: skip
     for option in reversed(options):
         command = option(command)
@@ -101,7 +104,9 @@ def _plan_options(command: F) -> F:
 @recording_options
 @filter_options
 @json_option
-def plan(as_json: bool, csv_file: Path | None, rrd: Path | None, png: Path | None, **options: Any) -> None:
+def plan(
+    as_json: bool, csv_file: Path | None, rrd: Path | None, png: Path | None, overwrite: bool, **options: Any
+) -> None:  # fmt: skip
     """Orientations that determine the parameters best: which, in which order, and the sigmas to expect."""
     from kf_calib import planner
     from kf_calib.designs import Scheme, Search
@@ -109,6 +114,7 @@ def plan(as_json: bool, csv_file: Path | None, rrd: Path | None, png: Path | Non
     from kf_calib.views import plan as views
 
     _refuse_contradictions(options)
+    outputs = claimed(overwrite=overwrite)
     prospect = _prospect(options, as_json)
     reach = _reach(prospect.model.bench, options)
     scheme = Scheme.of(reach, options["repeats"], options["antipodal"])
@@ -120,18 +126,19 @@ def plan(as_json: bool, csv_file: Path | None, rrd: Path | None, png: Path | Non
         else:
             count = options["count"] or (scheme.copies if options["recording"] else 12)
             made = planner.plan(search, count, timing, options["seed"])
-    if csv_file:
-        views.write_csv(made, csv_file)
-    if rrd or png:
-        from kf_calib.views.rerun.plan import save
-
-        save_pictures(lambda path: save(made, path), rrd, png)
     if as_json:
         print_json(views.plan_object(made, options["beside_paper"]))
-        return
-    show(views.plan_report(made, options["beside_paper"]))
-    for path in filter(None, (csv_file, rrd, png)):
-        click.echo(f"saved {path}")
+    else:
+        show(views.plan_report(made, options["beside_paper"]))
+    with delivery(outputs, as_json) as deliver:
+        deliver.file(csv_file, lambda path: views.write_csv(made, path))
+        deliver.view(lambda path: _save_view(made, path), rrd, png)
+
+
+def _save_view(made: Plan, path: Path) -> None:
+    from kf_calib.views.rerun.plan import save
+
+    save(made, path)
 
 
 def _refuse_contradictions(options: Mapping[str, Any]) -> None:

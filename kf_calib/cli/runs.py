@@ -9,6 +9,7 @@ from typing import Any
 
 import rich_click as click
 
+from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.options import (
     BENCH_OPTIONS,
     INPUT,
@@ -19,6 +20,7 @@ from kf_calib.cli.options import (
     json_option,
     opened,
     overrides,
+    overwrite_option,
     png_option,
     print_json,
     progress,
@@ -26,7 +28,7 @@ from kf_calib.cli.options import (
     recording_options,
     rrd_option,
     save_model_option,
-    save_views,
+    save_view,
     settings_of,
     show,
     strict_option,
@@ -46,6 +48,7 @@ STEPS = "Steps"
 @rrd_option
 @png_option
 @save_model_option
+@overwrite_option
 @strict_option
 @json_option
 @click.pass_context
@@ -55,21 +58,19 @@ def replay(
     rrd: Path | None,
     png: Path | None,
     save_model: Path | None,
+    overwrite: bool,
     strict: bool,
     as_json: bool,
     **options: Any,
 ) -> None:
     """Run a recording through the filter: twelve parameters, their sigma, and whether the model fits."""
+    from kf_calib import model_file
     from kf_calib.calibration import calibrate
 
+    outputs = claimed(overwrite=overwrite)
     source, settings = opened(recording, options)
     with progress(f"replaying {recording.name}", as_json) as tick:
         result = calibrate(source, settings, tick)
-    save_views(result, rrd, png)
-    if save_model:
-        from kf_calib import model_file
-
-        model_file.write(save_model, result)
     if as_json:
         from kf_calib.views.json import replay_object
 
@@ -78,8 +79,9 @@ def replay(
         from kf_calib.views.console import summary
 
         show(summary(result))
-        for path in filter(None, (rrd, png, save_model)):
-            click.echo(f"saved {path}")
+    with delivery(outputs, as_json) as deliver:
+        deliver.file(save_model, lambda path: model_file.write(path, result))
+        deliver.view(lambda path: save_view(result, path), rrd, png)
     if strict and result.consistency.consistent is False:
         ctx.exit(1)
 
@@ -209,10 +211,9 @@ def diagnose(ctx: click.Context, recording: Path, strict: bool, as_json: bool, *
               help="First take the steps of this journal again.")  # fmt: skip
 @recording_options
 @filter_options
-@click.option("--save-model", "--out-model", type=click.Path(path_type=Path), metavar="FILE.toml", panel=OUTPUT,
-              help="Save the last model here.")  # fmt: skip
-@click.option("--journal", "journal_file", type=click.Path(path_type=Path), metavar="FILE", panel=OUTPUT,
-              help="Keep a journal of the steps here.")  # fmt: skip
+@output_option("--save-model", "--out-model", metavar="FILE.toml", help="Save the last model here.", panel=OUTPUT)
+@output_option("--journal", "journal_file", metavar="FILE", help="Keep a journal of the steps here.", panel=OUTPUT)
+@overwrite_option
 @strict_option
 @json_option
 @click.pass_context
@@ -226,6 +227,7 @@ def improve(
     save_model: Path | None,
     journal_file: Path | None,
     from_journal: Path | None,
+    overwrite: bool,
     strict: bool,
     as_json: bool,
     **options: Any,
@@ -236,40 +238,42 @@ def improve(
     from kf_calib.views import improvement as views
 
     interactive = _asks(interactive, unattended, as_json)
+    outputs = claimed(overwrite=overwrite)
     earlier = journal.read(from_journal) if from_journal else None
     if earlier is not None:
         options |= _of_journal(ctx, options, earlier.origin.options)
+        outputs.spare(options["effects_from"])
     _refuse_engine(options)
     settings = settings_of(options)
     origin = journal.Origin.of(recording, _for_journal(options, settings.effects))
     if earlier is not None:
         earlier.refuse_other(origin, from_journal)
 
-    def keep(state: improvement.Improvement) -> None:
-        if journal_file:
-            journal.write(journal_file, state, origin)
+    with delivery(outputs, as_json) as deliver:
 
-    difference = None
-    with progress(f"improving on {recording.name}", as_json) as tick:
-        start = calibrate(recording_of(recording, options), settings, tick)
-        if earlier is not None:
-            state, difference = journal.replayed(earlier, start)
-        elif interactive:
-            state = improvement.begun(start)
+        def keep(state: improvement.Improvement) -> None:
+            deliver.keep(journal_file, lambda path: journal.write(path, state, origin))
+
+        difference = None
+        with progress(f"improving on {recording.name}", as_json) as tick:
+            start = calibrate(recording_of(recording, options), settings, tick)
+            if earlier is not None:
+                state, difference = journal.replayed(earlier, start)
+            elif interactive:
+                state = improvement.begun(start)
+            else:
+                state = improvement.improve(start, accept_first, keep)
+        if interactive:
+            state = views.session(state, lambda text, usual: click.prompt(text, default=usual or None), show, keep)
+        with progress("holding out orientations", as_json or not honest) as tick:
+            checked = improvement.honest(start, on_fold=tick) if honest else None
+        if as_json:
+            files = {"saved_model": save_model, "journal": journal_file}
+            print_json(views.improvement_object(state, checked, difference, files))
         else:
-            state = improvement.improve(start, accept_first, keep)
-    if interactive:
-        state = views.session(state, lambda text, usual: click.prompt(text, default=usual or None), show, keep)
-    with progress("holding out orientations", as_json or not honest) as tick:
-        checked = improvement.honest(start, on_fold=tick) if honest else None
-    keep(state)
-    if save_model:
-        model_file.write(save_model, state.result)
-    files = {"saved_model": save_model, "journal": journal_file}
-    if as_json:
-        print_json(views.improvement_object(state, checked, difference, files))
-    else:
-        show(views.improvement_report(state, checked, difference, files))
+            show(views.improvement_report(state, checked, difference))
+        deliver.file(save_model, lambda path: model_file.write(path, state.result))
+        deliver.file(journal_file, lambda path: journal.write(path, state, origin))
     if strict and state.found.test.consistent is False:
         ctx.exit(1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Iterator, Mapping
@@ -19,6 +20,7 @@ from mcap.writer import Writer
 
 from kf_calib.bench import Bench
 from kf_calib.errors import InputError, KfCalibError
+from kf_calib.outputs import Growing, refuse
 from kf_calib.samples import Batch, Stream
 from kf_calib.sources import cdr
 from kf_calib.sources.mcap_file import HEAD, MAGIC, McapFile, MessageFinder
@@ -38,17 +40,11 @@ _END = (  # of a file without a summary: all fields are zero
 )
 
 
-def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Raises InputError where a recording cannot be begun at ``path``: before a bench is waited for, not after."""
-    if path.exists() and not overwrite:
-        raise InputError(f"{path} exists already: give another name, or --overwrite to replace it.")
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path} cannot be created (its folder does not exist): choose another place.")
-
-
 class Recorder:
     """An open recording of ``bench``; a context manager that finishes the file.
 
+    An earlier file of that name (``overwrite``) stays till the first readings are on the disk; a failure before that
+    leaves it as it was, and no file where there was none.
     flush_s: a write that comes this long (wall clock) after the last one brought to the disk is brought there too.
     chunk_size: bytes of readings packed into one chunk at most. background: the disk is waited for in a thread of its
     own, and what it refuses is told by the next call.
@@ -75,6 +71,7 @@ class Recorder:
         """Bytes of the file with whole chunks; another reader sees them."""
         self.synced_s = time.monotonic()
         """When what the disk is known to hold was written (``time.monotonic``)."""
+        self._place = Growing(self.path)
         self._file: IO[bytes] | None = self._create(overwrite)
         self._flush_s = flush_s
         self._flushed_s = self.synced_s
@@ -89,6 +86,7 @@ class Recorder:
             else _Channel(ATTITUDE_TOPIC, cdr.QUATERNION, cdr.quaternion_message("platform")),
             _Channel(TEMPERATURE_TOPIC, cdr.TEMPERATURE, cdr.temperature_message("accelerometer")),
         )
+        self._head: float = math.inf  # bytes of the file before the first reading
         with self._storing():
             self._writer.start(profile="ros2")
             metadata = bench.to_metadata()
@@ -96,6 +94,7 @@ class Recorder:
             for channel in self._channels[:2]:  # so that even a recording without samples says what it is
                 channel.register(self._writer)
             self._sync()
+        self._head = self.size
 
     def write(self, batch: Batch) -> None:
         """Adds the samples of ``batch``, the streams merged by their stamps. Raises InputError where they do not fit.
@@ -145,7 +144,7 @@ class Recorder:
         """What was written between two sizes that the file had after a ``flush``, as a replay gives it."""
         find = MessageFinder()
         decoders = [cdr.Decoder(channel.kind, channel.width) for channel in self._channels]
-        for block in McapFile(self.path).blocks(_ignore, start, end):
+        for block in McapFile(self._place.at).blocks(_ignore, start, end):
             streams = [Stream.empty(channel.width) for channel in self._channels]
             for group in find(block).groups:
                 k = next(k for k, channel in enumerate(self._channels) if channel.id == group.channel)
@@ -160,12 +159,25 @@ class Recorder:
             self._flush()
             self._writer.finish()
             self._file.flush()
-            self._settle()
+            self._wait()
             os.fsync(self._file.fileno())
             self._file.close()
+            self._place.settle()
             self._file, self.flushed = None, self.readings
         if self._disk:
             self._disk.shutdown()
+
+    def finish(self) -> None:
+        """Finishes a file that holds readings; where none has come, leaves no file, and an earlier one as it was."""
+        if self._file is None or self.readings:
+            self.close()
+            return
+        file, self._file = self._file, None
+        if self._disk:
+            self._disk.shutdown()
+        with suppress(OSError):
+            file.close()
+        self._place.discard()
 
     def __enter__(self) -> Self:
         return self
@@ -173,13 +185,15 @@ class Recorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        if error is None:
+            self.close()
+        else:
+            self.finish()
 
     def _create(self, overwrite: bool) -> IO[bytes]:
+        refuse(self.path, overwrite)
         try:
-            return self.path.open("wb" if overwrite else "xb")
-        except FileExistsError:
-            raise InputError(f"{self.path} exists already: give another name, or --overwrite to replace it.") from None
+            return self._place.at.open("xb")
         except OSError as error:
             raise InputError(f"{self.path} cannot be created ({error.strerror}): choose another place.") from error
 
@@ -197,6 +211,9 @@ class Recorder:
         if self._file is not None:
             self._writer.flush()
             self.size, self.flushed = self._file.tell(), self.readings
+            if self.readings and not self._place.settled:
+                os.fsync(self._file.fileno())
+                self._place.settle()
 
     def _sync(self) -> None:
         if self._file is None:
@@ -206,14 +223,14 @@ class Recorder:
         if self._disk is None:
             self._bring(self._file.fileno(), self._flushed_s)
         elif self._pending is None or self._pending.done():  # else the disk is slow: the next time is soon
-            self._settle()
+            self._wait()
             self._pending = self._disk.submit(self._bring, self._file.fileno(), self._flushed_s)
 
     def _bring(self, descriptor: int, written_s: float) -> None:
         os.fsync(descriptor)
         self.synced_s = written_s
 
-    def _settle(self) -> None:
+    def _wait(self) -> None:
         """Waits for the disk; raises what it refused."""
         pending, self._pending = self._pending, None
         if pending:
@@ -233,14 +250,23 @@ class Recorder:
                 self._disk.shutdown()
             with suppress(OSError):  # what is left in its buffer fails again
                 file.close()
+            kept = self._kept(isinstance(error, OSError))
             if isinstance(error, OSError):
-                with suppress(OSError):  # then it stays as it is, and readable all the same
-                    self.size = _finish(self.path)
-                raise KfCalibError(
-                    f"{self.path} cannot be written on ({error.strerror}): it holds what was recorded till then; "
-                    "make room and record the rest into a new file."
-                ) from error
+                raise KfCalibError(f"{self.path} cannot be written on ({error.strerror}): {kept}.") from error
             raise
+
+    def _kept(self, is_full: bool) -> str:
+        """Keeps what is whole of a file that was given up, where anything is, and says so."""
+        size = 0
+        with suppress(OSError):  # then it stays as it is, and readable all the same
+            size = self._place.at.stat().st_size
+            size = self.size = _finish(self._place.at) if is_full else size
+        with suppress(OSError):
+            if size <= self._head:
+                self._place.discard()
+                return "nothing was recorded; make room and begin anew"
+            self._place.settle()
+        return "it holds what was recorded till then; make room and record the rest into a new file"
 
 
 def _finish(path: Path) -> int:

@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 
 from kf_calib.bench import Bench
-from kf_calib.errors import InputError, KfCalibError
+from kf_calib.errors import InputError
+from kf_calib.outputs import write_whole
 from kf_calib.samples import Batch, Floats, Stream, Times
 from kf_calib.sources.gimbals import Motion, attitude
 from kf_calib.sources.hidden import Hidden, Rig, Stage, sizes_in_sigma, steps_of
@@ -41,6 +42,12 @@ from kf_calib.sources.physics import (
 )
 from kf_calib.sources.plans import YZX, Visit, stays
 from kf_calib.sources.sensors import Sensors
+
+
+def truth_file(recording: Path) -> Path:
+    """The side file with the truth of ``NAME.mcap``: ``NAME.truth.json``."""
+    return recording.parent / f"{recording.stem}.truth.json"
+
 
 START_NS = 1_750_000_000_000_000_000
 """Stamp of the first sample: 15 June 2025, 15:06:40 UTC."""
@@ -156,12 +163,9 @@ class Simulation:
         return {"parameters_at_end": there}
 
     def write_truth(self, recording: str | PathLike[str]) -> Path:
-        """Writes ``NAME.truth.json`` beside the recording ``NAME.mcap``; returns its path."""
-        path = Path(recording).with_suffix(".truth.json")
-        try:
-            path.write_text(json.dumps(self.truth, indent=2) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise KfCalibError(f"{path}: the truth cannot be written ({error.strerror}).") from None
+        """Writes ``NAME.truth.json`` beside the recording ``NAME.mcap``; returns its path. Raises InputError."""
+        path = truth_file(Path(recording))
+        write_whole(path, (json.dumps(self.truth, indent=2) + "\n").encode())
         return path
 
     def _steps(self) -> list[Step]:

@@ -123,9 +123,7 @@ def notes(state: Improvement) -> list[str]:
     return [*said, *state.result.warnings]
 
 
-def improvement_report(
-    state: Improvement, honest: Honest | None, replay_difference: float | None, files: Mapping[str, Path | None]
-) -> RenderableType:
+def improvement_report(state: Improvement, honest: Honest | None, replay_difference: float | None) -> RenderableType:
     """What ``improve`` prints: the errors falling, why it stopped, what would settle it, the parameters."""
     style = "bold green" if state.because == "consistent" else "bold yellow"
     parts: list[RenderableType] = [
@@ -144,7 +142,6 @@ def improvement_report(
         same = "to the last bit" if replay_difference == 0 else f"but for {replay_difference:.1g} of a figure at most"
         parts.append(Text(f"The steps of the journal gave its figures again, {same}."))
     parts += [Text(f"Note: {sentence}", style="yellow") for sentence in notes(state)]
-    parts += [Text(f"saved {path}") for path in files.values() if path]
     return Group(*parts)
 
 

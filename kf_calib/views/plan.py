@@ -11,9 +11,9 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib import paper
-from kf_calib.errors import InputError
 from kf_calib.experiment import DEVIATIONS
 from kf_calib.model import STATE_COUNT
+from kf_calib.outputs import write_whole
 from kf_calib.planner import Plan, papers_sigma
 from kf_calib.samples import Floats
 from kf_calib.views.console import symbol
@@ -158,7 +158,4 @@ def write_csv(made: Plan, path: Path) -> None:
     """Names of the gimbals, then a line of angles in deg for each dwell."""
     header = ",".join(f"gimbal_{name}_deg" for name in gimbal_names(made))
     rows = [",".join(repr(float(angle)) for angle in row) for row in made.gimbal_deg]
-    try:
-        path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: the plan cannot be written ({error.strerror}).") from None
+    write_whole(path, ("\n".join([header, *rows]) + "\n").encode())

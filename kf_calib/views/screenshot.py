@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kf_calib.errors import KfCalibError
+from kf_calib.outputs import whole
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
@@ -44,7 +45,8 @@ def screenshot(
     """Draw a recording into a PNG of ``size`` (width, height) pixels, and return its path.
 
     ``timeline`` and ``time`` move the cursor first (s on a timeline of durations, a count on a sequence);
-    without them the picture is what the file opens with. Raises ScreenshotError.
+    without them the picture is what the file opens with. Raises ScreenshotError, and
+    InputError where the PNG cannot be written.
     """
     rrd, png = Path(rrd_path).resolve(), Path(png_path).resolve()
     if not rrd.is_file():
@@ -161,8 +163,6 @@ def _write(picture: bytes, png: Path) -> None:
     """The picture without the window's top bar."""
     from PIL import Image
 
-    whole = Image.open(io.BytesIO(picture))
-    try:
-        whole.crop((0, _MENU_PX, whole.width, whole.height)).save(png, "PNG")
-    except OSError as error:
-        raise ScreenshotError(f"the picture {png} cannot be written ({error.strerror}).") from None
+    window = Image.open(io.BytesIO(picture))
+    with whole(png) as part:
+        window.crop((0, _MENU_PX, window.width, window.height)).save(part, "PNG")

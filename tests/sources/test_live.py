@@ -326,7 +326,7 @@ def test_what_cannot_be_opened_is_told_at_once(tmp_path: Path) -> None:
         ("sim://?speed=0", {}, "speed=0 is not a positive number"),
         ("sim://?sped=3", {}, "no setting 'sped'"),
         ("sim://", {"record": tmp_path / "there.mcap"}, "exists already"),
-        ("sim://", {"record": tmp_path / "no" / "a.mcap"}, "its folder does not exist"),
+        ("sim://", {"record": tmp_path / "no" / "a.mcap"}, "there is no folder"),
     ]:
         with pytest.raises(InputError, match=words) as caught:
             open_live(url, **options)

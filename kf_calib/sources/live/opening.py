@@ -10,12 +10,12 @@ from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from kf_calib.errors import InputError
+from kf_calib.outputs import Outputs
 from kf_calib.sources.live.bag import BagFeed
 from kf_calib.sources.live.feed import Feed
 from kf_calib.sources.live.links import GrowingFile, Link, SerialPort, StandardInput, Tcp
 from kf_calib.sources.live.source import QUEUED, LiveSource
 from kf_calib.sources.live.streamed import StreamedFeed
-from kf_calib.sources.recorder import refuse_existing
 from kf_calib.sources.recording import Recording
 
 _TEXT_FILES = (".csv", ".jsonl", ".txt", ".tsv", ".log")
@@ -45,8 +45,7 @@ def open_live(
     again. idle_s: ends the source where nothing has come for so long. queued: samples that may wait for the consumer.
     Raises InputError where it cannot be opened.
     """
-    if record is not None:
-        refuse_existing(record, overwrite)
+    Outputs({"--record": record}, files_of(url), overwrite)
     address, query = _split(url)
     give_up_s, idle_s = query.pop("give_up", give_up_s), query.pop("idle", idle_s)
     scheme = url.partition("://")[0] if "://" in url else ""
@@ -59,6 +58,15 @@ def open_live(
         name = "standard input" if address == "-" else address.removeprefix("tail:")
         feed = StreamedFeed(name, link, overrides or {}, columns, header, give_up_s, idle_s)
     return LiveSource(feed, record, overwrite, queued)
+
+
+def files_of(url: str) -> list[Path]:
+    """Files that a live source of this URL is read from, and so must not be written."""
+    scheme, separator, rest = url.partition("://")
+    if separator and scheme == "sim":
+        return [Path(text) for key, text in parse_qsl(rest.partition("?")[2]) if key == "plan"]
+    address = _split(url)[0]
+    return [] if separator or address == "-" else [Path(address.removeprefix("tail:").partition("?")[0])]
 
 
 def _split(url: str) -> tuple[str, dict[str, float]]:

@@ -15,10 +15,11 @@ import numpy as np
 
 from kf_calib.bench import Bench
 from kf_calib.errors import InputError, KfCalibError
+from kf_calib.outputs import refuse
 from kf_calib.samples import Batch, Stream
 from kf_calib.sources.live.continuity import Abreast, Continuity
 from kf_calib.sources.live.feed import Feed, Lost, Regained
-from kf_calib.sources.recorder import Recorder, refuse_existing
+from kf_calib.sources.recorder import Recorder
 from kf_calib.sources.recording import GAP_RECORD
 
 _FLUSH_S = 0.5  # with the time that flushing takes, less than the second that a kill may cost
@@ -143,7 +144,7 @@ class LiveSource:
 
     def __init__(self, feed: Feed, record: Path | None = None, overwrite: bool = False, queued: int = QUEUED) -> None:
         if record is not None:
-            refuse_existing(record, overwrite)
+            refuse(record, overwrite)
         self.name = feed.name
         self._feed, self._record, self._overwrite = feed, record, overwrite
         self._lock = threading.Condition()  # of all that follows
@@ -271,7 +272,7 @@ class LiveSource:
         self._feed.close()
         with self._lock:
             if self._recorder:
-                self._store(self._recorder.close)
+                self._store(self._recorder.finish)
             self._feed.link = "ended"
             self._is_finished = True
             self._lock.notify_all()

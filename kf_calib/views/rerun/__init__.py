@@ -12,7 +12,6 @@ Entities: ``parameters/ACCELEROMETER/SYMBOL/{log10_sigma,deviation,band}``, ``pl
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,8 +19,8 @@ from pathlib import Path
 import rerun as rr
 
 from kf_calib.calibration import Calibration
-from kf_calib.errors import InputError
 from kf_calib.views.rerun.correlation import log_correlation
+from kf_calib.views.rerun.file import rrd_file
 from kf_calib.views.rerun.layout import TABS, layout
 from kf_calib.views.rerun.names import BENCH_TIME, ORIENTATION
 from kf_calib.views.rerun.platform import log_platform
@@ -34,18 +33,13 @@ __all__ = ["BENCH_TIME", "ORIENTATION", "TABS", "grow", "layout", "log", "save"]
 def save(result: Calibration, path: str | Path, timeline: str = BENCH_TIME, tab: str = TABS[0]) -> Path:
     """Write the view of a run to an .rrd file that opens laid out, at the end of the run.
 
-    ``timeline``: BENCH_TIME or ORIENTATION; ``tab``: which of TABS is in front. Raises InputError for no such folder.
+    ``timeline``: BENCH_TIME or ORIENTATION; ``tab``: which of TABS is in front. Raises InputError where the
+    file cannot be written.
     """
     path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"the Rerun recording {path} cannot be written: there is no folder {path.parent}.")
     history = History.of(result)
-    # an identity of its own: two views written by one process would else be merged by the viewer
-    with _strict(), rr.RecordingStream("kf_calib", recording_id=uuid.uuid4()) as stream:
-        stream.save(path, default_blueprint=layout(result, history, timeline, tab))
+    with _strict(), rrd_file(path, layout(result, history, timeline, tab)) as stream:
         _log(result, history, stream)
-        stream.flush()
-        stream.disconnect()
     return path
 
 

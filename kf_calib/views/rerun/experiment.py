@@ -8,7 +8,6 @@ Entities: ``optimal/...`` and ``nonoptimal/...``: ``parameters/ACCELEROMETER/SYM
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,11 +17,11 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from kf_calib import paper
-from kf_calib.errors import InputError
 from kf_calib.experiment import GRAVITY_MPS2, READINGS, Column, Experiment, shrinking
 from kf_calib.model import PRIORS
 from kf_calib.samples import Floats
 from kf_calib.views.rerun.correlation import LIFT, picture
+from kf_calib.views.rerun.file import rrd_file
 from kf_calib.views.rerun.names import (
     ACCELEROMETERS,
     GOLD,
@@ -43,20 +42,15 @@ _UNIT = np.array([GRAVITY_MPS2, GRAVITY_MPS2, GRAVITY_MPS2, 1.0])
 
 
 def save(found: Experiment, words: str, path: str | Path) -> Path:
-    """Write the view to an .rrd file; ``words``: Markdown of the results. Raises InputError for no such folder."""
+    """Write the view to an .rrd file; ``words``: Markdown of the results. Raises InputError where it cannot be."""
     path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"the Rerun recording {path} cannot be written: there is no folder {path.parent}.")
     sigmas = {name: _sigmas(column) for name, column in _columns(found).items()}
-    with rr.RecordingStream("kf_calib", recording_id=uuid.uuid4()) as stream:
-        stream.save(path, default_blueprint=_layout(sigmas))
+    with rrd_file(path, _layout(sigmas)) as stream:
         for name, column in _columns(found).items():
             _log_sigmas(stream, name, sigmas[name])
             _log_directions(stream, name, column)
         _log_design(stream, found)
         stream.log("summary", rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN), static=True)
-        stream.flush()
-        stream.disconnect()
     return path
 
 

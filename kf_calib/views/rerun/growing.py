@@ -13,16 +13,14 @@ import socket
 import subprocess
 import tempfile
 import threading
-import uuid
 from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
-import rerun as rr
-
 from kf_calib.calibration import Calibration
-from kf_calib.errors import InputError
+from kf_calib.outputs import Growing
 from kf_calib.views.rerun import grow
+from kf_calib.views.rerun.file import new_stream
 from kf_calib.views.screenshot import binary, obituary
 
 PORT = 9876
@@ -41,16 +39,22 @@ class GrowingView:
     ) -> None:
         self.dropped, self.trouble = 0, ""
         self._results = queue.Queue[Calibration | None](waiting)
-        self._streams, self._viewer, self._relays = [_saving(rrd)] if rrd else [], None, False
+        self._file = _GrowingFile(rrd) if rrd else None
+        self._viewer, self._relays = None, False
+        self._stream = new_stream()
+        self._encoded = self._stream.binary_stream()
+        self._is_gone = False  # the viewer
         self._log = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the viewer's pipe
         if port is not None:
-            piped = _stream()
-            self._encoded = piped.binary_stream()
-            self._streams.append(piped)
             self._relays = _listens(port)
             self._viewer = _viewer(port, bind, self._log)
         self._thread = threading.Thread(target=self._show, name="rerun", daemon=True)
         self._thread.start()
+
+    @property
+    def began(self) -> bool:
+        """Whether there is a file by now."""
+        return self._file is not None and self._file.began
 
     def offer(self, result: Calibration) -> None:
         """Show a result when there is time; never waits."""
@@ -84,42 +88,66 @@ class GrowingView:
             while (result := self._results.get()) is not None:
                 count = len(result.visits)
                 lay_out = count >= 2 * laid_out or count < shown  # not each time: who looks on may have changed it
-                for stream in self._streams:
-                    grow(result, stream, shown, lay_out)
-                    stream.flush()
+                grow(result, self._stream, shown, lay_out)
                 shown, laid_out = count, count if lay_out else laid_out
-                if self._viewer is not None and not self.trouble:
-                    self._pass_on(self._viewer, self._encoded.read() or b"")
+                self._pass_on(self._encoded.read() or b"")
         except Exception as error:  # a view that fails is no reason for a run to
             self.trouble = f"the Rerun view stopped: {error}"
-        for stream in self._streams:
-            stream.disconnect()
+        self._stream.disconnect()
+        if self._file is not None:
+            self._file.close()
         if self._viewer is not None and self._viewer.stdin is not None:
             with suppress(OSError):
                 self._viewer.stdin.close()
         self._log.close()
 
-    def _pass_on(self, viewer: subprocess.Popen[bytes], data: bytes) -> None:
+    def _pass_on(self, data: bytes) -> None:
+        """To the file and to the viewer: what is the matter with one is no reason to leave out the other."""
+        if self._file is not None:
+            self.trouble = self._file.write(data) or self.trouble
+        viewer = self._viewer
+        if viewer is None or self._is_gone:
+            return
         assert viewer.stdin is not None
         try:
             viewer.stdin.write(data)
             viewer.stdin.flush()
         except OSError:
+            self._is_gone = True
             viewer.wait()
             self._log.seek(0)
             self.trouble = self.trouble or obituary(self._log.read().decode(errors="replace"))
 
 
-def _stream() -> rr.RecordingStream:
-    return rr.RecordingStream("kf_calib", recording_id=uuid.uuid4())
+class _GrowingFile:
+    """The view so far; an earlier file of that name stays until there is something to see."""
 
+    def __init__(self, path: Path) -> None:
+        self._path, self._place = path, Growing(path)
+        self._file: IO[bytes] | None = None
+        self.began = self._is_lost = False
 
-def _saving(path: Path) -> rr.RecordingStream:
-    if not path.parent.is_dir():
-        raise InputError(f"the Rerun recording {path} cannot be written: there is no folder {path.parent}.")
-    stream = _stream()
-    stream.save(path)
-    return stream
+    def write(self, data: bytes) -> str:
+        """Why the file ends here, the first time that it does."""
+        if self._is_lost:
+            return ""
+        try:
+            self._file = self._file or self._place.at.open("xb")
+            self._file.write(data)
+            self._file.flush()
+            self._place.settle()
+            self.began = True
+        except OSError as error:
+            self._is_lost = True
+            return f"{self._path} is not written on ({error.strerror})."
+        return ""
+
+    def close(self) -> None:
+        if self._file is not None:
+            with suppress(OSError):
+                self._file.close()
+            if not self._place.settled:
+                self._place.discard()
 
 
 def _listens(port: int) -> bool:

@@ -7,7 +7,6 @@ uncertainty}``, ``parameters/ACCELEROMETER/SYMBOL/log10_sigma``, ``bench/pose/GI
 from __future__ import annotations
 
 import itertools
-import uuid
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from kf_calib import aims, paper
 from kf_calib.bench import slerp
-from kf_calib.errors import InputError
 from kf_calib.model import STATE_COUNT
 from kf_calib.planner import Plan
 from kf_calib.samples import Floats
 from kf_calib.views.plan import gimbal_names, sentences
+from kf_calib.views.rerun.file import rrd_file
 from kf_calib.views.rerun.layout import WHOLE_RUN, power
 from kf_calib.views.rerun.names import (
     ACCELEROMETERS,
@@ -47,18 +46,13 @@ _LIFT = 1.13
 def save(made: Plan, path: str | Path) -> Path:
     """Write the view of a plan to an .rrd file that opens laid out, at the end of the plan."""
     path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"the Rerun recording {path} cannot be written: there is no folder {path.parent}.")
-    with rr.RecordingStream("kf_calib", recording_id=uuid.uuid4()) as stream:
-        stream.save(path, default_blueprint=_layout(made))
+    with rrd_file(path, _layout(made)) as stream:
         log_frame(stream)
         _log_tour(made, stream)
         _log_uncertainty(made, stream)
         _log_sigmas(made, stream)
         _log_angles(made, stream)
         stream.log("summary", rr.TextDocument(_summary(made), media_type=rr.MediaType.MARKDOWN), static=True)
-        stream.flush()
-        stream.disconnect()
     return path
 
 

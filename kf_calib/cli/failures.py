@@ -1,0 +1,60 @@
+"""What a command that failed says: one sentence, whatever went wrong."""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from pathlib import Path
+
+import click
+
+from kf_calib.errors import KfCalibError
+
+TRACEBACK = "KF_CALIB_TRACEBACK"
+
+
+def tell(error: BaseException) -> None:
+    """Print the sentence, after the traceback where the environment asks for it."""
+    if os.environ.get(TRACEBACK):
+        traceback.print_exception(error, file=sys.stderr)
+    click.echo(f"kf-calib: {sentence(error)}", err=True)
+
+
+def sentence(error: BaseException) -> str:
+    """What went wrong, where, and what to do next."""
+    match error:
+        case click.ClickException():
+            ctx = getattr(error, "ctx", None)
+            hint = f" (see {ctx.command_path} --help)" if ctx is not None else ""
+            return f"{error.format_message().rstrip()}{hint}"
+        case KfCalibError():
+            return str(error)
+        case MemoryError():
+            return f"there is not memory enough ({_said(error)}): give it fewer readings, or more memory."
+        case OSError() if error.strerror:
+            where = "" if error.filename is None else f"{error.filename}: "
+            return f"{where}{error.strerror} ({_place(error)}): mend that, and run it again."
+        case _:
+            return (
+                f"{_said(error)}, which was not foreseen, in {_place(error)}: please report it, with the traceback "
+                f"that {TRACEBACK}=1 in the environment shows."
+            )
+
+
+def _said(error: BaseException) -> str:
+    """Type and text, in one line."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def _place(error: BaseException) -> str:
+    """The innermost line of this package that was at work, as ``kf_calib/kalman.py:88``."""
+    package = Path(__file__).parents[1]
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if package in Path(frame.filename).parents]
+    if not (own or frames):
+        return "an unknown place"
+    frame = (own or frames)[-1]
+    path = Path(frame.filename)
+    return f"{path.relative_to(package.parent) if own else path}:{frame.lineno}"

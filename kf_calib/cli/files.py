@@ -1,0 +1,113 @@
+"""The files that commands write: which they are, and their turn, which comes when the result has been printed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, TypeVar
+
+import rich_click as click
+
+from kf_calib.cli.echo import echo
+from kf_calib.cli.failures import tell
+from kf_calib.outputs import Outputs
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class OutputFile(click.Path):
+    """The type of an option or argument that names a file to write."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+
+def output_option(*names: str, **attributes: Any) -> Callable[[F], F]:
+    """An option that names a file to write."""
+    return click.option(*names, type=OutputFile(), **attributes)
+
+
+def claimed(
+    inputs: Iterable[Path] = (), beside: Mapping[str, Path] = MappingProxyType({}), overwrite: bool = False
+) -> Outputs:
+    """The outputs of the command that runs, seen to harm nothing; every path among its options is one, or is read.
+
+    inputs: files that it reads besides. beside: files that it writes besides.
+    """
+    ctx = click.get_current_context()
+    files, read = dict[str, Path | None](beside), list(inputs)
+    for param in ctx.command.params:
+        value = ctx.params.get(param.name or "")
+        if isinstance(param.type, OutputFile):
+            files[param.opts[0] if isinstance(param, click.Option) else param.make_metavar(ctx)] = value
+        else:
+            read += [each for each in (value if isinstance(value, tuple) else [value]) if isinstance(each, Path)]
+    outputs = Outputs(files, read, overwrite)
+    if ctx.params.get("model_file"):
+        from kf_calib import model_file
+
+        outputs.spare(model_file.read(ctx.params["model_file"]).effects_from)
+    return outputs
+
+
+class Delivery:
+    """Writes one file after another; what fails is told when all have had their turn. Each that is done is printed."""
+
+    def __init__(self, outputs: Outputs, quiet: bool) -> None:
+        self._outputs, self._quiet = outputs, quiet
+        self.failures = dict[Path, Exception]()
+
+    def keep(self, path: Path | None, save: Callable[[Path], object]) -> bool:
+        """Write a file without a word, if there is to be one; whether it is there."""
+        if path is None:
+            return False
+        try:
+            self._outputs.write(path, save)
+        except Exception as error:
+            self.failures[path] = error
+            return False
+        self.failures.pop(path, None)
+        return True
+
+    def file(self, path: Path | None, save: Callable[[Path], object]) -> None:
+        """Write a file, if there is to be one."""
+        if self.keep(path, save) and not self._quiet:
+            echo(f"saved {path}")
+
+    def view(self, save: Callable[[Path], object], rrd: Path | None, png: Path | None) -> None:
+        """What ``save`` writes as a Rerun recording, and a picture of it; either may be left out."""
+        self.file(rrd, save)
+        if png:
+            self._picture(save, None if rrd in self.failures else rrd, png)
+
+    def _picture(self, save: Callable[[Path], object], rrd: Path | None, png: Path) -> None:
+        import tempfile
+
+        from kf_calib.views.screenshot import ScreenshotError, screenshot
+
+        def draw(path: Path) -> None:
+            with tempfile.TemporaryDirectory() as folder:
+                drawn = rrd or Path(folder) / "view.rrd"
+                if rrd is None:
+                    save(drawn)
+                screenshot(drawn, path)
+
+        self.file(png, draw)
+        if isinstance(error := self.failures.get(png), ScreenshotError):
+            click.echo(f"kf-calib: the picture could not be drawn: {error}", err=True)
+            del self.failures[png]
+
+
+@contextmanager
+def delivery(outputs: Outputs, quiet: bool) -> Iterator[Delivery]:
+    """What writes the files of a run; in the end it tells what could not be written, and the command exits with 2."""
+    delivering = Delivery(outputs, quiet)
+    try:
+        yield delivering
+    finally:
+        for error in delivering.failures.values():
+            tell(error)
+    if delivering.failures:
+        click.get_current_context().exit(2)
