@@ -219,9 +219,19 @@ def pair(text: str) -> tuple[str, str]:
 @json_option
 def demo(folder: Path, as_json: bool) -> None:
     """The main job on a simulated run: record, replay, compare with least squares, save the view; files in FOLDER."""
+    from rich.console import Group
+    from rich.markup import escape
+
+    from kf_calib.calibration import calibrate
     from kf_calib.comparison import compare as run
     from kf_calib.sources.recording import Recording
     from kf_calib.sources.simulated import simulation
+    from kf_calib.views.console import comparison_table, summary
+    from kf_calib.views.json import compare_object, replay_object
+
+    def say(shown: Any) -> None:
+        if not as_json:
+            show(shown)
 
     folder.mkdir(parents=True, exist_ok=True)
     recording, rrd = folder / "demo.mcap", folder / "demo.rrd"
@@ -230,19 +240,16 @@ def demo(folder: Path, as_json: bool) -> None:
     with progress("recording a simulated run", as_json) as tick:
         made = _record(source, recording, True, tick)
         truth = source.write_truth(recording)
-    with progress("replaying and comparing", as_json):
-        compared = run(Recording(recording))
-        save_views(compared.result, rrd, None)
+    say(escape(f"Recorded a simulated bench run to {recording}: {made}.\n"))
+    with progress("replaying", as_json) as tick:
+        result = calibrate(Recording(recording), on_progress=tick)
+    say(summary(result))
+    with progress("comparing", as_json) as tick:
+        compared = run(Recording(recording), on_progress=tick)
+    say(Group("", comparison_table(compared)))
+    with progress("saving the view", as_json):
+        save_views(result, rrd, None)
+    say(escape(f"\nTruth: {truth}. View: {rrd} (open it with .venv/bin/rerun {rrd})."))
     if as_json:
-        from kf_calib.views.json import compare_object, replay_object
-
         files = {"recording": str(recording), "truth": str(truth), "view": str(rrd)}
-        print_json({**files, "replay": replay_object(compared.result), "compare": compare_object(compared)})
-        return
-    from kf_calib.views.console import comparison_table, summary
-
-    click.echo(f"Recorded a simulated bench run to {recording}: {made}.\n")
-    show(summary(compared.result))
-    click.echo()
-    show(comparison_table(compared))
-    click.echo(f"\nTruth: {truth}. View: {rrd} (open it with .venv/bin/rerun {rrd}).")
+        print_json({**files, "replay": replay_object(result), "compare": compare_object(compared)})
