@@ -17,7 +17,7 @@ from kf_calib.diagnosis import diagnose
 from kf_calib.improvement import improve
 
 RECORDING = Path(__file__).resolve().parents[1] / "recordings" / "hidden.mcap"
-FRAME = re.compile(r"━ +(?:(\d+)% )?\d:\d\d:\d\d (.+?) *$")
+FRAME = re.compile(r"[━╺] +(?:(\d+)% )?\d:\d\d:\d\d (.+?) *$")
 
 
 def heard(run: Callable[[], object]) -> list[str]:
@@ -60,34 +60,29 @@ class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
 
-    @property
-    def frames(self) -> list[tuple[str, str]]:
-        """Percentage and text of each frame of the progress."""
-        plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.getvalue())
-        return [(found[1] or "", found[2]) for line in re.split(r"[\r\n]+", plain) if (found := FRAME.search(line))]
 
-
-@pytest.fixture
-def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
-    """The error stream is a terminal of 80 columns."""
+def watched(run, monkeypatch: pytest.MonkeyPatch, *words: object) -> list[tuple[str, str]]:
+    """Percentage and text of each frame that a command shows on a terminal of 80 columns."""
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setattr("sys.stderr", shown := Terminal())
-    return shown
+    monkeypatch.setattr("sys.stderr", terminal := Terminal())  # here: pytest sets its own before it calls a test
+    assert run(*words)[0] == 0
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
+    return [(found[1] or "", found[2]) for line in re.split(r"[\r\n]+", plain) if (found := FRAME.search(line))]
 
 
-def test_on_a_terminal_a_share_grows_where_it_is_known(run, terminal: Terminal) -> None:
-    assert run("compare", RECORDING)[0] == 0
-    shares = [int(share) for share, text in terminal.frames if share and "filterpy" in text]
+def test_on_a_terminal_a_share_grows_where_it_is_known(run, monkeypatch) -> None:
+    frames = watched(run, monkeypatch, "compare", RECORDING)
+    shares = [int(share) for share, text in frames if share and "filterpy" in text]
     assert len(set(shares)) > 2 and max(shares) < 100
 
 
-def test_on_a_terminal_the_stage_is_said_where_no_share_is_known(run, terminal: Terminal) -> None:
-    assert run("diagnose", RECORDING)[0] == 0
-    texts = {text for _, text in terminal.frames}
+def test_on_a_terminal_the_stage_is_said_where_no_share_is_known(run, monkeypatch) -> None:
+    frames = watched(run, monkeypatch, "diagnose", RECORDING)
+    texts = {text for _, text in frames}
     assert len(texts) > 4 and all(text.startswith("diagnosing hidden.mcap") for text in texts)
     assert any("refitting with" in text for text in texts)
-    assert not any(share for share, text in terminal.frames if "refitting" in text or "scanning" in text)
+    assert not any(share for share, text in frames if "refitting" in text or "scanning" in text)
 
 
 def test_where_the_error_stream_is_no_terminal_there_is_none(run) -> None:
