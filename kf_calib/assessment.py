@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from kf_calib import stage
 from kf_calib.calibration import consistency
 from kf_calib.effects import Effect, effect_named, names, walk_named
 from kf_calib.fitting import Fit
@@ -202,17 +203,18 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
 def _scanned(fitted: Fit) -> Scan:
     """The scan of all candidates, and of an oscillation at the frequency, below those of lines, that explains most."""
     carried, noise = fitted.carried, fitted.noise.judging
-    effect = _oscillation(carried.model)
+    effect, tried = _oscillation(carried.model), candidates(carried.model)
+    stage.say(f"scanning {len({str(each) for each in tried})} effects")
     if effect is None or carried.model.oscillates:
-        return scan(carried, noise, candidates(carried.model))
+        return scan(carried, noise, tried)
     values = slow_hz(fitted, effect)
     if not len(values):
-        return scan(carried, noise, candidates(carried.model))
+        return scan(carried, noise, tried)
     coarse = falls(carried, noise, [effect.at(value) for value in values])
     near = values[np.argmax(coarse)] + 0.125 * values[0] * np.arange(-3, 4)
     slow = [effect.at(value) for value in near]
     swinging = slow[int(np.argmax(falls(carried, noise, slow)))]
-    found = scan(carried, noise, [*candidates(carried.model), swinging])
+    found = scan(carried, noise, [*tried, swinging])
     *others, last = found.candidates
     return replace(found, candidates=(*others, replace(last, tried=len(values))))
 

@@ -17,13 +17,23 @@ from typing import Literal, get_args
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from kf_calib import averaging, blunders, information, kalman, paper
+from kf_calib import averaging, blunders, information, kalman, paper, stage
 from kf_calib.bench import Bench
 from kf_calib.dwells import Block, Segmenter, Tally, dwell_blocks
 from kf_calib.effects import of_the_users, remarks_of
 from kf_calib.errors import InputError, UnobservableError, check_number
 from kf_calib.fitting import WALK, Fit, fit
-from kf_calib.folding import Carried, DwellFactor, Folder, columns_of, lines_of, means_of, samples_of, without
+from kf_calib.folding import (
+    Carried,
+    DwellFactor,
+    Folder,
+    Samples,
+    columns_of,
+    lines_of,
+    means_of,
+    samples_of,
+    without,
+)
 from kf_calib.held_out import HeldOut, held_out
 from kf_calib.information import Step
 from kf_calib.likelihood import ENOUGH_DIRECTIONS, FEWEST, directions, freedom
@@ -384,17 +394,19 @@ def calibrate(
     source, settings = opened(source), settings or Settings()
     with threadpool_limits(1, user_api="blas"):  # small decompositions: with threads they take three times as long
         if Model.of(source.bench, settings.effects).averages and not settings.window_s:
-            settings = replace(settings, window_s=_window_s(source, settings))
+            stage.say("reading how it vibrates")
+            settings = replace(settings, window_s=_window_s(source, settings, on_progress))
+            stage.say("reading")
         passed = Pass(source, settings)
         if plain is None:
             passed.fold(on_progress)
         return concluded(passed, source, on_progress, plain)
 
 
-def _window_s(source: Source, settings: Settings) -> float:
+def _window_s(source: Source, settings: Settings, on_progress: Callable[[float], None] | None) -> float:
     """Length of the windows that average the vibration in a source away: from a pass of its own."""
     plain = Pass(source, replace(settings, effects=()))
-    return averaging.window_s(lines_of(plain.fold()))
+    return averaging.window_s(lines_of(plain.fold(on_progress)))
 
 
 def concluded(
@@ -412,6 +424,7 @@ def concluded(
     dwells = passed.dwells if plain is None else plain.dwells
     if plain is None:
         refuse_unusable(dwells, passed.tally, bench)
+    stage.say("estimating")
     if again is not None and Model.of(bench, settings.effects).oscillates:
         passed, fitted = _on_carrier(replace(passed, source=again), dwells, plain, on_progress)
     else:
@@ -419,7 +432,8 @@ def concluded(
     result = evaluated(fitted, settings)
     refuse_unseen(result)
     if again is not None and settings.engine == "filterpy":
-        result = replace(result, estimate=filterpy_estimate(again, result))
+        stage.say("filterpy, reading by reading")
+        result = replace(result, estimate=filterpy_estimate(again, result, on_progress=on_progress))
     reread = None if again is None else partial(calibrate, again)
     return replace(told(result, passed), reread=reread)
 
@@ -451,6 +465,7 @@ def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
     """
     settings = replace(before.settings, effects=tuple(effects))
     model = Model.of(before.bench, settings.effects)
+    stage.say(f"refitting with {' + '.join(map(str, model.effects))}" if model.effects else "refitting the twelve")
     other = model.averages and not all(dwell.averaged for dwell in before.fit.dwells)
     if before.reread is not None and (other or (model.dynamic and not before.carried.slews)):
         return before.reread(settings)
@@ -501,6 +516,7 @@ def _nearer(passed: Pass, carrier: float | Fit, on_progress: Callable[[float], N
     """The source folded on a carrier, in Hz or where a fit has the oscillation, and the fit there."""
     carrier_hz = _oscillation_hz(carrier) if isinstance(carrier, Fit) else carrier
     for left in reversed(range(_CARRIERS)):
+        stage.say(f"reading on a carrier of {carrier_hz:.3g} Hz")
         passed = Pass(passed.source, passed.settings, folder=Folder(carrier_hz))
         dwells = passed.fold(on_progress)
         fitted = _fitted(passed, dwells)
@@ -545,13 +561,21 @@ def evaluated(fitted: Fit, settings: Settings) -> Calibration:
 
 
 def filterpy_estimate(
-    source: Source, result: Calibration, form: Literal["square-root", "plain"] = "square-root"
+    source: Source,
+    result: Calibration,
+    form: Literal["square-root", "plain"] = "square-root",
+    on_progress: Callable[[float], None] | None = None,
+    at_most: float = math.inf,
 ) -> Estimate:
-    """The same posterior by filterpy's filter, sample by sample: a second pass over the source."""
+    """The same posterior by filterpy's filter, sample by sample: a second pass over the source.
+
+    on_progress: with the share of readings that are done. at_most: stop after about so many readings.
+    """
     prior, model = result.settings.prior, result.model
     scale = np.concatenate([np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), result.carried.sizes[STATE_COUNT:]])
+    samples = samples_of(Pass(source, result.settings).rows(), result.carried)
     posterior = kalman.estimate(
-        samples_of(Pass(source, result.settings).rows(), result.carried),
+        _counted(samples, result.carried, on_progress, at_most),
         result.noise.weights,
         model.nominal_state(),
         None if prior.diffuse else information.prior_covariance(prior, model),
@@ -560,6 +584,20 @@ def filterpy_estimate(
         form,
     )
     return result.considering(posterior.state, posterior.covariance)
+
+
+def _counted(
+    samples: Iterable[Samples], carried: Carried, on_progress: Callable[[float], None] | None, at_most: float
+) -> Iterator[Samples]:
+    """The same samples, their share told as each stretch of them is done, up to a number of readings."""
+    total, done = sum(dwell.count for dwell in [*carried.dwells, *carried.slews]), 0
+    for piece in samples:
+        yield piece
+        done += len(piece.readings)
+        if on_progress is not None:
+            on_progress(done / total)
+        if done >= at_most:
+            return
 
 
 def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> None:

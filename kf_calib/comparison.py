@@ -15,19 +15,24 @@ from typing import TypeVar
 
 import numpy as np
 
+from kf_calib import stage
 from kf_calib.batch import least_squares
 from kf_calib.calibration import Calibration, Estimate, Pass, Settings, calibrate, filterpy_estimate
 from kf_calib.folding import samples_of
 from kf_calib.samples import Source
 from kf_calib.sources.recording import opened
 
-Extra = TypeVar("Extra")
+Result = TypeVar("Result")
+
+_TRACED = 1000  # readings over which the memory of filterpy is traced
 
 
 @dataclass(frozen=True)
 class Way:
     """One way of estimating: wall seconds, peak memory in MB (numpy's and Python's), distance from the block engine.
 
+    Tracing memory makes many small steps several times slower, so it is traced in a run of its own; filterpy's over its
+    first thousand readings, since it keeps none of them.
     max_difference_sigma: largest |difference| of the twelve parameters in sigma; max_relative_variance: of diag P.
     """
 
@@ -49,34 +54,50 @@ class Comparison:
         return max(way.max_difference_sigma for way in self.ways.values())
 
 
-def compare(source: Source | str | PathLike[str], settings: Settings | None = None) -> Comparison:
-    """Run all three ways, each over a source (or the recording at a path) from its start, and measure them."""
-    recording = opened(source)
+def compare(
+    source: Source | str | PathLike[str],
+    settings: Settings | None = None,
+    on_progress: Callable[[float], None] | None = None,
+) -> Comparison:
+    """Run all three ways, each over a source (or the recording at a path) from its start, and measure them.
+
+    on_progress: how much of each way is done; it begins anew with each.
+    """
+    source = opened(source)
     settings = replace(settings or Settings(), engine="block")
-    result, block = _measured(lambda: (done := calibrate(recording, settings), done.estimate))
+    stage.say("block engine")
+    result, block_s = _timed(lambda: calibrate(source, settings, on_progress))
 
-    def batch() -> tuple[None, Estimate]:
-        samples = samples_of(Pass(recording, settings).rows(), result.carried)
+    def batch() -> Estimate:
         around = result.model.nominal_state()
-        return None, result.considering(*least_squares(samples, result.noise.weights, result.carried.state, around))
+        samples = samples_of(Pass(source, settings).rows(), result.carried)
+        return result.considering(*least_squares(samples, result.noise.weights, result.carried.state, around))
 
+    stage.say("filterpy, reading by reading")
+    filterpy, filterpy_s = _timed(lambda: filterpy_estimate(source, result, on_progress=on_progress))
+    stage.say("batch least squares")
+    least, batch_s = _timed(batch)
+    stage.say("memory of each")
     ways = {
-        "block": block,
-        "filterpy": _measured(lambda: (None, filterpy_estimate(recording, result)))[1],
-        "batch": _measured(batch)[1],
+        "block": Way(result.estimate, block_s, _peak_mb(lambda: calibrate(source, settings))),
+        "filterpy": Way(filterpy, filterpy_s, _peak_mb(lambda: filterpy_estimate(source, result, at_most=_TRACED))),
+        "batch": Way(least, batch_s, _peak_mb(batch)),
     }
-    ways = {name: _against(way, block.estimate) for name, way in ways.items()}
+    ways = {name: _against(way, result.estimate) for name, way in ways.items()}
     return Comparison(result, ways, tuple(_remarks(settings, result)))
 
 
-def _measured(run: Callable[[], tuple[Extra, Estimate]]) -> tuple[Extra, Way]:
-    tracemalloc.start()
+def _timed(run: Callable[[], Result]) -> tuple[Result, float]:
     begin = time.perf_counter()
-    extra, estimate = run()
-    wall_s = time.perf_counter() - begin
+    return run(), time.perf_counter() - begin
+
+
+def _peak_mb(run: Callable[[], object]) -> float:
+    tracemalloc.start()
+    run()
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    return extra, Way(estimate, wall_s, peak / 1e6)
+    return peak / 1e6
 
 
 def _against(way: Way, reference: Estimate) -> Way:

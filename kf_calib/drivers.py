@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kf_calib import stage
 from kf_calib.assessment import EQUAL
 from kf_calib.bench import Bench
 from kf_calib.effects import Effect, effect_named, walk_named
@@ -149,6 +150,7 @@ def families(fitted: Fit, known: Sequence[Effect] = ()) -> tuple[list[Family], f
         with contextlib.suppress(InputError):  # a jump so late, a decay so fast that the trial of a formula misses it
             effects += [effect_named(_named(text), bench) for text in texts]
             listed.append((driver, texts))
+    stage.say(f"trying {len(effects)} formulas")
     scanned = scan(fitted.carried, fitted.noise.judging, [*effects, *known])
     beside = scanned.candidates[len(effects) :]
     out, place = list[Family](), 0

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,7 +15,45 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: a process a 
 
 from kf_calib.cli import main
 
+_DRIVERS = {name: os.environ.get(name) for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES")}
+os.environ.update(dict.fromkeys(_DRIVERS, os.devnull))  # hidden: a test that draws must say so, with ``draws``
+
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "recordings"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    """A test that is marked ``draws`` has the machine's graphics driver, and is skipped where there is none."""
+    if item.get_closest_marker("draws") is None:
+        return (yield)
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in _DRIVERS.items():
+            patch.delenv(name) if value is None else patch.setenv(name, value)
+        if reason := _why_nothing_is_drawn():
+            pytest.skip(reason)
+        return (yield)
+
+
+@functools.cache
+def _why_nothing_is_drawn() -> str:
+    """What the viewer says for want of a graphics driver; empty where it draws."""
+    import rerun as rr
+
+    from kf_calib.views.screenshot import ScreenshotError, screenshot
+
+    with tempfile.TemporaryDirectory() as folder:
+        rrd = Path(folder, "empty.rrd")
+        with rr.RecordingStream("empty") as stream:
+            stream.save(rrd)
+            stream.log("nothing", rr.TextDocument(""), static=True)
+            stream.disconnect()
+        try:
+            screenshot(rrd, rrd.with_suffix(".png"), (64, 64))
+        except ScreenshotError as error:
+            if "graphics driver" in str(error):
+                return str(error)
+            raise
+    return ""
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from long_runs import slow
 from synthetic import Run
 
 from kf_calib.calibration import Calibration, calibrate
@@ -42,7 +43,7 @@ def damaged(content: bytes, rng: np.random.Generator, how: str) -> bytes:
     return content[:place] + bytes([content[place] ^ (1 << int(rng.integers(8)))]) + content[place + 1 :]
 
 
-@pytest.mark.parametrize("trials", [40, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("trials", [40, *slow(1000)])
 @pytest.mark.parametrize("how", ["truncated", "flipped"])
 def test_damage_is_told_or_harmless(whole: Path, tmp_path: Path, how: str, trials: int) -> None:
     expected, content, rng = outcome(whole), whole.read_bytes(), np.random.default_rng(5)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from long_runs import slow
 from synthetic import Run
 
 from kf_calib import assessment
@@ -33,10 +34,10 @@ HAND = Path(__file__).resolve().parents[2] / "shared" / "recordings" / "ferraris
 
 
 def run(*hidden: str, seed: int = 5, plan: list | None = None) -> Calibration:
-    """A calibration without the hidden effects in its model."""
+    """A calibration without the hidden effects in its model. A diagnosis takes as long as there are dwells."""
     base = Simulation(
         BENCH, GRADES["navigation"].sensors(seed), Noise(white_mps2=5e-5),
-        plan or spread_plan(24, dwell_s=8.0, seed=seed),
+        plan or spread_plan(16, dwell_s=8.0, seed=seed),
         sample_hz=50.0, angle_hz=20.0, slew_rate_degps=90.0, seed=seed,
         ambient=Ambient(swing_c=5.0, period_s=300.0, sigma_c=0.0),
     )  # fmt: skip
@@ -45,8 +46,10 @@ def run(*hidden: str, seed: int = 5, plan: list | None = None) -> Calibration:
 
 @pytest.mark.parametrize(
     "name",
-    ["second-order", "hysteresis", "encoder-harmonic-1:z", "thermal-scale", "axis-nonorthogonality:z", "settling",
-     "cross-coupling-ip", "scale-drift"],
+    [
+        "second-order", "encoder-harmonic-1:z", "thermal-scale", "settling",
+        *slow("hysteresis", "axis-nonorthogonality:z", "cross-coupling-ip", "scale-drift"),
+    ],
 )  # fmt: skip
 def test_a_hidden_effect_is_named(name: str) -> None:
     """Made by the nonlinear truth at 15 sigma: first name, and the error falls to its floor on what was held out."""
@@ -59,11 +62,11 @@ def test_a_hidden_effect_is_named(name: str) -> None:
 
 
 @pytest.mark.parametrize("case", [{}, {"phi": 0.9, "count": 500}, {"setting_deg": 0.01}])
-@pytest.mark.parametrize("runs", [8, pytest.param(15, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs", [4, *slow(15)])
 def test_nothing_is_found_in_noise(case: dict, runs: int) -> None:
-    """Of 15 runs at a level of 1 %, two or more alarms have a chance of 1 %."""
+    """Of 15 runs at a level of 1 %, two or more alarms have a chance of 1 %; of 4, one has 4 %."""
     tests = [assessed(calibrate(Run(seed=4000 + k, **{"dwells": 24, "count": 200, **case})).fit) for k in range(runs)]
-    assert sum(not each.consistent for each in tests) <= 1
+    assert sum(not each.consistent for each in tests) <= runs // 15
     assert np.median([min(each.p_values.values()) for each in tests]) > 0.2
 
 
@@ -71,7 +74,7 @@ def test_nothing_is_found_in_noise(case: dict, runs: int) -> None:
 def test_what_is_in_no_catalogue_is_unknown(name: str, driver: str) -> None:
     from kf_calib.views.diagnosis import description, diagnosis_object
 
-    found = diagnose(run(f"{name}=20sigma"))
+    found = diagnose(run(f"{name}=20sigma", plan=spread_plan(24, dwell_s=8.0, seed=5)))
     assert found.unknown and not found.missing
     shape = description(found)
     assert shape is not None and driver in shape.driver
@@ -84,7 +87,7 @@ def test_a_formula_that_explains_more_than_a_known_effect_speaks_against_it() ->
     """A fifth power looks like a third power to 0.96: named third-order, it would be a wrong name."""
     from kf_calib.views.diagnosis import description
 
-    found = diagnose(run("fifth-order=20sigma"))
+    found = diagnose(run("fifth-order=20sigma", plan=spread_plan(24, dwell_s=8.0, seed=5)))
     shape = description(found)
     assert found.unknown and shape is not None and shape.formula == "mine = a**5"
 
@@ -112,7 +115,7 @@ def test_scores_are_falls_of_chi_squared() -> None:
     np.testing.assert_allclose(found.candidates[0].sigma, after.estimate.effect_sigma, rtol=1e-3)
 
 
-@pytest.mark.parametrize("runs", [10, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs", [5, *slow(20)])
 def test_smallest_sizes_are_met(runs: int) -> None:
     """Power at the stated size, one coefficient hidden: about 0.9 of the runs."""
     sizes = {each.name: each.minimum for each in detectable(assessed(run().fit))}
@@ -146,7 +149,8 @@ def test_noise_rarely_puts_a_rival_so_far_ahead_that_the_truth_is_out() -> None:
 
 def test_command_line(tmp_path: Path) -> None:
     out = tmp_path / "run.mcap"
-    made = ["simulate", str(out), "--hide", "second-order=20sigma", "--dwell-s", "6", "--slew-degps", "90"]
+    made = ["simulate", str(out), "--hide", "second-order=20sigma", "--dwell-s", "6", "--slew-degps", "90",
+            "--orientations", "16"]  # fmt: skip
     assert CliRunner().invoke(cli, made).exit_code == 0
     printed = CliRunner().invoke(cli, ["diagnose", str(out), "--json"])
     content = json.loads(printed.stdout)

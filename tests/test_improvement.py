@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from long_runs import slow
 from scipy.stats import chi2
 from test_diagnosis import BENCH, run
 
@@ -60,7 +61,7 @@ def test_the_error_falls_to_the_noise(improved: Improvement) -> None:
     assert improved.removals[0].needed and not improved.steps[0].remarks
 
 
-@pytest.mark.parametrize("name", ["hysteresis", "encoder-harmonic-1:z", "axis-nonorthogonality:z"])
+@pytest.mark.parametrize("name", ["axis-nonorthogonality:z", *slow("hysteresis", "encoder-harmonic-1:z")])
 def test_other_kinds_of_effects(name: str) -> None:
     state = improve(run(f"{name}=15sigma"))
     assert [step.added for step in state.steps] == [name] and state.because == "consistent"
@@ -166,7 +167,7 @@ def test_dwells_left_out_are_still_where_others_came_from(quiet: Calibration) ->
 def test_the_honest_error_repeats_the_choice(second_order: Calibration, quiet: Calibration) -> None:
     checked = honest(second_order, folds=3)
     assert checked.chosen == {"second-order": 3} and 0.7 < checked.rms_mps2 / checked.expected_mps2 < 1.3
-    empty = honest(quiet, folds=6)
+    empty = honest(quiet, folds=4)
     assert empty.chosen == {} and 0.7 < empty.rms_mps2 / empty.expected_mps2 < 1.3
     assert quiet.held_out_rms_mps2 == pytest.approx(empty.rms_mps2, rel=0.15)
 
@@ -181,7 +182,7 @@ def test_honest_errors_are_those_of_orientations_left_out() -> None:
     assert checked.expected_mps2 == pytest.approx(cured.held_out_floor_mps2, rel=0.02)
 
 
-@pytest.mark.parametrize("runs", [4, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs", [2, *slow(20)])
 def test_sigmas_are_honest_after_improvement(runs: int) -> None:
     """NEES of the twelve over runs with a hidden effect: far outside its band before, inside after.
 
@@ -214,7 +215,8 @@ def test_sigmas_are_honest_after_improvement(runs: int) -> None:
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("improve") / "run.mcap"
-    words = ["simulate", str(out), "--hide", "second-order=20sigma", "--dwell-s", "6", "--slew-degps", "90"]
+    words = ["simulate", str(out), "--hide", "second-order=20sigma", "--dwell-s", "6", "--slew-degps", "90",
+             "--orientations", "16"]  # fmt: skip
     assert CliRunner().invoke(cli, words).exit_code == 0
     return out
 

@@ -93,7 +93,7 @@ def test_live_is_replay_to_the_bit_and_a_judgement_a_dwell() -> None:
 
 
 def test_a_missing_effect_is_told_while_the_run_goes_on_and_accepted_without_a_restart() -> None:
-    session = Session(bench("hysteresis=40sigma", orientations=14), auto=True)
+    session = Session(bench("hysteresis=40sigma", orientations=10), auto=True)
     found = judgements(session)
     alarmed = next(each for each in found if each.alarm)
     assert len(alarmed.result.visits) < 10 and "disagrees: accelerometer" in alarmed.verdict
@@ -102,7 +102,7 @@ def test_a_missing_effect_is_told_while_the_run_goes_on_and_accepted_without_a_r
     after = [each for each in found if each.result.model.effects]
     assert after and not after[0].final and all(each.consistent for each in after)
     assert after == found[-len(after) :], "once in, in all that follows"
-    equal(found[-1], Settings(effects=("hysteresis",)), bench("hysteresis=40sigma", orientations=14))
+    equal(found[-1], Settings(effects=("hysteresis",)), bench("hysteresis=40sigma", orientations=10))
 
 
 def test_accepting_by_hand_joins_the_model_at_once() -> None:
@@ -227,14 +227,14 @@ def test_memory_is_that_of_the_dwells() -> None:
 
 
 def test_screen_lines_and_objects_of_a_standing() -> None:
-    session = Session(bench("second-order=25sigma"), wanted={"theta1": 1e-6, "K1": 1e-9})
+    session = Session(bench("second-order=25sigma", orientations=8), wanted={"theta1": 1e-6, "K1": 1e-9})
     found = judgements(session)
     shown = plain(views.screen(session.standing, None, "sim://", hint="q: end"), width=80)
     for part in ("12 parameters", "reached", "disagrees: accelerometer", "next: gimbals at", "NIS/dof", "held out"):
         assert part in shown
     assert len(shown.splitlines()) <= 24
     told = views.line(found[-1])
-    assert told.startswith("dwell 12 to") and "worst sigma K1" in told and "\n" not in told
+    assert told.startswith("dwell 8 to") and "worst sigma K1" in told and "\n" not in told
     empty = plain(views.screen(Session(bench()).standing, None, "sim://"), width=80)
     assert "0 readings" in empty and len(empty.splitlines()) <= 24
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from long_runs import slow
 from scipy.signal import lfilter
 from scipy.stats import binom
 from test_effects import BENCH
@@ -49,17 +50,31 @@ def errors(result: Calibration, frequency_hz: float, size_sigma: float) -> list[
     return [(p.value - truth) / p.sigma for p, truth in zip(found, expected, strict=True)]
 
 
-@pytest.mark.parametrize("size_sigma", [1.0, 5.0])
 @pytest.mark.parametrize(
-    "frequency_hz, dwell_s", [(0.15, 6.0), (0.15, 40.0), (1.3, 6.0), (33.0, 6.0), (33.0, 40.0), (0.02, 40.0)]
+    "frequency_hz, dwell_s, size_sigma, dwells",
+    [
+        (0.15, 6.0, 5.0, 20),
+        (1.3, 6.0, 1.0, 20),
+        (33.0, 6.0, 1.0, 20),
+        (0.02, 40.0, 5.0, 12),
+        *slow(
+            *(
+                (*case, size_sigma, 30)
+                for case in [(0.15, 6.0), (0.15, 40.0), (1.3, 6.0), (33.0, 6.0), (33.0, 40.0), (0.02, 40.0)]
+                for size_sigma in (1.0, 5.0)
+            )
+        ),
+    ],
 )
-def test_frequency_and_amplitudes_are_found(frequency_hz: float, dwell_s: float, size_sigma: float) -> None:
-    result = calibrate(run(frequency_hz, size_sigma, dwell_s), WITH)
+def test_frequency_and_amplitudes_are_found(
+    frequency_hz: float, dwell_s: float, size_sigma: float, dwells: int
+) -> None:
+    result = calibrate(run(frequency_hz, size_sigma, dwell_s, dwells=dwells), WITH)
     assert np.abs(errors(result, frequency_hz, size_sigma)).max() < 4.0
     np.testing.assert_allclose(result.noise.effective_sigma_mps2, SIGMA, rtol=0.05)
 
 
-@pytest.mark.parametrize("runs, low, high", [(4, 0.8, 1.0), pytest.param(300, 0.92, 0.98, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs, low, high", [(3, 0.8, 1.0), *slow((300, 0.92, 0.98))])
 def test_intervals_cover(runs: int, low: float, high: float) -> None:
     ratios = np.array([errors(calibrate(run(33.0, 1.0, seed=50 + k), WITH), 33.0, 1.0) for k in range(runs)])
     share = float(np.mean(np.abs(ratios) < 1.96))
@@ -69,7 +84,7 @@ def test_intervals_cover(runs: int, low: float, high: float) -> None:
 
 
 def test_engines_and_batch_agree() -> None:
-    compared = compare(run(1.3, 2.0, dwells=10), WITH)
+    compared = compare(run(1.3, 2.0, dwells=8), WITH)
     assert compared.max_difference_sigma <= 1e-6
 
 
@@ -124,8 +139,11 @@ def noise_of(rng: np.random.Generator, kind: str, count: int) -> Floats:
 
 
 @pytest.mark.parametrize("kind, count, runs", [
-    ("white", 600, 100), ("common", 600, 100), ("coloured", 600, 100), ("flicker", 600, 200),
-    ("white", 200, 100), ("coloured", 4000, 40), ("flicker", 4000, 40),
+    ("white", 600, 30), ("common", 600, 30), ("coloured", 600, 30), ("flicker", 600, 30), ("coloured", 4000, 10),
+    *slow(
+        ("white", 600, 100), ("common", 600, 100), ("coloured", 600, 100), ("flicker", 600, 200),
+        ("white", 200, 100), ("coloured", 4000, 40), ("flicker", 4000, 40),
+    ),
 ])  # fmt: skip
 def test_noise_alone_has_no_line(kind: str, count: int, runs: int) -> None:
     """At 1 %, and 1.5 % on flicker, whose rise is followed less well; the bound is passed once in 200 times."""

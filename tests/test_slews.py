@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from long_runs import slow
 
 from kf_calib.bench import Bench, axes_of
 from kf_calib.calibration import Calibration, Pass, Settings, calibrate
@@ -60,7 +61,7 @@ def test_both_at_once_and_with_other_effects() -> None:
     assert (np.abs(value - truth) < 4.0 * sigma).all()
 
 
-@pytest.mark.parametrize("runs, low, high", [(4, 0.75, 1.0), pytest.param(300, 0.92, 0.98, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs, low, high", [(2, 0.75, 1.0), *slow((300, 0.92, 0.98))])
 @pytest.mark.parametrize("text, truth", [("latency=1ms", [1e-3]), (ARMS, ARMS_M)])
 def test_intervals_cover(text: str, truth: list[float], runs: int, low: float, high: float) -> None:
     """Coefficients over their sigmas, half the runs with noise of the encoders (which correlates a slew's readings)."""
@@ -75,7 +76,7 @@ def test_intervals_cover(text: str, truth: list[float], runs: int, low: float, h
 
 
 def test_engines_and_batch_agree() -> None:
-    compared = compare(run(["latency=1ms"], dwells=8, sample_hz=20.0), Settings(effects=("latency",)))
+    compared = compare(run(["latency=1ms"], dwells=6, sample_hz=10.0), Settings(effects=("latency",)))
     assert compared.result.carried.slews
     assert compared.max_difference_sigma <= 1e-6
     assert all(way.max_relative_variance <= 1e-8 for way in compared.ways.values())

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from long_runs import slow
 from scipy import stats
 from test_diagnosis_cases import BENCH, run
 
@@ -47,7 +48,7 @@ def test_a_walk_has_the_variance_on_the_shapes_that_is_expected() -> None:
 def test_what_shakes_a_platform_as_it_leaves_is_no_trend() -> None:
     """Motors shake it for a third of a second before angles tell: with two and a half times the noise of a reading."""
     ratios = list[float]()
-    for seed in range(12):
+    for seed in range(8):
         source = Simulation(
             BENCH, GRADES["mems"].sensors(seed), GRADES["mems"].noise, spread_plan(12, dwell_s=30.0, seed=seed),
             sample_hz=10.0, angle_hz=4.0, slew_rate_degps=5.0, seed=seed,
@@ -56,7 +57,7 @@ def test_what_shakes_a_platform_as_it_leaves_is_no_trend() -> None:
     assert np.mean(ratios) < 1.12  # 1.3 on the polynomials themselves
 
 
-@pytest.mark.parametrize("count", [24, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [24, *slow(200)])
 def test_of_white_noise_the_p_value_is_uniform(count: int) -> None:
     plan = spread_plan(12, dwell_s=6.0, seed=1)
     found = [found_in(run(seed=seed, plan=plan)) for seed in range(count)]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from long_runs import slow
 from scipy.stats import chi2, multivariate_normal
 from synthetic import Run
 
@@ -76,7 +77,7 @@ def test_the_likelihood_is_that_of_a_dense_covariance(held_s: float) -> None:
     means, state = result.carried.means, result.carried.state
     times = []
     for begin, end in means.ends_s:
-        times.append(begin + (end - begin) * (np.arange(2000) + 0.5) / 2000)
+        times.append(begin + (end - begin) * (np.arange(500) + 0.5) / 500)
     instants, kernel = np.concatenate(times), np.zeros((9, 9))
     for i in range(9):
         for j in range(9):
@@ -151,7 +152,7 @@ def dense(result: Calibration) -> Floats:
     return full
 
 
-@pytest.mark.parametrize("runs", [12, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs", [7, *slow(100)])
 def test_sigmas_of_a_walk_and_of_the_twelve_beside_it_are_honest(runs: int) -> None:
     """95 % intervals, the NEES of the twelve (biases at the end of the run), the run's own misfit."""
     ratios, nees, misfit = [], 0.0, 0

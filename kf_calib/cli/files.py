@@ -8,7 +8,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
 
-import rich_click as click
+import click
+import rich_click
 
 from kf_calib.cli.echo import echo
 from kf_calib.cli.failures import tell
@@ -26,7 +27,7 @@ class OutputFile(click.Path):
 
 def output_option(*names: str, **attributes: Any) -> Callable[[F], F]:
     """An option that names a file to write."""
-    return click.option(*names, type=OutputFile(), **attributes)
+    return rich_click.option(*names, type=OutputFile(), **attributes)
 
 
 def claimed(

@@ -262,10 +262,20 @@ def demo(folder: Path, as_json: bool) -> None:
 
     Files of an earlier demo there are replaced.
     """
+    from rich.console import Group
+    from rich.markup import escape
+
+    from kf_calib.calibration import calibrate
     from kf_calib.comparison import compare as run
     from kf_calib.sources.recording import Recording
     from kf_calib.sources.simulated import simulation
     from kf_calib.sources.simulator import truth_file
+    from kf_calib.views.console import comparison_table, summary
+    from kf_calib.views.json import compare_object, replay_object
+
+    def say(shown: Any) -> None:
+        if not as_json:
+            show(shown)
 
     folder.mkdir(parents=True, exist_ok=True)
     recording, rrd = folder / "demo.mcap", folder / "demo.rrd"
@@ -275,21 +285,18 @@ def demo(folder: Path, as_json: bool) -> None:
     with progress("recording a simulated run", as_json) as tick:
         made = _record(source, recording, True, tick)
         truth = source.write_truth(recording)
-    with progress("replaying and comparing", as_json):
-        compared = run(Recording(recording))
+    say(escape(f"Recorded a simulated bench run to {recording}: {made}.\n"))
+    with progress("replaying", as_json) as tick:
+        result = calibrate(Recording(recording), on_progress=tick)
+    say(summary(result))
+    with progress("comparing", as_json) as tick:
+        compared = run(Recording(recording), on_progress=tick)
+    say(Group("", comparison_table(compared)))
+    say(escape(f"\nTruth: {truth}."))
     if as_json:
-        from kf_calib.views.json import compare_object, replay_object
-
         files = {"recording": str(recording), "truth": str(truth), "view": str(rrd)}
-        print_json({**files, "replay": replay_object(compared.result), "compare": compare_object(compared)})
-    else:
-        from kf_calib.views.console import comparison_table, summary
-
-        echo(f"Recorded a simulated bench run to {recording}: {made}.\n")
-        show(summary(compared.result))
-        echo("")
-        show(comparison_table(compared))
-        echo(f"\nTruth: {truth}.")
-    with delivery(outputs, as_json) as deliver:
-        if deliver.keep(rrd, lambda path: save_view(compared.result, path)) and not as_json:
-            echo(f"View: {rrd} (open it with .venv/bin/rerun {rrd}).")
+        print_json({**files, "replay": replay_object(result), "compare": compare_object(compared)})
+    with delivery(outputs, as_json) as deliver, progress("saving the view", as_json):
+        kept = deliver.keep(rrd, lambda path: save_view(result, path))
+    if kept:
+        say(escape(f"View: {rrd} (open it with .venv/bin/rerun {rrd})."))

@@ -253,13 +253,29 @@ def show(renderable: Any) -> None:
 
 @contextlib.contextmanager
 def progress(text: str, quiet: bool = False) -> Iterator[Callable[[float], None]]:
-    """A progress bar on a terminal's stderr; nothing where stderr is piped."""
+    """What is being done, on a terminal's stderr; nothing where stderr is piped.
+
+    A bar where a fraction is told; while none is known, or all of it was read and the work goes on, the bar only
+    moves, beside the stage that the work is in.
+    """
     if quiet or not sys.stderr.isatty():
         yield lambda fraction: None
         return
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-    with Progress(console=Console(stderr=True), transient=True) as bars:
-        task = bars.add_task(text, total=1.0)
-        yield lambda fraction: bars.update(task, completed=fraction if fraction == fraction else 0.0)
+    from kf_calib import stage
+
+    columns = BarColumn(20), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False)
+    with Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bars:
+        bars.add_task(text, total=None)
+        (task,) = bars.tasks
+
+        def tick(fraction: float) -> None:  # a task whose total is reached would stand still from then on
+            task.completed, task.total = fraction, 1.0 if fraction < 1.0 else None
+
+        def say(now: str) -> None:
+            task.description = f"{text}: {now}"
+
+        with stage.listener(say):
+            yield tick

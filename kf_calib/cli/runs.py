@@ -96,8 +96,8 @@ def compare(recording: Path, as_json: bool, **options: Any) -> None:
     from kf_calib.comparison import compare as run
 
     source, settings = opened(recording, options)
-    with progress(f"comparing on {recording.name}", as_json):
-        compared = run(source, settings)
+    with progress(f"comparing on {recording.name}", as_json) as tick:
+        compared = run(source, settings, tick)
     if as_json:
         from kf_calib.views.json import compare_object
 
@@ -264,7 +264,10 @@ def improve(
             else:
                 state = improvement.improve(start, accept_first, keep)
         if interactive:
-            state = views.session(state, lambda text, usual: click.prompt(text, default=usual or None), show, keep)
+            state = views.session(
+                state, lambda text, usual: click.prompt(text, default=usual or None), show, keep,
+                lambda: progress("improving"),
+            )  # fmt: skip
         with progress("holding out orientations", as_json or not honest) as tick:
             checked = improvement.honest(start, on_fold=tick) if honest else None
         if as_json:

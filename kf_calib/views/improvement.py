@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -252,8 +253,12 @@ def session(
     ask: Callable[[str, str], str],
     show: Callable[[RenderableType], None],
     on_step: Callable[[Improvement], None],
+    busy: Callable[[], AbstractContextManager[object]] = nullcontext,
 ) -> Improvement:
-    """Ask what to do next until it is enough; ``ask`` takes a question and what an empty answer means."""
+    """Ask what to do next until it is enough; ``ask`` takes a question and what an empty answer means.
+
+    busy: entered while an answer is worked on.
+    """
     shown: Improvement | None = None
     while True:
         options = _options(state.found)
@@ -265,7 +270,8 @@ def session(
         if answer == "q":
             return replace(state, asked=True)
         try:
-            state = answered(state, answer, options)
+            with busy():
+                state = answered(state, answer, options)
             on_step(state)
         except InputError as error:
             show(Text(f"{error}", style="red"))
