@@ -36,10 +36,11 @@ def least_squares(
     design, readings = stacked[:, :-1], stacked[:, -1]
     scale = np.linalg.norm(design, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
-    left, singular, right = np.linalg.svd(design / scale, full_matrices=False)
+    left, upper = np.linalg.qr(design / scale)
+    rotated, singular, right = np.linalg.svd(upper)
     seen = singular > _SEEN * singular[0]
     inverse = (right[seen].T / singular[seen]) / scale[:, None]
-    solution = around + inverse @ (left[:, seen].T @ (readings - design @ around))
+    solution = around + inverse @ (rotated[:, seen].T @ (left.T @ (readings - design @ around)))
     return np.asarray(solution, float), np.asarray(inverse @ inverse.T, float)
 
 

@@ -30,8 +30,9 @@ from kf_calib.samples import Floats, Mask
 
 _FARTHEST = math.cos(math.radians(45.0))  # of an axis from nominal
 _GAIN = (0.5, 2.0)  # of a scale factor over nominal: beyond it is another unit or no accelerometer
-_DEAD = 0.05  # g: means of a channel that stay within it feel nothing, where the others show that the platform
-_TURNED = 1.0  # g: ... has turned
+_DEAD = 0.05  # g: means of a channel that stay within it feel nothing
+_TURNED = 1.0  # g: where gravity along the channel should have changed by more
+_CHANGED = 0.1  # g: where gravity should have changed by more, a reading that stays the same to its last digit is stuck
 _UNEXPLAINED = 0.05  # rms of what is left of the mean readings, g: beyond it the angles do not explain them
 _BETTER = 0.2  # of what is left: a change that mends leaves less than this share
 _SPREAD = 0.2  # least singular value of the directions over sqrt(D); 0.577 where they are spread evenly
@@ -111,7 +112,7 @@ def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
     """
     step = -(-len(dwells) // _MOST_DWELLS)
     means, stated = Means.of(dwells[::step]), Mounting.stated(bench)
-    _refuse_silent(means, bench)
+    _refuse_silent(means, stated)
     found = _affine(means, stated)
     if found is None and not _shows_all(means.readings / bench.gravity_mps2):
         return
@@ -155,24 +156,24 @@ def _nominal(bench: Bench) -> Floats:
     return paper.state_of(paper.nominal(bench.nominal)).reshape(3, 4)[:, :3]
 
 
-def _refuse_silent(means: Means, bench: Bench) -> None:
-    """Refuse where a channel hardly changes while the others feel the platform turn, or keeps one value to the end."""
+def _refuse_silent(means: Means, stated: Mounting) -> None:
+    """Refuse where a channel keeps one value, or hardly changes, although gravity along it should change by far."""
     readings, count = means.readings, len(means.readings)
-    ranges = np.ptp(readings, axis=0) / bench.gravity_mps2
+    expected = means.force(stated) @ _nominal(stated.bench).T
     same = np.abs(readings - readings[-1]) <= _STUCK * np.abs(readings[-1])
-    for i, channel in enumerate(map(abs, bench.channels)):
+    for i, channel in enumerate(map(abs, stated.bench.channels)):
         first = count - int(np.argmin(np.append(same[::-1, i], False)))
-        turned = np.ptp(readings[first:], axis=0).max(initial=0.0) / bench.gravity_mps2
-        if count - first >= 3 and turned > 0.1:
+        if count - first >= 3 and np.ptp(expected[first:, i]) > _CHANGED:
             since = f"from dwell {means.numbers[first]} on (at {means.middle_s[first]:.0f} s)" if first else "all along"
             raise BlunderError(
                 f"channel {channel} is stuck: {since} it reads {readings[-1, i]:.6g} m/s^2 in every orientation; check "
                 "its cable and converter, and evaluate what was recorded before."
             )
-        if ranges[i] < _DEAD and np.delete(ranges, i).min() > _TURNED:
+        spread_mps2 = float(np.ptp(readings[:, i]))
+        if spread_mps2 < _DEAD * stated.bench.gravity_mps2 and np.ptp(expected[:, i]) > _TURNED:
             raise BlunderError(
-                f"channel {channel} is dead: its mean stays within {np.ptp(readings[:, i]):.2g} m/s^2 in {count} "
-                "dwells while the others follow gravity; check that it is connected and on."
+                f"channel {channel} is dead: its mean stays within {spread_mps2:.2g} m/s^2 in {count} dwells in which "
+                "gravity along it should change by more than g; check that it is connected and on."
             )
 
 

@@ -7,6 +7,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from kf_calib import paper
+from kf_calib.bench import Bench, Vector
 from kf_calib.calibration import Calibration
 from kf_calib.views.rerun.names import BENCH_TIME, CHANNELS, GROUP_OF, GROUPS, LABELS, MICRO, ORIENTATION, path_of
 from kf_calib.views.rerun.platform import magnification
@@ -82,6 +83,13 @@ def _pose(result: Calibration) -> rrb.TimeSeriesView:
     return _series(["bench/pose/**"], name, rrb.Corner2D.RightTop)
 
 
+def eye(bench: Bench, position: Vector, target: Vector) -> rrb.EyeControls3D:
+    """A look at the platform from ``position`` to ``target``, both in a frame with y up, whatever axis is up."""
+    at_rest = np.zeros((1, len(bench.axes))) if bench.axes else np.array([[0.0, 0.0, 0.0, 1.0]])
+    place, goal, up = bench.to_platform(np.array([position, target, (0.0, 1.0, 0.0)]), at_rest)
+    return rrb.EyeControls3D(position=place, look_target=goal, eye_up=up)
+
+
 def _platform(result: Calibration) -> rrb.Spatial3DView:
     factor = magnification(result.estimate)
     ellipsoids = f" with 1σ ×{power(factor)}" if factor else ""
@@ -95,7 +103,7 @@ def _platform(result: Calibration) -> rrb.Spatial3DView:
         origin="platform",
         name=f"platform: E₁ E₂ E₃{ellipsoids}; up now and before",
         overrides={"platform/visited": rrb.VisibleTimeRanges(so_far)},
-        eye_controls=rrb.EyeControls3D(position=(1.8, 1.2, 2.2), look_target=(0.05, 0.18, 0.0), eye_up=(0, 1, 0)),
+        eye_controls=eye(result.bench, (1.8, 1.2, 2.2), (0.05, 0.18, 0.0)),
         line_grid=False,
     )
 
