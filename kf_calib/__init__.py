@@ -2,7 +2,7 @@
 
     import kf_calib
 
-    run = kf_calib.calibrate(kf_calib.open_recording("run.mcap"))
+    run = kf_calib.calibrate("run.mcap")        # or open_recording("bag", {"axes": "y z x"}), Settings(...)
     print(run)                                  # parameters, noise, verdict
     run.parameters["K1"].value, run.parameters["K1"].sigma
     print(kf_calib.diagnose(run).verdict)       # which physical effect is missing

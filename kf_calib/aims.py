@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib import paper
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, how_to_write
 from kf_calib.samples import Floats, Mask
 
 G = 9.80665
@@ -172,5 +172,7 @@ def _size(text: str, size: str, kind: str) -> float:
         value = math.nan
     if not 0.0 < value < math.inf:
         known = ", ".join(filter(None, units))
-        raise InputError(f"target {text!r} has no size above zero that fits: give a number in one of {known}.")
+        raise InputError(
+            f"target {text!r} has no size above zero that fits: give a number in one of {known}{how_to_write(size)}."
+        )
     return value

@@ -15,10 +15,16 @@ from kf_calib.model import dwell_map
 from kf_calib.noise import Noise
 from kf_calib.samples import Floats
 
+_SEEN = 1e-9  # a smaller singular value, beside the largest, is rounding
 
-def least_squares(samples: Iterable[Samples], noise: Noise, linearised_at: Floats) -> tuple[Floats, Floats]:
+
+def least_squares(
+    samples: Iterable[Samples], noise: Noise, linearised_at: Floats, around: Floats
+) -> tuple[Floats, Floats]:
     """State (p,) and covariance (p, p) of all samples; diffuse prior, no process noise.
 
+    Combinations of the state that the samples do not determine keep their value ``around``, and are not in the
+    covariance.
     Rows of a dwell have covariance V = I + B B^T after division by the white sigma, B the dwell's nuisance columns
     times their sigmas; V^(-1/2) = I - U (1 - (1 + s^2)^(-1/2)) U^T from the thin SVD of B.
     """
@@ -29,9 +35,12 @@ def least_squares(samples: Iterable[Samples], noise: Noise, linearised_at: Float
     stacked = np.concatenate(list(whitened))
     design, readings = stacked[:, :-1], stacked[:, -1]
     scale = np.linalg.norm(design, axis=0)
-    design = design / scale
-    solution = np.linalg.lstsq(design, readings, rcond=None)[0]
-    return solution / scale, np.linalg.inv(design.T @ design) / np.outer(scale, scale)
+    scale = np.where(scale > 0, scale, 1.0)
+    left, singular, right = np.linalg.svd(design / scale, full_matrices=False)
+    seen = singular > _SEEN * singular[0]
+    inverse = (right[seen].T / singular[seen]) / scale[:, None]
+    solution = around + inverse @ (left[:, seen].T @ (readings - design @ around))
+    return np.asarray(solution, float), np.asarray(inverse @ inverse.T, float)
 
 
 def _whitened(pieces: list[Samples], noise: Noise, linearised_at: Floats) -> Floats:

@@ -1,8 +1,10 @@
 """The bench: gimbal chain, Earth and gravity; platform angles in, specific force of the platform out.
 
 Frames (right-handed): n = North, Up, East; b = bench, n turned about the vertical by the azimuth;
-p = platform. ``C_bp = Rot(axis1, q1) Rot(axis2, q2) ...``, outer axis first, each gimbal turning about
-that axis of its parent; ``f_p = C_bp^T f_b``. All angles zero: y up, accelerometer 2 reads +g.
+u = the frame in which gimbal axes and sensors are named, b turned so that its axis ``up`` points up (u = b for y);
+p = platform. ``C_bp = C_bu Rot(axis1, q1) Rot(axis2, q2) ...``, outer axis first, each gimbal turning about
+that axis of its parent; ``f_p = C_bp^T f_b``. All angles zero: the axis ``up`` of the platform points up, by default y,
+and accelerometer 2 reads +g; with ``up`` z, as ROS has it, accelerometer 3 does.
 
 Reference ``base``: angles are relative to the bench, ``f_b = (0, g, 0)``. Reference ``inertial``: the platform is
 held in inertial space, angles are relative to the bench frame as it stood at the first sample, and gravity turns
@@ -20,7 +22,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kf_calib.errors import BenchError
+from kf_calib.errors import BenchError, how_to_write
 from kf_calib.samples import Floats, Times
 
 EARTH_RATE_RADPS = 7.292115e-5
@@ -30,10 +32,13 @@ FORMAT_VERSION = "1"
 Vector = tuple[float, float, float]
 _LETTERS: dict[str, Vector] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _FREE_TEXT = ("block_serial", "bench", "operator", "note")
+CHANNELS = (1, 2, 3)
+UP = ("y", "z", "x", "-y", "-z", "-x")
+"""Axes that can point up when all angles are zero."""
 _NUMBERS = (
     "gravity_mps2", "latitude_deg", "height_m", "azimuth_deg", "angle_sigma_deg", "scatter_sigma_mps2",
 )  # fmt: skip
-_KEYS = frozenset(("format_version", "axes", "reference", "nominal", *_NUMBERS, *_FREE_TEXT))
+_KEYS = frozenset(("format_version", "axes", "reference", "up", "channels", "nominal", *_NUMBERS, *_FREE_TEXT))
 
 
 def normal_gravity(latitude_deg: float, height_m: float = 0.0) -> float:
@@ -78,6 +83,21 @@ def _parse_axis(word: str) -> Vector:
     return (numbers[0] / length, numbers[1] / length, numbers[2] / length)
 
 
+def parse_channels(text: str) -> tuple[int, int, int]:
+    """``"1,-2,3"``: which channel of the recording each accelerometer is, with a minus where its sign is reversed."""
+    words = text.strip("[] ").replace(",", " ").split()
+    try:
+        first, second, third = (int(word) for word in words)
+    except ValueError:
+        first, second, third = 0, 0, 0
+    if sorted(map(abs, (first, second, third))) != [1, 2, 3]:
+        raise BenchError(
+            f"channels {text!r} name no order: give the channel of accelerometer 1, 2 and 3, each once, with a minus "
+            "where it is reversed, for example --channels 1,-2,3."
+        )
+    return first, second, third
+
+
 def _format_axis(axis: Vector) -> str:
     for letter, unit in _LETTERS.items():
         if axis == unit:
@@ -95,6 +115,8 @@ class Bench:
     angle_sigma_deg: repeatability of setting an orientation, 1 sigma; None: not known, to be estimated.
     scatter_sigma_mps2: scatter of each sensor from dwell to dwell, 1 sigma; None: not known, to be estimated.
     nominal: nominal parameters that differ from the paper's, in the units of the estimates (rad, 1, m/s^2).
+    up: the axis that points up when all angles are zero; the azimuth is that of x (of y where x is vertical).
+    channels: which channel of the recording accelerometers 1, 2, 3 are, negative where the sign is reversed.
     """
 
     axes: tuple[Vector, ...]
@@ -107,12 +129,19 @@ class Bench:
     scatter_sigma_mps2: float | None = None
     nominal: Mapping[str, float] = field(default_factory=dict[str, float])
     notes: Mapping[str, str] = field(default_factory=dict[str, str])
+    up: str = "y"
+    channels: tuple[int, int, int] = CHANNELS
 
     def __post_init__(self) -> None:
         if self.reference not in ("base", "inertial"):
             raise BenchError(
                 f"reference {self.reference!r} is not known: use base (angles relative to the bench) "
                 "or inertial (stabilised platform)."
+            )
+        if self.up not in UP:
+            raise BenchError(
+                f"up {self.up!r} is not known: give the axis that points up when all angles are zero, one of "
+                f"{', '.join(UP)}; --up z for sensors and angles as ROS names them."
             )
         if self.reference == "inertial" and self.latitude_deg is None:
             raise BenchError(
@@ -137,15 +166,12 @@ class Bench:
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str], has_angles: bool = True) -> Bench:
         """The bench from the strings of a metadata record (FORMAT.md), or from options of the same names."""
-        unknown = sorted(set(metadata) - _KEYS)
-        if unknown:
-            raise BenchError(f"bench key {unknown[0]!r} is not known: use one of {', '.join(sorted(_KEYS))}.")
+        numbers = numbers_of(metadata)
         version = metadata.get("format_version", FORMAT_VERSION)
         if version != FORMAT_VERSION:
             raise BenchError(
                 f"the recording has format_version {version!r}, this program reads {FORMAT_VERSION}: update kf_calib."
             )
-        numbers = {key: _number(key, metadata[key]) for key in _NUMBERS if metadata.get(key, "") != ""}
         if has_angles and not metadata.get("axes", "").strip():
             raise BenchError(
                 "the gimbal axes are not stated, so the angles cannot be used: give them outer to inner, "
@@ -162,6 +188,8 @@ class Bench:
             reference=metadata.get("reference", "base"),  # type: ignore[arg-type]  # __post_init__ refuses other words
             nominal=_nominal(metadata.get("nominal", "{}")),
             notes={key: metadata[key] for key in _FREE_TEXT if metadata.get(key)},
+            up=metadata.get("up", "y").strip().lower().removeprefix("+"),
+            channels=parse_channels(metadata.get("channels", "1,2,3")),
             **numbers,
         )
 
@@ -174,6 +202,8 @@ class Bench:
             "reference": self.reference,
             **{key: repr(float(value)) for key, value in numbers.items() if value is not None},
             **({"nominal": json.dumps(dict(self.nominal))} if self.nominal else {}),
+            **({"up": self.up} if self.up != "y" else {}),
+            **({"channels": ",".join(map(str, self.channels))} if self.channels != CHANNELS else {}),
             **self.notes,
         }
 
@@ -182,8 +212,17 @@ class Bench:
         columns = [self.to_platform(np.eye(3)[:, i], np.asarray(pose, float)) for i in range(3)]
         return np.stack(columns, axis=1)  # row i of C_bp is bench axis i seen in the platform
 
+    def readings(self, channels: Floats) -> Floats:
+        """Readings (n, 3) of accelerometers 1, 2, 3 from the channels (n, 3) of a recording."""
+        if self.channels == CHANNELS:
+            return channels
+        places = np.array(self.channels)
+        return channels[:, np.abs(places) - 1] * np.sign(places)
+
     def to_platform(self, vector: Floats, pose: Floats) -> Floats:
         """C_bp^T vector: a bench vector (3,) or (n, 3) seen in the platform at poses (n, k); returns (n, 3)."""
+        if self.up != "y":
+            vector = vector @ _frame_with_up(self.up).T
         if not self.axes:
             x, y, z, w = np.moveaxis(pose / np.linalg.norm(pose, axis=-1, keepdims=True), -1, 0)
             return _turn_by_quaternion(vector, np.stack([-x, -y, -z], axis=-1), w[..., None])
@@ -210,21 +249,41 @@ class Bench:
         return self.to_platform(up, np.asarray(pose, float))
 
 
+def numbers_of(metadata: Mapping[str, str]) -> dict[str, float]:
+    """The numbers among the keys of a bench; raises BenchError where one is none, or a key is not known."""
+    unknown = sorted(set(metadata) - _KEYS)
+    if unknown:
+        raise BenchError(f"bench key {unknown[0]!r} is not known: use one of {', '.join(sorted(_KEYS))}.")
+    return {key: _number(key, metadata[key]) for key in _NUMBERS if metadata.get(key, "") != ""}
+
+
 def _number(key: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise BenchError(f"bench key {key} is {text!r}, which is not a number.")
+        raise BenchError(f"bench key {key} is {text!r}, which is not a finite number{how_to_write(text)}.")
     return value
 
 
 def _nominal(text: str) -> dict[str, float]:
     try:
-        return {str(symbol): float(value) for symbol, value in json.loads(text).items()}
+        found = {str(symbol): float(value) for symbol, value in json.loads(text).items()}
     except (ValueError, TypeError, AttributeError):
         raise BenchError(f'bench key nominal is {text!r}: it must be a JSON object such as {{"theta1": 0}}.') from None
+    for symbol, value in found.items():
+        if not math.isfinite(value):
+            raise BenchError(f"bench key nominal has {symbol} = {value}, which is not a finite number.")
+    return found
+
+
+def _frame_with_up(up: str) -> Floats:
+    """C_ub (3, 3): bench vectors seen in the frame u whose axis ``up`` points up and whose x (y where x is vertical)
+    points where the bench's x does."""
+    vertical = np.array(_parse_axis(up))
+    level = np.array(_LETTERS["y" if up.endswith("x") else "x"])
+    return np.column_stack([level, vertical, np.cross(level, vertical)])  # the bench's x, y, z as seen in u
 
 
 def turn(vector: Floats, axis: Floats, angle_rad: Floats | float) -> Floats:

@@ -11,24 +11,28 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Literal
+from os import PathLike
+from typing import Literal, get_args
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from kf_calib import averaging, information, kalman, paper
+from kf_calib import averaging, blunders, information, kalman, paper
 from kf_calib.bench import Bench
 from kf_calib.dwells import Block, Segmenter, Tally, dwell_blocks
 from kf_calib.effects import of_the_users, remarks_of
-from kf_calib.errors import InputError, UnobservableError
+from kf_calib.errors import InputError, UnobservableError, check_number
 from kf_calib.fitting import WALK, Fit, fit
-from kf_calib.folding import Carried, DwellFactor, Folder, columns_of, lines_of, means_of, samples_of
-from kf_calib.held_out import held_out, orientations
+from kf_calib.folding import Carried, DwellFactor, Folder, columns_of, lines_of, means_of, samples_of, without
+from kf_calib.held_out import HeldOut, held_out
 from kf_calib.information import Step
+from kf_calib.likelihood import ENOUGH_DIRECTIONS, FEWEST, directions, freedom
 from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
 from kf_calib.noise import TOO_SHORT, Noise, considered, mean_covariances, steps
+from kf_calib.outlying import OutlyingDwell, outlying_dwells
 from kf_calib.readings import Readings, Watch
 from kf_calib.samples import Floats, Mask, Source
+from kf_calib.sources.recording import opened
 from kf_calib.stillness import Stillness
 from kf_calib.visibility import sights
 from kf_calib.walk import predicted, to_mean
@@ -44,11 +48,13 @@ Engine = Literal["block", "filterpy"]
 
 @dataclass(frozen=True)
 class Settings:
-    """How a run is evaluated.
+    """How a run is evaluated. Raises InputError where a value cannot be.
 
-    walk_mps2_per_sqrt_s: random walk of the biases (process noise), 0: none. effects: names of those in the model.
+    walk_mps2_per_sqrt_s: random walk of the biases (process noise), 0: none. effects: names of those in the model, or
+    the name of one.
     window_s: readings are averaged over windows of that length first; 0: only for effects that go with vibration, then
-    over windows of a second, or as long as the vibration needs that is seen.
+    over windows of a second, or as long as the vibration needs that is seen. left_out: numbers of dwells (from 1) that
+    are not used.
     """
 
     engine: Engine = "block"
@@ -56,8 +62,22 @@ class Settings:
     stillness: Stillness = field(default_factory=Stillness)
     gate_sigma: float | None = 6.0
     walk_mps2_per_sqrt_s: float = 0.0
-    effects: tuple[str, ...] = ()
+    effects: Sequence[str] = ()
     window_s: float = 0.0
+    left_out: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "effects", (self.effects,) if isinstance(self.effects, str) else tuple(self.effects))
+        if self.engine not in get_args(Engine):
+            raise InputError(f"engine {self.engine!r} is not known: use {' or '.join(get_args(Engine))}.")
+        if not isinstance(self.prior, Prior):
+            raise InputError(f'prior is {self.prior!r}: give a Prior, for example kf_calib.model.PRIORS["navigation"].')
+        if not isinstance(self.stillness, Stillness):
+            raise InputError(f"stillness is {self.stillness!r}: give a kf_calib.stillness.Stillness.")
+        if self.gate_sigma is not None:
+            check_number("gate_sigma (--gate-sigma)", self.gate_sigma, 3.0)
+        check_number("walk_mps2_per_sqrt_s (--bias-walk)", self.walk_mps2_per_sqrt_s)
+        check_number("window_s", self.window_s)
 
 
 @dataclass(frozen=True)
@@ -108,6 +128,11 @@ class Estimate:
     @cached_property
     def _lost(self) -> Floats:
         return self.undetermined / np.linalg.norm(self.undetermined, axis=0)
+
+    @cached_property
+    def determined(self) -> Mask:
+        """Which numbers of the state the orientations determine, (p,) bool."""
+        return np.asarray(np.linalg.norm(self._lost, axis=1) < 1e-9)
 
     @cached_property
     def sigma(self) -> Floats:
@@ -176,14 +201,25 @@ class Calibration:
     estimate: Estimate
     consistency: Consistency
     residual_rms_mps2: float
-    held_out_rms_mps2: float | None
-    held_out_floor_mps2: float | None
+    held_out: HeldOut | None
     tally: Tally
     warnings: tuple[str, ...]
     reread: Callable[..., Calibration] | None = field(default=None, repr=False, compare=False)
     """The same source evaluated anew: for models that need its readings folded otherwise."""
     readings: Readings = field(default_factory=Readings)
     """What the readings themselves show, whatever the model."""
+    outlying: tuple[OutlyingDwell, ...] = ()
+    """The dwell that alone does not fit, or those of which any one could be it."""
+
+    @property
+    def held_out_rms_mps2(self) -> float | None:
+        """Rms error of the mean readings of orientations that were left out."""
+        return None if self.held_out is None else self.held_out.rms_mps2
+
+    @property
+    def held_out_floor_mps2(self) -> float | None:
+        """What noise alone would give."""
+        return None if self.held_out is None else self.held_out.floor_mps2
 
     @property
     def noise(self) -> Noise:
@@ -231,6 +267,11 @@ class Calibration:
             for (symbol, value, sigma, expected, unit), own in zip(found, shown, strict=True)
         }
 
+    @property
+    def residuals_mps2(self) -> Floats:
+        """Mean readings of the dwells less the final estimate, (D, 3)."""
+        return np.array([visit.residual_mps2 for visit in self.visits])
+
     def considering(self, state: Floats, covariance: Floats) -> Estimate:
         """Another engine's state and covariance, the latter enlarged by what is considered only."""
         extra = considered(self.noise, self.carried.means, self.carried.state).sum(axis=0) + self.fit.considered
@@ -245,7 +286,7 @@ class Calibration:
         return f"<Calibration: {self.model.sum}, {len(self.visits)} dwells, p {format_p(self.consistency.p_value)}>"
 
     def trace(self) -> Iterator[tuple[float, int, Estimate]]:
-        """(elapsed_s, dwell index, estimate) within and after every dwell: after a second, two, four ..."""
+        """(elapsed_s, number of the dwell, estimate) within and after every dwell: after a second, two, four ..."""
         model, state, around = self.model, self.carried.state, self.model.nominal_state()
         factor = information.start(self.settings.prior, model)
         extra = np.zeros((model.count, model.count))
@@ -259,7 +300,7 @@ class Calibration:
                 walked = np.array([pause, steps([part], self.noise)[0, 1]])
                 factor = information.update(before, rows, walked).factor
                 extra = extra_before + considered(self.noise, means_of([part], own), state)[0]
-                yield part.end_s, index, _estimate(factor, around, extra)
+                yield part.end_s, dwell.number, _estimate(factor, around, extra)
             if len(self.fit.following[index]):
                 factor = information.update(factor, self.fit.following[index]).factor
 
@@ -316,26 +357,31 @@ class Pass:
             self.add(rows)
             if on_progress is not None:
                 on_progress(self.source.fraction)
-        return usable(self.folder.dwells)
+        return self.dwells
 
-
-def usable(dwells: list[DwellFactor]) -> list[DwellFactor]:
-    """Dwells of at least 8 readings: fewer cannot show their own noise."""
-    return [dwell for dwell in dwells if dwell.count >= 8]
+    @property
+    def dwells(self) -> list[DwellFactor]:
+        """Those folded so far that are used: of at least 8 readings, fewer cannot show their own noise, and not left
+        out by the settings."""
+        left_out = self.settings.left_out
+        if not left_out:
+            return [dwell for dwell in self.folder.dwells if dwell.count >= 8]
+        unused = {k for k, each in enumerate(self.folder.dwells) if each.count < 8 or each.number in left_out}
+        return without(self.folder.dwells, unused)
 
 
 def calibrate(
-    source: Source,
+    source: Source | str | PathLike[str],
     settings: Settings | None = None,
     on_progress: Callable[[float], None] | None = None,
     plain: Fit | None = None,
 ) -> Calibration:
-    """Evaluate a source: fold its dwells, model the noise, run the filter, judge the misfit.
+    """Evaluate a source (or the recording at a path): fold dwells, model the noise, run the filter, judge the misfit.
 
     plain: the fit of the same model to the dwells as they are, which is known to need them folded on a carrier.
     Raises InputError where the source holds nothing usable, UnobservableError where one orientation was visited only.
     """
-    settings = settings or Settings()
+    source, settings = opened(source), settings or Settings()
     with threadpool_limits(1, user_api="blas"):  # small decompositions: with threads they take three times as long
         if Model.of(source.bench, settings.effects).averages and not settings.window_s:
             settings = replace(settings, window_s=_window_s(source, settings))
@@ -348,7 +394,7 @@ def calibrate(
 def _window_s(source: Source, settings: Settings) -> float:
     """Length of the windows that average the vibration in a source away: from a pass of its own."""
     plain = Pass(source, replace(settings, effects=()))
-    return averaging.window_s(lines_of(usable(plain.fold())))
+    return averaging.window_s(lines_of(plain.fold()))
 
 
 def concluded(
@@ -363,7 +409,7 @@ def concluded(
     plain: the pass has not begun, since its fit is known, and does not do.
     """
     settings, bench = passed.settings, passed.source.bench
-    dwells = usable(passed.folder.dwells) if plain is None else plain.dwells
+    dwells = passed.dwells if plain is None else plain.dwells
     if plain is None:
         refuse_unusable(dwells, passed.tally, bench)
     if again is not None and Model.of(bench, settings.effects).oscillates:
@@ -380,11 +426,21 @@ def concluded(
 
 def told(result: Calibration, passed: Pass) -> Calibration:
     """The result with what its pass counted and saw, and a sentence on each thing that a user must know."""
+    outlying = outlying_dwells(result, lambda some: evaluated(_fit_again(result, some), result.settings))
     own = [effect for effect in result.model.effects if of_the_users(effect)]
     notes = [f"{sight}." for sight in sights(result.fit, own)]
     readings = passed.watch.judged(result.fit.dwells, result.noise)
-    said = [*passed.source.warnings, *passed.tally.sentences(), *readings.warnings, *result.warnings, *notes]
-    return replace(result, tally=passed.tally, readings=readings, warnings=tuple(said))
+    found = [" Or ".join(map(str, outlying))] if outlying else []
+    misfit = _misfit(result.consistency, result.residuals_mps2, result.bench, result.noise)
+    usual = [each for each in result.warnings if each != misfit or not (outlying or readings.saturation)]
+    counted = [*passed.tally.sentences(), *passed.tally.unmet(passed.settings.stillness)]
+    said = [*passed.source.warnings, *counted, *readings.warnings, *found, *usual, *notes]
+    return replace(result, tally=passed.tally, readings=readings, warnings=tuple(said), outlying=outlying)
+
+
+def _fit_again(result: Calibration, dwells: list[DwellFactor]) -> Fit:
+    """The same model fitted to some of the dwells."""
+    return fit(dwells, result.model, result.settings.walk_mps2_per_sqrt_s, result.carried.slews)
 
 
 def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
@@ -481,10 +537,9 @@ def evaluated(fitted: Fit, settings: Settings) -> Calibration:
     final = _estimate(steps[-1].factor, model.nominal_state(), extra.sum(axis=0) + fitted.considered)
     residuals = carried.means.readings - carried.means.design @ final.state
     visits = _visits(fitted, steps, residuals, extra, settings)
-    left_out, floor = held_out(fitted)
     judged = consistency(fitted)
     return Calibration(
-        model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), left_out, floor,
+        model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), held_out(fitted),
         Tally(), tuple(_remarks(carried, noise, final, judged, residuals)),
     )  # fmt: skip
 
@@ -524,6 +579,7 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
         )
     level = float(np.median([np.linalg.norm(dwell.means[4:]) for dwell in dwells])) / bench.gravity_mps2
     if 0.5 <= level <= 2.0:
+        blunders.refuse(dwells, bench)
         return
     units = {"g": 1 / 9.80665, "mg": 1e3 / 9.80665, "ug": 1e6 / 9.80665}
     measured = level * bench.gravity_mps2
@@ -598,6 +654,41 @@ def format_p(p_value: float | None) -> str:
     return "= -" if p_value is None else "< 1e-300" if p_value < 1e-300 else f"= {p_value:.2g}"
 
 
+def _misfit(judged: Consistency, residuals: Floats, bench: Bench, noise: Noise) -> str:
+    """What may be the matter where the dwells do not fit the model, from residuals (D, 3); '' where they fit."""
+    rms = float(np.sqrt(np.mean(residuals**2)))
+    if rms > 0.03 * bench.gravity_mps2:
+        return (
+            f"the angles do not explain the readings (residual {rms:.2g} m/s^2 rms between dwells): check the order "
+            "and sign of the axes, the unit of the angles, and which channel is which."
+        )
+    if judged.consistent is False:
+        return (
+            "the dwells scatter about the model by more than the noise: an effect is missing in the model, or "
+            f"{_beyond_noise(noise)}."
+        )
+    return ""
+
+
+def unstated(noise: Noise) -> list[str]:
+    """Bench keys of the noise from dwell to dwell that the recording does not state."""
+    known = {"angle_sigma_deg": noise.setting_stated, "scatter_sigma_mps2": noise.scatter_stated}
+    return [key for key, stated in known.items() if not stated]
+
+
+def beyond_stated(noise: Noise, bench: Bench) -> bool:
+    """Whether the setting error holds more than is stated: what the angles' own noise leaves uncertain of a pose."""
+    return bench.angle_sigma_deg is not None and np.degrees(noise.setting_rad) > 1.1 * bench.angle_sigma_deg
+
+
+def _beyond_noise(noise: Noise) -> str:
+    """What dwells may scatter by beside an effect."""
+    keys = " and ".join(unstated(noise))
+    if keys:
+        return f"there is noise from dwell to dwell, which was not stated ({keys})"
+    return "there is more noise from dwell to dwell than is stated (angle_sigma_deg, scatter_sigma_mps2)"
+
+
 def _remarks(
     carried: Carried, noise: Noise, estimate: Estimate, judged: Consistency, residuals: Floats
 ) -> Iterator[str]:
@@ -622,17 +713,13 @@ def _remarks(
             f"{len(dwells)} dwell{'s leave' if len(dwells) > 1 else ' leaves'} nothing over to judge the model by: "
             "visit at least five spread orientations."
         )
-    rms = float(np.sqrt(np.mean(residuals**2)))
-    if rms > 0.03 * model.bench.gravity_mps2:
-        yield (
-            f"the angles do not explain the readings (residual {rms:.2g} m/s^2 rms between dwells): check the order "
-            "and sign of the axes, the unit of the angles, and which channel is which."
-        )
-    elif judged.consistent is False:
-        yield (
-            f"the dwells scatter about the model by more than the noise (p {format_p(judged.p_value)}): an effect is "
-            "missing in the model, or noise from dwell to dwell was not stated (angle_sigma_deg, scatter_sigma_mps2)."
-        )
+    if misfit := _misfit(judged, residuals, model.bench, noise):
+        yield misfit
+    scales, expected = estimate.parameters[2::4], paper.nominal(model.bench.nominal)[2::4]
+    if not estimate.unseen[2::4].any() and (
+        common := blunders.common_scale(scales / expected, estimate.sigma[2::4] / np.abs(expected), model.bench)
+    ):
+        yield common
     windows = averaging.inflation() if dwells[0].averaged else 1.0
     if noise.inflation.max() > 1.5 * windows:
         kappa = ", ".join(f"{value / windows:.3g}" for value in noise.inflation)
@@ -641,13 +728,20 @@ def _remarks(
         slow = "; dwells are too short to tell how slow it is: stay longer in each" if short else ""
         yield f"the noise within a dwell is correlated: sigmas allow for it by inflating its variance by {kappa}{slow}."
     if not noise.checked and noise.scatter_mps2.any() and not noise.scatter_stated:
+        known = directions(carried.means.force_mps2)
         yield (
-            f"{len(orientations(dwells))} orientations cannot tell a setting error of the angles from scatter of the "
-            f"sensors: dwells are weighted alike and their whole misfit ({noise.scatter_mps2[0]:.2g} m/s^2) counts in "
-            "every sigma; at least 12 spread orientations would tell."
+            f"these orientations have gravity in {known} different direction{'s' * (known != 1)}, which cannot tell a "
+            "setting error of the angles from scatter of the sensors: dwells are weighted alike and their whole misfit "
+            f"({noise.scatter_mps2[0]:.2g} m/s^2) counts in every sigma; {ENOUGH_DIRECTIONS} directions, spread, would "
+            "tell."
+        )
+    if unstated(noise) and freedom(carried.means) < FEWEST:
+        yield (
+            f"{len(dwells)} dwell{'s are' if len(dwells) > 1 else ' is'} too few to estimate what was not stated "
+            f"({' and '.join(unstated(noise))}): it is taken as zero, and where it is not, sigmas are too small."
         )
     stated_deg = model.bench.angle_sigma_deg
-    if stated_deg is not None and np.degrees(noise.setting_rad) > 1.1 * stated_deg:
+    if stated_deg is not None and beyond_stated(noise, model.bench):
         yield (
             f"the angles' own noise leaves {np.degrees(noise.setting_rad):.2g} deg uncertain of a pose, with the "
             f"{stated_deg:g} deg stated for its setting: that is what dwells are weighted by."

@@ -10,6 +10,7 @@ import time
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from os import PathLike
 from typing import TypeVar
 
 import numpy as np
@@ -18,6 +19,7 @@ from kf_calib.batch import least_squares
 from kf_calib.calibration import Calibration, Estimate, Pass, Settings, calibrate, filterpy_estimate
 from kf_calib.folding import samples_of
 from kf_calib.samples import Source
+from kf_calib.sources.recording import opened
 
 Extra = TypeVar("Extra")
 
@@ -47,18 +49,20 @@ class Comparison:
         return max(way.max_difference_sigma for way in self.ways.values())
 
 
-def compare(source: Source, settings: Settings | None = None) -> Comparison:
-    """Run all three ways, each over the source from its start, and measure them."""
+def compare(source: Source | str | PathLike[str], settings: Settings | None = None) -> Comparison:
+    """Run all three ways, each over a source (or the recording at a path) from its start, and measure them."""
+    recording = opened(source)
     settings = replace(settings or Settings(), engine="block")
-    result, block = _measured(lambda: (done := calibrate(source, settings), done.estimate))
+    result, block = _measured(lambda: (done := calibrate(recording, settings), done.estimate))
 
     def batch() -> tuple[None, Estimate]:
-        samples = samples_of(Pass(source, settings).rows(), result.carried)
-        return None, result.considering(*least_squares(samples, result.noise.weights, result.carried.state))
+        samples = samples_of(Pass(recording, settings).rows(), result.carried)
+        around = result.model.nominal_state()
+        return None, result.considering(*least_squares(samples, result.noise.weights, result.carried.state, around))
 
     ways = {
         "block": block,
-        "filterpy": _measured(lambda: (None, filterpy_estimate(source, result)))[1],
+        "filterpy": _measured(lambda: (None, filterpy_estimate(recording, result)))[1],
         "batch": _measured(batch)[1],
     }
     ways = {name: _against(way, block.estimate) for name, way in ways.items()}
@@ -80,8 +84,8 @@ def _against(way: Way, reference: Estimate) -> Way:
     ones = np.concatenate([way.estimate.parameters, way.estimate.effects])
     others = np.concatenate([reference.parameters, reference.effects])
     sigma = np.concatenate([reference.sigma, reference.effect_sigma])
-    seen = np.isfinite(sigma)
-    variance = np.diag(way.estimate.covariance)[seen] / np.diag(reference.covariance)[seen]
+    seen, known = np.isfinite(sigma), reference.determined
+    variance = np.diag(way.estimate.covariance)[known] / np.diag(reference.covariance)[known]
     return replace(
         way,
         max_difference_sigma=float((np.abs(ones - others)[seen] / sigma[seen]).max(initial=0.0)),

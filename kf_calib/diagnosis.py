@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -18,7 +19,7 @@ from kf_calib import advice as advise
 from kf_calib import averaging
 from kf_calib.advice import Advice
 from kf_calib.assessment import EQUAL, LEVEL, SHARE, Test, assessed, price, run_level, threshold
-from kf_calib.calibration import Calibration, Parameter, format_p, refitted
+from kf_calib.calibration import Calibration, Parameter, calibrate, format_p, refitted
 from kf_calib.drivers import JUMP, Family, families, roughly
 from kf_calib.effects import walk_named
 from kf_calib.fitting import WALK, behind_within
@@ -37,7 +38,7 @@ from kf_calib.pairs import (
     pairs_of,
     paths_beside,
 )
-from kf_calib.samples import Floats
+from kf_calib.samples import Floats, Source
 from kf_calib.scan import scan
 from kf_calib.scattering import (
     as_if_stated,
@@ -116,8 +117,7 @@ class Diagnosis:
         """Residuals of the dwells (D, 3) over the sigma of their means."""
         carried = self.before.carried
         spread = mean_covariances(self.before.noise.judging, carried.means, carried.state)
-        residuals = np.array([visit.residual_mps2 for visit in self.before.visits])
-        return residuals / np.sqrt(np.einsum("dii->di", spread))
+        return self.before.residuals_mps2 / np.sqrt(np.einsum("dii->di", spread))
 
     def refit_with(self, name: str) -> Calibration:
         """The run with this effect, too: of a suspect it is there already."""
@@ -125,13 +125,19 @@ class Diagnosis:
         return next(own, None) or with_effects(self.before, (name,))
 
 
-def diagnose(before: Calibration) -> Diagnosis:
-    """What is missing in the model of a calibration, from its dwell factors alone."""
+def diagnose(run: Calibration | Source | str | PathLike[str]) -> Diagnosis:
+    """What is missing in the model of a calibration, from its dwell factors alone; a recording is calibrated first."""
+    before = run if isinstance(run, Calibration) else calibrate(run)
     with threadpool_limits(1, user_api="blas"):  # small decompositions
         return _diagnosed(before)
 
 
 def _diagnosed(before: Calibration) -> Diagnosis:
+    if before.outlying:  # a dwell that is wrong is no effect, and looks like many
+        test = assessed(before.fit)
+        said = " Or ".join(map(str, before.outlying))
+        verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {said}"
+        return Diagnosis(before, test, (), (), test.consistent is False, (), {}, None, verdict)
     test = _without_vibration(before, assessed(before.fit))
     found = _explained(before, test)
     if found.unknown and test.without_lines:  # of one phase all along and not of one amplitude

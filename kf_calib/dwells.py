@@ -17,7 +17,7 @@ from enum import Enum
 
 import numpy as np
 
-from kf_calib.bench import Bench, interpolate_pose, mean_pose, unwrap_pose
+from kf_calib.bench import Bench, interpolate_pose, mean_pose, pose_distance, unwrap_pose
 from kf_calib.errors import InputError
 from kf_calib.samples import Batch, Floats, Mask, Source, Stream, Times
 from kf_calib.slews import Curve
@@ -32,6 +32,7 @@ _LEAP_NS = 10 * _SECOND_NS  # a stamp this far ahead, with the next one behind i
 _SLEW_READINGS = 8  # of a slew, at least
 _REST_NS = 2 * _SECOND_NS  # a dwell that readings alone tell of, between angles that differ, lasts at least
 _PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
+_TURNING_DEG = 1.0  # in a block: a platform that only creeps stays below
 _SURE = 3  # messages: of fewer the noise of an encoder cannot be taken
 
 
@@ -39,6 +40,7 @@ _SURE = 3  # messages: of fewer the noise of an encoder cannot be taken
 class Block:
     """Up to 4000 consecutive readings of one dwell, which began at ``arrival_s``, or of the slew that ended it.
 
+    dwell: its number, counted from 1.
     arrival_s: as the angles tell it; felt_s: as the readings do, from which on they settle (None: not known better).
     elapsed_s (n,) since the first sample of the recording; accel_mps2 (n, 3); pose (1, k): the mean of the angle
     messages while the platform stands still, or (n, k) where it creeps; temperature_c (n,), NaN where not measured.
@@ -59,13 +61,17 @@ class Block:
     felt_s: float | None = None
     pose_sigma_rad: float = 0.0
     """What the noise of the angles leaves uncertain of the pose, 1 sigma."""
+    turns: tuple[int, ...] = ()
+    """Whole turns of each gimbal by which ``pose`` goes beyond the angles as they were recorded; () of quaternions."""
 
 
 @dataclass
 class Tally:
     """What became of every sample that was read; ``sentences`` says what a user should know of it.
 
-    slewing: used though the platform moved; moving: not used because it did.
+    slewing: used though the platform moved; moving: not used because it did. short_dwells: those too short for the
+    whole margin after their arrival, least_settling_s: what the shortest had. turned_deg: how far the platform turned,
+    at most, in a block that counts as still.
     """
 
     read: int = 0
@@ -82,6 +88,9 @@ class Tally:
     poses_dropped: int = 0
     gated: int = 0
     first_backward_s: float | None = None
+    short_dwells: int = 0
+    least_settling_s: float = math.inf
+    turned_deg: float = 0.0
 
     def sentences(self) -> list[str]:
         backward_s = self.first_backward_s or 0.0
@@ -95,6 +104,22 @@ class Tally:
             "gated": "outlying readings (innovation gate), rejected: {}; --no-gate keeps them.",
         }
         return [text.format(getattr(self, key)) for key, text in said.items() if getattr(self, key)]
+
+    def unmet(self, stillness: Stillness) -> list[str]:
+        """What was asked for and could not be done, one sentence each."""
+        said, one = list[str](), self.short_dwells == 1
+        if self.short_dwells:
+            said.append(
+                f"{self.short_dwells} dwell{' is' if one else 's are'} too short to leave out {stillness.settle_s:g} s "
+                f"after {'its' if one else 'each'} arrival (--settle-s): a third of {'it' if one else 'each'} was left "
+                f"out, {'' if one else 'of the shortest '}{self.least_settling_s:.3g} s."
+            )
+        if self.turned_deg > _TURNING_DEG:
+            said.append(
+                f"the platform turns by {self.turned_deg:.3g} deg in what counts as standing still (--still-deg "
+                f"{stillness.tolerance_deg:g}): where that is a slew, lower --still-deg."
+            )
+        return said
 
 
 class _Order:
@@ -158,6 +183,7 @@ class _Dwell:
     felt_ns: the arrival as the readings tell it; what settles counts from there.
     settling_ns: what is left out after the arrival; None while the dwell may still be too short for the whole margin.
     pose (1, k): where the platform stands, from the messages of the dwell's first block; pose_sigma_rad: of these.
+    turns: by which its poses go beyond the angles as they were recorded.
     """
 
     number: int
@@ -167,6 +193,7 @@ class _Dwell:
     settling_ns: int | None
     pose: Floats | None = None
     pose_sigma_rad: float = 0.0
+    turns: tuple[int, ...] | None = None
 
 
 @dataclass
@@ -188,9 +215,10 @@ class Segmenter:
                 "/platform/angles, or leave out the effects that show in slews only."
             )
         self.first_ns: int | None = None
-        self.dwell_count = 0
+        self.dwell_count = 0  # so many have begun; that is also the number of the latest
         self._accel = Stream.empty(3)
         self._pose = Stream.empty(self.bench.pose_width)
+        self._turns = np.empty((0, len(self.bench.axes)))  # by which each pose goes beyond what was recorded
         self._temperature = Stream.empty(1)
         self._orders = (_Order(), _Order(), _Order())
         self._decided_ns: int | None = None  # intervals of poses before this stamp have been judged
@@ -233,8 +261,9 @@ class Segmenter:
 
     def _take(self, batch: Batch, counted: bool = False) -> None:
         accel, pose = batch.accel, batch.pose
-        if not counted:
+        if not counted:  # what is held back comes a second time
             self.tally.read += len(accel)
+            accel = Stream(accel.time_ns, self.bench.readings(accel.values))
         if len(accel):
             finite = np.asarray(np.isfinite(accel.values).all(axis=1)) if not np.isfinite(accel.values).all() else None
             if finite is not None:
@@ -250,7 +279,10 @@ class Segmenter:
             self.tally.poses += len(pose)
             self.tally.poses_dropped += int((~sound).sum()) + counts.repeated + counts.backward + counts.leaping
             previous = self._pose.values[-1:] if len(self._pose) else None
-            self._pose += Stream(pose.time_ns, unwrap_pose(pose.values, not self.bench.axes, previous))
+            continuous = unwrap_pose(pose.values, not self.bench.axes, previous)
+            self._pose += Stream(pose.time_ns, continuous)
+            if self.bench.axes:
+                self._turns = np.concatenate([self._turns, np.rint((continuous - pose.values) / (2.0 * np.pi))])
         if len(batch.temperature):
             warm = batch.temperature
             self._temperature += self._orders[2](warm[np.isfinite(warm.values[:, 0])])
@@ -269,8 +301,8 @@ class Segmenter:
                 yield from self._slew(stamp)
                 self._discard(stamp)
                 self.dwell_count += 1
-                number, settling_ns = self.dwell_count - 1, None if settles else 0
-                self._dwell = _Dwell(number, stamp, felt_ns, self._next_pose_ns(stamp), settling_ns)
+                settling_ns = None if settles else 0
+                self._dwell = _Dwell(self.dwell_count, stamp, felt_ns, self._next_pose_ns(stamp), settling_ns)
             else:
                 lead_ns = min(self.stillness.lead_ns, (stamp - self._dwell.arrival_ns) // 10) if self._dwell else 0
                 yield from self._emit(stamp - lead_ns, closing=True)
@@ -409,7 +441,7 @@ class Segmenter:
         for part in np.array_split(np.arange(count), -(-count // BLOCK_SAMPLES)):
             own = elapsed_s[part]
             yield Block(
-                self.dwell_count - 1, float(elapsed_s[0]), own, accel.values[part], curve.angles(own), warm[part], curve
+                self.dwell_count, float(elapsed_s[0]), own, accel.values[part], curve.angles(own), warm[part], curve
             )
         self.tally.slewing += count
         self._accel = self._accel[count:]
@@ -424,6 +456,9 @@ class Segmenter:
             if not closing and (not judged or length_ns < 3 * settle_ns):
                 return
             dwell.settling_ns = rest_ns - dwell.arrival_ns + min(settle_ns, length_ns // 3)
+            if settle_ns > length_ns // 3:
+                self.tally.short_dwells += 1
+                self.tally.least_settling_s = min(self.tally.least_settling_s, length_ns // 3 / _SECOND_NS)
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
         first = min(int(np.searchsorted(self._accel.time_ns, dwell.arrival_ns + dwell.settling_ns)), count)
         if closing and dwell.pose is None and self._is_unsure(self._accel.time_ns[first:count]):
@@ -451,8 +486,16 @@ class Segmenter:
         pose, warm = self._block_pose(accel.time_ns), _carried_on(self._temperature, accel.time_ns)
         return Block(
             self._dwell.number, arrival_s, elapsed_s, accel.values, pose, warm, felt_s=felt_s,
-            pose_sigma_rad=self._dwell.pose_sigma_rad,
+            pose_sigma_rad=self._dwell.pose_sigma_rad, turns=self._dwell_turns(),
         )  # fmt: skip
+
+    def _dwell_turns(self) -> tuple[int, ...]:
+        """Of the open dwell, by its first pose."""
+        assert self._dwell is not None
+        if self._dwell.turns is None:
+            first = int(np.searchsorted(self._pose.time_ns, self._dwell.first_pose_ns))
+            self._dwell.turns = tuple(map(int, self._turns[first])) if self.bench.axes else ()
+        return self._dwell.turns
 
     def _block_pose(self, accel_ns: Times) -> Floats:
         assert self._dwell is not None
@@ -466,6 +509,8 @@ class Segmenter:
         inside = poses[first:last]
         if not self.stillness.creeps(inside):
             return self._standing_pose(inside)
+        turned_rad = float(pose_distance(inside[-1], inside[0], not self.bench.axes))
+        self.tally.turned_deg = max(self.tally.turned_deg, math.degrees(turned_rad))
         around = slice(max(first - 1, own), last + 1)
         return interpolate_pose(accel_ns, times[around], poses[around], not self.bench.axes)
 
@@ -491,7 +536,8 @@ class Segmenter:
         oldest = min(oldest, (self._decided_ns or oldest) - self.stillness.history_ns)
         if self.slews:  # a slew's curve begins a window before it
             oldest -= self.stillness.window_ns + self.stillness.lead_ns
-        self._pose = self._pose[max(int(np.searchsorted(self._pose.time_ns, oldest)) - HISTORY, 0) :]
+        kept = slice(max(int(np.searchsorted(self._pose.time_ns, oldest)) - HISTORY, 0), None)
+        self._pose, self._turns = self._pose[kept], self._turns[kept]
         self._temperature = self._temperature[max(int(np.searchsorted(self._temperature.time_ns, oldest)) - 2, 0) :]
 
 

@@ -86,6 +86,7 @@ class DwellFactor:
 
     moving: it is the slew after the dwell of that number, folded like a dwell. came_from: the dwell before it, where
     that one is left out (None: it is there, or there was none). pose_sigma_rad: of its pose, by noise of the angles.
+    turns: whole turns of each gimbal by which its pose goes beyond the angles as they were recorded.
     """
 
     number: int
@@ -96,6 +97,7 @@ class DwellFactor:
     moving: bool = False
     came_from: DwellFactor | None = None
     pose_sigma_rad: float = 0.0
+    turns: tuple[int, ...] = ()
 
     @property
     def carrier_hz(self) -> float:
@@ -172,6 +174,11 @@ class DwellFactor:
         """Mean pose (k,)."""
         weights = np.array([piece.count for piece in self.pieces]) / self.count
         return weights @ np.array([piece.nodes.pose.mean(axis=0) for piece in self.pieces])
+
+    @cached_property
+    def recorded_pose(self) -> Floats:
+        """Mean pose (k,) with its angles as they were recorded, not continued beyond a turn from dwell to dwell."""
+        return self.pose - 2.0 * np.pi * np.array(self.turns) if self.turns else self.pose
 
     @cached_property
     def factor(self) -> Floats:
@@ -462,7 +469,9 @@ class Folder:
         current = folded[-1] if folded and folded[-1].number == rows.dwell else None
         fresh = not rows.moving and (current is None or current.autocovariance.count < _CORRELATED_SAMPLES)
         folded_rows = fold(rows, self.carrier_hz)
-        block = DwellFactor(rows.dwell, folded_rows, moving=rows.moving, pose_sigma_rad=rows.pose_sigma_rad)
+        block = DwellFactor(
+            rows.dwell, folded_rows, moving=rows.moving, pose_sigma_rad=rows.pose_sigma_rad, turns=rows.turns
+        )
         if fresh:
             left = less_curve(rows.innovation, rows.elapsed_s, self.carrier_hz)
             own, spectrum = Autocovariance.of(left), Spectrum.of(left, rows.elapsed_s)

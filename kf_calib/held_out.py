@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from kf_calib import information, walk
 from kf_calib.fitting import Fit
 from kf_calib.folding import DwellFactor
 from kf_calib.model import Prior
-from kf_calib.noise import considered, mean_covariances
+from kf_calib.noise import considered, lifted, mean_covariances
 from kf_calib.samples import Floats
 
 SAME_POSE_DEG = 1.0
@@ -33,16 +34,36 @@ def orientations(dwells: Sequence[DwellFactor]) -> list[list[int]]:
     return groups
 
 
-def held_out(fitted: Fit) -> tuple[float | None, float | None]:
-    """Rms error of the dwell means of orientations left out of the fit, and the rms that the noise alone would give.
+@dataclass(frozen=True)
+class HeldOut:
+    """Mean readings of the dwells less what all other orientations predict, (D, 3), and its covariance (D, 3, 3)."""
+
+    errors_mps2: Floats
+    covariance: Floats
+
+    @property
+    def rms_mps2(self) -> float:
+        return float(np.sqrt(np.mean(self.errors_mps2**2)))
+
+    @property
+    def floor_mps2(self) -> float:
+        """The rms that noise alone would give."""
+        return float(np.sqrt(np.mean(np.einsum("dii->di", self.covariance))))
+
+    @property
+    def statistics(self) -> Floats:
+        """Chi-squared (D,) of each dwell's error, of 3 degrees of freedom."""
+        solved = np.linalg.solve(lifted(self.covariance), self.errors_mps2[:, :, None])[:, :, 0]
+        return np.asarray(np.einsum("di,di->d", self.errors_mps2, solved))
+
+
+def held_out(fitted: Fit) -> HeldOut | None:
+    """Errors of the dwell means of orientations left out of the fit.
 
     None where a fit without one of the orientations is undetermined. Slews are left out of no fit.
     """
     predicted = (_beside if fitted.noise.walk_mps2_per_sqrt_s else _without)(fitted, orientations(fitted.dwells))
-    if predicted is None:
-        return None, None
-    errors, spreads = predicted
-    return float(np.sqrt(np.mean(errors**2))), float(np.sqrt(np.mean(np.einsum("dii->di", spreads))))
+    return None if predicted is None else HeldOut(*predicted)
 
 
 def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from os import PathLike
 from typing import Literal
 
 import numpy as np
@@ -28,7 +29,7 @@ from kf_calib.fitting import Fit
 from kf_calib.folding import Carried, without
 from kf_calib.held_out import orientations
 from kf_calib.noise import mean_covariances
-from kf_calib.samples import Floats
+from kf_calib.samples import Floats, Source
 
 _NEEDED = 0.01  # an effect whose removal would raise chi-squared by no more than chance does in 99 of 100 runs is not
 _NEAR_THRESHOLD = 8.0  # sigma; what is found only if it comes out large comes out too large on average
@@ -144,7 +145,7 @@ class Improvement:
     @property
     def effects(self) -> tuple[str, ...]:
         """The effects of the model as it stands, as ``effect_named`` takes them."""
-        return self.result.settings.effects
+        return tuple(self.result.settings.effects)
 
     @property
     def kept(self) -> set[str]:
@@ -225,13 +226,15 @@ class Improvement:
 
 
 def improve(
-    start: Calibration, accept_first: bool = False, on_step: Callable[[Improvement], None] | None = None
+    run: Calibration | Source | str | PathLike[str],
+    accept_first: bool = False,
+    on_step: Callable[[Improvement], None] | None = None,
 ) -> Improvement:
-    """Add what the diagnosis names, until nothing is missing or nothing can be named.
+    """Add what the diagnosis names, until nothing is missing or nothing can be named; a recording is calibrated first.
 
     accept_first: of effects that explain the misfit equally well, take the first instead of stopping.
     """
-    state = begun(start)
+    state = begun(run)
     while (name := next_effect(state.found, accept_first)) is not None:
         state = stepped(state, name, None, "diagnosis")
         if on_step is not None:
@@ -239,8 +242,8 @@ def improve(
     return state
 
 
-def begun(start: Calibration) -> Improvement:
-    return Improvement(diagnose(start))
+def begun(run: Calibration | Source | str | PathLike[str]) -> Improvement:
+    return Improvement(diagnose(run))
 
 
 def next_effect(found: Diagnosis, accept_first: bool = False) -> str | None:

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from kf_calib.folding import DwellFactor, Means
-from kf_calib.noise import FLOOR_MPS2, Noise, mean_covariances, wander
+from kf_calib.noise import FLOOR_MPS2, Noise, lifted, mean_covariances, wander
 from kf_calib.samples import Floats
 from kf_calib.triangle import triangle
 from kf_calib.walk import Links, links
@@ -23,9 +23,11 @@ from kf_calib.walk import Links, links
 FEWEST = 6
 """Degrees of freedom between dwells; with fewer nothing is estimated."""
 
+ENOUGH_DIRECTIONS = 12
+"""Of gravity in the platform: where they are spread they check that a setting error only turns the specific force."""
+
 _SIGNIFICANT = 5.41  # 1 % point of the likelihood ratio of a variance against zero: half of chi2 with 1 dof
 _HELD = 12  # time constants of a walk that is held back
-_ROUNDING = 1e-14  # of a dwell's variance
 _RANGE = (-9.0, 3.0)  # of the logarithm of a part's size, about the size of the misfit
 
 Part = Literal["setting", "common", "scatter", "walk"]
@@ -57,11 +59,10 @@ def with_dwell_parts(
         scatter_stated=scatter_mps2 is not None,
         checked=scatter_mps2 is not None or _setting_is_checked(means.force_mps2),
     )
-    means = _reduced(means)
-    freedom = means.readings.size - means.design.shape[2]
-    if freedom < FEWEST or (stated.setting_stated and stated.scatter_stated and not walks):
+    free, means = freedom(means), _reduced(means)
+    if free < FEWEST or (stated.setting_stated and stated.scatter_stated and not walks):
         return stated
-    if not walks and chdtrc(freedom, misfit(stated.weights, means, state)) > 0.1:  # spares the search
+    if not walks and chdtrc(free, misfit(stated.weights, means, state)) > 0.1:  # spares the search
         return stated
     settings: list[tuple[Part, ...]] = [()] if stated.setting_stated or not stated.checked else [(), ("setting",)]
     scatters: list[tuple[Part, ...]] = [()] if stated.scatter_stated else [(), ("common",)]
@@ -98,8 +99,19 @@ def _setting_is_checked(force_mps2: Floats) -> bool:
     """Whether the readings along f overdetermine what they see by 3 or more: f^T S f + f^T b, 9 numbers at most."""
     x, y, z = force_mps2.T / np.linalg.norm(force_mps2, axis=1).mean()
     design = np.column_stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z])
-    directions = len(np.unique(np.round(design[:, 6:], 2), axis=0))
-    return directions - int(np.linalg.matrix_rank(design, tol=0.02)) >= 3
+    return directions(force_mps2) - int(np.linalg.matrix_rank(design, tol=0.02)) >= ENOUGH_DIRECTIONS - 9
+
+
+def directions(force_mps2: Floats) -> int:
+    """How many different directions forces (D, 3) have, to a hundredth."""
+    unit = force_mps2 / np.linalg.norm(force_mps2, axis=1).mean()
+    return len(np.unique(np.round(unit, 2) + 0.0, axis=0))
+
+
+def freedom(means: Means) -> int:
+    """Degrees of freedom of the dwells' means beside the model's coefficients."""
+    reduced = _reduced(means)
+    return reduced.readings.size - reduced.design.shape[2]
 
 
 def _most_likely(stated: Noise, parts: tuple[Part, ...], means: Means, state: Floats) -> tuple[Noise, float]:
@@ -316,10 +328,8 @@ def _rows(noise: Noise, means: Means, state: Floats, held_s: float = math.inf) -
 
 
 def _root(covariances: Floats) -> Floats:
-    """Triangular roots (D, 3, 3) of covariances; a setting error alone does not turn the force along itself, and noise
-    far below it is rounding."""
-    least = _ROUNDING * np.einsum("dii->d", covariances)
-    return np.linalg.cholesky(covariances + least[:, None, None] * np.eye(3))
+    """Triangular roots (D, 3, 3) of covariances."""
+    return np.asarray(np.linalg.cholesky(lifted(covariances)), float)
 
 
 def _linked_rows(own: Floats, intensity: float, path: Links, stacked: Floats) -> tuple[Floats, float]:
@@ -330,6 +340,7 @@ def _linked_rows(own: Floats, intensity: float, path: Links, stacked: Floats) ->
     rows[1:] -= share * stacked[:-1]
     diagonal = own + intensity**2 * path.alone[:, None, None] * np.eye(3)
     diagonal[1:] += share**2 * own[:-1]
+    diagonal = lifted(diagonal)
     beside = intensity**2 * path.beside[:, None, None] * np.eye(3) - share * own[:-1]
     bands = np.zeros((6, len(own), 3))
     for i in range(3):

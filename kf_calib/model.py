@@ -21,7 +21,7 @@ from kf_calib.averaging import averaged
 from kf_calib.bench import Bench
 from kf_calib.dwells import Block, Tally
 from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, check_number
 from kf_calib.samples import Floats, Mask
 from kf_calib.slews import Curve
 
@@ -84,7 +84,7 @@ class Rows:
     pieces: parts of the rows, u (n',) from -1 to 1 over each, and its nodes. moving: of the slew after the dwell.
     gated: in which channels each reading lay out that is not among them, (3, m) bool; None: there were none.
     raw: the rows before they were averaged, where they were; taken: how many readings a row then stands for.
-    pose_sigma_rad: of the pose, by the noise of the angles.
+    pose_sigma_rad: of the pose, by the noise of the angles. turns: by which it goes beyond the angles as recorded.
     """
 
     dwell: int
@@ -99,6 +99,7 @@ class Rows:
     raw: Rows | None = None
     taken: int = 1
     pose_sigma_rad: float = 0.0
+    turns: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -318,7 +319,7 @@ def _rows(block: Block, bench: Bench, force: Floats | None) -> Rows:
     innovation = gate.innovations(columns, block.accel_mps2, force is not None)
     return Rows(
         block.dwell, block.elapsed_s, columns, block.accel_mps2, innovation, force is not None, pieces,
-        pose_sigma_rad=block.pose_sigma_rad,
+        pose_sigma_rad=block.pose_sigma_rad, turns=block.turns,
     )  # fmt: skip
 
 
@@ -402,6 +403,11 @@ class Prior:
     misalignment_rad: float | None = None
     scale: float | None = None
     bias_mps2: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value is not None:
+                check_number(f"the prior's {name}", value)
 
     @property
     def diffuse(self) -> bool:

@@ -30,6 +30,7 @@ TOO_SHORT = 4.0
 
 _AVERAGES = 60  # of a block, at least, from which their own correlation is taken
 _WANDER = 6
+_ROUNDING = 1e-14  # of a dwell's variance
 
 
 @dataclass(frozen=True)
@@ -202,6 +203,13 @@ def mean_covariances(noise: Noise, means: Means, state: Floats) -> Floats:
     """
     own = noise.effective_sigma_mps2**2 / means.counts[:, None] + noise.scatter_mps2**2
     return own[:, :, None] * np.eye(3) + noise.setting_rad**2 * _turned(means, state)
+
+
+def lifted(covariances: Floats) -> Floats:
+    """Covariances (D, 3, 3) with as much more in all directions as is rounding: a setting error alone does not turn the
+    force along itself, and where noise is far below it, rounding decides whether there is a root."""
+    least = _ROUNDING * np.einsum("dii->d", covariances)
+    return np.asarray(covariances + least[:, None, None] * np.eye(3), float)
 
 
 def _turned(means: Means, state: Floats) -> Floats:

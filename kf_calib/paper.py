@@ -3,6 +3,8 @@
 Reading i = s_i . f + b_i with the sensitivity s_i = K_i E_i. For accelerometers 1 and 3
 ``E = (cos phi cos theta, sin theta, -sin phi cos theta)``, for 2
 ``E = (sin nu1, sqrt(1 - sin^2 nu1 - sin^2 nu2), -sin nu2)`` (M. D. Grebenkin, Vestnik MEPhI 8(3), 2019, eq. 1-6).
+E_2 always has a positive y, so an accelerometer 2 that points the other way has a negative K2: parameters and state
+are one to one.
 State order: s1x s1y s1z b1, s2x s2y s2z b2, s3x s3y s3z b3. Angles in rad, K without unit, b in m/s^2.
 """
 
@@ -48,11 +50,14 @@ def _axis(i: int, p1: float, p2: float) -> Floats:
 
 
 def parameters_of(state: Floats) -> Floats:
-    """The paper's parameters (..., 12) of affine states (..., 12); exact for any size of misalignment."""
+    """The paper's parameters (..., 12) of affine states (..., 12); ``state_of`` gives these states again, whatever way
+    the axes point: K1, K3 are positive, K2 has the sign of s2y."""
     out = np.empty_like(state)
     for i in range(3):
         s = state[..., 4 * i : 4 * i + 3]
         scale = np.linalg.norm(s, axis=-1)
+        if i == 1:
+            scale = np.copysign(scale, s[..., 1])
         x, y, z = np.moveaxis(s / scale[..., None], -1, 0)
         angles = (np.arcsin(x), -np.arcsin(z)) if i == 1 else (np.arcsin(y), np.arctan2(-z, x))
         out[..., 4 * i], out[..., 4 * i + 1] = angles
@@ -66,7 +71,7 @@ def jacobian(state: Floats) -> Floats:
     for i in range(3):
         rows = slice(4 * i, 4 * i + 4)
         s = state[4 * i : 4 * i + 3]
-        scale = float(np.linalg.norm(s))
+        scale = math.copysign(np.linalg.norm(s), s[1] if i == 1 else 1.0)
         axis = s / scale
         block = np.eye(4)
         if i == 1:
@@ -81,7 +86,7 @@ def jacobian(state: Floats) -> Floats:
 
 
 def _arcsine_gradient(axis: Floats, k: int) -> Floats:
-    """Gradient of asin(s_k / |s|) with respect to s, times |s|."""
+    """Gradient of asin(s_k / K) with respect to s, times K; ``axis`` = s / K."""
     return (np.eye(3)[k] - axis[k] * axis) / math.sqrt(1 - axis[k] ** 2)
 
 

@@ -12,7 +12,7 @@ filter after each dwell, the dwells in their order.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,6 +22,7 @@ from threadpoolctl import threadpool_limits
 from kf_calib import aims, paper
 from kf_calib.designs import Search
 from kf_calib.errors import InputError, UnobservableError
+from kf_calib.likelihood import directions
 from kf_calib.model import STATE_COUNT
 from kf_calib.prospect import PAUSE_S, Prospect
 from kf_calib.samples import Floats
@@ -29,6 +30,8 @@ from kf_calib.tour import Timing, middles_s, order, slews_s, time_correlation
 from kf_calib.triangle import triangle
 
 _DIGITS = 2  # of an angle in deg
+_LITTLE = 1  # of degrees of freedom: no judgement of a model
+_WEAK = 10.0  # times the sigma by balanced directions
 _MOST = 400  # dwells a plan with --fewest may have
 
 
@@ -168,7 +171,28 @@ class Plan:
                 f"time goes with the direction of gravity (correlation {self.correlation:.2f}), so a drift would pass "
                 "for a change of the parameters: visit more orientations, or repeat them (--repeats 2)."
             )
-        return said
+        return [*said, *self._weaknesses()]
+
+    def _weaknesses(self) -> Iterator[str]:
+        """Where a plan from nothing leaves little to go by."""
+        if self.prospect.last is not None:
+            return
+        different, count = directions(self.directions), len(self.prospect.symbols)
+        left = 3 * different - count
+        if left <= _LITTLE:
+            over = f"only {left} is" if left > 0 else "nothing is"
+            yield (
+                f"{different} directions of gravity × 3 readings = {3 * different} for {count} parameters: {over} left "
+                "over to judge the model by: visit more orientations."
+            )
+        worse = np.ones(count) if self.balanced_sigma is None else self.sigma[-1] / self.balanced_sigma
+        worst = int(np.argmax(worse))
+        if worse[worst] > _WEAK:
+            yield (
+                f"{self.prospect.symbols[worst]} is known {worse[worst]:.2g} times worse than by as many dwells in "
+                "directions that are spread, and what the model or the angles are off by goes into it as much: widen "
+                "what the gimbals reach (--limit, --forbid, --positions), or choose another --criterion."
+            )
 
 
 def plan(search: Search, count: int, timing: Timing, seed: int = 0) -> Plan:

@@ -21,7 +21,7 @@ from kf_calib.effects import Effect, Stimulus
 from kf_calib.fitting import Fit
 from kf_calib.folding import Means
 from kf_calib.model import STATE_COUNT, Model, Prior, effect_columns
-from kf_calib.noise import Noise, considered, mean_covariances
+from kf_calib.noise import Noise, considered, lifted, mean_covariances
 from kf_calib.samples import Floats
 from kf_calib.stillness import Stillness
 from kf_calib.triangle import triangle
@@ -168,7 +168,7 @@ class Prospect:
         count = len(stimulus)
         means = Means(design, np.zeros((count, 3)), stimulus.force_mps2, np.full(count, self.readings),
                       np.zeros((count, 2)))  # fmt: skip
-        root = np.linalg.cholesky(mean_covariances(self.noise, means, self.state))
+        root = np.linalg.cholesky(lifted(mean_covariances(self.noise, means, self.state)))
         return np.asarray(np.linalg.solve(root, design), float)
 
     def stimulus(self, poses: Floats, at_s: Floats | None = None) -> Stimulus:

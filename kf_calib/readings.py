@@ -61,7 +61,7 @@ class Quantisation:
 
 @dataclass(frozen=True)
 class Saturation:
-    """A channel (1, 2, 3) cut off at a level: share of its readings stuck there, and the dwells, counted from 1."""
+    """A channel (1, 2, 3) cut off at a level: share of its readings stuck there, and the numbers of the dwells."""
 
     channel: int
     level_mps2: float
@@ -80,8 +80,8 @@ class Saturation:
 class Outliers:
     """Readings rejected by the gate; by_channel counts one twice where it lies out in two channels.
 
-    clustered_p: run-level probability of so many in any stretch of dwells (which are ``dwells``, counted from 1) were
-    they spread at random; None where there are none, or one dwell only, or where coarse steps or flat tops make some.
+    clustered_p: run-level probability of so many in any stretch of dwells (whose numbers are ``dwells``) were they
+    spread at random; None where there are none, or one dwell only, or where coarse steps or flat tops make some.
     """
 
     count: int = 0
@@ -143,12 +143,14 @@ class Readings:
 
 @dataclass
 class _Seen:
-    """Of one dwell. ends (6,): the largest of the three channels, and of their negatives; stuck (6,): readings there.
+    """Of the dwell of that number.
 
+    ends (6,): the largest of the three channels, and of their negatives; stuck (6,): readings there.
     distinct (3,): how many values ``sampled`` readings had; values: some of them, by channel. rejected: readings; out
     (3,): in which channel.
     """
 
+    number: int
     ends: Floats
     stuck: Floats
     count: int
@@ -170,7 +172,7 @@ class Watch:
             return
         seen = self._dwells.get(rows.dwell)
         if seen is None:
-            seen = self._dwells[rows.dwell] = _first_seen(rows.readings)
+            seen = self._dwells[rows.dwell] = _first_seen(rows.dwell, rows.readings)
         _reach(seen, rows)
         seen.count += len(rows.readings)
         if rows.gated is not None:
@@ -190,7 +192,7 @@ class Watch:
         return Readings(tuple(grids), flat, outliers)
 
 
-def _first_seen(readings: Floats) -> _Seen:
+def _first_seen(number: int, readings: Floats) -> _Seen:
     """A dwell with what the values of its first block say of steps."""
     sample = np.sort(readings[:: -(-len(readings) // _SAMPLE)].T)
     new = sample[:, 1:] != sample[:, :-1]
@@ -199,7 +201,7 @@ def _first_seen(readings: Floats) -> _Seen:
         np.append(own[:1], own[1:][up])[:_VALUES] if few else own[:0]
         for own, up, few in zip(sample, new, distinct <= size / 2, strict=True)
     ]
-    return _Seen(np.full(6, -np.inf), np.zeros(6), 0, distinct, size, values)
+    return _Seen(number, np.full(6, -np.inf), np.zeros(6), 0, distinct, size, values)
 
 
 def _reach(seen: _Seen, rows: Rows) -> None:
@@ -299,7 +301,7 @@ def _saturations(
         usual = float(np.median(missing[inside]))  # noise that is not Gaussian has flat tops at every level
         if missing[at].sum() > _CROWDED and missing[at].mean() > 4.0 * usual:
             level = float(ends[at, side][0]) * (1.0 if side < 3 else -1.0)
-            which = tuple((np.flatnonzero(at & (stuck[:, side] > 1)) + 1).tolist())
+            which = tuple(each.number for each, is_cut in zip(seen, at & (stuck[:, side] > 1), strict=True) if is_cut)
             yield Saturation(i + 1, level, float(stuck[at, side].sum() / counts.sum()), which)
 
 
@@ -318,12 +320,14 @@ def _outliers(seen: Sequence[_Seen]) -> Outliers:
     if not total:
         return Outliers()
     by_channel = tuple(np.sum([each.out for each in seen], axis=0).astype(int).tolist())
-    p_value, dwells = clustering(gated, counts)
-    return Outliers(total, total / float(counts.sum()), by_channel, p_value, dwells)
+    p_value, stretch = clustering(gated, counts)
+    return Outliers(
+        total, total / float(counts.sum()), by_channel, p_value, tuple(each.number for each in seen[stretch])
+    )
 
 
-def clustering(hits: Floats, counts: Floats) -> tuple[float | None, tuple[int, ...]]:
-    """Run-level p of ``hits`` (D,) among ``counts`` (D,) readings, and the stretch of dwells, from 1, that has most.
+def clustering(hits: Floats, counts: Floats) -> tuple[float | None, slice]:
+    """Run-level p of ``hits`` (D,) among ``counts`` (D,) readings, and the stretch of the D dwells that has most.
 
     Given their sum, hits in a stretch are binomial; stretches of 1, 2, 4 ... dwells are looked at, and the least tail
     probability is multiplied by their number: at most the size it states, however few the hits.
@@ -344,8 +348,8 @@ def clustering(hits: Floats, counts: Floats) -> tuple[float | None, tuple[int, .
             best, stretch = float(tails[first]), (first * size, min((first + length) * size, len(hits)))
         length *= 2
     if not tried:
-        return None, ()
-    return min(1.0, best * tried), tuple(range(stretch[0] + 1, stretch[1] + 1))
+        return None, slice(0, 0)
+    return min(1.0, best * tried), slice(*stretch)
 
 
 def _dwells(numbers: Sequence[int]) -> str:

@@ -7,7 +7,7 @@ alarm the model counts as consistent. The last judgement is that of ``diagnose``
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from kf_calib import paper
 from kf_calib.advice import Course, course
 from kf_calib.assessment import LEVEL, assessed
-from kf_calib.calibration import Calibration, Pass, concluded, evaluate, format_p, refuse_unusable, told, usable
+from kf_calib.calibration import Calibration, Pass, concluded, evaluate, format_p, refuse_unusable, told
 from kf_calib.diagnosis import Diagnosis, diagnose, next_orientation
 from kf_calib.folding import DwellFactor
 from kf_calib.noise import mean_covariances
@@ -143,7 +143,7 @@ class Standing:
     judged_s: float = 0.0
     problem: str = ""
     notice: str = ""
-    model: tuple[str, ...] = ()
+    model: Sequence[str] = ()
 
     @property
     def sigma(self) -> Floats:
@@ -169,7 +169,7 @@ def targets(texts: Mapping[str, float]) -> Floats:
 def judged(passed: Pass, wanted: Floats, watch: Watch | None = None) -> Judgement:
     """The run after the dwells folded so far; ``watch``: that of the judgement before. Raises InputError where the
     readings cannot be used as they are."""
-    settings, bench, dwells = passed.settings, passed.source.bench, usable(passed.folder.dwells)
+    settings, bench, dwells = passed.settings, passed.source.bench, passed.dwells
     with threadpool_limits(1, user_api="blas"):
         refuse_unusable(dwells, passed.tally, bench)
         result = told(evaluate(dwells, bench, settings, passed.folder.slews), passed)
@@ -226,7 +226,7 @@ def _sizes(result: Calibration, wanted: Floats) -> Floats:
 def current(dwell: DwellFactor, judgement: Judgement | None) -> Current:
     """The open dwell, as far as it is folded, beside the judgement of those before it."""
     seconds, unknown = dwell.end_s - dwell.start_s, np.full(12, np.nan)
-    here = Current(dwell.number + 1, dwell.pose, dwell.count, seconds, unknown, None, unknown)
+    here = Current(dwell.number, dwell.recorded_pose, dwell.count, seconds, unknown, None, unknown)
     if judgement is None:
         return here
     result, wanted = judgement.result, judgement.wanted

@@ -13,12 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench import mean_pose, pose_distance
+from kf_calib.errors import InputError, check_number
 from kf_calib.samples import Floats, Mask, Stream, Times
 
 _SECOND_NS = 1_000_000_000
 _BEFORE = 3  # messages, at least, that one is held against
 _APART_NS = 2 * _SECOND_NS  # messages that lie farther apart tell no departure
 _CREEPING_NS = 10 * _SECOND_NS  # from when on a platform that still creeps is taken as one that goes on so
+_LARGEST_DEG = 5.0  # of a tolerance: a platform that turns at 10 deg/s would be still
 _PARTS = 8  # of a block, whose mean poses are compared
 
 HISTORY = _BEFORE + 2
@@ -34,6 +36,17 @@ class Stillness:
     window_s: float = 0.5
     settle_s: float = 1.0
     lead_s: float = 0.25
+
+    def __post_init__(self) -> None:
+        check_number("tolerance_deg (--still-deg)", self.tolerance_deg, above=True)
+        if self.tolerance_deg > _LARGEST_DEG:
+            raise InputError(
+                f"a platform that turns by {self.tolerance_deg:g} deg in half a second does not stand still: give "
+                f"--still-deg (tolerance_deg) above 0 and up to {_LARGEST_DEG:g}."
+            )
+        check_number("window_s", self.window_s, above=True)
+        check_number("settle_s (--settle-s)", self.settle_s)
+        check_number("lead_s", self.lead_s)
 
     @property
     def tolerance_rad(self) -> float:

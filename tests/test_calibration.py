@@ -12,7 +12,7 @@ from synthetic import G, Run, sensitivities
 
 from kf_calib.bench import Bench, axes_of
 from kf_calib.calibration import Settings, calibrate
-from kf_calib.errors import InputError, UnobservableError
+from kf_calib.errors import BlunderError, InputError, UnobservableError
 from kf_calib.held_out import orientations
 from kf_calib.samples import Batch, Stream
 from kf_calib.sources.recording import Recording
@@ -107,13 +107,15 @@ def test_counts_are_noticed() -> None:
 def test_wrong_axes_are_noticed() -> None:
     run = Run(seed=8)
     run.bench = replace(run.bench, axes=axes_of("xzy"))
-    assert any("angles do not explain" in warning for warning in calibrate(run).warnings)
+    with pytest.raises(BlunderError, match="gimbal axes are, outer to inner, y z x"):
+        calibrate(run)
 
 
 def test_degrees_taken_for_radians_are_noticed() -> None:
     run = Run(seed=8)
     run.pose = replace(run.pose, values=np.degrees(run.pose.values))
-    assert any("unit of the angles" in warning for warning in calibrate(run).warnings)
+    with pytest.raises(BlunderError, match="--angle-unit deg"):
+        calibrate(run)
 
 
 def test_noise_free_readings_do_no_harm() -> None:

@@ -40,6 +40,15 @@ def test_three_ways_agree_to_rounding(name: str) -> None:
         assert way.max_relative_variance <= 1e-8
 
 
+def test_three_ways_agree_on_what_orientations_about_one_axis_determine() -> None:
+    """Two parameters of the twelve are not seen, and one sensor's sensitivity along the axis is not either."""
+    poses = np.radians([[0.0, 0.0, angle] for angle in (0, 30, 70, 110, 200, 300)])
+    compared = compare(Run(seed=1, count=60, poses=poses))
+    assert compared.result.estimate.unseen.any() and not compared.result.estimate.unseen.all()
+    for way in compared.ways.values():
+        assert way.max_difference_sigma < 1e-6 and way.max_relative_variance < 1e-9
+
+
 def test_plain_form_of_filterpy_agrees_to_its_own_rounding() -> None:
     """With a stated prior; with a diffuse one (1e5 sigma) the plain form itself is off by 1e-4 sigma."""
     run = CASES["paper grade"]

@@ -39,3 +39,15 @@ def test_both_jacobians_by_finite_differences(size: float) -> None:
     )
     np.testing.assert_allclose(paper.sensitivity_jacobian(truth), forward, atol=1e-9)
     np.testing.assert_allclose(paper.jacobian(state), back.T, atol=1e-9)
+
+
+def test_parameters_and_state_are_one_to_one_whatever_way_the_axes_point() -> None:
+    """An accelerometer 2 that points down has a negative K2; no sign is lost, and the Jacobian is the derivative."""
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        state = rng.standard_normal(12)
+        np.testing.assert_allclose(paper.state_of(paper.parameters_of(state)), state, atol=1e-12)
+        assert (paper.parameters_of(state)[6] < 0) == (state[5] < 0)
+        steps = 1e-6 * np.eye(12)
+        differences = (paper.parameters_of(state + steps) - paper.parameters_of(state - steps)).T / 2e-6
+        np.testing.assert_allclose(paper.jacobian(state), differences, rtol=1e-4, atol=1e-4)

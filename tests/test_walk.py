@@ -98,6 +98,16 @@ def test_the_likelihood_is_that_of_a_dense_covariance(held_s: float) -> None:
     np.testing.assert_allclose(differences[:, 0], differences[:, 1], atol=2e-3)
 
 
+@pytest.mark.parametrize("setting_deg", [0.01, 1.0, 100.0])
+def test_the_likelihood_of_a_walk_is_there_however_large_a_setting_error_is_tried_beside_it(setting_deg: float) -> None:
+    """No rotation changes a reading along the force: there the covariance is that of the noise, or of rounding."""
+    result = calibrate(Run(seed=3, dwells=24, count=60, white_mps2=1e-6))
+    noise = replace(result.noise, setting_rad=np.radians(setting_deg), walk_mps2_per_sqrt_s=1e-9)
+    found = [restricted_log_likelihood(noise, result.carried.means, result.carried.state, held_s=held_s)
+             for held_s in (np.inf, 50.0)]  # fmt: skip
+    assert np.isfinite(found).all()
+
+
 def test_leaving_an_orientation_out_equals_a_fit_without_it() -> None:
     """The two filters that meet at the dwell left out, against the covariance of all means and generalised least
     squares; one orientation is visited twice. In dwells as short as here a path shows in the means alone."""

@@ -7,8 +7,10 @@ inconsistent and ``--strict`` asked; 2: anything else, with one sentence on stde
 from __future__ import annotations
 
 import sys
+from itertools import chain
 
 import click
+import rich_click
 
 from kf_calib.cli.echo import fall_silent, open_streams
 from kf_calib.cli.failures import tell
@@ -18,14 +20,35 @@ from kf_calib.cli.paper import paper
 from kf_calib.cli.plan import plan
 from kf_calib.cli.runs import compare, diagnose, improve, list_effects, replay
 
+SECTIONS = {
+    "Evaluate a recording": (replay, diagnose, improve, compare),
+    "Run a bench": (plan, record, live),
+    "Try it without a bench": (demo, simulate),
+    "Look up": (list_effects, paper),
+}
+"""The commands, as ``--help`` has them."""
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
-@click.version_option(package_name="kf_calib")
+
+_HELP = {
+    "theme": "default-slim",
+    "max_width": 110,
+    "force_terminal": None,  # colours on a terminal only, whatever the environment of a build says
+    "options_table_column_types": ["opt_all_metavar", "help"],
+    "options_table_help_sections": ["help", "default"],
+    "default_string": r"\[default: {}]",
+    "command_groups": {
+        "*": [{"name": name, "commands": [each.name for each in own]} for name, own in SECTIONS.items()]
+    },
+}
+
+
+@rich_click.group(context_settings={"help_option_names": ["-h", "--help"], "rich_help_config": _HELP})
+@rich_click.version_option(package_name="kf_calib")
 def cli() -> None:
     """Calibrate accelerometers on a stationary gimballed bench with a Kalman filter."""
 
 
-for command in (demo, simulate, record, live, replay, compare, list_effects, diagnose, improve, plan, paper):
+for command in chain.from_iterable(SECTIONS.values()):
     cli.add_command(command)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
 
-import click
+import rich_click as click
 
 from kf_calib.cli.echo import echo
 from kf_calib.cli.failures import tell

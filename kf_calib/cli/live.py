@@ -16,14 +16,17 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-import click
+import rich_click as click
 
 from kf_calib.cli.echo import fall_silent
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.making import pair
+from kf_calib.cli.numbers import NOT_NEGATIVE, POSITIVE
 from kf_calib.cli.options import (
+    INPUT,
     bench_options,
     columns_option,
+    examples,
     filter_options,
     json_line,
     json_option,
@@ -37,7 +40,7 @@ from kf_calib.cli.options import (
     show,
     strict_option,
 )
-from kf_calib.errors import InputError, KfCalibError
+from kf_calib.errors import InputError, KfCalibError, how_to_write
 
 if TYPE_CHECKING:
     from kf_calib.calibration import Settings
@@ -47,45 +50,45 @@ if TYPE_CHECKING:
     from kf_calib.standing import Judgement
     from kf_calib.views.rerun.growing import GrowingView
 
+RUNNING = "While it runs"
 _REFRESH_S = 0.25
 _SIZES = {"rad": 1.0, "deg": math.pi / 180, "arcmin": math.pi / 10800, "arcsec": math.pi / 648000, "1": 1.0,
           "ppm": 1e-6, "m/s^2": 1.0, "mg": 9.80665e-3, "ug": 9.80665e-6, "µg": 9.80665e-6}  # fmt: skip
 _KINDS = {"rad": ("rad", "deg", "arcmin", "arcsec"), "1": ("1", "ppm"), "m/s^2": ("m/s^2", "mg", "ug", "µg")}
 
 
-@click.command()
+@click.command(
+    epilog=examples(
+        "live /dev/ttyUSB0 --bench bench.toml --record run.mcap --target theta=1arcsec --target K=2ppm --rerun",
+        'live "sim://?speed=10&hide=second-order=4e-6" --target K=0.1ppm',
+    )
+)
 @click.argument("source", metavar="SOURCE")
-@output_option("--record", metavar="OUT.mcap", help="Record the run here.")
-@columns_option
-@click.option("--header", default="", metavar="NAMES", help="Names of the columns of CSV rows that come without any.")
-@click.option(
-    "--give-up-s",
-    type=click.FloatRange(min=0),
-    default=600.0,
-    show_default=True,
-    help="Seconds for which a lost link is tried again.",
-)
-@click.option(
-    "--idle-s",
-    type=click.FloatRange(min=0, min_open=True),
-    default=math.inf,
-    show_default="never",
-    help="End the run when nothing has come for so long.",
-)
-@click.option("--target", "targets", multiple=True, metavar="SYMBOL=SIGMA",
+@output_option("--record", metavar="OUT.mcap", panel=RUNNING, help="Record the run here.")
+@click.option("--target", "targets", multiple=True, metavar="SYMBOL=SIGMA", panel=RUNNING,
               help="The sigma wanted of a parameter (theta1) or of a kind (theta, phi, nu, K, b), with a unit: "
-              "theta1=2arcsec, K=5ppm, b=10ug; repeatable.")  # fmt: skip
-@click.option("--auto", is_flag=True, help="Accept a missing effect when it can be told from all others.")
-@click.option("--rerun", "with_viewer", is_flag=True, help="Show the run in the Rerun viewer, opened if none is.")
-@click.option("--rerun-port", type=click.IntRange(1, 65535), default=9876, show_default=True, help="The viewer's port.")
-@click.option(
-    "--rerun-bind", default="127.0.0.1", show_default=True, help="Address a viewer that is opened listens on."
-)
-@rrd_option
-@save_model_option
-@overwrite_option
+              "theta1=2arcsec, K=5ppm, b=10ug; repeatable.")
+@click.option("--auto", is_flag=True, panel=RUNNING,
+              help="Accept a missing effect when it can be told from all others.")
+@click.option("--rerun", "with_viewer", is_flag=True, panel=RUNNING,
+              help="Show the run in the Rerun viewer, opened if none is.")
+@click.option("--rerun-port", type=click.IntRange(1, 65535), default=9876, show_default=True, metavar="PORT",
+              panel=RUNNING,
+              help="The viewer's port.")
+@click.option("--rerun-bind", default="127.0.0.1", show_default=True, panel=RUNNING, metavar="ADDRESS",
+              help="Address a viewer that is opened listens on.")
+@columns_option
+@click.option("--header", default="", metavar="NAMES", panel=INPUT,
+              help="Names of the columns of CSV rows that come without any.")
+@click.option("--give-up-s", type=NOT_NEGATIVE, default=600.0, show_default=True, panel=INPUT,
+              help="Seconds for which a lost link is tried again.")
+@click.option("--idle-s", type=POSITIVE, default=math.inf, show_default="never", panel=INPUT,
+              help="End the run when nothing has come for so long.")
 @bench_options
 @filter_options
+@overwrite_option
+@rrd_option
+@save_model_option
 @strict_option
 @json_option
 @click.pass_context
@@ -399,7 +402,8 @@ def _targets(texts: tuple[str, ...]) -> dict[str, float]:
             value = math.nan
         if not 0.0 < value < math.inf:
             raise InputError(
-                f"--target {text!r}: give a sigma above zero in {', '.join(kinds)}, as {name}=1{kinds[-1]}."
+                f"--target {text!r}: give a sigma above zero in {', '.join(kinds)}, as {name}=1{kinds[-1]}"
+                f"{how_to_write(size)}."
             )
         out |= dict.fromkeys(symbols, value)
     return out

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import click
+import rich_click as click
 
 from kf_calib.cli.echo import echo
 from kf_calib.cli.files import OutputFile, claimed, delivery
+from kf_calib.cli.numbers import NUMBER, POSITIVE
 from kf_calib.cli.options import (
+    OUTPUT,
     F,
     bench_options,
     columns_option,
+    examples,
     json_option,
     overrides,
     overwrite_option,
@@ -30,8 +35,10 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from kf_calib.samples import Source
+    from kf_calib.sources.simulator import Simulation
 
 
+_LARGE_BYTES = 1e9  # of a recording: minutes of work
 _HOW_TO_HIDE = """\
 --hide NAME=SIZE: one size for all coefficients, with signs drawn from the seed, or SIZE,SIZE,... one for each;
 constants after semicolons: 'warm-up=20ug;tau=600'. Without :AXIS an effect is on every gimbal axis.
@@ -44,13 +51,13 @@ def _hidden_table() -> RenderableType:
     """Every kind of hidden effect, in two lines or more."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Group
-    from rich.table import Table
 
     from kf_calib.sources.hidden import INNER, catalogue
+    from kf_calib.views.tables import Table
 
     kinds = catalogue().values()
     table = Table(title=f"{len(kinds)} effects to hide", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("effect\nwhat it is", min_width=26)
+    table.add_column("effect\nwhat it is")
     for heading in ("in the\ncatalogue", "SI unit\ncoefficients", "constants", "navigation grade\nMEMS"):
         table.add_column(heading, no_wrap=True)
     for kind in kinds:
@@ -74,46 +81,50 @@ def _list_hidden(ctx: click.Context, _: click.Parameter, texts: tuple[str, ...])
 
 def simulation_options(command: F) -> F:
     """What the simulated bench is and does."""
+    run_option, hidden_option, noise_option, warmth_option = (
+        partial(click.option, panel=panel) for panel in ("Run", "Hidden effects", "Noise", "Temperature")
+    )
     options = [
-        click.option("--grade", type=click.Choice(["paper", "navigation", "mems"]), default="navigation",
-                     show_default=True, help="Grade of the simulated sensors."),
-        click.option("--plan", default="spread", show_default=True,
-                     help="spread, faces, or a CSV file of gimbal angles in deg, an orientation a line."),
-        click.option("--orientations", "count", type=click.IntRange(min=1), default=24, show_default=True,
-                     help="Orientations of a spread plan."),
-        click.option("--dwell-s", type=click.FloatRange(min=0, min_open=True), default=30.0, show_default=True,
-                     help="Seconds in each orientation."),
-        click.option("--sample-hz", type=click.FloatRange(min=0, min_open=True), default=100.0, show_default=True,
-                     help="Rate of the readings."),
-        click.option("--angle-hz", type=click.FloatRange(min=0, min_open=True), default=10.0, show_default=True,
-                     help="Rate of the platform angles."),
-        click.option("--slew-degps", type=click.FloatRange(min=0, min_open=True), default=20.0, show_default=True,
-                     help="Greatest speed between orientations, deg/s."),
-        click.option("--white", "white_mps2", type=float, help="White noise of a reading, m/s^2."),
-        click.option("--ar1", "ar1_phi", type=float, help="Correlation of that noise from one reading to the next."),
-        click.option("--flicker", "flicker_mps2", type=float, help="1/f noise: floor of the Allan deviation, m/s^2."),
-        click.option("--walk", "walk_mps2_per_sqrt_s", type=float, help="Random walk of the biases, m/s^2/sqrt(s)."),
-        click.option("--scatter", "scatter_mps2", type=float, help="Offset of each sensor in each dwell, m/s^2."),
-        click.option("--setting", "setting_sigma_deg", type=float, help="Setting error of each orientation, deg."),
-        click.option("--encoder-sigma", "encoder_sigma_deg", type=float, help="Noise of the encoders, deg."),
-        click.option("--encoder-step", "encoder_step_deg", type=float, help="Resolution of the encoders, deg."),
-        click.option("--outlier-rate", type=float, help="Share of readings that are outliers."),
-        click.option("--outlier-size", "outlier_mps2", type=float, help="Size of an outlier, m/s^2."),
-        click.option("--hide", "hidden", multiple=True, metavar="NAME=SIZE", is_eager=True, callback=_list_hidden,
-                     help="Hide an effect in the truth, for example second-order=4ug/g^2, second-order=10sigma (10 "
-                     "times what noise leaves uncertain), random or random=10sigma; repeatable; help lists them all."),
-        click.option("--temperature", "constant_c", type=float, default=25.0, show_default=True,
-                     help="Temperature about which it swings, degC."),
-        click.option("--temperature-swing", "swing_c", type=float, default=0.0, show_default=True,
-                     help="Swing of the temperature to either side, K."),
-        click.option("--temperature-period-s", "period_s", type=float, default=3600.0, show_default=True,
-                     help="Period of that swing, s."),
-        click.option("--warm-up-c", "warm_up_c", type=float, default=0.0, show_default=True,
-                     help="How much colder the start is, K."),
-        click.option("--warm-up-s", "warm_up_s", type=float, default=1800.0, show_default=True,
-                     help="Time constant of the warming up, s."),
-        click.option("--unstated", is_flag=True, help="Do not state the setting error and scatter in the recording."),
-        click.option("--seed", type=int, default=0, show_default=True, help="Seed of sensors, plan and noise."),
+        run_option("--grade", type=click.Choice(["paper", "navigation", "mems"]), default="navigation",
+                   show_default=True, help="Grade of the simulated sensors."),
+        run_option("--plan", default="spread", show_default=True,
+                   help="spread, faces, or a CSV file of gimbal angles in deg, an orientation a line."),
+        run_option("--orientations", "count", type=click.IntRange(min=1), metavar="N", default=24, show_default=True,
+                   help="Orientations of a spread plan."),
+        run_option("--dwell-s", type=POSITIVE, default=30.0, show_default=True,
+                   help="Seconds in each orientation."),
+        run_option("--sample-hz", type=POSITIVE, default=100.0, show_default=True,
+                   help="Rate of the readings."),
+        run_option("--angle-hz", type=POSITIVE, default=10.0, show_default=True,
+                   help="Rate of the platform angles."),
+        run_option("--slew-degps", type=POSITIVE, default=20.0, show_default=True,
+                   help="Greatest speed between orientations, deg/s."),
+        run_option("--seed", type=int, metavar="N", default=0, show_default=True,
+                   help="Seed of sensors, plan and noise."),
+        run_option("--unstated", is_flag=True, help="Do not state the setting error and scatter in the recording."),
+        hidden_option("--hide", "hidden", multiple=True, metavar="NAME=SIZE", is_eager=True, callback=_list_hidden,
+                      help="Hide an effect in the truth, for example second-order=4ug/g^2, second-order=10sigma (10 "
+                      "times what noise leaves uncertain), random or random=10sigma; repeatable; help lists them all."),
+        noise_option("--white", "white_mps2", type=NUMBER, help="White noise of a reading, m/s^2."),
+        noise_option("--ar1", "ar1_phi", type=NUMBER, help="Correlation of that noise from one reading to the next."),
+        noise_option("--flicker", "flicker_mps2", type=NUMBER, help="1/f noise: floor of the Allan deviation, m/s^2."),
+        noise_option("--walk", "walk_mps2_per_sqrt_s", type=NUMBER, help="Random walk of the biases, m/s^2/sqrt(s)."),
+        noise_option("--scatter", "scatter_mps2", type=NUMBER, help="Offset of each sensor in each dwell, m/s^2."),
+        noise_option("--setting", "setting_sigma_deg", type=NUMBER, help="Setting error of each orientation, deg."),
+        noise_option("--encoder-sigma", "encoder_sigma_deg", type=NUMBER, help="Noise of the encoders, deg."),
+        noise_option("--encoder-step", "encoder_step_deg", type=NUMBER, help="Resolution of the encoders, deg."),
+        noise_option("--outlier-rate", type=NUMBER, help="Share of readings that are outliers."),
+        noise_option("--outlier-size", "outlier_mps2", type=NUMBER, help="Size of an outlier, m/s^2."),
+        warmth_option("--temperature", "constant_c", type=NUMBER, default=25.0, show_default=True,
+                      help="Temperature about which it swings, degC."),
+        warmth_option("--temperature-swing", "swing_c", type=NUMBER, default=0.0, show_default=True,
+                      help="Swing of the temperature to either side, K."),
+        warmth_option("--temperature-period-s", "period_s", type=NUMBER, default=3600.0, show_default=True,
+                      help="Period of that swing, s."),
+        warmth_option("--warm-up-c", "warm_up_c", type=NUMBER, default=0.0, show_default=True,
+                      help="How much colder the start is, K."),
+        warmth_option("--warm-up-s", "warm_up_s", type=NUMBER, default=1800.0, show_default=True,
+                      help="Time constant of the warming up, s."),
     ]  # fmt: skip
     for option in reversed(options):
         command = option(command)
@@ -162,19 +173,22 @@ def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], 
     return _Recorded(readings, segmenter.dwell_count, duration_s, notes)
 
 
-@click.command()
+@click.command(
+    epilog=examples("simulate run.mcap", "simulate run.mcap --seed 3 --hide second-order=10sigma --temperature-swing 5")
+)
 @click.argument("out", type=OutputFile())
 @simulation_options
 @bench_options
 @overwrite_option
+@click.option("--large", is_flag=True, panel=OUTPUT, help="Begin even where the disk would not hold the recording.")
 @json_option
-def simulate(out: Path, overwrite: bool, as_json: bool, **options: Any) -> None:
+def simulate(out: Path, overwrite: bool, large: bool, as_json: bool, **options: Any) -> None:
     """Record a simulated bench run to OUT; its truth goes to a side file that no estimator opens."""
     from kf_calib.sources.simulated import simulation
     from kf_calib.sources.simulator import truth_file
 
     claimed([Path(options["plan"])], {"OUT, whose truth goes there": truth_file(out)}, overwrite)
-    source = simulation(options, overrides(options))
+    source = simulation(options, overrides(options), begin=partial(_foresee, out=out, large=large))
     with progress(f"simulating {out.name}", as_json) as tick:
         made = _record(source, out, overwrite, tick)
     truth = source.write_truth(out)
@@ -184,7 +198,29 @@ def simulate(out: Path, overwrite: bool, as_json: bool, **options: Any) -> None:
         echo(f"{out}: {made}; truth in {truth}")
 
 
-@click.command()
+def _foresee(run: Simulation, out: Path, large: bool) -> None:
+    """Say how large a large run becomes, before it begins; refuse what the disk does not hold."""
+    free = shutil.disk_usage(next(folder for folder in out.absolute().parents if folder.is_dir())).free
+    told = f"{len(run):.3g} readings, {run.duration_s / 3600:.3g} h of the bench, about {_size(run.file_bytes)}"
+    if run.file_bytes > free and not large:
+        raise InputError(
+            f"{out}: {told}, and the disk has {_size(free)} left: dwell shorter (--dwell-s), visit or read less "
+            "(--orientations, --sample-hz), or begin nevertheless with --large."
+        )
+    if run.file_bytes > _LARGE_BYTES:
+        click.echo(f"{out}: {told}.", err=True)
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e9:.3g} GB" if count < 1e12 else f"{count / 1e12:.3g} TB"
+
+
+@click.command(
+    epilog=examples(
+        'record run.mcap bench.csv --axes "y z x" --gravity 9.8123',
+        'record run.mcap - --bench bench.toml --column "acc x [g]=ax_g" < bench.csv',
+    )
+)
 @click.argument("out", type=OutputFile())
 @click.argument("lines", type=click.Path(path_type=Path, allow_dash=True), default="-")
 @columns_option
@@ -218,7 +254,7 @@ def pair(text: str) -> tuple[str, str]:
     return theirs, ours
 
 
-@click.command()
+@click.command(epilog=examples("demo", "demo somewhere"))
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default="out")
 @json_option
 def demo(folder: Path, as_json: bool) -> None:

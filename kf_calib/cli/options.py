@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import sys
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import click
+import rich_click as click
 
 from kf_calib.cli.echo import echo
 from kf_calib.cli.files import output_option
-from kf_calib.errors import InputError
+from kf_calib.cli.numbers import NOT_NEGATIVE, NUMBER, POSITIVE, NumberInRange
+from kf_calib.errors import BenchError, InputError
 
 if TYPE_CHECKING:
     from kf_calib.calibration import Calibration, Settings
@@ -22,55 +24,77 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+INPUT = "Input and bench"
+MODEL = "Model and evaluation"
+OUTPUT = "Output"
+"""Groups of options in ``--help``: an option joins one by ``panel=``, and stands where its decorator does."""
+
 BENCH_OPTIONS = {
-    "axes": ("--axes", 'Gimbal axes, outer to inner, for example "y z x".'),
-    "reference": ("--reference", "base (angles relative to the bench) or inertial (stabilised platform)."),
-    "gravity_mps2": ("--gravity", "Local gravity, m/s^2."),
-    "latitude_deg": ("--latitude", "Latitude, deg; gives normal gravity where --gravity is not stated."),
-    "height_m": ("--height", "Height, m, for normal gravity."),
-    "azimuth_deg": ("--azimuth", "Azimuth of the bench's x axis from North toward East, deg."),
-    "angle_sigma_deg": ("--angle-sigma", "Repeatability of setting an orientation, 1 sigma, deg (0: exact)."),
-    "scatter_sigma_mps2": ("--scatter-sigma", "Scatter of each sensor from dwell to dwell, 1 sigma, m/s^2."),
-    "nominal": ("--nominal", "Nominal parameters that differ, JSON, for example '{\"theta1\": 0}'."),
-}
+    "axes": ("--axes", str, "AXES", 'Gimbal axes, outer to inner, for example "y z x".'),
+    "up": ("--up", str, "AXIS", "Axis that points up when all angles are zero: y (the default; accelerometer 2 reads "
+           "+g), z as in ROS, x, -x, -y or -z."),
+    "channels": ("--channels", str, "N,N,N", "Which channel accelerometer 1, 2, 3 is, with a minus where its sign is "
+                 "reversed: 1,-2,3."),
+    "gravity_mps2": ("--gravity", NUMBER, "M/S^2", "Local gravity, m/s^2."),
+    "latitude_deg": ("--latitude", NUMBER, "DEG", "Latitude, deg; gives normal gravity where --gravity is not stated."),
+    "height_m": ("--height", NUMBER, "M", "Height, m, for normal gravity; 0 where it is not stated."),
+    "angle_sigma_deg": (
+        "--angle-sigma", NOT_NEGATIVE, "DEG",
+        "How well an orientation repeats, 1 sigma, deg (0: exactly); estimated where it is not stated.",
+    ),
+    "scatter_sigma_mps2": (
+        "--scatter-sigma", NOT_NEGATIVE, "M/S^2",
+        "Scatter of each sensor from dwell to dwell, 1 sigma, m/s^2; estimated where it is not stated.",
+    ),
+    "reference": (
+        "--reference", str, "WORD",
+        "base: angles are relative to the bench (usual); inertial: stabilised platform.",
+    ),
+    "azimuth_deg": ("--azimuth", NUMBER, "DEG", "Azimuth of the bench's x axis from North toward East, deg."),
+    "nominal": ("--nominal", str, "JSON", "Nominal parameters that differ, for example '{\"theta1\": 0}'."),
+}  # fmt: skip
 _ACCEL_UNITS = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "ug": 9.80665e-6}
 
 
 def bench_options(command: F) -> F:
     """The keys of the bench's record, for recordings that lack them; ``--bench`` reads them from a TOML file."""
-    for key, (name, text) in reversed(BENCH_OPTIONS.items()):
-        command = click.option(name, key, default=None, help=text)(command)
-    return click.option("--bench", "bench_file", type=click.Path(path_type=Path), help="TOML file of bench keys.")(
-        command
-    )
+    for key, (name, kind, metavar, text) in reversed(BENCH_OPTIONS.items()):
+        command = click.option(name, key, type=kind, metavar=metavar, default=None, help=text, panel=INPUT)(command)
+    return click.option(
+        "--bench", "bench_file", type=click.Path(path_type=Path), metavar="FILE.toml", panel=INPUT,
+        help="Bench keys from this file; the options below go before them.",
+    )(command)  # fmt: skip
 
 
 def recording_options(command: F) -> F:
-    """How to read a recording: topics, unit of the readings, and the bench."""
+    """How to read a recording: the bench, unit of the readings, and topics."""
     options = [
-        click.option("--accel-topic", help="Topic of the accelerometer, where there are several."),
-        click.option("--pose-topic", help="Topic of the platform's angles or attitude."),
-        click.option("--temperature-topic", help="Topic of the temperature."),
-        click.option(
-            "--accel-unit", type=click.Choice(list(_ACCEL_UNITS)), default="m/s2", help="Unit of the readings."
-        ),
-        click.option("--accel-scale", type=float, default=1.0, help="Size of one count, in the unit of the readings."),
-    ]
+        click.option("--accel-unit", type=click.Choice(list(_ACCEL_UNITS)), default="m/s2", show_default=True,
+                     help="Unit of the readings.", panel=INPUT),
+        click.option("--accel-scale", type=NUMBER, default=1.0, show_default=True,
+                     help="Size of one count, in the unit of the readings.", panel=INPUT),
+        click.option("--accel-topic", metavar="TOPIC", help="Topic of the accelerometer, where there are several.",
+                     panel=INPUT),
+        click.option("--pose-topic", metavar="TOPIC", help="Topic of the platform's angles or attitude.", panel=INPUT),
+        click.option("--temperature-topic", metavar="TOPIC", help="Topic of the temperature.", panel=INPUT),
+    ]  # fmt: skip
     for option in reversed(options):
         command = option(command)
     return bench_options(command)
 
 
 columns_option = click.option(
-    "--column", "columns", multiple=True, metavar="THEIRS=OURS",
+    "--column", "columns", multiple=True, metavar="THEIRS=OURS", panel=INPUT,
     help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.',
 )  # fmt: skip
-rrd_option = output_option("--rrd", help="Save the Rerun view here.")
-png_option = output_option("--png", help="Save a picture of the Rerun view here.")
-save_model_option = output_option("--save-model", help="Save the model here, for --model to read.")
-overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist already.")
+rrd_option = output_option("--rrd", metavar="FILE.rrd", help="Save the Rerun view here.", panel=OUTPUT)
+png_option = output_option("--png", metavar="FILE.png", help="Save a picture of the Rerun view here.", panel=OUTPUT)
+save_model_option = output_option(
+    "--save-model", metavar="FILE.toml", help="Save the model here, for --model to read.", panel=OUTPUT
+)
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist already.", panel=OUTPUT)
 effects_from_option = click.option(
-    "--effects-from", "effects_from", multiple=True, type=click.Path(path_type=Path), metavar="FILE.py",
+    "--effects-from", "effects_from", multiple=True, type=click.Path(path_type=Path), metavar="FILE.py", panel=MODEL,
     help="A Python file with effect classes of your own, for --with to name; repeatable.",
 )  # fmt: skip
 
@@ -78,33 +102,45 @@ effects_from_option = click.option(
 def filter_options(command: F) -> F:
     """How a run is evaluated."""
     options = [
-        click.option("--engine", type=click.Choice(["block", "filterpy"]), default="block", show_default=True,
-                     help="Block square-root filter, or filterpy sample by sample."),
-        click.option("--with", "effects", multiple=True, metavar="EFFECT",
+        click.option("--with", "effects", multiple=True, metavar="EFFECT", panel=MODEL,
                      help="An effect to put in the model, for example second-order, or a formula of your own, "
                      "for example 'mine = fx*fy*T'; repeatable."),
         effects_from_option,
-        click.option("--model", "model_file", type=click.Path(path_type=Path),
+        click.option("--model", "model_file", type=click.Path(path_type=Path), metavar="FILE.toml", panel=MODEL,
                      help="A model file (replay --save-model); its effects come before those of --with."),
-        click.option("--prior", type=click.Choice(["diffuse", "navigation", "mems"]), default="diffuse",
-                     show_default=True, help="What is believed of the sensors before the run."),
-        click.option("--bias-walk", type=click.FloatRange(min=0), default=0.0,
-                     help="Random walk of the biases, m/s^2 per square root of a second (process noise)."),
-        click.option("--gate/--no-gate", default=True, show_default=True, help="Reject outlying readings."),
-        click.option("--gate-sigma", type=click.FloatRange(min=3), default=6.0, show_default=True,
+        click.option("--leave-out", "left_out", type=click.IntRange(min=1), multiple=True, metavar="DWELL", panel=MODEL,
+                     help="Number of a dwell that is not to be used; repeatable."),
+        click.option("--settle-s", type=NOT_NEGATIVE, default=1.0, show_default=True, panel=MODEL,
+                     help="Seconds left out after each arrival; of a short dwell no more than a third."),
+        click.option("--still-deg", type=POSITIVE, default=0.05, show_default=True, panel=MODEL,
+                     help="Motion within half a second that still counts as standing still, deg."),
+        click.option("--gate/--no-gate", default=True, show_default=True, help="Reject outlying readings.",
+                     panel=MODEL),
+        click.option("--gate-sigma", type=NumberInRange(min=3), default=6.0, show_default=True, panel=MODEL,
                      help="Where the gate stands, robust sigma."),
-        click.option("--still-deg", type=click.FloatRange(min=0, min_open=True), default=0.05, show_default=True,
-                     help="Motion within a second that still counts as standing still, deg."),
-        click.option("--settle-s", type=click.FloatRange(min=0), default=1.0, show_default=True,
-                     help="Seconds left out after each arrival."),
+        click.option("--prior", type=click.Choice(["diffuse", "navigation", "mems"]), default="diffuse",
+                     show_default=True, help="What is believed of the sensors before the run.", panel=MODEL),
+        click.option("--bias-walk", type=NOT_NEGATIVE, default=0.0, show_default=True, panel=MODEL,
+                     help="Random walk of the biases, m/s^2 per square root of a second (process noise)."),
+        click.option("--engine", type=click.Choice(["block", "filterpy"]), default="block", show_default=True,
+                     help="Block square-root filter, or filterpy sample by sample.", panel=MODEL),
     ]  # fmt: skip
     for option in reversed(options):
         command = option(command)
     return command
 
 
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-strict_option = click.option("--strict", is_flag=True, help="Exit with 1 where model and measurements disagree.")
+json_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print one JSON object, and nothing else.", panel=OUTPUT
+)
+strict_option = click.option(
+    "--strict", is_flag=True, help="Exit with 1 where model and measurements disagree.", panel=OUTPUT
+)
+
+
+def examples(*lines: str) -> str:
+    """What follows the options in ``--help``, a line each."""
+    return "\n\n".join(["Examples:", *(f"$ kf-calib {line}" for line in lines)])
 
 
 def overrides(options: Mapping[str, Any]) -> dict[str, str]:
@@ -112,7 +148,7 @@ def overrides(options: Mapping[str, Any]) -> dict[str, str]:
     keys: dict[str, str] = {}
     if options["bench_file"]:
         keys |= _bench_from_toml(options["bench_file"])
-    keys |= {key: options[key] for key in BENCH_OPTIONS if options[key] is not None}
+    keys |= {key: str(options[key]) for key in BENCH_OPTIONS if options[key] is not None}
     return keys
 
 
@@ -122,9 +158,18 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error}).") from None
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: is not TOML ({error}); write lines such as gravity_mps2 = 9.81.") from None
+        raise InputError(
+            f"{path}: is not TOML ({error}); write lines such as gravity_mps2 = 9.81, numbers with a point."
+        ) from None
     table = table.get("bench", table)
-    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in table.items()}
+    keys = {key: value if isinstance(value, str) else json.dumps(value) for key, value in table.items()}
+    from kf_calib.bench import numbers_of
+
+    try:
+        numbers_of(keys)
+    except BenchError as error:
+        raise BenchError(f"{path}: {error}") from None
+    return keys
 
 
 def recording_of(path: Path, options: Mapping[str, Any]) -> Recording:
@@ -152,6 +197,7 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
         gate_sigma=options["gate_sigma"] if options["gate"] else None,
         walk_mps2_per_sqrt_s=options["bias_walk"],
         effects=effects_of(options),
+        left_out=tuple(options["left_out"]),
     )
 
 
@@ -198,7 +244,8 @@ def json_line(content: Mapping[str, Any]) -> str:
 def show(renderable: Any) -> None:
     from rich.console import Console
 
-    console = Console(width=None if sys.stdout.isatty() else 110, highlight=False, soft_wrap=not sys.stdout.isatty())
+    told = sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdigit()
+    console = Console(width=None if told else 110, highlight=False, soft_wrap=not sys.stdout.isatty())
     with console.capture() as printed:
         console.print(renderable)
     echo(printed.get(), end=False)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import click
+import rich_click as click
 
 from kf_calib.cli.files import claimed, delivery
+from kf_calib.cli.numbers import NumberInRange
 from kf_calib.cli.options import (
+    examples,
     json_option,
     overwrite_option,
     png_option,
@@ -21,45 +24,26 @@ from kf_calib.cli.options import (
 if TYPE_CHECKING:
     from kf_calib.experiment import Experiment
 
+of_the_run = partial(click.option, panel="Run")
+inferred = partial(click.option, panel="Conditions that the paper does not print: inferred")
 
-@click.command()
-@click.option("--repetitions", type=click.IntRange(1, 20000), default=200, show_default=True, help="Runs of each set.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the noise.")
-@click.option(
-    "--period-s",
-    type=click.FloatRange(min=0, min_open=True, max=3600),
-    default=25.0,
-    show_default=True,
-    help="From reading to reading in the non-optimal set, s; inferred, not printed in the paper.",
-)
-@click.option(
-    "--latitude",
-    type=click.FloatRange(-85, 85),
-    default=55.75,
-    show_default=True,
-    help="Latitude of the bench, deg; inferred.",
-)
-@click.option(
-    "--azimuth",
-    type=click.FloatRange(-360, 360),
-    default=0.0,
-    show_default=True,
-    help="Azimuth of the bench's x axis, deg; inferred.",
-)
-@click.option(
-    "--turns",
-    type=click.Choice(["platform", "platform-after-2", "bench", "bench-after-2"]),
-    default="platform",
-    show_default=True,
-    help="Whose axes the turns are about, and whether the third orientation goes on after the second.",
-)
-@click.option(
-    "--sampled",
-    type=click.Choice(["together", "123", "132", "213", "231", "312", "321"]),
-    default="together",
-    show_default=True,
-    help="Accelerometers read at once, or in turn in each orientation.",
-)
+
+@click.command(epilog=examples("paper", "paper --repetitions 1000 --rrd paper.rrd"))
+@of_the_run("--repetitions", type=click.IntRange(1, 20000), default=200, show_default=True, metavar="N",
+            help="Runs of each set.")
+@of_the_run("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="N", help="Seed of the noise.")
+@inferred("--period-s", type=NumberInRange(min=0, min_open=True, max=3600), default=25.0, show_default=True,
+          help="From reading to reading in the non-optimal set, s.")
+@inferred("--latitude", type=NumberInRange(-85, 85), default=55.75, show_default=True, help="Of the bench, deg.")
+@inferred("--azimuth", type=NumberInRange(-360, 360), default=0.0, show_default=True,
+          help="Of the bench's x axis, deg.")
+@inferred("--turns", type=click.Choice(["platform", "platform-after-2", "bench", "bench-after-2"]), default="platform",
+          show_default=True, metavar="WORD",
+          help="Whose axes the turns are about, and whether the third orientation goes on after the second: platform, "
+          "platform-after-2, bench or bench-after-2.")
+@inferred("--sampled", type=click.Choice(["together", "123", "132", "213", "231", "312", "321"]), default="together",
+          show_default=True, metavar="WORD",
+          help="Accelerometers read together, or in turn in each orientation: 123, 132 ... 321.")
 @rrd_option
 @png_option
 @overwrite_option

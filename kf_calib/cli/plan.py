@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
+import rich_click as click
 
 from kf_calib.cli.files import claimed, delivery, output_option
+from kf_calib.cli.numbers import POSITIVE, NumberInRange
 from kf_calib.cli.options import (
+    OUTPUT,
     F,
+    examples,
     filter_options,
     json_option,
     opened,
@@ -38,42 +42,48 @@ _CRITERIA = ("D", "A", "E", "minimax", "condition")
 
 def _plan_options(command: F) -> F:
     """What is aimed at, what the bench can do, and what a dwell tells."""
-    positive = click.FloatRange(min=0, min_open=True)
+    aim_option, reach_option, dwell_option = (
+        partial(click.option, panel=panel)
+        for panel in ("What to aim at", "What the bench can do", "What a dwell tells")
+    )
     options = [
-        click.option("--count", type=click.IntRange(min=1), help="Dwells; 12, and 1 where a recording is given."),
-        click.option("--criterion", type=click.Choice(_CRITERIA), default="D", show_default=True,
-                     help="Least generalised variance, mean variance, largest principal sigma, largest sigma (rad, 1, "
-                     "g), or the paper's condition number."),
-        click.option("--target", "targets", multiple=True, metavar="NAME=SIZE",
-                     help="Sigma wanted of a parameter or kind, as K=2ppm, b2=20ug, angles=0.1arcsec; repeatable: the "
-                     "worst relative to its target is made least."),
-        click.option("--fewest", is_flag=True, help="The fewest dwells that reach all targets."),
-        click.option("--grid-deg", type=positive, help="Angles are multiples of this."),
-        click.option("--positions", type=click.Path(path_type=Path), metavar="FILE.csv",
-                     help="Choose from these orientations, a line of gimbal angles in deg each."),
-        click.option("--limit", "limits", multiple=True, metavar="AXIS=LOW:HIGH",
+        aim_option("--count", type=click.IntRange(min=1), metavar="N",
+                   help="Dwells; 12, and 1 where a recording is given."),
+        aim_option("--criterion", type=click.Choice(_CRITERIA), default="D", show_default=True,
+                   help="Least generalised variance, mean variance, largest principal sigma, largest sigma (rad, 1, "
+                   "g), or the paper's condition number."),
+        aim_option("--target", "targets", multiple=True, metavar="NAME=SIZE",
+                   help="Sigma wanted of a parameter or kind, as K=2ppm, b2=20ug, angles=0.1arcsec; repeatable: the "
+                   "worst relative to its target is made least."),
+        aim_option("--fewest", is_flag=True, help="The fewest dwells that reach all targets."),
+        aim_option("--recording", type=click.Path(path_type=Path), metavar="REC",
+                   help="A run so far: what comes next, from the filter's own covariance."),
+        aim_option("--beside-paper", is_flag=True,
+                   help="The paper's optimal set beside it, as many readings a dwell."),
+        reach_option("--limit", "limits", multiple=True, metavar="AXIS=LOW:HIGH",
                      help="Range of a gimbal in deg, as z=-90:90; AXIS: its axis, number, or outer, middle, inner; "
                      "repeatable."),
-        click.option("--forbid", "zones", multiple=True, metavar="AXIS=LOW:HIGH,...",
+        reach_option("--forbid", "zones", multiple=True, metavar="AXIS=LOW:HIGH,...",
                      help="Angles not to be taken, of one gimbal or of several at once; repeatable."),
-        click.option("--repeats", type=click.IntRange(min=1), default=1, show_default=True,
+        reach_option("--grid-deg", type=POSITIVE, help="Angles are multiples of this."),
+        reach_option("--positions", type=click.Path(path_type=Path), metavar="FILE.csv",
+                     help="Choose from these orientations, a line of gimbal angles in deg each."),
+        reach_option("--repeats", type=click.IntRange(min=1), metavar="N", default=1, show_default=True,
                      help="Visits to each orientation, coming from others: scatter and hysteresis show."),
-        click.option("--antipodal", is_flag=True, help="Each orientation with its opposite, gravity turned over."),
-        click.option("--dwell-s", type=positive, help="Seconds in each orientation; 30, or as in the recording."),
-        click.option("--sample-hz", type=positive, default=100.0, show_default=True, help="Rate of the readings."),
-        click.option("--readings", type=positive, help="Readings of a dwell that are used, in place of the two above."),
-        click.option("--white", "white_mps2", type=positive, default=1e-4, show_default=True,
-                     help="White noise of a reading, m/s^2, where no recording tells it."),
-        click.option("--slew-degps", type=positive, default=20.0, show_default=True, help="Greatest speed, deg/s."),
-        click.option("--time-correlation", type=click.FloatRange(0, 1), default=0.1, show_default=True,
+        reach_option("--antipodal", is_flag=True, help="Each orientation with its opposite, gravity turned over."),
+        reach_option("--slew-degps", type=POSITIVE, default=20.0, show_default=True, help="Greatest speed, deg/s."),
+        reach_option("--time-correlation", type=NumberInRange(0, 1), default=0.1, show_default=True,
                      help="Correlation of time with the direction of gravity that the order may have; slews are the "
                      "shortest below it."),
-        click.option("--recording", type=click.Path(path_type=Path), metavar="REC",
-                     help="A run so far: what comes next, from the filter's own covariance."),
-        click.option("--beside-paper", is_flag=True,
-                     help="The paper's optimal set beside it, as many readings a dwell."),
-        click.option("--seed", type=int, default=0, show_default=True, help="Seed of the order of visits."),
-        output_option("--csv", "csv_file", help="Save the angles, for simulate --plan."),
+        reach_option("--seed", type=int, metavar="N", default=0, show_default=True,
+                     help="Seed of the order of visits."),
+        dwell_option("--dwell-s", type=POSITIVE, help="Seconds in each orientation; 30, or as in the recording."),
+        dwell_option("--sample-hz", type=POSITIVE, default=100.0, show_default=True, help="Rate of the readings."),
+        dwell_option("--readings", type=POSITIVE, help="Readings of a dwell that are used, in place of the two above."),
+        dwell_option("--white", "white_mps2", type=POSITIVE, default=1e-4, show_default=True,
+                     help="White noise of a reading, m/s^2, where no recording tells it."),
+        output_option("--csv", "csv_file", metavar="FILE.csv", panel=OUTPUT,
+                      help="Save the angles, for simulate --plan."),
         rrd_option,
         png_option,
         overwrite_option,
@@ -83,7 +93,13 @@ def _plan_options(command: F) -> F:
     return command
 
 
-@click.command()
+@click.command(
+    epilog=examples(
+        "plan --count 12 --limit z=-90:90 --csv plan.csv",
+        "plan --target K=2ppm --fewest",
+        "plan --recording run.mcap",
+    )
+)
 @_plan_options
 @recording_options
 @filter_options

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import click
+import rich_click as click
 
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.options import (
     BENCH_OPTIONS,
+    INPUT,
+    OUTPUT,
     effects_of,
+    examples,
     filter_options,
     json_option,
     opened,
@@ -31,15 +34,21 @@ from kf_calib.cli.options import (
     strict_option,
 )
 
+STEPS = "Steps"
 
-@click.command()
+
+@click.command(
+    epilog=examples(
+        "replay run.mcap", 'replay bag.mcap --axes "y z x" --gravity 9.8123 --with second-order --rrd run.rrd'
+    )
+)
 @click.argument("recording", type=click.Path(path_type=Path))
+@recording_options
+@filter_options
 @rrd_option
 @png_option
 @save_model_option
 @overwrite_option
-@recording_options
-@filter_options
 @strict_option
 @json_option
 @click.pass_context
@@ -77,7 +86,7 @@ def replay(
         ctx.exit(1)
 
 
-@click.command()
+@click.command(epilog=examples("compare run.mcap"))
 @click.argument("recording", type=click.Path(path_type=Path))
 @recording_options
 @filter_options
@@ -99,12 +108,16 @@ def compare(recording: Path, as_json: bool, **options: Any) -> None:
         show(comparison_table(compared))
 
 
-@click.command("effects")
+@click.command(
+    "effects",
+    epilog=examples("effects", "effects hysteresis", "effects 'mine = fx*fy*T' second-order --recording run.mcap"),
+)
 @click.argument("names", nargs=-1, metavar="[NAME]...")
 @click.option(
     "--recording",
     type=click.Path(path_type=Path),
     metavar="REC",
+    panel=INPUT,
     help="Say of each effect what this recording shows of it: visible, smallest size, confused with what.",
 )
 @recording_options
@@ -155,7 +168,7 @@ def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, option
         show(catalogue.sight_report(seen, title))
 
 
-@click.command()
+@click.command(epilog=examples("diagnose run.mcap", "diagnose run.mcap --with hysteresis"))
 @click.argument("recording", type=click.Path(path_type=Path))
 @recording_options
 @filter_options
@@ -179,28 +192,36 @@ def diagnose(ctx: click.Context, recording: Path, strict: bool, as_json: bool, *
         ctx.exit(1)
 
 
-@click.command()
+@click.command(
+    epilog=examples("improve run.mcap --unattended --save-model found.toml", "improve run.mcap --interactive")
+)
 @click.argument("recording", type=click.Path(path_type=Path))
-@click.option("--interactive/--unattended", default=None, help="Ask at every step, or never; on a terminal it asks.")
-@click.option("--accept-first", is_flag=True, help="Of effects that explain it equally well, take the first.")
+@click.option("--interactive", is_flag=True, panel=STEPS, help="Ask at every step; usual on a terminal.")
+@click.option("--unattended", is_flag=True, panel=STEPS, help="Never ask; usual where there is no terminal.")
+@click.option(
+    "--accept-first", is_flag=True, panel=STEPS, help="Of effects that explain it equally well, take the first."
+)
 @click.option(
     "--honest",
     is_flag=True,
+    panel=STEPS,
     help="Held-out error with the choice of effects repeated without what is held out, in 6 folds.",
 )
-@output_option("--save-model", "--out-model", help="Save the last model here.")
-@output_option("--journal", "journal_file", help="Keep a journal of the steps here.")
-@click.option("--from-journal", type=click.Path(path_type=Path), help="First take the steps of this journal again.")
-@overwrite_option
+@click.option("--from-journal", type=click.Path(path_type=Path), metavar="FILE", panel=STEPS,
+              help="First take the steps of this journal again.")  # fmt: skip
 @recording_options
 @filter_options
+@output_option("--save-model", "--out-model", metavar="FILE.toml", help="Save the last model here.", panel=OUTPUT)
+@output_option("--journal", "journal_file", metavar="FILE", help="Keep a journal of the steps here.", panel=OUTPUT)
+@overwrite_option
 @strict_option
 @json_option
 @click.pass_context
 def improve(
     ctx: click.Context,
     recording: Path,
-    interactive: bool | None,
+    interactive: bool,
+    unattended: bool,
     accept_first: bool,
     honest: bool,
     save_model: Path | None,
@@ -216,10 +237,7 @@ def improve(
     from kf_calib.calibration import calibrate
     from kf_calib.views import improvement as views
 
-    if interactive is None:
-        interactive = not as_json and sys.stdin.isatty() and sys.stdout.isatty()
-    if interactive and as_json:
-        raise click.UsageError("--interactive asks questions, --json prints one object and nothing else: choose one.")
+    interactive = _asks(interactive, unattended, as_json)
     outputs = claimed(overwrite=overwrite)
     earlier = journal.read(from_journal) if from_journal else None
     if earlier is not None:
@@ -260,6 +278,15 @@ def improve(
         ctx.exit(1)
 
 
+def _asks(interactive: bool, unattended: bool, as_json: bool) -> bool:
+    """Whether to ask at every step; raises UsageError where the options say both."""
+    if interactive and unattended:
+        raise click.UsageError("--interactive asks at every step, --unattended never does: choose one.")
+    if interactive and as_json:
+        raise click.UsageError("--interactive asks questions, --json prints one object and nothing else: choose one.")
+    return interactive or (not (unattended or as_json) and sys.stdin.isatty() and sys.stdout.isatty())
+
+
 _BY_CONTENT = ("bench_file", "model_file", *BENCH_OPTIONS)
 
 
@@ -271,7 +298,7 @@ def _refuse_engine(options: Mapping[str, Any]) -> None:
         )
 
 
-def _for_journal(options: Mapping[str, Any], effects: tuple[str, ...]) -> dict[str, Any]:
+def _for_journal(options: Mapping[str, Any], effects: Sequence[str]) -> dict[str, Any]:
     """All options that numbers depend on; files of bench keys and of models by what they say."""
     from kf_calib import model_file
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,12 +15,26 @@ from kf_calib.samples import Floats, Times
 _PEAK_OF_MINIMUM_JERK = 1.875  # greatest speed of the profile over its mean speed
 
 
-def attitude(axes: Sequence[Vector], angles_rad: Floats) -> Rotation:
-    """Platform -> bench at angles (n, k): each gimbal, outer first, turns about its axis of the one that carries it."""
-    turned = Rotation.from_rotvec(np.zeros((1, 3)))
+def attitude(axes: Sequence[Vector], angles_rad: Floats, up: str = "y") -> Rotation:
+    """Platform -> bench at angles (n, k): each gimbal, outer first, turns about its axis of the one that carries it,
+    and the first about one of a base whose axis ``up`` points up."""
+    turned = base_with_up(up)
     for axis, angle in zip(axes, angles_rad.T, strict=True):
         turned = turned * Rotation.from_rotvec(angle[:, None] * np.array(axis))
     return turned
+
+
+@lru_cache
+def base_with_up(up: str) -> Rotation:
+    """The frame in which the axes are named -> bench (y up): its axis ``up`` (z, -x ...) points up, and its x where the
+    bench's x does, or its y where x is vertical."""
+    if up == "y":
+        return Rotation.from_rotvec(np.zeros((1, 3)))
+    vertical = np.zeros(3)
+    vertical["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
+    level = [0.0, 1.0, 0.0] if up.endswith("x") else [1.0, 0.0, 0.0]
+    bench_from_base = np.array([level, vertical, np.cross(level, vertical)])  # rows: bench x, y, z seen in the base
+    return Rotation.from_matrix(bench_from_base[None])
 
 
 @dataclass(frozen=True)

@@ -97,9 +97,14 @@ Step = Callable[[State], None]
 """One part of the bench: changes what is true in a ``State``. It may remember what went before."""
 
 
-def gimbals(state: State) -> None:
-    """The chain of gimbals: angles -> attitude."""
-    state.attitude = attitude(state.axes, state.angles_rad)
+@dataclass(frozen=True)
+class Gimbals:
+    """The chain of gimbals, on a base whose axis ``up`` points up: angles -> attitude in the bench frame."""
+
+    up: str
+
+    def __call__(self, state: State) -> None:
+        state.attitude = attitude(state.axes, state.angles_rad, self.up)
 
 
 @dataclass(frozen=True)

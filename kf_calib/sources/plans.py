@@ -73,13 +73,13 @@ def angles_from_csv(path: Path, width: int) -> list[list[float]]:
     return rows
 
 
-def six_faces(axes: Sequence[Vector] = YZX, dwell_s: float = 60.0) -> list[Visit]:
+def six_faces(axes: Sequence[Vector] = YZX, dwell_s: float = 60.0, up: str = "y") -> list[Visit]:
     """Each platform axis up and down (+x, -x, +y, -y, +z, -z), by the fewest quarter turns of the gimbals.
 
     Raises InputError where quarter turns of these axes do not show all six faces to gravity.
     """
     quarters = sorted(itertools.product((0.0, 90.0, -90.0, 180.0), repeat=len(axes)), key=_total_turn)
-    seen = up_directions(axes, np.radians(quarters))
+    seen = up_directions(axes, np.radians(quarters), up)
     plan = list[Visit]()
     for face in np.vstack([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]:
         fitting = np.flatnonzero(seen @ face > 1 - _REACHED)
@@ -89,7 +89,9 @@ def six_faces(axes: Sequence[Vector] = YZX, dwell_s: float = 60.0) -> list[Visit
     return plan
 
 
-def spread_plan(count: int, axes: Sequence[Vector] = YZX, dwell_s: float = 60.0, seed: int = 0) -> list[Visit]:
+def spread_plan(
+    count: int, axes: Sequence[Vector] = YZX, dwell_s: float = 60.0, seed: int = 0, up: str = "y"
+) -> list[Visit]:
     """``count`` orientations whose directions of gravity are spread evenly over the sphere, in random order.
 
     The directions are a Fibonacci lattice turned at random; angles that do not move gravity are random, so that what
@@ -99,13 +101,13 @@ def spread_plan(count: int, axes: Sequence[Vector] = YZX, dwell_s: float = 60.0,
         raise InputError(f"a plan of {count} orientations is not possible: ask for one or more.")
     rng = np.random.default_rng(seed)
     directions = Rotation.random(rng=rng).apply(_fibonacci_lattice(count))
-    angles = [_angles_towards(direction, axes, rng) for direction in rng.permutation(directions)]
+    angles = [_angles_towards(direction, axes, rng, up) for direction in rng.permutation(directions)]
     return explicit_plan(np.degrees(angles), dwell_s)
 
 
-def up_directions(axes: Sequence[Vector], angles_rad: Floats) -> Floats:
-    """The vertical seen from the platform (n, 3) at gimbal angles (n, k)."""
-    return attitude(axes, angles_rad).inv().apply([0.0, 1.0, 0.0])
+def up_directions(axes: Sequence[Vector], angles_rad: Floats, up: str = "y") -> Floats:
+    """The vertical seen from the platform (n, 3) at gimbal angles (n, k); ``up``: what is up where these are zero."""
+    return attitude(axes, angles_rad, up).inv().apply([0.0, 1.0, 0.0])
 
 
 def _total_turn(angles_deg: Sequence[float]) -> float:
@@ -121,14 +123,14 @@ def _fibonacci_lattice(count: int) -> Floats:
     return np.column_stack([radius * np.cos(around), along, radius * np.sin(around)])
 
 
-def _angles_towards(direction: Floats, axes: Sequence[Vector], rng: np.random.Generator) -> Floats:
+def _angles_towards(direction: Floats, axes: Sequence[Vector], rng: np.random.Generator, up: str) -> Floats:
     """Gimbal angles (k,), rad in [-pi, pi), that point the vertical along ``direction``, from random starts.
 
     Angles that do not move gravity stay where they start: left to rounding, each machine would have a plan of its own.
     """
 
     def miss(angles_rad: Floats, start_rad: Floats) -> Floats:
-        apart = up_directions(axes, angles_rad[None])[0] - direction
+        apart = up_directions(axes, angles_rad[None], up)[0] - direction
         return np.append(apart, _PULL * (angles_rad - start_rad))
 
     best, cost = np.zeros(len(axes)), math.inf

@@ -21,7 +21,7 @@ from mcap.records import Channel, Metadata, Schema
 
 from kf_calib.bench import Bench
 from kf_calib.errors import BenchError, InputError
-from kf_calib.samples import Batch, Stream
+from kf_calib.samples import Batch, Source, Stream
 from kf_calib.sources.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, CdrError, Decoder, MessageType
 from kf_calib.sources.mcap_file import Block, DamagedError, McapFile, MessageFinder, Messages, Warn, parse
 
@@ -267,6 +267,11 @@ class Recording:
         except BenchError as error:
             where = f"{damage}, so give it by options" if contents.bench_damaged else str(self.path)
             raise BenchError(f"{where}: {error}") from error
+
+
+def opened(source: Source | str | PathLike[str]) -> Source:
+    """The source itself, or the recording at a path."""
+    return Recording(source) if isinstance(source, str | PathLike) else source
 
 
 class _Passage:

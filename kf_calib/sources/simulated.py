@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -50,8 +50,16 @@ def options_from_query(query: str) -> dict[str, Any]:
     return options
 
 
-def simulation(options: Mapping[str, Any], bench_keys: Mapping[str, str], batch_samples: int = 65536) -> Simulation:
-    """The run that these options describe (those of ``simulate``; None: as the grade has it). Raises InputError."""
+def simulation(
+    options: Mapping[str, Any],
+    bench_keys: Mapping[str, str],
+    batch_samples: int = 65536,
+    begin: Callable[[Simulation], None] = lambda run: None,
+) -> Simulation:
+    """The run that these options describe (those of ``simulate``; None: as the grade has it). Raises InputError.
+
+    begin: is given the run before anything is hidden in it, which takes as long as the run is large.
+    """
     options = {**DEFAULTS} | {key: value for key, value in options.items() if value is not None}
     keys = {"axes": "y z x", **bench_keys}
     if "latitude_deg" not in keys:
@@ -60,7 +68,7 @@ def simulation(options: Mapping[str, Any], bench_keys: Mapping[str, str], batch_
     names = {field.name for field in fields(grade.noise)}
     noise = replace(grade.noise, **{key: options[key] for key in names if key in options})
     axes = parse_axes(keys["axes"])
-    visits = _visits(options, axes)
+    visits = _visits(options, axes, keys.get("up", "y"))
     if not options["unstated"]:
         keys.setdefault("angle_sigma_deg", repr(noise.setting_sigma_deg))
         keys.setdefault("scatter_sigma_mps2", repr(noise.dwell_sigma_mps2(len(visits))))
@@ -70,14 +78,15 @@ def simulation(options: Mapping[str, Any], bench_keys: Mapping[str, str], batch_
         sample_hz=options["sample_hz"], angle_hz=options["angle_hz"], slew_rate_degps=options["slew_degps"],
         ambient=ambient, seed=options["seed"], grade=options["grade"], batch_samples=batch_samples,
     )  # fmt: skip
+    begin(run)
     return run.hiding(
         parse(options["hidden"], axes, seed=options["seed"], grade=options["grade"], sized=partial(sized, run))
     )
 
 
-def _visits(options: Mapping[str, Any], axes: tuple[Vector, ...]) -> list[Visit]:
+def _visits(options: Mapping[str, Any], axes: tuple[Vector, ...], up: str) -> list[Visit]:
     if options["plan"] == "spread":
-        return spread_plan(options["count"], axes, options["dwell_s"], options["seed"])
+        return spread_plan(options["count"], axes, options["dwell_s"], options["seed"], up)
     if options["plan"] == "faces":
-        return six_faces(axes, options["dwell_s"])
+        return six_faces(axes, options["dwell_s"], up)
     return explicit_plan(angles_from_csv(Path(options["plan"]), len(axes)), options["dwell_s"])

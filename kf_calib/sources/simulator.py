@@ -31,6 +31,7 @@ from kf_calib.sources.physics import (
     Ambient,
     BiasWalk,
     Disturbance,
+    Gimbals,
     Gravity,
     Inputs,
     Response,
@@ -38,7 +39,6 @@ from kf_calib.sources.physics import (
     SettingError,
     State,
     Step,
-    gimbals,
 )
 from kf_calib.sources.plans import YZX, Visit, stays
 from kf_calib.sources.sensors import Sensors
@@ -53,6 +53,8 @@ START_NS = 1_750_000_000_000_000_000
 """Stamp of the first sample: 15 June 2025, 15:06:40 UTC."""
 
 _TEMPERATURE_HZ = 1.0
+_READING_BYTES, _POSE_BYTES, _TEMPERATURE_BYTES = 50, 30, 35  # in a recording, compressed
+_LONGEST_S = 7e9  # the stamps of a recording end in 2262
 
 
 class Simulation:
@@ -96,6 +98,16 @@ class Simulation:
     def __len__(self) -> int:
         """Number of readings."""
         return self._accel.first_at(self.motion.end_ns)
+
+    @property
+    def duration_s(self) -> float:
+        return self.motion.end_ns * 1e-9
+
+    @property
+    def file_bytes(self) -> int:
+        """About as large its recording becomes."""
+        poses, temperatures = (clock.first_at(self.motion.end_ns) for clock in (self._pose, self._temperature))
+        return _READING_BYTES * len(self) + _POSE_BYTES * poses + _TEMPERATURE_BYTES * temperatures
 
     def __iter__(self) -> Iterator[Batch]:
         steps = self._steps()
@@ -159,7 +171,7 @@ class Simulation:
     def _steps(self) -> list[Step]:
         """The chain, fresh from its start."""
         hidden = self._hidden_steps()
-        platform: list[Step] = [*hidden["angles"], gimbals, *hidden["attitude"], *self._setting_steps()]
+        platform: list[Step] = [*hidden["angles"], Gimbals(self.bench.up), *hidden["attitude"], *self._setting_steps()]
         response: list[Step] = [Inputs(self.sensors), *hidden["input"], Response(self.sensors), *hidden["reading"]]
         force: list[Step] = [Gravity(self.bench), *hidden["force"]]
         return [*platform, *force, *response, *self._noise_steps(), *hidden["record"]]
@@ -201,7 +213,7 @@ class Simulation:
             for step in steps:
                 step(state)
             values[start:end] = state.reading_mps2
-        return Stream(START_NS + time_ns, values)
+        return Stream(START_NS + time_ns, _channels(values, self.bench.channels))
 
     def _state(self, time_ns: Times) -> State:
         dwell = int(self.motion.locate(time_ns[:1])[0][0])
@@ -253,6 +265,14 @@ class _Clock:
         return np.arange(self.first_at(start_ns), self.first_at(end_ns)) * self.period_ns
 
 
+def _channels(readings: Floats, wired: tuple[int, int, int]) -> Floats:
+    """What comes out of the three channels (n, 3) where accelerometer i is wired to channel |wired[i]|, by its sign."""
+    out = np.empty_like(readings)
+    for accelerometer, channel in enumerate(wired):
+        out[:, abs(channel) - 1] = readings[:, accelerometer] if channel > 0 else -readings[:, accelerometer]
+    return out
+
+
 def _refuse_impossible(
     plan: Sequence[Visit], axes: int, sample_hz: float, angle_hz: float, slew_rate_degps: float, batch_samples: int
 ) -> None:
@@ -263,6 +283,12 @@ def _refuse_impossible(
             raise InputError(f"visit {number} has angles {visit.gimbal_deg}: give one number for each of {axes} axes.")
         if not 0.0 < visit.dwell_s < math.inf:
             raise InputError(f"visit {number} lasts {visit.dwell_s:g} s: give a positive time.")
+    total_s = sum(visit.dwell_s for visit in plan)
+    if total_s > _LONGEST_S:
+        raise InputError(
+            f"the visits last {total_s:.3g} s in all, {total_s / 31557600:.3g} years: the stamps of a recording hold "
+            "220; dwell shorter."
+        )
     for name, rate_hz in (("sample_hz", sample_hz), ("angle_hz", angle_hz)):
         if not 0.0 < rate_hz <= 1e6:
             raise InputError(f"{name} is {rate_hz:g}: give a rate above 0 and up to 1e6 Hz.")

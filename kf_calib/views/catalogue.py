@@ -8,11 +8,11 @@ from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from kf_calib.effects import Effect, as_text, remarks_of
 from kf_calib.views.console import effect_rows, symbol
+from kf_calib.views.tables import Table
 from kf_calib.visibility import Sight
 
 

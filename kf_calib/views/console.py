@@ -7,17 +7,20 @@ import math
 
 import numpy as np
 from rich.console import Console, Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from kf_calib import paper
-from kf_calib.calibration import Calibration, Parameter, format_p
+from kf_calib.calibration import Calibration, Parameter, beyond_stated, format_p
 from kf_calib.comparison import Comparison
 from kf_calib.effects import Effect, as_text
 from kf_calib.fitting import WALK
 from kf_calib.held_out import orientations
+from kf_calib.likelihood import FEWEST, freedom
 from kf_calib.model import Model
+from kf_calib.outlying import OutlyingDwell
+from kf_calib.views.tables import Table
 
+_NOT_ESTIMATED = "not estimated"
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
 
 
@@ -58,6 +61,20 @@ def parameter_table(result: Calibration) -> Table:
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for k, parameter in enumerate(list(result.parameters.values())[:12]):
         table.add_row(*_row(parameter), end_section=k % 4 == 3)
+    return table
+
+
+def without_table(result: Calibration, found: OutlyingDwell) -> Table:
+    """The parameters as a fit without an outlying dwell has them, and by how much they differ from those with it."""
+    table = Table(title=f"Without dwell {found.number} (1σ)", title_justify="left")
+    for heading in ("parameter", "value", "sigma", "unit", "less with it"):
+        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
+    pairs = zip(result.parameters.values(), found.without.parameters.values(), strict=True)
+    for k, (before, parameter) in enumerate(pairs):
+        name, value, _, sigma, unit = _row(parameter)
+        known = parameter.value is not None and before.value is not None
+        moved = f"{(parameter.value - before.value) * parameter.per_si:+.3g}" if known else ""  # type: ignore[operator]
+        table.add_row(name, value, sigma, unit, moved, end_section=k % 4 == 3)
     return table
 
 
@@ -117,17 +134,23 @@ def noise_table(result: Calibration) -> Table:
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
     table.add_row("within a dwell", *(f"{value:.3g}" for value in noise.sigma_mps2), "m/s^2")
     table.add_row("inflation by correlation", *(f"{value:.3g}" for value in noise.inflation), "of variance")
-    table.add_row(
-        f"dwell to dwell, {_origin(noise.scatter_stated)}", *(f"{value:.3g}" for value in noise.scatter_mps2), "m/s^2"
-    )
-    table.add_row(
-        f"setting of angles, {_origin(noise.setting_stated)}", *[f"{np.degrees(noise.setting_rad):.3g}"] * 3, "deg"
-    )
+    scatter, setting = noise_origins(result)
+    scatters, settings = noise.scatter_mps2, np.full(3, np.degrees(noise.setting_rad))
+    for name, origin, values, unit in (
+        ("dwell to dwell", scatter, scatters, "m/s^2"), ("setting of angles", setting, settings, "deg"),
+    ):  # fmt: skip
+        cells = ["-"] * 3 if origin == _NOT_ESTIMATED else [f"{value:.3g}" for value in values]
+        table.add_row(f"{name}, {origin}", *cells, unit)
     return table
 
 
-def _origin(stated: bool) -> str:
-    return "stated" if stated else "estimated"
+def noise_origins(result: Calibration) -> tuple[str, str]:
+    """Where the scatter from dwell to dwell and the setting error of the angles come from."""
+    noise, few = result.noise, freedom(result.carried.means) < FEWEST
+    scatter = "stated" if noise.scatter_stated else _NOT_ESTIMATED if few else "estimated"
+    if not noise.setting_stated:
+        return scatter, _NOT_ESTIMATED if few or not noise.checked else "estimated"
+    return scatter, "with the angles' noise" if beyond_stated(noise, result.bench) else "stated"
 
 
 def verdict(result: Calibration) -> str:
@@ -137,7 +160,10 @@ def verdict(result: Calibration) -> str:
         text = "Nothing is left over to judge the model by."
     else:
         word = "agree" if judged.consistent else "DISAGREE"
-        text = f"Model and measurements {word} (p {format_p(judged.p_value)}, NIS/dof = {judged.nis_per_dof:.3g})."
+        text = (
+            f"Model and measurements {word}: noise alone gives a misfit this large with probability "
+            f"p {format_p(judged.p_value)} (NIS/dof = {judged.nis_per_dof:.3g})."
+        )
     if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2 is not None:
         text += (
             f" Orientations left out are predicted to {result.held_out_rms_mps2:.2g} m/s^2 rms; "
@@ -159,6 +185,7 @@ def summary(result: Calibration) -> RenderableType:
         Text(verdict(result), style="bold green" if result.consistency.consistent else "bold yellow"),
     ]  # fmt: skip
     parts += [Text(f"Note: {warning}", style="yellow") for warning in result.warnings]
+    parts += [without_table(result, found) for found in result.outlying]
     return Group(*parts)
 
 

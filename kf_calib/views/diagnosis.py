@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from kf_calib.advice import Advice
@@ -16,15 +15,15 @@ from kf_calib.diagnosis import Diagnosis, Suspect, next_orientation
 from kf_calib.drivers import Description, described
 from kf_calib.trend import Trend
 from kf_calib.views.console import plain, rounded, symbol
-from kf_calib.views.json import clean, readings_object
+from kf_calib.views.json import clean, outlying_object, readings_object
+from kf_calib.views.tables import Table
 
 
 def description(found: Diagnosis) -> Description | None:
-    """What an unknown misfit looks like; None where the misfit is known, or there is none."""
-    if not found.unknown:
+    """What an unknown misfit looks like; None where the misfit is known (one dwell, too), or there is none."""
+    if not found.unknown or found.before.outlying:
         return None
-    residuals = np.array([visit.residual_mps2 for visit in found.before.visits])
-    return described(found.before.fit, residuals, found.test.trend)
+    return described(found.before.fit, found.before.residuals_mps2, found.test.trend)
 
 
 def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
@@ -55,6 +54,7 @@ def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
             "held_out_rms_mps2": found.before.held_out_rms_mps2,
             "held_out_floor_mps2": found.before.held_out_floor_mps2,
             "readings": readings_object(found.before.readings),
+            "outlying_dwells": [outlying_object(each) for each in found.before.outlying],
             "warnings": list(found.before.warnings),
         }
     )
@@ -98,15 +98,15 @@ def verdict(found: Diagnosis) -> str:
 
 
 def _notes(found: Diagnosis) -> list[str]:
-    """Warnings that the verdict does not begin with."""
-    said = found.before.readings.biasing if found.test.consistent is False else []
+    """Warnings that the verdict does not hold."""
+    said = verdict(found)
     return [warning for warning in found.before.warnings if warning not in said]
 
 
 def diagnosis_report(found: Diagnosis) -> RenderableType:
     """What ``diagnose`` prints: the verdict, then what it rests on."""
     style = {True: "bold green", False: "bold yellow", None: "bold"}[found.test.consistent]
-    parts: list[RenderableType] = [Text(verdict(found), style=style)]
+    parts: list[RenderableType] = [Text(verdict(found), style=style), *map(Text, of_what_p_is(found))]
     readings = found.before.readings
     if readings.findings:
         parts.append(Text(f"In the readings: {'; '.join(readings.findings)}."))
@@ -146,13 +146,26 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
     return Group(*parts)
 
 
+def of_what_p_is(found: Diagnosis) -> list[str]:
+    """What the p-value of a run is the probability of, and that of the misfit alone, which ``replay`` prints."""
+    if found.test.p_value is None:
+        return []
+    alone = found.before.consistency.p_value
+    beside = "" if alone is None else f"; of the misfit as a whole alone, which replay prints, p {format_p(alone)}"
+    return [
+        "p of the run is the probability that noise alone shows as much in any of the effects, in the misfit as a "
+        f"whole, or within dwells{beside}."
+    ]
+
+
 def plain_report(found: Diagnosis) -> str:
     """The same as plain text."""
     return plain(diagnosis_report(found))
 
 
 def _suspect_table(found: Diagnosis) -> Table:
-    table = Table(title="Suspects (1σ; p of the whole run; held-out rms over its floor)", title_justify="left")
+    title = "Suspects (1σ; p: that noise alone lets any effect explain as much; held-out rms over its floor)"
+    table = Table(title=title, title_justify="left")
     for heading in ("effect", "p", "χ² / dof", "fits", "symbol", "value", "sigma", "unit", "held out"):
         left = heading in ("effect", "fits", "symbol", "unit")
         table.add_column(heading, justify="left" if left else "right", no_wrap=heading == "effect")
@@ -180,8 +193,8 @@ def _dwell_table(found: Diagnosis) -> Table:
     ratios = found.residual_ratios
     for k in np.argsort(-np.abs(ratios).max(axis=1))[:5].tolist():
         dwell = found.before.visits[k].dwell
-        angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(dwell.pose))
-        table.add_row(str(k + 1), f"{dwell.start_s:.0f}", angles, *(f"{ratio:+.1f}" for ratio in ratios[k]))
+        angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(dwell.recorded_pose))
+        table.add_row(str(dwell.number), f"{dwell.start_s:.0f}", angles, *(f"{ratio:+.1f}" for ratio in ratios[k]))
     return table
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from kf_calib.calibration import Calibration, evaluated, format_p
@@ -16,8 +15,9 @@ from kf_calib.diagnosis import Diagnosis, next_orientation
 from kf_calib.errors import InputError
 from kf_calib.improvement import Honest, Improvement, Removal, Spread, Step, extended, stepped, undone
 from kf_calib.views.console import effect_table, parameter_table, rounded, symbol
-from kf_calib.views.diagnosis import description, description_object, orientation_object
+from kf_calib.views.diagnosis import description, description_object, of_what_p_is, orientation_object
 from kf_calib.views.json import clean
+from kf_calib.views.tables import Bar, Table
 
 _WIDTH = 30  # characters of the longest bar
 _EIGHTHS = " ▏▎▍▌▋▊▉"
@@ -129,7 +129,7 @@ def improvement_report(state: Improvement, honest: Honest | None, replay_differe
     parts: list[RenderableType] = [
         progress(state), Text(f"Stopped, {state.because}: {state.reason}", style=style),
     ]  # fmt: skip
-    parts += [Text(line) for line in _settling(state)]
+    parts += [Text(line) for line in (*of_what_p_is(state.found), *_settling(state))]
     if not state.spreads or state.because != "ambiguous":
         parts.append(parameter_table(state.result))
     if state.spreads:
@@ -162,10 +162,10 @@ def progress(state: Improvement) -> RenderableType:
     for (label, _, p_value), (held_out, fitted) in zip(rows, errors, strict=True):
         p_text = "" if p_value is None else format_p(p_value).removeprefix("= ")
         if held_out is not None:
-            table.add_row(label, p_text, "held out", f"{held_out:.2f}", Text(bar(held_out, longest), style="cyan"))
+            table.add_row(label, p_text, "held out", f"{held_out:.2f}", Bar(bar(held_out, longest), style="cyan"))
             label = p_text = ""
         number = f"{fitted:.2f}" if floor else f"{fitted:.2g}"
-        table.add_row(label, p_text, "fitted", number, Text(bar(fitted, longest), style="dim"))
+        table.add_row(label, p_text, "fitted", number, Bar(bar(fitted, longest), style="dim"))
     said = [Text(line) for step in state.steps for line in (*map(_out, step.dropped), *step.remarks)]
     tests = [Text(f"Tested: {_test(each)}.") for each in state.removals]
     return Group(table, *said, *tests)

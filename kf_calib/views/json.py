@@ -10,6 +10,7 @@ import numpy as np
 from kf_calib.calibration import Calibration
 from kf_calib.comparison import Comparison
 from kf_calib.held_out import orientations
+from kf_calib.outlying import OutlyingDwell
 from kf_calib.readings import Readings
 
 
@@ -23,10 +24,7 @@ def replay_object(result: Calibration) -> dict[str, Any]:
             "orientations": len(orientations(dwells)),
             "engine": result.settings.engine,
             "model": [str(effect) for effect in result.model.effects],
-            "parameters": [
-                {"symbol": p.symbol, "value": p.value, "sigma": p.sigma, "unit": p.unit, "nominal": p.nominal}
-                for p in result.parameters.values()
-            ],
+            "parameters": parameters_object(result),
             "biases_at_s": dwells[-1].end_s if noise.walk_mps2_per_sqrt_s else None,
             "noise": {
                 "sigma_mps2": noise.sigma_mps2,
@@ -47,9 +45,29 @@ def replay_object(result: Calibration) -> dict[str, Any]:
             "held_out_floor_mps2": result.held_out_floor_mps2,
             "counts": {key: value for key, value in vars(result.tally).items() if isinstance(value, int)},
             "readings": readings_object(result.readings),
+            "outlying_dwells": [outlying_object(each) for each in result.outlying],
             "warnings": list(result.warnings),
         }
     )
+
+
+def parameters_object(result: Calibration) -> list[dict[str, Any]]:
+    return [
+        {"symbol": p.symbol, "value": p.value, "sigma": p.sigma, "unit": p.unit, "nominal": p.nominal}
+        for p in result.parameters.values()
+    ]
+
+
+def outlying_object(found: OutlyingDwell) -> dict[str, Any]:
+    """A dwell that alone does not fit, the turns of a gimbal that would explain it, and the parameters without it."""
+    return {
+        "dwell": found.number,
+        "gimbal_deg": np.degrees(found.dwell.recorded_pose) if found.without.bench.axes else None,
+        "error_mps2": found.error_mps2,
+        "p_value": found.p_value,
+        "turns": [vars(turn) | {"gimbal": turn.gimbal + 1} for turn in found.turns],
+        "without": {"p_value": found.without.consistency.p_value, "parameters": parameters_object(found.without)},
+    }
 
 
 def readings_object(found: Readings) -> dict[str, Any]:

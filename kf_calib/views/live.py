@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from kf_calib import paper
@@ -17,6 +16,7 @@ from kf_calib.standing import Judgement, Standing
 from kf_calib.views.console import symbol
 from kf_calib.views.diagnosis import diagnosis_object
 from kf_calib.views.json import clean, replay_object
+from kf_calib.views.tables import Bar, Table
 
 if TYPE_CHECKING:
     from kf_calib.sources.live import Status
@@ -69,7 +69,7 @@ def line(judgement: Judgement) -> str:
     per_dof = result.consistency.nis_per_dof
     nis = "" if per_dof is None else f"; NIS/dof {per_dof:.3g}"
     return (
-        f"dwell {len(result.visits)} to {dwell.end_s:.0f} s: {result.tally.read} readings; {seen}{nis}; "
+        f"dwell {dwell.number} to {dwell.end_s:.0f} s: {result.tally.read} readings; {seen}{nis}; "
         f"{judgement.verdict}{following}"
     )
 
@@ -132,7 +132,7 @@ def _here(standing: Standing) -> Text:
     return out
 
 
-def _sigmas(standing: Standing) -> Table:
+def _sigmas(standing: Standing) -> RenderableType:
     """The twelve, four a column group as in the paper: sigma, target and the time to it (or to half), and a bar."""
     table = Table.grid(padding=(0, 1))
     wanted = np.full(12, np.nan) if standing.judgement is None else standing.judgement.wanted
@@ -157,7 +157,7 @@ def _sigmas(standing: Standing) -> Table:
     return table
 
 
-def _bar(sigma: float, wanted: float, k: int) -> Text:
+def _bar(sigma: float, wanted: float, k: int) -> Bar:
     """A bar that is empty at the target; without one it shows the decades of sigma."""
     if math.isfinite(wanted):
         share = math.log10(max(sigma / wanted, 1e-9)) / _TARGET_DECADES
@@ -165,9 +165,9 @@ def _bar(sigma: float, wanted: float, k: int) -> Text:
         size = _COARSE * (9.80665 if paper.UNITS[k] == "m/s^2" else 1.0)
         share = 1.0 + math.log10(max(sigma / size, 1e-30)) / _DECADES
     if math.isfinite(wanted) and share <= 0:
-        return Text("reached", style="green")
+        return Bar("reached", style="green")
     full = round(_BAR * min(max(share, 0.0), 1.0))
-    return Text("█" * full + "·" * (_BAR - full), style="cyan" if math.isfinite(wanted) else "blue")
+    return Bar("█" * full + "·" * (_BAR - full), style="cyan" if math.isfinite(wanted) else "blue")
 
 
 def _fit(judgement: Judgement) -> Text:

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from kf_calib import experiment, paper
@@ -15,6 +14,7 @@ from kf_calib.inferred import AZIMUTHS_DEG, PERIODS_S, Found, Search
 from kf_calib.samples import Floats
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
+from kf_calib.views.tables import Table
 
 _ABOUT = {
     "platform": "turns about the platform's axes, the third from the start",

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from kf_calib import paper
@@ -19,6 +18,7 @@ from kf_calib.planner import Plan, papers_sigma
 from kf_calib.samples import Floats
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
+from kf_calib.views.tables import Table
 
 _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("µm/s²", 1e6)}
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from kf_calib.bench import Vector
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, how_to_write
 from kf_calib.sources.hidden.detectability import NoSizeError
 from kf_calib.sources.hidden.kinds import INNER, Hidden, Kind, catalogue
 from kf_calib.sources.hidden.units import si
@@ -79,7 +79,9 @@ def _sigmas(text: str) -> float | None:
     except ValueError:
         sigmas = math.nan
     if not 0.0 < sigmas < math.inf:
-        raise InputError(f"{text.strip()!r} is no size in sigma: give one positive number, for example 10sigma.")
+        raise InputError(
+            f"{text.strip()!r} is no size in sigma: give one positive number, for example 10sigma{how_to_write(text)}."
+        )
     return sigmas
 
 
@@ -102,7 +104,7 @@ def _read(text: str, axes: Sequence[Vector], seed: int, grade: str, sized: Sizer
     if colon and not kind.per_axis:
         raise InputError(f"{name} belongs to no gimbal axis: leave out {':' + axis!r}.")
     resized = _resizing(_sigmas(numbers), sized)
-    given = [math.sqrt(math.prod(kind.typical(grade)))] if resized else [si(number) for number in numbers.split(",")]
+    given = [math.sqrt(math.prod(kind.typical(grade)))] if resized else _given(numbers)
     inner = _inner(kind, constants)
     if kind.per_axis:
         chosen, names = _axes_meant(axis, axes), axis_names(axes)
@@ -110,6 +112,15 @@ def _read(text: str, axes: Sequence[Vector], seed: int, grade: str, sized: Sizer
     else:
         effects = [Hidden(kind, _sizes(kind, given, seed, name), inner)]
     return [resized(effect) for effect in effects] if resized else effects
+
+
+def _given(text: str) -> list[float]:
+    """Sizes in SI; where one has a unit all have one, but for zeros: 4,1arcsec is no 4 rad and 1 arcsec."""
+    words = [word.strip() for word in text.split(",")]
+    sizes, bare = [si(word) for word in words], [word[-1:] in "0123456789." for word in words]
+    if not all(bare) and any(alone and size for alone, size in zip(bare, sizes, strict=True)):
+        raise InputError(f"{text.strip()!r} has sizes with a unit and without: give each its unit{how_to_write(text)}.")
+    return sizes
 
 
 def _kind(name: str) -> Kind:
@@ -128,8 +139,10 @@ def _sizes(kind: Kind, given: Sequence[float], seed: int, quantity: str) -> tupl
     if len(given) == count:
         return tuple(given)
     if len(given) > 1:
-        words = ", ".join(kind.coefficients)
-        raise InputError(f"{kind.name} has {count} coefficients ({words}), {len(given)} are given: give 1 or {count}.")
+        words, point = ", ".join(kind.coefficients), ", and decimals with a point" if len(given) == 2 else ""
+        raise InputError(
+            f"{kind.name} has {count} coefficients ({words}), {len(given)} are given: give 1 or {count}{point}."
+        )
     signs = generator(seed, f"hidden signs {quantity}").choice([-1.0, 1.0], count) if kind.signed else np.ones(count)
     return tuple((given[0] * signs + 0.0).tolist())
 

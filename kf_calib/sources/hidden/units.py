@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, how_to_write
 
 STANDARD_GRAVITY_MPS2 = 9.80665
 
@@ -29,7 +29,7 @@ def si(text: str) -> float:
     """
     match = _NUMBER.fullmatch(text)
     if not match:
-        raise InputError(f"{text!r} is not a number: give one such as 4e-5 or 4ug/g^2.")
+        raise InputError(f"{text!r} is not a number: give one such as 4e-5 or 4ug/g^2{how_to_write(text)}.")
     value = float(match[1]) * _factor(match[2])
     if not math.isfinite(value):
         raise InputError(f"{text!r} is not a finite number: give one such as 4e-5.")

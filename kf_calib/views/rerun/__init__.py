@@ -64,11 +64,11 @@ def grow(result: Calibration, stream: rr.RecordingStream, shown: int, lay_out: b
 def _log(result: Calibration, history: History, stream: rr.RecordingStream, shown: int = 0) -> None:
     fresh = result.visits[shown:]
     if fresh:
-        log_parameters(history.after(shown), stream)
+        log_parameters(history.after(result.visits[:shown]), stream)
         log_platform(result, stream)
         log_innovations(fresh, stream, shown)
         log_nis(fresh, stream, shown)
-        log_correlation(fresh, stream, shown)
+        log_correlation(fresh, stream)
         log_bench(result, stream, shown)
     stream.log("summary", rr.TextDocument(summary(result), media_type=rr.MediaType.MARKDOWN), static=True)
 

@@ -33,10 +33,10 @@ def picture(matrix: Floats) -> NDArray[np.uint8]:
     return np.round(colours).clip(0, 255).astype(np.uint8)
 
 
-def log_correlation(visits: Sequence[Visit], stream: rr.RecordingStream, before: int = 0) -> None:
+def log_correlation(visits: Sequence[Visit], stream: rr.RecordingStream) -> None:
     """The picture after each dwell, the matrix itself (144 numbers, row by row), and the names of rows and columns."""
     matrices = [correlation(visit.estimate) for visit in visits]
-    index = times(*ends(visits, before))
+    index = times(*ends(visits))
     image = rr.Image.columns(
         buffer=[picture(matrix).tobytes() for matrix in matrices],
         format=[rr.components.ImageFormat(width=COUNT, height=COUNT, color_model="RGB", channel_datatype="U8")]

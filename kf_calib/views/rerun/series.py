@@ -40,7 +40,8 @@ Counts = NDArray[np.int64]
 class History:
     """The parameters along the run, in shown units: deviation from nominal and sigma (n, 12), NaN where not seen.
 
-    ``orientation`` (n,) counts from 1, the prior has 0; ``whole`` (n,) tells the rows at which a dwell is complete.
+    ``orientation`` (n,) is the number of the dwell, the prior has 0; ``whole`` (n,) tells the rows at which a dwell is
+    complete.
     """
 
     elapsed_s: Floats
@@ -49,15 +50,15 @@ class History:
     deviation: Floats
     sigma: Floats
 
-    def after(self, dwells: int) -> History:
-        """What came after so many dwells; the prior only where there were none."""
-        late = self.orientation > (dwells or -1)
+    def after(self, visits: Sequence[Visit]) -> History:
+        """What came after these visits; the prior only where there were none."""
+        late = self.orientation > (visits[-1].dwell.number if visits else -1)
         return History(*(getattr(self, each.name)[late] for each in fields(self)))
 
     @classmethod
     def of(cls, result: Calibration) -> History:
-        steps = [(0.0, -1, _prior(result)), *result.trace()]
-        orientation = np.array([index for _, index, _ in steps]) + 1
+        steps = [(0.0, 0, _prior(result)), *result.trace()]
+        orientation = np.array([number for _, number, _ in steps])
         sigma = np.array([estimate.sigma for _, _, estimate in steps])
         deviation = np.array([estimate.parameters for _, _, estimate in steps]) - paper.nominal(result.bench.nominal)
         return cls(
@@ -81,9 +82,10 @@ def times(elapsed_s: Floats, orientation: Counts | None = None) -> list[rr.TimeC
     return [bench_time] if orientation is None else [bench_time, rr.TimeColumn(ORIENTATION, sequence=orientation)]
 
 
-def ends(visits: Sequence[Visit], before: int = 0) -> tuple[Floats, Counts]:
-    """When each dwell ended, and its number, after those ``before`` them."""
-    return np.array([visit.dwell.end_s for visit in visits]), np.arange(1, len(visits) + 1) + before
+def ends(visits: Sequence[Visit]) -> tuple[Floats, Counts]:
+    """When each dwell ended, and its number."""
+    dwells = [visit.dwell for visit in visits]
+    return np.array([dwell.end_s for dwell in dwells]), np.array([dwell.number for dwell in dwells])
 
 
 def log_parameters(history: History, stream: rr.RecordingStream) -> None:
@@ -123,8 +125,11 @@ def _style(stream: rr.RecordingStream, path: str, style: rr.SeriesLines | rr.Ser
 
 
 def log_innovations(visits: Sequence[Visit], stream: rr.RecordingStream, before: int = 0) -> None:
-    """Innovation of each dwell and channel with its bounds of 2 sigma, um/s^2; and in units of its own sigma."""
-    (elapsed_s, number), count = ends(visits, before), before + len(visits)
+    """Innovation of each dwell and channel with its bounds of 2 sigma, um/s^2; and in units of its own sigma.
+
+    ``before``: how many dwells were sent before these.
+    """
+    (elapsed_s, number), count = ends(visits), before + len(visits)
     innovation = np.array([visit.innovation_mps2 for visit in visits]) * MICRO
     sigma = np.array([visit.innovation_sigma_mps2 for visit in visits]) * MICRO
     for i, (channel, colour) in enumerate(zip(CHANNELS, ACCELEROMETERS, strict=True)):
@@ -142,13 +147,12 @@ def log_innovations(visits: Sequence[Visit], stream: rr.RecordingStream, before:
 
 def log_nis(visits: Sequence[Visit], stream: rr.RecordingStream, before: int = 0) -> None:
     """NIS of each dwell that has degrees of freedom, with the middle 95 % of chi-squared; red above it."""
-    judged = [(k, visit) for k, visit in enumerate(visits, before + 1) if visit.dof > 0]
+    judged = [visit for visit in visits if visit.dof > 0]
     if not judged:
         return
-    number = np.array([number for number, _ in judged])
-    elapsed_s, _ = ends([visit for _, visit in judged])
-    value = np.array([visit.nis for _, visit in judged])
-    band = nis_band(np.array([visit.dof for _, visit in judged]))
+    elapsed_s, number = ends(judged)
+    value = np.array([visit.nis for visit in judged])
+    band = nis_band(np.array([visit.dof for visit in judged]))
     high = above(value, band)
     for name, place, colour in (("value", ~high, WHITE), ("above", high, RED)):
         _send(stream, f"nis/{name}", elapsed_s[place], number[place], value[place])
@@ -184,14 +188,14 @@ def log_bench(result: Calibration, stream: rr.RecordingStream, before: int = 0) 
     """The lane of dwells (empty while the platform moves), and the pose: gimbal angles in deg, or the quaternion."""
     dwells = [visit.dwell for visit in result.visits[before:]]
     begun = np.array([dwell.start_s for dwell in dwells])
-    done, number = ends(result.visits[before:], before)
+    done, number = ends(result.visits[before:])
     states = rr.StateChange.columns(state=[f"{k}" for k in number])
     rr.send_columns("bench/dwell", times(begun, number), states, recording=stream)
     edge = done[-1] + EDGE * (done[-1] - begun[0])
     over = rr.StateChange.columns(state=[""] * (len(dwells) + 1))
     rr.send_columns("bench/dwell", times(np.append(done, edge)), over, recording=stream)
-    poses = np.array([dwell.pose for dwell in dwells])
-    poses = (np.degrees(poses) + 180) % 360 - 180 if result.bench.axes else poses
+    poses = np.array([dwell.recorded_pose for dwell in dwells])
+    poses = np.degrees(poses) if result.bench.axes else poses
     for k, (name, angle) in enumerate(zip(pose_names(result), poses.T, strict=True)):
         colour = GIMBALS[k % len(GIMBALS)]
         step = rr.SeriesLines(names=name.replace("_", " "), colors=colour, widths=1.5, interpolation_mode="StepMid")

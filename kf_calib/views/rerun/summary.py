@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from kf_calib.calibration import Calibration, Parameter
+from kf_calib.views.console import noise_origins
 from kf_calib.views.rerun.correlation import correlation
 from kf_calib.views.rerun.names import GROUP_OF, LABELS, MICRO
 
@@ -78,10 +79,10 @@ def _noise(result: Calibration) -> str:
     if noise.inflation.max() > 1.05:
         parts.append(f"correlated: variance of means × {_three(noise.inflation)}")
     if noise.setting_rad > 0:
-        origin = "stated" if noise.setting_stated else "estimated"
+        origin = noise_origins(result)[1]
         parts.append(f"setting error {math.degrees(noise.setting_rad) * 3600:.3g} arcsec ({origin})")
     if noise.scatter_mps2.max() > 0:
-        origin = "stated" if noise.scatter_stated else "estimated"
+        origin = noise_origins(result)[0]
         parts.append(f"scatter {_three(noise.scatter_mps2 * MICRO)} µm/s² ({origin})")
     return f"**Noise** (1σ): {'; '.join(parts)}"
 

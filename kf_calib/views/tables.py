@@ -1,0 +1,110 @@
+"""Tables that fit the screen: text folds between its words, and numbers stay whole however narrow the screen is."""
+
+from __future__ import annotations
+
+import copy
+import textwrap
+from dataclasses import replace
+
+import rich.table
+from rich.box import SIMPLE_HEAD
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.table import Column
+from rich.text import Text
+
+_GLUE = "\u00a0"  # no line ends at it
+_READABLE = 16  # characters of a column of text, at least, where it has more
+_NARROWEST = 20  # characters of a line, at least, of a record
+
+
+class Bar(Text):
+    """A number drawn as a bar: the first thing that a narrow screen does without."""
+
+
+class Table(rich.table.Table):
+    """A table whose right-aligned columns hold numbers, which are never folded; other columns fold between words.
+
+    Where that does not fit, the frame is left out, then bars; and where that is not enough, each row becomes a record
+    of a line or more, every cell behind the heading of its column.
+    """
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        unframed = self._unframed()
+        for table in (self, unframed, unframed._without_bars()):
+            widths = table._fitting(console, options)
+            if widths is not None:
+                fitted = [replace(column, width=width) for column, width in zip(table.columns, widths, strict=True)]
+                yield from rich.table.Table.__rich_console__(table._of(fitted), console, options)
+                return
+        yield Text(self._without_bars()._records(max(options.max_width, _NARROWEST)))
+
+    def _of(self, columns: list[Column]) -> Table:
+        """The same rows with other columns."""
+        other = copy.copy(self)
+        other.columns = [replace(column, _index=k) for k, column in enumerate(columns)]
+        return other
+
+    def _unframed(self) -> Table:
+        """The same with a line under the headings in place of a frame."""
+        other = copy.copy(self)
+        other.box, other.show_edge, other.padding = self.box and SIMPLE_HEAD, False, (0, 0 if self.box else 1)
+        return other
+
+    def _without_bars(self) -> Table:
+        return self._of([column for column in self.columns if not any(isinstance(cell, Bar) for cell in column.cells)])
+
+    def _fitting(self, console: Console, options: ConsoleOptions) -> list[int] | None:
+        """The widths of the columns, all of their text where there is room for it; None where numbers would be cut."""
+        widths, least = [_widest(column) for column in self.columns], [_least(column) for column in self.columns]
+        unbounded = options.update(width=1 << 16)
+        frame = rich.table.Table.__rich_measure__(self, console, unbounded).maximum - sum(widths)
+        over = max(sum(widths) + frame - options.max_width, 0)
+        spare = [width - own for width, own in zip(widths, least, strict=True)]
+        if over > sum(spare):
+            return None
+        for k in range(len(spare)):  # columns give way in proportion to what they can do without
+            cut = -(-over * spare[k] // max(sum(spare[k:]), 1))
+            widths[k], over = widths[k] - cut, over - cut
+        return widths
+
+    def _records(self, width: int) -> str:
+        headings, cells = [_said(column.header) for column in self.columns], [list(c.cells) for c in self.columns]
+        lines = [*textwrap.wrap(_said(self.title or ""), width)]
+        for number, row in enumerate(self.rows):
+            label, *said = [_said(column[number]) for column in cells]
+            named = [f"{heading} {cell}".strip() for heading, cell in zip(headings[1:], said, strict=True) if cell]
+            glued = [part.replace(" ", _GLUE) if cell_len(part) <= width // 2 else part for part in named]
+            text = f"{label}: {', '.join(glued)}".removeprefix(": ")
+            wrapped = textwrap.wrap(
+                text, width, initial_indent="" if label else "  ", subsequent_indent="  ",
+                break_long_words=False, break_on_hyphens=False,
+            )  # fmt: skip
+            lines += [line.replace(_GLUE, " ") for line in wrapped]
+            if row.end_section and number < len(self.rows) - 1:
+                lines.append("")
+        return "\n".join(lines)
+
+
+def _said(cell: RenderableType | None) -> str:
+    """A cell on one line."""
+    return " ".join(str(cell or "").split())
+
+
+def _lengths(texts: list[str]) -> int:
+    return max(map(cell_len, texts), default=0)
+
+
+def _widest(column: Column) -> int:
+    return _lengths([line for cell in (column.header, *column.cells) for line in str(cell).splitlines()])
+
+
+def _least(column: Column) -> int:
+    """How narrow a column may become: its numbers whole, its text in words."""
+    if column.no_wrap:
+        return _widest(column)
+    words = _lengths(str(column.header).split())
+    if column.justify == "right":
+        return max(words, _lengths([line for cell in column.cells for line in str(cell).splitlines()]))
+    words = max(words, _lengths([word for cell in column.cells for word in str(cell).split()]))
+    return max(words, min(_widest(column), _READABLE))
