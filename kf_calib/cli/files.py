@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any, TypeVar
 
 import rich_click as click
+from click import get_current_context  # rich_click declares that there may be none
 
 from kf_calib.cli.echo import echo
 from kf_calib.cli.failures import tell
@@ -36,7 +37,7 @@ def claimed(
 
     inputs: files that it reads besides. beside: files that it writes besides.
     """
-    ctx = click.get_current_context()
+    ctx = get_current_context()
     files, read = dict[str, Path | None](beside), list(inputs)
     for param in ctx.command.params:
         value = ctx.params.get(param.name or "")
@@ -110,4 +111,4 @@ def delivery(outputs: Outputs, quiet: bool) -> Iterator[Delivery]:
         for error in delivering.failures.values():
             tell(error)
     if delivering.failures:
-        click.get_current_context().exit(2)
+        get_current_context().exit(2)
