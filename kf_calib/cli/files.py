@@ -8,8 +8,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
 
-import click
-import rich_click
+import rich_click as click
+from click import get_current_context  # rich_click declares that there may be none
 
 from kf_calib.cli.echo import echo
 from kf_calib.cli.failures import tell
@@ -27,7 +27,7 @@ class OutputFile(click.Path):
 
 def output_option(*names: str, **attributes: Any) -> Callable[[F], F]:
     """An option that names a file to write."""
-    return rich_click.option(*names, type=OutputFile(), **attributes)
+    return click.option(*names, type=OutputFile(), **attributes)
 
 
 def claimed(
@@ -37,7 +37,7 @@ def claimed(
 
     inputs: files that it reads besides. beside: files that it writes besides.
     """
-    ctx = click.get_current_context()
+    ctx = get_current_context()
     files, read = dict[str, Path | None](beside), list(inputs)
     for param in ctx.command.params:
         value = ctx.params.get(param.name or "")
@@ -111,4 +111,4 @@ def delivery(outputs: Outputs, quiet: bool) -> Iterator[Delivery]:
         for error in delivering.failures.values():
             tell(error)
     if delivering.failures:
-        click.get_current_context().exit(2)
+        get_current_context().exit(2)
