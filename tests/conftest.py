@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: a process a core is enough
+os.environ["COLUMNS"] = ""
+del os.environ["COLUMNS"]  # readline sets it behind Python's back, and a child would print tables that narrow
 
 from kf_calib.cli import main
 

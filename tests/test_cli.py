@@ -167,16 +167,59 @@ def test_bad_recordings_are_one_sentence(run, recording: Path, tmp_path: Path, n
         (["repeat", "{run}"], "repeat"),
         (["record", "{run}", "{tmp}/text.mcap", "--axes", "y z x", "--gravity", "9.8"], "."),
         (["simulate", "{run}"], "exists"),
+        (["replay", "{run}", "--gravity", "9,81"], "write 9.81 with a point"),
+        (["replay", "{run}", "--gravity", "nan"], "not a finite number"),
+        (["replay", "{run}", "--angle-sigma", "-1"], "x>=0"),
+        (["replay", "{run}", "--bench", "{tmp}/comma.toml"], "comma.toml: bench key gravity_mps2 is '9,81'"),
+        (["replay", "{run}", "--bench", "{tmp}/nan.toml"], "nominal has theta1 = nan"),
+        (["replay", "{run}", "--still-deg", "1000"], "above 0 and up to 5"),
+        (["plan", "--target", "K=2,5ppm"], "write 2.5 with a point"),
+        (["simulate", "{tmp}/new.mcap", "--hide", "base-tilt=4,1arcsec"], "write 4.1 with a point"),
+        (["simulate", "{tmp}/new.mcap", "--dwell-s", "1e8"], "or begin nevertheless with --large"),
+        (["simulate", "{tmp}/new.mcap", "--dwell-s", "1e9", "--large"], "years"),
         (["simulate", "{tmp}/new.mcap", "--plan", "{tmp}/text.mcap"], "no orientation"),
     ],
 )
 def test_bad_usage_is_one_sentence(run, recording: Path, tmp_path: Path, words: list[str], says: str) -> None:
     (tmp_path / "empty.mcap").touch()
     (tmp_path / "text.mcap").write_text("1, 2, three\n")
+    (tmp_path / "comma.toml").write_text('gravity_mps2 = "9,81"\n')
+    (tmp_path / "nan.toml").write_text("[nominal]\ntheta1 = nan\n")
     before = recording.read_bytes()
     code, out, err = run(*(word.format(tmp=tmp_path, run=recording) for word in words))
     assert (code, out) == (2, "") and err.startswith("kf-calib: ") and err.count("\n") == 1
     assert says in err and recording.read_bytes() == before
+
+
+def test_a_setting_that_cannot_be_kept_to_is_said(run, recording: Path) -> None:
+    _, out, _ = run("replay", recording, "--settle-s", 1000, "--json")
+    (said,) = json.loads(out)["warnings"]
+    assert said.startswith("11 dwells are too short to leave out 1000 s") and "of the shortest" in said
+    assert json.loads(run("replay", recording, "--json")[1])["warnings"] == []
+
+
+def test_noise_is_stated_estimated_or_neither(run, tmp_path: Path) -> None:
+    """The table beside the notes, with dwells that are too few, cannot tell, and can tell what was not stated."""
+    for count, rows in (5, "neither"), (7, "scatter"), (14, "both"):
+        path = tmp_path / f"{count}.mcap"
+        words = ["--orientations", count, "--unstated", "--setting", "0.005", "--seed", 3]
+        assert run("simulate", path, *QUICK, *words)[0] == 0
+        _, out, _ = run("replay", path)
+        assert ("dwell to dwell, estimated" in out) == (rows != "neither")
+        assert ("setting of angles, estimated" in out) == (rows == "both")
+        assert ("too few to estimate what was not stated" in out) == (rows == "neither")
+        assert ("gravity in 7 different directions" in out) == (rows == "scatter")
+        assert ", stated" not in out
+
+
+@pytest.mark.parametrize("command", ["replay", "diagnose", "improve", "live", "plan", "simulate", "record", "effects"])
+def test_help_groups_options_with_what_is_usual_first(run, command: str) -> None:
+    code, out, _ = run(command, "--help")
+    assert code == 0 and "…" not in out
+    groups = [line.rstrip(": ") for line in out.splitlines() if line[:1].isupper() and line.rstrip().endswith(":")]
+    assert {"Input and bench", "Output", "Examples"} <= set(groups)
+    left = out[out.index("Options:") : out.index("Examples:")]
+    assert left.count("--") == 1, "an option without a group: give it panel="
 
 
 def test_a_plan_from_a_file_is_visited(run, tmp_path: Path) -> None:

@@ -310,9 +310,10 @@ def test_bad_journals_are_one_sentence(recording: Path, tmp_path: Path, text: st
     assert "\n" not in str(done.exception)
 
 
-def test_bad_usage(recording: Path, tmp_path: Path) -> None:
-    assert "leave out --engine" in call("improve", recording, "--engine", "filterpy").output
-    assert "choose one" in call("improve", recording, "--json", "--interactive").output
+def test_bad_usage(run, recording: Path, tmp_path: Path) -> None:
+    assert "leave out --engine" in run("improve", recording, "--engine", "filterpy")[2]
+    assert "choose one" in run("improve", recording, "--json", "--interactive")[2]
+    assert "choose one" in run("improve", recording, "--interactive", "--unattended")[2]
     done = call("improve", recording, "--journal", tmp_path / "absent" / "journal.toml")
     assert isinstance(done.exception, InputError) and "another --journal" in str(done.exception)
     assert isinstance(call("improve", tmp_path / "absent.mcap").exception, InputError)

@@ -339,6 +339,18 @@ def test_the_rerun_view_of_a_plan(tmp_path: Path) -> None:
         save(plan(search(), 6, TIMING), tmp_path / "none" / "plan.rrd")
 
 
+def test_a_plan_says_where_it_leaves_little_to_go_by(run) -> None:
+    few = json.loads(run("plan", "--count", 4, "--json")[1])["remarks"]
+    assert any("4 directions of gravity × 3 readings = 12 for 12 parameters: nothing is" in said for said in few)
+    twice = json.loads(run("plan", "--count", 8, "--repeats", 2, "--json")[1])["remarks"]
+    assert any(said.startswith("4 directions of gravity") for said in twice)
+    limits = [word for axis in "yzx" for word in ("--limit", f"{axis}=0:1")]
+    narrow = json.loads(run("plan", "--count", 6, *limits, "--json")[1])["remarks"]
+    assert any("times worse than by as many dwells in directions that are spread" in said for said in narrow)
+    plenty = json.loads(run("plan", "--count", 12, "--json")[1])["remarks"]
+    assert not any("left over" in said or "times worse" in said for said in plenty)
+
+
 def test_the_readme_shows_what_the_command_prints(run) -> None:
     text = (Path(__file__).resolve().parents[1] / "README.md").read_text()
     shown = text[text.index("$ kf-calib plan --count 4") :].split("```")[0]
