@@ -366,6 +366,7 @@ def test_trials_go_on_where_they_stopped_and_are_pooled(
     assert "| right name first, n = 8 | 1.000 | 0.398 to 1.000 | 4 |" in (tmp_path / "t.md").read_text()
 
 
+@pytest.mark.slow
 def test_a_rival_of_the_best_of_many_frequencies_is_not_left_out(trial: Any) -> None:
     """The temperature swings, and a sinusoid of just its period explains a little more than the rate of temperature."""
     options = (

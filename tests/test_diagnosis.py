@@ -70,7 +70,9 @@ def test_nothing_is_found_in_noise(case: dict, runs: int) -> None:
     assert np.median([min(each.p_values.values()) for each in tests]) > 0.2
 
 
-@pytest.mark.parametrize("name, driver", [("encoder-harmonic-3:z", "angle"), ("triple-product", "specific force")])
+@pytest.mark.parametrize(
+    "name, driver", [("encoder-harmonic-3:z", "angle"), *slow(("triple-product", "specific force"))]
+)
 def test_what_is_in_no_catalogue_is_unknown(name: str, driver: str) -> None:
     from kf_calib.views.diagnosis import description, diagnosis_object
 
@@ -150,7 +152,7 @@ def test_noise_rarely_puts_a_rival_so_far_ahead_that_the_truth_is_out() -> None:
 def test_command_line(tmp_path: Path) -> None:
     out = tmp_path / "run.mcap"
     made = ["simulate", str(out), "--hide", "second-order=20sigma", "--dwell-s", "6", "--slew-degps", "90",
-            "--orientations", "16"]  # fmt: skip
+            "--orientations", "12"]  # fmt: skip
     assert CliRunner().invoke(cli, made).exit_code == 0
     printed = CliRunner().invoke(cli, ["diagnose", str(out), "--json"])
     content = json.loads(printed.stdout)

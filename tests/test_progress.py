@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import io
 import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from synthetic import Run
 
 from kf_calib import stage
 from kf_calib.calibration import calibrate
+from kf_calib.cli import cli
+from kf_calib.cli.options import progress
 from kf_calib.comparison import compare
 from kf_calib.diagnosis import diagnose
 from kf_calib.improvement import improve
 
-RECORDING = Path(__file__).resolve().parents[1] / "recordings" / "hidden.mcap"
 FRAME = re.compile(r"[━╺] +(?:(\d+)% )?\d:\d\d:\d\d (.+?) *$")
 
 
@@ -61,30 +64,51 @@ class Terminal(io.StringIO):
         return True
 
 
-def watched(run, monkeypatch: pytest.MonkeyPatch, *words: object) -> list[tuple[str, str]]:
-    """Percentage and text of each frame that a command shows on a terminal of 80 columns."""
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Callable[[], list[tuple[str, str]]]:
+    """From the first call on the error stream is a terminal; a call gives percentage and text of each frame so far."""
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setattr("sys.stderr", terminal := Terminal())  # here: pytest sets its own before it calls a test
-    assert run(*words)[0] == 0
-    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
-    return [(found[1] or "", found[2]) for line in re.split(r"[\r\n]+", plain) if (found := FRAME.search(line))]
+    screen = Terminal()
+
+    def frames() -> list[tuple[str, str]]:
+        monkeypatch.setattr("sys.stderr", screen)  # in the test: pytest sets its own before it calls one
+        plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.getvalue())
+        return [(found[1] or "", found[2]) for line in re.split(r"[\r\n]+", plain) if (found := FRAME.search(line))]
+
+    return frames
 
 
-def test_on_a_terminal_a_share_grows_where_it_is_known(run, monkeypatch) -> None:
-    frames = watched(run, monkeypatch, "compare", RECORDING)
-    shares = [int(share) for share, text in frames if share and "filterpy" in text]
-    assert len(set(shares)) > 2 and max(shares) < 100
+def test_a_share_is_shown_where_it_is_known_and_else_what_is_done(terminal) -> None:
+    terminal()
+    with progress("reading") as tick:
+        for share in (0.3, 0.6, 1.0):
+            time.sleep(0.25)
+            tick(share)
+        stage.say("estimating")
+        time.sleep(0.25)
+    assert list(dict.fromkeys(terminal())) == [
+        ("", "reading"), ("30", "reading"), ("60", "reading"), ("", "reading: estimating"),
+    ]  # fmt: skip
 
 
-def test_on_a_terminal_the_stage_is_said_where_no_share_is_known(run, monkeypatch) -> None:
-    frames = watched(run, monkeypatch, "diagnose", RECORDING)
-    texts = {text for _, text in frames}
-    assert len(texts) > 4 and all(text.startswith("diagnosing hidden.mcap") for text in texts)
-    assert any("refitting with" in text for text in texts)
-    assert not any(share for share, text in frames if "refitting" in text or "scanning" in text)
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("progress") / "run.mcap"
+    words = "--hide second-order=40sigma --orientations 9 --dwell-s 4 --slew-degps 180"
+    assert CliRunner().invoke(cli, ["simulate", str(out), *words.split()]).exit_code == 0
+    return out
 
 
-def test_where_the_error_stream_is_no_terminal_there_is_none(run) -> None:
-    code, _, err = run("diagnose", RECORDING)
+def test_a_terminal_sees_what_a_command_does(run, terminal, recording: Path) -> None:
+    terminal()
+    assert run("diagnose", recording)[0] == 0
+    texts = {text for _, text in terminal()}
+    assert len(texts) > 2 and all(text.startswith("diagnosing run.mcap") for text in texts)
+    assert any("refitting with" in text or "scanning" in text for text in texts)
+
+
+@pytest.mark.parametrize("command", ["diagnose", "compare"])
+def test_where_the_error_stream_is_no_terminal_there_is_none(run, recording: Path, command: str) -> None:
+    code, _, err = run(command, recording)
     assert code == 0 and not err

@@ -244,7 +244,7 @@ REPLAY_KEYS = {"samples", "dwells", "model", "parameters", "noise", "consistency
 DIAGNOSE_KEYS = {"consistent", "p_value", "verdict", "missing", "suspects", "ambiguity_set", "may_be_scatter",
                  "invisible", "detectable", "unknown", "next_orientation"}  # fmt: skip
 URL = "sim://?speed=500&orientations=6&dwell_s=5&sample_hz=50&slew_degps=180&seed=3"
-SLOW = URL.replace("speed=500", "speed=10").replace("orientations=6", "orientations=60")
+SLOW = URL.replace("speed=500", "speed=10").replace("orientations=6", "orientations=20")
 
 
 def live(*words: str, **kwargs: object) -> subprocess.Popen[str]:

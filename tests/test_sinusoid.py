@@ -84,7 +84,7 @@ def test_intervals_cover(runs: int, low: float, high: float) -> None:
 
 
 def test_engines_and_batch_agree() -> None:
-    compared = compare(run(1.3, 2.0, dwells=8), WITH)
+    compared = compare(run(1.3, 2.0, dwells=6, dwell_s=4.0), WITH)
     assert compared.max_difference_sigma <= 1e-6
 
 
