@@ -316,7 +316,7 @@ def _rows(noise: Noise, means: Means, state: Floats, held_s: float = math.inf) -
 
 def _root(covariances: Floats) -> Floats:
     """Triangular roots (D, 3, 3) of covariances."""
-    return np.linalg.cholesky(lifted(covariances))
+    return np.asarray(np.linalg.cholesky(lifted(covariances)), float)
 
 
 def _linked_rows(own: Floats, intensity: float, path: Links, stacked: Floats) -> tuple[Floats, float]:

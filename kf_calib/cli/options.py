@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import sys
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
@@ -22,6 +23,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 BENCH_OPTIONS = {
     "axes": ("--axes", 'Gimbal axes, outer to inner, for example "y z x".'),
+    "joints": ("--joints", 'Names of the gimbals among the joints of a bag, outer to inner, as "outer middle inner".'),
     "reference": ("--reference", "base (angles relative to the bench) or inertial (stabilised platform)."),
     "gravity_mps2": ("--gravity", "Local gravity, m/s^2."),
     "latitude_deg": ("--latitude", "Latitude, deg; gives normal gravity where --gravity is not stated."),
@@ -31,6 +33,7 @@ BENCH_OPTIONS = {
     "scatter_sigma_mps2": ("--scatter-sigma", "Scatter of each sensor from dwell to dwell, 1 sigma, m/s^2."),
     "nominal": ("--nominal", "Nominal parameters that differ, JSON, for example '{\"theta1\": 0}'."),
 }
+_ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
 _ACCEL_UNITS = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "ug": 9.80665e-6}
 
 
@@ -53,6 +56,9 @@ def recording_options(command: F) -> F:
             "--accel-unit", type=click.Choice(list(_ACCEL_UNITS)), default="m/s2", help="Unit of the readings."
         ),
         click.option("--accel-scale", type=float, default=1.0, help="Size of one count, in the unit of the readings."),
+        click.option(
+            "--angle-unit", type=click.Choice(list(_ANGLE_UNITS)), default="rad", help="Unit of the gimbal angles."
+        ),
     ]
     for option in reversed(options):
         command = option(command)
@@ -133,6 +139,7 @@ def recording_of(path: Path, options: Mapping[str, Any]) -> Recording:
         path,
         overrides(options),
         _ACCEL_UNITS[options["accel_unit"]] * options["accel_scale"],
+        angle_scale=_ANGLE_UNITS[options["angle_unit"]],
         accel_topic=options["accel_topic"],
         pose_topic=options["pose_topic"],
         temperature_topic=options["temperature_topic"],
