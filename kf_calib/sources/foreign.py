@@ -20,8 +20,8 @@ def advice(path: Path, head: bytes) -> str:
     if _is_lines(head):
         made = path.with_suffix(".mcap") if path.suffix != ".mcap" else path.with_name(f"{path.stem}_recorded.mcap")
         return (
-            f"{path} is not an MCAP file, it holds lines of text: record them first, by `kf-calib record {made} {path}`, "
-            f"and give {made}."
+            f"{path} is not an MCAP file, it holds lines of text: record them first, by "
+            f"`kf-calib record {made} {path}`, and give {made}."
         )
     return (
         f"{path} is not an MCAP file (its first bytes differ): give one, or have kf-calib record make one of CSV or "

@@ -73,6 +73,11 @@ class Recording:
         """The batches of a file that is being written, from its start; an empty one: nothing more has come yet."""
         return self._batches(growing=True)
 
+    @property
+    def warnings_while_read(self) -> list[str]:
+        """Those that are not of the file's end, which one that is still being written has not."""
+        return self.warnings[self._opening_warnings :]
+
     def _batches(self, growing: bool) -> Iterator[Batch]:
         del self.warnings[self._opening_warnings :]
         self.fraction, begun, parts = 0.0, 0, self._parts
