@@ -38,7 +38,9 @@ UP = ("y", "z", "x", "-y", "-z", "-x")
 _NUMBERS = (
     "gravity_mps2", "latitude_deg", "height_m", "azimuth_deg", "angle_sigma_deg", "scatter_sigma_mps2",
 )  # fmt: skip
-_KEYS = frozenset(("format_version", "axes", "reference", "up", "channels", "nominal", *_NUMBERS, *_FREE_TEXT))
+_KEYS = frozenset(
+    ("format_version", "axes", "joints", "reference", "up", "channels", "nominal", *_NUMBERS, *_FREE_TEXT)
+)
 
 
 def normal_gravity(latitude_deg: float, height_m: float = 0.0) -> float:
@@ -114,6 +116,7 @@ class Bench:
     axes: unit vectors, outer to inner; empty where an attitude quaternion is recorded instead of angles.
     angle_sigma_deg: repeatability of setting an orientation, 1 sigma; None: not known, to be estimated.
     scatter_sigma_mps2: scatter of each sensor from dwell to dwell, 1 sigma; None: not known, to be estimated.
+    joints: names of the gimbals' joints where angles come as joint states, outer to inner; empty: told by their names.
     nominal: nominal parameters that differ from the paper's, in the units of the estimates (rad, 1, m/s^2).
     up: the axis that points up when all angles are zero; the azimuth is that of x (of y where x is vertical).
     channels: which channel of the recording accelerometers 1, 2, 3 are, negative where the sign is reversed.
@@ -131,6 +134,7 @@ class Bench:
     notes: Mapping[str, str] = field(default_factory=dict[str, str])
     up: str = "y"
     channels: tuple[int, int, int] = CHANNELS
+    joints: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.reference not in ("base", "inertial"):
@@ -154,10 +158,21 @@ class Bench:
             raise BenchError(
                 f"gravity of {self.gravity_mps2:g} m/s^2 is not possible: give gravity_mps2 in m/s^2, about 9.8."
             )
+        if self.joints and (len(self.joints) != len(self.axes) or len(set(self.joints)) < len(self.joints)):
+            raise BenchError(
+                f"joints names {len(self.joints)} gimbals ({' '.join(self.joints)}) where there are {len(self.axes)} "
+                "axes: name each once, outer to inner."
+            )
         for key in ("angle_sigma_deg", "scatter_sigma_mps2"):
             value = getattr(self, key)
             if value is not None and not 0.0 <= value < math.inf:
                 raise BenchError(f"{key} {value:g} must be zero or positive; leave it out where it is not known.")
+
+    @property
+    def axis_letters(self) -> tuple[str, ...]:
+        """Letters of the gimbal axes, outer to inner; empty where one has none, or two have the same."""
+        letters = tuple(_format_axis(axis).removeprefix("-") for axis in self.axes)
+        return letters if len(set(letters)) == len(letters) and set(letters) <= set(_LETTERS) else ()
 
     @property
     def pose_width(self) -> int:
@@ -187,6 +202,7 @@ class Bench:
             axes=parse_axes(metadata["axes"]) if has_angles else (),
             reference=metadata.get("reference", "base"),  # type: ignore[arg-type]  # __post_init__ refuses other words
             nominal=_nominal(metadata.get("nominal", "{}")),
+            joints=tuple(metadata.get("joints", "").replace(",", " ").split()) if has_angles else (),
             notes={key: metadata[key] for key in _FREE_TEXT if metadata.get(key)},
             up=metadata.get("up", "y").strip().lower().removeprefix("+"),
             channels=parse_channels(metadata.get("channels", "1,2,3")),
@@ -199,6 +215,7 @@ class Bench:
         return {
             "format_version": FORMAT_VERSION,
             **({"axes": " ".join(map(_format_axis, self.axes))} if self.axes else {}),
+            **({"joints": " ".join(self.joints)} if self.joints else {}),
             "reference": self.reference,
             **{key: repr(float(value)) for key, value in numbers.items() if value is not None},
             **({"nominal": json.dumps(dict(self.nominal))} if self.nominal else {}),

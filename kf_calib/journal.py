@@ -38,6 +38,7 @@ from kf_calib.errors import InputError
 from kf_calib.improvement import By, Improvement, Step, begun, stepped
 from kf_calib.model_file import table_of
 from kf_calib.outputs import write_whole
+from kf_calib.sources.bags import files_of
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,11 @@ class Origin:
     def of(cls, recording: Path, options: Mapping[str, Any]) -> Origin:
         """Raises InputError where the recording cannot be read."""
         try:
-            with recording.open("rb") as file:
-                return cls(recording.name, hashlib.file_digest(file, "sha256").hexdigest(), options)
+            digest = hashlib.sha256()
+            for path in files_of(recording):
+                with path.open("rb") as file:
+                    hashlib.file_digest(file, lambda: digest)
+            return cls(recording.name, digest.hexdigest(), options)
         except OSError as error:
             raise InputError(f"{recording}: cannot be read ({error.strerror}): name a recording.") from None
 

@@ -58,6 +58,17 @@ def test_truth_is_not_in_the_recording(recording: Path) -> None:
     assert b"truth" not in content and b"grade" not in content and b"seed" not in content
 
 
+def test_a_folder_and_angles_in_degrees_give_the_same(run, recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    changed(recording, tmp_path / "bag" / "bag_0.mcap")
+    degrees = changed(recording, tmp_path / "deg.mcap", pose=lambda s: Stream(s.time_ns, np.degrees(s.values)))
+    results = [json.loads(run("replay", *words, "--json")[1]) for words in
+               ([recording], [tmp_path / "bag"], [degrees, "--angle-unit", "deg"])]  # fmt: skip
+    assert results[0] == results[1]
+    for one, other in zip(results[0]["parameters"], results[2]["parameters"], strict=True):
+        assert abs(one["value"] - other["value"]) < 1e-6 * one["sigma"]
+
+
 def test_replay_in_words(run, recording: Path) -> None:
     code, out, _ = run("replay", recording)
     assert code == 0 and "θ1" in out and "Model and measurements agree" in out and "\x1b" not in out
@@ -154,7 +165,7 @@ def test_bad_recordings_are_one_sentence(run, recording: Path, tmp_path: Path, n
     "words, says",
     [
         (["replay", "{tmp}/absent.mcap"], "absent.mcap"),
-        (["replay", "{tmp}"], "directory"),
+        (["replay", "{tmp}"], "holds several recordings (empty.mcap, text.mcap)"),
         (["replay", "{tmp}/empty.mcap"], "empty"),
         (["replay", "{tmp}/text.mcap"], "not an MCAP"),
         (["replay", "{run}", "--axes", "y q x"], "'q'"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import sys
 import tomllib
@@ -31,6 +32,8 @@ OUTPUT = "Output"
 
 BENCH_OPTIONS = {
     "axes": ("--axes", str, "AXES", 'Gimbal axes, outer to inner, for example "y z x".'),
+    "joints": ("--joints", str, "NAMES", 'Names of the gimbals among the joints of a bag, outer to inner, as "outer '
+               'middle inner".'),
     "up": ("--up", str, "AXIS", "Axis that points up when all angles are zero: y (the default; accelerometer 2 reads "
            "+g), z as in ROS, x, -x, -y or -z."),
     "channels": ("--channels", str, "N,N,N", "Which channel accelerometer 1, 2, 3 is, with a minus where its sign is "
@@ -53,6 +56,7 @@ BENCH_OPTIONS = {
     "azimuth_deg": ("--azimuth", NUMBER, "DEG", "Azimuth of the bench's x axis from North toward East, deg."),
     "nominal": ("--nominal", str, "JSON", "Nominal parameters that differ, for example '{\"theta1\": 0}'."),
 }  # fmt: skip
+_ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
 _ACCEL_UNITS = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "ug": 9.80665e-6}
 
 
@@ -73,6 +77,8 @@ def recording_options(command: F) -> F:
                      help="Unit of the readings.", panel=INPUT),
         click.option("--accel-scale", type=NUMBER, default=1.0, show_default=True,
                      help="Size of one count, in the unit of the readings.", panel=INPUT),
+        click.option("--angle-unit", type=click.Choice(list(_ANGLE_UNITS)), default="rad", show_default=True,
+                     help="Unit of the gimbal angles.", panel=INPUT),
         click.option("--accel-topic", metavar="TOPIC", help="Topic of the accelerometer, where there are several.",
                      panel=INPUT),
         click.option("--pose-topic", metavar="TOPIC", help="Topic of the platform's angles or attitude.", panel=INPUT),
@@ -179,6 +185,7 @@ def recording_of(path: Path, options: Mapping[str, Any]) -> Recording:
         path,
         overrides(options),
         _ACCEL_UNITS[options["accel_unit"]] * options["accel_scale"],
+        angle_scale=_ANGLE_UNITS[options["angle_unit"]],
         accel_topic=options["accel_topic"],
         pose_topic=options["pose_topic"],
         temperature_topic=options["temperature_topic"],

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.samples import Floats, Stream
+from kf_calib.sources.joints import Joints, JointsError
 
 Offsets = NDArray[np.int64]
 
@@ -255,24 +256,29 @@ def pack(kind: MessageType, template: bytes, stream: Stream) -> list[bytes]:
 class Decoder:
     """Samples from messages of one topic: stamps from header.stamp, ``width`` values each.
 
-    Values of joints come in the order of the first message's names, whatever the order in later ones.
+    joints: finds the gimbals among the positions of a joint state; messages without them are passed over.
     """
 
-    def __init__(self, kind: MessageType, width: int) -> None:
+    def __init__(self, kind: MessageType, width: int, joints: Joints | None = None) -> None:
         self.kind = kind
         self.width = width
-        self._names: tuple[str, ...] = ()
+        self._joints = joints or Joints(width)
 
     def __call__(self, buffer: bytes, at: Offsets, size: int) -> Stream:
         """The messages of ``size`` bytes each that start at offsets ``at`` (n,) of ``buffer``, all within it.
 
         Raises CdrError for a message of another layout.
         """
+        return self.located(buffer, at, size)[1]
+
+    def located(self, buffer: bytes, at: Offsets, size: int) -> tuple[Offsets, Stream]:
+        """The same, after the offsets (m,) of the messages that the m samples are from."""
         time_ns, values = np.empty(len(at), np.int64), np.empty((len(at), self.width))
-        rest = np.arange(len(at))
+        rest, kept = np.arange(len(at)), np.ones(len(at), bool)
         while len(rest):  # once, but for topics whose strings change
             start = int(at[rest[0]])
             layout = self._layout(buffer[start : start + size])
+            columns = self._columns(layout)
             every = np.ndarray((len(buffer) - layout.size + 1,), dtype_of(layout), buffer, strides=(1,))
             head = every["head"][at[rest]].view(_HEAD)
             alike = (head["kind"] == head["kind"][0]) & (head["frame"] == head["frame"][0])
@@ -280,11 +286,15 @@ class Decoder:
                 names = every["names"][at[rest]]
                 alike &= (names == names[0]).all(axis=1)
             stamps = head["sec"].astype(np.int64) * _NS_PER_S + head["nanosec"]
-            if len(rest) == len(at) and alike.all():
-                return Stream(stamps, self._values(every["numbers"][at], layout))
+            if len(rest) == len(at) and alike.all() and columns is not None:
+                return at, Stream(stamps, self._values(every["numbers"][at], layout, columns))
             part, rest = rest[alike], rest[~alike]
-            time_ns[part], values[part] = stamps[alike], self._values(every["numbers"][at[part]], layout)
-        return Stream(time_ns, values)
+            if columns is None:
+                kept[part] = False
+            else:
+                numbers = every["numbers"][at[part]]
+                time_ns[part], values[part] = stamps[alike], self._values(numbers, layout, columns)
+        return at[kept], Stream(time_ns[kept], values[kept])
 
     def _layout(self, message: bytes) -> Layout:
         if message[:2] != _LITTLE_ENDIAN[:2]:
@@ -297,17 +307,21 @@ class Decoder:
             raise CdrError(f"a {self.kind.name} does not fit in its {len(message)} bytes") from None
         if not layout.size <= len(message) <= layout.size + _MAX_PADDING:
             raise CdrError(f"a {self.kind.name} takes {layout.size} bytes, the message has {len(message)}")
-        if layout.width != self.width:
-            raise CdrError(f"it gives {layout.width} positions for {self.width} gimbal axes: state the axes it has")
-        self._names = self._names or layout.names
-        if sorted(layout.names) != sorted(self._names):
-            raise CdrError(f"joint names change from {' '.join(self._names)} to {' '.join(layout.names)}")
         return layout
 
-    def _values(self, numbers: NDArray[np.void], layout: Layout) -> Floats:
+    def _columns(self, layout: Layout) -> tuple[int, ...] | None:
+        """Which values of a message are wanted; None: none of them."""
+        if self.kind is not JOINT_STATE:
+            return tuple(range(layout.width))
+        try:
+            return self._joints(layout.names, layout.width)
+        except JointsError as error:
+            raise CdrError(str(error)) from None
+
+    def _values(self, numbers: NDArray[np.void], layout: Layout, columns: tuple[int, ...]) -> Floats:
         table = numbers.view("<f8").reshape(len(numbers), -1)
         if layout.flagged and np.any(table[:, layout.width] == -1.0):
             raise CdrError("linear_acceleration is marked as not measured (-1 in its covariance)")
-        if layout.names == self._names:
-            return table[:, : layout.width]
-        return table[:, [layout.names.index(name) for name in self._names]]
+        if columns == tuple(range(self.width)):
+            return table[:, : self.width]
+        return table[:, columns]

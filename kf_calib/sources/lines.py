@@ -18,6 +18,7 @@ from kf_calib.bench import Bench
 from kf_calib.errors import BenchError, InputError
 from kf_calib.samples import Batch
 from kf_calib.sources.csv_lines import CsvLines
+from kf_calib.sources.joints import as_columns
 from kf_calib.sources.json_lines import JsonLines
 from kf_calib.sources.line_parts import Account, LineReader
 
@@ -44,7 +45,7 @@ class Lines:
         self._path = Path(source) if isinstance(source, str | PathLike) else None
         self._stream = None if isinstance(source, str | PathLike) else source
         self.name = str(self._path) if self._path else name
-        self._overrides, self._columns = overrides, columns
+        self._overrides, self._columns = overrides, {**as_columns(overrides.get("joints", "")), **columns}
         self._bench: Bench | None = None
         self._waiting: _Passage | None = None  # begun to learn of the bench, not yet iterated
         self._latest: _Passage | None = None

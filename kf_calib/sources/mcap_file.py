@@ -29,6 +29,7 @@ from mcap.records import Channel, ChunkIndex, Header, MetadataIndex, Schema, Sta
 from numpy.typing import NDArray
 
 from kf_calib.errors import InputError
+from kf_calib.sources.foreign import HEAD_BYTES, advice
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")  # opcode, length of the content
@@ -206,11 +207,9 @@ class McapFile:
             file.seek(0)
             if not self.size:
                 raise InputError(f"{path} is empty: nothing was recorded in it.")
-            if file.read(len(MAGIC)) != MAGIC:
-                raise InputError(
-                    f"{path} is not an MCAP file (its first bytes differ): give one, or have kf-calib record make one "
-                    "of CSV or JSON lines."
-                )
+            head = file.read(HEAD_BYTES)
+            if not head.startswith(MAGIC):
+                raise InputError(advice(path, head))
             try:
                 self.summary = Summary.read(file, self.size)
             except DamagedError as damage:

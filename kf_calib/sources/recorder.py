@@ -23,8 +23,7 @@ from kf_calib.errors import InputError, KfCalibError
 from kf_calib.outputs import Growing, refuse
 from kf_calib.samples import Batch, Stream
 from kf_calib.sources import cdr
-from kf_calib.sources.mcap_file import HEAD, MAGIC, McapFile, MessageFinder
-from kf_calib.sources.recording import (
+from kf_calib.sources.contents import (
     ACCEL_TOPIC,
     ANGLES_TOPIC,
     ATTITUDE_TOPIC,
@@ -33,8 +32,9 @@ from kf_calib.sources.recording import (
     TEMPERATURE_TOPIC,
     bench_checksum,
 )
+from kf_calib.sources.joints import Joints, gimbal_names
+from kf_calib.sources.mcap_file import HEAD, MAGIC, McapFile, MessageFinder
 
-_AXIS_NAMES = {2: ("outer", "inner"), 3: ("outer", "middle", "inner")}
 _END = (  # of a file without a summary: all fields are zero
     HEAD.pack(Opcode.DATA_END, 4) + bytes(4) + HEAD.pack(Opcode.FOOTER, 20) + bytes(20) + MAGIC
 )
@@ -78,10 +78,10 @@ class Recorder:
         self._disk = ThreadPoolExecutor(1, "disk") if background else None
         self._pending: Future[None] | None = None
         self._writer = Writer(self._file, chunk_size=chunk_size, enable_data_crcs=True)
-        names = _AXIS_NAMES.get(len(bench.axes)) or [f"axis{i}" for i in range(len(bench.axes))]
+        self._joints = bench.joints or gimbal_names(len(bench.axes))
         self._channels = (
             _Channel(ACCEL_TOPIC, cdr.IMU, cdr.imu_message("accelerometer")),
-            _Channel(ANGLES_TOPIC, cdr.JOINT_STATE, cdr.joint_state_message("platform", names))
+            _Channel(ANGLES_TOPIC, cdr.JOINT_STATE, cdr.joint_state_message("platform", self._joints))
             if bench.axes
             else _Channel(ATTITUDE_TOPIC, cdr.QUATERNION, cdr.quaternion_message("platform")),
             _Channel(TEMPERATURE_TOPIC, cdr.TEMPERATURE, cdr.temperature_message("accelerometer")),
@@ -142,8 +142,8 @@ class Recorder:
 
     def read_back(self, start: int, end: int) -> Iterator[Batch]:
         """What was written between two sizes that the file had after a ``flush``, as a replay gives it."""
-        find = MessageFinder()
-        decoders = [cdr.Decoder(channel.kind, channel.width) for channel in self._channels]
+        find, joints = MessageFinder(), Joints(len(self._joints), self._joints)
+        decoders = [cdr.Decoder(channel.kind, channel.width, joints) for channel in self._channels]
         for block in McapFile(self._place.at).blocks(_ignore, start, end):
             streams = [Stream.empty(channel.width) for channel in self._channels]
             for group in find(block).groups:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from mcap.writer import Writer
 
 from kf_calib.bench import Bench, axes_of
 from kf_calib.samples import Batch, Source, Stream
+from kf_calib.sources import cdr
 from kf_calib.sources.recorder import Recorder
 
 START_NS = 1_750_000_000_123_456_789
@@ -67,3 +70,46 @@ def count_missing(found: Batch, expected: Batch) -> int:
         assert other.values[at].tobytes() == one.values.tobytes()
         missing += len(other) - len(one)
     return missing
+
+
+BATCH = made_batch(400)
+JOINTS = cdr.joint_state_message("platform", ["outer", "middle", "inner"])
+ACCEL = ("/accelerometer", cdr.IMU, cdr.imu_message("accelerometer"), BATCH.accel)
+ANGLES = ("/platform/angles", cdr.JOINT_STATE, JOINTS, BATCH.pose)
+HEAT = ("/temperature", cdr.TEMPERATURE, cdr.temperature_message(""), BATCH.temperature)
+Topic = tuple[str, cdr.MessageType, bytes, Stream]
+
+
+def write_officially(
+    path: Path,
+    topics: tuple[Topic, ...] = (ACCEL, ANGLES, HEAT),
+    *,
+    metadata: dict[str, str] | None = None,
+    encoding: str = "cdr",
+    schema_encoding: str = "ros2msg",
+    extra: Callable[[Writer, int], None] = lambda *_: None,
+    finish: bool = True,
+    **options: object,
+) -> Path:
+    """A file by the official writer, messages in the order of their stamps; ``extra`` is called between messages."""
+    with path.open("wb") as file:
+        writer = Writer(file, **{"chunk_size": 8_000, **options})
+        writer.start(profile="ros2")
+        if metadata is None:
+            metadata = BENCH.to_metadata()
+        if metadata:
+            writer.add_metadata("kf_calib.bench", metadata)
+        messages: list[tuple[int, int, bytes]] = []
+        for topic, kind, template, stream in topics:
+            schema = writer.register_schema(kind.name, schema_encoding, kind.schema.encode())
+            channel = writer.register_channel(topic, encoding, schema)
+            packed = cdr.pack(kind, template, stream)
+            messages += zip(stream.time_ns.tolist(), [channel] * len(packed), packed, strict=True)
+        for i, (stamp, channel, data) in enumerate(sorted(messages, key=lambda message: message[0])):
+            extra(writer, i)
+            writer.add_message(channel, log_time=stamp, data=data, publish_time=stamp)
+        if finish:
+            writer.finish()
+        else:
+            writer.flush()
+    return path

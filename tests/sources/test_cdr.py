@@ -141,7 +141,7 @@ JOINTS = cdr.joint_state_message("platform", ["outer", "inner"])
         (cdr.IMU, 3, IMU[:12] + b"\xff\xff\xff\xff" + IMU[16:], "ends at byte 4294967311 of 332"),
         (cdr.IMU, 3, IMU[:-72] + struct.pack("<d", -1.0) + IMU[-64:], "not measured"),
         (cdr.JOINT_STATE, 3, JOINTS, "gives 2 positions for 3 gimbal axes"),
-        (cdr.JOINT_STATE, 1, JOINTS, "gives 2 positions for 1 gimbal axes"),
+        (cdr.JOINT_STATE, 1, JOINTS, "gives 2 joints .outer, inner. where 1 gimbal axes are stated"),
         (cdr.TEMPERATURE, 1, IMU, "the message has 332"),
     ],
 )

@@ -19,8 +19,9 @@ from mcap_ros2.decoder import DecoderFactory
 from kf_calib.bench import Bench, parse_axes
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.samples import Batch, Stream
+from kf_calib.sources.contents import CHECKSUM_KEY
 from kf_calib.sources.recorder import Recorder
-from kf_calib.sources.recording import CHECKSUM_KEY, Recording
+from kf_calib.sources.recording import Recording
 
 KILLS = int(os.environ.get("KF_CALIB_KILLS", "8"))
 

@@ -27,6 +27,10 @@ class BagFeed(Feed):
         if not path.exists():
             raise InputError(f"{path} does not exist: check the path.")
 
+    @property
+    def warnings(self) -> list[str]:
+        return [] if self._recording is None else self._recording.warnings_while_read
+
     def begin(self) -> Bench:
         began_s = time.monotonic()
         while True:

@@ -54,6 +54,11 @@ class Feed(ABC):
         self.fraction = math.nan
         self.stopping = False
 
+    @property
+    def warnings(self) -> list[str]:
+        """What was lost, and what was not understood, a sentence each."""
+        return [f"{self.name}: {said}" for said in self.account.sentences()]
+
     @abstractmethod
     def begin(self) -> Bench:
         """Reads on until the bench is known. Raises InputError where it will not be."""

@@ -11,6 +11,8 @@ from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from kf_calib.errors import InputError
 from kf_calib.outputs import Outputs
+from kf_calib.sources.foreign import folder_advice
+from kf_calib.sources.joints import as_columns
 from kf_calib.sources.live.bag import BagFeed
 from kf_calib.sources.live.feed import Feed
 from kf_calib.sources.live.links import GrowingFile, Link, SerialPort, StandardInput, Tcp
@@ -56,6 +58,7 @@ def open_live(
     else:
         link = _link(address)
         name = "standard input" if address == "-" else address.removeprefix("tail:")
+        columns = {**as_columns((overrides or {}).get("joints", "")), **columns}
         feed = StreamedFeed(name, link, overrides or {}, columns, header, give_up_s, idle_s)
     return LiveSource(feed, record, overwrite, queued)
 
@@ -85,7 +88,7 @@ def _bag(address: str) -> Path | None:
     if path.is_dir():
         files = sorted(path.glob("*.mcap"), key=lambda file: file.stat().st_mtime)
         if not files:
-            raise InputError(f"{path} holds no .mcap file: give the folder of a bag recorded with -s mcap.")
+            raise InputError(folder_advice(path))
         return files[-1]
     return path if path.suffix == ".mcap" else None
 

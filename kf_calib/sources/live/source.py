@@ -170,7 +170,7 @@ class LiveSource:
 
     @property
     def warnings(self) -> list[str]:
-        return [f"{self.name}: {said}" for said in [*self._feed.account.sentences(), *self.status.sentences()]]
+        return [*self._feed.warnings, *(f"{self.name}: {said}" for said in self.status.sentences())]
 
     @property
     def fraction(self) -> float:
