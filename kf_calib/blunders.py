@@ -39,7 +39,7 @@ _SPREAD = 0.2  # least singular value of the directions over sqrt(D); 0.577 wher
 _BIAS = 0.3  # 1 sigma of a bias, g: what decides where the orientations do not determine it
 _NOMINAL = 0.15  # rms from nominal, g, of readings that have no blunder: biases, scale factors and mounting together
 _MOST_DWELLS = 96  # that are looked at: of more, some all along the run
-_MOST_CHANGES = 5  # of gimbals and channels together
+_MOST_CHANGES = 4  # of gimbals and channels together
 _MOST_NAMED = 3  # changes that would do equally well
 _ALIKE = 0.05  # of what three scale factors have in common: they differ by less
 _LITTLE = 20e-6  # of a scale factor: not worth a word
@@ -121,10 +121,10 @@ def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
             return
         _refuse_wrong_gain(found, bench)
     wrong = _what_is_wrong(found, bench)
+    _refuse_exchange(means, stated)
     mending = _mendings(means, stated, found)
     if mending:
         raise BlunderError(f"{wrong}: {_question(bench, mending)}")
-    _refuse_exchange(means, stated)
     if (found is None or not found.is_near()) and not _one_dwell(means, stated):
         raise BlunderError(
             f"{wrong}, and no order or sign of channels, gimbals or angles brings all axes near nominal: check what "

@@ -610,10 +610,12 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
             "record them on /platform/angles, at any rate."
         )
     if not dwells:
+        turns = tally.farthest_rad / (2.0 * math.pi)
+        unit = f"; angles of up to {turns:.0f} turns look like degrees (--angle-unit deg)" if turns > 3.0 else ""
         raise InputError(
             f"no dwell was found in {tally.read} readings ({tally.moving} moving, {tally.settling} settling, "
             f"{tally.not_finite} not finite, {tally.without_pose} without an angle): the platform must stand still; "
-            "if it did, raise --still-deg or lower --settle-s."
+            f"if it did, raise --still-deg or lower --settle-s{unit}."
         )
     level = float(np.median([np.linalg.norm(dwell.means[4:]) for dwell in dwells])) / bench.gravity_mps2
     if 0.5 <= level <= 2.0:

@@ -87,6 +87,7 @@ class Tally:
     poses: int = 0
     poses_dropped: int = 0
     gated: int = 0
+    farthest_rad: float = 0.0
     first_backward_s: float | None = None
     short_dwells: int = 0
     least_settling_s: float = math.inf
@@ -282,6 +283,7 @@ class Segmenter:
             continuous = unwrap_pose(pose.values, not self.bench.axes, previous)
             self._pose += Stream(pose.time_ns, continuous)
             if self.bench.axes:
+                self.tally.farthest_rad = max(self.tally.farthest_rad, float(np.abs(pose.values).max(initial=0.0)))
                 self._turns = np.concatenate([self._turns, np.rint((continuous - pose.values) / (2.0 * np.pi))])
         if len(batch.temperature):
             warm = batch.temperature

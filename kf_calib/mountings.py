@@ -16,7 +16,7 @@ import numpy as np
 from kf_calib.bench import UP, Bench
 from kf_calib.samples import Floats
 
-_MOST_CHANGES = 3
+_MOST_CHANGES = 2
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from altered import Altered, short_run
 from kf_calib.bench import UP, Bench, parse_axes, parse_channels
 from kf_calib.blunders import common_scale
 from kf_calib.calibration import calibrate
-from kf_calib.errors import BlunderError
+from kf_calib.errors import BlunderError, InputError
 from kf_calib.samples import Floats
 
 
@@ -156,3 +156,9 @@ def test_scale_factors_that_are_all_off_by_the_same() -> None:
     notes = calibrate(Altered(run, lambda _, a: a * local / scales)).warnings
     assert "off by the same -576 ppm" in " ".join(notes)
     assert "off by the same" not in " ".join(calibrate(run).warnings)
+
+
+def test_degrees_of_a_noisy_encoder_in_which_nothing_stands_still() -> None:
+    run = short_run(encoder_sigma_deg=0.02, angle_hz=50.0)
+    with pytest.raises(InputError, match=r"look like degrees \(--angle-unit deg\)"):
+        calibrate(Altered(run, poses=lambda _, q: np.degrees(q)))
