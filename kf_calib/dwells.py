@@ -307,7 +307,7 @@ class Segmenter:
                 self._dwell = _Dwell(self.dwell_count, stamp, felt_ns, self._next_pose_ns(stamp), settling_ns)
             else:
                 lead_ns = min(self.stillness.lead_ns, (stamp - self._dwell.arrival_ns) // 10) if self._dwell else 0
-                yield from self._emit(stamp - lead_ns, closing=True)
+                yield from self._emit(stamp - lead_ns, closing=True, left=True)
                 self._dwell = None
         horizon = self._horizon(final)
         if horizon is None:
@@ -448,8 +448,11 @@ class Segmenter:
         self.tally.slewing += count
         self._accel = self._accel[count:]
 
-    def _emit(self, until_ns: int, closing: bool) -> Iterator[Block]:
-        """Blocks of the open dwell from the readings before ``until_ns``; a last short one when it closes."""
+    def _emit(self, until_ns: int, closing: bool, left: bool = False) -> Iterator[Block]:
+        """Blocks of the open dwell from the readings before ``until_ns``; a last short one when it closes.
+
+        left: it closes because the platform has left; a dwell in which a run ends is short by no choice.
+        """
         assert self._dwell is not None
         dwell, settle_ns = self._dwell, self.stillness.settle_ns
         if dwell.settling_ns is None:
@@ -458,7 +461,7 @@ class Segmenter:
             if not closing and (not judged or length_ns < 3 * settle_ns):
                 return
             dwell.settling_ns = rest_ns - dwell.arrival_ns + min(settle_ns, length_ns // 3)
-            if settle_ns > length_ns // 3:
+            if settle_ns > length_ns // 3 and left:
                 self.tally.short_dwells += 1
                 self.tally.least_settling_s = min(self.tally.least_settling_s, length_ns // 3 / _SECOND_NS)
         count = int(np.searchsorted(self._accel.time_ns, until_ns))

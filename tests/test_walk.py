@@ -115,7 +115,9 @@ def test_leaving_an_orientation_out_equals_a_fit_without_it() -> None:
     poses = np.random.default_rng(2).uniform(-np.pi, np.pi, (12, 3))
     poses[9] = poses[4]
     result = fitted(walking(4, dwells=12, poses=poses, count=80, gap_s=100.0))
-    found, floor = held_out(result.fit)
+    left_out = held_out(result.fit)
+    assert left_out is not None
+    found, floor = left_out.rms_mps2, left_out.floor_mps2
     expected, floor_expected = by_conditioning(result)
     assert found == pytest.approx(expected, rel=0.02) and floor == pytest.approx(floor_expected, rel=0.02)
 
