@@ -16,7 +16,7 @@ from kf_calib.readings import Readings, clustering, common_step, missing_above
 from kf_calib.samples import Stream
 from kf_calib.sources.recording import Recording
 
-QUICK = ["--orientations", "16", "--dwell-s", "8", "--slew-degps", "360", "--sample-hz", "100", "--seed", "3"]
+QUICK = ["--orientations", "24", "--dwell-s", "8", "--slew-degps", "360", "--sample-hz", "100", "--seed", "3"]
 FACES = np.array([(0, b, c) for b, c in itertools.product(np.radians([0.0, 90, 180, 270]), np.radians([0.0, 45, 90]))])
 
 
