@@ -24,7 +24,7 @@ from kf_calib.sources.recording import opened
 
 Result = TypeVar("Result")
 
-_TRACED = 1000  # readings over which the memory of filterpy is traced
+_TRACED = 300  # readings over which the memory of filterpy is traced
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Way:
     """One way of estimating: wall seconds, peak memory in MB (numpy's and Python's), distance from the block engine.
 
     Tracing memory makes many small steps several times slower, so it is traced in a run of its own; filterpy's over its
-    first thousand readings, since it keeps none of them.
+    first few hundred readings, since it keeps none of them.
     max_difference_sigma: largest |difference| of the twelve parameters in sigma; max_relative_variance: of diag P.
     """
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 from scipy.signal import lfilter
@@ -11,8 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from kf_calib.bench import Bench, axes_of
 from kf_calib.samples import Batch, Stream
+from kf_calib.sources.plans import spread_plan
 
 G = 9.81
+plan_of = cache(spread_plan)
+"""A plan takes a tenth of a second, and many tests have the same."""
+
 SYMBOLS = ["theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3"]
 NOMINAL = np.array([np.radians(0.5), 0, 1, 0, 0, 0, 1, 0, np.radians(0.5), -np.pi / 2, 1, 0])
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from long_runs import slow
-from synthetic import Run
+from synthetic import Run, plan_of
 
 from kf_calib import assessment
 from kf_calib.assessment import EQUAL, assessed, detectable, independent_tests, price
@@ -25,7 +25,7 @@ from kf_calib.sources.hidden import parse
 from kf_calib.sources.hidden.detectability import sized
 from kf_calib.sources.noise_sources import Noise
 from kf_calib.sources.physics import Ambient
-from kf_calib.sources.plans import six_faces, spread_plan
+from kf_calib.sources.plans import six_faces
 from kf_calib.sources.sensors import GRADES
 from kf_calib.sources.simulator import Simulation
 
@@ -37,7 +37,7 @@ def run(*hidden: str, seed: int = 5, plan: list | None = None) -> Calibration:
     """A calibration without the hidden effects in its model. A diagnosis takes as long as there are dwells."""
     base = Simulation(
         BENCH, GRADES["navigation"].sensors(seed), Noise(white_mps2=5e-5),
-        plan or spread_plan(16, dwell_s=8.0, seed=seed),
+        plan or plan_of(16, dwell_s=8.0, seed=seed),
         sample_hz=50.0, angle_hz=20.0, slew_rate_degps=90.0, seed=seed,
         ambient=Ambient(swing_c=5.0, period_s=300.0, sigma_c=0.0),
     )  # fmt: skip
@@ -76,7 +76,7 @@ def test_nothing_is_found_in_noise(case: dict, runs: int) -> None:
 def test_what_is_in_no_catalogue_is_unknown(name: str, driver: str) -> None:
     from kf_calib.views.diagnosis import description, diagnosis_object
 
-    found = diagnose(run(f"{name}=20sigma", plan=spread_plan(24, dwell_s=8.0, seed=5)))
+    found = diagnose(run(f"{name}=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
     assert found.unknown and not found.missing
     shape = description(found)
     assert shape is not None and driver in shape.driver
@@ -89,7 +89,7 @@ def test_a_formula_that_explains_more_than_a_known_effect_speaks_against_it() ->
     """A fifth power looks like a third power to 0.96: named third-order, it would be a wrong name."""
     from kf_calib.views.diagnosis import description
 
-    found = diagnose(run("fifth-order=20sigma", plan=spread_plan(24, dwell_s=8.0, seed=5)))
+    found = diagnose(run("fifth-order=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
     shape = description(found)
     assert found.unknown and shape is not None and shape.formula == "mine = a**5"
 

@@ -13,6 +13,7 @@ import pytest
 from long_runs import slow
 from scipy.optimize import brentq
 from scipy.stats import chi2
+from synthetic import plan_of
 
 from kf_calib import information
 from kf_calib.bench import Bench, axes_of
@@ -30,12 +31,12 @@ from kf_calib.samples import Floats
 from kf_calib.sources.hidden import parse, sized
 from kf_calib.sources.noise_sources import Noise
 from kf_calib.sources.physics import Ambient
-from kf_calib.sources.plans import Visit, explicit_plan, spread_plan
+from kf_calib.sources.plans import Visit, explicit_plan
 from kf_calib.sources.sensors import GRADES
 from kf_calib.sources.simulator import Simulation
 
 BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
-PLAN = spread_plan(30, dwell_s=6.0, seed=4)
+PLAN = plan_of(30, dwell_s=6.0, seed=4)
 NAMES = [name for name in names(BENCH) if not effect_named(name, BENCH).dynamic]  # tests/test_slews.py has these
 OWN_TEST = {
     "vibration-rectification", "dead-zone", "bias-walk", "magnetic", "warm-up", "settling", "thermal-lag", "sinusoid",
@@ -51,7 +52,7 @@ INVISIBLE = {  # exactly: wrong g is a common scale, the innermost zero a misali
 }
 NOT_SIZED = {"vibration-rectification", "dead-zone", "bias-walk"}
 """Needs readings fast enough to resolve vibration; a width; not the same in two runs."""
-CHEAP = spread_plan(24, dwell_s=8.0, seed=4)
+CHEAP = plan_of(24, dwell_s=8.0, seed=4)
 HIDDEN = {
     "warm-up": ("warm-up=5e-3;tau=80", 80.0),
     "settling": ("settling=3e-5;tau=4", 4.0),
@@ -118,7 +119,7 @@ def test_coefficients_of_a_nonlinear_truth_are_found(name: str) -> None:
 )
 def test_time_constants_are_found_with_their_sigma(hidden: str, constant: float) -> None:
     name = hidden.partition("=")[0]
-    plan = spread_plan(24, dwell_s=30.0, seed=4)
+    plan = plan_of(24, dwell_s=30.0, seed=4)
     for seed in (5, 6, 7):
         source = run([hidden], 5e-5, seed, plan, sample_hz=50.0, period_s=600.0)
         result = with_effect(name, source)
@@ -144,13 +145,13 @@ def test_magnetic_sensitivity_is_found_as_its_product_with_the_field() -> None:
 
 def test_a_walk_of_the_biases_is_found_with_its_sigma() -> None:
     """Its intensity within 4 sigma, and without it the model fails; the effect has no coefficient else."""
-    source = run(["bias-walk=1e-5"], 5e-5, plan=spread_plan(60, dwell_s=10.0, seed=4))
+    source = run(["bias-walk=1e-5"], 5e-5, plan=plan_of(60, dwell_s=10.0, seed=4))
     result = with_effect("bias-walk", source)
     assert list(values(result)) == ["qb"] and result.model.count == 12
     value, sigma = values(result)["qb"]
     assert abs(value - 1e-5) < 4.0 * sigma < 3e-6
     assert result.consistency.consistent and calibrate(source).consistency.p_value < 1e-9
-    still = with_effect("bias-walk", run([], 5e-5, plan=spread_plan(60, dwell_s=10.0, seed=4)))
+    still = with_effect("bias-walk", run([], 5e-5, plan=plan_of(60, dwell_s=10.0, seed=4)))
     assert still.parameters["qb"].value is None
 
 
@@ -169,7 +170,7 @@ def test_vibration_rectification_is_found_at_the_size_white_noise_allows() -> No
 def test_windows_are_as_long_as_the_vibration_that_is_seen_needs() -> None:
     """33.7 Hz read 6 times a second show as 2.3 Hz: windows of a second would let a thousandth of 3 m/s^2 through."""
     hidden, seed = ["vibration-rectification=4e-5,-3e-5,2e-5"], 3
-    source = run(hidden, 5e-5, seed, spread_plan(24, dwell_s=60.0, seed=4), sample_hz=6.0)
+    source = run(hidden, 5e-5, seed, plan_of(24, dwell_s=60.0, seed=4), sample_hz=6.0)
     result = with_effect("vibration-rectification", source)
     assert 8.0 < result.settings.window_s < 9.0
     for (value, sigma), truth in zip(values(result).values(), source.hidden[0].sizes, strict=True):
@@ -177,7 +178,7 @@ def test_windows_are_as_long_as_the_vibration_that_is_seen_needs() -> None:
 
 
 def test_averages_of_still_readings_say_the_same_with_hardly_less_information() -> None:
-    source = run([], 5e-5, plan=spread_plan(24, dwell_s=15.0, seed=4))
+    source = run([], 5e-5, plan=plan_of(24, dwell_s=15.0, seed=4))
     whole, means = calibrate(source), calibrate(source, Settings(window_s=1.0))
     ratio = means.estimate.sigma / whole.estimate.sigma
     assert 0.98 < ratio.min() and ratio.max() < 1.1 and means.consistency.consistent
@@ -199,7 +200,7 @@ def sweep_plan(source: Simulation, step_rad: float = 2e-4) -> list[Visit]:
             return float(source.sensors.input_axes[i] @ BENCH.specific_force(np.zeros(1), pose)[0])
 
         zeros.append((gimbal, brentq(along, start - 0.2, start + 0.2)))
-    rows = [visit.gimbal_deg for visit in spread_plan(24, seed=4)]
+    rows = [visit.gimbal_deg for visit in plan_of(24, seed=4)]
     for k in range(16):
         for i, (gimbal, zero) in enumerate(zeros):
             pose = [20.0 + 40.0 * i, 0.0, 0.0]
@@ -279,7 +280,7 @@ def test_left_out_effect_biases_the_twelve_and_the_effect_in_the_model_mends_it(
     nothing; the first harmonic of the inner encoder biases by less than two runs show; an oscillation averages out.
     """
     constants = {"warm-up": ";tau=80", "settling": ";tau=4", "thermal-lag": ";tau=60", "magnetic": ";up=0"}
-    plan = spread_plan(24, dwell_s=10.0, seed=4)
+    plan = plan_of(24, dwell_s=10.0, seed=4)
     hidden = run([f"{name}=20sigma{constants.get(name, '')}"], 5e-5, number, plan, 10.0, 150.0, 2.0, 180.0).hidden
     nees = {(): 0.0, (name,): 0.0}
     for seed in (1000 + 2 * number, 1001 + 2 * number):

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from long_runs import slow
 from scipy.signal import lfilter
-from synthetic import Run
+from synthetic import Run, plan_of
 
 from kf_calib.bench import Bench, axes_of
 from kf_calib.calibration import calibrate
 from kf_calib.folding import Autocovariance, less_curve
 from kf_calib.likelihood import restricted_log_likelihood
 from kf_calib.sources.noise_sources import Noise as SimulatedNoise
-from kf_calib.sources.plans import spread_plan
 from kf_calib.sources.sensors import GRADES
 from kf_calib.sources.simulator import Simulation
 
@@ -97,7 +96,7 @@ def test_dwells_too_short_for_their_noise_raise_no_alarm_and_are_told(runs: int)
         bench = Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
         source = Simulation(
             bench, GRADES["mems"].sensors(seed), SimulatedNoise(white_mps2=0.02, ar1_phi=0.9),
-            spread_plan(16, dwell_s=10.0, seed=seed), sample_hz=4.0, angle_hz=4.0, slew_rate_degps=90.0, seed=seed,
+            plan_of(16, dwell_s=10.0, seed=seed), sample_hz=4.0, angle_hz=4.0, slew_rate_degps=90.0, seed=seed,
         )  # fmt: skip
         result = calibrate(source)
         assert result.consistency.p_value is not None

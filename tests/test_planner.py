@@ -110,6 +110,7 @@ def test_exchange_finds_what_brute_force_finds_on_a_small_grid(name: str) -> Non
     assert tried.measure(tried.best(5)) == pytest.approx(least, abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_bound_of_limited_gimbals_is_above_all_designs_and_near_the_best() -> None:
     limited = search(Reach(BENCH, {1: (-60.0, 60.0), 2: (-60.0, 60.0)}))
     rng = np.random.default_rng(1)

@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from synthetic import Run
+from long_runs import slow
+from synthetic import Run, plan_of
 from test_diagnosis import BENCH
 
 from kf_calib.calibration import Settings, calibrate
@@ -32,7 +33,6 @@ from kf_calib.samples import Batch
 from kf_calib.sources.hidden import parse
 from kf_calib.sources.hidden.detectability import sized
 from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.plans import spread_plan
 from kf_calib.sources.sensors import GRADES
 from kf_calib.sources.simulator import Simulation
 from kf_calib.standing import Judgement, current, judged, targets
@@ -46,7 +46,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def bench(*hidden: str, orientations: int = 12, batch: int = 40) -> Simulation:
     base = Simulation(
-        BENCH, GRADES["navigation"].sensors(5), Noise(white_mps2=5e-5), spread_plan(orientations, dwell_s=6.0, seed=5),
+        BENCH, GRADES["navigation"].sensors(5), Noise(white_mps2=5e-5), plan_of(orientations, dwell_s=6.0, seed=5),
         sample_hz=50.0, angle_hz=20.0, slew_rate_degps=180.0, seed=5, batch_samples=batch,
     )  # fmt: skip
     return base.hiding(parse(hidden, BENCH.axes, seed=5, sized=partial(sized, base)))
@@ -279,7 +279,7 @@ def test_json_has_an_object_a_dwell_and_ends_with_what_replay_and_diagnose_say(t
     assert (tmp_path / "run.rrd").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("how", [signal.SIGTERM, *slow(signal.SIGINT)])
 def test_a_signal_finishes_the_file_and_prints_the_summary(tmp_path: Path, how: signal.Signals) -> None:
     out = tmp_path / "run.mcap"
     with live(SLOW, "--record", str(out)) as process:

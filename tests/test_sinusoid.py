@@ -9,6 +9,7 @@ import pytest
 from long_runs import slow
 from scipy.signal import lfilter
 from scipy.stats import binom
+from synthetic import plan_of
 from test_effects import BENCH
 
 from kf_calib.bench import Bench
@@ -20,7 +21,6 @@ from kf_calib.samples import Floats
 from kf_calib.scan import falls, scan
 from kf_calib.sources.hidden import parse
 from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.plans import spread_plan
 from kf_calib.sources.sensors import GRADES
 from kf_calib.sources.simulator import Simulation
 from kf_calib.spectrum import Line, Spectrum, lines
@@ -36,7 +36,7 @@ def run(
     sizes = ",".join(str(size_sigma * SIGMA * share) for share in SHARES)
     return Simulation(
         bench, GRADES["navigation"].sensors(seed), Noise(white_mps2=SIGMA),
-        spread_plan(dwells, dwell_s=dwell_s, seed=4), sample_hz=100.0, slew_rate_degps=90.0, seed=seed,
+        plan_of(dwells, dwell_s=dwell_s, seed=4), sample_hz=100.0, slew_rate_degps=90.0, seed=seed,
         hidden=parse([f"sinusoid={sizes};frequency={frequency_hz}"], BENCH.axes, seed=seed),
     )  # fmt: skip
 

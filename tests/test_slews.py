@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from long_runs import slow
+from synthetic import plan_of
 
 from kf_calib.bench import Bench, axes_of
 from kf_calib.calibration import Calibration, Pass, Settings, calibrate
@@ -16,7 +17,6 @@ from kf_calib.model import Model
 from kf_calib.slews import Curve
 from kf_calib.sources.hidden import parse
 from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.plans import spread_plan
 from kf_calib.sources.sensors import GRADES
 from kf_calib.sources.simulator import Simulation
 
@@ -31,7 +31,7 @@ def run(
 ) -> Simulation:  # fmt: skip
     return Simulation(
         bench, GRADES["navigation"].sensors(seed), Noise(white_mps2=5e-5, **noise),
-        spread_plan(dwells, dwell_s=6.0, seed=4),
+        plan_of(dwells, dwell_s=6.0, seed=4),
         sample_hz=sample_hz, angle_hz=angle_hz, slew_rate_degps=rate, seed=seed, batch_samples=batch,
         hidden=parse(hidden, BENCH.axes, seed=seed),
     )  # fmt: skip

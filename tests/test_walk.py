@@ -176,9 +176,9 @@ def test_sigmas_of_a_walk_and_of_the_twelve_beside_it_are_honest(runs: int) -> N
 
 
 def test_no_walk_is_seen_where_there_is_none() -> None:
-    results = [fitted(walking(seed, 0.0)) for seed in range(100, 108)]
+    results = [fitted(walking(seed, 0.0)) for seed in range(100, 105)]
     unseen = [result.parameters["qb"].value is None for result in results]
-    assert sum(unseen) >= 2  # half the time the likelihood is highest at zero
+    assert sum(unseen) >= 1  # half the time the likelihood is highest at zero
     for result in results:
         value = result.parameters["qb"]
         assert value.value is None or value.value < 4.0 * value.sigma

@@ -299,7 +299,7 @@ def test_memory_does_not_grow_with_the_lines():
         return found
 
     peak(2)
-    assert peak(40) < 1.3 * peak(8)
+    assert peak(18) < 1.3 * peak(6)
 
 
 # -- live --
