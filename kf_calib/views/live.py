@@ -31,7 +31,7 @@ def live_object(judgement: Judgement, standing: Standing, status: Status | None)
     """One line of ``live --json``: the keys of replay and of diagnose as they stand, and what is of a live run only."""
     found = diagnosis_object(judgement.found)
     going = judgement.next_orientation
-    if not ((judgement.final or judgement.alarm) and found["next_orientation"]) and going is not None:
+    if not judgement.final and not (judgement.alarm and found["next_orientation"]) and going is not None:
         found["next_orientation"] = {"gimbal_deg": list(going[0]), "stay_s": None, "why": going[1]}
     left = dict(zip(paper.SYMBOLS, judgement.left_s, strict=True))
     wanted = dict(zip(paper.SYMBOLS, judgement.wanted, strict=True))
