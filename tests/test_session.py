@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -247,11 +248,17 @@ URL = "sim://?speed=500&orientations=6&dwell_s=5&sample_hz=50&slew_degps=180&see
 SLOW = URL.replace("speed=500", "speed=10").replace("orientations=6", "orientations=20")
 
 
-def live(*words: str, **kwargs: object) -> subprocess.Popen[str]:
+def live(*words: str, **kwargs: Any) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "kf_calib.cli", "live", *words]
-    return subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL
-    )
+    streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | kwargs
+    return subprocess.Popen(command, cwd=ROOT, text=True, **streams)
+
+
+def until(is_so: Callable[[], bool], patience_s: float = 60.0) -> None:
+    began = time.monotonic()
+    while not is_so():
+        assert time.monotonic() - began < patience_s, "waited in vain"
+        time.sleep(0.01)
 
 
 def replayed(*words: str) -> dict:
@@ -269,14 +276,69 @@ def test_json_has_an_object_a_dwell_and_ends_with_what_replay_and_diagnose_say(t
     assert [each["dwells"] for each in objects] == [1, 2, 3, 4, 5, 6, 6]
     assert [each["final"] for each in objects] == [False] * 6 + [True]
     assert all(each.keys() >= REPLAY_KEYS | DIAGNOSE_KEYS for each in objects)
-    replay, diagnosis = replayed("replay", str(out)), replayed("diagnose", str(out))
     last = objects[-1]
     assert last["source"]["link"] == "ended" and last["source"]["dropped"] == 0
-    for key in REPLAY_KEYS - {"warnings"}:
-        assert last[key] == replay[key], key
-    for key in DIAGNOSE_KEYS - {"next_orientation"}:
-        assert last[key] == diagnosis[key], key
+    as_replayed(last, out)
     assert (tmp_path / "run.rrd").stat().st_size > 10_000
+
+
+def as_replayed(last: dict, recording: Path) -> None:
+    """All that replay and diagnose say of the recording, to the last bit; warnings are of the source, too."""
+    for command in ("diagnose", "replay"):
+        found = replayed(command, str(recording))
+        same = {key: last[key] for key in found if key != "warnings"}
+        assert same == {key: found[key] for key in same}
+
+
+def lines_of(source: Simulation) -> list[str]:
+    """A run as JSON lines in the order of time, the angles on lines of their own, a header first."""
+    first = {"bench": source.bench.to_metadata()}
+    lines = list[tuple[int, str]]()
+    for batch in source:
+        for key, stream in (("accel_mps2", batch.accel), ("angles_rad", batch.pose)):
+            for stamp, values in zip(stream.time_ns.tolist(), stream.values.tolist(), strict=True):
+                lines.append((stamp, json.dumps({"time_ns": stamp, key: values})))
+    return [json.dumps(first), *(text for _, text in sorted(lines, key=lambda line: line[0]))]
+
+
+def late(lines: list[str], first: int, last: int, by: int) -> list[str]:
+    """The same lines, the readings among some of them later by so many: a link that lets the angles ahead."""
+    part = lines[first:last]
+    ahead = [line for line in part[by:] if "angles" in line]
+    return [*lines[:first], *ahead, *(line for line in part if line not in ahead), *lines[last:]]
+
+
+@pytest.mark.parametrize("way", ["pause", "pause and end", "idle", "Ctrl-C amid a dwell", "Ctrl-C in a pause"])
+def test_the_last_object_is_what_replay_and_diagnose_say_whichever_way_a_run_ends(tmp_path: Path, way: str) -> None:
+    """A pause comes at the end of a dwell, with the angles a second ahead of the readings."""
+    out, lines = tmp_path / "run.mcap", lines_of(bench(orientations=8))
+    at = len(lines) * 3 // 4
+    lines = late(lines, at - 200, at + 200, 70)
+    command = ["-", "--json", "--record", str(out), *(["--idle-s", "1"] if way == "idle" else [])]
+    with live(*command, stdin=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stdout is not None
+        said = threading.Thread(target=lambda: objects.extend(map(json.loads, process.stdout)))
+        objects = list[dict]()
+        said.start()
+        process.stdin.write("\n".join([*lines[:at], ""]))
+        process.stdin.flush()
+        until(lambda: len(objects) >= 4)
+        time.sleep(0.6)
+        if way == "Ctrl-C in a pause":
+            process.send_signal(signal.SIGINT)
+        elif way not in ("pause and end", "idle"):
+            process.stdin.write("\n".join([*lines[at : None if way == "pause" else -150], ""]))
+            process.stdin.flush()
+            until(lambda: len(objects) >= 6)
+            time.sleep(0.6)
+        if way == "Ctrl-C amid a dwell":
+            process.send_signal(signal.SIGINT)
+        if way != "idle":
+            process.stdin.close()
+        assert process.wait(120) == 0
+        said.join()
+    assert objects[-1]["final"] and [each["final"] for each in objects].count(True) == 1
+    as_replayed(objects[-1], out)
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
