@@ -39,7 +39,8 @@ class Stream:
         """One after another; there is at least one."""
         if len(streams) == 1:
             return streams[0]
-        return cls(np.concatenate([each.time_ns for each in streams]), np.concatenate([each.values for each in streams]))
+        times, values = zip(*((each.time_ns, each.values) for each in streams), strict=True)
+        return cls(np.concatenate(times), np.concatenate(values))
 
     def __len__(self) -> int:
         return len(self.time_ns)

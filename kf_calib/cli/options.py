@@ -249,13 +249,18 @@ def json_line(content: Mapping[str, Any]) -> str:
 
 
 def show(renderable: Any) -> None:
+    echo(rendered(renderable), end=False)
+
+
+def rendered(renderable: Any) -> str:
+    """As text for standard output, its line ended."""
     from rich.console import Console
 
     told = sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdigit()
     console = Console(width=None if told else 110, highlight=False, soft_wrap=not sys.stdout.isatty())
     with console.capture() as printed:
         console.print(renderable)
-    echo(printed.get(), end=False)
+    return printed.get()
 
 
 @contextlib.contextmanager

@@ -110,9 +110,10 @@ def _link(standing: Standing, status: Status | None, name: str, recording: str) 
     for word, count in counts.items():
         if count or word in ("gaps", "refused"):
             out.append(f"  {count} {word}", "red" if word in ("missing", "dropped") else "yellow" if count else "")
-    for trouble in (status.trouble, status.recording_trouble):
-        if trouble:
-            out.append(f"\n{trouble}", "bold red")
+    if status.trouble:
+        out.append(f"\n{status.trouble}", "bold red")
+    if status.recording_trouble:
+        out.append(f"\nRECORDING HAS STOPPED: {status.recording_trouble}", "bold white on red")
     if recording and not status.recording_trouble:
         age = "" if status.sync_age_s is None else f", on the disk up to {status.sync_age_s:.1f} s ago"
         out.append(f"\nrecording {recording}: {status.recorded} readings{age}")

@@ -29,7 +29,7 @@ from serial.rfc2217 import PortManager
 from kf_calib.bench import Bench
 from kf_calib.calibration import calibrate
 from kf_calib.errors import InputError
-from kf_calib.samples import Batch, Stream
+from kf_calib.samples import Batch
 from kf_calib.sources.line_parts import Account
 from kf_calib.sources.live import LiveSource, Status, frames, open_live
 from kf_calib.sources.live.continuity import Continuity

@@ -11,8 +11,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import numpy as np
-
 from kf_calib.bench import Bench
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.outputs import refuse
@@ -190,9 +188,13 @@ class LiveSource:
                 reconnects=feed.reconnects,
                 bytes=feed.bytes,
                 recorded=recorder.flushed if recorder else 0,
-                sync_age_s=now - recorder.synced_s if recorder and not self._is_finished else None,
+                sync_age_s=now - recorder.synced_s if recorder and self._is_recording else None,
                 recording_trouble=self._recording_trouble,
             )
+
+    @property
+    def _is_recording(self) -> bool:
+        return self._recorder is not None and not self._recording_trouble and not self._is_finished
 
     def stop(self) -> None:
         """Ends the iteration after what has come; from any thread, or a signal handler."""
@@ -300,8 +302,7 @@ class LiveSource:
 
     def _hand_on(self, batch: Batch, size: int) -> None:
         queue = self._queue
-        is_stored = self._recorder is not None and not self._recording_trouble
-        if queue.behind_from is not None and is_stored:
+        if queue.behind_from is not None and self._is_recording:
             queue.behind += len(batch.accel)
         elif queue.behind_from is None and (self._feed.patient or queue.fits(size)):
             queue.push(batch)
