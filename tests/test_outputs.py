@@ -5,12 +5,14 @@ from __future__ import annotations
 import errno
 import json
 import os
+import random
 import resource
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -246,13 +248,39 @@ def full_disk(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-@pytest.mark.parametrize("words", [["replay", "run.mcap"], ["plan", "--count", "6"]], ids=["replay", "plan"])
-def test_a_view_that_finds_no_room_is_told_after_the_result(run, here: Path, words: list[str]) -> None:
-    Path("old.rrd").write_bytes(MINE)
-    with full_disk(20_000):
-        code, out, err = run(*words, "--rrd", "old.rrd", "--overwrite", "--json")
-    assert code == 2 and json.loads(out) and "old.rrd cannot be written (File too large)" in err
-    assert Path("old.rrd").read_bytes() == MINE and not list(here.glob(".*"))
+FAST = "live sim://?speed=500&orientations=6&dwell_s=5&sample_hz=50&slew_degps=180&seed=3"
+
+
+@pytest.mark.parametrize("words", [
+    "replay run.mcap --rrd", "replay run.mcap --save-model", "plan --count 6 --rrd", f"{FAST} --rrd",
+    f"{FAST} --save-model", pytest.param("replay run.mcap --png", marks=pytest.mark.draws),
+])  # fmt: skip
+def test_a_file_that_finds_no_room_is_told_after_the_result(run, here: Path, words: str) -> None:
+    """It was waited for, for ever."""
+    Path("old").write_bytes(MINE)
+    with full_disk(50 if "model" in words else 20_000):
+        code, out, err = run(*words.split(), "old", "--overwrite", "--json")
+    assert code == 2 and json.loads(out.splitlines()[-1]) and "old cannot be written (" in err, err
+    assert Path("old").read_bytes() == MINE and not list(here.glob(".*"))
+
+
+def test_a_recording_that_finds_no_room_is_told_at_once(here: Path) -> None:
+    """Though more readings would come."""
+    words = ["record", "out.mcap", "-", "--axes", "y z x", "--gravity", "9.81"]
+    with full_disk(3000):
+        child = subprocess.Popen(
+            [sys.executable, "-m", "kf_calib.cli", *words], stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+    with child:
+        child.stdin.write(Path("lines.csv").read_text())
+        with suppress(BrokenPipeError):
+            while child.poll() is None:
+                child.stdin.write(f"{time.monotonic()},{random.random()},0,1,0,0,0\n")
+                child.stdin.flush()
+        with suppress(BrokenPipeError):
+            child.stdin.close()
+        assert child.stderr.readline().startswith("kf-calib: out.mcap cannot be written on (File too large)")
+    assert child.returncode == 2
 
 
 def test_one_file_that_fails_does_not_keep_others_from_being_written(
@@ -390,7 +418,7 @@ def test_a_disk_without_room_for_a_reading_leaves_the_earlier_recording(tmp_path
     assert path.read_bytes() == MINE and len(list(tmp_path.iterdir())) == 1
 
 
-@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
 def test_a_recording_that_is_ended_early_keeps_its_readings(here: Path, signal_number: int) -> None:
     Path("out.mcap").write_bytes(MINE)
     words = ["record", "out.mcap", "-", "--overwrite", "--axes", "y z x", "--gravity", "9.81"]
@@ -404,8 +432,10 @@ def test_a_recording_that_is_ended_early_keeps_its_readings(here: Path, signal_n
             child.stdin.flush()
             assert child.poll() is None
         child.send_signal(signal_number)
-        assert child.wait(20) == (130 if signal_number == signal.SIGINT else -signal_number)
-    assert sum(len(each.accel) for each in Recording("out.mcap")) >= 40
+        assert child.wait(20) == (130 if signal_number != signal.SIGKILL else -signal_number)
+    recording = Recording("out.mcap")
+    assert sum(len(each.accel) for each in recording) >= 40
+    assert bool(recording.warnings) == (signal_number == signal.SIGKILL), "else it is finished"
 
 
 UNFORESEEN = [

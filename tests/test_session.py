@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
 import re
+import resource
 import signal
 import socket
 import subprocess
@@ -25,6 +27,7 @@ from test_diagnosis import BENCH
 
 from kf_calib.calibration import Settings, calibrate
 from kf_calib.cli import cli
+from kf_calib.cli.echo import Printer
 from kf_calib.cli.live import _targets
 from kf_calib.diagnosis import diagnose
 from kf_calib.errors import InputError
@@ -32,8 +35,10 @@ from kf_calib.live import Session
 from kf_calib.samples import Batch
 from kf_calib.sources.hidden import parse
 from kf_calib.sources.hidden.detectability import sized
+from kf_calib.sources.live import Status
 from kf_calib.sources.noise_sources import Noise
 from kf_calib.sources.plans import spread_plan
+from kf_calib.sources.recording import Recording
 from kf_calib.sources.sensors import GRADES
 from kf_calib.sources.simulator import Simulation
 from kf_calib.standing import Judgement, current, judged, targets
@@ -341,7 +346,7 @@ def test_the_last_object_is_what_replay_and_diagnose_say_whichever_way_a_run_end
     as_replayed(objects[-1], out)
 
 
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_finishes_the_file_and_prints_the_summary(tmp_path: Path, how: signal.Signals) -> None:
     out = tmp_path / "run.mcap"
     with live(SLOW, "--record", str(out)) as process:
@@ -354,6 +359,101 @@ def test_a_signal_finishes_the_file_and_prints_the_summary(tmp_path: Path, how: 
     assert process.returncode == 0, errors
     assert "Parameters (1σ)" in said and "Model and measurements agree" in said
     assert replayed("replay", str(out))["warnings"] == [], "a finished file"
+
+
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_a_full_log_disk_ends_nothing(tmp_path: Path, form: list[str]) -> None:
+    out, model = tmp_path / "run.mcap", tmp_path / "model.toml"
+    words = [URL, *form, "--record", str(out), "--save-model", str(model)]
+    with Path("/dev/full").open("w") as full, live(*words, stdout=full) as process:
+        errors = process.communicate(timeout=240)[1].splitlines()
+    assert process.returncode == 2 and len(errors) == 2, errors
+    assert "standard output cannot be written to (No space left on device): the run goes on" in errors[0]
+    assert errors[1] == "kf-calib: 7 outputs could not be written to standard output: they are lost."
+    found = replayed("replay", str(out))
+    assert found["dwells"] == 6 and found["warnings"] == [] and model.exists()
+
+
+def test_a_log_goes_on_when_there_is_room_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Not with the lines that found none, nor in the middle of one."""
+    with (tmp_path / "log").open("w") as log:
+        monkeypatch.setattr(sys, "stdout", log)
+        out = Printer()
+        out("one")
+        with full_disk(6):
+            out("two")
+            out("three")
+        out("four")
+    assert (tmp_path / "log").read_text() == "one\ntw\nfour\n" and out.lost == 2
+
+
+@contextlib.contextmanager
+def full_disk(size: int) -> Iterator[None]:
+    """No file can grow beyond ``size`` bytes, of this process and those that it starts."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_a_recording_that_stops_is_told_at_once_and_by_the_exit_code(tmp_path: Path, form: list[str]) -> None:
+    out = tmp_path / "run.mcap"
+    with full_disk(40_000):
+        process = live(SLOW, *form, "--record", str(out))
+    with process:
+        assert process.stderr is not None and process.stdout is not None
+        first = process.stderr.readline()
+        assert process.poll() is None, "while the run goes on"
+        assert first.startswith(f"kf-calib: RECORDING HAS STOPPED: {out} cannot be written on (File too large)"), first
+        process.stdout.readline()
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert errors.splitlines()[-1].startswith("kf-calib: the run was not recorded to its end:")
+    recording = Recording(out)
+    assert sum(len(batch.accel) for batch in recording) > 300 and recording.warnings == [], "finished all the same"
+
+
+def test_a_recording_that_stops_is_loud_on_the_screen() -> None:
+    shown = views.screen(Session(bench()).standing, Status(recording_trouble="no room left."), "sim://", "run.mcap")
+    assert "RECORDING HAS STOPPED: no room left." in plain(shown, width=80)
+
+
+def test_nohup_keeps_a_run_alive(tmp_path: Path) -> None:
+    out = tmp_path / "run.mcap"
+    process = live(SLOW.replace("orientations=20", "orientations=8"), "--record", str(out),
+                   preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN))  # fmt: skip
+    with process:
+        assert process.stdout is not None and process.stdout.readline()
+        process.send_signal(signal.SIGHUP)
+        assert process.wait(120) == 0
+    assert replayed("replay", str(out))["dwells"] == 8
+
+
+@pytest.mark.parametrize("how", [None, signal.SIGHUP])
+def test_a_terminal_that_is_closed_costs_the_screen_only(tmp_path: Path, how: signal.Signals | None) -> None:
+    """With SIGHUP the run ends as it would by SIGTERM; without it goes on to its end."""
+    import pty
+
+    out, model = tmp_path / "run.mcap", tmp_path / "model.toml"
+    leader, follower = pty.openpty()
+    source = SLOW.replace("orientations=20", "orientations=10")
+    process = live(source, "--record", str(out), "--save-model", str(model), stdin=follower, stdout=follower,
+                   stderr=follower, env={**os.environ, "TERM": "xterm"}, start_new_session=True)  # fmt: skip
+    os.close(follower)
+    seen = b""
+    while not re.search(rb"orientation [5-9]", seen):
+        seen += os.read(leader, 65536)
+    os.close(leader)
+    for _ in range(3 if how else 0):  # from the terminal, and from the shell
+        process.send_signal(how or 0)
+        time.sleep(0.1)
+    assert process.wait(120) == 2, "what it had to say could not be written"
+    found = replayed("replay", str(out))
+    assert found["warnings"] == [] and (found["dwells"] < 10 if how else found["dwells"] == 10) and model.exists()
 
 
 def test_nobody_reading_ends_a_run_that_is_not_recorded() -> None:

@@ -199,7 +199,7 @@ class _Run:
         """Say at once, and once, that nothing is recorded any more."""
         trouble = self.source.status.recording_trouble
         if trouble and not self._is_warned:
-            complain(f"RECORDING HAS STOPPED, the run goes on without: {trouble}")
+            complain(f"RECORDING HAS STOPPED: {trouble}")
             self._is_warned = True
 
     @property
