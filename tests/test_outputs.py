@@ -260,7 +260,7 @@ def test_a_file_that_finds_no_room_is_told_after_the_result(run, here: Path, wor
     Path("old").write_bytes(MINE)
     with full_disk(50 if "model" in words else 20_000):
         code, out, err = run(*words.split(), "old", "--overwrite", "--json")
-    assert code == 2 and json.loads(out.splitlines()[-1]) and "old cannot be written (" in err, err
+    assert code == 2 and json.loads(out.splitlines()[-1]) and "cannot be written (" in err, err
     assert Path("old").read_bytes() == MINE and not list(here.glob(".*"))
 
 
