@@ -16,7 +16,7 @@ from kf_calib.readings import Readings, clustering, common_step, missing_above
 from kf_calib.samples import Stream
 from kf_calib.sources.recording import Recording
 
-QUICK = ["--orientations", "16", "--dwell-s", "8", "--slew-degps", "360", "--sample-hz", "100", "--seed", "3"]
+QUICK = ["--orientations", "24", "--dwell-s", "8", "--slew-degps", "360", "--sample-hz", "100", "--seed", "3"]
 FACES = np.array([(0, b, c) for b, c in itertools.product(np.radians([0.0, 90, 180, 270]), np.radians([0.0, 45, 90]))])
 
 
@@ -159,10 +159,9 @@ def test_common_step() -> None:
 
 
 def test_degenerate_readings_say_nothing_wrong() -> None:
-    dead, short, holed, one = Run(seed=8), Run(seed=8, count=40, dwells=6), Run(seed=8), Run(seed=8, dwells=5)
-    dead.accel.values[:, 1] = 9.3
+    short, holed, one = Run(seed=8, count=40, dwells=6), Run(seed=8), Run(seed=8, dwells=5)
     holed.accel.values[::7] = np.nan
-    assert readings(dead) == readings(short) == readings(holed) == Readings()
+    assert readings(short) == readings(holed) == Readings()
     one.accel.values[:300, 0] = 3.0  # stuck within the range is no end of it
     assert not readings(one).saturation
     crowd = Run(seed=8)

@@ -56,7 +56,6 @@ def errors(result: Calibration, frequency_hz: float, size_sigma: float) -> list[
         (0.15, 6.0, 5.0, 20),
         (1.3, 6.0, 1.0, 20),
         (33.0, 6.0, 1.0, 20),
-        (0.02, 40.0, 5.0, 12),
         *slow(
             *(
                 (*case, size_sigma, 30)

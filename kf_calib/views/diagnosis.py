@@ -100,7 +100,7 @@ def verdict(found: Diagnosis) -> str:
 def _notes(found: Diagnosis) -> list[str]:
     """Warnings that the verdict does not hold."""
     said = verdict(found)
-    return [warning for warning in found.before.warnings if warning not in said]
+    return [warning for warning in found.before.warnings if warning[1:] not in said]  # which may begin a sentence
 
 
 def diagnosis_report(found: Diagnosis) -> RenderableType:

@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from long_runs import slow
 
 from kf_calib.bench import Bench, axes_of
 from kf_calib.errors import InputError
@@ -174,7 +175,7 @@ NAMES = [
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("grade", ["navigation", "mems"])
+@pytest.mark.parametrize("grade", ["navigation", *slow("mems")])
 def test_every_effect_has_the_size_asked_for_or_a_sentence(name, grade):
     sensors, noise = GRADES[grade].sensors(3), GRADES[grade].noise
     run = simulation(noise, sensors=sensors, sample_hz=20.0, slew_rate_degps=90.0)

@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from long_runs import slow
 
 from kf_calib.bench import Bench, axes_of, parse_axes
 from kf_calib.errors import InputError
@@ -24,7 +25,7 @@ def directions(plan, axes=YZX) -> np.ndarray:
 
 
 @pytest.mark.parametrize("axes", [YZX, axes_of("zx"), axes_of("xz"), axes_of("zyx"), OBLIQUE], ids=str)
-@pytest.mark.parametrize("count", [12, 40])
+@pytest.mark.parametrize("count", [12, *slow(40)])
 def test_directions_fill_the_sphere(axes, count):
     up = directions(spread_plan(count, axes, seed=1), axes)
     # evenly spread: every eigenvalue is count / 3, and no two directions crowd
