@@ -321,17 +321,21 @@ def _turn_by_quaternion(vector: Floats, imaginary: Floats, real: Floats) -> Floa
     return vector + real * doubled + np.cross(imaginary, doubled)
 
 
-def unwrap_pose(pose: Floats, is_quaternion: bool, previous: Floats | None = None) -> Floats:
-    """Poses (n, k) made continuous: angles within half a turn, quaternions on the sign, of the pose before."""
-    stacked = pose if previous is None else np.vstack([previous, pose])
-    if len(stacked) < 2:
-        return pose
+def unwrap_pose(
+    pose: Floats, is_quaternion: bool, before: tuple[Floats, Floats] | None = None
+) -> tuple[Floats, Floats]:
+    """Poses (n, k) made continuous: angles within half a turn, quaternions on the sign, of the pose before.
+
+    And what makes them so: whole turns (n, k) that are added, or signs (n, 1). before: the last pose of those before
+    these, as it was recorded, and its turns or sign. Poses that come in parts become the same to the last bit.
+    """
+    last, made_so = (pose[0], np.ones(1) if is_quaternion else np.zeros(pose.shape[1])) if before is None else before
+    stacked = np.vstack([last, pose])
     if is_quaternion:
-        flips = np.cumprod(np.where(np.einsum("ij,ij->i", stacked[1:], stacked[:-1]) < 0, -1.0, 1.0))
-        smooth = np.concatenate([stacked[:1], stacked[1:] * flips[:, None]])
-    else:
-        smooth = np.unwrap(stacked, axis=0)
-    return smooth if previous is None else smooth[1:]
+        signs = made_so * np.cumprod(np.where(np.einsum("ij,ij->i", stacked[1:], stacked[:-1]) < 0, -1.0, 1.0))
+        return pose * signs[:, None], signs[:, None]
+    turns = made_so - np.cumsum(np.rint(np.diff(stacked, axis=0) / (2.0 * np.pi)), axis=0)
+    return pose + 2.0 * np.pi * turns, turns
 
 
 def interpolate_pose(at_ns: Times, time_ns: Times, pose: Floats, is_quaternion: bool) -> Floats:

@@ -27,6 +27,7 @@ BLOCK_SAMPLES = 4000
 """Samples of one block at the most: few enough for the cache; no power of two, whose columns would evict each other."""
 
 _SECOND_NS = 1_000_000_000
+_LAST_NS = 1 << 62  # after every stamp
 _HOLD_NS = _SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
 _LEAP_NS = 10 * _SECOND_NS  # a stamp this far ahead, with the next one behind it, is a damaged stamp
 _SLEW_READINGS = 8  # of a slew, at least
@@ -219,11 +220,13 @@ class Segmenter:
         self.dwell_count = 0  # so many have begun; that is also the number of the latest
         self._accel = Stream.empty(3)
         self._pose = Stream.empty(self.bench.pose_width)
-        self._turns = np.empty((0, len(self.bench.axes)))  # by which each pose goes beyond what was recorded
+        self._turns = np.empty((0, len(self.bench.axes) or 1))  # by which each pose goes beyond what was recorded
+        self._early = list[Stream]()  # poses, as recorded, that the readings have not reached
+        self._before: tuple[Floats, Floats] | None = None  # the last pose as recorded, and its turns
         self._temperature = Stream.empty(1)
         self._orders = (_Order(), _Order(), _Order())
         self._decided_ns: int | None = None  # intervals of poses before this stamp have been judged
-        self._cover_ns = -(1 << 62)  # a still window judged earlier reaches to here
+        self._cover_ns = -_LAST_NS  # a still window judged earlier reaches to here
         self._dwell: _Dwell | None = None
         self._encoder_rad = 0.0  # noise of a message, as the dwell before showed it
         self._begun = False
@@ -236,7 +239,7 @@ class Segmenter:
     def finish(self) -> Iterator[Block]:
         """The blocks still open at the end of the streams."""
         accel, pose, temperature = (order.flush() for order in self._orders)
-        self._take(Batch(accel, pose, temperature), counted=True)
+        self._take(Batch(accel, pose, temperature), final=True)
         yield from self._advance(final=True)
 
     @property
@@ -260,34 +263,50 @@ class Segmenter:
         aside.tally, aside._dwell = Tally(), replace(self._dwell)
         return list(aside._emit(horizon, closing=True))
 
-    def _take(self, batch: Batch, counted: bool = False) -> None:
-        accel, pose = batch.accel, batch.pose
-        if not counted:  # what is held back comes a second time
-            self.tally.read += len(accel)
-            accel = Stream(accel.time_ns, self.bench.readings(accel.values))
-        if len(accel):
-            finite = np.asarray(np.isfinite(accel.values).all(axis=1)) if not np.isfinite(accel.values).all() else None
-            if finite is not None:
-                self.tally.not_finite += int((~finite).sum())
-                accel = accel[finite]
-            accel = self._orders[0](accel, self.tally, self.first_ns)
-            if self.first_ns is None and len(accel):
-                self.first_ns = int(accel.time_ns[0])
-            self._accel += accel
+    def _take(self, batch: Batch, final: bool = False) -> None:
+        """Add a batch to what waits to be judged; in the end, what was held back comes a second time."""
+        if not final:
+            self.tally.read += len(batch.accel)
+            batch = replace(batch, accel=Stream(batch.accel.time_ns, self.bench.readings(batch.accel.values)))
+        self._take_readings(batch.accel)
+        self._take_poses(batch.pose, final)
+        if len(batch.temperature):
+            warm = batch.temperature
+            self._temperature += self._orders[2](warm[np.isfinite(warm.values[:, 0])])
+
+    def _take_readings(self, accel: Stream) -> None:
+        if not len(accel):
+            return
+        finite = np.asarray(np.isfinite(accel.values).all(axis=1)) if not np.isfinite(accel.values).all() else None
+        if finite is not None:
+            self.tally.not_finite += int((~finite).sum())
+            accel = accel[finite]
+        accel = self._orders[0](accel, self.tally, self.first_ns)
+        if self.first_ns is None and len(accel):
+            self.first_ns = int(accel.time_ns[0])
+        self._accel += accel
+
+    def _take_poses(self, pose: Stream, final: bool) -> None:
+        """Poses wait for the readings: when a platform came and left is judged by both, and must not depend on which
+        of them was ahead on the way here. ``_early`` has those that came too soon."""
         if len(pose):
             sound, counts = self._sound(pose.values), Tally()
             pose = self._orders[1](pose[sound], counts)
             self.tally.poses += len(pose)
             self.tally.poses_dropped += int((~sound).sum()) + counts.repeated + counts.backward + counts.leaping
-            previous = self._pose.values[-1:] if len(self._pose) else None
-            continuous = unwrap_pose(pose.values, not self.bench.axes, previous)
-            self._pose += Stream(pose.time_ns, continuous)
             if self.bench.axes:
                 self.tally.farthest_rad = max(self.tally.farthest_rad, float(np.abs(pose.values).max(initial=0.0)))
-                self._turns = np.concatenate([self._turns, np.rint((continuous - pose.values) / (2.0 * np.pi))])
-        if len(batch.temperature):
-            warm = batch.temperature
-            self._temperature += self._orders[2](warm[np.isfinite(warm.values[:, 0])])
+        self._early += [pose] if len(pose) else []
+        reached_ns = _LAST_NS if final else self._orders[0].last_ns
+        if not self._early or reached_ns is None or self._early[0].time_ns[0] > reached_ns:
+            return
+        pose = Stream.joined(self._early)
+        reached = int(np.searchsorted(pose.time_ns, reached_ns, side="right"))
+        pose, self._early = pose[:reached], [pose[reached:]] if reached < len(pose) else []
+        continuous, turns = unwrap_pose(pose.values, not self.bench.axes, self._before)
+        self._before = pose.values[-1], turns[-1]
+        self._pose += Stream(pose.time_ns, continuous)
+        self._turns = np.concatenate([self._turns, turns])
 
     def _sound(self, poses: Floats) -> Mask:
         """Which poses can be used, (m,) bool: finite, and quaternions of nearly unit length."""
@@ -401,7 +420,7 @@ class Segmenter:
                 return None
             return int(self._accel.time_ns[-1]) + 1 if len(self._accel) else None
         if final:
-            return int(self._pose.time_ns[-1]) + _HOLD_NS if len(self._pose) > 1 else 1 << 62
+            return int(self._pose.time_ns[-1]) + _HOLD_NS if len(self._pose) > 1 else _LAST_NS
         return self._decided_ns - self.stillness.lead_ns - self.stillness.window_ns
 
     def _resting_ns(self) -> int:
@@ -414,7 +433,7 @@ class Segmenter:
     def _discard(self, until_ns: int) -> None:
         """Drop the readings before ``until_ns``: the platform was moving, or no angle was known."""
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
-        first_pose = int(self._pose.time_ns[0]) if len(self._pose) and not self.dwell_count else -(1 << 62)
+        first_pose = int(self._pose.time_ns[0]) if len(self._pose) and not self.dwell_count else -_LAST_NS
         early = int(np.searchsorted(self._accel.time_ns[:count], first_pose - _HOLD_NS))
         self.tally.without_pose += early
         self.tally.moving += count - early

@@ -7,7 +7,8 @@
 - A file is written beside its place and takes its name when it is whole (``whole``): who looks sees the old or the new.
 - What grows for as long as a run lasts must be found if the run is killed (``Growing``). It is written under its own
   name from the start; where it replaces an earlier file, it takes that one's name as soon as its first readings are on
-  the disk, and till then the earlier one stays. Where nothing came, nothing is left.
+  the disk, and till then the earlier one stays. Where nothing came, nothing is left. Till it ends, no other run can
+  write it: both files are locked.
 
 Commands print their result first, and then write what else was asked for. A file that cannot be written is one sentence
 and exit 2; a picture that the viewer cannot draw, for want of a graphics driver for example, is a warning and exit 0.
@@ -23,8 +24,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import combinations
 from pathlib import Path
+from typing import IO
 
 from kf_calib.errors import InputError
+from kf_calib.lock import lock, writer
 
 _STREAMS = {0: "standard input", 1: "standard output"}
 
@@ -91,12 +94,18 @@ def refuse(path: Path, overwrite: bool = False, name: str = "name") -> None:
 def _refuse_found(path: Path, found: os.stat_result, overwrite: bool, name: str) -> None:
     if stat.S_ISDIR(found.st_mode):
         raise InputError(f"{path} is a folder: give {name} a file's name in it.")
-    if not stat.S_ISREG(found.st_mode):
-        raise InputError(f"{path} is not a plain file but a device, a pipe or the like: give another {name}.")
+    _refuse_device(path, found, name)
+    if who := writer(path):
+        raise InputError(f"{path} is being written by {who}: end that one first, or give another {name}.")
     if not overwrite:
         raise InputError(f"{path} exists already: give another name, or --overwrite to replace it.")
     if not (found.st_mode & 0o222 and os.access(path, os.W_OK)):
         raise InputError(f"{path} is protected from writing: give another {name}.")
+
+
+def _refuse_device(path: Path, found: os.stat_result, name: str = "name") -> None:
+    if not stat.S_ISREG(found.st_mode):
+        raise InputError(f"{path} is not a plain file but a device, a pipe or the like: give another {name}.")
 
 
 def target_of(path: Path) -> Path:
@@ -119,6 +128,8 @@ def whole(path: Path) -> Iterator[Path]:
     part = beside(target)
     if not target.parent.is_dir():
         raise InputError(f"{path} cannot be written: there is no folder {target.parent}.")
+    with suppress(FileNotFoundError):
+        _refuse_device(path, target.lstat())
     try:
         yield part
         _rename(part, target)
@@ -140,22 +151,48 @@ class Growing:
     """Where a file is written that grows: ``at``, which is the place it was asked for from ``settle`` on."""
 
     def __init__(self, path: Path) -> None:
-        self._target = target_of(path)
+        self._path, self._target = path, target_of(path)
         self.at = beside(self._target) if self._target.exists() else self._target
+        self._earlier: IO[bytes] | None = None
 
     @property
     def settled(self) -> bool:
         return self.at == self._target
+
+    def open(self) -> IO[bytes]:
+        """Create the file, which nobody else can write or replace while it is open. Raises InputError where another
+        run has it."""
+        if not self.settled:
+            self._earlier = self._target.open("r+b")
+            if not (lock(self._earlier) and os.path.samestat(os.fstat(self._earlier.fileno()), self._target.stat())):
+                self._let_go()
+                self._refuse()
+        file = self.at.open("xb")
+        if not lock(file):
+            file.close()
+            self._refuse()
+        return file
 
     def settle(self) -> None:
         """What is there is worth having: it takes the place of the earlier file, if there is one."""
         if not self.settled:
             _rename(self.at, self._target)
             self.at = self._target
+            self._let_go()
 
     def discard(self) -> None:
         """Nothing came: no file is left, and the earlier one stays."""
         self.at.unlink(missing_ok=True)
+        self._let_go()
+
+    def _let_go(self) -> None:
+        if self._earlier is not None:
+            self._earlier.close()
+            self._earlier = None
+
+    def _refuse(self) -> None:
+        who = writer(self._target) or "another run"
+        raise InputError(f"{self._path} is being written by {who}: end that one first, or give another name.")
 
 
 def _rename(part: Path, target: Path) -> None:

@@ -7,7 +7,7 @@ or, where the bench has no gimbal axes, the attitude quaternion platform -> benc
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
@@ -33,6 +33,14 @@ class Stream:
     @classmethod
     def empty(cls, width: int) -> Stream:
         return cls(np.empty(0, np.int64), np.empty((0, width)))
+
+    @classmethod
+    def joined(cls, streams: Sequence[Stream]) -> Stream:
+        """One after another; there is at least one."""
+        if len(streams) == 1:
+            return streams[0]
+        times, values = zip(*((each.time_ns, each.values) for each in streams), strict=True)
+        return cls(np.concatenate(times), np.concatenate(values))
 
     def __len__(self) -> int:
         return len(self.time_ns)

@@ -107,7 +107,7 @@ def test_slerp_agrees_with_scipy_even_for_tiny_arcs() -> None:
 
 def test_angles_are_interpolated_the_short_way_round() -> None:
     times = np.array([0, 1_000_000_000])
-    poses = unwrap_pose(np.radians([[359.0], [1.0]]), False)
+    poses, _ = unwrap_pose(np.radians([[359.0], [1.0]]), False)
     middle = interpolate_pose(np.array([500_000_000]), times, poses, False)
     assert np.cos(middle[0, 0]) == pytest.approx(1.0)
 

@@ -219,3 +219,45 @@ def test_a_gentle_start_of_a_slew_is_not_in_the_dwell() -> None:
         assert result.tally.gated <= 2
         p_values.append(result.consistency.p_value)
     assert np.mean(p_values) > 0.1
+
+
+def stretch(whole: Batch, since_ns: tuple[int, int], until_ns: tuple[int, int]) -> Batch:
+    """Readings and angles of a run between two stamps, of each its own."""
+    cuts = zip((whole.accel, whole.pose), since_ns, until_ns, strict=True)
+    return Batch(*(part[slice(*np.searchsorted(part.time_ns, (a, b)))] for part, a, b in cuts))
+
+
+def in_parts(whole: Batch, seed: int, ahead_s: float) -> list[Batch]:
+    """As a link delivers it: now more, now less, the angles behind the readings or ahead of them."""
+    rng, end = np.random.default_rng(seed), int(whole.accel.time_ns[-1])
+    parts, since = list[Batch](), (0, 0)
+    while since[0] <= end:
+        readings_ns = since[0] + round(rng.choice([0.02, 0.1, 0.5, 3.0]) * S)
+        until = readings_ns, max(since[1], readings_ns + round(rng.uniform(-1.0, ahead_s) * S))
+        parts.append(stretch(whole, since, until))
+        since = until
+    return [*parts, stretch(whole, since, (1 << 62, 1 << 62))]
+
+
+def blocks_of(batches: list[Batch], slews: bool) -> list:
+    segmenter = Segmenter(BENCH, slews=slews)
+    found = list(dwell_blocks(Given(*batches), segmenter))
+    return [vars(segmenter.tally)] + [
+        (each.dwell, each.arrival_s, each.felt_s, each.turns, each.pose_sigma_rad, each.elapsed_s.tobytes(),
+         each.accel_mps2.tobytes(), each.pose.tobytes()) for each in found
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("slews", [False, True])
+@pytest.mark.parametrize("rate_hz", [0.2, 0.5, 2.0, 20.0])
+@pytest.mark.parametrize("ahead_s", [0.0, 0.3, 8.0])
+def test_how_the_streams_come_in_parts_changes_no_bit(rate_hz: float, ahead_s: float, slews: bool) -> None:
+    """Angles that were ahead made readings of a slew those of a dwell; whole turns came with other roundings."""
+    points = [(0, 10.0), (20, 10.0), (24, 250.0), (45, 250.0), (47, 10.0), (70, 10.0), (71, 350.0), (90.0, 350.0)]
+    pose = path(*points, rate_hz=rate_hz, noise_deg=1e-4)
+    wrapped = (pose.values + np.pi) % (2.0 * np.pi) - np.pi
+    whole = Batch(readings(pose, 90.0), Stream(pose.time_ns, wrapped))
+    expected = blocks_of([whole], slews)
+    assert len(expected) > 3
+    for seed in range(6):
+        assert blocks_of(in_parts(whole, seed, ahead_s), slews) == expected

@@ -5,12 +5,14 @@ from __future__ import annotations
 import errno
 import json
 import os
+import random
 import resource
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +23,7 @@ from kf_calib.bench import Bench, parse_axes
 from kf_calib.cli import cli
 from kf_calib.cli.files import OutputFile
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.outputs import Outputs, whole
+from kf_calib.outputs import Growing, Outputs, whole, write_whole
 from kf_calib.samples import Batch, Stream
 from kf_calib.sources.recorder import Recorder
 from kf_calib.sources.recording import Recording
@@ -218,6 +220,15 @@ def test_a_file_that_comes_to_be_meanwhile_is_left_alone(here: Path) -> None:
     assert (here / "new").read_bytes() == MINE
 
 
+@pytest.mark.parametrize("name", ["device", "link"])
+def test_no_device_is_replaced_by_whatever_writes(here: Path, name: str) -> None:
+    os.mkfifo("device")
+    Path("link").symlink_to("device")
+    with pytest.raises(InputError, match="device"):
+        write_whole(Path(name), b"x")
+    assert Path("device").is_fifo() and Path("link").is_symlink() and not list(here.glob(".*"))
+
+
 def test_what_fails_half_way_leaves_the_earlier_file(here: Path) -> None:
     (here / "old").write_bytes(MINE)
     with pytest.raises(RuntimeError), whole(here / "old") as part:
@@ -237,13 +248,39 @@ def full_disk(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-@pytest.mark.parametrize("words", [["replay", "run.mcap"], ["plan", "--count", "6"]], ids=["replay", "plan"])
-def test_a_view_that_finds_no_room_is_told_after_the_result(run, here: Path, words: list[str]) -> None:
-    Path("old.rrd").write_bytes(MINE)
-    with full_disk(20_000):
-        code, out, err = run(*words, "--rrd", "old.rrd", "--overwrite", "--json")
-    assert code == 2 and json.loads(out) and "old.rrd cannot be written (File too large)" in err
-    assert Path("old.rrd").read_bytes() == MINE and not list(here.glob(".*"))
+FAST = "live sim://?speed=500&orientations=6&dwell_s=5&sample_hz=50&slew_degps=180&seed=3"
+
+
+@pytest.mark.parametrize("words", [
+    "replay run.mcap --rrd", "replay run.mcap --save-model", "plan --count 6 --rrd", f"{FAST} --rrd",
+    f"{FAST} --save-model", pytest.param("replay run.mcap --png", marks=pytest.mark.draws),
+])  # fmt: skip
+def test_a_file_that_finds_no_room_is_told_after_the_result(run, here: Path, words: str) -> None:
+    """It was waited for, for ever."""
+    Path("old").write_bytes(MINE)
+    with full_disk(50 if "model" in words else 20_000):
+        code, out, err = run(*words.split(), "old", "--overwrite", "--json")
+    assert code == 2 and json.loads(out.splitlines()[-1]) and "cannot be written (" in err, err
+    assert Path("old").read_bytes() == MINE and not list(here.glob(".*"))
+
+
+def test_a_recording_that_finds_no_room_is_told_at_once(here: Path) -> None:
+    """Though more readings would come."""
+    words = ["record", "out.mcap", "-", "--axes", "y z x", "--gravity", "9.81"]
+    with full_disk(3000):
+        child = subprocess.Popen(
+            [sys.executable, "-m", "kf_calib.cli", *words], stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+    with child:
+        child.stdin.write(Path("lines.csv").read_text())
+        with suppress(BrokenPipeError):
+            while child.poll() is None:
+                child.stdin.write(f"{time.monotonic()},{random.random()},0,1,0,0,0\n")
+                child.stdin.flush()
+        with suppress(BrokenPipeError):
+            child.stdin.close()
+        assert child.stderr.readline().startswith("kf-calib: out.mcap cannot be written on (File too large)")
+    assert child.returncode == 2
 
 
 def test_one_file_that_fails_does_not_keep_others_from_being_written(
@@ -314,6 +351,63 @@ def test_an_earlier_recording_stays_until_readings_of_the_new_one_are_on_the_dis
     assert backup.read_bytes() == MINE and {each.name for each in tmp_path.iterdir()} == {"run.mcap", "backup.mcap"}
 
 
+@pytest.mark.parametrize("there", [False, True])
+@pytest.mark.parametrize("words", [
+    "record out.mcap lines.csv --axes yzx --gravity 9.81", "simulate out.mcap", "replay run.mcap --rrd out.mcap",
+    "live sim://?speed=100 --record out.mcap",
+])  # fmt: skip
+@pytest.mark.parametrize("option", [[], ["--overwrite"]])
+def test_a_file_that_is_being_recorded_is_for_no_other_run(
+    run, here: Path, words: str, option: list[str], there: bool
+) -> None:
+    """Whether readings of the one that records are on the disk, or an earlier file is still there."""
+    if there:
+        Path("out.mcap").write_bytes(MINE)
+    with Recorder("out.mcap", BENCH, overwrite=there) as recorder:
+        for _ in range(2):
+            before = contents(here)
+            code, out, err = run(*words.split(), *option)
+            assert code == 2 and out == "" and err.count("\n") == 1, err
+            assert f"out.mcap is being written by another run (process {os.getpid()}): end that one first" in err
+            assert contents(here) == before
+            recorder.write(batch())
+            recorder.end_dwell()
+    assert sum(len(each.accel) for each in Recording("out.mcap")) == 200
+    assert run("replay", "run.mcap", "--save-model", "out.mcap", "--overwrite")[0] == 0, "free again"
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_of_two_that_begin_at_once_one_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: bool) -> None:
+    """Both have seen that the file is nobody's."""
+    path = tmp_path / "run.mcap"
+    if there:
+        path.write_bytes(MINE)
+    monkeypatch.setattr("kf_calib.sources.recorder.refuse", lambda *_: None)
+    with Recorder(path, BENCH, overwrite=True) as recorder:
+        second = Growing(path) if there else None
+        with pytest.raises(InputError, match="being written by another run"):
+            Recorder(path, BENCH, overwrite=True)
+        recorder.write(batch())
+        recorder.end_dwell()
+        if second:
+            with pytest.raises(InputError, match="being written by another run"):
+                second.open()
+    assert sum(len(each.accel) for each in Recording(path)) == 100 and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_killed_run_leaves_no_lock(here: Path) -> None:
+    words = ["record", "out.mcap", "-", "--axes", "y z x", "--gravity", "9.81"]
+    with subprocess.Popen([sys.executable, "-m", "kf_calib.cli", *words], stdin=subprocess.PIPE) as child:
+        child.stdin.write(Path("lines.csv").read_bytes())
+        child.stdin.flush()
+        while not Path("out.mcap").exists():
+            assert child.poll() is None
+        with pytest.raises(InputError, match=f"process {child.pid}"):
+            Recorder("out.mcap", BENCH, overwrite=True)
+        child.kill()
+    Recorder("out.mcap", BENCH, overwrite=True).close()
+
+
 def test_a_disk_without_room_for_a_reading_leaves_the_earlier_recording(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(MINE)
@@ -324,7 +418,7 @@ def test_a_disk_without_room_for_a_reading_leaves_the_earlier_recording(tmp_path
     assert path.read_bytes() == MINE and len(list(tmp_path.iterdir())) == 1
 
 
-@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
 def test_a_recording_that_is_ended_early_keeps_its_readings(here: Path, signal_number: int) -> None:
     Path("out.mcap").write_bytes(MINE)
     words = ["record", "out.mcap", "-", "--overwrite", "--axes", "y z x", "--gravity", "9.81"]
@@ -338,8 +432,10 @@ def test_a_recording_that_is_ended_early_keeps_its_readings(here: Path, signal_n
             child.stdin.flush()
             assert child.poll() is None
         child.send_signal(signal_number)
-        assert child.wait(20) == (130 if signal_number == signal.SIGINT else -signal_number)
-    assert sum(len(each.accel) for each in Recording("out.mcap")) >= 40
+        assert child.wait(20) == (130 if signal_number != signal.SIGKILL else -signal_number)
+    recording = Recording("out.mcap")
+    assert sum(len(each.accel) for each in recording) >= 40
+    assert bool(recording.warnings) == (signal_number == signal.SIGKILL), "else it is finished"
 
 
 UNFORESEEN = [

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
 import re
+import resource
 import signal
 import socket
 import subprocess
@@ -15,6 +17,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +28,7 @@ from test_diagnosis import BENCH
 
 from kf_calib.calibration import Settings, calibrate
 from kf_calib.cli import cli
+from kf_calib.cli.echo import Printer
 from kf_calib.cli.live import _targets
 from kf_calib.diagnosis import diagnose
 from kf_calib.errors import InputError
@@ -32,7 +36,10 @@ from kf_calib.live import Session
 from kf_calib.samples import Batch
 from kf_calib.sources.hidden import parse
 from kf_calib.sources.hidden.detectability import sized
+from kf_calib.sources.live import Status
 from kf_calib.sources.noise_sources import Noise
+from kf_calib.sources.plans import spread_plan
+from kf_calib.sources.recording import Recording
 from kf_calib.sources.sensors import GRADES
 from kf_calib.sources.simulator import Simulation
 from kf_calib.standing import Judgement, current, judged, targets
@@ -247,11 +254,17 @@ URL = "sim://?speed=500&orientations=6&dwell_s=5&sample_hz=50&slew_degps=180&see
 SLOW = URL.replace("speed=500", "speed=10").replace("orientations=6", "orientations=20")
 
 
-def live(*words: str, **kwargs: object) -> subprocess.Popen[str]:
+def live(*words: str, **kwargs: Any) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "kf_calib.cli", "live", *words]
-    return subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL
-    )
+    streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | kwargs
+    return subprocess.Popen(command, cwd=ROOT, text=True, **streams)
+
+
+def until(is_so: Callable[[], bool], patience_s: float = 60.0) -> None:
+    began = time.monotonic()
+    while not is_so():
+        assert time.monotonic() - began < patience_s, "waited in vain"
+        time.sleep(0.01)
 
 
 def replayed(*words: str) -> dict:
@@ -269,17 +282,72 @@ def test_json_has_an_object_a_dwell_and_ends_with_what_replay_and_diagnose_say(t
     assert [each["dwells"] for each in objects] == [1, 2, 3, 4, 5, 6, 6]
     assert [each["final"] for each in objects] == [False] * 6 + [True]
     assert all(each.keys() >= REPLAY_KEYS | DIAGNOSE_KEYS for each in objects)
-    replay, diagnosis = replayed("replay", str(out)), replayed("diagnose", str(out))
     last = objects[-1]
     assert last["source"]["link"] == "ended" and last["source"]["dropped"] == 0
-    for key in REPLAY_KEYS - {"warnings"}:
-        assert last[key] == replay[key], key
-    for key in DIAGNOSE_KEYS - {"next_orientation"}:
-        assert last[key] == diagnosis[key], key
+    as_replayed(last, out)
     assert (tmp_path / "run.rrd").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("how", [signal.SIGTERM, *slow(signal.SIGINT)])
+def as_replayed(last: dict, recording: Path) -> None:
+    """All that replay and diagnose say of the recording, to the last bit; warnings are of the source, too."""
+    for command in ("diagnose", "replay"):
+        found = replayed(command, str(recording))
+        same = {key: last[key] for key in found if key != "warnings"}
+        assert same == {key: found[key] for key in same}
+
+
+def lines_of(source: Simulation) -> list[str]:
+    """A run as JSON lines in the order of time, the angles on lines of their own, a header first."""
+    first = {"bench": source.bench.to_metadata()}
+    lines = list[tuple[int, str]]()
+    for batch in source:
+        for key, stream in (("accel_mps2", batch.accel), ("angles_rad", batch.pose)):
+            for stamp, values in zip(stream.time_ns.tolist(), stream.values.tolist(), strict=True):
+                lines.append((stamp, json.dumps({"time_ns": stamp, key: values})))
+    return [json.dumps(first), *(text for _, text in sorted(lines, key=lambda line: line[0]))]
+
+
+def late(lines: list[str], first: int, last: int, by: int) -> list[str]:
+    """The same lines, the readings among some of them later by so many: a link that lets the angles ahead."""
+    part = lines[first:last]
+    ahead = [line for line in part[by:] if "angles" in line]
+    return [*lines[:first], *ahead, *(line for line in part if line not in ahead), *lines[last:]]
+
+
+@pytest.mark.parametrize("way", ["pause", "pause and end", "idle", "Ctrl-C amid a dwell", "Ctrl-C in a pause"])
+def test_the_last_object_is_what_replay_and_diagnose_say_whichever_way_a_run_ends(tmp_path: Path, way: str) -> None:
+    """A pause comes at the end of a dwell, with the angles a second ahead of the readings."""
+    out, lines = tmp_path / "run.mcap", lines_of(bench(orientations=8))
+    at = len(lines) * 3 // 4
+    lines = late(lines, at - 200, at + 200, 70)
+    command = ["-", "--json", "--record", str(out), *(["--idle-s", "1"] if way == "idle" else [])]
+    with live(*command, stdin=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stdout is not None
+        said = threading.Thread(target=lambda: objects.extend(map(json.loads, process.stdout)))
+        objects = list[dict]()
+        said.start()
+        process.stdin.write("\n".join([*lines[:at], ""]))
+        process.stdin.flush()
+        until(lambda: len(objects) >= 4)
+        time.sleep(0.6)
+        if way == "Ctrl-C in a pause":
+            process.send_signal(signal.SIGINT)
+        elif way not in ("pause and end", "idle"):
+            process.stdin.write("\n".join([*lines[at : None if way == "pause" else -150], ""]))
+            process.stdin.flush()
+            until(lambda: len(objects) >= 6)
+            time.sleep(0.6)
+        if way == "Ctrl-C amid a dwell":
+            process.send_signal(signal.SIGINT)
+        if way != "idle":
+            process.stdin.close()
+        assert process.wait(120) == 0
+        said.join()
+    assert objects[-1]["final"] and [each["final"] for each in objects].count(True) == 1
+    as_replayed(objects[-1], out)
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, *slow(signal.SIGINT), signal.SIGHUP])
 def test_a_signal_finishes_the_file_and_prints_the_summary(tmp_path: Path, how: signal.Signals) -> None:
     out = tmp_path / "run.mcap"
     with live(SLOW, "--record", str(out)) as process:
@@ -292,6 +360,101 @@ def test_a_signal_finishes_the_file_and_prints_the_summary(tmp_path: Path, how: 
     assert process.returncode == 0, errors
     assert "Parameters (1σ)" in said and "Model and measurements agree" in said
     assert replayed("replay", str(out))["warnings"] == [], "a finished file"
+
+
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_a_full_log_disk_ends_nothing(tmp_path: Path, form: list[str]) -> None:
+    out, model = tmp_path / "run.mcap", tmp_path / "model.toml"
+    words = [URL, *form, "--record", str(out), "--save-model", str(model)]
+    with Path("/dev/full").open("w") as full, live(*words, stdout=full) as process:
+        errors = process.communicate(timeout=240)[1].splitlines()
+    assert process.returncode == 2 and len(errors) == 2, errors
+    assert "standard output cannot be written to (No space left on device): the run goes on" in errors[0]
+    assert errors[1] == "kf-calib: 7 outputs could not be written to standard output: they are lost."
+    found = replayed("replay", str(out))
+    assert found["dwells"] == 6 and found["warnings"] == [] and model.exists()
+
+
+def test_a_log_goes_on_when_there_is_room_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Not with the lines that found none, nor in the middle of one."""
+    with (tmp_path / "log").open("w") as log:
+        monkeypatch.setattr(sys, "stdout", log)
+        out = Printer()
+        out("one")
+        with full_disk(6):
+            out("two")
+            out("three")
+        out("four")
+    assert (tmp_path / "log").read_text() == "one\ntw\nfour\n" and out.lost == 2
+
+
+@contextlib.contextmanager
+def full_disk(size: int) -> Iterator[None]:
+    """No file can grow beyond ``size`` bytes, of this process and those that it starts."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_a_recording_that_stops_is_told_at_once_and_by_the_exit_code(tmp_path: Path, form: list[str]) -> None:
+    out = tmp_path / "run.mcap"
+    with full_disk(40_000):
+        process = live(SLOW, *form, "--record", str(out))
+    with process:
+        assert process.stderr is not None and process.stdout is not None
+        first = process.stderr.readline()
+        assert process.poll() is None, "while the run goes on"
+        assert first.startswith(f"kf-calib: RECORDING HAS STOPPED: {out} cannot be written on (File too large)"), first
+        process.stdout.readline()
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert errors.splitlines()[-1].startswith("kf-calib: the run was not recorded to its end:")
+    recording = Recording(out)
+    assert sum(len(batch.accel) for batch in recording) > 300 and recording.warnings == [], "finished all the same"
+
+
+def test_a_recording_that_stops_is_loud_on_the_screen() -> None:
+    shown = views.screen(Session(bench()).standing, Status(recording_trouble="no room left."), "sim://", "run.mcap")
+    assert "RECORDING HAS STOPPED: no room left." in plain(shown, width=80)
+
+
+def test_nohup_keeps_a_run_alive(tmp_path: Path) -> None:
+    out = tmp_path / "run.mcap"
+    process = live(SLOW.replace("orientations=20", "orientations=8"), "--record", str(out),
+                   preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN))  # fmt: skip
+    with process:
+        assert process.stdout is not None and process.stdout.readline()
+        process.send_signal(signal.SIGHUP)
+        assert process.wait(120) == 0
+    assert replayed("replay", str(out))["dwells"] == 8
+
+
+@pytest.mark.parametrize("how", [None, signal.SIGHUP])
+def test_a_terminal_that_is_closed_costs_the_screen_only(tmp_path: Path, how: signal.Signals | None) -> None:
+    """With SIGHUP the run ends as it would by SIGTERM; without it goes on to its end."""
+    import pty
+
+    out, model = tmp_path / "run.mcap", tmp_path / "model.toml"
+    leader, follower = pty.openpty()
+    source = SLOW.replace("orientations=20", "orientations=10")
+    process = live(source, "--record", str(out), "--save-model", str(model), stdin=follower, stdout=follower,
+                   stderr=follower, env={**os.environ, "TERM": "xterm"}, start_new_session=True)  # fmt: skip
+    os.close(follower)
+    seen = b""
+    while not re.search(rb"orientation [5-9]", seen):
+        seen += os.read(leader, 65536)
+    os.close(leader)
+    for _ in range(3 if how else 0):  # from the terminal, and from the shell
+        process.send_signal(how or 0)
+        time.sleep(0.1)
+    assert process.wait(120) == 2, "what it had to say could not be written"
+    found = replayed("replay", str(out))
+    assert found["warnings"] == [] and (found["dwells"] < 10 if how else found["dwells"] == 10) and model.exists()
 
 
 def test_nobody_reading_ends_a_run_that_is_not_recorded() -> None:

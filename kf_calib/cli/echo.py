@@ -1,9 +1,10 @@
-"""Printing a result that may have nobody to read it."""
+"""Printing what may have nobody to read it, or no room."""
 
 from __future__ import annotations
 
 import os
 import sys
+from contextlib import suppress
 
 import click
 
@@ -21,9 +22,52 @@ def echo(text: str, end: bool = True) -> None:
         raise KfCalibError(f"standard output cannot be written to ({error.strerror}): send it elsewhere.") from None
 
 
+class Printer:
+    """Prints for a run that goes on whatever becomes of what it prints.
+
+    lost: texts that could not be written, which is told once. is_heard: False as soon as nobody reads any more.
+    """
+
+    def __init__(self) -> None:
+        self.lost, self.is_heard = 0, True
+        self._is_amid = False  # a line, which what comes next must not go on with
+
+    def __call__(self, text: str, end: bool = True) -> None:
+        """Print, and end the line."""
+        try:
+            click.echo("\n" * self._is_amid + text, nl=end)
+            sys.stdout.flush()
+            self._is_amid = False
+        except BrokenPipeError:
+            fall_silent()
+            self.is_heard = False
+        except OSError as error:
+            self.fail(error)
+
+    def fail(self, error: OSError) -> None:
+        """A text is lost, and what waits to be printed is dropped."""
+        with suppress(OSError):
+            kept = os.dup(sys.stdout.fileno())
+            fall_silent()
+            sys.stdout.flush()
+            os.dup2(kept, sys.stdout.fileno())
+            os.close(kept)
+        self.lost, self._is_amid = self.lost + 1, True
+        if self.lost == 1:
+            complain(f"standard output cannot be written to ({error.strerror}): the run goes on, make room or end it.")
+
+
+def complain(text: str) -> None:
+    """Print a sentence to standard error, if that leads anywhere."""
+    with suppress(OSError):
+        click.echo(f"kf-calib: {text}", err=True)
+
+
 def fall_silent() -> None:
     """Have all that is still to be printed go nowhere; Python itself prints at its end what is left."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, sys.stdout.fileno())
+    os.close(nowhere)
 
 
 def open_streams() -> None:

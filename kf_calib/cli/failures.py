@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+from contextlib import suppress
 from pathlib import Path
 
 import click
 
+from kf_calib.cli.echo import complain
 from kf_calib.errors import KfCalibError
 
 TRACEBACK = "KF_CALIB_TRACEBACK"
@@ -17,8 +19,9 @@ TRACEBACK = "KF_CALIB_TRACEBACK"
 def tell(error: BaseException) -> None:
     """Print the sentence, after the traceback where the environment asks for it."""
     if os.environ.get(TRACEBACK):
-        traceback.print_exception(error, file=sys.stderr)
-    click.echo(f"kf-calib: {sentence(error)}", err=True)
+        with suppress(OSError):
+            traceback.print_exception(error, file=sys.stderr)
+    complain(sentence(error))
 
 
 def sentence(error: BaseException) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
 import os
 import queue
@@ -13,12 +14,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
-from kf_calib.cli.echo import fall_silent
+from kf_calib.cli.echo import Printer, complain
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.making import pair
 from kf_calib.cli.numbers import NOT_NEGATIVE, POSITIVE
@@ -32,14 +32,14 @@ from kf_calib.cli.options import (
     json_option,
     overrides,
     overwrite_option,
-    print_json,
+    rendered,
     rrd_option,
     save_model_option,
     save_view,
     settings_of,
-    show,
     strict_option,
 )
+from kf_calib.cli.signals import answered
 from kf_calib.errors import InputError, KfCalibError, how_to_write
 
 if TYPE_CHECKING:
@@ -132,28 +132,30 @@ def live(
         view = _view(rrd, rerun_port if with_viewer else None, rerun_bind)
         if view is not None:
             run.listeners.append(lambda judgement: view.offer(judgement.result))
-        with _ending(run):
+        with answered(run.asked):  # until all is written: who closes a terminal sends several
             _watched(run, source, record, as_json)
-        if view is not None:
-            view.close()
-    final = _outcome(run, as_json)
-    if final is None:
-        return
-    for said in _of_the_view(view):
-        click.echo(said, err=True)
-    if rrd and view is not None and view.began:
-        outputs.own(rrd)
-    with delivery(outputs, as_json) as deliver:
-        deliver.file(save_model, lambda path: model_file.write(path, final.result))
-        deliver.file(rrd, lambda path: save_view(final.result, path))  # every point by the noise of the whole run
-    if strict and final.consistent is False:
+            if view is not None:
+                view.close()
+            opened.close()
+            final = _outcome(run, as_json)
+            for said in [*_of_the_view(view), *run.troubles]:
+                complain(said)
+            if final is not None:
+                if rrd and view is not None and view.began:
+                    outputs.own(rrd)
+                with delivery(outputs, as_json or run.print.lost > 0) as deliver:
+                    deliver.file(save_model, lambda path: model_file.write(path, final.result))
+                    deliver.file(rrd, lambda path: save_view(final.result, path))  # by the noise of the whole run
+    if run.troubles:
+        ctx.exit(2)
+    if strict and final is not None and final.consistent is False:
         ctx.exit(1)
 
 
 class _Run:
     """A session in a thread of its own: the main thread has the screen, the keys and the signals.
 
-    judgements: those not shown yet. stopped: by a key or a signal.
+    judgements: those not shown yet. stopped: by a key or a signal. print: to standard output.
     """
 
     def __init__(
@@ -166,6 +168,7 @@ class _Run:
         every: bool,
     ) -> None:
         self.source, self.stopped, self.unshown = source, False, 0
+        self.print, self._is_warned = Printer(), False
         self.session: Session | None = None
         self.final: Judgement | None = None
         self.error: BaseException | None = None
@@ -185,6 +188,26 @@ class _Run:
         self.source.stop()
         if self.session is not None:
             self.session.hurry()
+
+    def asked(self, number: signal.Signals) -> None:
+        """To end, by a signal, as its end would; a second Ctrl-C does not wait for it."""
+        if number == signal.SIGINT and (self.stopped or not self.going):
+            raise KeyboardInterrupt
+        self.stop()
+
+    def warn(self) -> None:
+        """Say at once, and once, that nothing is recorded any more."""
+        trouble = self.source.status.recording_trouble
+        if trouble and not self._is_warned:
+            complain(f"RECORDING HAS STOPPED: {trouble}")
+            self._is_warned = True
+
+    @property
+    def troubles(self) -> list[str]:
+        """What failed, though the run went on to its end: it is no success then."""
+        trouble, lost = self.source.status.recording_trouble, self.print.lost
+        unheard = f"{lost} output{'s' * (lost != 1)} could not be written to standard output: they are lost."
+        return [f"the run was not recorded to its end: {trouble}"] * bool(trouble) + [unheard] * bool(lost)
 
     def accept(self) -> None:
         """The effect that is missing, as it stands."""
@@ -226,13 +249,16 @@ def _watched(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
     """The run to its end, with a screen, lines or objects."""
     run.start()
     if not as_json and sys.stdout.isatty():
-        _on_screen(run, name, record)
-        return
+        try:
+            _on_screen(run, name, record)
+        except OSError as error:  # the terminal is gone: the run is not
+            run.print.fail(error)
     told = ""
     while run.going:
         with contextlib.suppress(queue.Empty):
             judgement = run.judgements.get(timeout=_REFRESH_S)
             _print(run, judgement, as_json)
+        run.warn()
         standing = run.session.standing if run.session else None
         said = (standing.problem or standing.notice) if standing else ""
         if said and said != told and not as_json:
@@ -245,30 +271,20 @@ def _print(run: _Run, judgement: Judgement, as_json: bool) -> None:
 
     assert run.session is not None
     if as_json:
-        with _piped(run):
-            click.echo(json_line(views.live_object(judgement, run.session.standing, run.source.status)))
-            sys.stdout.flush()
+        _echo(run, json_line(views.live_object(judgement, run.session.standing, run.source.status)))
     elif not judgement.final:
         _echo(run, views.line(judgement))
 
 
 def _echo(run: _Run, text: str) -> None:
-    with _piped(run):
-        click.echo(text)
-        sys.stdout.flush()
-
-
-@contextlib.contextmanager
-def _piped(run: _Run) -> Iterator[None]:
     """Where nobody reads any more, a run that is recorded goes on in silence; another ends."""
-    try:
-        yield
-    except BrokenPipeError:
-        fall_silent()
+    was_heard = run.print.is_heard
+    run.print(text)
+    if was_heard and not run.print.is_heard:
         if run.source.status.sync_age_s is None:
             run.stop()
         else:
-            click.echo("kf-calib: nobody reads this output any more; the recording goes on.", err=True)
+            complain("nobody reads this output any more; the recording goes on.")
 
 
 def _on_screen(run: _Run, name: str, record: Path | None) -> None:
@@ -278,10 +294,12 @@ def _on_screen(run: _Run, name: str, record: Path | None) -> None:
     from kf_calib.standing import Standing
     from kf_calib.views.live import screen
 
-    with _keys(use=name != "-") as pressed, Live(console=Console(), auto_refresh=False, transient=True) as display:
+    display = Live(console=Console(), auto_refresh=False, transient=True, redirect_stderr=sys.stderr.isatty())
+    with _keys(use=name != "-") as pressed, display:
         while run.going:
             with contextlib.suppress(queue.Empty):
                 run.judgements.get_nowait()
+            run.warn()
             standing = run.session.standing if run.session else Standing()
             hint = "ending ..." if run.stopped else "a: accept what is missing   q: end the run"
             display.update(screen(standing, run.source.status, name, str(record or ""), hint), refresh=True)
@@ -304,34 +322,24 @@ def _keys(use: bool) -> Iterator[Callable[[float], str]]:
     before = termios.tcgetattr(sys.stdin)
     tty.setcbreak(sys.stdin)
     try:
-        yield lambda seconds: os.read(0, 1).decode(errors="replace") if select.select([0], [], [], seconds)[0] else ""
+        yield _key
     finally:
-        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+        with contextlib.suppress(termios.error):  # the terminal is gone
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+
+def _key(seconds: float) -> str:
+    if not select.select([0], [], [], seconds)[0]:
+        return ""
+    key = os.read(0, 1)
+    if not key:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))  # as a terminal says that is gone
+    return key.decode(errors="replace")
 
 
 def _no_key(seconds: float) -> str:
     time.sleep(seconds)
     return ""
-
-
-@contextlib.contextmanager
-def _ending(run: _Run) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the run as its end would; a second Ctrl-C does not wait for it."""
-
-    def asked(number: int, _: FrameType | None) -> None:
-        if run.stopped and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        run.stop()
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, asked) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _outcome(run: _Run, as_json: bool) -> Judgement | None:
@@ -341,9 +349,9 @@ def _outcome(run: _Run, as_json: bool) -> Judgement | None:
             raise run.error
         if as_json:
             samples = run.session.standing.samples if run.session else 0
-            print_json({"samples": samples, "dwells": 0, "final": True, "problem": str(run.error)})
+            run.print(json_line({"samples": samples, "dwells": 0, "final": True, "problem": str(run.error)}))
         else:
-            click.echo(f"Nothing to evaluate: {run.error}", err=True)
+            complain(f"nothing to evaluate: {run.error}")
         return None
     final = run.final
     assert final is not None
@@ -355,7 +363,7 @@ def _outcome(run: _Run, as_json: bool) -> Judgement | None:
         from kf_calib.views.console import summary
 
         style = {True: "bold green", False: "bold yellow", None: "bold"}[final.consistent]
-        show(Group(summary(final.result), Text(diagnosis.verdict(final.found), style=style)))
+        run.print(rendered(Group(summary(final.result), Text(diagnosis.verdict(final.found), style=style))), end=False)
     return final
 
 
@@ -371,7 +379,7 @@ def _of_the_view(view: GrowingView | None) -> list[str]:
     if view is None:
         return []
     late = f"the Rerun view left out {view.dropped} updates: it was slower than the run" if view.dropped else ""
-    return [f"kf-calib: {said}" for said in (view.trouble, late) if said]
+    return [said for said in (view.trouble, late) if said]
 
 
 def _refuse(settings: Settings) -> None:

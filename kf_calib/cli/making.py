@@ -28,6 +28,7 @@ from kf_calib.cli.options import (
     save_view,
     show,
 )
+from kf_calib.cli.signals import answered, interrupt
 from kf_calib.errors import InputError
 from kf_calib.outputs import Outputs
 
@@ -153,7 +154,7 @@ def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], 
     from kf_calib.sources.recorder import Recorder
 
     readings, first_ns, last_ns, segmenter = 0, None, 0, Segmenter(source.bench)
-    with Recorder(out, source.bench, overwrite=overwrite) as recorder:
+    with answered(interrupt), Recorder(out, source.bench, overwrite=overwrite) as recorder:
         for batch in source:
             recorder.write(batch)
             before = segmenter.dwell_count

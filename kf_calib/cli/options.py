@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import math
 import os
@@ -249,13 +250,18 @@ def json_line(content: Mapping[str, Any]) -> str:
 
 
 def show(renderable: Any) -> None:
+    echo(rendered(renderable), end=False)
+
+
+def rendered(renderable: Any) -> str:
+    """As text for standard output, its line ended; nothing is written."""
     from rich.console import Console
 
-    told = sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdigit()
-    console = Console(width=None if told else 110, highlight=False, soft_wrap=not sys.stdout.isatty())
-    with console.capture() as printed:
-        console.print(renderable)
-    echo(printed.get(), end=False)
+    screen, text = sys.stdout.isatty(), io.StringIO()
+    width = None if screen or os.environ.get("COLUMNS", "").isdigit() else 110
+    console = Console(file=text, force_terminal=screen or None, width=width, highlight=False, soft_wrap=not screen)
+    console.print(renderable)
+    return text.getvalue()
 
 
 @contextlib.contextmanager

@@ -193,7 +193,7 @@ class Recorder:
     def _create(self, overwrite: bool) -> IO[bytes]:
         refuse(self.path, overwrite)
         try:
-            return self._place.at.open("xb")
+            return self._place.open()
         except OSError as error:
             raise InputError(f"{self.path} cannot be created ({error.strerror}): choose another place.") from error
 

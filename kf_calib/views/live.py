@@ -31,7 +31,7 @@ def live_object(judgement: Judgement, standing: Standing, status: Status | None)
     """One line of ``live --json``: the keys of replay and of diagnose as they stand, and what is of a live run only."""
     found = diagnosis_object(judgement.found)
     going = judgement.next_orientation
-    if not ((judgement.final or judgement.alarm) and found["next_orientation"]) and going is not None:
+    if not judgement.final and not (judgement.alarm and found["next_orientation"]) and going is not None:
         found["next_orientation"] = {"gimbal_deg": list(going[0]), "stay_s": None, "why": going[1]}
     left = dict(zip(paper.SYMBOLS, judgement.left_s, strict=True))
     wanted = dict(zip(paper.SYMBOLS, judgement.wanted, strict=True))
@@ -110,9 +110,10 @@ def _link(standing: Standing, status: Status | None, name: str, recording: str) 
     for word, count in counts.items():
         if count or word in ("gaps", "refused"):
             out.append(f"  {count} {word}", "red" if word in ("missing", "dropped") else "yellow" if count else "")
-    for trouble in (status.trouble, status.recording_trouble):
-        if trouble:
-            out.append(f"\n{trouble}", "bold red")
+    if status.trouble:
+        out.append(f"\n{status.trouble}", "bold red")
+    if status.recording_trouble:
+        out.append(f"\nRECORDING HAS STOPPED: {status.recording_trouble}", "bold white on red")
     if recording and not status.recording_trouble:
         age = "" if status.sync_age_s is None else f", on the disk up to {status.sync_age_s:.1f} s ago"
         out.append(f"\nrecording {recording}: {status.recorded} readings{age}")

@@ -29,10 +29,10 @@ from serial.rfc2217 import PortManager
 from kf_calib.bench import Bench
 from kf_calib.calibration import calibrate
 from kf_calib.errors import InputError
-from kf_calib.samples import Batch, Stream
+from kf_calib.samples import Batch
 from kf_calib.sources.line_parts import Account
 from kf_calib.sources.live import LiveSource, Status, frames, open_live
-from kf_calib.sources.live.continuity import Abreast, Continuity
+from kf_calib.sources.live.continuity import Continuity
 from kf_calib.sources.live.feed import Feed, Lost, Regained
 from kf_calib.sources.live.links import Link
 from kf_calib.sources.live.protocols import Protocol
@@ -634,16 +634,6 @@ def test_bursts_are_no_gaps_but_a_pause_between_them_is() -> None:
     for k in range(0, 4000, 16):
         found.add(arrival[k : k + 16])
     assert found.gaps == 1 and found.missing == pytest.approx(50, abs=2)
-
-
-def test_poses_wait_for_the_readings_but_not_for_ever() -> None:
-    whole, abreast = made_batch(100), Abreast(3)
-    none = Stream.empty(3)
-    assert len(abreast.push(Batch(whole.accel[:10], whole.pose), 0.0).pose) == 1
-    assert len(abreast.push(Batch(whole.accel[10:50], none), 0.1).pose) == 4
-    assert len(abreast.push(Batch(none, none), 0.3).pose) == 0
-    assert len(abreast.push(Batch(none, none), 0.4).pose) == 5
-    assert len(abreast.rest().pose) == 0
 
 
 def test_the_status_says_what_a_user_must_know() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 import resource
@@ -209,6 +210,22 @@ def test_a_full_disk_is_told_and_what_was_written_stays(tmp_path: Path) -> None:
     assert recording.warnings == [], "the file has an end"
     assert len([m for m in decoded(path) if m.channel.topic == "/accelerometer"]) == len(found.accel)
     count_missing(found, made_batch(10_000))
+
+
+def test_a_disk_that_fails_in_the_background_is_told_by_the_next_call(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    recorder = Recorder(tmp_path / "a.mcap", BENCH, background=True, flush_s=0.01)
+    recorder.write(made_batch(100))
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(KfCalibError, match=r"cannot be written on \(Input/output error\): it holds what was"):
+        for _ in range(100):
+            time.sleep(0.02)
+            recorder.tick()
+    assert len(read(Recording(tmp_path / "a.mcap")).accel) == 100
 
 
 CHILD = """

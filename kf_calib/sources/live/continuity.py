@@ -1,14 +1,13 @@
-"""The order of samples: what is missing in it, and one stream kept from running ahead of the other."""
+"""The order of samples: what is missing in it."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from kf_calib.samples import Batch, Stream, Times
+from kf_calib.samples import Times
 
 _ENOUGH = 16  # steps that give a period
 _REMEMBERED = 256
-_HELD_S = 0.25
 
 
 class Continuity:
@@ -82,40 +81,3 @@ class Continuity:
             self._period_ns, self._limit_ns = median_ns, median_ns + max(0.5 * median_ns, 8.0 * jitter_ns)
             if median_ns < 0.5 * mean_ns:
                 self._period_ns, self._limit_ns = float(forward.mean()), 1.5 * float(forward.max())
-
-
-class Abreast:
-    """Holds angle messages back until the readings have reached their stamps, for a quarter of a second at most.
-
-    Where dwells begin and end then does not depend on how far one stream was ahead of the other on the way here, and a
-    replay, which sees them side by side, finds the same.
-    """
-
-    def __init__(self, pose_width: int) -> None:
-        self._pose = Stream.empty(pose_width)
-        self._reached_ns: int | None = None
-        self._since_s: float | None = None
-
-    def push(self, batch: Batch, now_s: float) -> Batch:
-        """What can go on, now that this has come."""
-        if len(batch.accel):
-            latest = int(batch.accel.time_ns.max())
-            self._reached_ns = latest if self._reached_ns is None else max(self._reached_ns, latest)
-        pose = self._pose + batch.pose
-        early = (
-            np.flatnonzero(pose.time_ns > self._reached_ns) if self._reached_ns is not None else np.arange(len(pose))
-        )
-        count = int(early[0]) if len(early) else len(pose)
-        if self._since_s is not None and now_s - self._since_s > _HELD_S:
-            count = len(pose)
-        if count == len(pose):
-            self._since_s = None
-        elif count or self._since_s is None:
-            self._since_s = now_s
-        self._pose = pose[count:]
-        return Batch(batch.accel, pose[:count], batch.temperature)
-
-    def rest(self) -> Batch:
-        """What is still held."""
-        pose, self._pose = self._pose, self._pose[:0]
-        return Batch(Stream.empty(3), pose)

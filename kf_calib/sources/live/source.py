@@ -11,13 +11,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import numpy as np
-
 from kf_calib.bench import Bench
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.outputs import refuse
 from kf_calib.samples import Batch, Stream
-from kf_calib.sources.live.continuity import Abreast, Continuity
+from kf_calib.sources.live.continuity import Continuity
 from kf_calib.sources.live.feed import Feed, Lost, Regained
 from kf_calib.sources.recorder import Recorder
 from kf_calib.sources.recording import GAP_RECORD
@@ -111,11 +109,7 @@ class _Queue:
         if not taken:
             return None
         self.samples -= sum(map(_size, taken))
-        return (
-            taken[0]
-            if len(taken) == 1
-            else Batch(*(_joined(streams) for streams in zip(*map(_streams, taken), strict=True)))
-        )
+        return Batch(*map(Stream.joined, zip(*map(_streams, taken), strict=True)))
 
     @property
     def waiting(self) -> int:
@@ -128,10 +122,6 @@ def _streams(batch: Batch) -> tuple[Stream, Stream, Stream]:
 
 def _size(batch: Batch) -> int:
     return sum(map(len, _streams(batch)))
-
-
-def _joined(streams: tuple[Stream, ...]) -> Stream:
-    return Stream(np.concatenate([each.time_ns for each in streams]), np.concatenate([each.values for each in streams]))
 
 
 class LiveSource:
@@ -198,9 +188,13 @@ class LiveSource:
                 reconnects=feed.reconnects,
                 bytes=feed.bytes,
                 recorded=recorder.flushed if recorder else 0,
-                sync_age_s=now - recorder.synced_s if recorder and not self._is_finished else None,
+                sync_age_s=now - recorder.synced_s if recorder and self._is_recording else None,
                 recording_trouble=self._recording_trouble,
             )
+
+    @property
+    def _is_recording(self) -> bool:
+        return self._recorder is not None and not self._recording_trouble and not self._is_finished
 
     def stop(self) -> None:
         """Ends the iteration after what has come; from any thread, or a signal handler."""
@@ -266,7 +260,7 @@ class LiveSource:
             with self._lock:
                 self._bench = bench
                 self._lock.notify_all()
-            self._take_all(bench)
+            self._take_all()
         except BaseException as error:  # the consumer is told, after what came before
             self._failure = error
         self._feed.close()
@@ -277,18 +271,16 @@ class LiveSource:
             self._is_finished = True
             self._lock.notify_all()
 
-    def _take_all(self, bench: Bench) -> None:
-        abreast, reason = Abreast(bench.pose_width), ""
+    def _take_all(self) -> None:
+        reason = ""
         for item in self._feed:
             match item:
                 case Batch():
-                    self._take(abreast.push(item, time.monotonic()))
+                    self._take(item)
                 case Lost(reason):
-                    self._take(abreast.rest())
                     self._continuity.cut()
                 case Regained(after_s):
                     self._mark_gap(reason, after_s)
-        self._take(abreast.rest())
 
     def _take(self, batch: Batch) -> None:
         """One batch: checked, recorded, handed on."""
@@ -310,8 +302,7 @@ class LiveSource:
 
     def _hand_on(self, batch: Batch, size: int) -> None:
         queue = self._queue
-        is_stored = self._recorder is not None and not self._recording_trouble
-        if queue.behind_from is not None and is_stored:
+        if queue.behind_from is not None and self._is_recording:
             queue.behind += len(batch.accel)
         elif queue.behind_from is None and (self._feed.patient or queue.fits(size)):
             queue.push(batch)

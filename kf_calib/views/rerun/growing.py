@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import IO
 
 from kf_calib.calibration import Calibration
+from kf_calib.errors import InputError
 from kf_calib.outputs import Growing
 from kf_calib.views.rerun import grow
 from kf_calib.views.rerun.file import new_stream
@@ -132,7 +133,7 @@ class _GrowingFile:
         if self._is_lost:
             return ""
         try:
-            self._file = self._file or self._place.at.open("xb")
+            self._file = self._file or self._place.open()
             self._file.write(data)
             self._file.flush()
             self._place.settle()
@@ -140,6 +141,9 @@ class _GrowingFile:
         except OSError as error:
             self._is_lost = True
             return f"{self._path} is not written on ({error.strerror})."
+        except InputError as error:
+            self._is_lost = True
+            return str(error)
         return ""
 
     def close(self) -> None:

@@ -1,0 +1,35 @@
+"""Signals that ask a run to end: Ctrl-C, SIGTERM, and SIGHUP, which comes when the terminal is closed."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+
+@contextmanager
+def answered(answer: Callable[[signal.Signals], None]) -> Iterator[None]:
+    """Have ``answer`` called for each of them; SIGHUP stays ignored where it was (nohup)."""
+
+    def called(number: int, _: FrameType | None) -> None:
+        answer(signal.Signals(number))
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    before = {number: signal.signal(number, called) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def interrupt(_: signal.Signals) -> None:
+    """Any of them is Ctrl-C: what is at work lets go of what it has open."""
+    raise KeyboardInterrupt
