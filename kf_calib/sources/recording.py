@@ -20,7 +20,7 @@ from mcap.records import Metadata
 
 from kf_calib.bench import Bench
 from kf_calib.errors import BenchError, InputError
-from kf_calib.samples import Batch, Source, Stream
+from kf_calib.samples import Batch, Floats, Source, Stream
 from kf_calib.sources.bags import files_of
 from kf_calib.sources.cdr import JOINT_STATE, CdrError, Decoder
 from kf_calib.sources.contents import BENCH_RECORD, POSES, READINGS, TEMPERATURES, Contents, Parts, Role
@@ -111,8 +111,8 @@ class Recording:
                 temperature = passage.track(topic, decoders.of(TEMPERATURES, topic))
             readings, angles = accel.read(block, messages), pose.read(block, messages)
             batch = Batch(
-                Stream(readings.time_ns, readings.values * self._accel_scale),
-                Stream(angles.time_ns, angles.values * self._angle_scale),
+                _scaled(readings, self._accel_scale),
+                _scaled(angles, self._angle_scale),
                 temperature.read(block, messages) if temperature else Stream.empty(1),
             )
             yield block.end, batch
@@ -268,6 +268,11 @@ class _Track:
         joined = sum((stream for _, stream in parts), Stream.empty(self.decode.width))
         order = np.argsort(np.concatenate([np.empty(0, np.int64), *(at for at, _ in parts)]))
         return Stream(joined.time_ns[order], joined.values[order])
+
+
+def _scaled(stream: Stream, scale: Floats | float) -> Stream:
+    with np.errstate(over="ignore"):  # what damage has made too large becomes infinite, and is counted as such
+        return Stream(stream.time_ns, stream.values * scale)
 
 
 def _gap(opcode: int, content: bytes) -> list[Mapping[str, str]]:
