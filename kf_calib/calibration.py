@@ -607,7 +607,8 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
     if tally.poses_dropped and not tally.poses:
         raise InputError(
             f"none of the {tally.poses_dropped} angle messages can be used: they are not finite, beyond "
-            f"{LARGEST_RAD:.0e} rad (counts of an encoder?) or no unit quaternions; record angles in rad or deg, or unit quaternions."
+            f"{LARGEST_RAD:.0e} rad (counts of an encoder?) or no unit quaternions; record angles in rad or deg, or "
+            "unit quaternions."
         )
     if not tally.poses:
         raise InputError(

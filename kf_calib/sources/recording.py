@@ -121,7 +121,8 @@ class Recording:
         self.warnings.append(f"{self.path}: topic {self._pose}: {said}.")
 
     def _survey(self, file: McapFile) -> Contents:
-        """Topics and bench: from the summary, else by reading on until no better choice of topics can come."""
+        """Topics and bench: from the summary, else by reading on until no better choice of topics can come, and where
+        something is damaged the bench."""
         contents, summary = Contents(file.path), file.summary
         if summary:
             contents.schemas = {schema.id: schema for schema in summary.schemas}
@@ -132,11 +133,12 @@ class Recording:
         lists_topics = bool(contents.channels and contents.schemas)
         if lists_topics and (contents.bench is not None or contents.bench_damaged):
             return contents
-        find = MessageFinder()
-        for block in file.blocks(warn=_ignore):
+        find, damage = MessageFinder(), list[str]()
+        for block in file.blocks(warn=damage.append):
             for opcode, content in find(block).others:
                 contents.add(opcode, content, warn=_ignore)
-            if lists_topics or self._is_settled(contents):
+            may_come_again = contents.bench is None and bool(contents.bench_damaged or damage)
+            if lists_topics or (self._is_settled(contents) and not may_come_again):
                 break
         return contents
 

@@ -415,8 +415,8 @@ def test_an_absurd_length_ends_an_unfinished_file(tmp_path: Path, length: int) -
 @pytest.mark.parametrize(
     ("offset", "content", "says"),
     [
-        (25, struct.pack("<Q", 1 << 50), f"claims to hold {1 << 50} bytes"),
-        (25, struct.pack("<Q", 1 << 29), "sizes contradict"),
+        (25, struct.pack("<Q", 1 << 50), f"claims to hold {1 << 30} MB, more than the 256 MB allowed (--max-chunk-mb)"),
+        (25, struct.pack("<Q", 1 << 27), "sizes contradict"),
         (37, struct.pack("<I", 1 << 31), "lengths contradict"),
         (41, b"zzzz", "compression 'zzzz' is not known"),
         (33, bytes([1, 2, 3, 4]), "checksum does not fit"),
