@@ -25,8 +25,18 @@ from kf_calib.sources.bags import files_of
 from kf_calib.sources.cdr import JOINT_STATE, CdrError, Decoder
 from kf_calib.sources.contents import BENCH_RECORD, POSES, READINGS, TEMPERATURES, Contents, Parts, Role
 from kf_calib.sources.joints import Joints
-from kf_calib.sources.mcap_file import Block, DamagedError, McapFile, MessageFinder, Messages, Warn, parse
+from kf_calib.sources.mcap_file import (
+    MAX_CHUNK_MB,
+    Block,
+    DamagedError,
+    McapFile,
+    MessageFinder,
+    Messages,
+    Warn,
+    parse,
+)
 
+_MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
 GAP_RECORD = "kf_calib.gap"
 """Metadata record at a place where the link to the bench was down: after_ns, seconds, reason."""
 
@@ -39,6 +49,7 @@ class Recording:
     accel_scale: factor on the readings, one for all or one a sensor (9.80665 for a file in g). angle_scale: factor on
     the gimbal angles (0.017453 for a file in degrees).
     accel_topic, pose_topic, temperature_topic: which to use where the file has several of the kind.
+    max_chunk_mb: chunks that unpack to more are passed over, and told.
     Raises InputError where the file, or what it holds, cannot be used.
     """
 
@@ -52,12 +63,13 @@ class Recording:
         accel_topic: str | None = None,
         pose_topic: str | None = None,
         temperature_topic: str | None = None,
+        max_chunk_mb: float = MAX_CHUNK_MB,
     ) -> None:
         self.path = Path(path)
         self.fraction = 0.0
         self._accel_scale, self._angle_scale = np.asarray(accel_scale, float), angle_scale
         self._wanted = {READINGS: accel_topic, POSES: pose_topic, TEMPERATURES: temperature_topic}
-        self._parts = Parts(self.path, [McapFile(file) for file in files_of(self.path)])
+        self._parts = Parts(self.path, [McapFile(file, int(max_chunk_mb * (1 << 20))) for file in files_of(self.path)])
         self.warnings = [file.trouble for file in self._parts.files if file.trouble]
         self._parts.contents = [self._survey(file) for file in self._parts.files]
         self._accel = self._require(READINGS, "convert the readings to sensor_msgs/msg/Imu")
@@ -84,12 +96,12 @@ class Recording:
         joints = Joints(len(self.bench.axes), self.bench.joints, self.bench.axis_letters, self._warn_of_joints)
         decoders = _Decoders(parts, self.bench.pose_width, joints)
         for file, contents in zip(parts.files, parts.contents, strict=True):
-            passage = _Passage(contents, self.warnings.append)
+            passage = _Passage(contents, self._warn_of_damage)
             for end, batch in self._part(file, passage, decoders, growing and file is parts.files[-1]):
                 self.fraction = math.nan if growing else min((begun + end) / parts.size, 1.0)
                 if growing or len(batch.accel) or len(batch.pose) or len(batch.temperature):
                     yield batch
-            passage.account(file.summary.message_counts if file.summary else {})
+            passage.account(file.summary.message_counts if file.summary else {}, self.warnings.append)
             begun += file.size
         if joints.others and not joints.found:
             raise InputError(
@@ -105,7 +117,7 @@ class Recording:
         accel, pose = (passage.track(topic, decoders.of(role, topic)) for role, topic in
                        ((READINGS, self._accel), (POSES, self._pose)))  # fmt: skip
         temperature = None
-        for block in file.blocks(self.warnings.append, growing=growing):
+        for block in file.blocks(self._warn_of_damage, growing=growing):
             messages = passage.find(block)
             if not temperature and (topic := self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])):
                 temperature = passage.track(topic, decoders.of(TEMPERATURES, topic))
@@ -116,6 +128,12 @@ class Recording:
                 temperature.read(block, messages) if temperature else Stream.empty(1),
             )
             yield block.end, batch
+
+    def _warn_of_damage(self, said: str) -> None:
+        if len(self.warnings) < _MOST_DAMAGES:
+            self.warnings.append(said)
+        elif len(self.warnings) == _MOST_DAMAGES:
+            self.warnings.append(f"{self.path} is damaged in more places than can be told.")
 
     def _warn_of_joints(self, said: str) -> None:
         self.warnings.append(f"{self.path}: topic {self._pose}: {said}.")
@@ -231,11 +249,11 @@ class _Passage:
             self._met[group.channel] += len(group.at)
         return messages
 
-    def account(self, stated: Mapping[int, int]) -> None:
+    def account(self, stated: Mapping[int, int], warn: Warn) -> None:
         """Warns of messages that the file should have (``stated``, by channel) but that were not met, and of gaps."""
         if self._gaps:
             reason = self._gaps[0].get("reason", "unknown")
-            self.warn(
+            warn(
                 f"{self.contents.path}: the link to the bench was lost {len(self._gaps)} times (first: {reason})."
             )
         for track in self._tracks:
@@ -243,10 +261,10 @@ class _Passage:
             total = sum(stated.get(channel, 0) for channel in ids)
             lost = total - sum(self._met[channel] for channel in ids)
             if lost > 0:
-                self.warn(f"{self.contents.path}: {lost} of {total} messages of {track.topic} are lost.")
+                warn(f"{self.contents.path}: {lost} of {total} messages of {track.topic} are lost.")
         stray = sum(count for channel, count in self._met.items() if channel not in self.contents.channels)
         if stray:
-            self.warn(f"{self.contents.path}: {stray} messages belong to no topic the file defines and are left out.")
+            warn(f"{self.contents.path}: {stray} messages belong to no topic the file defines and are left out.")
 
 
 @dataclass(frozen=True)
