@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import resource
 import struct
 import subprocess
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 from long_runs import slow
 from made_recordings import BENCH, START_NS, assert_equal, count_missing, made_batch, read, record
-from mcap.exceptions import EndOfFile
+from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel
@@ -307,6 +308,18 @@ def test_what_is_repeated_takes_little_room_and_bothers_no_reader(unfinished: Pa
         assert len(summary.channels) == len(summary.schemas) == 3 == summary.statistics.channel_count
         assert 5 <= sum(metadata.name == BENCH_RECORD for metadata in reader.iter_metadata()) <= 9
     assert len(read(Recording(path)).accel) == 10_000
+
+
+def test_the_page_on_unfinished_files_opens_one_with_the_official_reader(
+    unfinished: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = Path(__file__).resolve().parents[2] / "docs" / "recordings.md"
+    (code,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    monkeypatch.chdir(unfinished.parent)
+    with pytest.raises(McapError), unfinished.open("rb") as file:
+        make_reader(file).get_summary()  # as the page says
+    exec(code, {})
+    assert capsys.readouterr().out == "1000 readings\n"
 
 
 CHILD = """
