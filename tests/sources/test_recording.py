@@ -440,10 +440,15 @@ def test_damage_to_the_head_of_a_chunk(path: Path, offset: int, content: bytes, 
 
 
 @pytest.mark.parametrize("states_size", [True, False])
-def test_a_chunk_that_unpacks_to_more_than_it_says(tmp_path: Path, states_size: bool) -> None:
+@pytest.mark.parametrize("packing", ["zstd", "lz4"])
+def test_a_chunk_that_unpacks_to_more_than_it_says(tmp_path: Path, states_size: bool, packing: str) -> None:
     path = write_officially(tmp_path / "a.mcap", finish=False)
-    packed = zstandard.ZstdCompressor(write_content_size=states_size).compress(bytes(300_000_000))
-    content = struct.pack("<QQQII", 0, 0, 1000, 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    if packing == "zstd":
+        packed = zstandard.ZstdCompressor(write_content_size=states_size).compress(bytes(300_000_000))
+    else:
+        packed = lz4.frame.compress(bytes(300_000_000), store_size=states_size)
+    content = struct.pack("<QQQII", 0, 0, 1000, 0, len(packing)) + packing.encode()
+    content += struct.pack("<Q", len(packed)) + packed
     path.write_bytes(path.read_bytes() + HEAD.pack(Opcode.CHUNK, len(content)) + content)
     recording = Recording(path)
     tracemalloc.start()
