@@ -119,7 +119,7 @@ def _mb(size: int) -> str:
 
 
 def _allowed(max_chunk: int) -> str:
-    return f"more than the {_mb(max_chunk)} MB allowed (--max-chunk-mb)"
+    return f"more than the {_mb(max_chunk)} MB that --max-chunk-mb allows"
 
 
 def _decompress(compression: bytes, data: bytes, size: int) -> bytes:
