@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from mcap_ros2.decoder import DecoderFactory
 from kf_calib.bench import Bench, parse_axes
 from kf_calib.errors import BenchError, InputError, KfCalibError
 from kf_calib.samples import Batch, Stream
+from kf_calib.sources import recorder as recorder_module
 from kf_calib.sources.contents import BENCH_RECORD, CHECKSUM_KEY
 from kf_calib.sources.mcap_file import HEAD, MAGIC
 from kf_calib.sources.recorder import Recorder
@@ -173,15 +175,18 @@ def test_a_closed_recorder_refuses_more_and_closes_twice(tmp_path: Path) -> None
         recorder.write(made_batch(10))
 
 
-def test_samples_reach_the_disk_by_the_clock_and_at_the_end_of_a_dwell(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
+def test_samples_reach_the_disk_by_the_clock_and_at_the_end_of_a_dwell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, now_s = tmp_path / "a.mcap", [0.0]
+    monkeypatch.setattr(recorder_module, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
     with Recorder(path, BENCH, flush_s=0.05) as recorder:
         recorder.write(made_batch(100))
         recorder.end_dwell()
         assert len(read(Recording(path)).accel) == 100
         recorder.write(made_batch(100, START_NS + 10**9))
         assert len(read(Recording(path)).accel) == 100
-        time.sleep(0.06)
+        now_s[0] = 0.06
         recorder.write(made_batch(100, START_NS + 2 * 10**9))
         assert len(read(Recording(path)).accel) == 300
 
