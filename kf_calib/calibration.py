@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from kf_calib import averaging, blunders, information, kalman, paper, stage
 from kf_calib.bench import Bench
-from kf_calib.dwells import Block, Segmenter, Tally, dwell_blocks
+from kf_calib.dwells import LARGEST_RAD, Block, Segmenter, Tally, dwell_blocks
 from kf_calib.effects import of_the_users, remarks_of
 from kf_calib.errors import InputError, UnobservableError, check_number
 from kf_calib.fitting import WALK, Fit, fit
@@ -604,6 +604,12 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
     """Raise InputError where there is nothing to calibrate from, or where the readings are not in m/s^2."""
     if not tally.read:
         raise InputError("the recording holds no accelerometer readings: check that the logger wrote any.")
+    if tally.poses_dropped and not tally.poses:
+        raise InputError(
+            f"none of the {tally.poses_dropped} angle messages can be used: they are not finite, beyond "
+            f"{LARGEST_RAD:.0e} rad (counts of an encoder?) or no unit quaternions; record angles in rad or deg, or "
+            "unit quaternions."
+        )
     if not tally.poses:
         raise InputError(
             "the recording holds no platform angles (or attitude), so the direction of gravity is not known: "
@@ -614,8 +620,8 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
         unit = f"; angles of up to {turns:.0f} turns look like degrees (--angle-unit deg)" if turns > 3.0 else ""
         raise InputError(
             f"no dwell was found in {tally.read} readings ({tally.moving} moving, {tally.settling} settling, "
-            f"{tally.not_finite} not finite, {tally.without_pose} without an angle): the platform must stand still; "
-            f"if it did, raise --still-deg or lower --settle-s{unit}."
+            f"{tally.not_finite} not finite, {tally.too_large} too large, {tally.without_pose} without an angle): the "
+            f"platform must stand still; if it did, raise --still-deg or lower --settle-s{unit}."
         )
     level = float(np.median([np.linalg.norm(dwell.means[4:]) for dwell in dwells])) / bench.gravity_mps2
     if 0.5 <= level <= 2.0:

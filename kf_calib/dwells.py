@@ -26,6 +26,13 @@ from kf_calib.stillness import HISTORY, Stillness, encoder_sigma
 BLOCK_SAMPLES = 4000
 """Samples of one block at the most: few enough for the cache; no power of two, whose columns would evict each other."""
 
+LARGEST_MPS2 = 1e12
+"""Beyond any reading, counts of a 32-bit converter included: those are for the check of the unit to tell."""
+LARGEST_RAD = 1e6
+"""Beyond any angle: 160 000 turns, of which a double keeps the fraction to 1e-10 rad."""
+LARGEST_C = 1e6
+"""Beyond any temperature."""
+
 _SECOND_NS = 1_000_000_000
 _LAST_NS = 1 << 62  # after every stamp
 _HOLD_NS = _SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
@@ -81,12 +88,14 @@ class Tally:
     moving: int = 0
     settling: int = 0
     not_finite: int = 0
+    too_large: int = 0
     repeated: int = 0
     backward: int = 0
     leaping: int = 0
     without_pose: int = 0
     poses: int = 0
     poses_dropped: int = 0
+    temperatures_dropped: int = 0
     gated: int = 0
     farthest_rad: float = 0.0
     first_backward_s: float | None = None
@@ -98,11 +107,14 @@ class Tally:
         backward_s = self.first_backward_s or 0.0
         said = {
             "not_finite": "readings that were not finite (NaN or infinite), dropped: {}.",
+            "too_large": f"readings beyond {LARGEST_MPS2:.0e} m/s^2, which nothing can read, dropped: {{}}.",
             "repeated": "readings that repeated the stamp before them, dropped: {}.",
             "backward": f"readings whose stamps jumped back (first at {backward_s:.3f} s), dropped: {{}}.",
             "leaping": "readings with a stamp far ahead of their neighbours, dropped: {}.",
             "without_pose": "readings with no platform angle within 1 s of them, dropped: {}.",
-            "poses_dropped": "angle messages not finite, out of order of time or no unit quaternion, dropped: {}.",
+            "poses_dropped": f"angle messages not finite, beyond {LARGEST_RAD:.0e} rad, out of order of time or no "
+            "unit quaternion, dropped: {}.",
+            "temperatures_dropped": f"temperatures not finite or beyond {LARGEST_C:.0e} degC, dropped: {{}}.",
             "gated": "outlying readings (innovation gate), rejected: {}; --no-gate keeps them.",
         }
         return [text.format(getattr(self, key)) for key, text in said.items() if getattr(self, key)]
@@ -272,15 +284,19 @@ class Segmenter:
         self._take_poses(batch.pose, final)
         if len(batch.temperature):
             warm = batch.temperature
-            self._temperature += self._orders[2](warm[np.isfinite(warm.values[:, 0])])
+            readable = _within(warm.values, LARGEST_C)
+            self.tally.temperatures_dropped += int((~readable).sum())
+            self._temperature += self._orders[2](warm[readable])
 
     def _take_readings(self, accel: Stream) -> None:
         if not len(accel):
             return
-        finite = np.asarray(np.isfinite(accel.values).all(axis=1)) if not np.isfinite(accel.values).all() else None
-        if finite is not None:
-            self.tally.not_finite += int((~finite).sum())
-            accel = accel[finite]
+        readable = _within(accel.values, LARGEST_MPS2)
+        if not readable.all():
+            too_large = int(np.isfinite(accel.values[~readable]).all(axis=1).sum())
+            self.tally.too_large += too_large
+            self.tally.not_finite += int((~readable).sum()) - too_large
+            accel = accel[readable]
         accel = self._orders[0](accel, self.tally, self.first_ns)
         if self.first_ns is None and len(accel):
             self.first_ns = int(accel.time_ns[0])
@@ -309,11 +325,11 @@ class Segmenter:
         self._turns = np.concatenate([self._turns, turns])
 
     def _sound(self, poses: Floats) -> Mask:
-        """Which poses can be used, (m,) bool: finite, and quaternions of nearly unit length."""
-        finite: Mask = np.asarray(np.isfinite(poses).all(axis=1))
+        """Which poses can be used, (m,) bool: angles that can be, and quaternions of nearly unit length."""
+        readable = _within(poses, LARGEST_RAD)
         if self.bench.axes:
-            return finite
-        return finite & (np.abs(np.linalg.norm(poses, axis=1) - 1.0) < 0.01)
+            return readable
+        return readable & (np.abs(np.linalg.norm(np.where(readable[:, None], poses, 0.0), axis=1) - 1.0) < 0.01)
 
     def _advance(self, final: bool) -> Iterator[Block]:
         for stamp, event, settles in self._judge(final):
@@ -563,6 +579,11 @@ class Segmenter:
         kept = slice(max(int(np.searchsorted(self._pose.time_ns, oldest)) - HISTORY, 0), None)
         self._pose, self._turns = self._pose[kept], self._turns[kept]
         self._temperature = self._temperature[max(int(np.searchsorted(self._temperature.time_ns, oldest)) - 2, 0) :]
+
+
+def _within(values: Floats, largest: float) -> Mask:
+    """Which rows (m, k) hold nothing that is not finite or beyond ``largest``."""
+    return np.asarray((np.abs(values) <= largest).all(axis=1))
 
 
 def _carried_on(slow: Stream, at_ns: Times) -> Floats:

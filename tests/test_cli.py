@@ -149,6 +149,7 @@ BAD = {
     "no angles": (dict(pose=lambda s: Stream.empty(3)), "angles"),
     "no readings": (dict(accel=lambda s: Stream.empty(3)), "no accelerometer readings"),
     "one orientation": (dict(accel=lambda s: s[s.time_ns < s.time_ns[0] + 5 * 10**9]), "can be seen"),
+    "all too large": (dict(accel=lambda s: Stream(s.time_ns, 1e200 * s.values)), "too large"),
     "all NaN": (dict(accel=lambda s: Stream(s.time_ns, np.nan * s.values)), "not finite"),
 }
 

@@ -6,9 +6,12 @@ import itertools
 
 import numpy as np
 import pytest
+from synthetic import G, Run
 
 from kf_calib.bench import Bench, axes_of
+from kf_calib.calibration import calibrate
 from kf_calib.dwells import Segmenter, dwell_blocks
+from kf_calib.errors import InputError
 from kf_calib.samples import Batch, Stream
 from kf_calib.stillness import Stillness
 
@@ -182,6 +185,37 @@ def test_bad_samples_are_dropped_and_counted() -> None:
     assert tally.used == 2000 - 5 and len(got) == 1
     said = " ".join(tally.sentences())
     assert "NaN" in said and "jumped back" in said and "repeated the stamp" in said and "far ahead" in said
+
+
+@pytest.mark.parametrize("size", [2e12, 1e155, 1.7e308, -1e200])
+def test_what_nothing_can_read_is_dropped_and_told(size: float) -> None:
+    """One reading of 1e155, squared, made a run that could not be evaluated."""
+    run, altered = Run(seed=1, dwells=14, count=100), Run(seed=1, dwells=14, count=100)
+    altered.accel.values[1234, 1] = altered.pose.values[55, 2] = size
+    heat = Stream(run.accel.time_ns[[0, 500, 900]], np.array([[20.0], [size], [21.0]]))
+    batch = Batch(altered.accel, altered.pose, heat)
+    result = calibrate(Given(batch, bench=run.bench))
+    tally = result.tally
+    assert (tally.too_large, tally.poses_dropped, tally.temperatures_dropped, tally.not_finite) == (1, 1, 1, 0)
+    said = " ".join(result.warnings)
+    assert "readings beyond 1e+12 m/s^2, which nothing can read, dropped: 1" in said
+    assert "beyond 1e+06 rad" in said and "temperatures not finite or beyond 1e+06 degC, dropped: 1" in said
+    expected = calibrate(run).estimate
+    assert np.abs((result.estimate.parameters - expected.parameters) / expected.sigma).max() < 0.5
+
+
+def test_counts_of_a_converter_are_left_to_the_check_of_the_unit() -> None:
+    run = Run(seed=1, dwells=14, count=100)
+    counts = Stream(run.accel.time_ns, np.round(run.accel.values / G * 2**31))
+    with pytest.raises(InputError, match="they look like counts; give the size of one count"):
+        calibrate(Given(Batch(counts, run.pose), bench=run.bench))
+
+
+def test_counts_in_place_of_angles_are_told() -> None:
+    run = Run(seed=1, dwells=14, count=100)
+    counts = Stream(run.pose.time_ns, 1e9 + run.pose.values)
+    with pytest.raises(InputError, match=r"none of the 140 angle messages can be used: .* beyond 1e.06 rad"):
+        calibrate(Given(Batch(run.accel, counts), bench=run.bench))
 
 
 def test_readings_outside_the_angles_are_counted() -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from filterpy.kalman import SquareRootKalmanFilter
 from scipy.optimize import least_squares
 from synthetic import Run, sensitivities
 
@@ -132,3 +133,23 @@ def test_trace_ends_on_the_estimate_and_shrinks() -> None:
     determined = [estimate.sigma for _, _, estimate in trace if not estimate.unseen.any()]
     assert len(determined) > 8
     assert (np.diff(determined, axis=0) <= 1e-12).all()
+
+
+def test_filterpy_takes_the_roots_that_are_set_past_its_setters() -> None:
+    """The engine sets private attributes: a version of filterpy that names them otherwise would ignore them."""
+    rng = np.random.default_rng(0)
+    root, noise, walk = (np.tril(rng.normal(size=(n, n))) + 3 * np.eye(n) for n in (4, 3, 4))
+    h, start, reading = rng.normal(size=(3, 4)), rng.normal(size=4), rng.normal(size=3)
+    kf = SquareRootKalmanFilter(dim_x=4, dim_z=3)
+    kf.x, kf.H = start.copy(), h
+    kf._P1_2, kf._R1_2, kf._Q1_2 = root, noise, walk
+    why = "filterpy no longer knows _P1_2, _R1_2 or _Q1_2: see kalman.py, and the cap in pyproject.toml"
+    for known, square in ((kf.P, root), (kf.R, noise), (kf.Q, walk)):
+        np.testing.assert_allclose(known, square @ square.T, err_msg=why)
+    kf.predict()
+    predicted = root @ root.T + walk @ walk.T
+    np.testing.assert_allclose(kf.P, predicted, err_msg=why)
+    kf.update(reading)
+    gain = predicted @ h.T @ np.linalg.inv(h @ predicted @ h.T + noise @ noise.T)
+    np.testing.assert_allclose(kf.x, start + gain @ (reading - h @ start), err_msg=why)
+    np.testing.assert_allclose(kf.P, (np.eye(4) - gain @ h) @ predicted, atol=1e-12, err_msg=why)

@@ -84,6 +84,8 @@ def recording_options(command: F) -> F:
                      panel=INPUT),
         click.option("--pose-topic", metavar="TOPIC", help="Topic of the platform's angles or attitude.", panel=INPUT),
         click.option("--temperature-topic", metavar="TOPIC", help="Topic of the temperature.", panel=INPUT),
+        click.option("--max-chunk-mb", type=POSITIVE, default=256, show_default=True, metavar="MB", panel=INPUT,
+                     help="Chunks of the file that unpack to more are passed over, and told."),
     ]  # fmt: skip
     for option in reversed(options):
         command = option(command)
@@ -190,6 +192,7 @@ def recording_of(path: Path, options: Mapping[str, Any]) -> Recording:
         accel_topic=options["accel_topic"],
         pose_topic=options["pose_topic"],
         temperature_topic=options["temperature_topic"],
+        max_chunk_mb=options["max_chunk_mb"],
     )
 
 

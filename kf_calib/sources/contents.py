@@ -86,10 +86,14 @@ class Contents:
         except DamagedError:
             self.bench_damaged |= self.bench is None
             raise
-        if record.name == BENCH_RECORD and self.bench is None:
-            stated = record.metadata.pop(CHECKSUM_KEY, None)
-            self.bench_damaged = stated is not None and stated != bench_checksum(record.metadata)
-            self.bench = {} if self.bench_damaged else record.metadata
+        if record.name != BENCH_RECORD:
+            return
+        stated = record.metadata.pop(CHECKSUM_KEY, None)
+        if stated is not None and stated != bench_checksum(record.metadata):
+            self.bench_damaged |= self.bench is None
+            raise DamagedError("the bench's description does not fit its checksum")
+        if self.bench is None:  # the first whole one; recorders repeat it
+            self.bench, self.bench_damaged = record.metadata, False
 
     def topics(self, role: Role) -> list[str]:
         """Topics with a schema that ``role`` can use, in the order of the file."""

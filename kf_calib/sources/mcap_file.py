@@ -3,11 +3,13 @@
 A file is a sequence of records (opcode u8, length u64, content), most of them packed into chunks with a checksum.
 A recorder that was killed leaves no footer; a failing disk flips bits. Everything whole is read, everything lost is
 told in one sentence through ``warn``. Where the summary at the file's end is whole (it has a checksum of its own), its
-list of chunks leads past damage; without it nothing behind a damaged length can be found.
+list of chunks leads past damage; without it the next chunk is known by its head. Memory is that of a few blocks, or of
+one chunk where that is larger: what claims to unpack to more than is allowed is passed over.
 """
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from bisect import bisect_right
@@ -25,7 +27,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Header, MetadataIndex, Schema, Statistics
+from mcap.records import Channel, ChunkIndex, Header, Metadata, MetadataIndex, Schema, Statistics
 from numpy.typing import NDArray
 
 from kf_calib.errors import InputError
@@ -33,6 +35,8 @@ from kf_calib.sources.foreign import HEAD_BYTES, advice
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")  # opcode, length of the content
+MAX_CHUNK_MB = 256.0
+"""A chunk that unpacks to more is passed over: recorders write some MB, and a few kB of zeros claim a GB."""
 MESSAGE_FIELDS = 22  # channel u16, sequence u32, log time u64, publish time u64; then the message itself
 
 Warn = Callable[[str], None]
@@ -40,24 +44,27 @@ Integers = NDArray[np.int64]
 
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of its offsets, CRC
 _CHUNK = struct.Struct("<QQQII")  # first and last time, size and CRC uncompressed, length of the compression's name
-_CHUNK_LIMIT = 1 << 30
 _SUMMARY_LIMIT = 1 << 28
 _BLOCK = 1 << 22  # smaller chunks are joined: every block costs some hundred microseconds besides its messages
 _PIECE = 1 << 20
-_AHEAD = 2
+_AHEAD = 2 * _BLOCK  # bytes unpacked and not yet asked for
 _LONGEST_SPAN_S = 1e7  # a longer one is damage itself
 _MOST_KINDS = 16  # of record heads; beyond that, searching for them costs more than walking
+_MOST_OTHERS = 1 << 17  # records of a block that are no messages: every schema and channel there can be
+_PACKED_HEADS = tuple(struct.pack("<I", len(name)) + name for name in (b"zstd", b"lz4"))
 
 # What may stand in the data section, with the least length of its content
 _LEAST: dict[int, int] = {
     Opcode.HEADER: 8, Opcode.SCHEMA: 14, Opcode.CHANNEL: 16, Opcode.MESSAGE: MESSAGE_FIELDS, Opcode.CHUNK: 40,
     Opcode.MESSAGE_INDEX: 6, Opcode.ATTACHMENT: 36, Opcode.METADATA: 8, Opcode.DATA_END: 4,
 }  # fmt: skip
+_PARSED: dict[int, Callable[[ReadDataStream], object]] = {
+    Opcode.HEADER: Header.read, Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read,
+    Opcode.METADATA: Metadata.read,
+}  # fmt: skip
 _FIRST_PRIVATE_OPCODE = 0x80
 _NOTHING_YET = -1  # in place of an opcode: the next record of a growing file is not whole
 _Record = TypeVar("_Record")
-_Item = TypeVar("_Item")
-_Result = TypeVar("_Result")
 
 
 class DamagedError(Exception):
@@ -84,20 +91,35 @@ def parse(read: Callable[[ReadDataStream], _Record], content: bytes) -> _Record:
     return record
 
 
-def unpack_chunk(content: bytes) -> bytes:
+def unpack_chunk(content: bytes, max_chunk: int) -> bytes:
     """The records in the content of a chunk record. Raises DamagedError where size or checksum do not fit."""
-    _, _, size, crc, name_length = _CHUNK.unpack_from(content)
-    start = _CHUNK.size + name_length + 8
-    if start > len(content) or int.from_bytes(content[start - 8 : start], "little") != len(content) - start:
+    _, _, size, crc, _ = _CHUNK.unpack_from(content)
+    start = _packed_start(content)
+    if not start:
         raise DamagedError("its lengths contradict each other")
-    if size > _CHUNK_LIMIT:
-        raise DamagedError(f"it claims to hold {size} bytes, the limit is {_CHUNK_LIMIT}")
+    if size > max_chunk:
+        raise DamagedError(f"it claims to hold {_mb(size)} MB, {_allowed(max_chunk)}")
     data = _decompress(content[_CHUNK.size : start - 8], content[start:], size)
     if len(data) != size:
         raise DamagedError(f"it holds {len(data)} bytes in place of {size}")
     if crc and zlib.crc32(data) != crc:
         raise DamagedError("its checksum does not fit")
     return data
+
+
+def _packed_start(content: bytes) -> int:
+    """Where the packed records begin in the content of a chunk record; 0 where its lengths contradict each other."""
+    start = _CHUNK.size + _CHUNK.unpack_from(content)[-1] + 8
+    fits = start <= len(content) and int.from_bytes(content[start - 8 : start], "little") == len(content) - start
+    return start if fits else 0
+
+
+def _mb(size: int) -> str:
+    return f"{size / (1 << 20):.0f}"
+
+
+def _allowed(max_chunk: int) -> str:
+    return f"more than the {_mb(max_chunk)} MB that --max-chunk-mb allows"
 
 
 def _decompress(compression: bytes, data: bytes, size: int) -> bytes:
@@ -196,10 +218,14 @@ class Block:
 
 
 class McapFile:
-    """An MCAP file on disk. ``summary`` is None where the file's end is missing or damaged: ``trouble`` says so."""
+    """An MCAP file on disk. ``summary`` is None where the file's end is missing or damaged: ``trouble`` says so.
 
-    def __init__(self, path: Path) -> None:
+    max_chunk: bytes that a chunk may take, packed or unpacked.
+    """
+
+    def __init__(self, path: Path, max_chunk: int = int(MAX_CHUNK_MB * (1 << 20))) -> None:
         self.path = path
+        self.max_chunk = max_chunk
         self.summary: Summary | None = None
         self.trouble = ""
         with self.open() as file:
@@ -244,22 +270,10 @@ class McapFile:
         with self.open() as file:
             walk = _Walk(self, file, warn, start, end, growing)
             try:
-                yield from (map if growing else _ahead)(walk.unpack, walk.parcels())
+                yield from map(walk.unpack, walk.parcels()) if growing else _ahead(walk.unpack, walk.parcels())
             except OSError as error:
                 raise InputError(f"{self.path} cannot be read ({error.strerror}): check its medium.") from error
             walk.compare_checksum()
-
-
-def _ahead(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
-    """``map(work, items)``, a few items ahead in a thread: unpacking and checksums leave the interpreter free."""
-    with ThreadPoolExecutor(max_workers=1) as worker:
-        coming: deque[Future[_Result]] = deque()
-        for item in items:
-            coming.append(worker.submit(work, item))
-            if len(coming) > _AHEAD:
-                yield coming.popleft().result()
-        while coming:
-            yield coming.popleft().result()
 
 
 @dataclass
@@ -271,6 +285,18 @@ class _Parcel:
     end: int = 0
 
 
+def _ahead(unpack: Callable[[_Parcel], Block], parcels: Iterable[_Parcel]) -> Iterator[Block]:
+    """``map(unpack, parcels)``, some MB ahead in a thread: unpacking and checksums leave the interpreter free."""
+    with ThreadPoolExecutor(max_workers=1) as worker:
+        coming: deque[tuple[int, Future[Block]]] = deque()
+        for parcel in parcels:
+            coming.append((parcel.size, worker.submit(unpack, parcel)))
+            while sum(size for size, _ in coming) > _AHEAD:
+                yield coming.popleft()[1].result()
+        while coming:
+            yield coming.popleft()[1].result()
+
+
 class _Walk:
     """One passage through the data section, keeping the checksum of all that it passed."""
 
@@ -278,6 +304,7 @@ class _Walk:
         self, mcap: McapFile, file: IO[bytes], warn: Warn, start: int = 0, end: int | None = None, growing: bool = False
     ) -> None:
         self.path = mcap.path
+        self.max_chunk = mcap.max_chunk
         self.growing = growing
         self.file = file
         self.warn = warn
@@ -289,21 +316,28 @@ class _Walk:
         self.crc = self.crc_before_end = self.stated_crc = 0
         self.whole = not start  # nothing lost so far
         self.unchecked = False  # readings were passed that no chunk's checksum covers
+        self.next_chunk = 0  # found by its head; nothing before it is one
         if not start:
             self._take(len(MAGIC))
 
     def parcels(self) -> Iterator[_Parcel]:
         parcel = _Parcel()
         for start, opcode, content in self._records():
-            if opcode == _NOTHING_YET or (parcel.size >= _BLOCK and opcode != Opcode.MESSAGE_INDEX):
+            size = self._unpacked_size(opcode, content)
+            is_full = bool(parcel.records) and parcel.size + size > _BLOCK and opcode != Opcode.MESSAGE_INDEX
+            if opcode == _NOTHING_YET or is_full:
                 yield parcel
                 parcel = _Parcel()
             if opcode not in (Opcode.HEADER, _NOTHING_YET):
                 parcel.records.append((start, opcode, content))
-                parcel.size += _CHUNK.unpack_from(content)[2] if opcode == Opcode.CHUNK else len(content)
+                parcel.size += size
                 parcel.end = self.position
         if parcel.records:
             yield parcel
+
+    def _unpacked_size(self, opcode: int, content: bytes) -> int:
+        stated = _CHUNK.unpack_from(content)[2] if opcode == Opcode.CHUNK else len(content)
+        return stated if stated <= self.max_chunk else 0  # a chunk of more is passed over
 
     def unpack(self, parcel: _Parcel) -> Block:
         parts: list[bytes] = []
@@ -341,7 +375,7 @@ class _Walk:
             if not self._plausible(start, opcode, length, limit):
                 self._lose(start, opcode, limit)
                 continue
-            if opcode == Opcode.ATTACHMENT or opcode >= _FIRST_PRIVATE_OPCODE or length > _CHUNK_LIMIT + _PIECE:
+            if opcode == Opcode.ATTACHMENT or opcode >= _FIRST_PRIVATE_OPCODE or length > self.max_chunk + _PIECE:
                 self._pass_over(opcode, length)
                 continue
             content = self._take(length)
@@ -350,7 +384,13 @@ class _Walk:
                 return
             if not _consistent(opcode, content):
                 self.whole = False
-                self.warn(f"{self.path}: the record at byte {start} is damaged: its {length} bytes are passed over.")
+                if opcode in (Opcode.HEADER, Opcode.MESSAGE_INDEX):
+                    what = f"the record at byte {start} is damaged"
+                    self.warn(f"{self.path}: {what}: its {length} bytes are passed over.")
+                else:
+                    yield start, opcode, content  # whoever wants it tells what is lost
+                if not self.indexed:  # its length may be what is damaged
+                    self._go_to(min(self._chunk_after(start), self.position))
                 continue
             yield start, opcode, content
 
@@ -363,7 +403,7 @@ class _Walk:
         if len(head) < HEAD.size:
             return False
         opcode, length = HEAD.unpack(head)
-        return length > _CHUNK_LIMIT + _PIECE or not opcode or self.position + HEAD.size + length <= self.end
+        return length > self.max_chunk + _PIECE or not opcode or self.position + HEAD.size + length <= self.end
 
     def _take(self, length: int) -> bytes:
         data = self.file.read(length)
@@ -385,27 +425,50 @@ class _Walk:
         return known and start + HEAD.size + length <= limit
 
     def _pass_over(self, opcode: int, length: int) -> None:
-        if opcode != Opcode.ATTACHMENT:
-            start = self.position - HEAD.size
+        start = self.position - HEAD.size
+        if opcode == Opcode.CHUNK:
+            what = f"the chunk at byte {start} takes {_mb(length)} MB, {_allowed(self.max_chunk)}"
+            self.warn(f"{self.path}: {what}: it is passed over.")
+        elif opcode != Opcode.ATTACHMENT:
             self.warn(f"{self.path}: the record of kind {opcode} at byte {start} ({length} bytes) is passed over.")
         for taken in range(0, length, _PIECE):
             self._take(min(_PIECE, length - taken))
 
     def _lose(self, start: int, opcode: int, limit: int) -> None:
-        """Goes on at ``limit``, because nothing tells where the record at ``start`` ends."""
+        """Goes on at ``limit``, or the next chunk: nothing tells where the record at ``start`` ends."""
         self.whole = False
-        count = limit - start
-        if self.indexed:
-            index = self.chunks.get(start)
-            span = _span(index.message_start_time, index.message_end_time) if index else ""
+        index, times = self.chunks.get(start), self.file.read(16) if opcode == Opcode.CHUNK else b""
+        span = _span(index.message_start_time, index.message_end_time) if index else _span(*_times(times))
+        resumed = limit if self.indexed else self._chunk_after(start)
+        count = resumed - start
+        if self.indexed or resumed < limit:
             self.warn(f"{self.path} is damaged at byte {start}: {count} bytes{span} are lost.")
         elif opcode in _LEAST or count < HEAD.size:
-            times = self.file.read(16) if opcode == Opcode.CHUNK else b""
-            span = _span(*struct.unpack("<QQ", times)) if len(times) == 16 else ""
             self.warn(f"{self.path} breaks off in a record: the {count} bytes{span} from byte {start} on are lost.")
         else:
             self.warn(f"{self.path} is damaged at byte {start}: the {count} bytes from there to its end are lost.")
-        self.position = self.file.seek(limit)
+        self._go_to(resumed)
+
+    def _go_to(self, position: int) -> None:
+        self.position = self.file.seek(position)
+
+    def _chunk_after(self, start: int) -> int:
+        """Where the first packed chunk behind ``start`` begins, by all of its head; the end where there is none."""
+        if self.next_chunk > start:
+            return self.next_chunk
+        overlap = HEAD.size + _CHUNK.size + 4 + 8  # the longest head
+        place, self.next_chunk = start + 1, self.end
+        while place < self.end and self.next_chunk == self.end:
+            self.file.seek(place)
+            piece = self.file.read(min(_PIECE + overlap, self.end - place))
+            found = (place + at for at in _chunk_heads(piece) if place + at + self._chunk_length(piece, at) <= self.end)
+            self.next_chunk = next(found, self.end)
+            place += _PIECE
+        return self.next_chunk
+
+    @staticmethod
+    def _chunk_length(piece: bytes, at: int) -> int:
+        return HEAD.size + HEAD.unpack_from(piece, at)[1]
 
     def _loose(self, opcode: int, content: bytes) -> bytes:
         self.unchecked |= opcode == Opcode.MESSAGE
@@ -415,7 +478,7 @@ class _Walk:
         first_ns, last_ns, _, crc, _ = _CHUNK.unpack_from(content)
         self.unchecked |= crc == 0
         try:
-            return unpack_chunk(content)
+            return unpack_chunk(content, self.max_chunk)
         except DamagedError as damage:
             self.whole = False
             lost = f"its {len(content)} bytes{_span(first_ns, last_ns)} are lost"
@@ -424,13 +487,35 @@ class _Walk:
 
 
 def _consistent(opcode: int, content: bytes) -> bool:
+    """Whether a record is as long as what it holds; of loose messages, nothing in them tells."""
     if opcode == Opcode.MESSAGE_INDEX:
         size = len(content) - 6
         return int.from_bytes(content[2:6], "little") == size and size % 16 == 0
+    if opcode == Opcode.CHUNK:
+        return bool(_packed_start(content))
     try:
-        return opcode != Opcode.HEADER or bool(parse(Header.read, content))
+        return opcode not in _PARSED or bool(parse(_PARSED[opcode], content))
     except DamagedError:
         return False
+
+
+def _chunk_heads(piece: bytes) -> Iterator[int]:
+    """Where heads of packed chunks begin in ``piece``, ascending: opcode, name and both lengths agree."""
+    before = HEAD.size + _CHUNK.size - 4
+    places = sorted(hit.start() - before for head in _PACKED_HEADS for hit in re.finditer(re.escape(head), piece))
+    for at in places:
+        if at < 0 or piece[at] != Opcode.CHUNK:
+            continue
+        name = piece[at + before]  # the length of the name, one byte of it
+        rest = at + HEAD.size + _CHUNK.size + name + 8
+        length = HEAD.unpack_from(piece, at)[1]
+        if int.from_bytes(piece[rest - 8 : rest], "little") == length - (rest - at - HEAD.size):
+            yield at
+
+
+def _times(content: bytes) -> tuple[int, int]:
+    """First and last time in the first bytes of a chunk's content; no times at all where they are not there."""
+    return struct.unpack("<QQ", content) if len(content) == 16 else (1, 0)
 
 
 def _span(first_ns: int, last_ns: int) -> str:
@@ -458,6 +543,7 @@ class Messages:
 
 _MESSAGE = int(Opcode.MESSAGE)  # a plain int: comparing a whole block with an enum would widen it first
 _LEAST_MESSAGE = HEAD.size + MESSAGE_FIELDS
+_SPARSE = 16  # bytes to one with a message's opcode, at least: of random bytes it is one of 256
 _HEADS = np.dtype([("opcode", "u1"), ("length", "<i8"), ("channel", "<u2")])
 _CHANNEL_SHIFT, _LENGTH_SHIFT = 8, 24
 
@@ -477,7 +563,7 @@ class MessageFinder:
         data = block.data
         return (
             self._chain(data, block.index)
-            or self._chain(data, np.flatnonzero(np.frombuffer(data, np.uint8) == _MESSAGE))
+            or self._chain(data, _candidates(data))
             or self._walk(data, block.borders)
         )
 
@@ -508,8 +594,11 @@ class MessageFinder:
                     break
                 if opcode == _MESSAGE:
                     starts.append(position)
-                else:
+                elif len(others) < _MOST_OTHERS:
                     others.append((opcode, data[content : content + length]))
+                else:
+                    lost += border - position
+                    break
                 position = content + length
             position = border
         start = np.array(starts, np.int64)
@@ -519,6 +608,13 @@ class MessageFinder:
         if len(self._known) > _MOST_KINDS:
             self._known = []
         return Messages([_group(known, start[kind == known]) for known in kinds], others, lost)
+
+
+def _candidates(data: bytes) -> Integers:
+    """Bytes with a message's opcode; none where far too many have it to be worth looking at."""
+    has_opcode = np.frombuffer(data, np.uint8) == _MESSAGE
+    is_sparse = np.count_nonzero(has_opcode) <= len(data) // _SPARSE
+    return np.flatnonzero(has_opcode) if is_sparse else np.empty(0, np.int64)
 
 
 def _kinds(data: bytes, start: Integers) -> Integers:

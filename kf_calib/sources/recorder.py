@@ -16,6 +16,7 @@ from typing import IO, Self
 
 import numpy as np
 from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
 from mcap.writer import Writer
 
 from kf_calib.bench import Bench
@@ -35,6 +36,8 @@ from kf_calib.sources.contents import (
 from kf_calib.sources.joints import Joints, gimbal_names
 from kf_calib.sources.mcap_file import HEAD, MAGIC, McapFile, MessageFinder
 
+_REPEAT_BYTES = 1 << 26
+"""So far apart, at most, topics and bench are written again; a few kB each time."""
 _END = (  # of a file without a summary: all fields are zero
     HEAD.pack(Opcode.DATA_END, 4) + bytes(4) + HEAD.pack(Opcode.FOOTER, 20) + bytes(20) + MAGIC
 )
@@ -87,14 +90,15 @@ class Recorder:
             _Channel(TEMPERATURE_TOPIC, cdr.TEMPERATURE, cdr.temperature_message("accelerometer")),
         )
         self._head: float = math.inf  # bytes of the file before the first reading
+        metadata = bench.to_metadata()
+        self._described = metadata | {CHECKSUM_KEY: bench_checksum(metadata)}
         with self._storing():
             self._writer.start(profile="ros2")
-            metadata = bench.to_metadata()
-            self._writer.add_metadata(BENCH_RECORD, metadata | {CHECKSUM_KEY: bench_checksum(metadata)})
+            self._writer.add_metadata(BENCH_RECORD, self._described)
             for channel in self._channels[:2]:  # so that even a recording without samples says what it is
                 channel.register(self._writer)
             self._sync()
-        self._head = self.size
+        self._head = self._repeated_at = self.size
 
     def write(self, batch: Batch) -> None:
         """Adds the samples of ``batch``, the streams merged by their stamps. Raises InputError where they do not fit.
@@ -112,6 +116,7 @@ class Recorder:
         reached = np.concatenate([np.maximum.accumulate(stream.time_ns) for stream in streams])
         order = np.argsort(reached, kind="stable")
         with self._storing():
+            self._repeat_when_due()
             for i, stamp in zip(order.tolist(), stamps[order].tolist(), strict=True):
                 self._writer.add_message(ids[i], log_time=stamp, data=messages[i], publish_time=stamp)
             self.readings += len(batch.accel)
@@ -202,6 +207,16 @@ class Recorder:
             return cdr.pack(channel.kind, channel.template, stream)
         except cdr.CdrError as error:
             raise InputError(f"samples for {channel.topic} do not fit into {self.path}: {error}.") from error
+
+    def _repeat_when_due(self) -> None:
+        """Topics and bench once more in a file that has become twice as long, or longer by 64 MiB: of a file without
+        an end, they are all that says what its messages are, and damage to one place must not lose them."""
+        size = self._file.tell() if self._file else 0
+        if size >= min(2 * self._repeated_at, self._repeated_at + _REPEAT_BYTES):
+            self._writer.add_metadata(BENCH_RECORD, self._described)
+            for channel in self._channels:
+                channel.repeat(self._writer)
+            self._repeated_at = size
 
     def _sync_when_due(self) -> None:
         if time.monotonic() - self._flushed_s >= self._flush_s:
@@ -295,6 +310,7 @@ class _Channel:
     kind: cdr.MessageType
     template: bytes
     id: int = 0
+    schema: int = 0
 
     @property
     def width(self) -> int:
@@ -303,6 +319,13 @@ class _Channel:
     def register(self, writer: Writer) -> int:
         """The channel's number in the file, made known there on first use."""
         if not self.id:
-            schema = writer.register_schema(self.kind.name, "ros2msg", self.kind.schema.encode())
-            self.id = writer.register_channel(self.topic, "cdr", schema)
+            self.schema = writer.register_schema(self.kind.name, "ros2msg", self.kind.schema.encode())
+            self.id = writer.register_channel(self.topic, "cdr", self.schema)
         return self.id
+
+    def repeat(self, writer: Writer) -> None:
+        """Makes a channel that is known in the file known there again, in the chunk at hand."""
+        if self.id:  # the writer has no call for this: to register again is to make another channel
+            chunk = vars(writer)["_Writer__chunk_builder"]
+            chunk.add_schema(Schema(self.schema, self.kind.schema.encode(), "ros2msg", self.kind.name))
+            chunk.add_channel(Channel(self.id, self.topic, "cdr", {}, self.schema))

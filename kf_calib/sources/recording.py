@@ -20,13 +20,23 @@ from mcap.records import Metadata
 
 from kf_calib.bench import Bench
 from kf_calib.errors import BenchError, InputError
-from kf_calib.samples import Batch, Source, Stream
+from kf_calib.samples import Batch, Floats, Source, Stream
 from kf_calib.sources.bags import files_of
 from kf_calib.sources.cdr import JOINT_STATE, CdrError, Decoder
 from kf_calib.sources.contents import BENCH_RECORD, POSES, READINGS, TEMPERATURES, Contents, Parts, Role
 from kf_calib.sources.joints import Joints
-from kf_calib.sources.mcap_file import Block, DamagedError, McapFile, MessageFinder, Messages, Warn, parse
+from kf_calib.sources.mcap_file import (
+    MAX_CHUNK_MB,
+    Block,
+    DamagedError,
+    McapFile,
+    MessageFinder,
+    Messages,
+    Warn,
+    parse,
+)
 
+_MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
 GAP_RECORD = "kf_calib.gap"
 """Metadata record at a place where the link to the bench was down: after_ns, seconds, reason."""
 
@@ -39,6 +49,7 @@ class Recording:
     accel_scale: factor on the readings, one for all or one a sensor (9.80665 for a file in g). angle_scale: factor on
     the gimbal angles (0.017453 for a file in degrees).
     accel_topic, pose_topic, temperature_topic: which to use where the file has several of the kind.
+    max_chunk_mb: chunks that unpack to more are passed over, and told.
     Raises InputError where the file, or what it holds, cannot be used.
     """
 
@@ -52,12 +63,13 @@ class Recording:
         accel_topic: str | None = None,
         pose_topic: str | None = None,
         temperature_topic: str | None = None,
+        max_chunk_mb: float = MAX_CHUNK_MB,
     ) -> None:
         self.path = Path(path)
         self.fraction = 0.0
         self._accel_scale, self._angle_scale = np.asarray(accel_scale, float), angle_scale
         self._wanted = {READINGS: accel_topic, POSES: pose_topic, TEMPERATURES: temperature_topic}
-        self._parts = Parts(self.path, [McapFile(file) for file in files_of(self.path)])
+        self._parts = Parts(self.path, [McapFile(file, int(max_chunk_mb * (1 << 20))) for file in files_of(self.path)])
         self.warnings = [file.trouble for file in self._parts.files if file.trouble]
         self._parts.contents = [self._survey(file) for file in self._parts.files]
         self._accel = self._require(READINGS, "convert the readings to sensor_msgs/msg/Imu")
@@ -84,12 +96,12 @@ class Recording:
         joints = Joints(len(self.bench.axes), self.bench.joints, self.bench.axis_letters, self._warn_of_joints)
         decoders = _Decoders(parts, self.bench.pose_width, joints)
         for file, contents in zip(parts.files, parts.contents, strict=True):
-            passage = _Passage(contents, self.warnings.append)
+            passage = _Passage(contents, self._warn_of_damage)
             for end, batch in self._part(file, passage, decoders, growing and file is parts.files[-1]):
                 self.fraction = math.nan if growing else min((begun + end) / parts.size, 1.0)
                 if growing or len(batch.accel) or len(batch.pose) or len(batch.temperature):
                     yield batch
-            passage.account(file.summary.message_counts if file.summary else {})
+            passage.account(file.summary.message_counts if file.summary else {}, self.warnings.append)
             begun += file.size
         if joints.others and not joints.found:
             raise InputError(
@@ -105,23 +117,30 @@ class Recording:
         accel, pose = (passage.track(topic, decoders.of(role, topic)) for role, topic in
                        ((READINGS, self._accel), (POSES, self._pose)))  # fmt: skip
         temperature = None
-        for block in file.blocks(self.warnings.append, growing=growing):
+        for block in file.blocks(self._warn_of_damage, growing=growing):
             messages = passage.find(block)
             if not temperature and (topic := self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])):
                 temperature = passage.track(topic, decoders.of(TEMPERATURES, topic))
             readings, angles = accel.read(block, messages), pose.read(block, messages)
             batch = Batch(
-                Stream(readings.time_ns, readings.values * self._accel_scale),
-                Stream(angles.time_ns, angles.values * self._angle_scale),
+                _scaled(readings, self._accel_scale),
+                _scaled(angles, self._angle_scale),
                 temperature.read(block, messages) if temperature else Stream.empty(1),
             )
             yield block.end, batch
+
+    def _warn_of_damage(self, said: str) -> None:
+        if len(self.warnings) < _MOST_DAMAGES:
+            self.warnings.append(said)
+        elif len(self.warnings) == _MOST_DAMAGES:
+            self.warnings.append(f"{self.path} is damaged in more places than can be told.")
 
     def _warn_of_joints(self, said: str) -> None:
         self.warnings.append(f"{self.path}: topic {self._pose}: {said}.")
 
     def _survey(self, file: McapFile) -> Contents:
-        """Topics and bench: from the summary, else by reading on until no better choice of topics can come."""
+        """Topics and bench: from the summary, else by reading on until no better choice of topics can come, and where
+        something is damaged the bench."""
         contents, summary = Contents(file.path), file.summary
         if summary:
             contents.schemas = {schema.id: schema for schema in summary.schemas}
@@ -132,11 +151,12 @@ class Recording:
         lists_topics = bool(contents.channels and contents.schemas)
         if lists_topics and (contents.bench is not None or contents.bench_damaged):
             return contents
-        find = MessageFinder()
-        for block in file.blocks(warn=_ignore):
+        find, damage = MessageFinder(), list[str]()
+        for block in file.blocks(warn=damage.append):
             for opcode, content in find(block).others:
                 contents.add(opcode, content, warn=_ignore)
-            if lists_topics or self._is_settled(contents):
+            may_come_again = contents.bench is None and bool(contents.bench_damaged or damage)
+            if lists_topics or (self._is_settled(contents) and not may_come_again):
                 break
         return contents
 
@@ -229,11 +249,11 @@ class _Passage:
             self._met[group.channel] += len(group.at)
         return messages
 
-    def account(self, stated: Mapping[int, int]) -> None:
+    def account(self, stated: Mapping[int, int], warn: Warn) -> None:
         """Warns of messages that the file should have (``stated``, by channel) but that were not met, and of gaps."""
         if self._gaps:
             reason = self._gaps[0].get("reason", "unknown")
-            self.warn(
+            warn(
                 f"{self.contents.path}: the link to the bench was lost {len(self._gaps)} times (first: {reason})."
             )
         for track in self._tracks:
@@ -241,10 +261,10 @@ class _Passage:
             total = sum(stated.get(channel, 0) for channel in ids)
             lost = total - sum(self._met[channel] for channel in ids)
             if lost > 0:
-                self.warn(f"{self.contents.path}: {lost} of {total} messages of {track.topic} are lost.")
+                warn(f"{self.contents.path}: {lost} of {total} messages of {track.topic} are lost.")
         stray = sum(count for channel, count in self._met.items() if channel not in self.contents.channels)
         if stray:
-            self.warn(f"{self.contents.path}: {stray} messages belong to no topic the file defines and are left out.")
+            warn(f"{self.contents.path}: {stray} messages belong to no topic the file defines and are left out.")
 
 
 @dataclass(frozen=True)
@@ -268,6 +288,11 @@ class _Track:
         joined = sum((stream for _, stream in parts), Stream.empty(self.decode.width))
         order = np.argsort(np.concatenate([np.empty(0, np.int64), *(at for at, _ in parts)]))
         return Stream(joined.time_ns[order], joined.values[order])
+
+
+def _scaled(stream: Stream, scale: Floats | float) -> Stream:
+    with np.errstate(over="ignore"):  # what damage has made too large becomes infinite, and is counted as such
+        return Stream(stream.time_ns, stream.values * scale)
 
 
 def _gap(opcode: int, content: bytes) -> list[Mapping[str, str]]:

@@ -5,22 +5,32 @@ from __future__ import annotations
 import errno
 import os
 import random
+import re
 import resource
+import struct
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from long_runs import slow
 from made_recordings import BENCH, START_NS, assert_equal, count_missing, made_batch, read, record
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import Channel
+from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 
 from kf_calib.bench import Bench, parse_axes
-from kf_calib.errors import InputError, KfCalibError
+from kf_calib.errors import BenchError, InputError, KfCalibError
 from kf_calib.samples import Batch, Stream
-from kf_calib.sources.contents import CHECKSUM_KEY
+from kf_calib.sources import recorder as recorder_module
+from kf_calib.sources.contents import BENCH_RECORD, CHECKSUM_KEY
+from kf_calib.sources.mcap_file import HEAD, MAGIC
 from kf_calib.sources.recorder import Recorder
 from kf_calib.sources.recording import Recording
 
@@ -166,15 +176,18 @@ def test_a_closed_recorder_refuses_more_and_closes_twice(tmp_path: Path) -> None
         recorder.write(made_batch(10))
 
 
-def test_samples_reach_the_disk_by_the_clock_and_at_the_end_of_a_dwell(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
+def test_samples_reach_the_disk_by_the_clock_and_at_the_end_of_a_dwell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, now_s = tmp_path / "a.mcap", [0.0]
+    monkeypatch.setattr(recorder_module, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
     with Recorder(path, BENCH, flush_s=0.05) as recorder:
         recorder.write(made_batch(100))
         recorder.end_dwell()
         assert len(read(Recording(path)).accel) == 100
         recorder.write(made_batch(100, START_NS + 10**9))
         assert len(read(Recording(path)).accel) == 100
-        time.sleep(0.06)
+        now_s[0] = 0.06
         recorder.write(made_batch(100, START_NS + 2 * 10**9))
         assert len(read(Recording(path)).accel) == 300
 
@@ -226,6 +239,109 @@ def test_a_disk_that_fails_in_the_background_is_told_by_the_next_call(
             time.sleep(0.02)
             recorder.tick()
     assert len(read(Recording(tmp_path / "a.mcap")).accel) == 100
+
+
+@pytest.fixture(scope="module")
+def unfinished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a recorder leaves that is killed after its tenth chunk."""
+    path = tmp_path_factory.mktemp("unfinished") / "a.mcap"
+    recorder = Recorder(path, BENCH)
+    for k in range(10):
+        recorder.write(made_batch(100, START_NS + k * 10**9))
+        recorder.end_dwell()
+    killed = path.with_name("killed.mcap")
+    killed.write_bytes(path.read_bytes())
+    recorder.close()
+    return killed
+
+
+def first_chunk(data: bytes) -> tuple[int, int]:
+    """Bytes where the head of the file ends and the second chunk begins."""
+    starts, position = [], len(MAGIC)
+    while position < len(data):
+        opcode, length = HEAD.unpack_from(data, position)
+        starts += [position] if opcode == Opcode.CHUNK else []
+        position += HEAD.size + length
+    return starts[0], starts[1]
+
+
+@pytest.mark.parametrize("trials", [150, *slow(3000)])
+def test_a_flipped_bit_in_the_first_chunk_of_an_unfinished_file_costs_that_chunk(
+    unfinished: Path, tmp_path: Path, trials: int
+) -> None:
+    """All that said what the messages are stood there, and nowhere else."""
+    whole, data = read(Recording(unfinished)), unfinished.read_bytes()
+    assert len(whole.accel) == 1000
+    start, end = first_chunk(data)
+    rng, path = random.Random(8), tmp_path / "flipped.mcap"
+    head = [(start + byte, bit) for byte in range(HEAD.size) for bit in range(8)]
+    for place, bit in [*head, *((rng.randrange(start, end), rng.randrange(8)) for _ in range(trials))]:
+        flipped = bytearray(data)
+        flipped[place] ^= 1 << bit
+        path.write_bytes(flipped)
+        recording = Recording(path)
+        found = read(recording)
+        assert recording.bench == BENCH
+        count_missing(found, whole)
+        assert len(found.accel) >= 900, (place - start, bit, recording.warnings)
+        assert len(found.accel) == 1000 or len(recording.warnings) > 1
+
+
+def test_a_flipped_bit_in_the_first_description_of_an_unfinished_file_is_made_good_by_the_second(
+    unfinished: Path, tmp_path: Path
+) -> None:
+    """But for the letters that say that it is a description (14), and that it has a checksum (5)."""
+    whole, data = read(Recording(unfinished)), unfinished.read_bytes()
+    start, path = first_chunk(data)[0], tmp_path / "flipped.mcap"
+    refused = 0
+    for place in range(len(MAGIC), start, 2):
+        flipped = bytearray(data)
+        flipped[place] ^= 1 << (place % 8)
+        path.write_bytes(flipped)
+        try:
+            recording = Recording(path)
+        except BenchError:
+            refused += 1
+            continue
+        assert recording.bench == BENCH, place
+        found = read(recording)
+        assert len(found.accel) >= 900, (place, recording.warnings)
+        count_missing(found, whole)
+    assert refused <= 10
+
+
+def test_what_is_repeated_takes_little_room_and_bothers_no_reader(unfinished: Path, tmp_path: Path) -> None:
+    """Ten chunks: in the second, and each time that the file has doubled."""
+    with unfinished.open("rb") as file:
+        named = 0
+        with pytest.raises((EndOfFile, struct.error)):
+            for record in StreamReader(file, validate_crcs=True).records:
+                named += isinstance(record, Channel) and record.topic == "/accelerometer"
+    assert 3 <= named <= 5
+    path = tmp_path / "a.mcap"
+    with Recorder(path, BENCH, chunk_size=20_000) as recorder:
+        for k in range(100):
+            recorder.write(made_batch(100, START_NS + k * 10**9))
+            recorder.flush()
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert sum(1 for _ in reader.iter_messages()) == 100 * 115
+        summary = reader.get_summary()
+        assert len(summary.channels) == len(summary.schemas) == 3 == summary.statistics.channel_count
+        assert 5 <= sum(metadata.name == BENCH_RECORD for metadata in reader.iter_metadata()) <= 9
+    assert len(read(Recording(path)).accel) == 10_000
+
+
+def test_the_page_on_unfinished_files_opens_one_with_the_official_reader(
+    unfinished: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = Path(__file__).resolve().parents[2] / "docs" / "recordings.md"
+    (code,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    monkeypatch.chdir(unfinished.parent)
+    with pytest.raises(McapError), unfinished.open("rb") as file:
+        make_reader(file).get_summary()  # as the page says
+    exec(code, {})
+    assert capsys.readouterr().out == "1000 readings\n"
 
 
 CHILD = """

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import random
 import struct
+import subprocess
+import sys
 import time
 import tracemalloc
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import pytest
 import zstandard
+from long_runs import slow
 from made_recordings import (
     ACCEL,
     ANGLES,
@@ -404,7 +409,7 @@ def test_an_absurd_length_is_jumped_over_by_the_summary(path: Path, opcode: Opco
 
 @pytest.mark.parametrize("length", [1 << 60, 1 << 30, 5_000, 1, 0])
 def test_an_absurd_length_ends_an_unfinished_file(tmp_path: Path, length: int) -> None:
-    path = write_officially(tmp_path / "a.mcap", finish=False)
+    path = write_officially(tmp_path / "a.mcap", finish=False, compression=CompressionType.NONE)
     start = place_of(path.read_bytes(), Opcode.CHUNK, 6)
     recording = Recording(patched(path, start + 1, struct.pack("<Q", length)))
     missing = count_missing(read(recording), BATCH)
@@ -415,8 +420,8 @@ def test_an_absurd_length_ends_an_unfinished_file(tmp_path: Path, length: int) -
 @pytest.mark.parametrize(
     ("offset", "content", "says"),
     [
-        (25, struct.pack("<Q", 1 << 50), f"claims to hold {1 << 50} bytes"),
-        (25, struct.pack("<Q", 1 << 29), "sizes contradict"),
+        (25, struct.pack("<Q", 1 << 50), f"hold {1 << 30} MB, more than the 256 MB that --max-chunk-mb allows"),
+        (25, struct.pack("<Q", 1 << 27), "sizes contradict"),
         (37, struct.pack("<I", 1 << 31), "lengths contradict"),
         (41, b"zzzz", "compression 'zzzz' is not known"),
         (33, bytes([1, 2, 3, 4]), "checksum does not fit"),
@@ -435,10 +440,15 @@ def test_damage_to_the_head_of_a_chunk(path: Path, offset: int, content: bytes, 
 
 
 @pytest.mark.parametrize("states_size", [True, False])
-def test_a_chunk_that_unpacks_to_more_than_it_says(tmp_path: Path, states_size: bool) -> None:
+@pytest.mark.parametrize("packing", ["zstd", "lz4"])
+def test_a_chunk_that_unpacks_to_more_than_it_says(tmp_path: Path, states_size: bool, packing: str) -> None:
     path = write_officially(tmp_path / "a.mcap", finish=False)
-    packed = zstandard.ZstdCompressor(write_content_size=states_size).compress(bytes(300_000_000))
-    content = struct.pack("<QQQII", 0, 0, 1000, 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    if packing == "zstd":
+        packed = zstandard.ZstdCompressor(write_content_size=states_size).compress(bytes(300_000_000))
+    else:
+        packed = lz4.frame.compress(bytes(300_000_000), store_size=states_size)
+    content = struct.pack("<QQQII", 0, 0, 1000, 0, len(packing)) + packing.encode()
+    content += struct.pack("<Q", len(packed)) + packed
     path.write_bytes(path.read_bytes() + HEAD.pack(Opcode.CHUNK, len(content)) + content)
     recording = Recording(path)
     tracemalloc.start()
@@ -447,6 +457,82 @@ def test_a_chunk_that_unpacks_to_more_than_it_says(tmp_path: Path, states_size: 
     tracemalloc.stop()
     assert peak < 10_000_000
     assert "is damaged" in recording.warnings[1]
+
+
+def chunk_of(unit: bytes, size: int, packing: str) -> bytes:
+    """A chunk record that unpacks to ``size`` bytes, made piece by piece: this process must not need the room."""
+    piece = unit * ((1 << 16) // len(unit))
+    if packing == "zstd":
+        packer, begin = zstandard.ZstdCompressor().compressobj(), b""
+    else:
+        packer = lz4.frame.LZ4FrameCompressor()
+        begin = packer.begin()
+    count, crc, packed = size // len(piece), 0, [begin]
+    for _ in range(count):
+        packed.append(packer.compress(piece))
+        crc = zlib.crc32(piece, crc)
+    data = b"".join([*packed, packer.flush()])
+    head = struct.pack("<QQQII", 0, 0, count * len(piece), crc, len(packing)) + packing.encode()
+    content = head + struct.pack("<Q", len(data)) + data
+    return HEAD.pack(Opcode.CHUNK, len(content)) + content
+
+
+READ = """
+import sys, time
+from pathlib import Path
+from kf_calib.sources.recording import Recording
+def memory(key):
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith(key)).split()[1]) >> 10
+before, started = memory("VmRSS:"), time.monotonic()
+recording = Recording(sys.argv[1], max_chunk_mb=float(sys.argv[2]))
+print(sum(len(batch.accel) for batch in recording), memory("VmHWM:") - before, time.monotonic() - started)
+print(*recording.warnings, sep="\\n")
+"""
+BOMBS = {
+    "zeros": (bytes(1), "zstd"),
+    "every byte looks like a message": (b"\x05", "zstd"),
+    "a million empty records": (HEAD.pack(0x80, 0), "zstd"),
+    "empty messages": (HEAD.pack(Opcode.MESSAGE, 22) + bytes(22), "zstd"),
+    "empty schemas": (HEAD.pack(Opcode.SCHEMA, 0), "lz4"),
+}
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peak memory is read from /proc")
+@pytest.mark.parametrize("limit_mb", [32, *slow(256)])
+@pytest.mark.parametrize("name", BOMBS)
+def test_chunks_that_unpack_to_gigabytes_take_the_memory_allowed(tmp_path: Path, name: str, limit_mb: int) -> None:
+    """104 kB took 10.3 GB. One chunk is within the limit, twice, and one beyond it."""
+    unit, packing = BOMBS[name]
+    path = write_officially(tmp_path / "a.mcap", finish=False)
+    allowed, beyond = (chunk_of(unit, mb << 20, packing) for mb in (limit_mb, limit_mb * 5 // 4))
+    path.write_bytes(path.read_bytes() + beyond + 2 * allowed)
+    words = [sys.executable, "-c", READ, path, str(limit_mb)]
+    done = subprocess.run(words, capture_output=True, text=True, check=True, timeout=100)
+    first, *told = done.stdout.splitlines()
+    readings, peak_mb, seconds = map(float, first.split())
+    assert readings == 400
+    assert peak_mb < 4 * limit_mb + 60, f"{peak_mb} MB for chunks of {limit_mb} MB, in {seconds:.1f} s"
+    assert f"more than the {limit_mb} MB that --max-chunk-mb allows" in told[1]
+    assert len(told) <= 102
+
+
+def test_a_chunk_that_takes_more_in_the_file_than_allowed_is_passed_over(tmp_path: Path) -> None:
+    path = write_officially(tmp_path / "a.mcap", finish=False)
+    content = struct.pack("<QQQII", 0, 0, 10, 0, 4) + b"zstd" + struct.pack("<Q", 4 << 20) + bytes(4 << 20)
+    path.write_bytes(path.read_bytes() + HEAD.pack(Opcode.CHUNK, len(content)) + content)
+    recording = Recording(path, max_chunk_mb=1)
+    assert_equal(read(recording), BATCH)
+    assert "takes 4 MB, more than the 1 MB that --max-chunk-mb allows: it is passed over." in recording.warnings[1]
+
+
+@pytest.mark.parametrize("compression", [CompressionType.LZ4, CompressionType.ZSTD])
+def test_without_a_summary_the_next_chunk_is_found_behind_damage(tmp_path: Path, compression: CompressionType) -> None:
+    path = write_officially(tmp_path / "a.mcap", finish=False, compression=compression)
+    start = place_of(path.read_bytes(), Opcode.CHUNK, 6)
+    recording = Recording(patched(path, start + 1, struct.pack("<Q", 1 << 60)))
+    assert 20 <= count_missing(read(recording), BATCH) <= 30
+    assert f"is damaged at byte {start}" in recording.warnings[1] and "s of readings, are lost" in recording.warnings[1]
 
 
 @pytest.mark.parametrize(
