@@ -38,7 +38,6 @@ from kf_calib.sources.hidden import parse
 from kf_calib.sources.hidden.detectability import sized
 from kf_calib.sources.live import Status
 from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.plans import spread_plan
 from kf_calib.sources.recording import Recording
 from kf_calib.sources.sensors import GRADES
 from kf_calib.sources.simulator import Simulation
