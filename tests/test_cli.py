@@ -206,7 +206,7 @@ def test_bad_usage_is_one_sentence(run, recording: Path, tmp_path: Path, words: 
 def test_a_setting_that_cannot_be_kept_to_is_said(run, recording: Path) -> None:
     _, out, _ = run("replay", recording, "--settle-s", 1000, "--json")
     (said,) = json.loads(out)["warnings"]
-    assert said.startswith("11 dwells are too short to leave out 1000 s") and "of the shortest" in said
+    assert said.startswith("10 dwells are too short to leave out 1000 s") and "of the shortest" in said
     assert json.loads(run("replay", recording, "--json")[1])["warnings"] == []
 
 
