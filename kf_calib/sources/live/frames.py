@@ -175,6 +175,10 @@ class FrameReader:
                 values = contents.view("<f8").astype(float)
                 usable = np.isfinite(values).all(axis=1)
                 self._refuse(places[own][~usable], "a number is not finite")
+                if kind == ATTITUDE:
+                    is_zero = usable & ~values.any(axis=1)
+                    self._refuse(places[own][is_zero], "the quaternion is zero")
+                    usable &= ~is_zero
                 if kind == ACCEL:
                     self._follow(heads["number"].astype(np.int64))
                 yield _Found(kind, places[own][usable], heads["time_ns"][usable], values[usable])
@@ -183,7 +187,11 @@ class FrameReader:
         """Why frames of this kind with so many bytes of values cannot be used; a first pose settles what poses are."""
         if (heads["version"] != VERSION).any():
             return f"it is not of version {VERSION}"
-        if kind in (ANGLES, ATTITUDE) and size and size % 8 == 0 and not self.pose_width:
+        if not size:
+            return "it has no values"
+        if kind == ATTITUDE and size != 32:
+            return "it is not a quaternion"
+        if kind in (ANGLES, ATTITUDE) and size % 8 == 0 and not self.pose_width:
             self.has_angles, self.pose_width = kind == ANGLES, size // 8
         widths = {ACCEL: 3, TEMPERATURE: 1, ANGLES if self.has_angles else ATTITUDE: self.pose_width}
         if kind not in widths:
