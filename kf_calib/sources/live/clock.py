@@ -60,17 +60,22 @@ class Clock:
     @property
     def trouble(self) -> str:
         """What is wrong with the clock, or was last; "" where it always went on."""
+        if self._first is None or self._last_ns is None:
+            return ""
+        first_ns = int(self._first.time_ns[0])
         if self._unmoved >= _PERSISTS:
             return (
-                f"the bench's clock stands still: the last {self._unmoved} readings have the same stamp; they are "
-                "recorded and left out"
+                f"the bench's clock stands still at {(self._last_ns - first_ns) / _SECOND_NS:.3f} s after the first "
+                "reading; what comes is recorded and left out of the evaluation"
             )
-        if not self.restarts or self._first is None:
+        if not self.restarts:
             return ""
         last, count = self.restarts[-1], len(self.restarts)
-        since_s = (last.after_ns - int(self._first.time_ns[0])) / _SECOND_NS
-        times = f" ({count} times in all)" if count > 1 else ""
-        return f"{last.reason}, {since_s:.3f} s after the first reading{times}; the new stamps follow the last one"
+        times = f" (it was set {count} times in all)" if count > 1 else ""
+        return (
+            f"{last.reason}, {(last.after_ns - first_ns) / _SECOND_NS:.3f} s after the first reading{times}; the new "
+            "stamps are counted on from the last one"
+        )
 
     def push(self, batch: Batch, now_s: float) -> Batch:
         """The samples by their new stamps; now_s: when they came, the same for all where that says nothing."""

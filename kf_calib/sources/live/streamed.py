@@ -187,7 +187,9 @@ class StreamedFeed(Feed):
     def _read(self) -> None:
         try:
             self._read_on()
-        finally:  # whatever happened: else the run would wait for ever
+        except Exception as error:  # of a library or a driver, in a way that is not known
+            self.trouble = f"the link cannot be read on ({type(error).__name__}: {error})"
+        finally:  # else the run would wait for ever
             self._link.close()
             self._put(_Ended())
 
