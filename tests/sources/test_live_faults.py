@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -28,6 +31,7 @@ from kf_calib.sources.recording import Recording
 from kf_calib.sources.simulated import options_from_query, simulation
 
 SECOND_NS = 1_000_000_000
+TCP_REPAIR = 19  # Linux: a connection under repair sends nothing
 
 
 @contextmanager
@@ -132,6 +136,7 @@ def test_the_system_asks_a_silent_peer_within_seconds() -> None:
     assert found == [5, 2, 3, 11_000][: len(found)]
 
 
+@pytest.mark.slow
 def test_a_peer_that_was_switched_off_and_on_is_noticed() -> None:
     """Its connection is gone without a word; the system learns it when it asks (after 5 s; it was two hours)."""
 
@@ -140,9 +145,8 @@ def test_a_peer_that_was_switched_off_and_on_is_noticed() -> None:
         if number == 1:
             time.sleep(0.5)
             client.setsockopt(socket.IPPROTO_TCP, TCP_REPAIR, 1)
-            client.close()  # under repair: nothing is sent
+            client.close()
 
-    TCP_REPAIR = 19
     with socket.socket() as trial:
         try:
             trial.setsockopt(socket.IPPROTO_TCP, TCP_REPAIR, 1)
@@ -154,6 +158,34 @@ def test_a_peer_that_was_switched_off_and_on_is_noticed() -> None:
             wait_for(lambda: source.status.samples >= 100)
             assert time.monotonic() - began_s < 15.0
             assert source.status.reconnects == 1
+
+
+POWERLESS = """
+import subprocess, sys, time
+sys.path.insert(0, sys.argv[1])
+from test_live_faults import KEYS, csv_rows, open_live, serving, wait_for
+subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+with serving(lambda client, number: client.sendall(csv_rows(100 * number, 100 * number + 50))) as (url, _):
+    with open_live(f"{url}?silent=1000", KEYS) as source:
+        wait_for(lambda: source.status.samples == 50)
+        subprocess.run(["ip", "link", "set", "lo", "down"], check=True)
+        began_s = time.monotonic()
+        wait_for(lambda: source.status.link == "lost")
+        print(time.monotonic() - began_s)
+        subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+        wait_for(lambda: source.status.samples == 100)
+"""
+
+
+@pytest.mark.slow
+def test_a_loss_of_power_is_noticed_in_seconds() -> None:
+    """A network of its own, which is cut: neither FIN nor RST. It took 119 minutes."""
+    alone = ["unshare", "-n"]
+    if shutil.which("unshare") is None or subprocess.run([*alone, "ip", "link"], capture_output=True).returncode:
+        pytest.skip("needs Linux and the rights of root")
+    command = [*alone, sys.executable, "-c", POWERLESS, str(Path(__file__).parent)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert float(done.stdout) < 15.0
 
 
 def test_a_link_that_fails_in_a_way_of_its_own_is_told_and_what_came_is_kept() -> None:
