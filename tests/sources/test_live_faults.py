@@ -196,6 +196,11 @@ def test_a_link_that_fails_in_a_way_of_its_own_is_told_and_what_came_is_kept() -
     assert "unknown" in source.status.trouble
 
 
+def test_a_first_block_that_is_large_is_read_to_its_end() -> None:
+    with scripted(json_rows(0, 5000)) as source:
+        assert numbers(read(source)) == list(range(5000))
+
+
 # -- the end of a run --
 
 

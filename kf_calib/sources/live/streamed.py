@@ -76,6 +76,7 @@ class StreamedFeed(Feed):
         self._inbox = deque[bytes | Lost | Regained | _Ended]()
         self._inbox_bytes = 0
         self._arrived = threading.Condition()
+        self._items = self._understood()  # one: what is left of a block when the bench is known is not lost
         try:
             link.open()
         except OSError as error:
@@ -90,7 +91,7 @@ class StreamedFeed(Feed):
     def begin(self) -> Bench:
         self._reader.start()
         ahead, first_s = 0, math.inf
-        for item in self._understood():
+        for item in self._items:
             if isinstance(item, Batch):
                 ahead += len(item.accel) + len(item.temperature)
                 first_s = min(first_s, time.monotonic()) if ahead else first_s
@@ -120,7 +121,7 @@ class StreamedFeed(Feed):
         while self._ahead:
             item = self._ahead.popleft()
             yield _widened(item, width) if isinstance(item, Batch) else item
-        for item in self._understood():
+        for item in self._items:
             yield _widened(item, width) if isinstance(item, Batch) else item
 
     @property
