@@ -310,6 +310,24 @@ def test_damaged_stamps_and_pauses_set_no_clock() -> None:
     assert (source.status.clock_restarts, source.status.left_out) == (0, 3)
 
 
+@pytest.mark.parametrize("back_s", [5.5, 7.0, 9.9, 30.0])
+@pytest.mark.parametrize("size", [1, 1000])
+def test_one_stamp_that_lies_back_sets_no_clock(back_s: float, size: int) -> None:
+    stamps = at(0, 1000).accel.time_ns.copy()
+    stamps[900] -= round(back_s * SECOND_NS)
+    clock = Clock()
+    for k in range(0, 1000, size):
+        clock.push(Batch(Stream(stamps[k : k + size], np.zeros((len(stamps[k : k + size]), 3))), at(0, 0).pose), 0.0)
+    assert (clock.restarts, clock.left_out) == ([], 1)
+
+
+def test_readings_that_are_seldom_are_no_leaps() -> None:
+    stamps, clock = START_NS + 15 * SECOND_NS * np.arange(20), Clock()
+    parts = [clock.push(Batch(Stream(stamps[k : k + 1], np.ones((1, 3))), at(0, 0).pose), 0.0) for k in range(20)]
+    got = [t for part in [*parts, clock.rest()] for t in part.accel.time_ns.tolist()]
+    assert got == stamps.tolist() and clock.left_out == 0
+
+
 def test_a_bench_that_sends_all_again_has_set_no_clock() -> None:
     """A server of a file that begins it again with each connection."""
     with LiveSource(Given(at(0, 1000), at(0, 1000), at(10, 1000))) as source:

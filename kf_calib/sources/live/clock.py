@@ -6,6 +6,7 @@ Without this, all readings after a restart would be stamped before those that ca
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -34,7 +35,7 @@ class Restart:
     @property
     def reason(self) -> str:
         way = "back" if self.by_ns < 0 else "ahead"
-        return f"the bench's clock jumped {way} by {abs(self.by_ns) / _SECOND_NS:.6g} s"
+        return f"the bench's clock jumped {way} by {abs(self.by_ns) / _SECOND_NS:.1f} s"
 
 
 class Clock:
@@ -110,9 +111,9 @@ class Clock:
         stamps, sound = np.empty_like(stream.time_ns), np.zeros(len(raw), bool)
         for i, own in enumerate(raw):
             if not self._follows(own + self._shifts[-1]) and not self._repeats(stream[i : i + 1]):
-                agreeing = _agreeing(raw[i : i + _PERSISTS])
+                agreeing, needed = self._agreeing(raw[i : i + _PERSISTS])
                 is_last = i + agreeing == len(raw)
-                if agreeing == _PERSISTS or (final and is_last and own + self._shifts[-1] > (self._last_ns or 0)):
+                if agreeing >= needed or (final and is_last and self._is_pause(own)):
                     self._go_on_at(own, now_s)
                 elif is_last and not final:
                     self._held = stream[i:]
@@ -126,6 +127,20 @@ class Clock:
     def _follows(self, stamp: int) -> bool:
         return self._last_ns is None or bool(_fit(np.array(stamp - self._last_ns)))
 
+    def _is_pause(self, raw: int) -> bool:
+        return self._last_ns is not None and 0 < raw + self._shifts[-1] - self._last_ns < _SET_NS
+
+    def _agreeing(self, raw: list[int]) -> tuple[int, int]:
+        """How many of these stamps, from the first on, go on from each other and not from the last, and how many have
+        to for a clock that was set; after a pause one more is enough."""
+        longest_ns, needed = (_SET_NS, 2) if self._is_pause(raw[0]) else (_LEAP_NS, _PERSISTS)
+        count = 1
+        for before, stamp in pairwise(raw):
+            if not -_BACK_NS < stamp - before < longest_ns or self._follows(stamp + self._shifts[-1]):
+                break
+            count += 1
+        return count, needed
+
     def _repeats(self, reading: Stream) -> bool:
         """Whether the bench sends again what it has sent, from its first reading on: no clock was set."""
         assert self._first is not None
@@ -137,10 +152,10 @@ class Clock:
     def _go_on_at(self, raw: int, now_s: float) -> None:
         """The stamps go on here: after a pause as they are, else close behind the last."""
         assert self._last_ns is not None
-        step = raw + self._shifts[-1] - self._last_ns
-        if 0 < step < _SET_NS:
-            self._last_ns += step
+        if self._is_pause(raw):
+            self._last_ns = raw + self._shifts[-1]
             return
+        step = raw + self._shifts[-1] - self._last_ns
         begin = self._last_ns + round(max(now_s - self._came_s, _BREAK_S) * _SECOND_NS)
         self.restarts.append(Restart(self._last_ns, begin, step, begin - raw))
         self._shifts.append(begin - raw)
@@ -192,9 +207,3 @@ class _Follower:
 def _fit(steps: Times) -> Mask:
     """Which steps from stamp to stamp are those of a clock that goes on."""
     return (steps > -_BACK_NS) & (steps < _LEAP_NS)
-
-
-def _agreeing(stamps: list[int]) -> int:
-    """How many of these, from the first on, follow each other."""
-    steps = _fit(np.diff(np.array(stamps, np.int64)))
-    return len(stamps) if steps.all() else 1 + int(np.argmin(steps))

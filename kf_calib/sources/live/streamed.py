@@ -7,6 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 from kf_calib.bench import Bench
@@ -191,7 +192,8 @@ class StreamedFeed(Feed):
         except Exception as error:  # of a library or a driver, in a way that is not known
             self.trouble = f"the link cannot be read on ({type(error).__name__}: {error})"
         finally:  # else the run would wait for ever
-            self._link.close()
+            with suppress(Exception):
+                self._link.close()
             self._put(_Ended())
 
     def _read_on(self) -> None:
