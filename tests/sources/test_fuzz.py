@@ -113,15 +113,16 @@ TRIED = Counter[str]()
 
 
 def try_all(form: str, inputs: list[bytes], *, is_begun: bool) -> None:
-    """The inputs together, then a sound one, of which all must come."""
+    """The inputs one by one, then a sound one, of which all must come; and all at once, of which the same must come."""
     chain, end = _Chain(form, is_begun=is_begun), b"\0" if form == "frames" else b"\n"
     account = chain.protocol.account
-    for data in inputs:
-        chain.push(data + end)
-    chain.push(end)
+    came = sum([chain.push(data + end) for data in [*inputs, b""]])
     before = account.malformed
     got, refused = chain.push(_sound(form, 1)), account.malformed - before
     assert (got, refused) == (1, 0) or (not is_begun and refused == 1)  # poses may have been settled otherwise
+    at_once = _Chain(form, is_begun=is_begun)
+    assert at_once.push(b"".join(data + end for data in [*inputs, b""]) + _sound(form, 1)) == came + got
+    assert at_once.protocol.account.malformed == account.malformed
     assert account.malformed <= account.lines and all(map(str.isprintable, account.sentences()))
     TRIED[form] += len(inputs)
 
@@ -154,9 +155,11 @@ def test_none_of_a_hundred_thousand_inputs_ends_a_run(form: str) -> None:
     ("form", "data"),
     [
         ("json", b'{"time_s": 1.234e-01700001234567, "accel_mps2": [1, 2, 3]}'),
+        ("json", b'{"time_s": 1.5, "accel_mps2": [1, 2, 1.234e-011700001234567890123]}'),
         ("json", b'{"time_ns": 1, "accel_mps2": [1, 2, 1.234e-01700001234567]}'),
         ("json", b'{"time_ns": 1e99999999999999999999, "accel_mps2": [1, 2, 3]}'),
         ("csv", b"1.234e-01700001234567,1,2,3,4,5,6,7"),
+        ("csv", b"1.5,1,2,1.234e-01700001234567,4,5,6,7"),
         ("frames", _frame(frames.ANGLES, 0, START_NS, b"")),
         ("frames", _frame(frames.ATTITUDE, 0, START_NS, b"")),
         ("frames", _frame(frames.ACCEL, 0, START_NS, b"")),
@@ -164,3 +167,6 @@ def test_none_of_a_hundred_thousand_inputs_ends_a_run(form: str) -> None:
 )
 def test_inputs_that_ended_runs(form: str, data: bytes, is_begun: bool) -> None:
     try_all(form, [data], is_begun=is_begun)
+    chain = _Chain(form, is_begun=is_begun)
+    assert chain.push(data + (b"\0" if form == "frames" else b"\n")) == 0
+    assert chain.protocol.account.malformed == 1
