@@ -72,7 +72,7 @@ FRAMES = st.builds(_frame, KINDS, st.integers(0, 2**32 - 1), st.integers(-(2**63
 INPUTS = {
     "json": bent(JSON_LINES.map(lambda line: line.encode(errors="replace"))),
     "csv": bent(CSV_LINES.map(lambda line: line.encode(errors="replace"))),
-    "frames": bent(FRAMES),
+    "frames": st.one_of(bent(FRAMES), bent(FRAMES), st.binary(max_size=3)),
 }
 
 

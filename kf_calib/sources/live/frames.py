@@ -141,7 +141,7 @@ class FrameReader:
     def _settle(self, frames: list[bytes]) -> None:
         """Learns from the first pose of all what poses are: below, frames are read by their lengths."""
         for frame in frames:
-            if not (1 < frame[0] and len(frame) <= _SHORT + 1 and frame[1] in (ANGLES, ATTITUDE)):
+            if not (HEAD.size < len(frame) <= _SHORT + 1 and frame[0] > 1 and frame[1] in (ANGLES, ATTITUDE)):
                 continue
             body = _sound_body(frame)
             size = len(body) - HEAD.size - _CRC.size if body else 0
