@@ -6,7 +6,9 @@ It prints where it listens, waits for the first client, sends the run in real ti
 what became of every reading as one JSON object. Faults are drawn from ``--seed``: drop (a reading is not sent), garbage
 (random bytes between two samples), damage (a byte of a sample is changed), stall (nothing for a while, the samples
 follow at once), burst (half a second of samples at once), disconnect (the connection ends amid a sample; what comes
-before the next client is lost), step (the clock jumps by up to 5 s either way). Listens on 127.0.0.1 only.
+before the next client is lost), vanish (as a loss of power: nothing comes over the connection any more, which does not
+end), step (the clock jumps by up to 5 s either way), restart (the clock starts at zero again), freeze (the clock stands
+still for a while). Listens on 127.0.0.1 only.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from kf_calib.sources.live import frames
 from kf_calib.sources.simulated import options_from_query, simulation
 from kf_calib.sources.simulator import START_NS, Simulation
 
-FAULTS = ("drop", "garbage", "damage", "stall", "burst", "disconnect", "step")
+FAULTS = ("drop", "garbage", "damage", "stall", "burst", "disconnect", "vanish", "step", "restart", "freeze")
 _STEP_S = 0.001
 _KINDS = (frames.ACCEL, frames.ANGLES, frames.TEMPERATURE)
 
@@ -42,6 +44,7 @@ class Tcp:
         self._server = socket.create_server(("127.0.0.1", port))
         self.url = f"socket://127.0.0.1:{self._server.getsockname()[1]}"
         self._client: socket.socket | None = None
+        self._vanished = list[socket.socket]()
 
     def wait(self, seconds: float) -> bool:
         """Whether a client is there, which is waited for."""
@@ -70,8 +73,16 @@ class Tcp:
             self._client.close()
             self._client = None
 
+    def vanish(self) -> None:
+        """Leaves the client with a connection over which nothing comes any more."""
+        if self._client is not None:
+            self._vanished.append(self._client)
+            self._client = None
+
     def close(self) -> None:
         self.disconnect()
+        for client in self._vanished:
+            client.close()
         self._server.close()
 
 
@@ -108,6 +119,9 @@ class Pty:
 
     def disconnect(self) -> None:
         """A terminal has no connection to end."""
+
+    def vanish(self) -> None:
+        """A terminal has no connection to lose."""
 
     def close(self) -> None:
         time.sleep(0.2)  # what is not read when a terminal hangs up is lost
@@ -183,6 +197,7 @@ class Emulator:
         self._rng = np.random.default_rng(seed)
         self._numbers = dict.fromkeys(_KINDS, 0)
         self._shift_ns = 0
+        self._frozen: tuple[int, int] | None = None  # the stamp that stays, and until which time of the run
         self._hold_until_s = 0.0
         self._away_until_s = 0.0
         self.stopping = False
@@ -253,6 +268,11 @@ class Emulator:
         if self._keep:
             self.ledger.stamps_ns += stamps
 
+    def _stamp(self, time_ns: int) -> int:
+        if self._frozen and time_ns < self._frozen[1]:
+            return self._frozen[0]
+        return time.time_ns() if self._wall else time_ns + self._shift_ns
+
     def _with_fault(
         self, kind: int, time_ns: int, values: list[float], is_here: bool
     ) -> Iterator[tuple[bytes, int | None, bool]]:
@@ -260,7 +280,7 @@ class Emulator:
         is_reading = kind == frames.ACCEL
         self.ledger.readings += is_reading
         number, self._numbers[kind] = self._numbers[kind], self._numbers[kind] + 1
-        stamp = time.time_ns() if self._wall else time_ns + self._shift_ns
+        stamp = self._stamp(time_ns)
         data = FORMATS[self._form](kind, number, stamp, values)
         whole = (data, stamp if is_reading else None, False)
         if not (self._faults and is_here and self._left > 0 and self._rng.random() < 1.0 / self._every):
@@ -295,6 +315,16 @@ class Emulator:
                 self.ledger.unsent += is_reading
                 self._away_until_s = time.monotonic() + self._outage_s * float(self._rng.random())
                 yield data[: len(data) // 2], None, True
+            case "vanish":
+                self._away_until_s = time.monotonic() + self._outage_s * float(self._rng.random())
+                yield whole
+                self._outlet.vanish()
+            case "restart":
+                self._shift_ns = -time_ns
+                yield whole
+            case "freeze":
+                self._frozen = (stamp, time_ns + int(self._rng.uniform(0.05e9, 0.5e9)))
+                yield whole
             case _:
                 self._shift_ns += int(self._rng.uniform(-5e9, 5e9))
                 yield whole

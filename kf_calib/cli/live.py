@@ -253,17 +253,27 @@ def _watched(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
             _on_screen(run, name, record)
         except OSError as error:  # the terminal is gone: the run is not
             run.print.fail(error)
-    told = ""
+    told = dict[str, str]()
     while run.going:
         with contextlib.suppress(queue.Empty):
             judgement = run.judgements.get(timeout=_REFRESH_S)
             _print(run, judgement, as_json)
         run.warn()
-        standing = run.session.standing if run.session else None
-        said = (standing.problem or standing.notice) if standing else ""
-        if said and said != told and not as_json:
-            _echo(run, said)
-        told = said
+        now = _said(run)
+        for about, said in now.items():
+            if said and said != told.get(about) and not as_json:
+                _echo(run, said)
+        told = now
+
+
+def _said(run: _Run) -> dict[str, str]:
+    """What a user must know at once, about what: said again where it changes."""
+    standing, status = run.session.standing if run.session else None, run.source.status
+    return {
+        "evaluation": (standing.problem or standing.notice) if standing else "",
+        "link": "the link is lost, and tried again" if status.link == "lost" else "",
+        "clock": status.clock_trouble,
+    }
 
 
 def _print(run: _Run, judgement: Judgement, as_json: bool) -> None:

@@ -11,7 +11,16 @@ from decimal import Decimal
 from operator import mul
 
 from kf_calib.errors import InputError
-from kf_calib.sources.line_parts import ACCEL_UNITS, TIME_DECIMALS, Account, LineError, LineReader, Rows, stamp_ns
+from kf_calib.sources.line_parts import (
+    ACCEL_UNITS,
+    TIME_DECIMALS,
+    Account,
+    LineError,
+    LineReader,
+    Rows,
+    number_of,
+    stamp_ns,
+)
 
 _ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
 _USUAL_GIMBALS = ("outer", "middle", "inner")
@@ -33,7 +42,7 @@ class _Columns:
             if any(cells):
                 raise LineError("some components of a vector are missing")
             return None
-        values = list(map(float, cells))
+        values = list(map(number_of, cells))
         if not math.isfinite(sum(values)):
             raise LineError("a number is not finite")
         return list(map(mul, values, self.factors))

@@ -121,10 +121,19 @@ class LineReader(ABC):
         """Adds what one line holds, all of it or nothing; raises LineError or one of ``_faults``."""
 
 
+def number_of(text: str) -> float:
+    """The number that a text says. Raises LineError where it is too small for one, as when two have run together:
+    1.234e-01700001234567 is no zero."""
+    value = float(text)
+    if value == 0.0 and float(text.lower().partition("e")[0]):
+        raise LineError("a number is out of range")
+    return value
+
+
 def stamp_ns(number: int | Decimal, decimals: int) -> int:
     """A stamp in whole nanoseconds from one in a unit of 10^decimals ns, exactly; halves go to the even one."""
     if isinstance(number, Decimal):
-        if not number.is_finite() or number.adjusted() > 20:  # before an exponent is written out in full
+        if not number.is_finite() or abs(number.adjusted()) > 20:  # before an exponent is written out in full
             raise LineError("the time stamp is out of range")
         nanoseconds = round(number.scaleb(decimals))
     else:

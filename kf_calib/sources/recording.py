@@ -39,6 +39,9 @@ from kf_calib.sources.mcap_file import (
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
 GAP_RECORD = "kf_calib.gap"
 """Metadata record at a place where the link to the bench was down: after_ns, seconds, reason."""
+CLOCK_RECORD = "kf_calib.clock"
+"""Where the bench's clock was set: after_ns, begin_ns (the first new stamp), shift_ns (from there on), reason."""
+_MARKS = {GAP_RECORD: "the link to the bench was lost", CLOCK_RECORD: "the bench's clock was set during the run"}
 
 
 class Recording:
@@ -231,7 +234,7 @@ class _Passage:
         self._find = MessageFinder()
         self._tracks: list[_Track] = []
         self._met = Counter[int]()
-        self._gaps = list[Mapping[str, str]]()
+        self._marks = list[Metadata]()
 
     def track(self, topic: str, decode: Decoder) -> _Track:
         track = _Track(self.contents, topic, decode)
@@ -242,7 +245,7 @@ class _Passage:
         messages = self._find(block)
         for opcode, content in messages.others:
             self.contents.add(opcode, content, self.warn)
-            self._gaps += _gap(opcode, content)
+            self._marks += _mark(opcode, content)
         if messages.lost:
             self.warn(f"{self.contents.path}: {messages.lost} bytes of records before byte {block.end} make no sense.")
         for group in messages.groups:
@@ -251,11 +254,10 @@ class _Passage:
 
     def account(self, stated: Mapping[int, int], warn: Warn) -> None:
         """Warns of messages that the file should have (``stated``, by channel) but that were not met, and of gaps."""
-        if self._gaps:
-            reason = self._gaps[0].get("reason", "unknown")
-            warn(
-                f"{self.contents.path}: the link to the bench was lost {len(self._gaps)} times (first: {reason})."
-            )
+        for name, what in _MARKS.items():
+            if marks := [mark for mark in self._marks if mark.name == name]:
+                reason = marks[0].metadata.get("reason", "unknown")
+                warn(f"{self.contents.path}: {what} {len(marks)} times (first: {reason}).")
         for track in self._tracks:
             ids = self.contents.ids(track.topic)
             total = sum(stated.get(channel, 0) for channel in ids)
@@ -295,15 +297,15 @@ def _scaled(stream: Stream, scale: Floats | float) -> Stream:
         return Stream(stream.time_ns, stream.values * scale)
 
 
-def _gap(opcode: int, content: bytes) -> list[Mapping[str, str]]:
-    """The facts of a record that marks a gap; none of any other."""
+def _mark(opcode: int, content: bytes) -> list[Metadata]:
+    """A record that says what happened to the link or the clock; none of any other."""
     if opcode != Opcode.METADATA:
         return []
     try:
         record = parse(Metadata.read, content)
     except DamagedError:  # told already
         return []
-    return [record.metadata] if record.name == GAP_RECORD else []
+    return [record] if record.name in _MARKS else []
 
 
 def _ignore(_: str) -> None:

@@ -106,12 +106,14 @@ def _link(standing: Standing, status: Status | None, name: str, recording: str) 
     out.append(status.link, {"live": "green", "lost": "bold red"}.get(status.link, "yellow"))
     out.append(f"  {status.rate_hz:.0f} Hz  {status.samples} readings")
     counts = {"gaps": status.gaps, "refused": status.refused, "reconnects": status.reconnects,
-              "missing": status.missing, "dropped": status.dropped}  # fmt: skip
+              "missing": status.missing, "left out": status.left_out, "dropped": status.dropped}  # fmt: skip
     for word, count in counts.items():
+        style = "red" if word in ("missing", "left out", "dropped") else "yellow"
         if count or word in ("gaps", "refused"):
-            out.append(f"  {count} {word}", "red" if word in ("missing", "dropped") else "yellow" if count else "")
-    if status.trouble:
-        out.append(f"\n{status.trouble}", "bold red")
+            out.append(f"  {count} {word}", style if count else "")
+    for trouble in (status.trouble, status.clock_trouble):
+        if trouble:
+            out.append(f"\n{trouble}", "bold red")
     if status.recording_trouble:
         out.append(f"\nRECORDING HAS STOPPED: {status.recording_trouble}", "bold white on red")
     if recording and not status.recording_trouble:

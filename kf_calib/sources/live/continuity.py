@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from kf_calib.samples import Times
@@ -35,12 +37,17 @@ class Continuity:
         """The link broke here: whatever the next stamp is, there is a gap before it."""
         self._is_cut = True
 
-    def add(self, time_ns: Times) -> None:
-        """The stamps (n,) of further readings."""
+    def add(self, time_ns: Times, begins: Sequence[int] = ()) -> None:
+        """The stamps (n,) of further readings. begins: those of them where the bench's clock was set: each is a gap,
+        and how many readings it had room for is not known."""
         if not len(time_ns):
             return
         steps = np.diff(time_ns, prepend=time_ns[0] if self.last_ns is None else self.last_ns)
-        steps = steps[1:] if self.last_ns is None else steps
+        is_known = ~np.isin(time_ns, begins)
+        is_known[0] &= self.last_ns is not None
+        self.gaps += len(begins)
+        self._is_cut &= not begins
+        steps = steps[is_known]
         self.last_ns = int(time_ns[-1])
         if self._is_cut and len(steps):
             self._is_cut = False

@@ -138,7 +138,20 @@ class FrameReader:
             self._account.refuse(self._account.lines, "the link broke in it")
         self._tail = b""
 
+    def _settle(self, frames: list[bytes]) -> None:
+        """Learns from the first pose of all what poses are: below, frames are read by their lengths."""
+        for frame in frames:
+            if not (HEAD.size < len(frame) <= _SHORT + 1 and frame[0] > 1 and frame[1] in (ANGLES, ATTITUDE)):
+                continue
+            body = _sound_body(frame)
+            size = len(body) - HEAD.size - _CRC.size if body else 0
+            if body and body[1] == VERSION and size and size % 8 == 0 and (frame[1] == ANGLES or size == 32):
+                self.has_angles, self.pose_width = frame[1] == ANGLES, size // 8
+                return
+
     def _read(self, frames: list[bytes], first: int) -> Batch:
+        if not self.pose_width:
+            self._settle(frames)
         lengths = np.fromiter(map(len, frames), np.int64, len(frames))
         found = list[_Found]()
         for length in np.unique(lengths).tolist():
@@ -175,24 +188,30 @@ class FrameReader:
                 values = contents.view("<f8").astype(float)
                 usable = np.isfinite(values).all(axis=1)
                 self._refuse(places[own][~usable], "a number is not finite")
+                if kind == ATTITUDE:
+                    is_zero = usable & ~values.any(axis=1)
+                    self._refuse(places[own][is_zero], "the quaternion is zero")
+                    usable &= ~is_zero
                 if kind == ACCEL:
                     self._follow(heads["number"].astype(np.int64))
                 yield _Found(kind, places[own][usable], heads["time_ns"][usable], values[usable])
 
     def _misfit(self, kind: int, size: int, heads: NDArray[np.void]) -> str | None:
-        """Why frames of this kind with so many bytes of values cannot be used; a first pose settles what poses are."""
+        """Why frames of this kind with so many bytes of values cannot be used."""
         if (heads["version"] != VERSION).any():
             return f"it is not of version {VERSION}"
-        if kind in (ANGLES, ATTITUDE) and size and size % 8 == 0 and not self.pose_width:
-            self.has_angles, self.pose_width = kind == ANGLES, size // 8
+        if not size:
+            return "it has no values"
+        if kind == ATTITUDE and size != 32:
+            return "it is not a quaternion"
         widths = {ACCEL: 3, TEMPERATURE: 1, ANGLES if self.has_angles else ATTITUDE: self.pose_width}
         if kind not in widths:
             return "it is of a kind that is not known, or not like the poses before it"
         return None if size == 8 * widths[kind] else f"it has {size} bytes of values"
 
     def _read_long(self, frame: bytes, place: int) -> None:
-        body = uncobs(frame) if len(frame) <= _LONGEST else None
-        if body is None or len(body) < HEAD.size + _CRC.size or _CRC.unpack(body[-4:])[0] != zlib.crc32(body[:-4]):
+        body = _sound_body(frame) if len(frame) <= _LONGEST else None
+        if body is None:
             self._account.refuse(place, "its checksum does not fit")
         elif body[0] != BENCH:
             self._account.refuse(place, f"it has {len(body) - HEAD.size - 4} bytes of values")
@@ -221,6 +240,14 @@ class FrameReader:
     def _refuse(self, places: Places, reason: str) -> None:
         for place in places.tolist():
             self._account.refuse(place, reason)
+
+
+def _sound_body(frame: bytes) -> bytes | None:
+    """A frame decoded, with its checksum; None where that does not fit."""
+    body = uncobs(frame)
+    if body is None or len(body) < HEAD.size + _CRC.size or _CRC.unpack(body[-4:])[0] != zlib.crc32(body[:-4]):
+        return None
+    return body
 
 
 def _stream(found: Sequence[_Found], kind: int, width: int) -> Stream:

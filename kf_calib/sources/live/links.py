@@ -6,6 +6,7 @@ raises OSError where the link broke, EOFError where it ended.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import socket
@@ -21,13 +22,17 @@ from kf_calib.sources.live.feed import IDLE_S
 _BLOCK_BYTES = 1 << 18
 _WAIT_S = 0.1
 _CONNECT_S = 5.0
+_SILENT_S = 5  # before the other side is asked whether it is still there
+_ASKED = (2, 3)  # every so many seconds, and so many times
 
 
 class Link(ABC):
-    """reopens: it may come back after it broke. patient: what is not read yet stays where it is."""
+    """reopens: it may come back after it broke. patient: what is not read yet stays where it is. breaks_unseen: the
+    other side may be gone without a sign."""
 
     reopens = True
     patient = False
+    breaks_unseen = False
     starts_amid = False
     """What is read first after opening may be the end of a line."""
 
@@ -44,13 +49,18 @@ class Link(ABC):
 class Tcp(Link):
     """A TCP server. (pyserial's socket:// drops what came before it was first read, and what came before the end.)"""
 
+    breaks_unseen = True
+
     def __init__(self, host: str, port: int) -> None:
         self._address = (host, port)
         self._socket: socket.socket | None = None
 
     def open(self) -> None:
-        self._socket = socket.create_connection(self._address, timeout=_CONNECT_S)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # a peer that lost its power says nothing
+        try:
+            self._socket = socket.create_connection(self._address, timeout=_CONNECT_S)
+        except UnicodeError as error:  # a name that cannot be one
+            raise OSError(str(error)) from None
+        _ask_when_silent(self._socket)
         self._socket.settimeout(_WAIT_S)
 
     def read(self) -> bytes:
@@ -69,6 +79,24 @@ class Tcp(Link):
             self._socket = None
 
 
+def _ask_when_silent(connection: socket.socket) -> None:
+    """Has the system ask the other side, when it is silent, whether it is still there: one that lost its power, or
+    its cable, says nothing. It is then known after 11 s, where the system lets this be set (else hours)."""
+    every_s, times = _ASKED
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    settings = {
+        "TCP_KEEPIDLE": _SILENT_S,
+        "TCP_KEEPALIVE": _SILENT_S,  # its name on macOS
+        "TCP_KEEPINTVL": every_s,
+        "TCP_KEEPCNT": times,
+        "TCP_USER_TIMEOUT": 1000 * (_SILENT_S + every_s * times),
+    }
+    for name, value in settings.items():
+        if (option := getattr(socket, name, None)) is not None:
+            with contextlib.suppress(OSError):  # a system may know the name and not the option
+                connection.setsockopt(socket.IPPROTO_TCP, option, value)
+
+
 class SerialPort(Link):
     """Whatever pyserial opens: /dev/ttyUSB0, COM3, rfc2217://host:port, loop://."""
 
@@ -76,6 +104,7 @@ class SerialPort(Link):
 
     def __init__(self, url: str, settings: Mapping[str, Any]) -> None:
         self._url, self._settings = url, settings
+        self.breaks_unseen = url.startswith(("rfc2217://", "socket://"))
         self.port: Any = None
 
     def open(self) -> None:
@@ -87,7 +116,12 @@ class SerialPort(Link):
             raise OSError(str(error)) from None
 
     def read(self) -> bytes:
-        return self.port.read(min(max(self.port.in_waiting, 1), _BLOCK_BYTES))  # its errors are OSErrors
+        try:
+            return self.port.read(min(max(self.port.in_waiting, 1), _BLOCK_BYTES))
+        except OSError:
+            raise
+        except Exception as error:  # pyserial lets TypeError, termios.error ... through where a port is pulled out
+            raise OSError(str(error) or type(error).__name__) from error
 
     def close(self) -> None:
         if self.port is not None:

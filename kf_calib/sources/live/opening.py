@@ -38,18 +38,21 @@ def open_live(
     header: str = "",
     give_up_s: float = 600.0,
     idle_s: float = math.inf,
+    silent_s: float = 60.0,
     queued: int = QUEUED,
 ) -> LiveSource:
     """A bench while it runs: a serial port, ``socket://host:port``, ``-``, a growing file, ``sim://?speed=20``.
 
     overrides: bench metadata keys that win over what the bench says. record: file to record to. columns: our name for
     each foreign column or key. header: of CSV rows that come without one. give_up_s: how long a lost link is tried
-    again. idle_s: ends the source where nothing has come for so long. queued: samples that may wait for the consumer.
+    again. idle_s: ends the source where nothing has come for so long. silent_s: a connection over a network on which
+    nothing more has come for so long is opened again. queued: samples that may wait for the consumer.
     Raises InputError where it cannot be opened.
     """
     Outputs({"--record": record}, files_of(url), overwrite)
     address, query = _split(url)
     give_up_s, idle_s = query.pop("give_up", give_up_s), query.pop("idle", idle_s)
+    silent_s = query.pop("silent", silent_s)
     scheme = url.partition("://")[0] if "://" in url else ""
     if scheme == "sim":
         feed = _simulated(url.partition("://")[2], overrides or {})
@@ -59,7 +62,7 @@ def open_live(
         link = _link(address)
         name = "standard input" if address == "-" else address.removeprefix("tail:")
         columns = {**as_columns((overrides or {}).get("joints", "")), **columns}
-        feed = StreamedFeed(name, link, overrides or {}, columns, header, give_up_s, idle_s)
+        feed = StreamedFeed(name, link, overrides or {}, columns, header, give_up_s, idle_s, silent_s)
     return LiveSource(feed, record, overwrite, queued)
 
 
@@ -73,11 +76,11 @@ def files_of(url: str) -> list[Path]:
 
 
 def _split(url: str) -> tuple[str, dict[str, float]]:
-    """The address, and what its query says of us: give_up, idle, and a serial port's baud, parity ..., as numbers."""
+    """The address with what its query says of a serial port (baud, parity ...), and give_up, idle and silent of it."""
     if url.startswith("sim:"):
         return url, {}
     address, _, query = url.partition("?")
-    ours = {key: text for key, text in parse_qsl(query) if key in ("give_up", "idle")}
+    ours = {key: text for key, text in parse_qsl(query) if key in ("give_up", "idle", "silent")}
     rest = urlencode([pair for pair in parse_qsl(query, keep_blank_values=True) if pair[0] not in ours])
     return address + ("?" + rest) * bool(rest), {key: _positive(key, text) for key, text in ours.items()}
 
@@ -120,8 +123,8 @@ def _link(address: str) -> Link:
         else:
             left.append((key, text))
     if left and "://" not in plain:
-        names = ", ".join(_PORT_SETTINGS)
-        raise InputError(f"{address}: {left[0][0]!r} is no setting of a port: use one of {names}, give_up, idle.")
+        names = ", ".join([*_PORT_SETTINGS, "give_up", "idle", "silent"])
+        raise InputError(f"{address}: {left[0][0]!r} is no setting of a port: use one of {names}.")
     return SerialPort(plain + ("?" + urlencode(left)) * bool(left), settings)
 
 

@@ -15,10 +15,11 @@ from kf_calib.bench import Bench
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.outputs import refuse
 from kf_calib.samples import Batch, Stream
+from kf_calib.sources.live.clock import Clock, Restart
 from kf_calib.sources.live.continuity import Continuity
 from kf_calib.sources.live.feed import Feed, Lost, Regained
 from kf_calib.sources.recorder import Recorder
-from kf_calib.sources.recording import GAP_RECORD
+from kf_calib.sources.recording import CLOCK_RECORD, GAP_RECORD
 
 _FLUSH_S = 0.5  # with the time that flushing takes, less than the second that a kill may cost
 QUEUED = 200_000
@@ -36,9 +37,11 @@ class Status:
     link: connecting, live, lost (being tried again) or ended; trouble: why it is down. rate_hz: readings a second, of
     the last two seconds. samples: readings; poses: angle messages. refused: lines or frames that could not be used,
     with the reason of the first. gaps: places where the stamps leap or the link broke; missing: readings lost on the
-    way, exact where the bench numbers its frames, else what the gaps have room for. dropped: readings that the
-    consumer was too slow for and that are in no recording; waiting: readings on their way to it. recorded: readings in
-    whole chunks of the recording; sync_age_s: age of the newest that the disk is known to hold, None without an open
+    way, exact where the bench numbers its frames, else what the gaps have room for. clock_restarts: how often the
+    bench's clock was set during the run; left_out: readings whose stamps are damaged or not later than those before
+    them, which the evaluation leaves out; clock_trouble: what is wrong with the clock, or was. dropped: readings that
+    the consumer was too slow for and that are in no recording; waiting: readings on their way to it. recorded: readings
+    in whole chunks of the recording; sync_age_s: age of the newest that the disk is known to hold, None without an open
     recording; recording_trouble: why it ended early.
     """
 
@@ -52,6 +55,9 @@ class Status:
     first_refusal: str = ""
     gaps: int = 0
     missing: int = 0
+    clock_restarts: int = 0
+    left_out: int = 0
+    clock_trouble: str = ""
     dropped: int = 0
     waiting: int = 0
     reconnects: int = 0
@@ -65,6 +71,12 @@ class Status:
         said = [
             (self.reconnects, f"the link was lost and regained {self.reconnects} times"),
             (self.missing, f"{self.missing} readings were lost on the way, in {self.gaps} gaps"),
+            (self.clock_trouble, self.clock_trouble),
+            (
+                self.left_out,
+                f"{self.left_out} readings have stamps that are damaged or not later than those before them, and are "
+                "left out: check the bench's clock",
+            ),
             (self.dropped, f"{self.dropped} readings came faster than they could be evaluated and were left out"),
             (self.recording_trouble, self.recording_trouble.removesuffix(".")),
             (self.trouble, self.trouble.removesuffix(".")),
@@ -140,6 +152,7 @@ class LiveSource:
         self._lock = threading.Condition()  # of all that follows
         self._queue = _Queue(queued)
         self._counts, self._continuity = _Counts(), Continuity()
+        self._clock, self._begins = Clock(), list[int]()
         self._arrivals = deque[tuple[float, int]]()
         self._recorder: Recorder | None = None
         self._recording_trouble = ""
@@ -183,6 +196,9 @@ class LiveSource:
                 first_refusal=f"{first[0]}: {first[1]}" if first else "",
                 gaps=self._continuity.gaps,
                 missing=self._continuity.missing if feed.lost is None else feed.lost,
+                clock_restarts=len(self._clock.restarts),
+                left_out=self._clock.left_out,
+                clock_trouble=self._clock.trouble,
                 dropped=self._counts.dropped,
                 waiting=self._queue.waiting,
                 reconnects=feed.reconnects,
@@ -276,15 +292,24 @@ class LiveSource:
         for item in self._feed:
             match item:
                 case Batch():
-                    self._take(item)
+                    self._take(self._by_one_clock(item, time.monotonic()))
                 case Lost(reason):
                     self._continuity.cut()
                 case Regained(after_s):
                     self._mark_gap(reason, after_s)
+        self._take(self._clock.rest())
+
+    def _by_one_clock(self, batch: Batch, now: float) -> Batch:
+        """The samples that can be stored, by stamps that go on though the bench's clock was set."""
+        batch, known = Batch(*map(self._storable, _streams(batch))), len(self._clock.restarts)
+        with self._lock:
+            batch = self._clock.push(batch, 0.0 if self._feed.patient else now)
+        for restart in self._clock.restarts[known:]:
+            self._mark_restart(restart)
+        return Batch(*map(self._storable, _streams(batch)))
 
     def _take(self, batch: Batch) -> None:
-        """One batch: checked, recorded, handed on."""
-        batch = Batch(*map(self._storable, _streams(batch)))
+        """One batch: recorded, handed on."""
         size, queue = _size(batch), self._queue
         with self._lock:
             if not size:
@@ -332,6 +357,13 @@ class LiveSource:
         with self._lock:
             self._store_if_open(lambda recorder: recorder.mark(GAP_RECORD, facts))
 
+    def _mark_restart(self, restart: Restart) -> None:
+        facts = {"after_ns": restart.after_ns, "begin_ns": restart.begin_ns, "shift_ns": restart.shift_ns}
+        texts = {key: str(value) for key, value in facts.items()} | {"reason": restart.reason}
+        self._begins.append(restart.begin_ns)
+        with self._lock:
+            self._store_if_open(lambda recorder: recorder.mark(CLOCK_RECORD, texts))
+
     def _storable(self, stream: Stream) -> Stream:
         """The samples whose stamps a recording can hold; the others are refused."""
         fits = (stream.time_ns >= 0) & (stream.time_ns < _LATEST_NS)
@@ -347,7 +379,8 @@ class LiveSource:
         counts.readings += len(batch.accel)
         counts.poses += len(batch.pose)
         counts.temperatures += len(batch.temperature)
-        self._continuity.add(batch.accel.time_ns)
+        begins, self._begins = self._begins, []
+        self._continuity.add(batch.accel.time_ns, begins)
         self._arrivals.append((now, len(batch.accel)))
         while self._arrivals[0][0] < now - _RATE_S:
             self._arrivals.popleft()

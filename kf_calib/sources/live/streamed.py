@@ -7,6 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 from kf_calib.bench import Bench
@@ -19,7 +20,8 @@ from kf_calib.sources.live.protocols import Protocol
 
 _PACE_S = 0.012  # between reads: many small ones cost more than they bring; a serial port holds 4 KB meanwhile
 _INBOX_BYTES = 1 << 25
-_PUSHED_BYTES = 1 << 20
+_PUSHED_BYTES = 1 << 16  # understood at once: garbage of many short lines takes a quarter of a second
+_AFTER_STOP_S = 1.0  # for what came before the end; longer only where garbage has piled up
 _TICK_S = 0.1
 _FIRST_WAIT_S = 0.1
 _LONGEST_WAIT_S = 5.0
@@ -32,8 +34,21 @@ class _Ended:
     """Nothing more comes."""
 
 
+@dataclass
+class _Outage:
+    """From the loss of the link until something comes again: why, since when, and the wait before the next try."""
+
+    reason: str
+    since_s: float
+    wait_s: float = 0.0
+
+    def try_later(self) -> None:
+        self.wait_s = min(max(2.0 * self.wait_s, _FIRST_WAIT_S), _LONGEST_WAIT_S)
+
+
 class StreamedFeed(Feed):
-    """give_up_s: how long a lost link is tried again. idle_s: ends where nothing came for so long.
+    """give_up_s: how long a lost link is tried again. idle_s: ends where nothing came for so long. silent_s: a link
+    that can break without a sign is opened again where nothing came for so long; before anything came it is left alone.
 
     Raises InputError where the link cannot be opened.
     """
@@ -47,16 +62,22 @@ class StreamedFeed(Feed):
         header: str,
         give_up_s: float,
         idle_s: float,
+        silent_s: float = math.inf,
     ) -> None:
         super().__init__(name)
         self.patient = link.patient
         self._link, self._overrides = link, overrides
         self._give_up_s, self._idle_s = give_up_s, idle_s
+        self._silent_s = silent_s if link.breaks_unseen else math.inf
+        self._came_s = self._stopped_s = math.inf
+        self._outage: _Outage | None = None
+        self._left_bytes = 0
         self._protocol = Protocol(name, columns, header)
         self._ahead = deque[Batch | Lost | Regained]()
         self._inbox = deque[bytes | Lost | Regained | _Ended]()
         self._inbox_bytes = 0
         self._arrived = threading.Condition()
+        self._items = self._understood()  # one: what is left of a block when the bench is known is not lost
         try:
             link.open()
         except OSError as error:
@@ -71,11 +92,12 @@ class StreamedFeed(Feed):
     def begin(self) -> Bench:
         self._reader.start()
         ahead, first_s = 0, math.inf
-        for item in self._understood():
+        for item in self._items:
             if isinstance(item, Batch):
                 ahead += len(item.accel) + len(item.temperature)
                 first_s = min(first_s, time.monotonic()) if ahead else first_s
-            self._ahead.append(item)
+            if not isinstance(item, Batch) or len(item.accel) or len(item.pose) or len(item.temperature):
+                self._ahead.append(item)  # not what says that nothing came, which would pile up
             reader = self._protocol.reader
             if reader is None:
                 continue
@@ -100,8 +122,13 @@ class StreamedFeed(Feed):
         while self._ahead:
             item = self._ahead.popleft()
             yield _widened(item, width) if isinstance(item, Batch) else item
-        for item in self._understood():
+        for item in self._items:
             yield _widened(item, width) if isinstance(item, Batch) else item
+
+    @property
+    def warnings(self) -> list[str]:
+        left = f"{self.name}: {self._left_bytes} bytes that came shortly before the end were not read any more."
+        return super().warnings + [left] * bool(self._left_bytes)
 
     def close(self) -> None:
         self.stopping = True
@@ -116,7 +143,11 @@ class StreamedFeed(Feed):
             self.account, self.lost = self._protocol.account, self._protocol.lost
             match item:
                 case bytes():
-                    yield self._protocol.push(item) if item else nothing(0)
+                    for at in range(0, len(item) or 1, _PUSHED_BYTES):
+                        if self._is_late():
+                            self._left_bytes += len(item) - at
+                            break
+                        yield self._protocol.push(item[at : at + _PUSHED_BYTES]) if item else nothing(0)
                 case Lost():
                     self._protocol.cut_off()
                     yield item
@@ -129,6 +160,12 @@ class StreamedFeed(Feed):
                     self.account, self.lost = self._protocol.account, self._protocol.lost
                     return
             self.account, self.lost = self._protocol.account, self._protocol.lost
+
+    def _is_late(self) -> bool:
+        """Whether the end was asked for, and the time for what had come till then is over."""
+        now = time.monotonic()
+        self._stopped_s = min(self._stopped_s, now) if self.stopping else math.inf
+        return now - self._stopped_s > _AFTER_STOP_S
 
     def _next(self) -> bytes | Lost | Regained | _Ended:
         """All bytes that wait, up to a number, or one event; b"" where nothing comes."""
@@ -150,24 +187,41 @@ class StreamedFeed(Feed):
     # -- the thread that reads --
 
     def _read(self) -> None:
-        last_s = time.monotonic()
-        while not self.stopping and time.monotonic() - last_s < self._idle_s:
+        try:
+            self._read_on()
+        except Exception as error:  # of a library or a driver, in a way that is not known
+            self.trouble = f"the link cannot be read on ({type(error).__name__}: {error})"
+        finally:  # else the run would wait for ever
+            with suppress(Exception):
+                self._link.close()
+            self._put(_Ended())
+
+    def _read_on(self) -> None:
+        self._came_s = opened_s = time.monotonic()
+        while not self.stopping and time.monotonic() - self._came_s < self._idle_s:
             try:
                 block = self._link.read()
+                if not block and self.bytes and time.monotonic() - max(opened_s, self._came_s) > self._silent_s:
+                    raise TimeoutError(f"nothing came for {self._silent_s:g} s")
             except EOFError:
-                break
+                return
             except OSError as error:
-                if not self._regain(_reason(error)):
-                    break
-                last_s = time.monotonic()
+                if not self._reopen(_reason(error)):
+                    return
+                opened_s = time.monotonic()
                 continue
             if block:
-                last_s = time.monotonic()
-                self.bytes += len(block)
-                self._put(block)
+                self._take_in(block)
                 time.sleep(_PACE_S)
-        self._link.close()
-        self._put(_Ended())
+
+    def _take_in(self, block: bytes) -> None:
+        self._came_s = time.monotonic()
+        if self._outage is not None:  # only now: a server may accept and close at once
+            self._put(Regained(self._came_s - self._outage.since_s))
+            self._outage, self.link, self.trouble = None, "live", ""
+            self.reconnects += 1
+        self.bytes += len(block)
+        self._put(block)
 
     def _put(self, item: bytes | Lost | Regained | _Ended) -> None:
         """Into the inbox; where that is full the link's own buffers have to hold what comes."""
@@ -178,29 +232,30 @@ class StreamedFeed(Feed):
             self._inbox_bytes += len(item) if isinstance(item, bytes) else 0
             self._arrived.notify()
 
-    def _regain(self, reason: str) -> bool:
-        """Opens the link again, waiting longer from try to try; False where it is given up."""
+    def _reopen(self, reason: str) -> bool:
+        """Opens the link again, waiting longer from try to try until something comes; False where it is given up."""
         self._link.close()
-        self._put(Lost(reason))
-        if not self._link.reopens:
-            return False
-        self.link, self.trouble = "lost", f"the link was lost ({reason})"
-        lost_s, wait_s = time.monotonic(), _FIRST_WAIT_S
-        while not self.stopping:
-            down_s = time.monotonic() - lost_s
-            if down_s > min(self._give_up_s, self._idle_s):
-                self.trouble = f"the link was lost ({reason}) and did not come back within {down_s:.0f} s."
+        if self._outage is None:
+            self._put(Lost(reason))
+            if not self._link.reopens:
                 return False
+            self._outage, self.link = _Outage(reason, time.monotonic()), "lost"
+        outage, why = self._outage, reason
+        while not self.stopping:
+            now = time.monotonic()
+            left_s = min(outage.since_s + self._give_up_s, self._came_s + self._idle_s) - now
+            if left_s < 0.0:
+                self.trouble = f"the link was lost ({why}) and did not come back within {now - outage.since_s:.0f} s."
+                return False
+            self.trouble = f"the link was lost ({why})"
+            self._nap(min(outage.wait_s, left_s))
+            outage.try_later()
             try:
                 self._link.open()
             except OSError as error:
-                self.trouble = f"the link was lost ({reason}; {_reason(error)})"
-                self._nap(min(wait_s, max(min(self._give_up_s, self._idle_s) - down_s, 0.0)))
-                wait_s = min(2.0 * wait_s, _LONGEST_WAIT_S)
+                why = f"{reason}; {_reason(error)}"
                 continue
-            self.link, self.trouble = "live", ""
-            self.reconnects += 1
-            self._put(Regained(time.monotonic() - lost_s))
+            self.trouble = f"the link was lost ({reason}); it is open again, and nothing has come yet"
             return True
         return False
 

@@ -1,0 +1,209 @@
+"""The bench's clock: where it is set or starts again, stamps go on from the last; where it stands still, it is said.
+
+Without this, all readings after a restart would be stamped before those that came, and left out of the evaluation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from kf_calib.samples import Batch, Mask, Stream, Times
+
+_SECOND_NS = 1_000_000_000
+_BACK_NS = 5 * _SECOND_NS  # less is a late sample, or a bench that sends its last readings again after a lost link
+_LEAP_NS = 10 * _SECOND_NS  # further ahead is a pause or a damaged stamp: the readings after it tell which
+_SET_NS = 86_400 * _SECOND_NS  # no pause is as long as this: the clock was set
+_BREAK_S = 1.0  # at least, before the new stamps: angles that came a little late are still in order
+_PERSISTS = 5  # readings that agree with each other tell a clock that was set from damaged stamps
+
+
+@dataclass(frozen=True)
+class Restart:
+    """The clock was set, or started again, after the reading of stamp ``after_ns``.
+
+    by_ns: how far its stamps jumped. shift_ns: what is added to them from ``begin_ns``, the first of them, on.
+    """
+
+    after_ns: int
+    begin_ns: int
+    by_ns: int
+    shift_ns: int
+
+    @property
+    def reason(self) -> str:
+        way = "back" if self.by_ns < 0 else "ahead"
+        return f"the bench's clock jumped {way} by {abs(self.by_ns) / _SECOND_NS:.1f} s"
+
+
+class Clock:
+    """Stamps of all streams on one line of time, from those of a clock that may be set during the run.
+
+    The readings tell that it was; angles and temperatures follow. restarts: in order. left_out: readings that an
+    evaluation leaves out, since their stamp is damaged, or no later than one before them.
+    """
+
+    def __init__(self) -> None:
+        self.restarts = list[Restart]()
+        self.left_out = 0
+        self._held = Stream.empty(3)  # the clock may have been set before these
+        self._first: Stream | None = None
+        self._last_ns: int | None = None
+        self._reached_ns = -(1 << 62)
+        self._came_s = 0.0
+        self._is_repeating = False
+        self._unmoved = 0
+        self._shifts = [0]
+        self._others = (_Follower(), _Follower())
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the clock, or was last; "" where it always went on."""
+        if self._first is None or self._last_ns is None:
+            return ""
+        first_ns = int(self._first.time_ns[0])
+        if self._unmoved >= _PERSISTS:
+            return (
+                f"the bench's clock stands still at {(self._last_ns - first_ns) / _SECOND_NS:.3f} s after the first "
+                "reading; what comes is recorded and left out of the evaluation"
+            )
+        if not self.restarts:
+            return ""
+        last, count = self.restarts[-1], len(self.restarts)
+        times = f" (it was set {count} times in all)" if count > 1 else ""
+        return (
+            f"{last.reason}, {(last.after_ns - first_ns) / _SECOND_NS:.3f} s after the first reading{times}; the new "
+            "stamps are counted on from the last one"
+        )
+
+    def push(self, batch: Batch, now_s: float) -> Batch:
+        """The samples by their new stamps; now_s: when they came, the same for all where that says nothing."""
+        accel = self._readings(self._held + batch.accel, now_s, final=False)
+        pose, temperature = (
+            follow(stream, self._shifts, self._last_ns)
+            for follow, stream in zip(self._others, (batch.pose, batch.temperature), strict=True)
+        )
+        return Batch(accel, pose, temperature)
+
+    def rest(self) -> Batch:
+        """The readings that wait for the next to tell whether the clock was set."""
+        return Batch(self._readings(self._held, self._came_s, final=True), self._others[0].none)
+
+    def _readings(self, stream: Stream, now_s: float, final: bool) -> Stream:
+        self._held = stream[:0]
+        if not len(stream):
+            return stream
+        self._first = stream[:1] if self._first is None else self._first
+        stamps, sound = stream.time_ns + self._shifts[-1], np.ones(len(stream), bool)
+        if _fit(np.diff(stamps, prepend=stamps[0] if self._last_ns is None else self._last_ns)).all():
+            self._last_ns, self._came_s, self._is_repeating = int(stamps[-1]), now_s, False
+        else:
+            stamps, sound = self._one_by_one(stream, now_s, final)
+        self._count(stamps[sound])
+        self.left_out += int((~sound).sum())
+        return Stream(stamps, stream.values[: len(stamps)])
+
+    def _one_by_one(self, stream: Stream, now_s: float, final: bool) -> tuple[Times, Mask]:
+        """The new stamps and which of them follow each other, up to a reading of which the next ones have to tell."""
+        raw: list[int] = stream.time_ns.tolist()
+        stamps, sound = np.empty_like(stream.time_ns), np.zeros(len(raw), bool)
+        for i, own in enumerate(raw):
+            if not self._follows(own + self._shifts[-1]) and not self._repeats(stream[i : i + 1]):
+                agreeing, needed = self._agreeing(raw[i : i + _PERSISTS])
+                is_last = i + agreeing == len(raw)
+                if agreeing >= needed or (final and is_last and self._is_pause(own)):
+                    self._go_on_at(own, now_s)
+                elif is_last and not final:
+                    self._held = stream[i:]
+                    return stamps[:i], sound[:i]
+            stamps[i] = own + self._shifts[-1]
+            sound[i] = self._follows(int(stamps[i]))  # a damaged stamp stays as it is
+            if sound[i]:
+                self._last_ns, self._came_s, self._is_repeating = int(stamps[i]), now_s, False
+        return stamps, sound
+
+    def _follows(self, stamp: int) -> bool:
+        return self._last_ns is None or bool(_fit(np.array(stamp - self._last_ns)))
+
+    def _is_pause(self, raw: int) -> bool:
+        return self._last_ns is not None and 0 < raw + self._shifts[-1] - self._last_ns < _SET_NS
+
+    def _agreeing(self, raw: list[int]) -> tuple[int, int]:
+        """How many of these stamps, from the first on, go on from each other and not from the last, and how many have
+        to for a clock that was set; after a pause one more is enough."""
+        longest_ns, needed = (_SET_NS, 2) if self._is_pause(raw[0]) else (_LEAP_NS, _PERSISTS)
+        count = 1
+        for before, stamp in pairwise(raw):
+            if not -_BACK_NS < stamp - before < longest_ns or self._follows(stamp + self._shifts[-1]):
+                break
+            count += 1
+        return count, needed
+
+    def _repeats(self, reading: Stream) -> bool:
+        """Whether the bench sends again what it has sent, from its first reading on: no clock was set."""
+        assert self._first is not None
+        self._is_repeating |= bool(
+            reading.time_ns[0] == self._first.time_ns[0] and (reading.values == self._first.values).all()
+        )
+        return self._is_repeating
+
+    def _go_on_at(self, raw: int, now_s: float) -> None:
+        """The stamps go on here: after a pause as they are, else close behind the last."""
+        assert self._last_ns is not None
+        if self._is_pause(raw):
+            self._last_ns = raw + self._shifts[-1]
+            return
+        step = raw + self._shifts[-1] - self._last_ns
+        begin = self._last_ns + round(max(now_s - self._came_s, _BREAK_S) * _SECOND_NS)
+        self.restarts.append(Restart(self._last_ns, begin, step, begin - raw))
+        self._shifts.append(begin - raw)
+        self._last_ns = begin
+
+    def _count(self, stamps: Times) -> None:
+        if not len(stamps):
+            return
+        steps = np.diff(stamps, prepend=self._reached_ns)
+        moved = np.flatnonzero(steps)
+        self._unmoved = len(steps) - 1 - int(moved[-1]) if len(moved) else self._unmoved + len(steps)
+        before = np.maximum.accumulate(np.concatenate([[self._reached_ns], stamps]))
+        self.left_out += int((stamps <= before[:-1]).sum())
+        self._reached_ns = int(before[-1])
+
+
+class _Follower:
+    """The stamps of a stream beside the readings, each of which may have come before or after theirs."""
+
+    def __init__(self) -> None:
+        self.none = Stream.empty(0)
+        self._last_ns: int | None = None
+        self._shift = 0
+
+    def __call__(self, stream: Stream, shifts: list[int], reached_ns: int | None) -> Stream:
+        """reached_ns: of the readings, by their new stamps; shifts: of all times the clock was set."""
+        self.none = stream[:0]
+        if not len(stream):
+            return stream
+        stamps = stream.time_ns + self._shift
+        if self._last_ns is not None and _fit(np.diff(stamps, prepend=self._last_ns)).all():
+            self._last_ns = int(stamps[-1])
+            return Stream(stamps, stream.values)
+        raw: list[int] = stream.time_ns.tolist()
+        return Stream(np.array([self._stamp(own, shifts, reached_ns) for own in raw], np.int64), stream.values)
+
+    def _stamp(self, raw: int, shifts: list[int], reached_ns: int | None) -> int:
+        stamp = raw + self._shift
+        if reached_ns is None or (self._last_ns is not None and _fit(np.array(stamp - self._last_ns))):
+            self._last_ns = stamp
+            return stamp
+        shift = min([self._shift, *shifts], key=lambda shift: abs(raw + shift - reached_ns))
+        if self._last_ns is None or abs(raw + shift - reached_ns) <= abs(self._last_ns - reached_ns):
+            self._shift, self._last_ns = shift, raw + shift
+            return raw + shift
+        return stamp  # damaged, or the readings have not shown yet that the clock was set
+
+
+def _fit(steps: Times) -> Mask:
+    """Which steps from stamp to stamp are those of a clock that goes on."""
+    return (steps > -_BACK_NS) & (steps < _LEAP_NS)
