@@ -11,7 +11,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "kf_calib"
 LEVELS = [
-    ["errors", "stage"],
+    ["errors", "stage", "text"],
     ["outputs", "samples"],
     ["bench"],
     ["effects", "mountings", "slews", "stillness"],

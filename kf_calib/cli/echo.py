@@ -1,4 +1,4 @@
-"""Printing a result that may have nobody to read it."""
+"""Printing: what comes from files and links commands no terminal, and there may be nobody to read it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,23 @@ import sys
 import click
 
 from kf_calib.errors import KfCalibError
+from kf_calib.text import printable, sentence
 
 
-def echo(text: str, end: bool = True) -> None:
+def echo(text: str) -> None:
     """Print, and end the line; where nobody reads any more, what follows is printed to nobody, and the work goes on."""
+    echo_drawn(f"{printable(text)}\n")
+
+
+def complain(said: str) -> None:
+    """Print one line on the error stream."""
+    click.echo(sentence(said), err=True)
+
+
+def echo_drawn(text: str) -> None:
+    """Print what a ``PlainConsole`` has drawn, with its colours; as ``echo`` otherwise."""
     try:
-        click.echo(text, nl=end)
+        click.echo(text, nl=False)
         sys.stdout.flush()
     except BrokenPipeError:
         fall_silent()

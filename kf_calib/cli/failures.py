@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-import sys
 import traceback
 from pathlib import Path
 
 import click
 
+from kf_calib.cli.echo import complain
 from kf_calib.errors import KfCalibError
+from kf_calib.text import printable
 
 TRACEBACK = "KF_CALIB_TRACEBACK"
 
@@ -17,8 +18,8 @@ TRACEBACK = "KF_CALIB_TRACEBACK"
 def tell(error: BaseException) -> None:
     """Print the sentence, after the traceback where the environment asks for it."""
     if os.environ.get(TRACEBACK):
-        traceback.print_exception(error, file=sys.stderr)
-    click.echo(f"kf-calib: {sentence(error)}", err=True)
+        click.echo(printable("".join(traceback.format_exception(error))), err=True)
+    complain(f"kf-calib: {sentence(error)}")
 
 
 def sentence(error: BaseException) -> str:

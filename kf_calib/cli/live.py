@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
-from kf_calib.cli.echo import fall_silent
+from kf_calib.cli.echo import complain, fall_silent
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.making import pair
 from kf_calib.cli.numbers import NOT_NEGATIVE, POSITIVE
@@ -41,6 +41,7 @@ from kf_calib.cli.options import (
     strict_option,
 )
 from kf_calib.errors import InputError, KfCalibError, how_to_write
+from kf_calib.text import sentence
 
 if TYPE_CHECKING:
     from kf_calib.calibration import Settings
@@ -140,7 +141,7 @@ def live(
     if final is None:
         return
     for said in _of_the_view(view):
-        click.echo(said, err=True)
+        complain(said)
     if rrd and view is not None and view.began:
         outputs.own(rrd)
     with delivery(outputs, as_json) as deliver:
@@ -254,7 +255,7 @@ def _print(run: _Run, judgement: Judgement, as_json: bool) -> None:
 
 def _echo(run: _Run, text: str) -> None:
     with _piped(run):
-        click.echo(text)
+        click.echo(sentence(text))
         sys.stdout.flush()
 
 
@@ -268,17 +269,17 @@ def _piped(run: _Run) -> Iterator[None]:
         if run.source.status.sync_age_s is None:
             run.stop()
         else:
-            click.echo("kf-calib: nobody reads this output any more; the recording goes on.", err=True)
+            complain("kf-calib: nobody reads this output any more; the recording goes on.")
 
 
 def _on_screen(run: _Run, name: str, record: Path | None) -> None:
-    from rich.console import Console
     from rich.live import Live
 
     from kf_calib.standing import Standing
     from kf_calib.views.live import screen
+    from kf_calib.views.terminal import PlainConsole
 
-    with _keys(use=name != "-") as pressed, Live(console=Console(), auto_refresh=False, transient=True) as display:
+    with _keys(use=name != "-") as pressed, Live(console=PlainConsole(), auto_refresh=False, transient=True) as display:
         while run.going:
             with contextlib.suppress(queue.Empty):
                 run.judgements.get_nowait()
@@ -343,7 +344,7 @@ def _outcome(run: _Run, as_json: bool) -> Judgement | None:
             samples = run.session.standing.samples if run.session else 0
             print_json({"samples": samples, "dwells": 0, "final": True, "problem": str(run.error)})
         else:
-            click.echo(f"Nothing to evaluate: {run.error}", err=True)
+            complain(f"Nothing to evaluate: {run.error}")
         return None
     final = run.final
     assert final is not None

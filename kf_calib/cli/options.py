@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import rich_click as click
 
-from kf_calib.cli.echo import echo
+from kf_calib.cli.echo import echo, echo_drawn
 from kf_calib.cli.files import output_option
 from kf_calib.cli.numbers import NOT_NEGATIVE, NUMBER, POSITIVE, NumberInRange
 from kf_calib.errors import BenchError, InputError
@@ -245,17 +245,19 @@ def print_json(content: Mapping[str, Any]) -> None:
 
 
 def json_line(content: Mapping[str, Any]) -> str:
-    return json.dumps(content, ensure_ascii=False, allow_nan=False)
+    """One line of JSON; what is not printable is escaped, which JSON itself asks of a part of it only."""
+    text = json.dumps(content, ensure_ascii=False, allow_nan=False)
+    return text if text.isprintable() else "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 
 
 def show(renderable: Any) -> None:
-    from rich.console import Console
+    from kf_calib.views.terminal import PlainConsole
 
     told = sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdigit()
-    console = Console(width=None if told else 110, highlight=False, soft_wrap=not sys.stdout.isatty())
+    console = PlainConsole(width=None if told else 110, soft_wrap=not sys.stdout.isatty())
     with console.capture() as printed:
         console.print(renderable)
-    echo(printed.get(), end=False)
+    echo_drawn(printed.get())
 
 
 @contextlib.contextmanager
@@ -268,13 +270,13 @@ def progress(text: str, quiet: bool = False) -> Iterator[Callable[[float], None]
     if quiet or not sys.stderr.isatty():
         yield lambda fraction: None
         return
-    from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
     from kf_calib import stage
+    from kf_calib.views.terminal import PlainConsole
 
     columns = BarColumn(20), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False)
-    with Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bars:
+    with Progress(*columns, console=PlainConsole(stderr=True), transient=True, redirect_stdout=False) as bars:
         bars.add_task(text, total=None)
         (task,) = bars.tasks
 
