@@ -12,10 +12,13 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "kf_calib"
 LEVELS = [
     ["errors", "stage", "text"],
+    ["toml_file"],
     ["outputs", "samples"],
+    ["paper", "schema"],
+    ["bench_keys"],
     ["bench"],
     ["effects", "mountings", "slews", "stillness"],
-    ["triangle", "autoregression", "dwells", "paper", "gate", "spectrum"],
+    ["triangle", "autoregression", "dwells", "gate", "spectrum"],
     ["averaging", "trace", "walk"],
     ["model"],
     ["folding"],

@@ -7,7 +7,6 @@ import json
 import math
 import os
 import sys
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -17,7 +16,7 @@ import rich_click as click
 from kf_calib.cli.echo import echo, echo_drawn
 from kf_calib.cli.files import output_option
 from kf_calib.cli.numbers import NOT_NEGATIVE, NUMBER, POSITIVE, NumberInRange
-from kf_calib.errors import BenchError, InputError
+from kf_calib.errors import BenchError
 
 if TYPE_CHECKING:
     from kf_calib.calibration import Calibration, Settings
@@ -159,22 +158,19 @@ def overrides(options: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _bench_from_toml(path: Path) -> dict[str, str]:
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error}).") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(
-            f"{path}: is not TOML ({error}); write lines such as gravity_mps2 = 9.81, numbers with a point."
-        ) from None
-    table = table.get("bench", table)
-    keys = {key: value if isinstance(value, str) else json.dumps(value) for key, value in table.items()}
-    from kf_calib.bench import numbers_of
+    from kf_calib.bench import metadata_of
+    from kf_calib.bench_keys import known
+    from kf_calib.toml_file import table_of
 
+    content = table_of(path, "gravity_mps2 = 9.81, numbers with a point")
+    table = content.get("bench", content) if isinstance(content.get("bench"), dict) else content
     try:
-        numbers_of(keys)
+        keys = metadata_of(table)
+        known(keys)
     except BenchError as error:
         raise BenchError(f"{path}: {error}") from None
+    except (ValueError, RecursionError):
+        raise BenchError(f"{path}: has a value that is too large for any key: write numbers and text.") from None
     return keys
 
 
