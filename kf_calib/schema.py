@@ -11,6 +11,7 @@ import msgspec
 _COMMANDS = r"\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff"
 TEXT = Annotated[str, msgspec.Meta(max_length=1000, pattern=rf"\A[^{_COMMANDS}]*\Z")]
 """Text for people and names; line ends and tabs may be in it."""
+FINITE = Annotated[float, msgspec.Meta(ge=-1.7e308, le=1.7e308)]
 _WORDS = {"`str`": "text", "`float`": "a number", "`int`": "a whole number", "`bool`": "true or false",
           "`array`": "a list", "`object`": "a table", "`null`": "nothing"}  # fmt: skip
 
@@ -19,10 +20,13 @@ class Misfit(ValueError):
     """A value is not what it must be; the text says where in it and why, without a full stop."""
 
 
-def converted(value: Any, kind: Any) -> Any:
-    """The value as ``kind``, a type with limits as msgspec has them; text may stand for a number. Raises Misfit."""
+def converted(value: Any, kind: Any, strict: bool = False) -> Any:
+    """The value as ``kind``, a type with limits as msgspec has them. Raises Misfit.
+
+    strict: text cannot stand for a number.
+    """
     try:
-        return msgspec.convert(value, kind, strict=False)
+        return msgspec.convert(value, kind, strict=strict)
     except (msgspec.ValidationError, OverflowError, RecursionError, UnicodeError) as error:
         raise Misfit(_in_words(str(error))) from None
 

@@ -49,7 +49,7 @@ def claimed(
     if ctx.params.get("model_file"):
         from kf_calib import model_file
 
-        outputs.spare(model_file.read(ctx.params["model_file"]).effects_from)
+        outputs.spare([each.path for each in model_file.read(ctx.params["model_file"]).programs])
     return outputs
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import rich_click as click
 
-from kf_calib.cli.echo import echo, echo_drawn
+from kf_calib.cli.echo import complain, echo, echo_drawn
 from kf_calib.cli.files import output_option
 from kf_calib.cli.numbers import NOT_NEGATIVE, NUMBER, POSITIVE, NumberInRange
 from kf_calib.errors import BenchError
@@ -100,7 +100,11 @@ save_model_option = output_option(
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist already.", panel=OUTPUT)
 effects_from_option = click.option(
     "--effects-from", "effects_from", multiple=True, type=click.Path(path_type=Path), metavar="FILE.py", panel=MODEL,
-    help="A Python file with effect classes of your own, for --with to name; repeatable.",
+    help="A Python file with effect classes of your own, for --with to name; repeatable. It is run.",
+)  # fmt: skip
+trust_option = click.option(
+    "--trust", is_flag=True, panel=MODEL,
+    help="Run the Python files that a model file or a journal names: they can do all that you can.",
 )  # fmt: skip
 
 
@@ -111,6 +115,7 @@ def filter_options(command: F) -> F:
                      help="An effect to put in the model, for example second-order, or a formula of your own, "
                      "for example 'mine = fx*fy*T'; repeatable."),
         effects_from_option,
+        trust_option,
         click.option("--model", "model_file", type=click.Path(path_type=Path), metavar="FILE.toml", panel=MODEL,
                      help="A model file (replay --save-model); its effects come before those of --with."),
         click.option("--leave-out", "left_out", type=click.IntRange(min=1), multiple=True, metavar="DWELL", panel=MODEL,
@@ -215,18 +220,20 @@ def opened(path: Path, options: Mapping[str, Any]) -> tuple[Recording, Settings]
 
 
 def effects_of(options: Mapping[str, Any]) -> tuple[str, ...]:
-    """Effects of the model file, then those of ``--with``; the user's files are read first."""
+    """Effects of the model file, then those of ``--with``; the model file is checked before a Python file is run."""
+    from kf_calib import model_file
     from kf_calib.effects import load_file, merged, refuse_unknown
 
+    model = model_file.read(options["model_file"]) if options["model_file"] is not None else None
     for path in options["effects_from"]:
         load_file(path)
     for text in options["effects"]:
         refuse_unknown(text)  # at once, not after a long recording was read
-    if options["model_file"] is None:
+    if model is None:
         return tuple(options["effects"])
-    from kf_calib import model_file
-
-    return merged(model_file.read(options["model_file"]).effects, options["effects"])
+    for change in model.load(options["effects_from"], options["trust"]):
+        complain(f"kf-calib: {change}")
+    return merged(model.effects, options["effects"])
 
 
 def save_view(result: Calibration, path: Path) -> None:
