@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from numbers import Real
 from typing import Annotated, Any, Literal, NamedTuple
 
-import msgspec
-from msgspec import UNSET, Meta, UnsetType
+from pydantic import ConfigDict, Field, with_config
+from typing_extensions import TypedDict
 
 from kf_calib import paper
 from kf_calib.errors import BenchError, how_to_write
@@ -21,15 +21,22 @@ UP = ("y", "z", "x", "-y", "-z", "-x")
 NUMBERS = ("gravity_mps2", "latitude_deg", "height_m", "azimuth_deg", "angle_sigma_deg", "scatter_sigma_mps2")
 FREE_TEXT = ("block_serial", "bench", "operator", "note")
 
-_ANGLE, _SMALL = Annotated[float, Meta(ge=-6.3, le=6.3)], Annotated[float, Meta(ge=-0.78, le=0.78)]
-_SCALE, _BIAS = Annotated[float, Meta(ge=-10.0, le=10.0)], Annotated[float, Meta(ge=-100.0, le=100.0)]
-_OF_SYMBOL = {"theta": _ANGLE, "phi": _ANGLE, "nu": _SMALL, "K": _SCALE, "b": _BIAS}
-_Nominal = msgspec.defstruct(
-    "_Nominal",
-    [(symbol, _OF_SYMBOL[symbol.rstrip("123")] | UnsetType, UNSET) for symbol in paper.SYMBOLS],
-    forbid_unknown_fields=True,
+
+def _between(least: float, most: float) -> Any:
+    return Annotated[float, Field(ge=least, le=most, allow_inf_nan=False)]
+
+
+_OF_SYMBOL = {
+    "theta": _between(-6.3, 6.3), "phi": _between(-6.3, 6.3), "K": _between(-10, 10), "b": _between(-100, 100),
+    "nu": _between(-0.78, 0.78),  # accelerometer 2 has an axis with y above zero: within 45 deg
+}  # fmt: skip
+_Nominal = with_config(ConfigDict(extra="forbid"))(
+    TypedDict(
+        "_Nominal",
+        {symbol: _OF_SYMBOL[symbol.rstrip("123")] for symbol in paper.SYMBOLS},  # pyright: ignore  # not written out
+        total=False,
+    )
 )
-"""Accelerometer 2 has an axis with y above zero: nu within 45 deg."""
 
 
 class Key(NamedTuple):
@@ -40,7 +47,7 @@ class Key(NamedTuple):
 
 
 def _number(least: float, most: float, words: str) -> Key:
-    return Key(Annotated[float, Meta(ge=least, le=most)], f"a finite number from {least:g} to {most:g}, {words}")
+    return Key(_between(least, most), f"a finite number from {least:g} to {most:g}, {words}")
 
 
 _WORDS = "text of at most 1000 characters without control characters"
@@ -86,28 +93,32 @@ def checked(key: str, value: Any) -> Any:
     """The value of a key as its type; numbers and the nominal parameters may be text. Raises BenchError."""
     kind, words = KEYS[key]
     try:
-        found = converted(_plain(key, value), kind)
+        return converted(_plain(key, value), kind)
     except Misfit as error:
         hint = how_to_write(value) if isinstance(value, str) and key in NUMBERS else ""
         said = cut(repr(value) if isinstance(value, str | Real) else str(value), 60)
         why = f" ({error})" if key == "nominal" else ""
         raise BenchError(f"bench key {key} is {said}{why}, and must be {words}{hint}.") from None
-    if isinstance(found, _Nominal):
-        return {symbol: size for symbol in paper.SYMBOLS if (size := getattr(found, symbol)) is not UNSET}
-    return found
 
 
 def _plain(key: str, value: Any) -> Any:
-    """Without what is allowed around a value; JSON text as what it says, numbers of numpy as Python's."""
-    if key == "nominal" and isinstance(value, str):
-        try:
-            return json.loads(value)
-        except (ValueError, RecursionError):
-            raise Misfit("not JSON") from None
-    if key == "up" and isinstance(value, str):
-        return value.strip().lower().removeprefix("+")
-    if isinstance(value, str):
-        return value.strip() if key in NUMBERS else value
-    if isinstance(value, Mapping):
-        return {each: _plain("", size) for each, size in value.items()}
-    return float(value) if isinstance(value, Real) and not isinstance(value, int) else value
+    """Text that stands for a number, for JSON or for an axis as that; numbers of numpy as Python's."""
+    match value:
+        case str() if key == "nominal":
+            try:
+                return json.loads(value)
+            except (ValueError, RecursionError):
+                raise Misfit("not JSON") from None
+        case str() if key == "up":
+            return value.strip().lower().removeprefix("+")
+        case str() if key in NUMBERS:
+            try:
+                return float(value)
+            except ValueError:
+                return value
+        case Mapping():
+            return {each: _plain("", size) for each, size in value.items()}
+        case Real() if not isinstance(value, int):
+            return float(value)
+        case _:
+            return value

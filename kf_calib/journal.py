@@ -33,9 +33,9 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired
 
-import msgspec
+from typing_extensions import TypedDict
 
 from kf_calib.calibration import Calibration
 from kf_calib.diagnosis import Diagnosis
@@ -139,31 +139,31 @@ def _entry(step: Step) -> dict[str, Any]:
     return out | {"by": step.by, "undone": step.undone, "dropped": tests, "figures": figures(step.found)}
 
 
-class _Recording(msgspec.Struct):
+class _Recording(TypedDict):
     name: TEXT
     sha256: TEXT
 
 
-class _Dropped(msgspec.Struct):
+class _Dropped(TypedDict):
     name: TEXT
 
 
-class _Step(msgspec.Struct):
+class _Step(TypedDict):
     by: By
     undone: bool
     dropped: list[_Dropped]
     figures: dict[str, FINITE]
-    added: TEXT | None = None
+    added: NotRequired[TEXT]
 
 
-class _Content(msgspec.Struct):
+class _Content(TypedDict):
     version: TEXT
     stopped_because: TEXT
     recording: _Recording
     options: dict[str, TEXT | bool | int | FINITE | list[TEXT | int | FINITE]]
     start: dict[str, FINITE]
     steps: list[_Step]
-    sha256: dict[TEXT, TEXT] = {}
+    sha256: NotRequired[dict[TEXT, TEXT]]
 
 
 def read(path: Path) -> Journal:
@@ -173,19 +173,21 @@ def read(path: Path) -> Journal:
     """
     table = table_of(path, "those of improve --journal")
     try:
-        content: _Content = converted(table, _Content, strict=True)
-        options, steps = dict(content.options), [step for step in content.steps if not step.undone]
-        files = converted(options.pop("effects_from", []), list[TEXT], strict=True)
-        programs = tuple(Program(Path(text), content.sha256.get(text, "")) for text in files)
-        choices = tuple(
-            Choice(step.added, tuple(each.name for each in step.dropped), step.by, step.figures) for step in steps
-        )
-        given = converted(options.get("effects", []), list[TEXT], strict=True)
+        content: _Content = converted(table, _Content)
+        options, sums = dict(content["options"]), content.get("sha256", {})
+        files = converted(options.pop("effects_from", []), list[TEXT])
+        programs = tuple(Program(Path(text), sums.get(text, "")) for text in files)
+        choices = tuple(_choice(step) for step in content["steps"] if not step["undone"])
+        given = converted(options.get("effects", []), list[TEXT])
         refuse_unfit([*given, *(choice.added for choice in choices if choice.added)], programs)
     except (Misfit, InputError) as error:
         raise InputError(f"{path}: is no journal of improve ({error}): write one with --journal.") from None
-    origin = Origin(content.recording.name, content.recording.sha256, options, programs)
-    return Journal(origin, content.version, content.start, choices, content.stopped_because == "asked")
+    origin = Origin(content["recording"]["name"], content["recording"]["sha256"], options, programs)
+    return Journal(origin, content["version"], content["start"], choices, content["stopped_because"] == "asked")
+
+
+def _choice(step: _Step) -> Choice:
+    return Choice(step.get("added"), tuple(each["name"] for each in step["dropped"]), step["by"], step["figures"])
 
 
 def replayed(

@@ -27,9 +27,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NotRequired
 
-import msgspec
+from pydantic import StringConstraints
+from typing_extensions import TypedDict
 
 from kf_calib import effects
 from kf_calib.calibration import Calibration
@@ -41,14 +42,17 @@ from kf_calib.text import cut
 from kf_calib.toml_file import table_of
 
 _EXAMPLE = 'effects = ["NAME", "mine = a*T"]'
-_Path = Annotated[str, msgspec.Meta(min_length=1, max_length=4096, pattern=r"\A[^\x00\ud800-\udfff]*\Z")]
+_Path = Annotated[str, StringConstraints(min_length=1, max_length=4096, pattern=r"\A[^\x00]*\z")]
 
 
-class _Content(msgspec.Struct):
+class _Content(TypedDict):
     effects: list[TEXT]
-    effects_from: list[_Path] = []
-    sha256: dict[_Path, TEXT] = {}
-    coefficients: list[dict[str, str | FINITE]] = []
+    effects_from: NotRequired[list[_Path]]
+    sha256: NotRequired[dict[_Path, TEXT]]
+    coefficients: NotRequired[list[dict[str, str | FINITE]]]
+
+
+_KEYS = tuple(_Content.__annotations__)
 
 
 @dataclass(frozen=True)
@@ -85,20 +89,21 @@ def read(path: str | Path) -> ModelFile:
     path = Path(path)
     table = table_of(path, _EXAMPLE)
     for key in table:
-        if key not in _Content.__struct_fields__:
-            near = difflib.get_close_matches(key, _Content.__struct_fields__, n=1, cutoff=0.4)
-            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(_Content.__struct_fields__)}."
+        if key not in _KEYS:
+            near = difflib.get_close_matches(key, _KEYS, n=1, cutoff=0.4)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(_KEYS)}."
             raise InputError(f"{path}: has a key {cut(key, 60)!r}, which no model has: {hint}")
     if "effects" not in table:
         raise InputError(f"{path}: names no effects: write a line such as {_EXAMPLE}.")
     try:
-        content = converted(table, _Content, strict=True)
+        content: _Content = converted(table, _Content)
     except Misfit as error:
         raise InputError(f"{path}: {error}: write lines such as {_EXAMPLE}.") from None
-    programs = tuple(Program(path.parent / text, content.sha256.get(text, "")) for text in content.effects_from)
+    sums = content.get("sha256", {})
+    programs = tuple(Program(path.parent / text, sums.get(text, "")) for text in content.get("effects_from", []))
     with _telling(path):
-        effects.refuse_unfit(content.effects, programs)
-    return ModelFile(path, tuple(content.effects), programs)
+        effects.refuse_unfit(content["effects"], programs)
+    return ModelFile(path, tuple(content["effects"]), programs)
 
 
 @contextmanager

@@ -2,41 +2,40 @@
 
 from __future__ import annotations
 
-import re
+from functools import lru_cache
 from typing import Annotated, Any
 
-import msgspec
+from pydantic import Field, StringConstraints, TypeAdapter, ValidationError
 
-# control characters, what turns the direction of writing, and halves of characters, which no file can hold
-_COMMANDS = r"\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff"
-TEXT = Annotated[str, msgspec.Meta(max_length=1000, pattern=rf"\A[^{_COMMANDS}]*\Z")]
+from kf_calib.text import cut
+
+# control characters, and what turns the direction of writing
+_COMMANDS = r"\x00-\x08\x0b-\x1f\x7f-\x9f\u{2028}-\u{202e}\u{2066}-\u{2069}"
+TEXT = Annotated[str, StringConstraints(max_length=1000, pattern=rf"\A[^{_COMMANDS}]*\z")]
 """Text for people and names; line ends and tabs may be in it."""
-FINITE = Annotated[float, msgspec.Meta(ge=-1.7e308, le=1.7e308)]
-_WORDS = {"`str`": "text", "`float`": "a number", "`int`": "a whole number", "`bool`": "true or false",
-          "`array`": "a list", "`object`": "a table", "`null`": "nothing"}  # fmt: skip
+FINITE = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Misfit(ValueError):
     """A value is not what it must be; the text says where in it and why, without a full stop."""
 
 
-def converted(value: Any, kind: Any, strict: bool = False) -> Any:
-    """The value as ``kind``, a type with limits as msgspec has them. Raises Misfit.
-
-    strict: text cannot stand for a number.
-    """
+def converted(value: Any, kind: Any) -> Any:
+    """The value as ``kind``, a type with limits as pydantic has them; text is no number, nor is true. Raises Misfit."""
     try:
-        return msgspec.convert(value, kind, strict=strict)
-    except (msgspec.ValidationError, OverflowError, RecursionError, UnicodeError) as error:
-        raise Misfit(_in_words(str(error))) from None
+        return _adapter(kind).validate_python(value, strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        said = first["msg"].replace("Input should", "it must").replace("Extra inputs are not permitted", "it is unknown")
+        said = said.replace("Field required", "it is missing")
+        if first["type"] == "string_pattern_mismatch":
+            said = "it must hold no control characters"
+        place = cut(".".join(map(str, first["loc"])), 100)
+        raise Misfit(f"{place}: {said}" if place else said) from None
+    except (OverflowError, RecursionError, UnicodeError):
+        raise Misfit("it is larger or deeper than any value, or no text") from None
 
 
-def _in_words(said: str) -> str:
-    """``steps[3].by: expected text, got a list`` of msgspec's message."""
-    if "matching regex" in said:
-        said = re.sub(r"Expected .*(?= - at |$)", "expected no control characters", said, flags=re.DOTALL)
-    what, _, place = said.partition(" - at `$")
-    for word, plain in _WORDS.items():
-        what = what.replace(word, plain)
-    what = what[:1].lower() + what[1:].replace("`", "")
-    return f"{place.strip('`.')}: {what}" if place else what
+@lru_cache(maxsize=64)
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
