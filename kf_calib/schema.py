@@ -26,8 +26,8 @@ def converted(value: Any, kind: Any) -> Any:
         return _adapter(kind).validate_python(value, strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        said = first["msg"].replace("Input should", "it must").replace("Extra inputs are not permitted", "it is unknown")
-        said = said.replace("Field required", "it is missing")
+        said = first["msg"].replace("Input should", "it must").replace("Field required", "it is missing")
+        said = said.replace("Extra inputs are not permitted", "it is unknown")
         if first["type"] == "string_pattern_mismatch":
             said = "it must hold no control characters"
         place = cut(".".join(map(str, first["loc"])), 100)

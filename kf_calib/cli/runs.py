@@ -343,6 +343,8 @@ def _of_journal(ctx: click.Context, options: Mapping[str, Any], origin: Origin, 
     for param in own:
         if (name := param.name or "") in kept:
             try:
+                if isinstance(kept[name], list | tuple) != bool(getattr(param, "multiple", False)):
+                    raise TypeError
                 out[name] = param.type_cast_value(ctx, kept[name])
             except (click.BadParameter, TypeError, ValueError) as error:
                 why = error.message if isinstance(error, click.BadParameter) else f"{kept[name]!r}"
