@@ -17,30 +17,21 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kf_calib.errors import BenchError, how_to_write
+from kf_calib.errors import BenchError
 from kf_calib.samples import Floats, Times
+from kf_calib.text import cut
 
 EARTH_RATE_RADPS = 7.292115e-5
 """Earth's rotation in inertial space (WGS 84), rad/s: 15.041 deg/h."""
 
-FORMAT_VERSION = "1"
 Vector = tuple[float, float, float]
 _LETTERS: dict[str, Vector] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_FREE_TEXT = ("block_serial", "bench", "operator", "note")
 CHANNELS = (1, 2, 3)
-UP = ("y", "z", "x", "-y", "-z", "-x")
-"""Axes that can point up when all angles are zero."""
-_NUMBERS = (
-    "gravity_mps2", "latitude_deg", "height_m", "azimuth_deg", "angle_sigma_deg", "scatter_sigma_mps2",
-)  # fmt: skip
-_KEYS = frozenset(
-    ("format_version", "axes", "joints", "reference", "up", "channels", "nominal", *_NUMBERS, *_FREE_TEXT)
-)
 
 
 def normal_gravity(latitude_deg: float, height_m: float = 0.0) -> float:
@@ -77,7 +68,7 @@ def _parse_axis(word: str) -> Vector:
     length = math.hypot(*numbers) if len(numbers) == 3 else 0.0
     if not (math.isfinite(length) and length > 0):
         raise BenchError(
-            f"axis {word!r} is not known: give each gimbal axis, outer first, as x, y, z or three "
+            f"axis {cut(word, 60)!r} is not known: give each gimbal axis, outer first, as x, y, z or three "
             'comma-separated numbers, for example --axes "y z x".'
         )
     if abs(length - 1.0) < 1e-12:  # a unit vector survives being written and read again
@@ -94,8 +85,8 @@ def parse_channels(text: str) -> tuple[int, int, int]:
         first, second, third = 0, 0, 0
     if sorted(map(abs, (first, second, third))) != [1, 2, 3]:
         raise BenchError(
-            f"channels {text!r} name no order: give the channel of accelerometer 1, 2 and 3, each once, with a minus "
-            "where it is reversed, for example --channels 1,-2,3."
+            f"channels {cut(text, 60)!r} name no order: give the channel of accelerometer 1, 2 and 3, each once, with "
+            "a minus where it is reversed, for example --channels 1,-2,3."
         )
     return first, second, third
 
@@ -137,36 +128,23 @@ class Bench:
     joints: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.reference not in ("base", "inertial"):
-            raise BenchError(
-                f"reference {self.reference!r} is not known: use base (angles relative to the bench) "
-                "or inertial (stabilised platform)."
-            )
-        if self.up not in UP:
-            raise BenchError(
-                f"up {self.up!r} is not known: give the axis that points up when all angles are zero, one of "
-                f"{', '.join(UP)}; --up z for sensors and angles as ROS names them."
-            )
+        from kf_calib.bench_keys import FREE_TEXT, NUMBERS, checked
+
+        own = {key: getattr(self, key) for key in ("reference", "up", *NUMBERS)}
+        stated = {key: value for key, value in own.items() if value is not None or key == "gravity_mps2"}
+        notes = {key: value for key, value in self.notes.items() if key in FREE_TEXT}
+        for key, value in {**stated, "nominal": self.nominal, "joints": " ".join(self.joints), **notes}.items():
+            checked(key, value)
         if self.reference == "inertial" and self.latitude_deg is None:
             raise BenchError(
                 "an inertially held platform needs the latitude, because gravity turns with the Earth in it: "
                 "give latitude_deg (--latitude)."
-            )
-        if self.latitude_deg is not None and not abs(self.latitude_deg) <= 90.0:
-            raise BenchError(f"latitude_deg {self.latitude_deg:g} is not between -90 and 90: check its unit.")
-        if not 1.0 <= self.gravity_mps2 <= 30.0:
-            raise BenchError(
-                f"gravity of {self.gravity_mps2:g} m/s^2 is not possible: give gravity_mps2 in m/s^2, about 9.8."
             )
         if self.joints and (len(self.joints) != len(self.axes) or len(set(self.joints)) < len(self.joints)):
             raise BenchError(
                 f"joints names {len(self.joints)} gimbals ({' '.join(self.joints)}) where there are {len(self.axes)} "
                 "axes: name each once, outer to inner."
             )
-        for key in ("angle_sigma_deg", "scatter_sigma_mps2"):
-            value = getattr(self, key)
-            if value is not None and not 0.0 <= value < math.inf:
-                raise BenchError(f"{key} {value:g} must be zero or positive; leave it out where it is not known.")
 
     @property
     def axis_letters(self) -> tuple[str, ...]:
@@ -181,13 +159,11 @@ class Bench:
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str], has_angles: bool = True) -> Bench:
         """The bench from the strings of a metadata record (FORMAT.md), or from options of the same names."""
-        numbers = numbers_of(metadata)
-        version = metadata.get("format_version", FORMAT_VERSION)
-        if version != FORMAT_VERSION:
-            raise BenchError(
-                f"the recording has format_version {version!r}, this program reads {FORMAT_VERSION}: update kf_calib."
-            )
-        if has_angles and not metadata.get("axes", "").strip():
+        from kf_calib.bench_keys import FREE_TEXT, NUMBERS, known
+
+        given = known(metadata)
+        numbers = {key: given[key] for key in NUMBERS if key in given}
+        if has_angles and not given.get("axes", "").strip():
             raise BenchError(
                 "the gimbal axes are not stated, so the angles cannot be used: give them outer to inner, "
                 'for example --axes "y z x".'
@@ -199,19 +175,21 @@ class Bench:
                 )
             numbers["gravity_mps2"] = normal_gravity(numbers["latitude_deg"], numbers.get("height_m", 0.0))
         return cls(
-            axes=parse_axes(metadata["axes"]) if has_angles else (),
-            reference=metadata.get("reference", "base"),  # type: ignore[arg-type]  # __post_init__ refuses other words
-            nominal=_nominal(metadata.get("nominal", "{}")),
-            joints=tuple(metadata.get("joints", "").replace(",", " ").split()) if has_angles else (),
-            notes={key: metadata[key] for key in _FREE_TEXT if metadata.get(key)},
-            up=metadata.get("up", "y").strip().lower().removeprefix("+"),
-            channels=parse_channels(metadata.get("channels", "1,2,3")),
+            axes=parse_axes(given["axes"]) if has_angles else (),
+            reference=given.get("reference", "base"),
+            nominal=given.get("nominal", {}),
+            joints=tuple(given.get("joints", "").replace(",", " ").split()) if has_angles else (),
+            notes={key: given[key] for key in FREE_TEXT if given.get(key)},
+            up=given.get("up", "y"),
+            channels=parse_channels(given.get("channels", "1,2,3")),
             **numbers,
         )
 
     def to_metadata(self) -> dict[str, str]:
         """The strings of a metadata record; ``from_metadata`` of it gives this bench again."""
-        numbers = {key: getattr(self, key) for key in _NUMBERS}
+        from kf_calib.bench_keys import FORMAT_VERSION, NUMBERS
+
+        numbers = {key: getattr(self, key) for key in NUMBERS}
         return {
             "format_version": FORMAT_VERSION,
             **({"axes": " ".join(map(_format_axis, self.axes))} if self.axes else {}),
@@ -266,33 +244,12 @@ class Bench:
         return self.to_platform(up, np.asarray(pose, float))
 
 
-def numbers_of(metadata: Mapping[str, str]) -> dict[str, float]:
-    """The numbers among the keys of a bench; raises BenchError where one is none, or a key is not known."""
-    unknown = sorted(set(metadata) - _KEYS)
-    if unknown:
-        raise BenchError(f"bench key {unknown[0]!r} is not known: use one of {', '.join(sorted(_KEYS))}.")
-    return {key: _number(key, metadata[key]) for key in _NUMBERS if metadata.get(key, "") != ""}
+def metadata_of(values: Mapping[str, Any]) -> dict[str, str]:
+    """The strings of a metadata record from values of JSON or TOML.
 
-
-def _number(key: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise BenchError(f"bench key {key} is {text!r}, which is not a finite number{how_to_write(text)}.")
-    return value
-
-
-def _nominal(text: str) -> dict[str, float]:
-    try:
-        found = {str(symbol): float(value) for symbol, value in json.loads(text).items()}
-    except (ValueError, TypeError, AttributeError):
-        raise BenchError(f'bench key nominal is {text!r}: it must be a JSON object such as {{"theta1": 0}}.') from None
-    for symbol, value in found.items():
-        if not math.isfinite(value):
-            raise BenchError(f"bench key nominal has {symbol} = {value}, which is not a finite number.")
-    return found
+    Raises ValueError or RecursionError for integers of thousands of digits and for lists in lists without end.
+    """
+    return {key: value if isinstance(value, str) else json.dumps(value, default=str) for key, value in values.items()}
 
 
 def _frame_with_up(up: str) -> Floats:

@@ -12,6 +12,9 @@
     [options]                               # of the command line, where they were given; a replay takes them from here
     angle_sigma_deg = "0.002"
 
+    [sha256]                                # of the Python files under effects_from, which a replay asks leave to run
+    "/home/me/my_effects.py" = "9c1a..."
+
     [start]                                 # figures of the first model: SI, every digit
     held_out_rms_mps2 = 1.4e-5
 
@@ -28,36 +31,42 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired
+
+from typing_extensions import TypedDict
 
 from kf_calib.calibration import Calibration
 from kf_calib.diagnosis import Diagnosis
+from kf_calib.effects import refuse_unfit
+from kf_calib.effects.programs import Program
 from kf_calib.errors import InputError
 from kf_calib.improvement import By, Improvement, Step, begun, stepped
-from kf_calib.model_file import table_of
 from kf_calib.outputs import write_whole
+from kf_calib.schema import FINITE, TEXT, Misfit, converted
 from kf_calib.sources.bags import files_of
+from kf_calib.toml_file import table_of
 
 
 @dataclass(frozen=True)
 class Origin:
-    """What an improvement was made from: the recording, its fingerprint, and the options it was read with."""
+    """What an improvement was made from: the recording, its fingerprint, options, and Python files of effects."""
 
     name: str
     sha256: str
-    options: Mapping[str, Any]
+    options: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    programs: tuple[Program, ...] = ()
 
     @classmethod
-    def of(cls, recording: Path, options: Mapping[str, Any]) -> Origin:
+    def of(cls, recording: Path) -> Origin:
         """Raises InputError where the recording cannot be read."""
         try:
             digest = hashlib.sha256()
             for path in files_of(recording):
                 with path.open("rb") as file:
                     hashlib.file_digest(file, lambda: digest)
-            return cls(recording.name, digest.hexdigest(), options)
+            return cls(recording.name, digest.hexdigest())
         except OSError as error:
             raise InputError(f"{recording}: cannot be read ({error.strerror}): name a recording.") from None
 
@@ -115,7 +124,8 @@ def write(path: Path, state: Improvement, origin: Origin) -> None:
         "reason": state.reason,
         "model": list(state.effects),
         "recording": {"name": origin.name, "sha256": origin.sha256},
-        "options": dict(origin.options),
+        "options": {**origin.options, "effects_from": [str(each.path) for each in origin.programs]},
+        "sha256": {str(each.path): each.sha256 for each in origin.programs},
         "start": figures(state.start),
         "steps": [_entry(step) for step in state.history],
     }
@@ -129,31 +139,55 @@ def _entry(step: Step) -> dict[str, Any]:
     return out | {"by": step.by, "undone": step.undone, "dropped": tests, "figures": figures(step.found)}
 
 
+class _Recording(TypedDict):
+    name: TEXT
+    sha256: TEXT
+
+
+class _Dropped(TypedDict):
+    name: TEXT
+
+
+class _Step(TypedDict):
+    by: By
+    undone: bool
+    dropped: list[_Dropped]
+    figures: dict[str, FINITE]
+    added: NotRequired[TEXT]
+
+
+class _Content(TypedDict):
+    version: TEXT
+    stopped_because: TEXT
+    recording: _Recording
+    options: dict[str, TEXT | bool | int | FINITE | list[TEXT | int | FINITE]]
+    start: dict[str, FINITE]
+    steps: list[_Step]
+    sha256: NotRequired[dict[TEXT, TEXT]]
+
+
 def read(path: Path) -> Journal:
-    """Raises InputError, with the path, where the file cannot be read or is no journal."""
-    table = table_of(path)
+    """Read a journal and check all that can be checked before the Python files that it names have run.
+
+    Raises InputError, with the path, where the file cannot be read or is no journal.
+    """
+    table = table_of(path, "those of improve --journal")
     try:
-        recording, steps = table["recording"], [step for step in table["steps"] if not step["undone"]]
-        return Journal(
-            Origin(str(recording["name"]), str(recording["sha256"]), dict(table["options"])),
-            str(table["version"]),
-            _numbers(table["start"]),
-            tuple(_choice(step) for step in steps),
-            table["stopped_because"] == "asked",
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{path}: is no journal of improve ({what}): write one with --journal.") from None
+        content: _Content = converted(table, _Content)
+        options, sums = dict(content["options"]), content.get("sha256", {})
+        files = converted(options.pop("effects_from", []), list[TEXT])
+        programs = tuple(Program(Path(text), sums.get(text, "")) for text in files)
+        choices = tuple(_choice(step) for step in content["steps"] if not step["undone"])
+        given = converted(options.get("effects", []), list[TEXT])
+        refuse_unfit([*given, *(choice.added for choice in choices if choice.added)], programs)
+    except (Misfit, InputError) as error:
+        raise InputError(f"{path}: is no journal of improve ({error}): write one with --journal.") from None
+    origin = Origin(content["recording"]["name"], content["recording"]["sha256"], options, programs)
+    return Journal(origin, content["version"], content["start"], choices, content["stopped_because"] == "asked")
 
 
-def _choice(step: Mapping[str, Any]) -> Choice:
-    by: By = "user" if step["by"] == "user" else "diagnosis"
-    added = None if "added" not in step else str(step["added"])
-    return Choice(added, tuple(str(each["name"]) for each in step["dropped"]), by, _numbers(step["figures"]))
-
-
-def _numbers(table: Mapping[str, Any]) -> dict[str, float]:
-    return {key: float(value) for key, value in table.items()}
+def _choice(step: _Step) -> Choice:
+    return Choice(step.get("added"), tuple(each["name"] for each in step["dropped"]), step["by"], step["figures"])
 
 
 def replayed(

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kf_calib.bench import UP, Bench
+from kf_calib.bench import Bench
+from kf_calib.bench_keys import UP
 from kf_calib.samples import Floats
 
 _MOST_CHANGES = 2

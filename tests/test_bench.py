@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from kf_calib.bench import (
@@ -13,12 +16,14 @@ from kf_calib.bench import (
     Bench,
     axes_of,
     interpolate_pose,
+    metadata_of,
     normal_gravity,
     parse_axes,
     pose_distance,
     slerp,
     unwrap_pose,
 )  # fmt: skip
+from kf_calib.bench_keys import KEYS
 from kf_calib.errors import BenchError
 
 G = 9.81
@@ -127,9 +132,59 @@ def test_angles_are_interpolated_the_short_way_round() -> None:
         ({"axes": "y", "gravity_mps2": "9.81", "angle_sigma_deg": "-1"}, "angle_sigma_deg"),
         ({"axes": "y", "gravity_mps2": "9.81", "nominal": "[1]"}, "nominal"),
         ({"axes": "y", "gravity_mps2": "9.81", "axis": "x"}, "axis"),
+        ({"axes": "y", "gravity_mps2": "9.81", "nominal": '{"theta1": NaN}'}, "theta1: it must be a finite number"),
+        ({"axes": "y", "gravity_mps2": "9.81", "nominal": '{"theta9": 0}'}, "theta9: it is unknown"),
+        ({"axes": "y", "gravity_mps2": "9.81", "nominal": '{"nu1": 1}'}, "nu1: it must be less than or equal to 0.78"),
+        ({"axes": "y", "gravity_mps2": "9.81", "nominal": "[" * 100_000}, "nominal"),
+        ({"axes": "y", "gravity_mps2": "9" * 400}, "gravity_mps2"),
+        ({"axes": "y", "gravity_mps2": "9.81\0"}, "gravity_mps2"),
+        ({"axes": "y", "gravity_mps2": "9.81", "azimuth_deg": "1e300"}, "azimuth_deg"),
+        ({"axes": "y", "gravity_mps2": "9.81", "note": "\ud800"}, "note"),
+        ({"axes": "y", "gravity_mps2": "9.81", "bench": "\x1b[2J"}, "without control characters"),
+        ({"axes": "y", "gravity_mps2": "9.81", "operator": "x" * 1_000_000}, "at most 1000 characters"),
+        ({"axes": "y", "gravity_mps2": "9.81", "x" * 1_000_000: "1"}, "is not known"),
+        ({"axes": 5, "gravity_mps2": "9.81"}, "axes"),
+        ({"axes": "y", "gravity_mps2": True}, "gravity_mps2"),
+        ({"axes": "y", "gravity_mps2": None}, "gravity_mps2"),
     ],
+    ids=lambda value: value[:20] if isinstance(value, str) else "",
 )
 def test_an_impossible_bench_is_one_sentence(metadata: dict[str, str], says: str) -> None:
     with pytest.raises(BenchError, match=re.escape(says)) as caught:
         Bench.from_metadata(metadata)
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize(
+    "values, key",
+    [({"nominal": {"theta1": math.nan}}, "nominal"), ({"nominal": {"K1": math.inf}}, "nominal"),
+     ({"azimuth_deg": math.nan}, "azimuth_deg"), ({"height_m": math.inf}, "height_m"),
+     ({"gravity_mps2": math.nan}, "gravity_mps2"), ({"gravity_mps2": None}, "gravity_mps2"),
+     ({"notes": {"note": "\x9b2J"}}, "note"), ({"angle_sigma_deg": "x"}, "angle_sigma_deg")],
+)  # fmt: skip
+def test_a_bench_made_in_python_is_held_to_the_same(values: dict[str, object], key: str) -> None:
+    with pytest.raises(BenchError, match=f"bench key {key} is "):
+        Bench(**{"axes": axes_of("y"), "gravity_mps2": G, **values})
+
+
+JSON_VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers(-(10**500), 10**500) | st.floats() | st.text()
+    | st.characters(categories=["Cs"]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=9), inner, max_size=3),
+    max_leaves=6,
+)  # fmt: skip
+
+
+@settings(max_examples=1500, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+@given(st.dictionaries(st.sampled_from(sorted(KEYS)), JSON_VALUES | st.sampled_from(["y z x", "9.81", "1,2,3", "z"])))
+def test_whatever_values_say_is_a_bench_or_a_sentence(values: dict[str, object]) -> None:
+    """As they come in a recording (text), in JSON or TOML (made text), and from Python."""
+    for metadata in ({**values}, metadata_of({"axes": "y z x", "gravity_mps2": 9.81} | values)):
+        try:
+            bench = Bench.from_metadata(metadata)
+        except BenchError as error:
+            assert "\n" not in str(error) and len(str(error)) < 1000
+        else:
+            assert np.isfinite([*bench.nominal.values(), bench.gravity_mps2, bench.azimuth_deg]).all()
+            assert Bench.from_metadata(bench.to_metadata()) == bench
+            "".join(bench.to_metadata().values()).encode()

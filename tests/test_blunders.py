@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from altered import Altered, short_run
 
-from kf_calib.bench import UP, Bench, parse_axes, parse_channels
+from kf_calib.bench import Bench, parse_axes, parse_channels
+from kf_calib.bench_keys import UP
 from kf_calib.blunders import common_scale
 from kf_calib.calibration import calibrate
 from kf_calib.errors import BlunderError, InputError

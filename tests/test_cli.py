@@ -183,7 +183,7 @@ def test_bad_recordings_are_one_sentence(run, recording: Path, tmp_path: Path, n
         (["replay", "{run}", "--gravity", "nan"], "not a finite number"),
         (["replay", "{run}", "--angle-sigma", "-1"], "x>=0"),
         (["replay", "{run}", "--bench", "{tmp}/comma.toml"], "comma.toml: bench key gravity_mps2 is '9,81'"),
-        (["replay", "{run}", "--bench", "{tmp}/nan.toml"], "nominal has theta1 = nan"),
+        (["replay", "{run}", "--bench", "{tmp}/nan.toml"], "(theta1: it must be a finite number)"),
         (["replay", "{run}", "--still-deg", "1000"], "above 0 and up to 5"),
         (["plan", "--target", "K=2,5ppm"], "write 2.5 with a point"),
         (["simulate", "{tmp}/new.mcap", "--hide", "base-tilt=4,1arcsec"], "write 4.1 with a point"),

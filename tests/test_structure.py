@@ -11,11 +11,14 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "kf_calib"
 LEVELS = [
-    ["errors", "lock", "stage"],
+    ["errors", "lock", "stage", "text"],
+    ["toml_file"],
     ["outputs", "samples"],
+    ["paper", "schema"],
+    ["bench_keys"],
     ["bench"],
     ["effects", "mountings", "slews", "stillness"],
-    ["triangle", "autoregression", "dwells", "paper", "gate", "spectrum"],
+    ["triangle", "autoregression", "dwells", "gate", "spectrum"],
     ["averaging", "trace", "walk"],
     ["model"],
     ["folding"],

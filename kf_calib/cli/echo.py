@@ -1,4 +1,4 @@
-"""Printing what may have nobody to read it, or no room."""
+"""Printing: what comes from files and links commands no terminal, and there may be nobody to read it, or no room."""
 
 from __future__ import annotations
 
@@ -9,12 +9,18 @@ from contextlib import suppress
 import click
 
 from kf_calib.errors import KfCalibError
+from kf_calib.text import printable, sentence
 
 
-def echo(text: str, end: bool = True) -> None:
+def echo(text: str) -> None:
     """Print, and end the line; where nobody reads any more, what follows is printed to nobody, and the work goes on."""
+    echo_drawn(f"{printable(text)}\n")
+
+
+def echo_drawn(text: str) -> None:
+    """Print what a ``PlainConsole`` has drawn, with its colours; as ``echo`` otherwise."""
     try:
-        click.echo(text, nl=end)
+        click.echo(text, nl=False)
         sys.stdout.flush()
     except BrokenPipeError:
         fall_silent()
@@ -33,7 +39,7 @@ class Printer:
         self._is_amid = False  # a line, which what comes next must not go on with
 
     def __call__(self, text: str, end: bool = True) -> None:
-        """Print, and end the line."""
+        """Print what is fit for a terminal (a ``sentence``, JSON, what a ``PlainConsole`` has drawn)."""
         try:
             click.echo("\n" * self._is_amid + text, nl=end)
             sys.stdout.flush()
@@ -60,7 +66,7 @@ class Printer:
 def complain(text: str) -> None:
     """Print a sentence to standard error, if that leads anywhere."""
     with suppress(OSError):
-        click.echo(f"kf-calib: {text}", err=True)
+        click.echo(f"kf-calib: {sentence(text)}", err=True)
 
 
 def fall_silent() -> None:

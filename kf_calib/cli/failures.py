@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import traceback
 from contextlib import suppress
 from pathlib import Path
@@ -12,6 +11,7 @@ import click
 
 from kf_calib.cli.echo import complain
 from kf_calib.errors import KfCalibError
+from kf_calib.text import printable
 
 TRACEBACK = "KF_CALIB_TRACEBACK"
 
@@ -20,7 +20,7 @@ def tell(error: BaseException) -> None:
     """Print the sentence, after the traceback where the environment asks for it."""
     if os.environ.get(TRACEBACK):
         with suppress(OSError):
-            traceback.print_exception(error, file=sys.stderr)
+            click.echo(printable("".join(traceback.format_exception(error))), err=True)
     complain(sentence(error))
 
 

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
-from kf_calib.cli.echo import echo
+from kf_calib.cli.echo import complain, echo
 from kf_calib.cli.failures import tell
 from kf_calib.outputs import Outputs
 
@@ -49,7 +49,7 @@ def claimed(
     if ctx.params.get("model_file"):
         from kf_calib import model_file
 
-        outputs.spare(model_file.read(ctx.params["model_file"]).effects_from)
+        outputs.spare([each.path for each in model_file.read(ctx.params["model_file"]).programs])
     return outputs
 
 
@@ -97,7 +97,7 @@ class Delivery:
 
         self.file(png, draw)
         if isinstance(error := self.failures.get(png), ScreenshotError):
-            click.echo(f"kf-calib: the picture could not be drawn: {error}", err=True)
+            complain(f"the picture could not be drawn: {error}")
             del self.failures[png]
 
 

@@ -41,6 +41,7 @@ from kf_calib.cli.options import (
 )
 from kf_calib.cli.signals import answered
 from kf_calib.errors import InputError, KfCalibError, how_to_write
+from kf_calib.text import sentence
 
 if TYPE_CHECKING:
     from kf_calib.calibration import Settings
@@ -262,7 +263,7 @@ def _watched(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
         now = _said(run)
         for about, said in now.items():
             if said and said != told.get(about) and not as_json:
-                _echo(run, said)
+                _echo(run, sentence(said))
         told = now
 
 
@@ -283,7 +284,7 @@ def _print(run: _Run, judgement: Judgement, as_json: bool) -> None:
     if as_json:
         _echo(run, json_line(views.live_object(judgement, run.session.standing, run.source.status)))
     elif not judgement.final:
-        _echo(run, views.line(judgement))
+        _echo(run, sentence(views.line(judgement)))
 
 
 def _echo(run: _Run, text: str) -> None:
@@ -298,13 +299,13 @@ def _echo(run: _Run, text: str) -> None:
 
 
 def _on_screen(run: _Run, name: str, record: Path | None) -> None:
-    from rich.console import Console
     from rich.live import Live
 
     from kf_calib.standing import Standing
     from kf_calib.views.live import screen
+    from kf_calib.views.terminal import PlainConsole
 
-    display = Live(console=Console(), auto_refresh=False, transient=True, redirect_stderr=sys.stderr.isatty())
+    display = Live(console=PlainConsole(), auto_refresh=False, transient=True, redirect_stderr=sys.stderr.isatty())
     with _keys(use=name != "-") as pressed, display:
         while run.going:
             with contextlib.suppress(queue.Empty):

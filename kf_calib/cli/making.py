@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import rich_click as click
 
-from kf_calib.cli.echo import echo
+from kf_calib.cli.echo import complain, echo
 from kf_calib.cli.files import OutputFile, claimed, delivery
 from kf_calib.cli.numbers import NUMBER, POSITIVE
 from kf_calib.cli.options import (
@@ -31,6 +31,7 @@ from kf_calib.cli.options import (
 from kf_calib.cli.signals import answered, interrupt
 from kf_calib.errors import InputError
 from kf_calib.outputs import Outputs
+from kf_calib.text import sentence
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -209,7 +210,7 @@ def _foresee(run: Simulation, out: Path, large: bool) -> None:
             "(--orientations, --sample-hz), or begin nevertheless with --large."
         )
     if run.file_bytes > _LARGE_BYTES:
-        click.echo(f"{out}: {told}.", err=True)
+        complain(f"{out}: {told}.")
 
 
 def _size(count: int) -> str:
@@ -245,7 +246,7 @@ def record(
         return
     echo(f"{out}: {made}")
     for warning in warnings:
-        echo(f"Note: {warning}")
+        echo(f"Note: {sentence(warning)}")
 
 
 def pair(text: str) -> tuple[str, str]:
@@ -264,7 +265,6 @@ def demo(folder: Path, as_json: bool) -> None:
     Files of an earlier demo there are replaced.
     """
     from rich.console import Group
-    from rich.markup import escape
 
     from kf_calib.calibration import calibrate
     from kf_calib.comparison import compare as run
@@ -286,18 +286,18 @@ def demo(folder: Path, as_json: bool) -> None:
     with progress("recording a simulated run", as_json) as tick:
         made = _record(source, recording, True, tick)
         truth = source.write_truth(recording)
-    say(escape(f"Recorded a simulated bench run to {recording}: {made}.\n"))
+    say(f"Recorded a simulated bench run to {recording}: {made}.\n")
     with progress("replaying", as_json) as tick:
         result = calibrate(Recording(recording), on_progress=tick)
     say(summary(result))
     with progress("comparing", as_json) as tick:
         compared = run(Recording(recording), on_progress=tick)
     say(Group("", comparison_table(compared)))
-    say(escape(f"\nTruth: {truth}."))
+    say(f"\nTruth: {truth}.")
     if as_json:
         files = {"recording": str(recording), "truth": str(truth), "view": str(rrd)}
         print_json({**files, "replay": replay_object(result), "compare": compare_object(compared)})
     with delivery(outputs, as_json) as deliver, progress("saving the view", as_json):
         kept = deliver.keep(rrd, lambda path: save_view(result, path))
     if kept:
-        say(escape(f"View: {rrd} (open it with .venv/bin/rerun {rrd})."))
+        say(f"View: {rrd} (open it with .venv/bin/rerun {rrd}).")

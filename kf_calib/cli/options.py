@@ -8,17 +8,16 @@ import json
 import math
 import os
 import sys
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import rich_click as click
 
-from kf_calib.cli.echo import echo
+from kf_calib.cli.echo import complain, echo, echo_drawn
 from kf_calib.cli.files import output_option
 from kf_calib.cli.numbers import NOT_NEGATIVE, NUMBER, POSITIVE, NumberInRange
-from kf_calib.errors import BenchError, InputError
+from kf_calib.errors import BenchError
 
 if TYPE_CHECKING:
     from kf_calib.calibration import Calibration, Settings
@@ -104,7 +103,11 @@ save_model_option = output_option(
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist already.", panel=OUTPUT)
 effects_from_option = click.option(
     "--effects-from", "effects_from", multiple=True, type=click.Path(path_type=Path), metavar="FILE.py", panel=MODEL,
-    help="A Python file with effect classes of your own, for --with to name; repeatable.",
+    help="A Python file with effect classes of your own, for --with to name; repeatable. It is run.",
+)  # fmt: skip
+trust_option = click.option(
+    "--trust", is_flag=True, panel=MODEL,
+    help="Run the Python files that a model file or a journal names: they can do all that you can.",
 )  # fmt: skip
 
 
@@ -115,6 +118,7 @@ def filter_options(command: F) -> F:
                      help="An effect to put in the model, for example second-order, or a formula of your own, "
                      "for example 'mine = fx*fy*T'; repeatable."),
         effects_from_option,
+        trust_option,
         click.option("--model", "model_file", type=click.Path(path_type=Path), metavar="FILE.toml", panel=MODEL,
                      help="A model file (replay --save-model); its effects come before those of --with."),
         click.option("--leave-out", "left_out", type=click.IntRange(min=1), multiple=True, metavar="DWELL", panel=MODEL,
@@ -162,22 +166,19 @@ def overrides(options: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _bench_from_toml(path: Path) -> dict[str, str]:
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error}).") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(
-            f"{path}: is not TOML ({error}); write lines such as gravity_mps2 = 9.81, numbers with a point."
-        ) from None
-    table = table.get("bench", table)
-    keys = {key: value if isinstance(value, str) else json.dumps(value) for key, value in table.items()}
-    from kf_calib.bench import numbers_of
+    from kf_calib.bench import metadata_of
+    from kf_calib.bench_keys import known
+    from kf_calib.toml_file import table_of
 
+    content = table_of(path, "gravity_mps2 = 9.81, numbers with a point")
+    table = content.get("bench", content) if isinstance(content.get("bench"), dict) else content
     try:
-        numbers_of(keys)
+        keys = metadata_of(table)
+        known(keys)
     except BenchError as error:
         raise BenchError(f"{path}: {error}") from None
+    except (ValueError, RecursionError):
+        raise BenchError(f"{path}: has a value that is too large for any key: write numbers and text.") from None
     return keys
 
 
@@ -223,18 +224,20 @@ def opened(path: Path, options: Mapping[str, Any]) -> tuple[Recording, Settings]
 
 
 def effects_of(options: Mapping[str, Any]) -> tuple[str, ...]:
-    """Effects of the model file, then those of ``--with``; the user's files are read first."""
+    """Effects of the model file, then those of ``--with``; the model file is checked before a Python file is run."""
+    from kf_calib import model_file
     from kf_calib.effects import load_file, merged, refuse_unknown
 
+    model = model_file.read(options["model_file"]) if options["model_file"] is not None else None
     for path in options["effects_from"]:
         load_file(path)
     for text in options["effects"]:
         refuse_unknown(text)  # at once, not after a long recording was read
-    if options["model_file"] is None:
+    if model is None:
         return tuple(options["effects"])
-    from kf_calib import model_file
-
-    return merged(model_file.read(options["model_file"]).effects, options["effects"])
+    for change in model.load(options["effects_from"], options["trust"]):
+        complain(f"{change}")
+    return merged(model.effects, options["effects"])
 
 
 def save_view(result: Calibration, path: Path) -> None:
@@ -249,21 +252,22 @@ def print_json(content: Mapping[str, Any]) -> None:
 
 
 def json_line(content: Mapping[str, Any]) -> str:
-    return json.dumps(content, ensure_ascii=False, allow_nan=False)
+    """One line of JSON; what is not printable is escaped, which JSON itself asks of a part of it only."""
+    text = json.dumps(content, ensure_ascii=False, allow_nan=False)
+    return text if text.isprintable() else "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 
 
 def show(renderable: Any) -> None:
-    echo(rendered(renderable), end=False)
+    echo_drawn(rendered(renderable))
 
 
 def rendered(renderable: Any) -> str:
     """As text for standard output, its line ended; nothing is written."""
-    from rich.console import Console
+    from kf_calib.views.terminal import PlainConsole
 
     screen, text = sys.stdout.isatty(), io.StringIO()
     width = None if screen or os.environ.get("COLUMNS", "").isdigit() else 110
-    console = Console(file=text, force_terminal=screen or None, width=width, highlight=False, soft_wrap=not screen)
-    console.print(renderable)
+    PlainConsole(file=text, force_terminal=screen or None, width=width, soft_wrap=not screen).print(renderable)
     return text.getvalue()
 
 
@@ -277,13 +281,13 @@ def progress(text: str, quiet: bool = False) -> Iterator[Callable[[float], None]
     if quiet or not sys.stderr.isatty():
         yield lambda fraction: None
         return
-    from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
     from kf_calib import stage
+    from kf_calib.views.terminal import PlainConsole
 
     columns = BarColumn(20), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False)
-    with Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bars:
+    with Progress(*columns, console=PlainConsole(stderr=True), transient=True, redirect_stdout=False) as bars:
         bars.add_task(text, total=None)
         (task,) = bars.tasks
 

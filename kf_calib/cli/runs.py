@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
+from kf_calib.cli.echo import complain
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.options import (
     BENCH_OPTIONS,
@@ -33,6 +35,10 @@ from kf_calib.cli.options import (
     show,
     strict_option,
 )
+from kf_calib.errors import InputError
+
+if TYPE_CHECKING:
+    from kf_calib.journal import Origin
 
 STEPS = "Steps"
 
@@ -240,14 +246,14 @@ def improve(
     interactive = _asks(interactive, unattended, as_json)
     outputs = claimed(overwrite=overwrite)
     earlier = journal.read(from_journal) if from_journal else None
-    if earlier is not None:
-        options |= _of_journal(ctx, options, earlier.origin.options)
+    origin = journal.Origin.of(recording)
+    if earlier is not None and from_journal is not None:
+        earlier.refuse_other(origin, from_journal)
+        options |= _of_journal(ctx, options, earlier.origin, from_journal)
         outputs.spare(options["effects_from"])
     _refuse_engine(options)
     settings = settings_of(options)
-    origin = journal.Origin.of(recording, _for_journal(options, settings.effects))
-    if earlier is not None:
-        earlier.refuse_other(origin, from_journal)
+    origin = replace(origin, **_for_journal(options, settings.effects))
 
     with delivery(outputs, as_json) as deliver:
 
@@ -291,6 +297,8 @@ def _asks(interactive: bool, unattended: bool, as_json: bool) -> bool:
 
 
 _BY_CONTENT = ("bench_file", "model_file", *BENCH_OPTIONS)
+_LEAVE = ("effects_from", "trust")
+"""Options by which a user allows Python files to be run: a journal cannot give them."""
 
 
 def _refuse_engine(options: Mapping[str, Any]) -> None:
@@ -302,27 +310,46 @@ def _refuse_engine(options: Mapping[str, Any]) -> None:
 
 
 def _for_journal(options: Mapping[str, Any], effects: Sequence[str]) -> dict[str, Any]:
-    """All options that numbers depend on; files of bench keys and of models by what they say."""
+    """Options and programs of an ``Origin``: all that numbers depend on; files of bench keys and of models by what they
+    say."""
     from kf_calib import model_file
+    from kf_calib.effects import loaded
 
     files = [*options["effects_from"]]
     if options["model_file"] is not None:
-        files += model_file.read(options["model_file"]).effects_from
-    kept = {key: value for key, value in options.items() if value is not None and key not in _BY_CONTENT}
-    plain = {"effects": list(effects), "effects_from": [str(path.resolve()) for path in files]}
-    return kept | overrides(options) | plain
+        files += model_file.read(options["model_file"]).allowed(options["effects_from"], options["trust"]).files
+    others = (*_BY_CONTENT, *_LEAVE)
+    kept = {key: value for key, value in options.items() if value is not None and key not in others}
+    return {"options": kept | overrides(options) | {"effects": list(effects)}, "programs": tuple(loaded(files))}
 
 
-def _of_journal(ctx: click.Context, options: Mapping[str, Any], kept: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of a journal, as if they had been given; raises UsageError where some are given as well."""
+def _of_journal(ctx: click.Context, options: Mapping[str, Any], origin: Origin, path: Path) -> dict[str, Any]:
+    """The options of a journal, as if they had been given, with the Python files that may be run for it.
+
+    Raises UsageError where some are given as well, and InputError where the journal's make no sense.
+    """
     from click.core import ParameterSource
 
-    own = [param for param in ctx.command.params if param.name in options]
+    from kf_calib.effects.programs import allowed
+
+    own = [param for param in ctx.command.params if param.name in options and param.name not in _LEAVE]
     given = [
         param.opts[0] for param in own if ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE
     ]
     if given:
         raise click.UsageError(f"--from-journal has its options from the journal: leave out {', '.join(given)}.")
-    return {param.name or "": param.type_cast_value(ctx, kept[param.name]) for param in own if param.name in kept} | {
-        key: None for key in _BY_CONTENT if key not in kept
-    }
+    kept = {key: value for key, value in origin.options.items() if key not in ("bench_file", "model_file")}
+    out: dict[str, Any] = {key: None for key in _BY_CONTENT if key not in kept}
+    for param in own:
+        if (name := param.name or "") in kept:
+            try:
+                if isinstance(kept[name], list | tuple) != bool(getattr(param, "multiple", False)):
+                    raise TypeError
+                out[name] = param.type_cast_value(ctx, kept[name])
+            except (click.BadParameter, TypeError, ValueError) as error:
+                why = error.message if isinstance(error, click.BadParameter) else f"{kept[name]!r}"
+                raise InputError(f"{path}: is no journal of improve (option {name}: {why}).") from None
+    found = allowed(path, origin.programs, options["effects_from"], options["trust"])
+    for change in found.changes:
+        complain(f"{change}")
+    return out | {"effects_from": (*options["effects_from"], *found.files)}

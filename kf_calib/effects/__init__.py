@@ -8,6 +8,7 @@ batch least squares, the views and the tests; so is one that a user registers (`
 from __future__ import annotations
 
 import difflib
+import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
@@ -16,12 +17,14 @@ from pathlib import Path
 from kf_calib.bench import Bench
 from kf_calib.effects import checks, drift, dynamic, formula, frame, sensor, surroundings, thermal, user
 from kf_calib.effects.effect import Coefficient, Effect, FrameEffect, SensorEffect, Unknown
+from kf_calib.effects.programs import Program
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 
 __all__ = [
     "Coefficient", "Effect", "FrameEffect", "SensorEffect", "Stimulus", "Unknown", "as_text", "effect_named",
-    "files_of", "load_file", "merged", "names", "of_the_users", "refuse_unknown", "register", "remarks_of",
+    "load_file", "loaded", "merged", "names", "of_the_users", "programs_of", "refuse_unfit", "refuse_unknown",
+    "register", "remarks_of",
 ]  # fmt: skip
 
 _PLAIN: dict[str, type[Effect]] = {
@@ -49,11 +52,11 @@ _OF_A_GIMBAL = {
 
 @dataclass(frozen=True)
 class _Registered:
-    """A user's class; where it came from, in words and, if from a file, as a path; what its checks had to say."""
+    """A user's class; where it came from, in words and, if from a file, as that file; what its checks had to say."""
 
     kind: type[Effect]
     origin: str
-    file: Path | None
+    program: Program | None
     remarks: tuple[str, ...]
 
 
@@ -104,6 +107,14 @@ def refuse_unknown(text: str) -> None:
         raise _unknown(text, known)
 
 
+def refuse_unfit(texts: Iterable[str], programs: Iterable[Program]) -> None:
+    """Raise InputError for what is no effect, as far as that is known before the programs have run."""
+    undefined = bool(list(programs))
+    for text in texts:
+        if "=" in text or not undefined:
+            refuse_unknown(text)
+
+
 def _unknown(text: str, known: list[str]) -> InputError:
     near = difflib.get_close_matches(text, known, n=3, cutoff=0.4)
     hint = f"did you mean {' or '.join(near)}?" if near else f"the catalogue has {', '.join(known)}."
@@ -132,7 +143,7 @@ def _catalogue_symbols() -> dict[str, str]:
     return found | {effect.unknown.symbol: str(effect) for effect in known if effect.unknown is not None}
 
 
-def register(kind: type[Effect], origin: str = "this program", file: Path | None = None) -> type[Effect]:
+def register(kind: type[Effect], origin: str = "this program", program: Program | None = None) -> type[Effect]:
     """Let a user's class into the catalogue, completed and checked; a decorator of it, too.
 
     Raises InputError, in one sentence, where its name or symbols are taken or a check fails.
@@ -151,16 +162,32 @@ def register(kind: type[Effect], origin: str = "this program", file: Path | None
     effect = user.made(kind, origin)
     said = checks.check(effect)
     user.refuse_symbols(effect, _catalogue_symbols())
-    _registered[name] = _Registered(kind, origin, file, said)
+    _registered[name] = _Registered(kind, origin, program, said)
     return kind
 
 
 def load_file(path: Path) -> list[str]:
-    """Register the effect classes of a Python file; returns their names. A file loaded again replaces its classes."""
-    file = path.resolve()
-    for name in [name for name, known in _registered.items() if known.file == file]:
+    """Run a Python file and register its effect classes; returns their names.
+
+    A file that has changed since it was loaded replaces its classes; one that has not is not run again.
+    """
+    source = user.source_of(path)
+    program = Program(path.resolve(), hashlib.sha256(source).hexdigest())
+    before = {name: known.program for name, known in _registered.items() if known.program}
+    before = {name: known for name, known in before.items() if known.path == program.path}
+    if before and set(before.values()) == {program}:
+        return list(before)
+    _forget(program.path)
+    try:
+        return [register(kind, str(path), program).name for kind in user.classes_in(source, path)]
+    except InputError:
+        _forget(program.path)
+        raise
+
+
+def _forget(file: Path) -> None:
+    for name in [name for name, known in _registered.items() if known.program and known.program.path == file]:
         del _registered[name]
-    return [register(kind, str(path), file).name for kind in user.classes_in_file(path)]
 
 
 @cache
@@ -187,10 +214,16 @@ def as_text(effect: Effect) -> str:
     return effect.text if isinstance(effect, formula.Formula | formula.FrameFormula) else str(effect)
 
 
-def files_of(effects: Iterable[Effect]) -> list[Path]:
-    """The user's files that classes of these effects came from."""
+def programs_of(effects: Iterable[Effect]) -> list[Program]:
+    """The user's files that classes of these effects came from, as they were run."""
     known = (_registered.get(str(effect)) for effect in effects)
-    return list(dict.fromkeys(each.file for each in known if each is not None and each.file is not None))
+    return list(dict.fromkeys(each.program for each in known if each is not None and each.program is not None))
+
+
+def loaded(files: Iterable[Path]) -> list[Program]:
+    """These files as they were run."""
+    run = {known.program.path: known.program for known in _registered.values() if known.program}
+    return list(dict.fromkeys(run[file.resolve()] for file in files))
 
 
 def merged(first: Iterable[str], second: Iterable[str]) -> tuple[str, ...]:

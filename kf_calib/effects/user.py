@@ -35,12 +35,19 @@ TWELVE = frozenset(f"{stem}{i}" for stem in ("theta", "phi", "nu", "K", "b") for
 """Symbols of the paper's parameters, one or two of them never used: no effect may have them."""
 
 
-def classes_in_file(path: Path) -> list[type[Effect]]:
-    """The effect classes a Python file defines, in its order; raises InputError where it cannot be run or has none."""
+def source_of(path: Path) -> bytes:
+    """The text of a Python file; raises InputError where it cannot be read."""
     try:
-        source = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}): give a Python file of effect classes.") from None
+
+
+def classes_in(source: bytes, path: Path) -> list[type[Effect]]:
+    """The effect classes that the text of a Python file defines, in its order.
+
+    Raises InputError where it cannot be run or has none.
+    """
     # run from its text: nothing is written beside the user's file, and an old compiled copy is never taken for it
     module = ModuleType(f"kf_calib_user_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]}")
     module.__file__ = str(path)

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from decimal import Decimal
 from typing import Any
 
+from kf_calib.bench import metadata_of
 from kf_calib.sources.line_parts import (
     ACCEL_UNITS,
     TIME_DECIMALS,
@@ -85,8 +86,7 @@ class JsonLines(LineReader):
         bench = entry["bench"]
         if not isinstance(bench, dict):
             raise LineError("bench is not a JSON object")
-        pairs = ((key, value) for key, value in bench.items() if value is not None)
-        self.metadata = {key: value if isinstance(value, str) else json.dumps(value) for key, value in pairs}
+        self.metadata = metadata_of({key: value for key, value in bench.items() if value is not None})
         return True
 
     def _time_ns(self, entry: dict[str, Any], line: str) -> int:

@@ -6,7 +6,7 @@ import io
 import math
 
 import numpy as np
-from rich.console import Console, Group, RenderableType
+from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib import paper
@@ -19,6 +19,7 @@ from kf_calib.likelihood import FEWEST, freedom
 from kf_calib.model import Model
 from kf_calib.outlying import OutlyingDwell
 from kf_calib.views.tables import Table
+from kf_calib.views.terminal import PlainConsole, note
 
 _NOT_ESTIMATED = "not estimated"
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
@@ -184,7 +185,7 @@ def summary(result: Calibration) -> RenderableType:
         *([effect_table(result)] if result.model.effects else []), noise_table(result),
         Text(verdict(result), style="bold green" if result.consistency.consistent else "bold yellow"),
     ]  # fmt: skip
-    parts += [Text(f"Note: {warning}", style="yellow") for warning in result.warnings]
+    parts += [note(warning) for warning in result.warnings]
     parts += [without_table(result, found) for found in result.outlying]
     return Group(*parts)
 
@@ -199,13 +200,13 @@ def comparison_table(compared: Comparison) -> RenderableType:
             name, f"{way.wall_s:.3f}", f"{way.peak_mb:.1f}", f"{way.max_difference_sigma:.1e}",
             f"{way.max_relative_variance:.1e}",
         )  # fmt: skip
-    return Group(table, *(Text(f"Note: {sentence}") for sentence in compared.remarks))
+    return Group(table, *map(note, compared.remarks))
 
 
 def plain(renderable: RenderableType, width: int = 110) -> str:
     """As text without colour or control characters."""
     out = io.StringIO()
-    Console(file=out, width=width, no_color=True, highlight=False).print(renderable)
+    PlainConsole(file=out, width=width, no_color=True).print(renderable)
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines())
 
 

@@ -17,6 +17,7 @@ from kf_calib.trend import Trend
 from kf_calib.views.console import plain, rounded, symbol
 from kf_calib.views.json import clean, outlying_object, readings_object
 from kf_calib.views.tables import Table
+from kf_calib.views.terminal import note
 
 
 def description(found: Diagnosis) -> Description | None:
@@ -142,7 +143,7 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
     if found.test.invisible:
         parts.append(Text(f"Not to be seen with this run: {', '.join(found.test.invisible)}."))
     parts.append(_detectable_table(detectable(found.test)))
-    parts += [Text(f"Note: {warning}", style="yellow") for warning in _notes(found)]
+    parts += map(note, _notes(found))
     return Group(*parts)
 
 

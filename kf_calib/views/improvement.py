@@ -15,10 +15,12 @@ from kf_calib.calibration import Calibration, evaluated, format_p
 from kf_calib.diagnosis import Diagnosis, next_orientation
 from kf_calib.errors import InputError
 from kf_calib.improvement import Honest, Improvement, Removal, Spread, Step, extended, stepped, undone
+from kf_calib.text import sentence
 from kf_calib.views.console import effect_table, parameter_table, rounded, symbol
 from kf_calib.views.diagnosis import description, description_object, of_what_p_is, orientation_object
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Bar, Table
+from kf_calib.views.terminal import note
 
 _WIDTH = 30  # characters of the longest bar
 _EIGHTHS = " ▏▎▍▌▋▊▉"
@@ -142,7 +144,7 @@ def improvement_report(state: Improvement, honest: Honest | None, replay_differe
     if replay_difference is not None:
         same = "to the last bit" if replay_difference == 0 else f"but for {replay_difference:.1g} of a figure at most"
         parts.append(Text(f"The steps of the journal gave its figures again, {same}."))
-    parts += [Text(f"Note: {sentence}", style="yellow") for sentence in notes(state)]
+    parts += map(note, notes(state))
     return Group(*parts)
 
 
@@ -274,7 +276,7 @@ def session(
                 state = answered(state, answer, options)
             on_step(state)
         except InputError as error:
-            show(Text(f"{error}", style="red"))
+            show(Text(sentence(str(error)), style="red"))
 
 
 def answered(state: Improvement, answer: str, options: list[tuple[str, ...]]) -> Improvement:

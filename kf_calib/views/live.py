@@ -13,6 +13,7 @@ from rich.text import Text
 from kf_calib import paper
 from kf_calib.samples import Floats, Mask
 from kf_calib.standing import Judgement, Standing
+from kf_calib.text import sentence
 from kf_calib.views.console import symbol
 from kf_calib.views.diagnosis import diagnosis_object
 from kf_calib.views.json import clean, replay_object
@@ -85,7 +86,7 @@ def screen(standing: Standing, status: Status | None, name: str, recording: str 
         going = judgement.next_orientation
         if going is not None:
             parts.append(Text(f"next: gimbals at {_angles(going[0])} deg: {going[1]}", style="bold"))
-    parts += [Text(text, style="yellow") for text in (standing.problem, standing.notice) if text]
+    parts += [Text(sentence(text), style="yellow") for text in (standing.problem, standing.notice) if text]
     if hint:
         parts.append(Text(hint, style="dim"))
     return Group(*parts)
@@ -113,9 +114,9 @@ def _link(standing: Standing, status: Status | None, name: str, recording: str) 
             out.append(f"  {count} {word}", style if count else "")
     for trouble in (status.trouble, status.clock_trouble):
         if trouble:
-            out.append(f"\n{trouble}", "bold red")
+            out.append(f"\n{sentence(trouble)}", "bold red")
     if status.recording_trouble:
-        out.append(f"\nRECORDING HAS STOPPED: {status.recording_trouble}", "bold white on red")
+        out.append(f"\nRECORDING HAS STOPPED: {sentence(status.recording_trouble)}", "bold white on red")
     if recording and not status.recording_trouble:
         age = "" if status.sync_age_s is None else f", on the disk up to {status.sync_age_s:.1f} s ago"
         out.append(f"\nrecording {recording}: {status.recorded} readings{age}")

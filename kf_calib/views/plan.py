@@ -19,6 +19,7 @@ from kf_calib.samples import Floats
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Table
+from kf_calib.views.terminal import note
 
 _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("µm/s²", 1e6)}
 
@@ -81,7 +82,7 @@ def generalised_ratio(made: Plan) -> float:
 def plan_report(made: Plan, beside_paper: bool = False) -> RenderableType:
     """What ``plan`` prints."""
     return Group(_orientations(made), _sigmas(made, beside_paper), *map(Text, sentences(made, beside_paper)),
-                 *(Text(f"Note: {remark}", style="yellow") for remark in made.remarks))  # fmt: skip
+                 *map(note, made.remarks))  # fmt: skip
 
 
 def _orientations(made: Plan) -> Table:

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kf_calib.bench import metadata_of
 from kf_calib.samples import Batch, Floats, Mask, Stream, Times
 from kf_calib.sources.line_parts import Account
 
@@ -221,13 +222,11 @@ class FrameReader:
     def _learn(self, text: bytes, place: int) -> None:
         try:
             facts = json.loads(text)
+            if not isinstance(facts, dict):
+                raise ValueError
+            self.metadata = metadata_of({key: value for key, value in facts.items() if value is not None})
         except (ValueError, RecursionError):
-            facts = None
-        if not isinstance(facts, dict):
             self._account.refuse(place, "it holds no JSON object")
-            return
-        pairs = ((key, value) for key, value in facts.items() if value is not None)
-        self.metadata = {key: value if isinstance(value, str) else json.dumps(value) for key, value in pairs}
 
     def _follow(self, numbers: NDArray[np.int64]) -> None:
         """Counts the numbers passed over; one that is far off is that of a bench that counts anew."""

@@ -19,6 +19,7 @@ from pathlib import Path
 import rerun as rr
 
 from kf_calib.calibration import Calibration
+from kf_calib.text import printable
 from kf_calib.views.rerun.correlation import log_correlation
 from kf_calib.views.rerun.file import rrd_file
 from kf_calib.views.rerun.layout import TABS, layout
@@ -70,7 +71,7 @@ def _log(result: Calibration, history: History, stream: rr.RecordingStream, show
         log_nis(fresh, stream, shown)
         log_correlation(fresh, stream)
         log_bench(result, stream, shown)
-    stream.log("summary", rr.TextDocument(summary(result), media_type=rr.MediaType.MARKDOWN), static=True)
+    stream.log("summary", rr.TextDocument(printable(summary(result)), media_type=rr.MediaType.MARKDOWN), static=True)
 
 
 @contextmanager

@@ -1,0 +1,36 @@
+"""Text from files, links and arguments, made fit for a terminal.
+
+What a recording, a stream or a file name holds may be anything, commands to the terminal included: colours, a new
+title, lines moved over others. Whatever Python does not call printable is therefore written as its code, ``\\x1b``.
+"""
+
+from __future__ import annotations
+
+LONGEST = 1000
+"""Characters of a message, at most."""
+_END = 300  # of a message that is cut: its last words say what to do
+
+
+def printable(text: str) -> str:
+    """The text with all but its line ends printable."""
+    if text.isprintable():
+        return text
+    return "".join(each if each.isprintable() or each == "\n" else _code(each) for each in text)
+
+
+def sentence(text: str) -> str:
+    """The text on one printable line of at most ``LONGEST`` characters; what is too long loses its middle."""
+    line = printable(cut(text, LONGEST)).replace("\n", "\\n")
+    return cut(line, LONGEST)
+
+
+def cut(text: str, longest: int) -> str:
+    """The text, without what is too much in its middle."""
+    if len(text) <= longest:
+        return text
+    end = min(_END, longest // 3)
+    return f"{text[: longest - end - 3]} … {text[-end:]}"
+
+
+def _code(each: str) -> str:
+    return each.encode("unicode_escape").decode()
