@@ -151,8 +151,8 @@ def test_noise_rarely_puts_a_rival_so_far_ahead_that_the_truth_is_out() -> None:
 
 def test_command_line(tmp_path: Path) -> None:
     out = tmp_path / "run.mcap"
-    made = ["simulate", str(out), "--hide", "second-order=20sigma", "--dwell-s", "6", "--slew-degps", "90",
-            "--orientations", "16"]  # fmt: skip
+    made = ["simulate", str(out), "--hide", "second-order=40sigma", "--dwell-s", "6", "--slew-degps", "90",
+            "--orientations", "10"]  # fmt: skip
     assert CliRunner().invoke(cli, made).exit_code == 0
     printed = CliRunner().invoke(cli, ["diagnose", str(out), "--json"])
     content = json.loads(printed.stdout)

@@ -100,7 +100,7 @@ def test_coefficients_of_a_nonlinear_truth_are_found(name: str) -> None:
     effect = effect_named(name, BENCH)
     size = SIZES[effect.coefficients[0].unit]
     truth = [size * (1.0, -0.6, 0.8, 0.5, -0.9, 0.7)[k] for k in range(len(effect.coefficients))]
-    dwells = Pass(run([f"{name}={','.join(map(str, truth))}"], plan=PLAN[:18]), Settings()).fold()
+    dwells = Pass(run([f"{name}={','.join(map(str, truth))}"], plan=PLAN[:18], sample_hz=10.0), Settings()).fold()
     result, without = (evaluate(dwells, BENCH, Settings(effects=effects)) for effects in ((name,), ()))
     got = [result.parameters[c.symbol].value for c in effect.coefficients]
     if name == "axis-nonorthogonality" or name.startswith("axis-"):  # the directions across an axis are free

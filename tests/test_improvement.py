@@ -215,8 +215,8 @@ def test_sigmas_are_honest_after_improvement(runs: int) -> None:
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("improve") / "run.mcap"
-    words = ["simulate", str(out), "--hide", "second-order=20sigma", "--dwell-s", "6", "--slew-degps", "90",
-             "--orientations", "16"]  # fmt: skip
+    words = ["simulate", str(out), "--hide", "second-order=40sigma", "--dwell-s", "6", "--slew-degps", "90",
+             "--orientations", "10"]  # fmt: skip
     assert CliRunner().invoke(cli, words).exit_code == 0
     return out
 

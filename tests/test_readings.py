@@ -194,7 +194,8 @@ def simulated(printed, path: Path, *hide: str) -> Path:
 
 
 def test_hidden_flat_tops_are_said_before_an_effect_is_named(printed, tmp_path: Path) -> None:
-    path = simulated(printed, tmp_path / "flat.mcap", "saturation=0,9.5,0")
+    path = tmp_path / "flat.mcap"
+    printed("simulate", path, *QUICK, "--plan", "faces", "--hide", "saturation=0,9.5,0")
     found = json.loads(printed("diagnose", path, "--json"))
     assert {each["channel"] for each in found["readings"]["saturation"]} == {2}
     assert {abs(each["level_mps2"]) for each in found["readings"]["saturation"]} == {9.5}
