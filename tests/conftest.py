@@ -17,23 +17,23 @@ del os.environ["COLUMNS"]  # readline sets it behind Python's back, and a child 
 
 from kf_calib.cli import main
 
-_DRIVERS = {name: os.environ.get(name) for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES")}
-os.environ.update(dict.fromkeys(_DRIVERS, os.devnull))  # hidden: a test that draws must say so, with ``draws``
-
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "recordings"
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
-    """A test that is marked ``draws`` has the machine's graphics driver, and is skipped where there is none."""
-    if item.get_closest_marker("draws") is None:
-        return (yield)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """The graphics driver is hidden from a test that does not say that it draws: it would fail where there is none."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in _DRIVERS.items():
-            patch.delenv(name) if value is None else patch.setenv(name, value)
-        if reason := _why_nothing_is_drawn():
-            pytest.skip(reason)
+        if item.get_closest_marker("draws") is None:
+            for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
+                patch.setenv(name, os.devnull)
         return (yield)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A test that draws is skipped where there is no graphics driver."""
+    if item.get_closest_marker("draws") is not None and (reason := _why_nothing_is_drawn()):
+        pytest.skip(reason)
 
 
 @functools.cache

@@ -470,6 +470,7 @@ def test_small_effects_are_linear_in_their_size(name):
     np.testing.assert_allclose(two - none, 2 * (one - none), rtol=0, atol=2e-3 * np.abs(two - none).max() + 1e-13)
 
 
+@pytest.mark.slow  # all at once, below, in short
 @pytest.mark.parametrize("name", catalogue())
 def test_batches_do_not_matter_to_an_effect(name):
     text = f"{name}={VISIBLE[name]}"

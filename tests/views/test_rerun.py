@@ -230,7 +230,7 @@ def _drawn(recording: Path, picture: Path, **options) -> np.ndarray:
 def test_without_a_graphics_driver_it_says_what_to_install(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As is any test that does not say that it draws."""
+    """As it is for any test that does not say that it draws."""
     monkeypatch.setattr("kf_calib.views.screenshot._IDLE_S", 0.0)  # as on a busy machine: it listens, and ends later
     with pytest.raises(ScreenshotError, match="mesa-vulkan-drivers"):
         screenshot(recording, tmp_path / "x.png")
