@@ -68,7 +68,7 @@ def test_metadata_says_which_files_and_in_which_order(tmp_path: Path) -> None:
     folder = split(tmp_path / "bag", names)
     (folder / "metadata.yaml").write_text(METADATA.format("\n".join(f"    - {name}" for name in names)))
     assert read(Recording(folder)).accel.time_ns.tolist() == BATCH.accel.time_ns.tolist()
-    one, other = Origin.of(folder, {}), Origin.of(folder / "z.mcap", {})
+    one, other = Origin.of(folder), Origin.of(folder / "z.mcap")
     assert one.name == "bag" and one.sha256 != other.sha256
     (folder / "a.mcap").unlink()
     with pytest.raises(InputError, match=r"lacks a\.mcap, which its metadata.yaml names"):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from kf_calib.samples import Batch
 from kf_calib.sources.live import frames
 from kf_calib.sources.live.clock import Clock
-from kf_calib.sources.live.continuity import Abreast, Continuity
+from kf_calib.sources.live.continuity import Continuity
 from kf_calib.sources.live.protocols import Protocol
 
 START_NS = 1_750_000_000_000_000_000
@@ -94,7 +94,7 @@ class _Chain:
 
     def __init__(self, form: str, *, is_begun: bool) -> None:
         self.protocol, self.form = Protocol("fuzz", {}, CELLS if form == "csv" else ""), form
-        self._clock, self._continuity, self._abreast = Clock(), Continuity(), Abreast(3)
+        self._clock, self._continuity = Clock(), Continuity()
         opening = {"json": b'{"bench": {}}\n', "csv": b"", "frames": b"\0" + frames.bench({})}[form]
         self.push(opening + (_sound(form, 0) if is_begun else b""))
         assert self.protocol.reader is not None
@@ -105,7 +105,6 @@ class _Chain:
         fits = (batch.accel.time_ns >= 0) & (batch.accel.time_ns < 1 << 61)
         timed = self._clock.push(Batch(batch.accel[fits], batch.pose[:0], batch.temperature[:0]), 0.0)
         self._continuity.add(timed.accel.time_ns)
-        self._abreast.push(timed, 0.0)
         return len(batch.accel)
 
 
