@@ -23,6 +23,7 @@ import numpy as np
 
 from kf_calib import paper
 from kf_calib.bench import CHANNELS, Bench
+from kf_calib.effects.effect import G
 from kf_calib.errors import BlunderError
 from kf_calib.folding import DwellFactor
 from kf_calib.mountings import Mounting, mountings
@@ -45,7 +46,6 @@ _ALIKE = 0.05  # of what three scale factors have in common: they differ by less
 _LITTLE = 20e-6  # of a scale factor: not worth a word
 _STUCK = 1e-9  # relative: readings that differ by less are one value
 
-STANDARD_GRAVITY_MPS2 = 9.80665
 Channels = tuple[int, int, int]
 
 
@@ -348,11 +348,11 @@ def common_scale(scales: Floats, sigmas: Floats, bench: Bench) -> str:
     if not (same and abs(level) > max(5.0 * float(sigmas.max()), _LITTLE)):
         return ""
     said = f"the three scale factors are off by the same {1e6 * level:+.0f} ppm, as they are where"
-    factor = bench.gravity_mps2 / STANDARD_GRAVITY_MPS2
+    factor = bench.gravity_mps2 / G
     if abs(level - (1.0 / factor - 1.0)) < max(5.0 * float(sigmas.max()), _ALIKE * abs(level)):
         return (
             f"{said} readings in units of local gravity ({bench.gravity_mps2:.6g} m/s^2) are taken for such of "
-            f"standard gravity ({STANDARD_GRAVITY_MPS2}): if they are, state --accel-scale {factor:.7f}."
+            f"standard gravity ({G}): if they are, state --accel-scale {factor:.7f}."
         )
     seen_mps2 = bench.gravity_mps2 * (1.0 + level)
     return f"{said} gravity is not {bench.gravity_mps2:.6g} m/s^2 as stated, but {seen_mps2:.6g}."

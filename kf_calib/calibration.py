@@ -39,7 +39,7 @@ from kf_calib.information import Step
 from kf_calib.likelihood import ENOUGH_DIRECTIONS, FEWEST, directions, freedom
 from kf_calib.model import PRIORS, STATE_COUNT, Model, Prior, Rows, model_rows
 from kf_calib.noise import TOO_SHORT, Noise, considered, mean_covariances, steps
-from kf_calib.outlying import OutlyingDwell, outlying_dwells
+from kf_calib.outlying import OutlyingDwell, in_words, outlying_dwells
 from kf_calib.readings import Readings, Watch
 from kf_calib.samples import Floats, Mask, Source
 from kf_calib.sources.recording import opened
@@ -423,6 +423,7 @@ def concluded(
     settings, bench = passed.settings, passed.source.bench
     dwells = passed.dwells if plain is None else plain.dwells
     if plain is None:
+        _refuse_absent(settings.left_out, passed.folder.dwells)
         refuse_unusable(dwells, passed.tally, bench)
     stage.say("estimating")
     if again is not None and Model.of(bench, settings.effects).oscillates:
@@ -444,7 +445,7 @@ def told(result: Calibration, passed: Pass) -> Calibration:
     own = [effect for effect in result.model.effects if of_the_users(effect)]
     notes = [f"{sight}." for sight in sights(result.fit, own)]
     readings = passed.watch.judged(result.fit.dwells, result.noise)
-    found = [" Or ".join(map(str, outlying))] if outlying else []
+    found = [in_words(outlying)] if outlying else []
     misfit = _misfit(result.consistency, result.residuals_mps2, result.bench, result.noise)
     usual = [each for each in result.warnings if each != misfit or not (outlying or readings.saturation)]
     counted = [*passed.tally.sentences(), *passed.tally.unmet(passed.settings.stillness)]
@@ -598,6 +599,16 @@ def _counted(
             on_progress(done / total)
         if done >= at_most:
             return
+
+
+def _refuse_absent(left_out: Sequence[int], dwells: Sequence[DwellFactor]) -> None:
+    """Raise InputError where a dwell is to be left out that is not there: another one was meant."""
+    absent = sorted(set(left_out) - {dwell.number for dwell in dwells})
+    if absent and dwells:
+        raise InputError(
+            f"there is no dwell {absent[0]} to leave out (--leave-out): the run has dwells {dwells[0].number} to "
+            f"{dwells[-1].number}."
+        )
 
 
 def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> None:

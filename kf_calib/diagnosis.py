@@ -25,6 +25,7 @@ from kf_calib.effects import walk_named
 from kf_calib.fitting import WALK, behind_within
 from kf_calib.noise import mean_covariances
 from kf_calib.odds import as_fall
+from kf_calib.outlying import in_words
 from kf_calib.pairs import (
     MOST,
     WALKS,
@@ -135,8 +136,7 @@ def diagnose(run: Calibration | Source | str | PathLike[str]) -> Diagnosis:
 def _diagnosed(before: Calibration) -> Diagnosis:
     if before.outlying:  # a dwell that is wrong is no effect, and looks like many
         test = assessed(before.fit)
-        said = " Or ".join(map(str, before.outlying))
-        verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {said}"
+        verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {in_words(before.outlying)}"
         return Diagnosis(before, test, (), (), test.consistent is False, (), {}, None, verdict)
     test = _without_vibration(before, assessed(before.fit))
     found = _explained(before, test)

@@ -10,7 +10,7 @@ by more than any known effect makes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -75,6 +75,11 @@ class OutlyingDwell:
         p_value = self.without.consistency.p_value
         agrees = "" if p_value is None else f" (p = {p_value:.2g})"
         return f"{told}; without it model and measurements agree{agrees}: --leave-out {self.number}."
+
+
+def in_words(found: Sequence[OutlyingDwell]) -> str:
+    """What is said of the dwells of which any one could be it; '' where there are none."""
+    return " Or ".join(map(str, found))
 
 
 def outlying_dwells(

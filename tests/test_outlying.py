@@ -8,6 +8,7 @@ from altered import Altered, mistyped, short_run
 
 from kf_calib.calibration import Settings, calibrate
 from kf_calib.diagnosis import diagnose
+from kf_calib.errors import InputError
 
 
 @pytest.mark.parametrize("options", [{}, {"unstated": True}, {"setting_sigma_deg": 0.01}, {"grade": "mems"}], ids=str)
@@ -68,3 +69,8 @@ def test_poses_are_those_that_were_recorded() -> None:
     run = short_run(count=8)
     typed = np.degrees(np.array([visit.dwell.recorded_pose for visit in calibrate(run).visits]))
     np.testing.assert_allclose(typed, [visit.gimbal_deg for visit in run.plan], atol=1e-9)
+
+
+def test_a_dwell_to_leave_out_must_be_there() -> None:
+    with pytest.raises(InputError, match=r"no dwell 9 to leave out \(--leave-out\): the run has dwells 1 to 8"):
+        calibrate(short_run(count=8), Settings(left_out=(2, 9)))
