@@ -7,7 +7,7 @@ all come from such factors.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from kf_calib.triangle import triangle
 
 _SLOW = np.arange(1, 5)
 _STILL = np.zeros(2)
+_AT_ONCE = 1 << 17  # numbers of rows worked on together, so that they stay in the cache
 
 
 def whitened(
@@ -44,47 +45,81 @@ def whitened(
     ``flicker_mps2`` (3,): sqrt(h) of 1/f noise of density h / f, whose slow parts within a dwell are states, too.
     ``reduced``: to as few rows as the columns have rank; else all are there, which is faster where columns are many.
     """
-    sigma, sigmas = noise.effective_sigma_mps2, noise.dwell_sigmas
-    used, units = np.flatnonzero(sigmas > 0), _units(columns)
-    nuisances, slow = dwell_map(state)[:, :, used], 0 if flicker_mps2 is None else len(_SLOW)
-    offsets, priors = len(used), sigmas[used]
-    if flicker_mps2 is not None:
-        priors = np.append(priors, np.outer(np.maximum(flicker_mps2, FLOOR_MPS2), 1.0 / np.sqrt(_SLOW)))
-    count, ratios = len(priors), noise.walk_mps2_per_sqrt_s / sigma
     inside = 3 if noise.walk_mps2_per_sqrt_s else 0
-    first_of_model = count + inside
-    out = list[Floats]()
-    for dwell, own in zip(dwells, columns, strict=True):
-        triangles, regressors = dwell.triangles, dwell.regressors
-        carried, size, width = triangles[:, : dwell.width, : dwell.width], dwell.width * len(triangles), own.shape[-1]
-        rows = np.zeros((3 * size + count, first_of_model + width + 1))
-        turned = regressors @ nuisances[:, None]
-        modelled = carried @ on_basis(np.moveaxis(own, 2, 0))  # (3, pieces, K, p)
-        for i in range(3):
-            part = rows[i * size : (i + 1) * size]
-            part[:, :offsets] = turned[i].reshape(size, offsets) / sigma[i]
-            if slow:
-                first = offsets + slow * i
-                waves = carried[:, :, :3] @ on_basis(_waves(dwell))
-                part[:, first : first + slow] = waves.reshape(size, slow) / sigma[i]
-            part[:, first_of_model:-1] = modelled[i].reshape(size, width) / sigma[i]
-            readings = triangles[:, : dwell.width, dwell.width + i]
-            if about is not None:
-                readings = readings - (carried @ on_basis((own[:, :, i] @ about)[:, :, None]))[:, :, 0]
-            part[:, -1] = readings.reshape(size) / sigma[i]
-            if inside:
-                part[:, count + i] = dwell.walk.step / sigma[i]
-                part[:] = dwell.walk.whiten(part, float(ratios[i]))
-        rows[3 * size :, :count] = np.diag(1.0 / priors)
-        informative = np.append(np.ones(inside), units)
-        out.append(_informative(triangle(rows)[count:, count:], informative) if reduced else _less(rows, count))
+    informative = np.append(np.ones(inside), _units(columns)) if reduced else None
+    out = list[Floats]([np.empty((0, 0))] * len(dwells))
+    for places in _alike(dwells, columns[0].shape[-1]):
+        batch, stacked = [dwells[k] for k in places], np.array([columns[k] for k in places])
+        rows, count = _weighted(batch, stacked, noise, state, about, flicker_mps2)
+        if informative is None:
+            found = list(_less(rows, count))
+        else:
+            found = _informative(triangle(rows)[:, count:, count:], informative)
+        for k, own in zip(places, found, strict=True):
+            out[k] = own
     return out
 
 
+def _alike(dwells: Sequence[DwellFactor], width: int) -> Iterator[list[int]]:
+    """Places of dwells whose rows are of one shape, as many at once as leave their ``width`` columns in the cache."""
+    by_shape = dict[tuple[int, int], list[int]]()
+    for k, dwell in enumerate(dwells):
+        by_shape.setdefault((len(dwell.pieces), dwell.width), []).append(k)
+    for (pieces, size), places in by_shape.items():
+        most = max(_AT_ONCE // (3 * pieces * size * (width + 1)), 1)
+        yield from (places[first : first + most] for first in range(0, len(places), most))
+
+
+def _weighted(
+    dwells: Sequence[DwellFactor],
+    columns: Floats,
+    noise: Noise,
+    state: Floats,
+    about: Floats | None,
+    flicker_mps2: Floats | None,
+) -> tuple[Floats, int]:
+    """Rows [nuisances | S | H | z] of unit noise of dwells of one shape (d, r, n), and how many nuisances they have.
+
+    ``columns`` (d, pieces, K, 3, p). The rows of the channels come one after another, then those of the priors.
+    """
+    sigma, sigmas = noise.effective_sigma_mps2, noise.dwell_sigmas
+    used, slow = np.flatnonzero(sigmas > 0), 0 if flicker_mps2 is None else len(_SLOW)
+    offsets, priors = len(used), sigmas[used]
+    if flicker_mps2 is not None:
+        priors = np.append(priors, np.outer(np.maximum(flicker_mps2, FLOOR_MPS2), 1.0 / np.sqrt(_SLOW)))
+    count, (many, pieces, functions, _, width) = len(priors), columns.shape
+    inside, size = 3 if noise.walk_mps2_per_sqrt_s else 0, pieces * functions
+    triangles = np.array([dwell.triangles for dwell in dwells])
+    carried = triangles[:, :, :functions, :functions]
+    regressors = np.array([dwell.regressors for dwell in dwells])
+    nuisances = dwell_map(state)[:, :, used]
+    waves = carried[..., :3] @ on_basis(np.array([_waves(dwell) for dwell in dwells])) if slow else None
+    rows = np.zeros((many, 3 * size + count, count + inside + width + 1))
+    for i in range(3):
+        part = rows[:, i * size : (i + 1) * size]
+        part[..., :offsets] = (regressors @ nuisances[i]).reshape(many, size, offsets)
+        if waves is not None:
+            first = offsets + slow * i
+            part[..., first : first + slow] = waves.reshape(many, size, slow)
+        part[..., count + inside : -1] = (carried @ on_basis(columns[..., i, :])).reshape(many, size, width)
+        readings = triangles[:, :, :functions, functions + i, None]
+        if about is not None:
+            readings = readings - carried @ on_basis((columns[..., i, :] @ about)[..., None])
+        part[..., -1] = readings.reshape(many, size)
+        if inside:
+            part[..., count + i] = [dwell.walk.step for dwell in dwells]
+        part /= sigma[i]
+        if inside:
+            for own, dwell in zip(part, dwells, strict=True):
+                own[:] = dwell.walk.whiten(own, float(noise.walk_mps2_per_sqrt_s / sigma[i]))
+    rows[:, 3 * size :, :count] = np.diag(1.0 / priors)
+    return rows, count
+
+
 def _less(rows: Floats, count: int) -> Floats:
-    """Rows without the first ``count`` columns, projected off them."""
-    nuisances = np.linalg.qr(rows[:, :count])[0]
-    return rows[:, count:] - nuisances @ (nuisances.T @ rows[:, count:])
+    """Rows (d, r, n) without the first ``count`` columns, projected off them."""
+    nuisances = np.linalg.qr(rows[..., :count])[0]
+    return rows[..., count:] - nuisances @ (np.swapaxes(nuisances, 1, 2) @ rows[..., count:])
 
 
 def judged(
@@ -107,7 +142,10 @@ def judged(
     count, places = columns[0].shape[3] + len(sigma) + 1, width + np.arange(len(sigma))
     prior = np.zeros((len(sigma), count))
     prior[np.arange(len(sigma)), places] = 1.0 / sigma
-    both = [np.insert(own, [width] * len(sigma), more, axis=3) for own, more in zip(columns, slow, strict=True)]
+    both = [
+        np.concatenate([own[..., :width], more, own[..., width:]], axis=3)
+        for own, more in zip(columns, slow, strict=True)
+    ]
     return [prior, *whitened(dwells, both, noise, state, flicker_mps2=flicker, reduced=reduced)], width + len(sigma)
 
 
@@ -124,14 +162,16 @@ def _units(columns: Sequence[Floats]) -> Floats:
     return np.where(largest > 0, largest, 1.0)
 
 
-def _informative(rows: Floats, units: Floats) -> Floats:
-    """As few rows [H | z] as H has rank: what the rows leave over is split off.
+def _informative(rows: Floats, units: Floats) -> list[Floats]:
+    """Of rows [H | z] of dwells (d, r, n) as few as H has rank: what the rows leave over is split off.
 
     A still dwell has rank 3. By SVD: QR would spread the residuals over rows that columns of rounding size lead.
     """
-    left, singular, _ = np.linalg.svd(rows[:, :-1] / units, full_matrices=False)
-    rank = int((singular > 1e-9 * singular[0]).sum())
-    return left[:, :rank].T @ rows
+    left, singular, _ = np.linalg.svd(rows[..., :-1] / units, full_matrices=False)
+    ranks = (singular > 1e-9 * singular[:, :1]).sum(axis=1)
+    most = int(ranks.max())
+    turned = np.swapaxes(left[..., :most], 1, 2) @ rows
+    return [own[:rank].copy() for own, rank in zip(turned, ranks, strict=True)]
 
 
 @dataclass(frozen=True)
