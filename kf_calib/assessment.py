@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +18,7 @@ from kf_calib.folding import DwellFactor, lines_of, stimulus_of
 from kf_calib.model import Model
 from kf_calib.odds import as_fall
 from kf_calib.samples import Floats
-from kf_calib.scan import Candidate, Scan, falls, scan
+from kf_calib.scan import Candidate, Frame, Scan
 from kf_calib.spectrum import Line, lowest_hz
 from kf_calib.trace import band_hz
 from kf_calib.trend import Trend, trend
@@ -91,6 +91,7 @@ class Test:
     between: str = ""
     paths: float = 0.0
     trend: Trend | None = None
+    frame: Frame | None = field(default=None, repr=False, compare=False)
 
     @property
     def p_value(self) -> float | None:
@@ -167,15 +168,17 @@ def candidates(model: Model) -> list[Effect]:
     return out
 
 
-def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
+def assessed(fitted: Fit, tests: float | None = None, seed: int = 0, frame: Frame | None = None) -> Test:
     """Score tests of all candidates, calibrated on their own columns by drawing residuals as noise alone makes them.
 
-    tests: as how many independent ones they count, where that is known from nearly the same columns.
+    tests: as how many independent ones they count, where that is known from nearly the same columns. frame: of another
+    fit of the run, used where it serves this one, too.
     """
     from scipy.special import chdtrc
 
     model, agreed = fitted.carried.model, consistency(fitted)
-    found = _scanned(fitted)
+    frame = _frame(fitted, frame)
+    found = _scanned(fitted, frame)
     statistics = found.statistics
     tests = tests or independent_tests(found, seed)
     best, scores, p_values = dict[str, int](), dict[str, float](), dict[str, float]()
@@ -196,26 +199,31 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0) -> Test:
         paths = _beside_best(found, scores, tests) if beyond > 0.0 else 0.0
         scores[name] = beyond + paths
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
-    test = Test(found, best, scores, p_values, agreed.p_value, name, tests, slewing, (), paths=paths)
+    test = Test(found, best, scores, p_values, agreed.p_value, name, tests, slewing, (), paths=paths, frame=frame)
     return _with_lines(test, fitted)
 
 
-def _scanned(fitted: Fit) -> Scan:
-    """The scan of all candidates, and of an oscillation at the frequency, below those of lines, that explains most."""
+def _frame(fitted: Fit, known: Frame | None) -> Frame:
+    """The columns of all candidates of the catalogue in the noise of a fit: those that are known, where they serve."""
     carried, noise = fitted.carried, fitted.noise.judging
-    effect, tried = _oscillation(carried.model), candidates(carried.model)
+    if known is not None and known.serves(carried, noise):
+        return known
+    tried = candidates(Model(carried.model.bench))
     stage.say(f"scanning {len({str(each) for each in tried})} effects")
-    if effect is None or carried.model.oscillates:
-        return scan(carried, noise, tried)
-    values = slow_hz(fitted, effect)
-    if not len(values):
-        return scan(carried, noise, tried)
-    coarse = falls(carried, noise, [effect.at(value) for value in values])
-    near = values[np.argmax(coarse)] + 0.125 * values[0] * np.arange(-3, 4)
-    slow = [effect.at(value) for value in near]
-    swinging = slow[int(np.argmax(falls(carried, noise, slow)))]
-    found = scan(carried, noise, [*tried, swinging])
-    *others, last = found.candidates
+    return Frame(carried, noise, tried)
+
+
+def _scanned(fitted: Fit, frame: Frame) -> Scan:
+    """The scan of all candidates, and of an oscillation at the frequency, below those of lines, that explains most."""
+    carried, effect = fitted.carried, _oscillation(fitted.carried.model)
+    values = np.zeros(0) if effect is None or carried.model.oscillates else slow_hz(fitted, effect)
+    if effect is None or not len(values):
+        return frame.scan(carried)
+    best = values[np.argmax(frame.falls(carried, effect, values))]
+    near = [effect.at(hz) for hz in best + 0.125 * values[0] * np.arange(-3, 4)]
+    found = frame.scan(carried, near)
+    others, swinging = found.candidates[: -len(near)], found.candidates[-len(near) :]
+    last = swinging[int(np.argmax(found.statistics[-len(near) :]))]
     return replace(found, candidates=(*others, replace(last, tried=len(values))))
 
 

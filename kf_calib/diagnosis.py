@@ -236,7 +236,7 @@ def _beside_lines(found: Diagnosis) -> Diagnosis | None:
     if not test.oscillating:
         return None
     known = found.refit_with(test.oscillating)
-    rest = _explained(known, assessed(known.fit, test.effective_tests))
+    rest = _explained(known, assessed(known.fit, test.effective_tests, frame=test.frame))
     if not rest.missing:
         return None
     both = (*rest.missing, test.oscillating)
@@ -397,7 +397,7 @@ def _pairs_with_walk(found: Diagnosis, pairs: Pairs, beyond: bool = False) -> di
     if not test.walking:
         return {}
     candidates, tests, out = test.scan.candidates, test.effective_tests, dict[Pair, float]()
-    beside = assessed(found.refit_with(test.walking).fit, tests)
+    beside = assessed(found.refit_with(test.walking).fit, tests, frame=test.frame)
     least = test.scores[test.walking] - test.paths + (EQUAL if beyond else 0.0)
     likely = [name for name in beside.ranked if name in test.best and (beside.scores[name] > 0.0 or not beyond)]
     for name in likely[:MOST]:
@@ -430,7 +430,7 @@ def _fits(refit: Calibration, before: Test, added: int = 1) -> bool:
     least = LEVEL if walks else _REFUSED
     if (misfit is not None and misfit < SHARE * least) or (walks and _no_walk(refit)) or _at_an_end(refit):
         return False
-    left = assessed(refit.fit, before.effective_tests)
+    left = assessed(refit.fit, before.effective_tests, frame=before.frame)
     if left.trend and misfit is not None:
         free = walks or added > 1
         if _together(misfit, left.trend.p_value) < SHARE * (LEVEL if free else _REFUSED):

@@ -1,25 +1,28 @@
 """Candidates against a model: what each would explain, what it cannot be told from, how small it may be.
 
-The whitened rows [H | G | z] of a run (H the model's columns, G the candidates', z the readings) are folded into one
-triangle, and G and z are projected off H. Everything asked of a candidate is then read from a few small matrices:
-its score test, its coefficients, its overlap with any other, and the size at which it would be found.
+The candidates' columns G are evaluated and whitened once for a run and its noise, and written in an orthonormal frame
+of their own. Beside any model H, readings z, and columns that come later only these are whitened; what they have in
+the frame and beside it is a small matrix, in which G and z are projected off H. Everything asked of a candidate is
+then read from that: its score test, its coefficients, its overlap with any other, and the size at which it would be
+found.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from kf_calib import information
+from kf_calib import information, walk
 from kf_calib.effects import Effect
-from kf_calib.folding import Carried, candidate_columns
+from kf_calib.folding import Carried, DwellFactor, candidate_columns
+from kf_calib.model import STATE_COUNT
 from kf_calib.noise import Noise, steps
+from kf_calib.periodogram import Periodogram
 from kf_calib.samples import Floats, Mask
-from kf_calib.walk import unfolded
 
 _SEEN = 1e-6
 """A candidate of which the model leaves less than this share is invisible."""
@@ -27,7 +30,7 @@ _SEEN = 1e-6
 _SAME = 1.0 - 1e-6
 """Cosine above which two directions are one."""
 
-_TOGETHER = 200  # of many effects, so many are held at a time
+_TOGETHER = 64  # columns that are whitened at a time: memory stays that of the result
 
 
 @dataclass(frozen=True, repr=False)
@@ -96,11 +99,86 @@ class Scan:
         return candidate.inverse @ (candidate.basis.T @ self.residual)
 
 
+class Frame:
+    """The whitened columns of ``effects`` over all dwells, C = basis (m, r) coordinates (r, q), basis orthonormal.
+
+    It serves every model of the same dwells that is judged by the same noise; rotations and input axes stay linearised
+    at the ``state`` it was made with.
+    """
+
+    def __init__(self, carried: Carried, noise: Noise, effects: Sequence[Effect]) -> None:
+        self.dwells, self.noise, self.state, self.effects = carried.dwells, noise, carried.state, list(effects)
+        ends = np.cumsum([0, *(len(effect.coefficients) for effect in effects)]).tolist()
+        self.parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
+        self.basis, self.coordinates = np.linalg.qr(self._columns(carried))
+        self._periodogram: Periodogram | None = None
+
+    def serves(self, carried: Carried, noise: Noise) -> bool:
+        """Whether these dwells are the frame's, judged by the same noise."""
+        same = len(carried.dwells) == len(self.dwells) and all(map(_is, carried.dwells, self.dwells))
+        return same and all(np.array_equal(getattr(noise, key), getattr(self.noise, key)) for key in _OF_NOISE)
+
+    def scan(self, carried: Carried, more: Sequence[Effect] = ()) -> Scan:
+        """Those of the effects that the model carried does not have, and ``more`` behind them, beside that model."""
+        kept = [k for k, effect in enumerate(self.effects) if str(effect) not in carried.model.parts]
+        rows, width = whitened(carried, self.noise, more, self.state)
+        inside, outside = np.zeros((self.basis.shape[1], rows.shape[1])), rows
+        for _ in range(2):  # twice, or the rounding of what is large stays in what is left
+            share = self.basis.T @ outside
+            inside, outside = inside + share, outside - self.basis @ share
+        beside = information.accumulated([outside])
+        own = [self.coordinates[:, self.parts[k]] for k in kept]
+        count = sum(each.shape[1] for each in own)
+        small = np.vstack([
+            np.hstack([inside[:, :width], *own, inside[:, width:]]),
+            np.hstack([beside[:, :width], np.zeros((len(beside), count)), beside[:, width:]]),
+        ])  # fmt: skip
+        effects = [*(self.effects[k] for k in kept), *more]
+        return projected(
+            information.accumulated([small]), width, effects, [len(effect.coefficients) for effect in effects]
+        )
+
+    def falls(self, carried: Carried, effect: Effect, values_hz: Floats) -> Floats:
+        """By how much an oscillation at each of these frequencies, alone, would lower chi-squared (n,) beside the model
+        carried; the same frequencies every time."""
+        if self._periodogram is None:
+            self._periodogram = Periodogram(carried, self.noise, effect, values_hz)
+        rows, width = _judged(carried.dwells, carried.columns, self.noise, self.state, STATE_COUNT)
+        own = np.concatenate(rows[len(rows) - len(self.dwells) :])
+        return self._periodogram.falls(_stacked(rows, self.dwells, self.noise), own[:, _inside(self.noise) :], width)
+
+    def _columns(self, carried: Carried) -> Floats:
+        """The whitened columns (m, q), some effects at a time."""
+        out: Floats | None = None
+        for part in _batches(range(len(self.effects)), [own.stop - own.start for own in self.parts]):
+            rows, width = whitened(carried, self.noise, [self.effects[k] for k in part], self.state)
+            if out is None:
+                out = np.empty((len(rows), self.parts[-1].stop))
+            out[:, self.parts[part[0]].start : self.parts[part[-1]].stop] = rows[:, width:-1]
+        return np.zeros((0, 0)) if out is None else out
+
+
+_OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps2_per_sqrt_s")
+
+
+def _is(one: object, other: object) -> bool:
+    return one is other
+
+
+def _batches(numbers: range, sizes: Sequence[int]) -> Iterator[list[int]]:
+    """Numbers in order, together as many as have about ``_TOGETHER`` columns."""
+    part, count = list[int](), 0
+    for k in numbers:
+        part, count = [*part, k], count + sizes[k]
+        if count >= _TOGETHER or k == numbers[-1]:
+            yield part
+            part, count = [], 0
+
+
 def scan(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Scan:
     """Project ``effects`` off the model carried."""
-    rows, width = _rows(carried, noise, effects)
-    counts = [len(effect.coefficients) for effect in effects]
-    return projected(information.accumulated(rows, steps(carried.dwells, noise)), width, effects, counts)
+    rows, width = whitened(carried, noise, effects)
+    return projected(information.accumulated([rows]), width, effects, [len(effect.coefficients) for effect in effects])
 
 
 def projected(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
@@ -129,15 +207,9 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
     Nothing else is asked of them, so the rows are not folded: of n columns in d rows that takes d n, not d n^2.
     """
     out = list[Floats]()
-    for first in range(0, len(effects), _TOGETHER):
-        part = effects[first : first + _TOGETHER]
-        rows, width = _rows(carried, noise, part, reduced=False)
-        if noise.walk_mps2_per_sqrt_s:
-            stacked, walked = unfolded(rows, steps(carried.dwells, noise), width)
-            width += walked
-        else:
-            stacked = np.concatenate(rows)
-        sizes, rest = np.linalg.norm(stacked[:, width:-1], axis=0), _beside(stacked, width)
+    for part in _batches(range(len(effects)), [len(effect.coefficients) for effect in effects]):
+        rows, width = whitened(carried, noise, [effects[k] for k in part])
+        sizes, rest = np.linalg.norm(rows[:, width:-1], axis=0), _beside(rows, width)
         columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
         columns = columns.T.reshape(len(part), -1, len(rest))
         along, gram = columns @ rest[:, -1], columns @ columns.swapaxes(1, 2)
@@ -146,11 +218,33 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
     return np.concatenate(out)
 
 
-def _rows(carried: Carried, noise: Noise, effects: Sequence[Effect], reduced: bool = True) -> tuple[list[Floats], int]:
-    """Rows [H | G | z] of the model carried and of ``effects``, and how many columns come before G."""
-    added = candidate_columns(carried.dwells, effects, carried.model.bench, carried.state)
+def whitened(
+    carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats | None = None
+) -> tuple[Floats, int]:
+    """Rows [H | W | G | z] (m, c) of unit noise of the model carried and of ``effects``, and how many columns come
+    before G. state: where rotations and input axes are linearised, other than where the model is."""
+    at = carried.state if state is None else state
+    added = candidate_columns(carried.dwells, effects, carried.model.bench, at)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
-    return information.judged(carried.dwells, columns, noise, carried.state, carried.model.count, reduced)
+    rows, width = _judged(carried.dwells, columns, noise, at, carried.model.count)
+    return _stacked(rows, carried.dwells, noise), width
+
+
+def _judged(
+    dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats, width: int
+) -> tuple[list[Floats], int]:
+    """``information.judged`` with all rows that the dwells have."""
+    return information.judged(dwells, columns, noise, state, width, reduced=False)
+
+
+def _stacked(rows: Sequence[Floats], dwells: Sequence[DwellFactor], noise: Noise) -> Floats:
+    """All rows, a walk of the biases taken out of their noise."""
+    return walk.whitened(rows, steps(dwells, noise)) if _inside(noise) else np.concatenate(rows)
+
+
+def _inside(noise: Noise) -> int:
+    """How many columns lead a dwell's rows, of the steps that the biases take in it."""
+    return 3 if noise.walk_mps2_per_sqrt_s else 0
 
 
 def _candidate(effect: Effect, columns: Floats, units: Floats) -> Candidate:

@@ -199,28 +199,35 @@ def _sigmas(steps: Floats, inside: int) -> Floats:
     return np.sqrt(np.repeat(variances, 3))
 
 
-def unfolded(rows: Sequence[Floats], steps: Floats, width: int) -> tuple[Floats, int]:
-    """All rows at once, [H | W | G | z] of H ``width``, the biases those at the beginning, and how many columns W has.
+def whitened(rows: Sequence[Floats], steps: Floats) -> Floats:
+    """Rows (m, c) of unit noise from rows [S | X] of each dwell, the walk being in their noise; X (r, c): any columns,
+    of which the first twelve are the parameters', the biases those at the end of the dwell.
 
-    W: of each bias's steps in the pauses and the dwells, in their sigma; the rows of their priors come last. Rows
-    before those of the dwells have no S.
+    A square-root information filter of the walk alone: its state, the way w from the bias at the beginning of the run
+    to that at the end of a dwell, is found from each dwell by QR, and all of X is its right-hand side. What is left of
+    a dwell's rows is their innovation, of unit noise and independent of all others. Rows before those of the dwells
+    have no S and are kept as they are.
     """
-    before, dwells = rows[: len(rows) - len(steps)], rows[len(rows) - len(steps) :]
-    place = np.repeat(np.arange(len(dwells)), [len(own) for own in dwells])
-    stacked = np.concatenate(dwells)
-    inside, body = stacked[:, :3], stacked[:, 3:]
-    later = body[:, None, [3, 7, 11]] * (place[:, None] >= np.arange(len(dwells)))[:, :, None]
-    within = later + inside[:, None, :] * (place[:, None] == np.arange(len(dwells)))[:, :, None]
-    moving = np.stack([later * np.sqrt(steps[:, 0, None]), within * np.sqrt(steps[:, 1, None])], axis=1)
-    moving = moving.reshape(len(body), -1)[:, np.repeat(steps.T.ravel() > 0, 3)]
-    count = moving.shape[1]
-    above = np.concatenate([np.zeros((0, body.shape[1])), *before])
-    out = np.zeros((len(above) + len(body) + count, body.shape[1] + count))
-    beside = np.concatenate([above, body, np.zeros((count, body.shape[1]))])
-    out[:, :width], out[:, width + count :] = beside[:, :width], beside[:, width:]
-    out[len(above) : len(above) + len(body), width : width + count] = moving
-    out[len(above) + len(body) :, width : width + count] = np.eye(count)
-    return out, count
+    above, dwells = rows[: len(rows) - len(steps)], rows[len(rows) - len(steps) :]
+    upper, right, out = np.zeros((0, 3)), np.zeros((0, dwells[0].shape[1] - 3)), list(above)
+    for own, (pause, inside) in zip(dwells, steps, strict=True):
+        unknown = ([pause] if pause > 0 and len(upper) else []) + ([inside] if len(upper) else [])
+        first, count = 3 * len(unknown), 3 * len(unknown) + len(upper)
+        biases = own[:, 3:][:, [3, 7, 11]]
+        design = np.zeros((count + len(own) + (0 if len(upper) else 3), first + 3))
+        design[:first, :first] = np.diag(np.repeat(1.0 / np.sqrt(unknown), 3))
+        if len(upper):  # w before is w less the steps in the pause and in the dwell
+            design[first:count] = np.hstack([-upper] * len(unknown) + [upper])
+            design[count:] = np.hstack([np.zeros((len(own), first - 3)), own[:, :3], biases])
+        else:  # the first dwell: the way is the step within it
+            design[:3], design[3:] = np.eye(3) / np.sqrt(inside), own[:, :3] + biases
+        sides = np.zeros((len(design), right.shape[1]))
+        sides[first:count], sides[len(design) - len(own) :] = right, own[:, 3:]
+        turned, triangular = np.linalg.qr(design, mode="complete")
+        sides = turned.T @ sides
+        upper, right = triangular[first : first + 3, first:], sides[first : first + 3]
+        out.append(sides[first + 3 :])
+    return np.concatenate(out)
 
 
 def predicted(factor: Floats, variance: float) -> Floats:

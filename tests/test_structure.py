@@ -24,6 +24,7 @@ LEVELS = [
     ["folding"],
     ["noise", "blunders"],
     ["information", "kalman", "batch", "readings", "likelihood", "odds"],
+    ["periodogram"],
     ["aims", "scan", "experiment"],
     ["fitting", "inferred"],
     ["prospect", "reach", "trend"],
