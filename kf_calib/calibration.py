@@ -308,11 +308,11 @@ class Calibration:
                 own = [columns[: len(part.pieces)]]
                 rows = information.whitened([part], own, self.noise.weights, state)[0]
                 walked = np.array([pause, steps([part], self.noise)[0, 1]])
-                factor = information.update(before, rows, walked).factor
+                factor, _ = information.update(before, rows, walked)
                 extra = extra_before + considered(self.noise, means_of([part], own), state)[0]
                 yield part.end_s, dwell.number, _estimate(factor, around, extra)
             if len(self.fit.following[index]):
-                factor = information.update(factor, self.fit.following[index]).factor
+                factor, _ = information.update(factor, self.fit.following[index])
 
     def during(self, dwell: DwellFactor) -> Estimate:
         """The estimate were a dwell that follows the run, and is not in it yet, to end as it is now."""
@@ -320,7 +320,7 @@ class Calibration:
         both, state = [fitted.dwells[-1], dwell], self.carried.state
         own = columns_of(both, self.model, state)[1:]
         rows = information.whitened([dwell], own, self.noise.weights, state)[0]
-        factor = information.update(factor, rows, steps(both, self.noise)[-1]).factor
+        factor, _ = information.update(factor, rows, steps(both, self.noise)[-1])
         extra = extra + considered(self.noise, means_of([dwell], own), state)[0]
         return _estimate(factor, self.model.nominal_state(), extra)
 
@@ -667,26 +667,35 @@ def refuse_unseen(result: Calibration) -> None:
 
 def _estimate(factor: Floats, nominal_state: Floats, extra: Floats) -> Estimate:
     """The estimate of a factor, its covariance P enlarged by what is considered: P + P B P, B = ``extra`` (12, 12)."""
-    state, covariance, undetermined = information.solve(factor, nominal_state)
-    return Estimate(state, covariance + covariance @ extra @ covariance, undetermined)
+    return _estimates(factor[None], nominal_state, extra)[0]
+
+
+def _estimates(factors: Floats, nominal_state: Floats, extra: Floats) -> list[Estimate]:
+    """The same of many factors (n, p, p + 1), ``extra`` (n, p, p)."""
+    states, covariances, undetermined = zip(*information.solved(factors, nominal_state), strict=True)
+    covariance = np.array(covariances)
+    covariance = covariance + covariance @ extra @ covariance
+    return [Estimate(*each) for each in zip(states, covariance, undetermined, strict=True)]
 
 
 def _visits(fitted: Fit, steps: list[Step], residuals: Floats, extra: Floats, settings: Settings) -> tuple[Visit, ...]:
     carried, means, around = fitted.carried, fitted.carried.means, fitted.carried.model.nominal_state()
     own, walked = mean_covariances(fitted.noise, means, carried.state), to_mean(fitted.steps)
-    before, extra = information.start(settings.prior, carried.model), np.cumsum(extra, axis=0)
-    visits = list[Visit]()
+    first, extra = information.start(settings.prior, carried.model), np.concatenate([0.0 * extra[:1], extra])
+    factors, extra = np.array([first, *(step.factor for step in steps)]), np.cumsum(extra, axis=0)
+    reached = _estimates(factors, around, extra)
+    known, visits = reached[:-1], list[Visit]()
+    if walked.any():
+        before = [predicted(factor, float(step)) for factor, step in zip(factors, walked, strict=False)]
+        known = _estimates(np.array(before), around, extra[:-1])
     for k, (dwell, step) in enumerate(zip(carried.dwells, steps, strict=True)):
-        known = _estimate(predicted(before, float(walked[k])), around, extra[k - 1] if k else 0.0 * extra[0])
         innovation, sigma = np.full(3, np.nan), np.full(3, np.nan)
-        if not known.undetermined.size:
+        if not known[k].undetermined.size:
             rows = means.design[k]
-            innovation = means.readings[k] - rows @ known.state
-            predicted_by = np.maximum(np.diag(rows @ known.covariance @ rows.T), 0.0)  # rounding, where little is known
+            innovation = means.readings[k] - rows @ known[k].state
+            predicted_by = np.maximum(np.diag(rows @ known[k].covariance @ rows.T), 0.0)  # rounding, where known little
             sigma = np.sqrt(predicted_by + np.diag(own[k]))
-        estimate = _estimate(step.factor, around, extra[k])
-        visits.append(Visit(dwell, estimate, step.nis, step.dof, innovation, sigma, residuals[k]))
-        before = step.factor
+        visits.append(Visit(dwell, reached[k + 1], step.nis, step.dof, innovation, sigma, residuals[k]))
     return tuple(visits)
 
 

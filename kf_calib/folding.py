@@ -115,9 +115,23 @@ class DwellFactor:
         return np.array([piece.triangle for piece in self.pieces])
 
     @cached_property
+    def nodes(self) -> Nodes:
+        """What it felt at the nodes of all its pieces, in order."""
+        every = [piece.nodes for piece in self.pieces]
+        return Nodes(
+            elapsed_s=np.concatenate([each.elapsed_s for each in every]),
+            since_arrival_s=np.concatenate([each.since_arrival_s for each in every]),
+            force_mps2=np.concatenate([each.force_mps2 for each in every]),
+            pose=np.concatenate([each.pose for each in every]),
+            temperature_c=np.concatenate([each.temperature_c for each in every]),
+            rate_radps=np.concatenate([_or_still(each.rate_radps) for each in every]),
+            rate_change_radps2=np.concatenate([_or_still(each.rate_change_radps2) for each in every]),
+        )
+
+    @cached_property
     def regressors(self) -> Floats:
         """Rows of 1, f_x, f_y, f_z of each piece, (pieces, K, 4)."""
-        values = np.array([piece.nodes.regressors for piece in self.pieces])
+        values = self.nodes.regressors.reshape(len(self.pieces), 3, -1)
         return self.triangles[:, : self.width, :3] @ parabola(values)
 
     @cached_property
@@ -185,7 +199,7 @@ class DwellFactor:
         """Triangle (7, 7) over [1 f_x f_y f_z | z1 z2 z3]."""
         return _folded(self.rows([piece.nodes.regressors for piece in self.pieces]))
 
-    @property
+    @cached_property
     def means(self) -> Floats:
         """Means of the regressors and readings, (7,): 1, f (3), z (3)."""
         return self.factor[0] / self.factor[0, 0]
@@ -265,11 +279,12 @@ def _folded(stacked: Floats) -> Floats:
 
 def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> Stimulus:
     """The nodes of all pieces of all dwells and slews, in order; rotations are linearised at the affine ``state``."""
-    nodes = [piece.nodes for dwell in dwells for piece in dwell.pieces]
+    nodes = [dwell.nodes for dwell in dwells]
     before = [last for dwell, last in zip(dwells, _before(dwells), strict=True) for _ in dwell.pieces]
+    elapsed_s = np.concatenate([each.elapsed_s for each in nodes])
     return Stimulus(
         bench=bench,
-        elapsed_s=np.concatenate([each.elapsed_s for each in nodes]),
+        elapsed_s=elapsed_s,
         since_arrival_s=np.concatenate([each.since_arrival_s for each in nodes]),
         force_mps2=np.concatenate([each.force_mps2 for each in nodes]),
         previous_force_mps2=np.repeat([each.means[1:4] for each in before], 3, axis=0),
@@ -278,17 +293,17 @@ def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> S
         temperature_c=_signal_only(dwells, np.concatenate([each.temperature_c for each in nodes])),
         sensitivity=state[:12].reshape(3, 4)[:, :3],
         variance_mps2_2=_varying(dwells).reshape(-1, 3),
-        rate_radps=np.concatenate([_still if each.rate_radps is None else each.rate_radps for each in nodes]),
-        rate_change_radps2=np.concatenate(
-            [_still if each.rate_change_radps2 is None else each.rate_change_radps2 for each in nodes]
-        ),
-        half_s=np.repeat([0.5 * (each.elapsed_s[2] - each.elapsed_s[0]) for each in nodes], 3),
-        within=np.tile([-1.0, 0.0, 1.0], len(nodes)),
+        rate_radps=np.concatenate([_or_still(each.rate_radps) for each in nodes]),
+        rate_change_radps2=np.concatenate([_or_still(each.rate_change_radps2) for each in nodes]),
+        half_s=np.repeat(0.5 * (elapsed_s[2::3] - elapsed_s[::3]), 3),
+        within=np.tile([-1.0, 0.0, 1.0], len(before)),
         carrier_hz=dwells[0].carrier_hz,
     )
 
 
-_still = np.zeros((3, 3))
+def _or_still(rate: Floats | None) -> Floats:
+    """The rate at the nodes of a piece; none where the platform stands."""
+    return np.zeros((3, 3)) if rate is None else rate
 
 
 def _before(dwells: Sequence[DwellFactor]) -> list[DwellFactor]:
@@ -312,11 +327,13 @@ def _signal_only(dwells: Sequence[DwellFactor], temperature_c: Floats) -> Floats
     Means of dwells that follow each other differ as much as any two (von Neumann's ratio near 1), and by no more than
     temperatures within a dwell.
     """
-    by_dwell = np.split(temperature_c, np.cumsum([3 * len(dwell.pieces) for dwell in dwells])[:-1])
-    means = np.array([own.mean() for own in by_dwell])
+    counts = np.array([3 * len(dwell.pieces) for dwell in dwells])
+    firsts = np.cumsum(counts) - counts
+    means = np.add.reduceat(temperature_c, firsts) / counts
     if len(means) < 4 or not np.isfinite(means).all():
         return temperature_c
-    between, within = means.var(), float(np.mean([own.var() for own in by_dwell]))
+    spread = np.add.reduceat((temperature_c - np.repeat(means, counts)) ** 2, firsts) / counts
+    between, within = means.var(), float(spread.mean())
     alike = np.mean(np.diff(means) ** 2) > between  # 2 var on average where one says nothing of the next
     if alike and between < 2.0 * within:
         return np.full(len(temperature_c), means.mean())
@@ -379,17 +396,26 @@ class Means:
 
 
 def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
-    design = []
-    for dwell, own in zip(dwells, columns, strict=True):
-        width = dwell.width
-        first = dwell.triangles[:, 0, :width] / dwell.triangles[:, :1, 0]  # means of the basis
-        weights = np.array([piece.count for piece in dwell.pieces]) / dwell.count
-        coefficients = on_basis(own.reshape(*own.shape[:2], -1))
-        design.append(np.einsum("b,bk,bkc->c", weights, first, coefficients).reshape(own.shape[2:]))
+    design = np.zeros((len(dwells), *columns[0].shape[2:]))
+    for places in alike(dwells):
+        own, batch = np.array([columns[k] for k in places]), [dwells[k] for k in places]
+        triangles, width = np.array([dwell.triangles for dwell in batch]), batch[0].width
+        first = triangles[:, :, 0, :width] / triangles[:, :, :1, 0]  # means of the basis
+        weights = np.array([dwell.counts / dwell.count for dwell in batch])
+        coefficients = on_basis(own.reshape(*own.shape[:3], -1))
+        design[places] = np.einsum("db,dbk,dbkc->dc", weights, first, coefficients).reshape(-1, *own.shape[3:])
     means = np.array([dwell.means for dwell in dwells])
     counts = np.array([dwell.count for dwell in dwells], float)
     ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
-    return Means(np.array(design), means[:, 4:], means[:, 1:4], counts, ends)
+    return Means(design, means[:, 4:], means[:, 1:4], counts, ends)
+
+
+def alike(dwells: Sequence[DwellFactor]) -> list[list[int]]:
+    """Places of dwells that have as many pieces of one width: their arrays can be worked on together."""
+    places = dict[tuple[int, int], list[int]]()
+    for k, dwell in enumerate(dwells):
+        places.setdefault((len(dwell.pieces), dwell.width), []).append(k)
+    return list(places.values())
 
 
 class Carried:

@@ -13,6 +13,7 @@ from kf_calib.folding import DwellFactor
 from kf_calib.model import Prior
 from kf_calib.noise import considered, lifted, mean_covariances
 from kf_calib.samples import Floats
+from kf_calib.triangle import triangle
 
 SAME_POSE_DEG = 1.0
 """Dwells whose gravity directions are closer than this are visits of one orientation."""
@@ -23,14 +24,14 @@ def orientations(dwells: Sequence[DwellFactor]) -> list[list[int]]:
     means = np.array([dwell.means for dwell in dwells])
     direction = means[:, 1:4] / np.linalg.norm(means[:, 1:4], axis=1, keepdims=True)
     place = np.column_stack([direction, [dwell.pose for dwell in dwells]])
-    groups, heads = list[list[int]](), np.empty((0, place.shape[1]))
+    groups, heads = list[list[int]](), np.empty_like(place)
     for k, here in enumerate(place):
-        near = np.flatnonzero(np.abs(heads - here).max(axis=1) < np.radians(SAME_POSE_DEG))
-        if near.size:
-            groups[near[0]].append(k)
+        near = np.abs(heads[: len(groups)] - here).max(axis=1, initial=0.0) < np.radians(SAME_POSE_DEG)
+        if near.any():
+            groups[int(near.argmax())].append(k)
         else:
+            heads[len(groups)] = here
             groups.append([k])
-            heads = np.vstack([heads, here])
     return groups
 
 
@@ -75,23 +76,26 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
     rows = fitted.rows(noise.weights)
     extra, own = considered(noise, carried.means, carried.state), mean_covariances(noise, carried.means, carried.state)
     empty = information.start(Prior(), carried.model)
-    slews = information.update(empty, np.concatenate(fitted.following)).factor if carried.slews else empty
-    factors = [information.update(empty, np.concatenate([rows[k] for k in group])).factor for group in groups]
+    slews = information.update(empty, np.concatenate(fitted.following))[0] if carried.slews else empty
     heads, tails = [slews], [empty]
-    for factor in factors[:-1]:
-        heads.append(information.update(heads[-1], factor).factor)
-    for factor in factors[:0:-1]:
-        tails.insert(0, information.update(tails[0], factor).factor)
-    errors, spreads = np.zeros((len(rows), 3)), own
-    for group, head, tail in zip(groups, heads, tails, strict=True):
-        state, covariance, lost = information.solve(information.update(head, tail).factor, around)
-        if lost.size:
-            return None
-        covariance = covariance + covariance @ (extra.sum(axis=0) - extra[group].sum(axis=0)) @ covariance
-        design = carried.means.design[group]
-        errors[group] = carried.means.readings[group] - design @ state
-        spreads[group] = own[group] + design @ covariance @ np.swapaxes(design, 1, 2)
-    return errors, spreads
+    for group in groups[:-1]:
+        heads.append(information.update(heads[-1], np.concatenate([rows[k] for k in group]))[0])
+    for group in groups[:0:-1]:
+        tails.append(information.update(tails[-1], np.concatenate([rows[k] for k in group]))[0])
+    merged = triangle(np.concatenate([heads, tails[::-1]], axis=1))[:, : len(empty)]
+    states, covariances, lost = zip(*information.solved(merged, around), strict=True)
+    if any(each.size for each in lost):
+        return None
+    place = np.empty(len(rows), np.intp)
+    for k, group in enumerate(groups):
+        place[group] = k
+    left_out = np.zeros_like(covariances)
+    np.add.at(left_out, place, extra)
+    covariance = np.array(covariances)
+    covariance = (covariance + covariance @ (extra.sum(axis=0) - left_out) @ covariance)[place]
+    design = carried.means.design
+    errors = carried.means.readings - (design @ np.array(states)[place, :, None])[:, :, 0]
+    return errors, own + design @ covariance @ np.swapaxes(design, 1, 2)
 
 
 def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | None:
@@ -101,18 +105,19 @@ def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | Non
     rows, means, around = fitted.all_rows(noise.weights), carried.means, carried.model.nominal_state()
     errors, spreads = np.zeros((len(rows), 3)), mean_covariances(noise, means, carried.state)
     spreads += (steps[:, 1] / 12.0)[:, None, None] * np.eye(3)  # of a path's mean about the middle of its ends
-    alone = _passes(rows, steps, ())
+    alone, ways = _passes(rows, steps, ()), dict[int, list[tuple[int, Floats]]]()
     for group in groups:
         heads, tails = alone if len(group) == 1 else _passes(rows, steps, group)
         for k in group:
-            nothing = np.zeros((len(around), 3))
-            upper, count = walk.advanced(heads[k], steps[k], np.hstack([nothing, tails[k]]))
+            upper, count = walk.advanced(heads[k], steps[k], np.hstack([np.zeros((len(around), 3)), tails[k]]))
             order = [*range(count, upper.shape[1] - 1), *range(count), upper.shape[1] - 1]
-            moving = np.append(around, np.zeros(count))
-            state, covariance, lost = information.solve(upper[: len(moving), order], moving)
+            ways.setdefault(count, []).append((k, upper[: len(around) + count, order]))
+    for count, own in ways.items():
+        half = np.hstack([-0.5 * np.eye(3), np.zeros((3, count - 3))])  # the mean is half a step short of the end
+        found = information.solved(np.array([upper for _, upper in own]), np.append(around, np.zeros(count)))
+        for (k, _), (state, covariance, lost) in zip(own, found, strict=True):
             if lost.size:
                 return None
-            half = np.hstack([-0.5 * np.eye(3), np.zeros((3, count - 3))])  # the mean is half a step short of the end
             design = np.hstack([means.design[k], half])
             errors[k] = means.readings[k] - design @ state
             spreads[k] += design @ covariance @ design.T

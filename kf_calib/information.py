@@ -8,12 +8,13 @@ all come from such factors.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kf_calib import paper, walk
-from kf_calib.folding import DwellFactor
+from kf_calib.folding import DwellFactor, alike
 from kf_calib.model import STATE_COUNT, Model, Prior, dwell_map, on_basis
 from kf_calib.noise import FLOOR_MPS2, Noise, flicker_sigma, wander
 from kf_calib.samples import Floats
@@ -48,7 +49,7 @@ def whitened(
     inside = 3 if noise.walk_mps2_per_sqrt_s else 0
     informative = np.append(np.ones(inside), _units(columns)) if reduced else None
     out = list[Floats]([np.empty((0, 0))] * len(dwells))
-    for places in _alike(dwells, columns[0].shape[-1]):
+    for places in _batches(dwells, columns[0].shape[-1]):
         batch, stacked = [dwells[k] for k in places], np.array([columns[k] for k in places])
         rows, count = _weighted(batch, stacked, noise, state, about, flicker_mps2)
         if informative is None:
@@ -60,14 +61,12 @@ def whitened(
     return out
 
 
-def _alike(dwells: Sequence[DwellFactor], width: int) -> Iterator[list[int]]:
+def _batches(dwells: Sequence[DwellFactor], width: int) -> Iterator[list[int]]:
     """Places of dwells whose rows are of one shape, as many at once as leave their ``width`` columns in the cache."""
-    by_shape = dict[tuple[int, int], list[int]]()
-    for k, dwell in enumerate(dwells):
-        by_shape.setdefault((len(dwell.pieces), dwell.width), []).append(k)
-    for (pieces, size), places in by_shape.items():
-        most = max(_AT_ONCE // (3 * pieces * size * (width + 1)), 1)
-        yield from (places[first : first + most] for first in range(0, len(places), most))
+    for places in alike(dwells):
+        first = dwells[places[0]]
+        most = max(_AT_ONCE // (3 * len(first.pieces) * first.width * (width + 1)), 1)
+        yield from (places[k : k + most] for k in range(0, len(places), most))
 
 
 def _weighted(
@@ -199,14 +198,14 @@ def start(prior: Prior, model: Model) -> Floats:
     return triangle(np.column_stack([root, root @ model.nominal_state()]))[: model.count]
 
 
-def update(factor: Floats, rows: Floats, walked: Floats = _STILL) -> Step:
-    """Time and measurement update with whitened rows (m, s + p + 1); ``walked`` (2,): variances of the biases' steps in
-    the pause before the dwell and in the dwell."""
+def update(factor: Floats, rows: Floats, walked: Floats = _STILL) -> tuple[Floats, float]:
+    """Time and measurement update with whitened rows (m, s + p + 1): the factor, and the normalised innovation squared.
+
+    ``walked`` (2,): variances of the biases' steps in the pause before the dwell and in the dwell.
+    """
     width, (upper, count) = len(factor), walk.advanced(factor, walked, rows)
-    after, left = upper[count : count + width, count:], upper[count + width :, -1]
-    known = rank(factor)
-    gained = rank(after) - known if known < width else 0
-    return Step(after, float(left @ left), row_rank(rows) - gained)
+    left = upper[count + width :, -1]
+    return upper[count : count + width, count:], float(left @ left)
 
 
 def restricted(factor: Floats, kept: Sequence[int]) -> Floats:
@@ -227,12 +226,17 @@ def run(first: Floats, rows: Iterable[Floats], walked: Iterable[Floats], followi
 
     A step's factor is that after the slew, its innovation that of the dwell.
     """
-    found, factor = list[Step](), first
+    factors, after, told = [first], list[Floats](), list[tuple[float, int]]()
     for dwell_rows, variances, more in zip(rows, walked, following, strict=True):
-        step = update(factor, dwell_rows, variances)
-        found.append(replace(step, factor=update(step.factor, more).factor) if len(more) else step)
-        factor = found[-1].factor
-    return found
+        own, nis = update(factors[-1], dwell_rows, variances)
+        after.append(own)
+        told.append((nis, row_rank(dwell_rows)))
+        factors.append(update(own, more)[0] if len(more) else own)
+    gained = ranks(np.array(after)) - ranks(np.array(factors[:-1]))
+    return [
+        Step(factor, nis, count - new)
+        for factor, (nis, count), new in zip(factors[1:], told, gained.tolist(), strict=True)
+    ]
 
 
 def accumulated(rows: Sequence[Floats], walked: Floats | None = None) -> Floats:
@@ -254,22 +258,28 @@ def accumulated(rows: Sequence[Floats], walked: Floats | None = None) -> Floats:
 
 
 def scaled(factor: Floats) -> tuple[Floats, Floats]:
-    """R in units in which its columns are of the same order, and those units (p,).
+    """R (..., p, p) of a factor in units in which its columns are of the same order, and those units (..., p).
 
     One unit for all sensitivities and one for all biases: a column of rounding size must stay small.
     """
-    size = np.linalg.norm(factor[:, :-1], axis=0)
-    twelve = size[:STATE_COUNT].reshape(3, 4)
-    largest = np.tile([*[twelve[:, :3].max()] * 3, twelve[:, 3].max()], 3)
-    scale = np.concatenate([largest, size[STATE_COUNT:]])
+    size = np.linalg.norm(factor[..., :-1], axis=-2)
+    twelve = size[..., :STATE_COUNT].reshape(*size.shape[:-1], 3, 4)
+    largest = np.repeat(twelve.max(axis=-2)[..., 3:], 4, axis=-1)
+    largest[..., :3] = twelve[..., :3].max(axis=(-2, -1))[..., None]
+    scale = np.concatenate([np.tile(largest, 3), size[..., STATE_COUNT:]], axis=-1)
     scale = np.where(scale > 0, scale, 1.0)
-    return factor[:, :-1] / scale, scale
+    return factor[..., :-1] / scale[..., None, :], scale
 
 
 def rank(factor: Floats, tolerance: float = 1e-9) -> int:
     """How many combinations of the states the factor determines."""
-    singular = np.linalg.svd(scaled(factor)[0], compute_uv=False)
-    return int((singular > tolerance).sum())
+    return int(ranks(factor, tolerance))
+
+
+def ranks(factors: Floats, tolerance: float = 1e-9) -> NDArray[np.intp]:
+    """The same of many factors (..., p, p + 1)."""
+    singular = np.linalg.svd(scaled(factors)[0], compute_uv=False)
+    return np.asarray((singular > tolerance).sum(axis=-1))
 
 
 def solve(factor: Floats, around: Floats, tolerance: float = 1e-9) -> tuple[Floats, Floats, Floats]:
@@ -277,9 +287,18 @@ def solve(factor: Floats, around: Floats, tolerance: float = 1e-9) -> tuple[Floa
 
     Undetermined combinations keep their value ``around``; their variance is not in the covariance.
     """
-    upper, scale = scaled(factor)
+    return solved(factor[None], around, tolerance)[0]
+
+
+def solved(factors: Floats, around: Floats, tolerance: float = 1e-9) -> list[tuple[Floats, Floats, Floats]]:
+    """The same of many factors (n, p, p + 1)."""
+    upper, scale = scaled(factors)
     left, singular, right = np.linalg.svd(upper)
     seen = singular > tolerance
-    inverse = (right[seen].T / singular[seen]) / scale[:, None]  # (p, rank)
-    state = around + inverse @ (left[:, seen].T @ (factor[:, -1] - factor[:, :-1] @ around))
-    return state, inverse @ inverse.T, right[~seen].T / scale[:, None]
+    back = np.swapaxes(right, 1, 2) / scale[:, :, None]
+    inverse = back * (seen / np.where(seen, singular, 1.0))[:, None, :]  # (n, p, p), zeros where not determined
+    beside = factors[:, :, -1] - factors[:, :, :-1] @ around
+    states = around + (inverse @ (np.swapaxes(left, 1, 2) @ beside[:, :, None]))[:, :, 0]
+    covariances = inverse @ np.swapaxes(inverse, 1, 2)
+    lost = [own[:, ~known] for own, known in zip(back, seen, strict=True)]
+    return list(zip(states, covariances, lost, strict=True))

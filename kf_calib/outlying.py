@@ -95,8 +95,9 @@ def outlying_dwells(
     statistics = left_out.statistics
     if statistics.max() < 30.0:  # no dwell can be beyond the level
         return ()
-    order = np.argsort(-statistics)[:_TRIED]
-    tried = [k for k in order.tolist() if statistics[k] > _NEARLY * statistics[order[0]]]
+    ratios = (statistics / statistics.max()).round(9)  # of dwells as far off, to rounding, the first comes first
+    order = np.argsort(-ratios, kind="stable")[:_TRIED]
+    tried = [k for k in order.tolist() if ratios[k] > _NEARLY]
     found = [_judged(result, k, evaluate(without(dwells, (k,)))) for k in tried]
     return tuple(each for each in found if each is not None)
 

@@ -148,8 +148,8 @@ class Running:
         return [*range(STATE_COUNT), *(k for name in self.inside for k in range(*parts[name].indices(count)))]
 
     def _updated(self, rows: Floats, walked: Floats) -> Running:
-        step = information.update(self.factor, rows, walked)
-        return replace(self, factor=step.factor, left=self.left + step.nis, rows=self.rows + len(rows))
+        factor, left = information.update(self.factor, rows, walked)
+        return replace(self, factor=factor, left=self.left + left, rows=self.rows + len(rows))
 
     def _folded(self) -> Running:
         """The same with its factor made anew from the dwells."""
