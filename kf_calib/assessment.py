@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -91,7 +91,6 @@ class Test:
     between: str = ""
     paths: float = 0.0
     trend: Trend | None = None
-    frame: Frame | None = field(default=None, repr=False, compare=False)
 
     @property
     def p_value(self) -> float | None:
@@ -168,17 +167,16 @@ def candidates(model: Model) -> list[Effect]:
     return out
 
 
-def assessed(fitted: Fit, tests: float | None = None, seed: int = 0, frame: Frame | None = None) -> Test:
+def assessed(fitted: Fit, tests: float | None = None, seed: int = 0, frames: list[Frame] | None = None) -> Test:
     """Score tests of all candidates, calibrated on their own columns by drawing residuals as noise alone makes them.
 
-    tests: as how many independent ones they count, where that is known from nearly the same columns. frame: of another
-    fit of the run, used where it serves this one, too.
+    tests: as how many independent ones they count, where that is known from nearly the same columns. frames: where a
+    frame of columns is kept for all fits of a run that are judged by the same noise.
     """
     from scipy.special import chdtrc
 
     model, agreed = fitted.carried.model, consistency(fitted)
-    frame = _frame(fitted, frame)
-    found = _scanned(fitted, frame)
+    found = _scanned(fitted, _frame(fitted, [] if frames is None else frames))
     statistics = found.statistics
     tests = tests or independent_tests(found, seed)
     best, scores, p_values = dict[str, int](), dict[str, float](), dict[str, float]()
@@ -199,18 +197,20 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0, frame: Fram
         paths = _beside_best(found, scores, tests) if beyond > 0.0 else 0.0
         scores[name] = beyond + paths
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
-    test = Test(found, best, scores, p_values, agreed.p_value, name, tests, slewing, (), paths=paths, frame=frame)
+    test = Test(found, best, scores, p_values, agreed.p_value, name, tests, slewing, (), paths=paths)
     return _with_lines(test, fitted)
 
 
-def _frame(fitted: Fit, known: Frame | None) -> Frame:
-    """The columns of all candidates of the catalogue in the noise of a fit: those that are known, where they serve."""
+def _frame(fitted: Fit, frames: list[Frame]) -> Frame:
+    """The columns of all candidates of the catalogue in the noise of a fit: those in ``frames``, where they serve."""
     carried, noise = fitted.carried, fitted.noise.judging
-    if known is not None and known.serves(carried, noise):
-        return known
+    for known in frames:
+        if known.serves(carried, noise):
+            return known
     tried = candidates(Model(carried.model.bench))
     stage.say(f"scanning {len({str(each) for each in tried})} effects")
-    return Frame(carried, noise, tried)
+    frames[:] = [Frame(carried, noise, tried)]  # one is all that memory should hold
+    return frames[0]
 
 
 def _scanned(fitted: Fit, frame: Frame) -> Scan:

@@ -42,6 +42,7 @@ from kf_calib.noise import TOO_SHORT, Noise, considered, mean_covariances, steps
 from kf_calib.outlying import OutlyingDwell, in_words, outlying_dwells
 from kf_calib.readings import Readings, Watch
 from kf_calib.samples import Floats, Mask, Source
+from kf_calib.scan import Frame
 from kf_calib.sources.recording import opened
 from kf_calib.stillness import Stillness
 from kf_calib.visibility import sights
@@ -220,6 +221,13 @@ class Calibration:
     """What the readings themselves show, whatever the model."""
     outlying: tuple[OutlyingDwell, ...] = ()
     """The dwell that alone does not fit, or those of which any one could be it."""
+    frames: list[Frame] = field(default_factory=list[Frame], repr=False, compare=False)
+    """The candidates' columns, kept for all models of the run."""
+
+    @cached_property
+    def refits(self) -> dict[tuple[str, ...], Calibration]:
+        """The models that were asked for (``refitted``), by their effects: none is fitted twice."""
+        return {}
 
     @property
     def held_out_rms_mps2(self) -> float | None:
@@ -464,7 +472,14 @@ def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
     Only effects that need other factors (an oscillation its carrier, some the slews, some averages of the readings)
     cost another pass over the source.
     """
-    settings = replace(before.settings, effects=tuple(effects))
+    key = tuple(effects)
+    if key not in before.refits:
+        before.refits[key] = replace(_refitted(before, key), frames=before.frames)
+    return before.refits[key]
+
+
+def _refitted(before: Calibration, effects: tuple[str, ...]) -> Calibration:
+    settings = replace(before.settings, effects=effects)
     model = Model.of(before.bench, settings.effects)
     stage.say(f"refitting with {' + '.join(map(str, model.effects))}" if model.effects else "refitting the twelve")
     other = model.averages and not all(dwell.averaged for dwell in before.fit.dwells)

@@ -135,10 +135,10 @@ def diagnose(run: Calibration | Source | str | PathLike[str]) -> Diagnosis:
 
 def _diagnosed(before: Calibration) -> Diagnosis:
     if before.outlying:  # a dwell that is wrong is no effect, and looks like many
-        test = assessed(before.fit)
+        test = assessed(before.fit, frames=before.frames)
         verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {in_words(before.outlying)}"
         return Diagnosis(before, test, (), (), test.consistent is False, (), {}, None, verdict)
-    test = _without_vibration(before, assessed(before.fit))
+    test = _without_vibration(before, assessed(before.fit, frames=before.frames))
     found = _explained(before, test)
     if found.unknown and test.without_lines:  # of one phase all along and not of one amplitude
         test = test.without_lines
@@ -146,7 +146,7 @@ def _diagnosed(before: Calibration) -> Diagnosis:
     if test.vibration and not before.fit.dwells[0].averaged and before.reread is not None:
         window_s = averaging.window_s(test.vibration)
         rested = before.reread(replace(before.settings, window_s=window_s))
-        still = assessed(rested.fit)
+        still = assessed(rested.fit, frames=rested.frames)
         still = still.without_lines or still  # what the windows let through is vibration, too
         found = _explained(rested, replace(still, vibration=test.vibration))
     found = replace(found, back_s=_back_s(found))
@@ -173,7 +173,7 @@ def _told_in_its_noise(found: Diagnosis) -> Diagnosis:
     if refit is None or not (found.missing or found.unknown or fitting):
         return found
     stated = as_if_stated(before, refit)
-    again = _or_walk(_likeliest(stated, _without_vibration(stated, assessed(stated.fit))))
+    again = _or_walk(_likeliest(stated, _without_vibration(stated, assessed(stated.fit, frames=stated.frames))))
     if not (again.missing or again.unknown):
         return found
     suspects = tuple(replace(each, refit=found.refit_with(each.name)) for each in again.suspects)
@@ -236,7 +236,7 @@ def _beside_lines(found: Diagnosis) -> Diagnosis | None:
     if not test.oscillating:
         return None
     known = found.refit_with(test.oscillating)
-    rest = _explained(known, assessed(known.fit, test.effective_tests, frame=test.frame))
+    rest = _explained(known, assessed(known.fit, test.effective_tests, frames=found.before.frames))
     if not rest.missing:
         return None
     both = (*rest.missing, test.oscillating)
@@ -397,7 +397,7 @@ def _pairs_with_walk(found: Diagnosis, pairs: Pairs, beyond: bool = False) -> di
     if not test.walking:
         return {}
     candidates, tests, out = test.scan.candidates, test.effective_tests, dict[Pair, float]()
-    beside = assessed(found.refit_with(test.walking).fit, tests, frame=test.frame)
+    beside = assessed(found.refit_with(test.walking).fit, tests, frames=found.before.frames)
     least = test.scores[test.walking] - test.paths + (EQUAL if beyond else 0.0)
     likely = [name for name in beside.ranked if name in test.best and (beside.scores[name] > 0.0 or not beyond)]
     for name in likely[:MOST]:
@@ -430,7 +430,7 @@ def _fits(refit: Calibration, before: Test, added: int = 1) -> bool:
     least = LEVEL if walks else _REFUSED
     if (misfit is not None and misfit < SHARE * least) or (walks and _no_walk(refit)) or _at_an_end(refit):
         return False
-    left = assessed(refit.fit, before.effective_tests, frame=before.frame)
+    left = assessed(refit.fit, before.effective_tests, frames=refit.frames)
     if left.trend and misfit is not None:
         free = walks or added > 1
         if _together(misfit, left.trend.p_value) < SHARE * (LEVEL if free else _REFUSED):

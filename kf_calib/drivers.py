@@ -12,6 +12,7 @@ from kf_calib import stage
 from kf_calib.assessment import EQUAL
 from kf_calib.bench import Bench
 from kf_calib.effects import Effect, effect_named, walk_named
+from kf_calib.effects.formula import formula
 from kf_calib.errors import InputError
 from kf_calib.fitting import Fit, fit
 from kf_calib.folding import DwellFactor
@@ -137,18 +138,25 @@ def _goes_on(trend: Trend | None) -> bool:
 def _trend_beside(fitted: Fit, family: Family) -> Trend | None:
     """What is left of the trends with a family in the model."""
     model = fitted.carried.model
-    for formula in family.formulas:
-        model += effect_named(formula, model.bench)
+    for text in family.formulas:
+        model += effect_named(text, model.bench)
     return trend_of(fit(fitted.dwells, model, fitted.noise.walk_mps2_per_sqrt_s, fitted.carried.slews))
 
 
 def families(fitted: Fit, known: Sequence[Effect] = ()) -> tuple[list[Family], float]:
     """All families tried on what the model leaves, beside effects that are ``known``; and the chi-squared that is left
-    there beyond its dof."""
+    there beyond its dof. They are tried once for each fit."""
+    key = tuple((str(effect), effect.value) for effect in known)
+    if key not in fitted.families:
+        fitted.families[key] = _tried(fitted, known)
+    return fitted.families[key]
+
+
+def _tried(fitted: Fit, known: Sequence[Effect]) -> tuple[list[Family], float]:
     bench, listed, effects = fitted.carried.model.bench, list[tuple[str, list[str]]](), list[Effect]()
     for driver, texts in _families(bench, fitted.dwells):
         with contextlib.suppress(InputError):  # a jump so late, a decay so fast that the trial of a formula misses it
-            effects += [effect_named(_named(text), bench) for text in texts]
+            effects += [formula(_named(text), bench.axes, bench.gravity_mps2, checked=False) for text in texts]
             listed.append((driver, texts))
     stage.say(f"trying {len(effects)} formulas")
     scanned = scan(fitted.carried, fitted.noise.judging, [*effects, *known])

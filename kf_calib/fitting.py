@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -88,6 +89,11 @@ class Fit:
             standing = np.zeros((len(more), own.shape[1] - more.shape[1]))
             out.append(np.vstack([own, np.hstack([standing, more])]) if len(more) else own)
         return out
+
+    @cached_property
+    def families(self) -> dict[Any, Any]:
+        """The formulas that were tried on what this fit leaves (``drivers.families``), by what else was tried."""
+        return {}
 
     @cached_property
     def considered(self) -> Floats:

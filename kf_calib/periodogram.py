@@ -27,7 +27,7 @@ from kf_calib.samples import Floats
 _SEEN = 1e-6  # of a column beside the model: less is nothing
 _NEW = 1e-9  # of a column beside those before: less is rounding
 _SPARE = 18  # points beyond the phase, rad, that a dwell goes through: 1e-10 of a column
-_AT_ONCE = 256  # frequencies
+_AT_ONCE = 64  # frequencies
 _LEAST_PAUSE = 1e-6  # of the largest step of a walk: no pause is taken to be shorter
 
 Waves = NDArray[np.complex128]
@@ -81,9 +81,9 @@ class Periodogram:
         count, points = columns.shape[1], self._shares.shape[1]
         waves = self._waves.reshape(len(columns), -1)
         sums = np.array([waves[part].T @ columns[part] for part in _parts(self._ends)])  # (D, 3 points, c)
-        out = np.empty((len(self.values_hz), 3, count), complex)
+        out: Waves = np.empty((len(self.values_hz), 3, count), np.complex128)
         for part, turning in self._turning():
-            found = (turning @ sums.reshape(len(sums), -1)).reshape(-1, points, 3, count)
+            found = (turning @ sums.reshape(len(sums), -1)).reshape(len(turning), points, 3, count)
             out[part] = np.einsum("np,npic->nic", self._shares[part], found)
         return np.concatenate([out.real, out.imag], axis=1)
 
@@ -180,7 +180,7 @@ class _Path:
         self._columns[: ends[1], :3] = 0.0  # the first dwell is where the way begins
         self._root = cholesky_banded(self._bands(steps / self._unit**2), lower=True)
 
-    def products(self, columns: NDArray[np.generic]) -> NDArray[np.generic]:
+    def products(self, columns: NDArray[Any]) -> NDArray[Any]:
         """Products (6 D, c) of the path's columns with others (m, c)."""
         return np.concatenate([self._columns[part].T @ columns[part] for part in _parts(self._ends)])
 

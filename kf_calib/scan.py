@@ -10,7 +10,7 @@ found.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -31,6 +31,8 @@ _SAME = 1.0 - 1e-6
 """Cosine above which two directions are one."""
 
 _TOGETHER = 64  # columns that are whitened at a time: memory stays that of the result
+_OF_ONE_KIND = 400  # the same of many effects of one kind
+_MANY = 100  # oscillations, of which a periodogram is quicker
 
 
 @dataclass(frozen=True, repr=False)
@@ -110,7 +112,8 @@ class Frame:
         self.dwells, self.noise, self.state, self.effects = carried.dwells, noise, carried.state, list(effects)
         ends = np.cumsum([0, *(len(effect.coefficients) for effect in effects)]).tolist()
         self.parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
-        self.basis, self.coordinates = np.linalg.qr(self._columns(carried))
+        rows, width = whitened(carried, noise, effects)
+        self.basis, self.coordinates = np.linalg.qr(rows[:, width:-1])
         self._periodogram: Periodogram | None = None
 
     def serves(self, carried: Carried, noise: Noise) -> bool:
@@ -147,16 +150,6 @@ class Frame:
         own = np.concatenate(rows[len(rows) - len(self.dwells) :])
         return self._periodogram.falls(_stacked(rows, self.dwells, self.noise), own[:, _inside(self.noise) :], width)
 
-    def _columns(self, carried: Carried) -> Floats:
-        """The whitened columns (m, q), some effects at a time."""
-        out: Floats | None = None
-        for part in _batches(range(len(self.effects)), [own.stop - own.start for own in self.parts]):
-            rows, width = whitened(carried, self.noise, [self.effects[k] for k in part], self.state)
-            if out is None:
-                out = np.empty((len(rows), self.parts[-1].stop))
-            out[:, self.parts[part[0]].start : self.parts[part[-1]].stop] = rows[:, width:-1]
-        return np.zeros((0, 0)) if out is None else out
-
 
 _OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps2_per_sqrt_s")
 
@@ -165,14 +158,10 @@ def _is(one: object, other: object) -> bool:
     return one is other
 
 
-def _batches(numbers: range, sizes: Sequence[int]) -> Iterator[list[int]]:
-    """Numbers in order, together as many as have about ``_TOGETHER`` columns."""
-    part, count = list[int](), 0
-    for k in numbers:
-        part, count = [*part, k], count + sizes[k]
-        if count >= _TOGETHER or k == numbers[-1]:
-            yield part
-            part, count = [], 0
+def _batches(numbers: range, sizes: Sequence[int], columns: int) -> list[list[int]]:
+    """Numbers in order, together as many as have about so many columns."""
+    ends = np.cumsum(sizes) // columns
+    return [[k for k in numbers if ends[k] == each] for each in dict.fromkeys(ends.tolist())]
 
 
 def scan(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Scan:
@@ -206,8 +195,13 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
 
     Nothing else is asked of them, so the rows are not folded: of n columns in d rows that takes d n, not d n^2.
     """
+    if effects[0].oscillates and len(effects) > _MANY and not carried.carrier_hz:
+        rows, width = _judged(carried.dwells, carried.columns, noise, carried.state, carried.model.count)
+        own = np.concatenate(rows[len(rows) - len(carried.dwells) :])[:, _inside(noise) :]
+        many = Periodogram(carried, noise, effects[0], np.array([effect.value for effect in effects]))
+        return many.falls(_stacked(rows, carried.dwells, noise), own, width)
     out = list[Floats]()
-    for part in _batches(range(len(effects)), [len(effect.coefficients) for effect in effects]):
+    for part in _batches(range(len(effects)), [len(effect.coefficients) for effect in effects], _OF_ONE_KIND):
         rows, width = whitened(carried, noise, [effects[k] for k in part])
         sizes, rest = np.linalg.norm(rows[:, width:-1], axis=0), _beside(rows, width)
         columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
@@ -223,11 +217,20 @@ def whitened(
 ) -> tuple[Floats, int]:
     """Rows [H | W | G | z] (m, c) of unit noise of the model carried and of ``effects``, and how many columns come
     before G. state: where rotations and input axes are linearised, other than where the model is."""
-    at = carried.state if state is None else state
-    added = candidate_columns(carried.dwells, effects, carried.model.bench, at)
-    columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
-    rows, width = _judged(carried.dwells, columns, noise, at, carried.model.count)
-    return _stacked(rows, carried.dwells, noise), width
+    at, bench, dwells = carried.state if state is None else state, carried.model.bench, carried.dwells
+    sizes = [len(effect.coefficients) for effect in effects]
+    out, first = np.zeros((0, 0)), 0
+    for part in _batches(range(len(effects)), sizes, _TOGETHER) or [[]]:
+        added = candidate_columns(dwells, [effects[k] for k in part], bench, at)
+        columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
+        rows, width = _judged(dwells, columns, noise, at, carried.model.count)
+        stacked = _stacked(rows, dwells, noise)
+        if not first:
+            out = np.empty((len(stacked), width + sum(sizes) + 1))
+            out[:, :width], out[:, -1], first = stacked[:, :width], stacked[:, -1], width
+        count = sum(sizes[k] for k in part)
+        out[:, first : first + count], first = stacked[:, width : width + count], first + count
+    return out, first - sum(sizes)
 
 
 def _judged(

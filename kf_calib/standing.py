@@ -198,7 +198,7 @@ def _least(result: Calibration) -> int:
 
 def _not_judged(result: Calibration, watch: Watch | None) -> Diagnosis:
     """What can be said without an alarm: what the run could show so far, and that nothing is beyond chance."""
-    test = assessed(result.fit, None if watch is None else watch.tests)
+    test = assessed(result.fit, None if watch is None else watch.tests, frames=result.frames)
     said = "Nothing is beyond chance so far: no effect is missing that this run has shown."
     if watch is None:
         said = "Too few orientations so far to judge the model by: visit more."

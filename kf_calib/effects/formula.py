@@ -159,12 +159,13 @@ class Formula(SensorEffect):
     """An effect ``name = expression``; raises InputError, with the formula in it, where it cannot be used.
 
     text: what gives the same effect again; remarks: what its checks had to say. The unit of the coefficients follows
-    from that of the expression, their scale from what they add on a trial run: about 1e-3 m/s^2.
+    from that of the expression, their scale from what they add on a trial run: about 1e-3 m/s^2. checked: not for
+    formulas that the program has written itself.
     """
 
     source, confused_with = "user's formula", ""
 
-    def __init__(self, name: str, expression: str, bench: Bench) -> None:
+    def __init__(self, name: str, expression: str, bench: Bench, checked: bool = True) -> None:
         from kf_calib.effects.formula_units import coefficient_units
 
         self._values = _Reading(name, expression, bench)
@@ -175,8 +176,8 @@ class Formula(SensorEffect):
         # of the class in the catalogue; here each formula has its own
         vars(self).update(name=name, title=expression, symbol=symbol_stem(name), unit=unit, shown=shown, scale=1.0)
         self.text = f"{name} = {expression}"
-        stimulus = checks.trial(bench)
-        self.remarks = checks.check(self, stimulus)
+        stimulus = _trial(bench.axes, bench.gravity_mps2)
+        self.remarks = checks.check(self, stimulus) if checked else ()
         vars(self).update(scale=_LARGE_MPS2 / self._values.typical(stimulus))
 
     def terms(self, s: Stimulus) -> Floats:
@@ -193,7 +194,7 @@ class FrameFormula(FrameEffect):
 
     source, confused_with = "user's formula", ""
 
-    def __init__(self, name: str, place: str, expression: str, bench: Bench) -> None:
+    def __init__(self, name: str, place: str, expression: str, bench: Bench, checked: bool = True) -> None:
         from kf_calib.effects.formula_units import turning_units
 
         self._values, self._unit = _Reading(name, expression, bench), ""
@@ -201,12 +202,12 @@ class FrameFormula(FrameEffect):
         unit, shown = turning_units(self._values.unit)
         vars(self).update(name=name, variant=place, title=expression)
         self.text = f"{name}:{place} = {expression}"
-        stimulus = checks.trial(bench)
+        stimulus = _trial(bench.axes, bench.gravity_mps2)
         if self._values(stimulus).shape[1] != 1:
             raise InputError(f"{name}: an angle is one for the whole block: use fx, fy, fz in place of a, p, o and da.")
         symbols = [f"{symbol_stem(name)}{axis}" for axis in ("NE" if place == BASE else [f"_{place}"])]
         self._coefficients = tuple(Coefficient(symbol, unit, 1.0, *shown) for symbol in symbols)
-        self.remarks = checks.check(self, stimulus)
+        self.remarks = checks.check(self, stimulus) if checked else ()
         scale = _LARGE_RAD / self._values.typical(stimulus)
         self._coefficients = tuple(replace(each, scale=scale) for each in self._coefficients)
 
@@ -221,9 +222,17 @@ class FrameFormula(FrameEffect):
         return values[:, :, None] * np.stack(axes, axis=1)
 
 
-@lru_cache(maxsize=256)
-def formula(text: str, axes: tuple[Vector, ...], gravity_mps2: float) -> Formula | FrameFormula:
+@lru_cache(maxsize=8)
+def _trial(axes: tuple[Vector, ...], gravity_mps2: float) -> Stimulus:
+    """The trial run of a bench: no formula can write into it, so all share it."""
+    return checks.trial(Bench(axes, gravity_mps2))
+
+
+@lru_cache(maxsize=1024)
+def formula(text: str, axes: tuple[Vector, ...], gravity_mps2: float, checked: bool = True) -> Formula | FrameFormula:
     """The formula's effect, made once for each bench: a run asks for it many times."""
     (full, expression), bench = split(text), Bench(axes, gravity_mps2)
     name, _, place = full.partition(":")
-    return FrameFormula(name, place, expression, bench) if place else Formula(name, expression, bench)
+    if place:
+        return FrameFormula(name, place, expression, bench, checked)
+    return Formula(name, expression, bench, checked)
