@@ -45,6 +45,7 @@ from kf_calib.samples import Floats, Mask, Source
 from kf_calib.scan import Frame
 from kf_calib.sources.recording import opened
 from kf_calib.stillness import Stillness
+from kf_calib.tails import f_tail
 from kf_calib.visibility import sights
 from kf_calib.walk import predicted, to_mean
 
@@ -716,8 +717,6 @@ def _visits(fitted: Fit, steps: list[Step], residuals: Floats, extra: Floats, se
 
 def consistency(fitted: Fit) -> Consistency:
     """Whether the dwells agree with the fitted model within the noise it is judged by."""
-    from scipy.special import fdtrc
-
     noise, dwells, rows = fitted.noise, fitted.dwells, fitted.judged
     upper = information.accumulated(rows, fitted.steps)
     statistic = float(upper[-1, -1] ** 2)
@@ -726,7 +725,7 @@ def consistency(fitted: Fit) -> Consistency:
     if dof <= 0:
         return Consistency(statistic, 0, None, None)
     noise_dof = float(sum(max(dwell.count - 4, 1) for dwell in dwells) / noise.inflation.mean())
-    p_value = float(fdtrc(dof, max(noise_dof, 1.0), statistic / dof))
+    p_value = f_tail(dof, max(noise_dof, 1.0), statistic / dof)
     return Consistency(statistic, dof, p_value, p_value >= 0.01)
 
 

@@ -212,15 +212,15 @@ class DwellFactor:
         out[:, :, width:] = self.triangles[:, :, self.width :]
         return out.reshape(-1, width + 3)
 
-    def merged(self, other: DwellFactor) -> DwellFactor:
-        """The same dwell from two stretches of samples."""
-        pieces = sorted((*self.pieces, *other.pieces), key=lambda piece: piece.nodes.elapsed_s[0])
+    def merged(self, others: Sequence[DwellFactor]) -> DwellFactor:
+        """The same dwell from this and other stretches of samples."""
+        pieces = (piece for each in (self, *others) for piece in each.pieces)
         return replace(
             self,
-            pieces=tuple(pieces),
-            autocovariance=self.autocovariance + other.autocovariance,
-            spectrum=self.spectrum + other.spectrum,
-            trace=self.trace + other.trace,
+            pieces=tuple(sorted(pieces, key=lambda piece: piece.nodes.elapsed_s[0])),
+            autocovariance=sum((each.autocovariance for each in others), self.autocovariance),
+            spectrum=sum((each.spectrum for each in others), self.spectrum),
+            trace=sum((each.trace for each in others), self.trace),
         )
 
     def repeated(self, times: float) -> DwellFactor:
@@ -481,31 +481,75 @@ def samples_of(rows: Iterable[Rows], carried: Carried) -> Iterator[Samples]:
             yield Samples(block.dwell, block.elapsed_s[part], observation, regressors, readings, block.moving)
 
 
+class _Growing:
+    """Dwells, or slews, one after another; the last grows block by block.
+
+    Its blocks are merged when it is asked for: merged as they come, all that it holds would be copied at every block.
+    """
+
+    def __init__(self, folded: Iterable[DwellFactor] = ()) -> None:
+        self._folded, self._blocks = list(folded), list[DwellFactor]()
+
+    def add(self, block: DwellFactor) -> None:
+        if self._last(block.number) is None:
+            self.folded.append(block)
+        elif block.autocovariance.count:  # of its first readings: how many more are wanted is seen in the dwell
+            self._folded[-1] = self._folded[-1].merged([block])
+        else:
+            self._blocks.append(block)
+
+    def correlated(self, number: int) -> int:
+        """Readings in the autocovariance of the dwell of that number, which is the last or is still to come."""
+        last = self._last(number)
+        return last.autocovariance.count if last else 0
+
+    @property
+    def folded(self) -> list[DwellFactor]:
+        """All of them, each with all its blocks."""
+        if self._blocks:
+            self._folded[-1] = self._folded[-1].merged(self._blocks)
+            self._blocks = []
+        return self._folded
+
+    def _last(self, number: int) -> DwellFactor | None:
+        return self._folded[-1] if self._folded and self._folded[-1].number == number else None
+
+
 class Folder:
     """Folds rows into the lists of dwell factors and of slews, one after another, on a carrier where one is given."""
 
     def __init__(self, carrier_hz: float = 0.0) -> None:
-        self.dwells: list[DwellFactor] = []
-        self.slews: list[DwellFactor] = []
+        self._dwells, self._slews = _Growing(), _Growing()
         self.carrier_hz = carrier_hz
         self._cells: Cells | None = None
 
+    @property
+    def dwells(self) -> list[DwellFactor]:
+        return self._dwells.folded
+
+    @dwells.setter
+    def dwells(self, dwells: Iterable[DwellFactor]) -> None:
+        self._dwells = _Growing(dwells)
+
+    @property
+    def slews(self) -> list[DwellFactor]:
+        return self._slews.folded
+
+    @slews.setter
+    def slews(self, slews: Iterable[DwellFactor]) -> None:
+        self._slews = _Growing(slews)
+
     def add(self, rows: Rows) -> None:
-        folded = self.slews if rows.moving else self.dwells
-        current = folded[-1] if folded and folded[-1].number == rows.dwell else None
-        fresh = not rows.moving and (current is None or current.autocovariance.count < _CORRELATED_SAMPLES)
-        folded_rows = fold(rows, self.carrier_hz)
+        growing = self._slews if rows.moving else self._dwells
         block = DwellFactor(
-            rows.dwell, folded_rows, moving=rows.moving, pose_sigma_rad=rows.pose_sigma_rad, turns=rows.turns
-        )
-        if fresh:
+            rows.dwell, fold(rows, self.carrier_hz), moving=rows.moving, pose_sigma_rad=rows.pose_sigma_rad,
+            turns=rows.turns,
+        )  # fmt: skip
+        if not rows.moving and growing.correlated(rows.dwell) < _CORRELATED_SAMPLES:
             left = less_curve(rows.innovation, rows.elapsed_s, self.carrier_hz)
             own, spectrum = Autocovariance.of(left), Spectrum.of(left, rows.elapsed_s)
             block = replace(block, autocovariance=own, spectrum=spectrum)
         self._cells = self._cells or Cells.of(rows.elapsed_s)
         if self._cells and not rows.moving and not block.averaged:
             block = replace(block, trace=Trace.of(rows.readings, rows.elapsed_s, self._cells))
-        if current is None:
-            folded.append(block)
-        else:
-            folded[-1] = current.merged(block)
+        growing.add(block)

@@ -19,6 +19,7 @@ import numpy as np
 from kf_calib.folding import Carried, DwellFactor, Means, without
 from kf_calib.noise import lifted, mean_covariances
 from kf_calib.samples import Floats
+from kf_calib.tails import f_tail
 
 if TYPE_CHECKING:
     from kf_calib.calibration import Calibration
@@ -104,8 +105,6 @@ def outlying_dwells(
 
 def _judged(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell | None:
     """Dwell ``k`` against the calibration from all others; None where they disagree too, or it is within chance."""
-    from scipy.special import fdtrc
-
     if rest.consistency.consistent is not True:
         return None
     dwells, estimate, noise = result.fit.dwells, rest.estimate, rest.noise
@@ -113,7 +112,7 @@ def _judged(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell | N
     error, covariance = means.readings[0] - means.design[0] @ estimate.state, _covariance(rest, means)
     freedom = 1e9 if noise.setting_stated and noise.scatter_stated else max(rest.consistency.dof, 1)
     statistic = float(error @ np.linalg.solve(covariance, error))
-    p_value = min(len(dwells) * float(fdtrc(3, freedom, statistic / 3.0)), 1.0)
+    p_value = min(len(dwells) * f_tail(3.0, freedom, statistic / 3.0), 1.0)
     if p_value > LEVEL:
         return None
     turns = tuple(_turns(dwells[k], means, rest))

@@ -17,7 +17,6 @@ and exit 2; a picture that the viewer cannot draw, for want of a graphics driver
 from __future__ import annotations
 
 import os
-import secrets
 import shutil
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -115,7 +114,7 @@ def target_of(path: Path) -> Path:
 
 def beside(target: Path) -> Path:
     """A new name in the same folder, for what is not whole yet."""
-    return target.with_name(f".kf-calib-{secrets.token_hex(4)}.part")
+    return target.with_name(f".kf-calib-{os.urandom(4).hex()}.part")
 
 
 @contextmanager

@@ -295,9 +295,10 @@ def _saturations(
         width = max(step or 0.0, float(np.spacing(np.float32(ends[:, side].max()))))
         if width > 2.0 * sigma:
             continue  # a dwell may then have one value anywhere
-        sigma = math.sqrt(sigma**2 - width**2 / 12.0)
+        sigma, at = math.sqrt(sigma**2 - width**2 / 12.0), reached[:, side]
+        if stuck[at, side].sum() <= _CROWDED * float(noise.inflation[i]):
+            continue  # no more can be missing above a value than there are at it
         missing = missing_above(stuck[:, side], counts, width / sigma) / float(noise.inflation[i])
-        at = reached[:, side]
         usual = float(np.median(missing[inside]))  # noise that is not Gaussian has flat tops at every level
         if missing[at].sum() > _CROWDED and missing[at].mean() > 4.0 * usual:
             level = float(ends[at, side][0]) * (1.0 if side < 3 else -1.0)

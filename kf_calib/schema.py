@@ -1,4 +1,8 @@
-"""Values from outside as the types they must have, with limits; what does not fit is told in words."""
+"""Values of files and streams as the types they must have, with limits; what does not fit is told in words.
+
+Keys of a bench are checked without it (``bench_keys``): every run has them, and pydantic takes as long to import as a
+short recording to be evaluated.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +11,9 @@ from typing import Annotated, Any
 
 from pydantic import Field, StringConstraints, TypeAdapter, ValidationError
 
-from kf_calib.text import cut
+from kf_calib.text import COMMANDS, LONGEST, cut
 
-# control characters, and what turns the direction of writing
-_COMMANDS = r"\x00-\x08\x0b-\x1f\x7f-\x9f\u{2028}-\u{202e}\u{2066}-\u{2069}"
-TEXT = Annotated[str, StringConstraints(max_length=1000, pattern=rf"\A[^{_COMMANDS}]*\z")]
+TEXT = Annotated[str, StringConstraints(max_length=LONGEST, pattern=rf"\A[^{COMMANDS}]*\z")]
 """Text for people and names; line ends and tabs may be in it."""
 FINITE = Annotated[float, Field(allow_inf_nan=False)]
 

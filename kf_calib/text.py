@@ -8,6 +8,8 @@ from __future__ import annotations
 
 LONGEST = 1000
 """Characters of a message, at most."""
+COMMANDS = r"\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069"
+"""Control characters, but for line ends and tabs, and what turns the direction of writing: for a regular expression."""
 _END = 300  # of a message that is cut: its last words say what to do
 
 

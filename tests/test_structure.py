@@ -11,7 +11,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "kf_calib"
 LEVELS = [
-    ["errors", "lock", "stage", "text"],
+    ["errors", "lock", "stage", "tails", "text"],
     ["toml_file"],
     ["outputs", "samples"],
     ["paper", "schema"],

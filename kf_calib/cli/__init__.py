@@ -7,26 +7,37 @@ inconsistent and ``--strict`` asked; 2: anything else, with one sentence on stde
 from __future__ import annotations
 
 import sys
-from itertools import chain
+from importlib import import_module
 
 import click
 import rich_click
 
 from kf_calib.cli.echo import fall_silent, open_streams
 from kf_calib.cli.failures import tell
-from kf_calib.cli.live import live
-from kf_calib.cli.making import demo, record, simulate
-from kf_calib.cli.paper import paper
-from kf_calib.cli.plan import plan
-from kf_calib.cli.runs import compare, diagnose, improve, list_effects, replay
 
 SECTIONS = {
-    "Evaluate a recording": (replay, diagnose, improve, compare),
-    "Run a bench": (plan, record, live),
-    "Try it without a bench": (demo, simulate),
-    "Look up": (list_effects, paper),
-}
-"""The commands, as ``--help`` has them."""
+    "Evaluate a recording": {"replay": "runs.replay", "diagnose": "runs.diagnose", "improve": "runs.improve",
+                             "compare": "runs.compare"},
+    "Run a bench": {"plan": "plan.plan", "record": "making.record", "live": "live.live"},
+    "Try it without a bench": {"demo": "making.demo", "simulate": "making.simulate"},
+    "Look up": {"effects": "runs.list_effects", "paper": "paper.paper"},
+}  # fmt: skip
+"""The commands, as ``--help`` has them, and where in this package each is."""
+
+_HOMES = {name: home for own in SECTIONS.values() for name, home in own.items()}
+
+
+class _Commands(rich_click.RichGroup):
+    """Commands that are imported when one of them runs, or all are listed."""
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        for name in [cmd_name] if cmd_name in _HOMES else _HOMES:  # a mistyped one is compared with all
+            module, function = _HOMES[name].split(".")
+            self.add_command(getattr(import_module(f"kf_calib.cli.{module}"), function))
+        return super().get_command(ctx, cmd_name)
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted(_HOMES)
 
 
 _HELP = {
@@ -37,19 +48,15 @@ _HELP = {
     "options_table_help_sections": ["help", "default"],
     "default_string": r"\[default: {}]",
     "command_groups": {
-        "*": [{"name": name, "commands": [each.name for each in own]} for name, own in SECTIONS.items()]
+        "*": [{"name": name, "commands": [*own]} for name, own in SECTIONS.items()]
     },
 }
 
 
-@rich_click.group(context_settings={"help_option_names": ["-h", "--help"], "rich_help_config": _HELP})
+@rich_click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "rich_help_config": _HELP})
 @rich_click.version_option(package_name="kf_calib")
 def cli() -> None:
     """Calibrate accelerometers on a stationary gimballed bench with a Kalman filter."""
-
-
-for command in chain.from_iterable(SECTIONS.values()):
-    cli.add_command(command)
 
 
 def main() -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
@@ -14,6 +14,9 @@ from click import get_current_context  # rich_click declares that there may be n
 from kf_calib.cli.echo import complain, echo
 from kf_calib.cli.failures import tell
 from kf_calib.outputs import Outputs
+
+if TYPE_CHECKING:
+    from kf_calib.calibration import Calibration
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -76,6 +79,13 @@ class Delivery:
         """Write a file, if there is to be one."""
         if self.keep(path, save) and not self._quiet:
             echo(f"saved {path}")
+
+    def model(self, path: Path | None, result: Calibration) -> None:
+        """Write the model of a result, if there is to be a file of it."""
+        if path is not None:
+            from kf_calib import model_file
+
+            self.file(path, lambda path: model_file.write(path, result))
 
     def view(self, save: Callable[[Path], object], rrd: Path | None, png: Path | None) -> None:
         """What ``save`` writes as a Rerun recording, and a picture of it; either may be left out."""

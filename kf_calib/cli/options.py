@@ -225,10 +225,13 @@ def opened(path: Path, options: Mapping[str, Any]) -> tuple[Recording, Settings]
 
 def effects_of(options: Mapping[str, Any]) -> tuple[str, ...]:
     """Effects of the model file, then those of ``--with``; the model file is checked before a Python file is run."""
-    from kf_calib import model_file
     from kf_calib.effects import load_file, merged, refuse_unknown
 
-    model = model_file.read(options["model_file"]) if options["model_file"] is not None else None
+    model = None
+    if options["model_file"] is not None:
+        from kf_calib import model_file
+
+        model = model_file.read(options["model_file"])
     for path in options["effects_from"]:
         load_file(path)
     for text in options["effects"]:

@@ -70,7 +70,6 @@ def replay(
     **options: Any,
 ) -> None:
     """Run a recording through the filter: twelve parameters, their sigma, and whether the model fits."""
-    from kf_calib import model_file
     from kf_calib.calibration import calibrate
 
     outputs = claimed(overwrite=overwrite)
@@ -86,7 +85,7 @@ def replay(
 
         show(summary(result))
     with delivery(outputs, as_json) as deliver:
-        deliver.file(save_model, lambda path: model_file.write(path, result))
+        deliver.model(save_model, result)
         deliver.view(lambda path: save_view(result, path), rrd, png)
     if strict and result.consistency.consistent is False:
         ctx.exit(1)
@@ -239,7 +238,7 @@ def improve(
     **options: Any,
 ) -> None:  # fmt: skip
     """Add the effects that are missing, one after another, and see the error fall, until there is a reason to stop."""
-    from kf_calib import improvement, journal, model_file
+    from kf_calib import improvement, journal
     from kf_calib.calibration import calibrate
     from kf_calib.views import improvement as views
 
@@ -281,7 +280,7 @@ def improve(
             print_json(views.improvement_object(state, checked, difference, files))
         else:
             show(views.improvement_report(state, checked, difference))
-        deliver.file(save_model, lambda path: model_file.write(path, state.result))
+        deliver.model(save_model, state.result)
         deliver.file(journal_file, lambda path: journal.write(path, state, origin))
     if strict and state.found.test.consistent is False:
         ctx.exit(1)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from kf_calib.calibration import Calibration
-from kf_calib.comparison import Comparison
 from kf_calib.held_out import orientations
 from kf_calib.outlying import OutlyingDwell
 from kf_calib.readings import Readings
+
+if TYPE_CHECKING:
+    from kf_calib.comparison import Comparison
 
 
 def replay_object(result: Calibration) -> dict[str, Any]:
