@@ -163,7 +163,7 @@ def fit(
     within = replace(within, walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
     slews = [slew for slew in slews if slew.number >= dwells[0].number] if model.dynamic else []
     fitted = Fit(Carried(dwells, model, model.nominal_state(), slews), within)
-    searching = False
+    searching, sizes = False, None
     for number in range(_PASSES_WITH_UNKNOWNS if model.unknowns or model.stepped else _PASSES):
         if number == 1 and model.unknowns:
             model, searching = _placed(fitted), True
@@ -177,7 +177,7 @@ def fit(
             model = model.moved(np.clip(moved, -reach, reach))
         carried = Carried(dwells, model, state, slews)
         stated = _setting_deg(dwells, bench), bench.scatter_sigma_mps2
-        noise = with_dwell_parts(within, carried.means, state, *stated, walks=model.walks)
+        noise, sizes = with_dwell_parts(within, carried.means, state, *stated, walks=model.walks, near=sizes)
         noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
         fitted = replace(fitted, carried=carried, noise=noise)
         if model.walks:

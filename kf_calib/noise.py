@@ -202,7 +202,7 @@ def mean_covariances(noise: Noise, means: Means, state: Floats) -> Floats:
     diag(kappa sigma_w^2 / n + sigma_s^2) + sigma_alpha^2 S (|f|^2 I - f f^T) S^T, S the sensitivities (rows).
     """
     own = noise.effective_sigma_mps2**2 / means.counts[:, None] + noise.scatter_mps2**2
-    return own[:, :, None] * np.eye(3) + noise.setting_rad**2 * _turned(means, state)
+    return own[:, :, None] * np.eye(3) + noise.setting_rad**2 * turned(means, state)
 
 
 def lifted(covariances: Floats) -> Floats:
@@ -212,7 +212,7 @@ def lifted(covariances: Floats) -> Floats:
     return np.asarray(covariances + least[:, None, None] * np.eye(3), float)
 
 
-def _turned(means: Means, state: Floats) -> Floats:
+def turned(means: Means, state: Floats) -> Floats:
     """Covariance (D, 3, 3) of the mean readings per unit variance of a random small rotation."""
     force, sensitivity = means.force_mps2, state[:12].reshape(3, 4)[:, :3]
     across = np.einsum("di,di->d", force, force)[:, None, None] * np.eye(3) - force[:, :, None] * force[:, None, :]
@@ -230,4 +230,4 @@ def considered(noise: Noise, means: Means, state: Floats) -> Floats:
         return np.zeros((len(means.counts), count, count))
     weight = 1.0 / np.einsum("dii->di", mean_covariances(noise.weights, means, state))
     weighted = weight[:, :, None] * means.design
-    return noise.setting_rad**2 * np.swapaxes(weighted, 1, 2) @ _turned(means, state) @ weighted
+    return noise.setting_rad**2 * np.swapaxes(weighted, 1, 2) @ turned(means, state) @ weighted
