@@ -29,8 +29,6 @@ from kf_calib.samples import Batch, Source
 from kf_calib.standing import Judgement, Standing, concluding, current, judged, targets
 
 _FIRST_LOOK_S = 1.0
-_AGREEING = 3  # judgements in a row that name the same effects before they are accepted unasked
-_FREEDOM = 9  # degrees left over with them in the model, at least
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,6 @@ class Session:
         self._lock = threading.Condition()
         self._waiting, self._ended, self._hurried = deque[_Closed](), False, False
         self._last: _Closed | None = None
-        self._named = deque[frozenset[str]](maxlen=_AGREEING)
 
     def run(self) -> Judgement:
         """Evaluate the source to its end; the final judgement. Raises KfCalibError where nothing can be said."""
@@ -200,12 +197,12 @@ class Session:
 
     def _judge(self) -> None:
         """The judging thread: dwells as they close, in order."""
-        watch = None
+        before = None
         while (closed := self._next()) is not None:
             with self._lock:
                 settings = self.settings
             try:
-                judgement = judged(replace(closed.passed, settings=settings), self.wanted, watch)
+                judgement = judged(replace(closed.passed, settings=settings), self.wanted, before)
             except KfCalibError as error:
                 with self._lock:
                     self._publish(problem=str(error))
@@ -213,7 +210,7 @@ class Session:
             except Exception as error:  # the run goes on, and its end is judged anew
                 self.say(f"a dwell could not be judged: {error!r}")
                 continue
-            watch = judgement.watch
+            before = judgement
             self._told(judgement, closed.elapsed_s)
             self._automatic(judgement)
 
@@ -229,17 +226,11 @@ class Session:
             listener(judgement)
 
     def _automatic(self, judgement: Judgement) -> None:
-        """With ``auto``: accept what is missing, once it has been told from all else dwell after dwell.
-
-        After few orientations a wrong effect may be the only one that fits.
-        """
-        found = judgement.found
-        told_apart = judgement.alarm and found.after is not None and len(found.ambiguity) == len(found.missing)
-        if not (told_apart and found.after is not None and found.after.consistency.dof >= _FREEDOM):
-            self._named = deque(maxlen=_AGREEING)
+        """With ``auto``: accept what is missing, once looks in a row have told it from all else."""
+        if not (self.auto and judgement.alarm and judgement.look.settled):
             return
-        self._named.append(frozenset(found.missing))
-        if not self.auto or len(self._named) < _AGREEING or len(set(self._named)) > 1:
+        found = judgement.found
+        if found.after is None or len(found.ambiguity) != len(found.missing):
             return
         try:
             self.accept(*found.missing)

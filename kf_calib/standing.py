@@ -2,7 +2,8 @@
 
 A ``Judgement`` is made when a dwell closes, from the dwell factors so far, by the code that evaluates a recording. A
 look at every dwell is a look too many for the chance of a false alarm that one run has: until the ``Watch`` raises its
-alarm the model counts as consistent. The last judgement is that of ``diagnose``.
+alarm the model counts as consistent. Trying all candidates is a ``Look``, which takes longer than all the rest: it is
+made again when it may say something else. The last judgement is that of ``diagnose``.
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from kf_calib import paper
-from kf_calib.advice import Course, course
+from kf_calib.advice import Advice, Course, course
 from kf_calib.assessment import LEVEL, assessed
 from kf_calib.calibration import Calibration, Pass, concluded, evaluate, format_p, refuse_unusable, told
 from kf_calib.diagnosis import Diagnosis, diagnose, next_orientation
 from kf_calib.folding import DwellFactor
+from kf_calib.held_out import SAME_POSE_DEG
 from kf_calib.noise import mean_covariances
+from kf_calib.reach import wrapped
 from kf_calib.samples import Floats, Source
 from kf_calib.watch import Watch
 
@@ -31,22 +34,99 @@ _LITTLE = 0.1  # of what a dwell has brought: more of it would bring less
 _STAYING = (2.0, 4.0, 8.0, 16.0, 32.0)
 
 
+_GROWN = 1.25  # by which a run has grown when all candidates are tried again
+_AGREEING = 3  # looks in a row that say the same
+_FREEDOM = 9  # degrees left over with what is missing in the model, at least
+
+
 @dataclass(frozen=True)
-class Judgement:
-    """A run after a dwell. wanted (12,): target of each sigma, SI; NaN where none is set. course: how the sigmas would
-    go on, None while they are not determined."""
+class Look:
+    """All candidates tried against a run as it stood; diagnosed where the watch had raised its alarm.
+
+    agreed: how many looks in a row have said the same.
+    """
 
     result: Calibration
-    found: Diagnosis
+    watch: Watch | None
+    diagnosed: Diagnosis | None = None
+    agreed: int = 1
+
+    @cached_property
+    def found(self) -> Diagnosis:
+        return self.diagnosed or _not_judged(self.result, self.watch)
+
+    @cached_property
+    def going(self) -> tuple[Advice, str] | None:
+        """Where to go next, and why."""
+        return next_orientation(self.found)
+
+    @property
+    def settled(self) -> bool:
+        """Whether enough looks in a row have said the same, of enough dwells: after few, a wrong effect may be the only
+        one that fits."""
+        after = None if self.diagnosed is None else self.diagnosed.after
+        return self.agreed >= _AGREEING and (after is None or after.consistency.dof >= _FREEDOM)
+
+    def again(self, result: Calibration, watch: Watch | None) -> Look:
+        """The look at the run as it stands now: this one, unless it may say something else."""
+        return _look(result, watch, self) if self._is_due(result, watch) else self
+
+    def _is_due(self, result: Calibration, watch: Watch | None) -> bool:
+        before = self.result
+        if len(result.visits) >= _GROWN * len(before.visits) or result.settings.effects != before.settings.effects:
+            return True
+        if (watch is None) != (self.watch is None) or _alarmed(watch) != (self.diagnosed is not None):
+            return True
+        return self.diagnosed is not None and (not self.settled or self._is_followed(result))
+
+    def _is_followed(self, result: Calibration) -> bool:
+        """Whether the platform has been where this look sent it."""
+        if self.going is None:
+            return False
+        poses = np.array([visit.dwell.pose for visit in result.visits[len(self.result.visits) :]])
+        apart = np.abs(wrapped(poses - np.radians(self.going[0].gimbal_deg)))
+        return bool((apart.max(axis=1) < np.radians(SAME_POSE_DEG)).any()) if len(poses) else False
+
+
+def _look(result: Calibration, watch: Watch | None, before: Look | None = None) -> Look:
+    if not _alarmed(watch):
+        return Look(result, watch)
+    found = diagnose(result)
+    same = before is not None and before.diagnosed is not None and _said(found) == _said(before.diagnosed)
+    return Look(result, watch, found, before.agreed + 1 if before and same else 1)
+
+
+def _said(found: Diagnosis) -> tuple[object, ...]:
+    """What must be the same for two diagnoses to agree."""
+    enough = found.after is not None and found.after.consistency.dof >= _FREEDOM
+    return found.test.consistent, frozenset(found.missing), frozenset(found.ambiguity), enough
+
+
+def _alarmed(watch: Watch | None) -> bool:
+    return watch is not None and watch.alarmed is not None
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A run after a dwell. look: at all candidates, made now or a few dwells ago. wanted (12,): target of each sigma,
+    SI; NaN where none is set. course: how the sigmas would go on, None while they are not determined."""
+
+    result: Calibration
+    look: Look
     watch: Watch | None
     wanted: Floats
     course: Course | None = None
     final: bool = False
 
     @property
+    def found(self) -> Diagnosis:
+        """Of the look: of so many dwells as there were then."""
+        return self.look.found
+
+    @property
     def alarm(self) -> bool:
         """Whether the stream, or in the end the run, is beyond chance."""
-        return self.found.test.consistent is False and (self.final or self._alarmed is not None)
+        return (self.final or _alarmed(self.watch)) and self.found.test.consistent is False
 
     @property
     def consistent(self) -> bool | None:
@@ -55,8 +135,11 @@ class Judgement:
         return None if self.watch is None or self.watch.p_value is None else not self.alarm
 
     @property
-    def _alarmed(self) -> int | None:
-        return None if self.watch is None else self.watch.alarmed
+    def p_value(self) -> float | None:
+        """Of the run where it is final, else of the stream up to now; None while it is not judged."""
+        if self.final:
+            return self.found.test.p_value
+        return None if self.watch is None else self.watch.p_value
 
     @property
     def suspects(self) -> tuple[str, ...]:
@@ -69,7 +152,7 @@ class Judgement:
     @property
     def disagreeing(self) -> tuple[int, int, float]:
         """The dwell (from 1) and the accelerometer whose residual is largest in its sigma, and that ratio."""
-        ratios = self.found.residual_ratios
+        ratios = replace(self.found, before=self.result).residual_ratios
         dwell, channel = np.unravel_index(int(np.argmax(np.abs(ratios))), ratios.shape)
         return int(dwell) + 1, int(channel) + 1, float(ratios[dwell, channel])
 
@@ -82,8 +165,7 @@ class Judgement:
             )
         looks = f", look {self.watch.looks}" if self.watch is not None and not self.final else ""
         if not self.alarm:
-            p_value = self.found.test.p_value if self.final or self.watch is None else self.watch.p_value
-            return f"model consistent (p {format_p(p_value)}{looks})"
+            return f"model consistent (p {format_p(self.p_value)}{looks})"
         dwell, channel, ratio = self.disagreeing
         named = f"suspects {', '.join(self.suspects)}" if self.suspects else "no known effect explains it"
         if self.found.missing and len(self.suspects) == len(self.found.missing):
@@ -93,7 +175,7 @@ class Judgement:
     @cached_property
     def next_orientation(self) -> tuple[tuple[float, ...], str] | None:
         """Gimbal angles, deg, and why: what tells suspects apart, else what sharpens the worst sigma."""
-        going = next_orientation(self.found) if self.final or self.alarm else None
+        going = self.look.going if self.final or self.alarm else None
         if going is not None:
             return going[0].gimbal_deg, going[1]
         if self.course is None:
@@ -166,17 +248,16 @@ def targets(texts: Mapping[str, float]) -> Floats:
     return np.array([texts.get(symbol, np.nan) for symbol in paper.SYMBOLS])
 
 
-def judged(passed: Pass, wanted: Floats, watch: Watch | None = None) -> Judgement:
-    """The run after the dwells folded so far; ``watch``: that of the judgement before. Raises InputError where the
-    readings cannot be used as they are."""
+def judged(passed: Pass, wanted: Floats, before: Judgement | None = None) -> Judgement:
+    """The run after the dwells folded so far, ``before``: after fewer of them. Raises InputError where the readings
+    cannot be used as they are."""
     settings, bench, dwells = passed.settings, passed.source.bench, passed.dwells
     with threadpool_limits(1, user_api="blas"):
         refuse_unusable(dwells, passed.tally, bench)
         result = told(evaluate(dwells, bench, settings, passed.folder.slews), passed)
-        watch = _watched(dwells, result, watch)
-        alarmed = watch is not None and watch.alarmed is not None
-        found = diagnose(result) if alarmed else _not_judged(result, watch)
-        return Judgement(result, found, watch, wanted, _course(result, wanted))
+        watch = _watched(dwells, result, None if before is None else before.watch)
+        look = _look(result, watch) if before is None else before.look.again(result, watch)
+        return Judgement(result, look, watch, wanted, _course(result, wanted))
 
 
 def _watched(dwells: list[DwellFactor], result: Calibration, watch: Watch | None) -> Watch | None:
@@ -209,7 +290,8 @@ def concluding(passed: Pass, wanted: Floats, watch: Watch | None, again: Source 
     """The last judgement: the calibration and the diagnosis of the whole run, as of its recording (``again``)."""
     with threadpool_limits(1, user_api="blas"):
         result = concluded(passed, again)
-        return Judgement(result, diagnose(result), watch, wanted, _course(result, wanted), final=True)
+        look = Look(result, watch, diagnose(result))
+        return Judgement(result, look, watch, wanted, _course(result, wanted), final=True)
 
 
 def _course(result: Calibration, wanted: Floats) -> Course | None:

@@ -29,7 +29,13 @@ def description(found: Diagnosis) -> Description | None:
 
 def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
     """What ``diagnose --json`` prints; p-values are those of the run."""
-    unknown, going = description(found), next_orientation(found)
+    going = next_orientation(found)
+    return found_object(found) | {"next_orientation": None if going is None else orientation_object(*going)}
+
+
+def found_object(found: Diagnosis) -> dict[str, Any]:
+    """The same but where to go next."""
+    unknown = description(found)
     missing = "unknown" if found.unknown else found.missing[0] if found.missing else None
     return clean(
         {
@@ -51,7 +57,6 @@ def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
                 {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in detectable(found.test)
             ],
             "unknown": description_object(unknown),
-            "next_orientation": None if going is None else orientation_object(*going),
             "held_out_rms_mps2": found.before.held_out_rms_mps2,
             "held_out_floor_mps2": found.before.held_out_floor_mps2,
             "readings": readings_object(found.before.readings),
@@ -70,7 +75,7 @@ def _trend_object(trend: Trend | None) -> dict[str, Any] | None:
 
 def orientation_object(advice: Advice, why: str) -> dict[str, Any]:
     """stay_s: how long to stay there, where that is longer than the dwells so far."""
-    return {"gimbal_deg": list(advice.gimbal_deg), "stay_s": advice.stay_s, "why": why}
+    return clean({"gimbal_deg": list(advice.gimbal_deg), "stay_s": advice.stay_s, "why": why})
 
 
 def description_object(unknown: Description | None) -> dict[str, Any] | None:

@@ -15,7 +15,7 @@ from kf_calib.samples import Floats, Mask
 from kf_calib.standing import Judgement, Standing
 from kf_calib.text import sentence
 from kf_calib.views.console import symbol
-from kf_calib.views.diagnosis import diagnosis_object
+from kf_calib.views.diagnosis import found_object, orientation_object
 from kf_calib.views.json import clean, replay_object
 from kf_calib.views.tables import Bar, Table
 
@@ -30,15 +30,14 @@ _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": (
 
 def live_object(judgement: Judgement, standing: Standing, status: Status | None) -> dict[str, Any]:
     """One line of ``live --json``: the keys of replay and of diagnose as they stand, and what is of a live run only."""
-    found = diagnosis_object(judgement.found)
-    going = judgement.next_orientation
-    if not judgement.final and not (judgement.alarm and found["next_orientation"]) and going is not None:
-        found["next_orientation"] = {"gimbal_deg": list(going[0]), "stay_s": None, "why": going[1]}
     left = dict(zip(paper.SYMBOLS, judgement.left_s, strict=True))
     wanted = dict(zip(paper.SYMBOLS, judgement.wanted, strict=True))
     own = {
         "consistent": judgement.consistent,
+        "p_value": judgement.p_value,
         "final": judgement.final,
+        "diagnosed_dwells": len(judgement.look.result.visits),
+        "next_orientation": _going(judgement),
         "standing": judgement.verdict,
         "alarm": judgement.alarm,
         "looks": judgement.watch.looks if judgement.watch else 0,
@@ -48,7 +47,16 @@ def live_object(judgement: Judgement, standing: Standing, status: Status | None)
         "notice": standing.notice,
         "source": source_object(status),
     }
-    return replay_object(judgement.result) | found | clean(own)
+    return found_object(judgement.found) | replay_object(judgement.result) | clean(own)
+
+
+def _going(judgement: Judgement) -> dict[str, Any] | None:
+    """What the look advises, or while nothing is beyond chance what sharpens the sigmas."""
+    advised = judgement.look.going if judgement.final or judgement.alarm else None
+    if advised is not None:
+        return orientation_object(*advised)
+    going = None if judgement.final else judgement.next_orientation
+    return None if going is None else {"gimbal_deg": list(going[0]), "stay_s": None, "why": going[1]}
 
 
 def source_object(status: Status | None) -> dict[str, Any] | None:
