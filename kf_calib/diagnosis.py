@@ -340,7 +340,7 @@ def _formulas(found: Diagnosis) -> list[tuple[float, Family]]:
     first."""
     test = found.test
     known = [test.candidate(name).effect for name in test.best]
-    tried = [each for each in families(found.before.fit, known)[0] if each.dof and not each.known]
+    tried = [each for each in families(found.before.fit, known) if each.dof and not each.known]
     out = [(each.fall - threshold(each.dof, test.effective_tests), each) for each in tried]
     return sorted(out, key=lambda each: -each[0])
 

@@ -11,19 +11,21 @@ import numpy as np
 from kf_calib import stage
 from kf_calib.assessment import EQUAL
 from kf_calib.bench import Bench
+from kf_calib.calibration import consistency
 from kf_calib.effects import Effect, effect_named, walk_named
 from kf_calib.effects.formula import formula
 from kf_calib.errors import InputError
 from kf_calib.fitting import Fit, fit
 from kf_calib.folding import DwellFactor
 from kf_calib.samples import Floats
-from kf_calib.scan import scan
+from kf_calib.scan import Frame, batches
 from kf_calib.trend import Trend
 from kf_calib.trend import trend as trend_of
 
 _CHANCE = 1e-4  # of a family to fall as much where nothing is missing: there are about a hundred
 _WITHIN = 0.01  # of trends within dwells
 _SAME = 0.99  # cosine above which a formula is a known effect
+_TOGETHER = 24  # columns of families that are tried at a time
 _DECAYS_S = (10, 30, 100, 300)
 _JUMPS = 100  # at most
 
@@ -95,7 +97,8 @@ def described(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Des
     """
     from scipy.special import chdtri
 
-    found, excess = families(fitted)
+    found, misfit = families(fitted), consistency(fitted)
+    excess = misfit.statistic - misfit.dof
     best = max(found, key=lambda family: family.score)
     walk, scatter = fitted.walk_gain, fitted.scatter_gain
     irregular = 2.0 * max(walk, scatter)
@@ -143,32 +146,33 @@ def _trend_beside(fitted: Fit, family: Family) -> Trend | None:
     return trend_of(fit(fitted.dwells, model, fitted.noise.walk_mps2_per_sqrt_s, fitted.carried.slews))
 
 
-def families(fitted: Fit, known: Sequence[Effect] = ()) -> tuple[list[Family], float]:
-    """All families tried on what the model leaves, beside effects that are ``known``; and the chi-squared that is left
-    there beyond its dof. They are tried once for each fit."""
+def families(fitted: Fit, known: Sequence[Effect] = ()) -> list[Family]:
+    """All families tried on what the model leaves, beside effects that are ``known``; once for each fit."""
     key = tuple((str(effect), effect.value) for effect in known)
     if key not in fitted.families:
         fitted.families[key] = _tried(fitted, known)
     return fitted.families[key]
 
 
-def _tried(fitted: Fit, known: Sequence[Effect]) -> tuple[list[Family], float]:
-    bench, listed, effects = fitted.carried.model.bench, list[tuple[str, list[str]]](), list[Effect]()
+def _tried(fitted: Fit, known: Sequence[Effect]) -> list[Family]:
+    bench, tried = fitted.carried.model.bench, list[tuple[str, list[str], list[Effect]]]()
     for driver, texts in _families(bench, fitted.dwells):
         with contextlib.suppress(InputError):  # a jump so late, a decay so fast that the trial of a formula misses it
-            effects += [formula(_named(text), bench.axes, bench.gravity_mps2, checked=False) for text in texts]
-            listed.append((driver, texts))
-    stage.say(f"trying {len(effects)} formulas")
-    scanned = scan(fitted.carried, fitted.noise.judging, [*effects, *known])
-    beside = scanned.candidates[len(effects) :]
-    out, place = list[Family](), 0
-    for driver, texts in listed:
-        own, place = slice(place, place + len(texts)), place + len(texts)
-        parts = scanned.candidates[own]
-        same = all(any(part.within(each, _SAME) for each in beside) for part in parts)
-        fall, rank = scanned.explained(np.concatenate([part.basis for part in parts], axis=1))
-        out.append(Family(driver, tuple(texts), fall, rank, tuple(scanned.statistics[own].tolist()), same))
-    return out, float(scanned.residual @ scanned.residual) - len(scanned.residual)
+            own = [formula(_named(text), bench.axes, bench.gravity_mps2, checked=False) for text in texts]
+            tried.append((driver, texts, [*own]))
+    stage.say(f"trying {sum(len(texts) for _, texts, _ in tried)} formulas")
+    frame, out = Frame(fitted.carried, fitted.noise.judging, known), list[Family]()
+    for part in batches([sum(len(each.coefficients) for each in effects) for _, _, effects in tried], _TOGETHER):
+        some = [tried[k] for k in part]
+        scanned = frame.scan(fitted.carried, [effect for _, _, effects in some for effect in effects])
+        beside, left = scanned.candidates[: len(known)], iter(scanned.candidates[len(known) :])
+        falls = iter(scanned.statistics[len(known) :].tolist())
+        for driver, texts, effects in some:
+            parts = [next(left) for _ in effects]
+            same = all(any(own.within(each, _SAME) for each in beside) for own in parts)
+            fall, rank = scanned.explained(np.concatenate([own.basis for own in parts], axis=1))
+            out.append(Family(driver, tuple(texts), fall, rank, tuple(next(falls) for _ in effects), same))
+    return out
 
 
 def _named(text: str, number: int = 0) -> str:

@@ -246,8 +246,9 @@ def accumulated(rows: Sequence[Floats], walked: Floats | None = None) -> Floats:
     all rows are folded at once.
     """
     if walked is None or not walked.any():
-        stacked = np.concatenate(rows)
-        return triangle(np.vstack([stacked, np.zeros((max(stacked.shape[1] - len(stacked), 0), stacked.shape[1]))]))
+        stacked = rows[0] if len(rows) == 1 else np.concatenate(rows)
+        lacking = max(stacked.shape[1] - len(stacked), 0)
+        return triangle(np.vstack([stacked, np.zeros((lacking, stacked.shape[1]))]) if lacking else stacked)
     width = rows[-1].shape[1] - 4
     factor, left = np.zeros((width, width + 1)), 0.0
     padded = np.vstack([np.zeros((len(rows) - len(walked), 2)), walked])

@@ -23,6 +23,7 @@ from kf_calib.model import STATE_COUNT
 from kf_calib.noise import Noise, steps
 from kf_calib.periodogram import Periodogram
 from kf_calib.samples import Floats, Mask
+from kf_calib.triangle import orthonormal
 
 _SEEN = 1e-6
 """A candidate of which the model leaves less than this share is invisible."""
@@ -30,7 +31,7 @@ _SEEN = 1e-6
 _SAME = 1.0 - 1e-6
 """Cosine above which two directions are one."""
 
-_TOGETHER = 64  # columns that are whitened at a time: memory stays that of the result
+_TOGETHER = 24  # columns that are whitened at a time: memory stays that of the result
 _OF_ONE_KIND = 400  # the same of many effects of one kind
 _MANY = 100  # oscillations, of which a periodogram is quicker
 
@@ -112,8 +113,7 @@ class Frame:
         self.dwells, self.noise, self.state, self.effects = carried.dwells, noise, carried.state, list(effects)
         ends = np.cumsum([0, *(len(effect.coefficients) for effect in effects)]).tolist()
         self.parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
-        rows, width = whitened(carried, noise, effects)
-        self.basis, self.coordinates = np.linalg.qr(rows[:, width:-1])
+        self.basis, self.coordinates = orthonormal(columns_of(carried, noise, effects))
         self._periodogram: Periodogram | None = None
 
     def serves(self, carried: Carried, noise: Noise) -> bool:
@@ -125,10 +125,11 @@ class Frame:
         """Those of the effects that the model carried does not have, and ``more`` behind them, beside that model."""
         kept = [k for k, effect in enumerate(self.effects) if str(effect) not in carried.model.parts]
         rows, width = whitened(carried, self.noise, more, self.state)
-        inside, outside = np.zeros((self.basis.shape[1], rows.shape[1])), rows
+        basis = self.basis if self.effects else np.zeros((len(rows), 0))
+        inside, outside = np.zeros((basis.shape[1], rows.shape[1])), rows
         for _ in range(2):  # twice, or the rounding of what is large stays in what is left
-            share = self.basis.T @ outside
-            inside, outside = inside + share, outside - self.basis @ share
+            share = basis.T @ outside
+            inside, outside = inside + share, outside - basis @ share
         beside = information.accumulated([outside])
         own = [self.coordinates[:, self.parts[k]] for k in kept]
         count = sum(each.shape[1] for each in own)
@@ -156,12 +157,6 @@ _OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps
 
 def _is(one: object, other: object) -> bool:
     return one is other
-
-
-def _batches(numbers: range, sizes: Sequence[int], columns: int) -> list[list[int]]:
-    """Numbers in order, together as many as have about so many columns."""
-    ends = np.cumsum(sizes) // columns
-    return [[k for k in numbers if ends[k] == each] for each in dict.fromkeys(ends.tolist())]
 
 
 def scan(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Scan:
@@ -201,7 +196,7 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
         many = Periodogram(carried, noise, effects[0], np.array([effect.value for effect in effects]))
         return many.falls(_stacked(rows, carried.dwells, noise), own, width)
     out = list[Floats]()
-    for part in _batches(range(len(effects)), [len(effect.coefficients) for effect in effects], _OF_ONE_KIND):
+    for part in batches([len(effect.coefficients) for effect in effects], _OF_ONE_KIND):
         rows, width = whitened(carried, noise, [effects[k] for k in part])
         sizes, rest = np.linalg.norm(rows[:, width:-1], axis=0), _beside(rows, width)
         columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
@@ -217,20 +212,28 @@ def whitened(
 ) -> tuple[Floats, int]:
     """Rows [H | W | G | z] (m, c) of unit noise of the model carried and of ``effects``, and how many columns come
     before G. state: where rotations and input axes are linearised, other than where the model is."""
-    at, bench, dwells = carried.state if state is None else state, carried.model.bench, carried.dwells
-    sizes = [len(effect.coefficients) for effect in effects]
-    out, first = np.zeros((0, 0)), 0
-    for part in _batches(range(len(effects)), sizes, _TOGETHER) or [[]]:
-        added = candidate_columns(dwells, [effects[k] for k in part], bench, at)
-        columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
-        rows, width = _judged(dwells, columns, noise, at, carried.model.count)
-        stacked = _stacked(rows, dwells, noise)
-        if not first:
-            out = np.empty((len(stacked), width + sum(sizes) + 1))
-            out[:, :width], out[:, -1], first = stacked[:, :width], stacked[:, -1], width
-        count = sum(sizes[k] for k in part)
-        out[:, first : first + count], first = stacked[:, width : width + count], first + count
-    return out, first - sum(sizes)
+    at, dwells = carried.state if state is None else state, carried.dwells
+    added = candidate_columns(dwells, effects, carried.model.bench, at)
+    columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
+    rows, width = _judged(dwells, columns, noise, at, carried.model.count)
+    return _stacked(rows, dwells, noise), width
+
+
+def columns_of(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
+    """G (m, q) of ``whitened``, some effects at a time: it takes no more memory than the result."""
+    sizes, out, first = [len(effect.coefficients) for effect in effects], np.zeros((0, 0)), 0
+    for part in batches(sizes, _TOGETHER):
+        rows, width = whitened(carried, noise, [effects[k] for k in part])
+        out = out if len(out) else np.empty((len(rows), sum(sizes)))
+        count = rows.shape[1] - width - 1
+        out[:, first : first + count], first = rows[:, width:-1], first + count
+    return out
+
+
+def batches(sizes: Sequence[int], columns: int) -> list[list[int]]:
+    """Numbers of effects of so many columns each, in order, as many together as have about ``columns``."""
+    ends = (np.cumsum(sizes) // columns).tolist()
+    return [[k for k, end in enumerate(ends) if end == each] for each in dict.fromkeys(ends)]
 
 
 def _judged(
