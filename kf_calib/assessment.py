@@ -14,7 +14,7 @@ from kf_calib import stage
 from kf_calib.calibration import consistency
 from kf_calib.effects import Effect, effect_named, names, walk_named
 from kf_calib.fitting import Fit
-from kf_calib.folding import DwellFactor, lines_of, stimulus_of
+from kf_calib.folding import DwellFactor, stimulus_of
 from kf_calib.model import Model
 from kf_calib.odds import as_fall
 from kf_calib.samples import Floats
@@ -176,7 +176,8 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0, frames: lis
     from scipy.special import chdtrc
 
     model, agreed = fitted.carried.model, consistency(fitted)
-    found = _scanned(fitted, _frame(fitted, [] if frames is None else frames))
+    frame = frame_of(fitted, [] if frames is None else frames)
+    found = _scanned(fitted, frame)
     statistics = found.statistics
     tests = tests or independent_tests(found, seed)
     best, scores, p_values = dict[str, int](), dict[str, float](), dict[str, float]()
@@ -198,10 +199,10 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0, frames: lis
         scores[name] = beyond + paths
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
     test = Test(found, best, scores, p_values, agreed.p_value, name, tests, slewing, (), paths=paths)
-    return _with_lines(test, fitted)
+    return _with_lines(test, fitted, frame)
 
 
-def _frame(fitted: Fit, frames: list[Frame]) -> Frame:
+def frame_of(fitted: Fit, frames: list[Frame]) -> Frame:
     """The columns of all candidates of the catalogue in the noise of a fit: those in ``frames``, where they serve."""
     carried, noise = fitted.carried, fitted.noise.judging
     for known in frames:
@@ -245,7 +246,7 @@ def _searched_hz(dwells: Sequence[DwellFactor]) -> tuple[float, float, float]:
     return *steady, first
 
 
-def _with_lines(test: Test, fitted: Fit) -> Test:
+def _with_lines(test: Test, fitted: Fit, frame: Frame) -> Test:
     """The test with the lines of the spectrum: they speak for an oscillation, whatever of it is slow."""
     from scipy.special import chdtri
 
@@ -258,7 +259,7 @@ def _with_lines(test: Test, fitted: Fit) -> Test:
     bands = [f"of {a:.2g} to {b:.2g} Hz" if np.isfinite(b) else f"above {a:.2g} Hz" for a, b in gaps if b > 1.5 * a]
     if bands:
         test = replace(test, between=f"{name} {' and '.join(bands)}")
-    seen = lines_of(fitted.dwells, LEVEL * REST)
+    seen = frame.lines(LEVEL * REST)
     if not seen:
         return replace(test, trend=trend(fitted))
     p_value = seen[0].p_value

@@ -213,7 +213,6 @@ class Calibration:
     estimate: Estimate
     consistency: Consistency
     residual_rms_mps2: float
-    held_out: HeldOut | None
     tally: Tally
     warnings: tuple[str, ...]
     reread: Callable[..., Calibration] | None = field(default=None, repr=False, compare=False)
@@ -229,6 +228,12 @@ class Calibration:
     def refits(self) -> dict[tuple[str, ...], Calibration]:
         """The models that were asked for (``refitted``), by their effects: none is fitted twice."""
         return {}
+
+    @cached_property
+    def held_out(self) -> HeldOut | None:
+        """What each orientation is predicted to read by a fit without it; None where there are too few."""
+        with threadpool_limits(1, user_api="blas"):  # small decompositions
+            return held_out(self.fit)
 
     @property
     def held_out_rms_mps2(self) -> float | None:
@@ -572,8 +577,7 @@ def evaluated(fitted: Fit, settings: Settings) -> Calibration:
     visits = _visits(fitted, steps, residuals, extra, settings)
     judged = consistency(fitted)
     return Calibration(
-        model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), held_out(fitted),
-        Tally(), tuple(_remarks(carried, noise, final, judged, residuals)),
+        model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), Tally(), tuple(_remarks(carried, noise, final, judged, residuals)),
     )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from kf_calib import advice as advise
 from kf_calib import averaging
 from kf_calib.advice import Advice
-from kf_calib.assessment import EQUAL, LEVEL, SHARE, Test, assessed, price, run_level, threshold
+from kf_calib.assessment import EQUAL, LEVEL, SHARE, Test, assessed, frame_of, price, run_level, threshold
 from kf_calib.calibration import Calibration, Parameter, calibrate, format_p, refitted
 from kf_calib.drivers import JUMP, Family, families, roughly
 from kf_calib.effects import walk_named
@@ -340,7 +340,9 @@ def _formulas(found: Diagnosis) -> list[tuple[float, Family]]:
     first."""
     test = found.test
     known = [test.candidate(name).effect for name in test.best]
-    tried = [each for each in families(found.before.fit, known) if each.dof and not each.known]
+    fitted = found.before.fit
+    frame = frame_of(fitted, found.before.frames)
+    tried = [each for each in families(fitted, known, frame) if each.dof and not each.known]
     out = [(each.fall - threshold(each.dof, test.effective_tests), each) for each in tried]
     return sorted(out, key=lambda each: -each[0])
 

@@ -146,27 +146,33 @@ def _trend_beside(fitted: Fit, family: Family) -> Trend | None:
     return trend_of(fit(fitted.dwells, model, fitted.noise.walk_mps2_per_sqrt_s, fitted.carried.slews))
 
 
-def families(fitted: Fit, known: Sequence[Effect] = ()) -> list[Family]:
-    """All families tried on what the model leaves, beside effects that are ``known``; once for each fit."""
+def families(fitted: Fit, known: Sequence[Effect] = (), frame: Frame | None = None) -> list[Family]:
+    """All families tried on what the model leaves, beside effects that are ``known``; once for each fit.
+
+    frame: that has the columns of all of these effects, or all but some.
+    """
     key = tuple((str(effect), effect.value) for effect in known)
     if key not in fitted.families:
-        fitted.families[key] = _tried(fitted, known)
+        frame = frame or Frame(fitted.carried, fitted.noise.judging, known)
+        had = [effect for effect in known if frame.has(effect)]
+        others = [effect for effect in known if not frame.has(effect)]
+        fitted.families[key] = _tried(fitted, frame.only(had), others)
     return fitted.families[key]
 
 
-def _tried(fitted: Fit, known: Sequence[Effect]) -> list[Family]:
+def _tried(fitted: Fit, frame: Frame, others: Sequence[Effect]) -> list[Family]:
     bench, tried = fitted.carried.model.bench, list[tuple[str, list[str], list[Effect]]]()
     for driver, texts in _families(bench, fitted.dwells):
         with contextlib.suppress(InputError):  # a jump so late, a decay so fast that the trial of a formula misses it
             own = [formula(_named(text), bench.axes, bench.gravity_mps2, checked=False) for text in texts]
             tried.append((driver, texts, [*own]))
     stage.say(f"trying {sum(len(texts) for _, texts, _ in tried)} formulas")
-    frame, out = Frame(fitted.carried, fitted.noise.judging, known), list[Family]()
+    out, known = list[Family](), len(frame.effects) + len(others)
     for part in batches([sum(len(each.coefficients) for each in effects) for _, _, effects in tried], _TOGETHER):
         some = [tried[k] for k in part]
-        scanned = frame.scan(fitted.carried, [effect for _, _, effects in some for effect in effects])
-        beside, left = scanned.candidates[: len(known)], iter(scanned.candidates[len(known) :])
-        falls = iter(scanned.statistics[len(known) :].tolist())
+        scanned = frame.scan(fitted.carried, [*others, *(effect for _, _, effects in some for effect in effects)])
+        beside, left = scanned.candidates[:known], iter(scanned.candidates[known:])
+        falls = iter(scanned.statistics[known:].tolist())
         for driver, texts, effects in some:
             parts = [next(left) for _ in effects]
             same = all(any(own.within(each, _SAME) for each in beside) for own in parts)

@@ -79,7 +79,7 @@ class Piece:
     taken: int = 0
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class DwellFactor:
     """One dwell: its pieces in order of time, its readings in cells of the run's clock, and the autocovariance and the
     spectrum of its first readings.

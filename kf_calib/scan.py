@@ -9,6 +9,7 @@ found.
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,11 +19,12 @@ import numpy as np
 
 from kf_calib import information, walk
 from kf_calib.effects import Effect
-from kf_calib.folding import Carried, DwellFactor, candidate_columns
+from kf_calib.folding import Carried, DwellFactor, candidate_columns, lines_of
 from kf_calib.model import STATE_COUNT
 from kf_calib.noise import Noise, steps
 from kf_calib.periodogram import Periodogram
 from kf_calib.samples import Floats, Mask
+from kf_calib.spectrum import Line
 from kf_calib.triangle import orthonormal
 
 _SEEN = 1e-6
@@ -111,10 +113,31 @@ class Frame:
 
     def __init__(self, carried: Carried, noise: Noise, effects: Sequence[Effect]) -> None:
         self.dwells, self.noise, self.state, self.effects = carried.dwells, noise, carried.state, list(effects)
-        ends = np.cumsum([0, *(len(effect.coefficients) for effect in effects)]).tolist()
-        self.parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
+        self.parts = _parts(effects)
         self.basis, self.coordinates = orthonormal(columns_of(carried, noise, effects))
         self._periodogram: Periodogram | None = None
+        self._lines: dict[float, tuple[Line, ...]] = {}
+
+    def only(self, effects: Sequence[Effect]) -> Frame:
+        """The frame with no others than these effects, which it has to have."""
+        own = dict(zip(map(_key, self.effects), self.parts, strict=True))
+        out = copy.copy(self)
+        out.effects = list(effects)
+        out.coordinates = np.concatenate(
+            [self.coordinates[:, :0], *(self.coordinates[:, own[_key(each)]] for each in effects)], axis=1
+        )
+        out.parts = _parts(effects)
+        return out
+
+    def has(self, effect: Effect) -> bool:
+        """Whether the effect, at the value where its constant stands, is among its own."""
+        return _key(effect) in map(_key, self.effects)
+
+    def lines(self, level: float) -> tuple[Line, ...]:
+        """Oscillations in the readings of the dwells (``folding.lines_of``), whatever the model."""
+        if level not in self._lines:
+            self._lines[level] = lines_of(self.dwells, level)
+        return self._lines[level]
 
     def serves(self, carried: Carried, noise: Noise) -> bool:
         """Whether these dwells are the frame's, judged by the same noise."""
@@ -153,6 +176,16 @@ class Frame:
 
 
 _OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps2_per_sqrt_s")
+
+
+def _parts(effects: Sequence[Effect]) -> list[slice]:
+    """Where the columns of each effect are."""
+    ends = np.cumsum([0, *(len(effect.coefficients) for effect in effects)]).tolist()
+    return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+
+def _key(effect: Effect) -> tuple[str, float]:
+    return str(effect), effect.value
 
 
 def _is(one: object, other: object) -> bool:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,8 +113,18 @@ def _squares(carried: Carried, state: Floats) -> tuple[Floats, Mask]:
     return out, seen
 
 
+_known: WeakKeyDictionary[DwellFactor, tuple[Floats, NDArray[np.intp]]] = WeakKeyDictionary()
+
+
 def _shapes_in(dwell: DwellFactor) -> tuple[Floats, NDArray[np.intp]]:
-    """Orthonormal columns (r, k) on the rows of a dwell's triangles, and the degree of each less one (k,)."""
+    """Orthonormal columns (r, k) on the rows of a dwell's triangles, and the degree of each less one (k,); once for
+    each dwell, whatever the model."""
+    if dwell not in _known:
+        _known[dwell] = _made(dwell)
+    return _known[dwell]
+
+
+def _made(dwell: DwellFactor) -> tuple[Floats, NDArray[np.intp]]:
     if dwell.count < _FEWEST or dwell.end_s <= dwell.start_s:
         return np.zeros((dwell.width * len(dwell.pieces), 0)), np.zeros(0, np.intp)
     at = np.array([piece.nodes.elapsed_s for piece in dwell.pieces])
