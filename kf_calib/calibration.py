@@ -577,7 +577,8 @@ def evaluated(fitted: Fit, settings: Settings) -> Calibration:
     visits = _visits(fitted, steps, residuals, extra, settings)
     judged = consistency(fitted)
     return Calibration(
-        model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))), Tally(), tuple(_remarks(carried, noise, final, judged, residuals)),
+        model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))),
+        Tally(), tuple(_remarks(carried, noise, final, judged, residuals)),
     )  # fmt: skip
 
 

@@ -33,7 +33,7 @@ def f_tail(freedom: float, noise_freedom: float, ratio: float) -> float:
 
 
 def _fraction(a: float, b: float, x: float, away: float) -> float:
-    """The continued fraction by which x^a (1 - x)^b / B(a, b) is divided, by Lentz's method; away: a - (a + b) x >= 0."""
+    """The continued fraction by which x^a (1 - x)^b / B(a, b) is divided (Lentz); away: a - (a + b) x >= 0."""
     value = upper = a * (away + 1.0) / (a + 1.0)
     lower, m, change = 0.0, 0, 2.0
     while abs(change - 1.0) > _ENOUGH:

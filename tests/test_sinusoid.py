@@ -16,9 +16,9 @@ from kf_calib.bench import Bench
 from kf_calib.calibration import Calibration, Settings, calibrate
 from kf_calib.comparison import compare
 from kf_calib.effects import checks, effect_named
-from kf_calib.folding import less_curve, stimulus_of
+from kf_calib.folding import Carried, less_curve, stimulus_of
 from kf_calib.samples import Floats
-from kf_calib.scan import falls, scan
+from kf_calib.scan import Frame, falls, scan
 from kf_calib.sources.hidden import parse
 from kf_calib.sources.noise_sources import Noise
 from kf_calib.sources.sensors import GRADES
@@ -98,6 +98,25 @@ def test_many_frequencies_are_tried_as_a_scan_would(scatter_mps2: float, walk_mp
     expected = scan(fitted.carried, noise, effects).statistics
     assert expected.max() > 10.0
     np.testing.assert_allclose(falls(fitted.carried, noise, effects), expected, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("scatter_mps2", [0.0, 2e-5])
+@pytest.mark.parametrize("walk_mps2", [0.0, 1e-6])
+def test_a_periodogram_gives_what_each_frequency_alone_does(scatter_mps2: float, walk_mps2: float) -> None:
+    """Interpolated between a few frequencies, beside two models, against every frequency worked out."""
+    fitted = calibrate(run(0.1, 1.0, dwells=10), Settings(effects=("scale-drift",))).fit
+    noise = replace(
+        fitted.noise, scatter_mps2=np.full(3, scatter_mps2), scatter_stated=True, walk_mps2_per_sqrt_s=walk_mps2
+    )
+    values = np.linspace(0.01, 0.5, 400)
+    frame = Frame(fitted.carried, noise, [])
+    twelve = Carried(fitted.dwells, fitted.carried.model - fitted.carried.model.effects[0], fitted.carried.state[:12])
+    for carried in (fitted.carried, twelve):
+        effects = [effect_named("sinusoid", BENCH).at(value) for value in values[::7]]
+        expected = scan(carried, noise, effects).statistics
+        assert expected.max() > 10.0
+        found = frame.falls(carried, effect_named("sinusoid", BENCH), values)[::7]
+        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_columns_are_the_nearest_parabolas() -> None:

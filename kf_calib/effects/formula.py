@@ -128,51 +128,59 @@ def symbol_stem(name: str) -> str:
 
 
 class _Reading:
-    """A formula read: its expression over the quantities of the bench, and its unit."""
+    """A formula read: its expression over the quantities of the bench."""
 
     def __init__(self, name: str, expression: str, bench: Bench) -> None:
-        from kf_calib.effects.formula_units import unit_of
-
-        self._name, known = name, quantities(bench.axes)
+        self.name, self._known = name, quantities(bench.axes)
         try:
-            self._expression = Expression(expression, {key: quantity.meaning for key, quantity in known.items()})
-            self.unit = unit_of(self._expression, {key: quantity.unit for key, quantity in known.items()})
+            self.expression = Expression(expression, {key: each.meaning for key, each in self._known.items()})
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
 
     def __call__(self, s: Stimulus) -> Floats:
         """Values (m, 1) or (m, 3)."""
-        known = quantities(s.bench.axes)
-        values = self._expression({name: known[name].of(s) for name in self._expression.names})
+        values = self.expression({name: self._known[name].of(s) for name in self.expression.names})
         return np.array(np.broadcast_to(values, (len(s), np.shape(values)[-1] if np.ndim(values) else 1)), dtype=float)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Of the quantities, by name."""
+        return {key: quantity.unit for key, quantity in self._known.items()}
 
     def typical(self, stimulus: Stimulus) -> float:
         """Rms on a trial run, to a power of ten."""
         size = np.abs(self(stimulus))
         largest = float(size.max())
         if not 1e-60 < largest < 1e60:
-            raise InputError(f"{self._name} has values up to {largest:.1e}: multiply the formula by a constant.")
+            raise InputError(f"{self.name} has values up to {largest:.1e}: multiply the formula by a constant.")
         return 10.0 ** round(math.log10(largest * np.sqrt(np.mean((size / largest) ** 2))))
+
+
+def _units(reading: _Reading, turning: bool) -> tuple[str, tuple[str, float]]:
+    """SI unit of a formula's coefficients, a unit of the field, and how many of it are one; of angles, or readings."""
+    from kf_calib.effects.formula_units import coefficient_units, turning_units, unit_of
+
+    try:
+        unit = unit_of(reading.expression, reading.units)
+        return turning_units(unit) if turning else coefficient_units(unit)
+    except InputError as error:
+        raise InputError(f"{reading.name}: {error}") from None
 
 
 class Formula(SensorEffect):
     """An effect ``name = expression``; raises InputError, with the formula in it, where it cannot be used.
 
     text: what gives the same effect again; remarks: what its checks had to say. The unit of the coefficients follows
-    from that of the expression, their scale from what they add on a trial run: about 1e-3 m/s^2. checked: not for
-    formulas that the program has written itself.
+    from that of the expression, their scale from what they add on a trial run: about 1e-3 m/s^2. Not ``checked`` are
+    formulas that the program has written itself, to see what they explain: they have no units.
     """
 
     source, confused_with = "user's formula", ""
 
     def __init__(self, name: str, expression: str, bench: Bench, checked: bool = True) -> None:
-        from kf_calib.effects.formula_units import coefficient_units
-
-        self._values = _Reading(name, expression, bench)
-        try:
-            unit, shown = coefficient_units(self._values.unit)
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from None
+        self._values, unit, shown = _Reading(name, expression, bench), "", ("", 1.0)
+        if checked:
+            unit, shown = _units(self._values, turning=False)
         # of the class in the catalogue; here each formula has its own
         vars(self).update(name=name, title=expression, symbol=symbol_stem(name), unit=unit, shown=shown, scale=1.0)
         self.text = f"{name} = {expression}"
@@ -195,11 +203,10 @@ class FrameFormula(FrameEffect):
     source, confused_with = "user's formula", ""
 
     def __init__(self, name: str, place: str, expression: str, bench: Bench, checked: bool = True) -> None:
-        from kf_calib.effects.formula_units import turning_units
-
-        self._values, self._unit = _Reading(name, expression, bench), ""
+        self._values, unit, shown = _Reading(name, expression, bench), "", ("", 1.0)
         self._gimbal = None if place == BASE else gimbal_number(place, gimbal_letters(bench.axes))
-        unit, shown = turning_units(self._values.unit)
+        if checked:
+            unit, shown = _units(self._values, turning=True)
         vars(self).update(name=name, variant=place, title=expression)
         self.text = f"{name}:{place} = {expression}"
         stimulus = _trial(bench.axes, bench.gravity_mps2)
