@@ -117,6 +117,7 @@ class Frame:
         self.basis, self.coordinates = orthonormal(columns_of(carried, noise, effects))
         self._periodogram: Periodogram | None = None
         self._lines: dict[float, tuple[Line, ...]] = {}
+        self._last: tuple[Carried, Floats, Floats, int] | None = None
 
     def only(self, effects: Sequence[Effect]) -> Frame:
         """The frame with no others than these effects, which it has to have."""
@@ -147,23 +148,32 @@ class Frame:
     def scan(self, carried: Carried, more: Sequence[Effect] = ()) -> Scan:
         """Those of the effects that the model carried does not have, and ``more`` behind them, beside that model."""
         kept = [k for k, effect in enumerate(self.effects) if str(effect) not in carried.model.parts]
-        rows, width = whitened(carried, self.noise, more, self.state)
-        basis = self.basis if self.effects else np.zeros((len(rows), 0))
-        inside, outside = np.zeros((basis.shape[1], rows.shape[1])), rows
-        for _ in range(2):  # twice, or the rounding of what is large stays in what is left
-            share = basis.T @ outside
-            inside, outside = inside + share, outside - basis @ share
-        beside = information.accumulated([outside])
+        inside, outside, width = self._model(carried)
+        more_inside, more_outside = self._split(columns_of(carried, self.noise, more, self.state))
+        beside = information.accumulated([np.hstack([outside[:, :-1], more_outside, outside[:, -1:]])])
         own = [self.coordinates[:, self.parts[k]] for k in kept]
         count = sum(each.shape[1] for each in own)
         small = np.vstack([
-            np.hstack([inside[:, :width], *own, inside[:, width:]]),
+            np.hstack([inside[:, :-1], *own, more_inside, inside[:, -1:]]),
             np.hstack([beside[:, :width], np.zeros((len(beside), count)), beside[:, width:]]),
         ])  # fmt: skip
         effects = [*(self.effects[k] for k in kept), *more]
         return projected(
             information.accumulated([small]), width, effects, [len(effect.coefficients) for effect in effects]
         )
+
+    def _model(self, carried: Carried) -> tuple[Floats, Floats, int]:
+        """[H | W | z] of a model in the frame and beside it, and how many columns come before z; kept for the next
+        scan beside the same."""
+        if self._last is None or self._last[0] is not carried:
+            rows, width = whitened(carried, self.noise, [], self.state)
+            self._last = carried, *self._split(rows), width
+        return self._last[1:]
+
+    def _split(self, rows: Floats) -> tuple[Floats, Floats]:
+        """Columns (m, c) as coordinates (r, c) in the frame, and what is beside it (m, c)."""
+        inside = self.basis.T @ rows
+        return inside, rows - self.basis @ inside
 
     def falls(self, carried: Carried, effect: Effect, values_hz: Floats) -> Floats:
         """By how much an oscillation at each of these frequencies, alone, would lower chi-squared (n,) beside the model
@@ -252,11 +262,11 @@ def whitened(
     return _stacked(rows, dwells, noise), width
 
 
-def columns_of(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
+def columns_of(carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats | None = None) -> Floats:
     """G (m, q) of ``whitened``, some effects at a time: it takes no more memory than the result."""
     sizes, out, first = [len(effect.coefficients) for effect in effects], np.zeros((0, 0)), 0
-    for part in batches(sizes, _TOGETHER):
-        rows, width = whitened(carried, noise, [effects[k] for k in part])
+    for part in batches(sizes, _TOGETHER) or [[]]:
+        rows, width = whitened(carried, noise, [effects[k] for k in part], state)
         out = out if len(out) else np.empty((len(rows), sum(sizes)))
         count = rows.shape[1] - width - 1
         out[:, first : first + count], first = rows[:, width:-1], first + count

@@ -30,7 +30,7 @@ def orthonormal(rows: Floats) -> tuple[Floats, Floats]:
     for both."""
     count, width = rows.shape
     part = max(_PART, 4 * width)
-    if count < 2 * part:
+    if count < 2 * part or not width:
         return np.linalg.qr(rows)
     parts = [slice(k, min(k + part, count)) for k in range(0, count - width, part)]
     parts[-1] = slice(parts[-1].start, count)  # no part has fewer rows than columns
