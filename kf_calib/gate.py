@@ -46,7 +46,7 @@ def inliers(columns: Floats, readings: Floats, innovation: Floats, static: bool,
         centre = np.median(kept, axis=1, keepdims=True)
         sigma = _GAUSSIAN_MAD * np.median(np.abs(kept - centre), axis=1, keepdims=True)
         sigma = np.where(sigma > 0, sigma, kept.std(axis=1, keepdims=True))
-        now: Mask = (np.abs(innovation - centre) <= threshold * np.maximum(sigma, 1e-12)).all(axis=0)
+        now: Mask = np.all(np.abs(innovation - centre) <= threshold * np.maximum(sigma, 1e-12), axis=0)
         if (now == keep).all():
             break
         keep = now
