@@ -13,7 +13,6 @@ from kf_calib.calibration import Pass, Settings
 from kf_calib.folding import DwellFactor, Folder
 from kf_calib.model import Rows
 from kf_calib.samples import Batch, Stream
-from kf_calib.triangle import triangle
 
 BLOCKS = 24
 
@@ -82,20 +81,3 @@ def test_no_piece_of_a_long_dwell_is_taken_up_at_every_block(
     pieces = len(folder.dwells[0].pieces)
     assert pieces > BLOCKS
     assert handled[0] < 2 * pieces  # 13 times as many where each block was merged as it came
-
-
-@pytest.mark.parametrize("count", [3, 6, 100, 4096, 4097, 9000])
-def test_a_triangle_has_the_normal_equations_of_its_rows(count: int) -> None:
-    rows = np.random.default_rng(count).normal(size=(6, count)).T
-    upper = triangle(rows)
-    assert upper.shape == (min(count, 6), 6)
-    np.testing.assert_array_equal(upper, np.triu(upper))
-    np.testing.assert_allclose(upper.T @ upper, rows.T @ rows, rtol=1e-12, atol=1e-10)
-
-
-def test_a_triangle_in_parts_keeps_small_numbers_beside_large_ones() -> None:
-    """Through the normal equations the last column would be lost: its square is beyond the 16 digits of the first."""
-    rng = np.random.default_rng(1)
-    rows = np.column_stack([np.full(9000, 1e9), 1e9 + rng.normal(size=9000)])
-    expected = np.linalg.norm(rows[:, 1] - rows[:, 1].mean())
-    assert abs(triangle(rows)[1, 1]) == pytest.approx(expected, rel=1e-5)
