@@ -70,7 +70,7 @@ def _nominal(value: Any) -> dict[str, float]:
 
 
 class Key(NamedTuple):
-    """read: gives the value as its type, or raises ValueError with what is wrong. words: what it must be."""
+    """read: gives the value as its type, or raises ValueError. words: what it must be, for people."""
 
     read: Callable[[Any], Any]
     words: str

@@ -149,8 +149,9 @@ class _Order:
             stream, self._held = self._held + stream, Stream.empty(0)
         if not len(stream):
             return stream
-        steps = np.diff(stream.time_ns, prepend=stream.time_ns[0] - 1 if self.last_ns is None else self.last_ns)
-        if steps.min() > 0 and steps.max() < _LEAP_NS:
+        begun = 1 if self.last_ns is None else stream.time_ns[0] - self.last_ns
+        steps = np.diff(stream.time_ns)
+        if min(begun, steps.min(initial=1)) > 0 and max(begun, steps.max(initial=1)) < _LEAP_NS:
             self.last_ns = int(stream.time_ns[-1])
             return stream
         return self._one_by_one(stream, tally or Tally(), first_ns)
@@ -285,14 +286,16 @@ class Segmenter:
         if len(batch.temperature):
             warm = batch.temperature
             readable = _within(warm.values, LARGEST_C)
-            self.tally.temperatures_dropped += int((~readable).sum())
-            self._temperature += self._orders[2](warm[readable])
+            if readable is not None:
+                self.tally.temperatures_dropped += int((~readable).sum())
+                warm = warm[readable]
+            self._temperature += self._orders[2](warm)
 
     def _take_readings(self, accel: Stream) -> None:
         if not len(accel):
             return
         readable = _within(accel.values, LARGEST_MPS2)
-        if not readable.all():
+        if readable is not None:
             too_large = int(np.isfinite(accel.values[~readable]).all(axis=1).sum())
             self.tally.too_large += too_large
             self.tally.not_finite += int((~readable).sum()) - too_large
@@ -327,6 +330,7 @@ class Segmenter:
     def _sound(self, poses: Floats) -> Mask:
         """Which poses can be used, (m,) bool: angles that can be, and quaternions of nearly unit length."""
         readable = _within(poses, LARGEST_RAD)
+        readable = np.ones(len(poses), bool) if readable is None else readable
         if self.bench.axes:
             return readable
         return readable & (np.abs(np.linalg.norm(np.where(readable[:, None], poses, 0.0), axis=1) - 1.0) < 0.01)
@@ -581,9 +585,10 @@ class Segmenter:
         self._temperature = self._temperature[max(int(np.searchsorted(self._temperature.time_ns, oldest)) - 2, 0) :]
 
 
-def _within(values: Floats, largest: float) -> Mask:
-    """Which rows (m, k) hold nothing that is not finite or beyond ``largest``."""
-    return np.asarray((np.abs(values) <= largest).all(axis=1))
+def _within(values: Floats, largest: float) -> Mask | None:
+    """Which rows (m, k) hold nothing that is not finite or beyond ``largest``; None: all of them."""
+    size = np.abs(values)
+    return None if size.max(initial=0.0) <= largest else np.asarray((size <= largest).all(axis=1))
 
 
 def _carried_on(slow: Stream, at_ns: Times) -> Floats:
@@ -593,12 +598,14 @@ def _carried_on(slow: Stream, at_ns: Times) -> Floats:
     """
     if not len(slow):
         return np.full(len(at_ns), np.nan)
-    since = np.searchsorted(at_ns, slow.time_ns)  # where each sample begins to count
-    own = np.repeat(np.arange(-1, len(slow)), np.diff(since, prepend=0, append=len(at_ns)))
-    steps_ns = np.diff(slow.time_ns, prepend=slow.time_ns[:1])
-    rises = np.diff(slow.values[:, 0], prepend=slow.values[:1, 0])
-    share = np.minimum((at_ns - slow.time_ns[own]) / np.maximum(steps_ns[own], 1), 1.0)
-    return np.where(own < 0, np.nan, slow.values[own, 0] + np.where(steps_ns[own] > 0, share * rises[own], 0.0))
+    counts = np.diff(np.searchsorted(at_ns, slow.time_ns), prepend=0, append=len(at_ns))  # before the first, of each
+    begins_ns, levels = np.append(0, slow.time_ns), np.append(np.nan, slow.values[:, 0])
+    steps_ns = np.append([1, 1], np.diff(slow.time_ns))
+    rises = np.where(steps_ns > 0, np.append([0.0, 0.0], np.diff(slow.values[:, 0])), 0.0)
+    begin_ns, level, step_ns, rise = (
+        np.repeat(each, counts) for each in (begins_ns, levels, np.maximum(steps_ns, 1), rises)
+    )
+    return level + np.minimum((at_ns - begin_ns) / step_ns, 1.0) * rise
 
 
 def dwell_blocks(source: Source, segmenter: Segmenter) -> Iterator[Block]:

@@ -41,15 +41,17 @@ def inliers(columns: Floats, readings: Floats, innovation: Floats, static: bool,
     if _plainly_clean(innovation, threshold):
         return None
     keep: Mask = np.ones(count, bool)
+    kept = innovation
     for _ in range(5):
-        centre = np.median(innovation[:, keep], axis=1, keepdims=True)
-        sigma = _GAUSSIAN_MAD * np.median(np.abs(innovation[:, keep] - centre), axis=1, keepdims=True)
-        sigma = np.where(sigma > 0, sigma, innovation[:, keep].std(axis=1, keepdims=True))
+        centre = np.median(kept, axis=1, keepdims=True)
+        sigma = _GAUSSIAN_MAD * np.median(np.abs(kept - centre), axis=1, keepdims=True)
+        sigma = np.where(sigma > 0, sigma, kept.std(axis=1, keepdims=True))
         now: Mask = np.all(np.abs(innovation - centre) <= threshold * np.maximum(sigma, 1e-12), axis=0)
         if (now == keep).all():
             break
         keep = now
         innovation = innovations(columns, readings, static, keep)
+        kept = innovation[:, keep]
     return None if keep.all() or keep.sum() < 4 else keep
 
 

@@ -1,6 +1,7 @@
-"""The chance that the F distribution exceeds a ratio: what ``scipy.special.fdtrc`` gives, in digits and in range.
+"""The chance that the F distribution exceeds a ratio: every run needs this one number.
 
-Importing scipy.special takes as long as evaluating a short recording, and every run needs this one number.
+``scipy.special.fdtrc`` gives it too, but takes longer to import than a short recording to evaluate, and of its digits
+half are lost where the noise is known to 1e9 degrees of freedom.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def f_tail(freedom: float, noise_freedom: float, ratio: float) -> float:
 
 
 def _fraction(a: float, b: float, x: float, away: float) -> float:
-    """The continued fraction by which x^a (1 - x)^b / B(a, b) is divided (Lentz); away: a - (a + b) x >= 0."""
+    """What divides x^a (1 - x)^b / B(a, b), by Lentz's method; away: a - (a + b) x >= 0."""
     value = upper = a * (away + 1.0) / (a + 1.0)
     lower, m, change = 0.0, 0, 2.0
     while abs(change - 1.0) > _ENOUGH:

@@ -71,7 +71,7 @@ class Trace:
     def of(cls, readings: Floats, elapsed_s: Floats, into: Cells) -> Trace:
         """Of a block (n, 3) at instants (n,), which rise."""
         cells = into.places(elapsed_s)
-        starts = np.flatnonzero(np.diff(cells, prepend=cells[0] - 1))
+        starts = np.append(0, np.flatnonzero(cells[1:] != cells[:-1]) + 1)
         places, length = cells[starts] - cells[0], int(cells[-1] - cells[0]) + 1
         if length > _LONGEST:
             return cls()

@@ -69,6 +69,11 @@ def test_a_folder_and_angles_in_degrees_give_the_same(run, recording: Path, tmp_
         assert abs(one["value"] - other["value"]) < 1e-6 * one["sigma"]
 
 
+def test_a_mistyped_command_is_told_what_was_meant(run) -> None:
+    code, out, err = run("diagnos", "run.mcap")
+    assert code == 2 and not out and "'diagnose'" in err
+
+
 def test_replay_in_words(run, recording: Path) -> None:
     code, out, _ = run("replay", recording)
     assert code == 0 and "θ1" in out and "Model and measurements agree" in out and "\x1b" not in out

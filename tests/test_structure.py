@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -88,3 +89,22 @@ def test_import_is_cheap_and_leaves_filterpy_and_rerun_alone() -> None:
     code = "import sys, kf_calib; print(*[m for m in ('filterpy', 'rerun', 'scipy', 'matplotlib') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
+
+
+HEAVY = (
+    "pydantic", "scipy.linalg", "scipy.optimize", "scipy.stats", "scipy.signal", "scipy.interpolate", "filterpy",
+    "rerun", "rich.console", "pint", "simpleeval", "serial", "tomli_w", "matplotlib", "kf_calib.diagnosis",
+    "kf_calib.cli.live", "kf_calib.cli.plan", "kf_calib.model_file", "kf_calib.comparison",
+)  # fmt: skip
+
+
+def test_a_replay_imports_nothing_that_it_does_not_need() -> None:
+    code = (
+        "import sys; from kf_calib.cli import cli; sys.argv[0] = 'kf-calib'; cli.main(sys.argv[1:], "
+        f"standalone_mode=False); print(*[m for m in {HEAVY} if m in sys.modules], file=sys.stderr)"
+    )
+    recording = PACKAGE.parent / "recordings" / "navigation_24.mcap"
+    command = [sys.executable, "-c", code, "replay", str(recording), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout)["dwells"] == 24
+    assert done.stderr.strip() == ""

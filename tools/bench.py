@@ -5,14 +5,18 @@ usage: .venv/bin/python tools/bench.py [--samples 1000000] [--scan-memory] [--la
 Peers: decoding alone (this package's reader, nothing done with the samples), and the textbook way: the official mcap
 reader with mcap-ros2-support's decoder and one update of filterpy's KalmanFilter a sample (timed on the first
 ``--peer-samples`` and scaled: it is linear). Each figure is the median of several runs, the ways taken in turn.
-``--large`` adds the peak memory of a ten times longer recording. The scan: decoding, folding, fitting the twelve, and
-projecting 70 further columns off them, those of all visible effects of the catalogue and of formulas.
+``--large`` adds the peak memory of a ten times longer recording. Start-up is a whole process, ``kf-calib replay
+--json`` of four minutes at 100 Hz. A growth exponent is of time in readings, those of one dwell: 1 is linear. The scan:
+decoding, folding, fitting the twelve, and projecting 70 further columns off them, those of all visible effects of the
+catalogue and of formulas.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
+import os
 import statistics
 import subprocess
 import sys
@@ -25,17 +29,17 @@ from typing import Any
 import numpy as np
 
 
-def make_recording(path: Path, samples: int) -> None:
-    """A simulated run of 24 dwells with angles at a tenth of the rate."""
+def make_recording(path: Path, samples: int, rate_hz: float = 1000.0, dwells: int = 24) -> None:
+    """A simulated run with angles at a tenth of the rate."""
     from kf_calib.bench import Bench, axes_of
     from kf_calib.sources.plans import spread_plan
     from kf_calib.sources.recorder import Recorder
     from kf_calib.sources.sensors import GRADES
     from kf_calib.sources.simulator import Simulation
 
-    grade, rate_hz = GRADES["navigation"], 1000.0
+    grade = GRADES["navigation"]
     bench = Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0)
-    plan = spread_plan(24, dwell_s=samples / rate_hz / 24, seed=1)
+    plan = spread_plan(dwells, dwell_s=samples / rate_hz / dwells, seed=1)
     run = Simulation(
         bench, grade.sensors(1), grade.noise, plan,
         sample_hz=rate_hz, angle_hz=rate_hz / 10, slew_rate_degps=720.0, seed=1,
@@ -56,6 +60,15 @@ def replay(path: Path) -> int:
     from kf_calib.sources.recording import Recording
 
     return calibrate(Recording(path)).tally.read
+
+
+def fold(path: Path) -> int:
+    from kf_calib.calibration import Pass, Settings
+    from kf_calib.sources.recording import Recording
+
+    passed = Pass(Recording(path), Settings())
+    passed.fold()
+    return passed.tally.read
 
 
 def candidates(dwells: list[Any], bench: Any, columns: int = 70) -> list[Any]:
@@ -156,6 +169,27 @@ def import_s() -> float:
     return started("import kf_calib") - started("pass")
 
 
+def start_up_s(path: Path) -> float:
+    """Wall time of ``kf-calib replay --json`` as a user has it: a process of its own, bytecode written before."""
+    env = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+    command = [sys.executable, "-m", "kf_calib.cli", "replay", str(path), "--json"]
+
+    def run() -> int:
+        return subprocess.run(command, env=env, stdout=subprocess.DEVNULL, check=True).returncode
+
+    run()
+    return statistics.median(seconds(run)[0] for _ in range(7))
+
+
+def growth_exponent(recordings: Sequence[Path], runs: int) -> float:
+    """Of the time to fold, from one of two recordings to the other."""
+    short, long = recordings
+    fold(short)
+    times = [(seconds(lambda: fold(short))[0], seconds(lambda: fold(long))[0]) for _ in range(runs)]
+    less, more = np.median(times, axis=0)
+    return math.log(more / less) / math.log(fold(long) / fold(short))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--samples", type=int, default=1_000_000)
@@ -168,6 +202,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.mcap"
         making_s, _ = seconds(lambda: make_recording(path, chosen.samples) or 0)
+        short, single = Path(folder) / "short.mcap", [Path(folder) / f"one_dwell_{k}.mcap" for k in (1, 4)]
+        make_recording(short, 24_000, rate_hz=100.0)
+        for k, each in zip((1, 4), single, strict=True):
+            make_recording(each, k * chosen.samples // 2, dwells=1)
         replay(path)  # imports and the disk cache are not what is compared
         _, columns = fold_and_scan(path)
         times: dict[str, list[float]] = {"decode": [], "replay": [], "scan": [], "textbook": []}
@@ -192,6 +230,8 @@ def main() -> None:
             "scan_s": median["scan"],
             "scan_over_replay": statistics.median(np.divide(times["scan"], times["replay"]).tolist()),
             "import_s": import_s(),
+            "start_up_s": start_up_s(short),
+            "one_dwell_growth_exponent": growth_exponent(single, chosen.runs),
             "replay_peak_mb": peak_mb(path),
             "scan_peak_mb": peak_mb(path, "fold_and_scan"),
         }
