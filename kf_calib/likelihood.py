@@ -81,6 +81,7 @@ def with_dwell_parts(
         setting_stated=angle_sigma_deg is not None,
         scatter_stated=scatter_mps2 is not None,
         checked=scatter_mps2 is not None or _setting_is_checked(means.force_mps2),
+        walk_mps2_per_sqrt_s=0.0 if walks else within.walk_mps2_per_sqrt_s,
     )
     if stated.setting_stated and stated.scatter_stated and not walks:
         return stated, {}
