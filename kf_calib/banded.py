@@ -43,15 +43,15 @@ def inverse(columns: Floats, lower: Floats) -> Floats:
     Block elimination from both ends: X_d = L_d^-T (I - M' M)^-1 L_d^-1, M = U_{d+1}^-1 L_{d+1,d}; below it
     -X_{d+1} L_{d+1,d} L_d^-1.
     """
-    forward = _unbanded(lower)
-    backward = _unbanded(root(_reversed(columns)))[::-1, 2::-1, ::-1]
+    forward, out = _unbanded(lower), np.zeros_like(columns)
     back, beside = np.linalg.inv(forward[:, :3]), forward[:-1, 3:]
-    share = np.linalg.solve(backward[1:], beside)
-    middle = np.tile(np.eye(3), (len(columns), 1, 1))
-    middle[:-1] -= np.swapaxes(share, 1, 2) @ share
-    out = np.zeros_like(columns)
-    out[:, :3] = np.swapaxes(back, 1, 2) @ np.linalg.inv(middle) @ back
-    out[:-1, 3:] = -out[1:, :3] @ beside @ back[:-1]
+    out[:, :3] = np.swapaxes(back, 1, 2) @ back
+    if beside.any():
+        backward = _unbanded(root(_reversed(columns)))[::-1, 2::-1, ::-1]
+        share = np.linalg.solve(backward[1:], beside)
+        middle = np.linalg.inv(np.eye(3) - np.swapaxes(share, 1, 2) @ share)
+        out[:-1, :3] = np.swapaxes(back[:-1], 1, 2) @ middle @ back[:-1]
+        out[:-1, 3:] = -out[1:, :3] @ beside @ back[:-1]
     return out
 
 
@@ -64,7 +64,7 @@ def outer(rows: Floats) -> Floats:
 
 def traces(one: Floats, others: Floats) -> Floats:
     """Of the products of one with others (k, D, 6, 3), (k,)."""
-    return np.tensordot(others, _TWICE * one, 3)
+    return others.reshape(len(others), one.size) @ (_TWICE * one).ravel()
 
 
 def products(columns: Floats, vector: Floats) -> Floats:

@@ -81,6 +81,7 @@ def with_dwell_parts(
         setting_stated=angle_sigma_deg is not None,
         scatter_stated=scatter_mps2 is not None,
         checked=scatter_mps2 is not None or _setting_is_checked(means.force_mps2),
+        walk_mps2_per_sqrt_s=0.0 if walks else within.walk_mps2_per_sqrt_s,
     )
     if stated.setting_stated and stated.scatter_stated and not walks:
         return stated, {}
@@ -109,14 +110,20 @@ def _combinations(stated: Noise, walks: bool) -> list[Parts]:
 def _chosen(
     stated: Noise, likelihood: Likelihood, combinations: Sequence[Parts], without: Point, near: Mapping[Parts, Floats]
 ) -> tuple[Noise, Mapping[Parts, Floats]]:
-    """The noise with the best of the combinations, and the sizes of each."""
-    best, score, found = (), -without.cost, dict[Parts, Floats]()
-    for parts in combinations:
+    """The noise with the best of the combinations, and the sizes of each.
+
+    The last of them has all others within it, so that none is likelier: what it leaves to be gained by those that are
+    charged for more spares their search.
+    """
+    charges = {parts: _charge(parts, likelihood) for parts in combinations}
+    best, score, most, found = (), -without.cost, math.inf, dict(near)
+    for parts in [combinations[-1], *sorted(combinations[:-1], key=charges.__getitem__)]:
+        if most - charges[parts] <= score:
+            continue
         found[parts], point = likelihood.of(parts).most_likely(near.get(parts))
-        walks = "walk" in parts
-        own = -point.cost - 0.5 * _SIGNIFICANT * (len(found[parts]) - walks) - _WALK * walks
-        if own > score:
-            best, score = parts, own
+        most = -point.cost if parts == combinations[-1] else max(most, -point.cost)
+        if -point.cost - charges[parts] > score:
+            best, score = parts, -point.cost - charges[parts]
     if not best:
         return stated, found
     units = np.concatenate([likelihood.units[part] for part in best])
@@ -125,6 +132,11 @@ def _chosen(
         spread = _last_spread(likelihood.of(best).curvature(found[best]))
         noise = replace(noise, walk_spread=spread)
     return noise, found
+
+
+def _charge(parts: Parts, likelihood: Likelihood) -> float:
+    """What parts have to gain in log-likelihood."""
+    return sum(_WALK if part == "walk" else 0.5 * _SIGNIFICANT * len(likelihood.units[part]) for part in parts)
 
 
 def _last_spread(curvature: Floats) -> float:

@@ -44,7 +44,8 @@ class Restricted:
     def at(self, variances: Floats) -> Point:
         """With y = P z the derivatives are (tr(P K_k) - y' K_k y) / 2 (Searle, Casella and McCulloch, 1992, sec. 6.6);
         y' K_k P K_l y / 2 is the mean of the information observed and expected (Gilmour, Thompson and Cullis, 1995)."""
-        covariance = self.fixed + np.tensordot(variances, self.shapes, 1)
+        wider = variances @ self.shapes.reshape(len(variances), self.fixed.size)
+        covariance = self.fixed + wider.reshape(self.fixed.shape)
         covariance[:, :3] = lifted(covariance[:, :3])
         lower, known = banded.root(covariance), len(self.prior)
         whitened = np.concatenate([self.prior, banded.solved(lower, self.rows)])
@@ -83,20 +84,21 @@ class Restricted:
         return 0.5 * (out + out.T)
 
     def _search(self, sizes: Floats) -> tuple[Floats, Point]:
-        """Newton's method by the sizes, to which the cost is even: the way to zero has no edge."""
-        point, last = self.at(sizes**2), None
+        """Newton's method by the sizes s, to which the cost is even: the way to zero has no edge.
+
+        The curvature there is 4 s s' times that by the variances, and on its diagonal 2 slope, taken as positive: from
+        far above a step then loses about half of a size, from far below it doubles it.
+        """
+        point = self.at(sizes**2)
         for _ in range(_STEPS):
             slope = 2.0 * sizes * point.slope
             curve = 4.0 * np.outer(sizes, sizes) * point.information + np.diag(2.0 * np.abs(point.slope) + 1e-12)
-            if last is not None:
-                curve = _seen(curve, sizes - last[0], slope - last[1])
             free = (sizes > _LEAST) | (slope < 0.0)
             step = np.zeros_like(sizes)
             step[free] = -np.linalg.solve(curve[np.ix_(free, free)], slope[free])
             found = self._lower(sizes, step, point) if -0.5 * slope @ step > _ENOUGH else None
             if found is None:
                 break
-            last = sizes, slope
             sizes, point = found
         return np.where(sizes > _LEAST, sizes, 0.0), point
 
@@ -109,11 +111,3 @@ class Restricted:
                 return moved, there
             step = 0.5 * step
         return None
-
-
-def _seen(curve: Floats, step: Floats, change: Floats) -> Floats:
-    """A curvature that has the change of slope seen along the last step (Broyden, Fletcher, Goldfarb, Shanno)."""
-    if change @ step <= 0.0:
-        return curve
-    before = curve @ step
-    return curve + np.outer(change, change) / (change @ step) - np.outer(before, before) / (step @ before)

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from kf_calib.samples import Floats
 
+_PART = 1024  # rows of a part that is taken at once: with its copies it stays in the processor's cache
+
 
 def triangle(rows: NDArray[np.floating[Any]]) -> Floats:
     """R of the QR decomposition of rows (..., m, n): (..., min(m, n), n), same normal equations R^T R as the rows.
