@@ -433,7 +433,10 @@ class Carried:
         columns = columns_of(every, model, state)
         self.columns = [own for each, own in zip(every, columns, strict=True) if not each.moving]
         self.slew_columns = [own for each, own in zip(every, columns, strict=True) if each.moving]
-        self.means = means_of(self.dwells, self.columns)
+
+    @cached_property
+    def means(self) -> Means:
+        return means_of(self.dwells, self.columns)
 
     @property
     def carrier_hz(self) -> float:
