@@ -149,14 +149,14 @@ def course(fitted: Fit, sizes: Floats, count: int = _STEPS) -> Course | None:
     factor, (rows,) = _with_next(fitted, [], poses, fitted.noise)
     jacobian = paper.jacobian(fitted.carried.state[:STATE_COUNT])
     at_least = np.diag(1.0 / np.maximum(fitted.carried.sizes, 1.0))  # what is not seen at all: to the size of g
-    factor = triangle(np.vstack([factor, at_least]))
-    sigmas, first = [_sigmas(factor[None], jacobian)[0]], 0
+    root = np.asarray(np.linalg.inv(triangle(np.vstack([factor, at_least]))), float)
+    sigmas, first = [_sigmas(root, jacobian)], 0
     for number in range(count):
-        after = triangle(np.concatenate([np.broadcast_to(factor, (len(rows), *factor.shape)), rows], axis=1))
+        after = _narrowed(root, rows)
         reached = _sigmas(after, jacobian)
         best = int(np.argmin(((reached / sizes) ** 2).sum(axis=1)))
         first = first if number else best
-        factor = after[best]
+        root = after[best]
         sigmas.append(reached[best])
     angles = tuple(np.degrees(poses[first]).round(1).tolist())
     return Course(angles, np.array(sigmas), len(fitted.dwells), _each_s(fitted))
@@ -169,10 +169,22 @@ def _each_s(fitted: Fit) -> float:
     return float(np.median(lengths))
 
 
-def _sigmas(factors: Floats, jacobian: Floats) -> Floats:
-    """Sigmas (m, 12) of the paper's parameters from triangles (m, p, p)."""
-    roots = np.linalg.inv(factors[:, : factors.shape[2]])[:, :STATE_COUNT]
-    return np.linalg.norm(jacobian @ roots, axis=2)
+def _sigmas(roots: Floats, jacobian: Floats) -> Floats:
+    """Sigmas (..., 12) of the paper's parameters from roots (..., p, p) of covariances."""
+    return np.asarray(np.linalg.norm(jacobian @ roots[..., :STATE_COUNT, :], axis=-1))
+
+
+def _narrowed(root: Floats, rows: Floats) -> Floats:
+    """Roots S (m, p, p) of the covariance S S^T after each of m sets of whitened rows (m, r, p), from that before.
+
+    S - S W^T M^-T (M + I)^-1 W, W the rows times S, M M^T = I + W W^T (Andrews, 1968).
+    """
+    seen = rows @ root
+    turned, one = np.swapaxes(seen, 1, 2), np.eye(rows.shape[1])
+    upper = triangle(np.concatenate([np.broadcast_to(one, (len(rows), *one.shape)), turned], axis=1))
+    upper = upper * np.where(np.einsum("mrr->mr", upper) < 0.0, -1.0, 1.0)[:, :, None]
+    gain = (root @ turned) @ np.linalg.inv(upper) @ np.linalg.inv(np.swapaxes(upper, 1, 2) + one)
+    return root - gain @ seen
 
 
 def _poses(fitted: Fit) -> Floats | None:

@@ -433,7 +433,19 @@ class Carried:
         columns = columns_of(every, model, state)
         self.columns = [own for each, own in zip(every, columns, strict=True) if not each.moving]
         self.slew_columns = [own for each, own in zip(every, columns, strict=True) if each.moving]
-        self.means = means_of(self.dwells, self.columns)
+
+    def followed_by(self, dwell: DwellFactor) -> Carried:
+        """With one more dwell; the columns of the others stay as they are."""
+        out = Carried.__new__(Carried)
+        out.dwells, out.slews, out.model, out.state = [*self.dwells, dwell], self.slews, self.model, self.state
+        last = stimulus_of(out.dwells, self.model.bench, self.state).ending(3 * len(dwell.pieces))
+        out.columns = [*self.columns, *_by_dwell([dwell], lambda s: self.model.columns(s, self.state), last)]
+        out.slew_columns = self.slew_columns
+        return out
+
+    @cached_property
+    def means(self) -> Means:
+        return means_of(self.dwells, self.columns)
 
     @property
     def carrier_hz(self) -> float:

@@ -87,10 +87,13 @@ class Running:
 
         Not ``exact``: earlier dwells stay as they were known when they closed.
         """
-        carried = Carried([*self.dwells, dwell], self.carried.model, self.about)
+        if exact:
+            carried = Carried([*self.dwells, dwell], self.carried.model, self.about)
+            if not all(map(np.array_equal, self.carried.columns, carried.columns[:-1])):
+                return replace(self, carried=carried)._folded()
+        else:
+            carried = self.carried.followed_by(dwell)
         more = replace(self, carried=carried)
-        if exact and not all(map(np.array_equal, self.carried.columns, carried.columns[:-1])):
-            return more._folded()
         return more._updated(more._rows([-1])[0], steps(carried.dwells[-2:], self.noise)[-1])
 
     def with_effect(self, text: str) -> Running:

@@ -265,9 +265,9 @@ def _watched(dwells: list[DwellFactor], result: Calibration, watch: Watch | None
     if len(dwells) < _least(result):
         return None
     if watch is None or watch.settings.effects != settings.effects:
-        return Watch.over(dwells, bench, settings, 0 if watch is None else watch.looks)
+        return Watch.over(dwells, bench, settings, 0 if watch is None else watch.looks, result.fit)
     for dwell in dwells[len(watch.dwells) :]:
-        watch = watch.after(dwell)
+        watch = watch.after(dwell, result.fit)
     return watch
 
 

@@ -10,15 +10,14 @@ adds q^2 T times a constant, and 1/f noise of density h / f adds h times one, wh
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kf_calib.fitting import Fit
-from kf_calib.folding import Carried, DwellFactor
+from kf_calib.folding import Carried, DwellFactor, alike
 from kf_calib.model import on_basis
 from kf_calib.noise import Noise, flicker_sigma
 from kf_calib.samples import Floats, Mask
@@ -104,33 +103,27 @@ def _squares(carried: Carried, state: Floats) -> tuple[Floats, Mask]:
     """Squares of the residuals' coefficients (D, 3, degrees) on shapes of mean square 1, and which degrees (D, degrees)
     a dwell has readings for."""
     out, seen = np.zeros((len(carried.dwells), 3, _DEGREE)), np.zeros((len(carried.dwells), _DEGREE), bool)
-    for k, (dwell, columns) in enumerate(zip(carried.dwells, carried.columns, strict=True)):
-        columns_of_shapes, degrees = _shapes_in(dwell)
-        width, triangles = dwell.width, dwell.triangles
-        left = triangles[:, :width, width:] - triangles[:, :width, :width] @ on_basis(columns @ state)
-        out[k, :, degrees] = (columns_of_shapes.T @ left.reshape(-1, 3)) ** 2 / dwell.count
-        seen[k, degrees] = True
+    for places in alike(carried.dwells):
+        dwells, columns = [carried.dwells[k] for k in places], np.array([carried.columns[k] for k in places])
+        width, triangles = dwells[0].width, np.array([dwell.triangles for dwell in dwells])
+        left = triangles[:, :, :width, width:] - triangles[:, :, :width, :width] @ on_basis(columns @ state)
+        frame, known = _shapes_in(dwells, triangles)
+        counts = np.array([dwell.count for dwell in dwells])[:, None, None]
+        along = np.swapaxes(left.reshape(len(dwells), -1, 3), 1, 2) @ frame
+        out[places, :, : frame.shape[2]] = along**2 / counts
+        seen[places, : frame.shape[2]] = known
     return out, seen
 
 
-_known: WeakKeyDictionary[DwellFactor, tuple[Floats, NDArray[np.intp]]] = WeakKeyDictionary()
-
-
-def _shapes_in(dwell: DwellFactor) -> tuple[Floats, NDArray[np.intp]]:
-    """Orthonormal columns (r, k) on the rows of a dwell's triangles, and the degree of each less one (k,); once for
-    each dwell, whatever the model."""
-    if dwell not in _known:
-        _known[dwell] = _made(dwell)
-    return _known[dwell]
-
-
-def _made(dwell: DwellFactor) -> tuple[Floats, NDArray[np.intp]]:
-    if dwell.count < _FEWEST or dwell.end_s <= dwell.start_s:
-        return np.zeros((dwell.width * len(dwell.pieces), 0)), np.zeros(0, np.intp)
-    at = np.array([piece.nodes.elapsed_s for piece in dwell.pieces])
-    u = 2.0 * (at - dwell.start_s) / (dwell.end_s - dwell.start_s) - 1.0
-    values = shapes(u)
-    rows = (dwell.triangles[:, : dwell.width, :3] @ on_basis(values)).reshape(-1, values.shape[2])
-    frame, upper = np.linalg.qr(rows)
-    known = np.abs(np.diag(upper)) > 1e-6 * np.sqrt(dwell.count)
-    return frame[:, known][:, 1:], np.flatnonzero(known)[1:] - 1
+def _shapes_in(dwells: Sequence[DwellFactor], triangles: Floats) -> tuple[Floats, Mask]:
+    """Orthonormal columns (d, r, k) on the rows of the triangles of dwells of one shape, a column a degree from one up,
+    and of which each dwell tells (d, k)."""
+    ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
+    counts, lengths = np.array([dwell.count for dwell in dwells]), ends[:, 1] - ends[:, 0]
+    at = np.array([dwell.nodes.elapsed_s for dwell in dwells]).reshape(*triangles.shape[:2], 3)
+    from_start = (at - ends[:, 0, None, None]) / np.where(lengths > 0.0, lengths, 1.0)[:, None, None]
+    rows = triangles[:, :, : dwells[0].width, :3] @ on_basis(shapes(2.0 * from_start - 1.0))
+    frame, upper = np.linalg.qr(rows.reshape(len(dwells), -1, rows.shape[3]))
+    known = np.abs(np.einsum("dkk->dk", upper[:, :, : upper.shape[1]])) > 1e-6 * np.sqrt(counts)[:, None]
+    known &= ((counts >= _FEWEST) & (lengths > 0.0))[:, None]
+    return frame[:, :, 1:], known[:, 1:]

@@ -49,22 +49,30 @@ class Watch:
 
     @classmethod
     def over(
-        cls, dwells: Sequence[DwellFactor], bench: Bench, settings: Settings | None = None, looks: int = 0
+        cls,
+        dwells: Sequence[DwellFactor],
+        bench: Bench,
+        settings: Settings | None = None,
+        looks: int = 0,
+        fitted: Fit | None = None,
     ) -> Watch:
-        """A watch over the dwells so far, at least four; they count as one look, after ``looks`` with another model."""
+        """A watch over the dwells so far, at least four; they count as one look, after ``looks`` with another model.
+
+        fitted: the model fitted to these dwells, where that is known.
+        """
         settings = settings or Settings()
         if len(dwells) < _FEWEST:
             raise ValueError(f"a watch begins with {_FEWEST} dwells, not {len(dwells)}")
         with threadpool_limits(1, user_api="blas"):
-            return cls(bench, settings, *_begun(dwells, bench, settings), looks)._looked()
+            return cls(bench, settings, *_begun(dwells, bench, settings, fitted), looks)._looked()
 
-    def after(self, dwell: DwellFactor) -> Watch:
-        """The watch after one more dwell."""
+    def after(self, dwell: DwellFactor, fitted: Fit | None = None) -> Watch:
+        """The watch after one more dwell. fitted: the model fitted to the dwells with it, where that is known."""
         with threadpool_limits(1, user_api="blas"):
             running = self.running.after(dwell, exact=False)  # made anew when it has grown by a quarter
             if len(running.dwells) < _GROWN * self.fitted_at:
                 return replace(self, running=running)._looked()
-            running, fitted_at, tests = _begun(running.dwells, self.bench, self.settings)
+            running, fitted_at, tests = _begun(running.dwells, self.bench, self.settings, fitted)
             return replace(self, running=running, fitted_at=fitted_at, tests=tests)._looked()
 
     @property
@@ -114,10 +122,12 @@ class Watch:
         return replace(self, looks=looks, alarmed=alarmed)
 
 
-def _begun(dwells: Sequence[DwellFactor], bench: Bench, settings: Settings) -> tuple[Running, int, float]:
+def _begun(
+    dwells: Sequence[DwellFactor], bench: Bench, settings: Settings, fitted: Fit | None
+) -> tuple[Running, int, float]:
     """Noise, linearisation and threshold found from the dwells so far."""
-    model = Model.of(bench, settings.effects)
-    fitted = fit(list(dwells), model, settings.walk_mps2_per_sqrt_s)
+    if fitted is None or fitted.carried.slews or len(fitted.dwells) != len(dwells):
+        fitted = fit(list(dwells), Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s)
     noise = replace(fitted.noise.judging, checked=True)  # a setting error counts in full where a misfit is judged
     running = Running.over(dwells, fitted.carried.model, noise, fitted.carried.state, _watched(fitted))
     return running, len(dwells), independent_tests(running.scan)

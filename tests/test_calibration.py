@@ -10,10 +10,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import G, Run, sensitivities
 
+from kf_calib import information
 from kf_calib.bench import Bench, axes_of
-from kf_calib.calibration import Settings, calibrate
+from kf_calib.calibration import Pass, Settings, calibrate
 from kf_calib.errors import BlunderError, InputError, UnobservableError
+from kf_calib.fitting import fit
 from kf_calib.held_out import orientations
+from kf_calib.model import Model
 from kf_calib.samples import Batch, Stream
 from kf_calib.sources.recording import Recording
 
@@ -179,3 +182,31 @@ def test_a_dwell_on_one_or_two_messages_of_a_noisy_encoder_is_left_out(seed: int
     assert result.consistency.p_value is not None and result.consistency.p_value > 0.01
     exact = calibrate(Run(seed=seed, dwells=24, count=50))  # every dwell of an encoder without noise is used
     assert len(exact.visits) == 24
+
+
+def test_dwells_whitened_together_are_those_whitened_alone() -> None:
+    """Of any shape, beside each other in any order; a factor is solved alike in company, undetermined or not."""
+    dwells = Pass(Run(dwells=14, count=200, setting_deg=0.01), Settings()).fold()
+    dwells = [next(iter(dwell.prefixes())) if k % 3 else dwell for k, dwell in enumerate(dwells)]
+    assert len({len(dwell.pieces) for dwell in dwells}) > 1
+    fitted = fit(dwells, Model.of(Run(dwells=1).bench, ("bias-drift",)))
+    columns, state = fitted.carried.columns, fitted.carried.state
+    for noise in (fitted.noise, replace(fitted.noise, scatter_mps2=np.full(3, 1e-5), walk_mps2_per_sqrt_s=1e-5)):
+        together = information.whitened(dwells, columns, noise, state, reduced=False)
+        for dwell, own, rows in zip(dwells, columns, together, strict=True):
+            (alone,) = information.whitened([dwell], [own], noise, state, reduced=False)
+            np.testing.assert_array_equal(rows, alone)
+        few = information.whitened(dwells, columns, noise, state)
+        for whole, rows in zip(together, few, strict=True):
+            assert len(rows) < len(whole)
+            left, right = rows[:, :-1].T @ rows, whole[:, :-1].T @ whole
+            np.testing.assert_allclose(left, right, rtol=0, atol=1e-9 * np.abs(right).max())
+    factors = [information.accumulated(fitted.rows()[:count])[:-1] for count in (1, 3, 14)]
+    around = fitted.carried.model.nominal_state()
+    for factor, (state, covariance, lost) in zip(factors, information.solved(np.array(factors), around), strict=True):
+        assert lost.shape[1] == len(factor) - information.rank(factor)
+        np.testing.assert_allclose(factor[:, :-1] @ lost, 0.0, atol=1e-6 * np.abs(factor).max())
+        if not lost.size:
+            np.testing.assert_allclose(factor[:, :-1] @ state, factor[:, -1], atol=1e-6 * np.abs(factor[:, -1]).max())
+            sigma = np.sqrt(np.diag(covariance))
+            np.testing.assert_allclose(factor[:, :-1].T @ factor[:, :-1] @ covariance, np.eye(len(sigma)), atol=1e-4)

@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,12 +27,14 @@ from long_runs import slow
 from synthetic import Run, plan_of
 from test_diagnosis import BENCH
 
-from kf_calib.calibration import Settings, calibrate
+from kf_calib import standing
+from kf_calib.calibration import Pass, Settings, calibrate
 from kf_calib.cli import cli
 from kf_calib.cli.echo import Printer
 from kf_calib.cli.live import _targets
 from kf_calib.diagnosis import diagnose
 from kf_calib.errors import InputError
+from kf_calib.folding import Folder
 from kf_calib.live import Session
 from kf_calib.samples import Batch
 from kf_calib.sources.hidden import parse
@@ -141,9 +144,33 @@ def test_the_look_into_a_dwell_takes_nothing_from_it() -> None:
     assert (current(last, wanted).stay_s == last.end_s - last.start_s).all()
 
 
-def judged_of(dwells: list, wanted: np.ndarray | None = None) -> Judgement:
-    from kf_calib.calibration import Pass
+def test_candidates_are_tried_again_only_where_that_may_say_something_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nothing is beyond chance only if somebody asks; then until three diagnoses agree, and as the run grows."""
+    diagnosed = list[int]()
+    monkeypatch.setattr(standing, "diagnose", lambda result: diagnosed.append(len(result.visits)) or diagnose(result))
+    monkeypatch.setattr(standing, "assessed", lambda *_: pytest.fail("nobody has asked"))
+    judgements = judged_one_by_one(bench("second-order=15sigma", orientations=24))
+    alarmed = [k for k, each in judgements.items() if each.watch is not None and each.watch.alarmed is not None]
+    assert 5 < alarmed[0], (alarmed, diagnosed)
+    assert alarmed[0] == diagnosed[0] and len(diagnosed) < len(alarmed) - 3
+    for k, each in judgements.items():
+        assert len(each.result.visits) == k
+        if k in alarmed:
+            assert k in diagnosed or (each.look.settled and k < 1.25 * len(each.look.result.visits))
+            assert each.alarm and "second-order" in each.suspects and f"look {each.watch.looks}" not in each.verdict
 
+
+def judged_one_by_one(source: Simulation) -> dict[int, Judgement]:
+    passed, out, before = Pass(source, Settings()), dict[int, Judgement](), None
+    dwells = passed.fold()
+    for count in range(1, len(dwells) + 1):
+        folder = Folder()
+        folder.dwells = dwells[:count]
+        out[count] = before = judged(replace(passed, folder=folder), targets({}), before)
+    return out
+
+
+def judged_of(dwells: list, wanted: np.ndarray | None = None) -> Judgement:
     passed = Pass(Run(dwells=9, count=400, white_mps2=1e-3), Settings())
     passed.fold()
     passed.folder.dwells = list(dwells)
@@ -158,8 +185,6 @@ def test_setting_error_makes_a_dwell_enough() -> None:
 
 
 def folded(source: Run):
-    from kf_calib.calibration import Pass
-
     passed = Pass(source, Settings())
     passed.fold()
     return passed

@@ -10,6 +10,7 @@ from test_diagnosis import run
 
 from kf_calib.assessment import candidates
 from kf_calib.calibration import Calibration, calibrate
+from kf_calib.folding import Carried
 from kf_calib.running import Running
 from kf_calib.scan import scan
 from kf_calib.watch import Watch
@@ -54,3 +55,17 @@ def test_a_missing_effect_raises_the_alarm_before_the_end() -> None:
     watch = watched(run("second-order=20sigma"))
     assert watch.alarmed is not None and watch.alarmed < 24
     assert watch.suspects[0] in {"second-order", "scale-asymmetry"}
+
+
+def test_a_dwell_more_has_the_columns_that_the_whole_run_gives_it() -> None:
+    """Its own temperatures alone would not do: their rate and what lags behind them come from before."""
+    result = run()
+    dwells, model = result.fit.dwells, result.model
+    for effect in candidates(model):
+        model = model if str(effect) in model.parts else model + effect
+    state = np.concatenate([result.carried.state[:12], np.zeros(model.count - 12)])
+    more, whole = Carried(dwells[:-1], model, state).followed_by(dwells[-1]), Carried(dwells, model, state)
+    lagged = model.parts["thermal-lag"]
+    assert np.abs(whole.columns[-1][..., lagged]).max() > 0.1
+    np.testing.assert_array_equal(more.columns[-1], whole.columns[-1])
+    assert more.means.readings.shape == whole.means.readings.shape

@@ -20,13 +20,15 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from bench_emulator import Emulator, Tcp
 
+from kf_calib.calibration import Pass, Settings
+from kf_calib.folding import Folder
 from kf_calib.live import Session
 from kf_calib.samples import Batch
 from kf_calib.sources.live import LiveSource, frames, open_live
@@ -34,6 +36,8 @@ from kf_calib.sources.live.links import Link
 from kf_calib.sources.live.streamed import StreamedFeed
 from kf_calib.sources.recording import Recording
 from kf_calib.sources.simulated import options_from_query, simulation
+from kf_calib.standing import judged, targets
+from kf_calib.views.live import line
 
 HERE = Path(__file__).resolve().parent
 KEYS = {"axes": "y z x", "gravity_mps2": "9.81"}
@@ -274,6 +278,27 @@ def faults(count: int, form: str, folder: Path) -> dict[str, Any]:
     }
 
 
+def judging(hidden: str, count: int) -> dict[str, Any]:
+    """Milliseconds of a core that judging a dwell takes, and saying it in a line, at the 24th and the last of so many:
+    the mean over eight dwells there, looks at all candidates among them, and the median."""
+    query = f"sample_hz=50&angle_hz=10&dwell_s=10&orientations={count}&seed=5{hidden}"
+    passed = Pass(simulation(options_from_query(query), {}, 4096), Settings())
+    dwells, before, taken = passed.fold(), None, dict[int, float]()
+    near = range(count - 8, count + 1)
+    for number in sorted({*range(1, 25), *near}):
+        folder = Folder()
+        folder.dwells = dwells[:number]
+        began_s = time.process_time()
+        before = judged(replace(passed, folder=folder), targets({}), before)
+        _ = line(before)
+        taken[number] = 1e3 * (time.process_time() - began_s)
+    out = dict[str, Any]()
+    for last in (24, count):
+        own = [taken[number] for number in range(last - 7, last + 1)]
+        out[f"at_{last}_ms"] = {"mean": round(float(np.mean(own)), 1), "median": round(float(np.median(own)), 1)}
+    return out
+
+
 def measurements(quick: bool, folder: Path) -> dict[str, Callable[[], dict[str, Any]]]:
     millions = 500_000 if quick else 5_000_000
     return {
@@ -281,6 +306,8 @@ def measurements(quick: bool, folder: Path) -> dict[str, Callable[[], dict[str, 
         "frames_1khz": lambda: steady("frames", 1000.0, 8.0 if quick else 30.0, folder),
         "evaluated_1khz": lambda: steady("json", 1000.0, 16.0 if quick else 60.0, folder, "evaluate"),
         "frames_10khz": lambda: steady("frames", 10_000.0, 8.0 if quick else 60.0, folder),
+        "judging": lambda: judging("", 100 if quick else 400),
+        "judging_alarmed": lambda: judging("&hide=second-order=20sigma", 48 if quick else 100),
         "memory": lambda: answer(child("gorge", millions, folder / "memory.mcap")),
         "random_bytes": lambda: answer(child("random_bytes", (10 if quick else 100) << 20, folder / "noise.mcap")),
         "kills": lambda: kills(3 if quick else 30, folder),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -21,6 +21,7 @@ _INTEGRALS = legendre.legvander(_POINTS, 2).T * _WEIGHTS  # (3, n): of Legendre'
 
 _RATE_WINDOW_S = 5.0  # at least: a thermometer of 0.01 K noise then shows rates of 1e-3 K/s
 _RATE_STILL = 0.02
+_OF_ALL = ("bench", "sensitivity", "carrier_hz", "part", "whole")  # is the same at all instants
 
 
 def smooth_between(times: Floats, values: Floats, at: Floats) -> Floats:
@@ -79,6 +80,13 @@ class Stimulus:
     within: Floats = field(default_factory=lambda: np.zeros(1))
     carrier_hz: float = 0.0
     part: int = 0
+    whole: Stimulus | None = None
+    """What it is the end of: temperatures that came before matter, too."""
+
+    def ending(self, count: int) -> Stimulus:
+        """Its last ``count`` instants."""
+        ends = {each.name: getattr(self, each.name)[-count:] for each in fields(self) if each.name not in _OF_ALL}
+        return replace(self, **ends, whole=self)
 
     def __len__(self) -> int:
         return len(self.elapsed_s)
@@ -153,6 +161,8 @@ class Stimulus:
         From 5 s before to 5 s after, and twice as long until that changes the rate by no more than 2 % (rms): what a
         rate that is mostly noise leaves of an effect another one explains. At the longest an eighth of the run.
         """
+        if self.whole is not None:
+            return self.whole.warming[-len(self) :]
         times, first = np.unique(self.elapsed_s, return_index=True)
         window_s, best, best_change = _RATE_WINDOW_S, self._change(times, first, _RATE_WINDOW_S), np.inf
         rate = best
@@ -187,6 +197,8 @@ class Stimulus:
 
         With equal steps h, r = h / tau: L_n = p L_(n-1) + (c - p) T_(n-1) + (1 - c) T_n, p = e^-r, c = (1 - p)/r.
         """
+        if self.whole is not None:
+            return self.whole.lagged_warmth(tau_s)[-len(self) :]
         from scipy.linalg import get_blas_funcs
 
         times, first = np.unique(np.append(self.elapsed_s[1:-1:3], self.elapsed_s[[0, -1]]), return_index=True)
