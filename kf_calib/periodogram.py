@@ -76,9 +76,11 @@ class Periodogram:
     def _along(self, columns: Floats) -> Floats:
         """Products (N, 6, c) of cosines and sines of the three accelerometers, in that order, with columns (m, c) that
         the rows of the dwells have."""
+        count, points = columns.shape[1], self._shares.shape[1]
+        if not count:
+            return np.zeros((len(self.values_hz), 6, 0))
         if self._path is not None:
             columns = self._path.freed(columns)
-        count, points = columns.shape[1], self._shares.shape[1]
         waves = self._waves.reshape(len(columns), -1)
         sums = np.array([waves[part].T @ columns[part] for part in _parts(self._ends)])  # (D, 3 points, c)
         out: Waves = np.empty((len(self.values_hz), 3, count), np.complex128)
