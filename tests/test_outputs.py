@@ -137,8 +137,10 @@ OUTPUTS = [(words, option) for words, options in WRITING for option in options]
 
 
 def test_every_output_is_among_them_and_can_be_replaced() -> None:
-    for name in cli.list_commands(click.Context(cli)):
-        command = cli.commands[name]
+    ctx = click.Context(cli)
+    for name in cli.list_commands(ctx):
+        command = cli.get_command(ctx, name)
+        assert command is not None
         asked = [param for param in command.params if isinstance(param.type, OutputFile)]
         if name in ("compare", "diagnose", "effects", "demo"):
             assert not asked
