@@ -20,6 +20,7 @@ from kf_calib.folding import DwellFactor, Means
 from kf_calib.noise import FLOOR_MPS2, Noise, mean_covariances, turned, wander
 from kf_calib.restricted import Point, Restricted
 from kf_calib.samples import Floats
+from kf_calib.tails import chi_squared_tail
 from kf_calib.walk import Links, links
 
 FEWEST = 6
@@ -72,8 +73,6 @@ def with_dwell_parts(
     Second: the sizes that each combination was searched to. Given as ``near`` with means that have changed little, they
     shorten the searches.
     """
-    from scipy.special import chdtrc
-
     stated = replace(
         within,
         setting_rad=float(np.radians(angle_sigma_deg or 0.0)),
@@ -92,7 +91,7 @@ def with_dwell_parts(
     combinations = _combinations(stated, walks)
     likelihood = _likelihood(stated.weights, {part for parts in combinations for part in parts}, means, state)
     without = likelihood.without()
-    if not walks and chdtrc(free, without.misfit) > 0.1:  # spares the search
+    if not walks and chi_squared_tail(free, without.misfit) > 0.1:  # spares the search
         return stated, {}
     return _chosen(stated, likelihood, combinations, without, near or {})
 

@@ -1,4 +1,4 @@
-"""The chance that the F distribution exceeds a ratio: every run needs this one number.
+"""The chance that an F or a chi-squared distribution exceeds a value: every run needs these two numbers.
 
 ``scipy.special.fdtrc`` gives it too, but takes longer to import than a short recording to evaluate, and of its digits
 half are lost where the noise is known to 1e9 degrees of freedom.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 _ENOUGH = 4e-16
+_KNOWN = 1e18  # degrees of freedom of noise that is as good as known
 
 
 def f_tail(freedom: float, noise_freedom: float, ratio: float) -> float:
@@ -31,6 +32,11 @@ def f_tail(freedom: float, noise_freedom: float, ratio: float) -> float:
     if away > 0.0:
         return factor / _fraction(a, b, a / beyond, away)
     return 1.0 - factor / _fraction(b, a, b * ratio / beyond, -away)
+
+
+def chi_squared_tail(freedom: float, value: float) -> float:
+    """Chance that chi-squared with so many degrees of freedom exceeds ``value``: F of noise that is known."""
+    return f_tail(freedom, _KNOWN, value / freedom)
 
 
 def _fraction(a: float, b: float, x: float, away: float) -> float:

@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 from scipy.special import chdtrc, fdtrc
 
-from kf_calib.tails import f_tail
+from kf_calib.tails import chi_squared_tail, f_tail
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 7, 60, 1000])
+def test_chi_squared_is_scipys(freedom: int) -> None:
+    for value in freedom * np.array([0.1, 0.9, 1.0, 1.3, 2.0]):
+        assert chi_squared_tail(freedom, value) == pytest.approx(float(chdtrc(freedom, value)), rel=1e-12)
 
 
 @pytest.mark.parametrize("freedom", [1.0, 2.0, 3.0, 7.5, 60.0, 1101.0, 12000.0])
