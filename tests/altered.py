@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from kf_calib.bench import Bench
-from kf_calib.samples import Batch, Floats, Source, Stream
-from kf_calib.sources.simulated import simulation
-from kf_calib.sources.simulator import START_NS, Simulation
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Batch, Source, Stream
+from kf_calib.sources.simulation.options import simulation
+from kf_calib.sources.simulation.simulator import START_NS, Simulation
 
 Change = Callable[[Floats, Floats], Floats]
 """New values (n, k) of time since the start, s (n,), and values (n, k)."""

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from kf_calib.bench import Bench, axes_of
-from kf_calib.samples import Batch, Stream
-from kf_calib.sources.plans import spread_plan
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.bench.streams import Batch, Stream
+from kf_calib.sources.simulation.visit_plans import spread_plan
 
 G = 9.81
 plan_of = cache(spread_plan)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from test_diagnosis_cases import run
 
-from kf_calib.advice import Advice, to_tell_apart
-from kf_calib.calibration import Calibration
+from kf_calib.bench.arrays import Floats
+from kf_calib.design.next_orientation import Advice, to_tell_apart
 from kf_calib.effects import Effect, effect_named
-from kf_calib.samples import Floats
-from kf_calib.scan import scan
-from kf_calib.sources.plans import Visit, spread_plan
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.score_test import scan
+from kf_calib.sources.simulation.visit_plans import Visit, spread_plan
 
 PLAN = spread_plan(12, dwell_s=8.0, seed=5)
 

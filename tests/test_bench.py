@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from kf_calib.bench import (
+from kf_calib.bench.bench import (
     EARTH_RATE_RADPS,
     Bench,
     axes_of,
@@ -22,8 +22,8 @@ from kf_calib.bench import (
     pose_distance,
     slerp,
     unwrap_pose,
-)  # fmt: skip
-from kf_calib.bench_keys import KEYS
+)
+from kf_calib.bench.keys import KEYS
 from kf_calib.errors import BenchError
 
 G = 9.81

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from altered import Altered, short_run
 
-from kf_calib.bench import Bench, parse_axes, parse_channels
-from kf_calib.bench_keys import UP
-from kf_calib.blunders import common_scale
-from kf_calib.calibration import calibrate
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench, parse_axes, parse_channels
+from kf_calib.bench.keys import UP
 from kf_calib.errors import BlunderError, InputError
-from kf_calib.samples import Floats
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.setup_blunders import common_scale
 
 
 def reordered(*channels: int):

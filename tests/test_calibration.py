@@ -10,15 +10,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import G, Run, sensitivities
 
-from kf_calib import information
-from kf_calib.bench import Bench, axes_of
-from kf_calib.calibration import Pass, Settings, calibrate
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BlunderError, InputError, UnobservableError
-from kf_calib.fitting import fit
-from kf_calib.held_out import orientations
-from kf_calib.model import Model
-from kf_calib.samples import Batch, Stream
-from kf_calib.sources.recording import Recording
+from kf_calib.estimation import square_root_information
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.cross_validation import orientations
+from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.fit import fit
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.settings import Settings
+from kf_calib.sources.files.recording import Recording
 
 
 def test_a_real_imu_placed_by_hand(ferraris: Path) -> None:
@@ -53,7 +55,7 @@ def test_held_out_equals_refits_without_the_orientation() -> None:
     result = calibrate(run)
     errors = []
     for left_out in range(8):
-        from kf_calib.calibration import evaluate
+        from kf_calib.estimation.calibration import evaluate
 
         kept = [visit.dwell for k, visit in enumerate(result.visits) if k != left_out]
         rest = evaluate(kept, replace(run.bench, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0), Settings())
@@ -192,19 +194,21 @@ def test_dwells_whitened_together_are_those_whitened_alone() -> None:
     fitted = fit(dwells, Model.of(Run(dwells=1).bench, ("bias-drift",)))
     columns, state = fitted.carried.columns, fitted.carried.state
     for noise in (fitted.noise, replace(fitted.noise, scatter_mps2=np.full(3, 1e-5), walk_mps2_per_sqrt_s=1e-5)):
-        together = information.whitened(dwells, columns, noise, state, reduced=False)
+        together = square_root_information.whitened(dwells, columns, noise, state, reduced=False)
         for dwell, own, rows in zip(dwells, columns, together, strict=True):
-            (alone,) = information.whitened([dwell], [own], noise, state, reduced=False)
+            (alone,) = square_root_information.whitened([dwell], [own], noise, state, reduced=False)
             np.testing.assert_array_equal(rows, alone)
-        few = information.whitened(dwells, columns, noise, state)
+        few = square_root_information.whitened(dwells, columns, noise, state)
         for whole, rows in zip(together, few, strict=True):
             assert len(rows) < len(whole)
             left, right = rows[:, :-1].T @ rows, whole[:, :-1].T @ whole
             np.testing.assert_allclose(left, right, rtol=0, atol=1e-9 * np.abs(right).max())
-    factors = [information.accumulated(fitted.rows()[:count])[:-1] for count in (1, 3, 14)]
+    factors = [square_root_information.accumulated(fitted.rows()[:count])[:-1] for count in (1, 3, 14)]
     around = fitted.carried.model.nominal_state()
-    for factor, (state, covariance, lost) in zip(factors, information.solved(np.array(factors), around), strict=True):
-        assert lost.shape[1] == len(factor) - information.rank(factor)
+    for factor, (state, covariance, lost) in zip(
+        factors, square_root_information.solved(np.array(factors), around), strict=True
+    ):
+        assert lost.shape[1] == len(factor) - square_root_information.rank(factor)
         np.testing.assert_allclose(factor[:, :-1] @ lost, 0.0, atol=1e-6 * np.abs(factor).max())
         if not lost.size:
             np.testing.assert_allclose(factor[:, :-1] @ state, factor[:, -1], atol=1e-6 * np.abs(factor[:, -1]).max())

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kf_calib.bench.streams import Batch, Stream
 from kf_calib.cli import main
-from kf_calib.samples import Batch, Stream
-from kf_calib.sources.recorder import Recorder
-from kf_calib.sources.recording import Recording
+from kf_calib.sources.files.recorder import Recorder
+from kf_calib.sources.files.recording import Recording
 
 PARAMETERS = ["theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3"]
 QUICK = ["--orientations", "12", "--dwell-s", "6", "--slew-degps", "360", "--sample-hz", "50"]

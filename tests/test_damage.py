@@ -9,11 +9,12 @@ import pytest
 from long_runs import slow
 from synthetic import Run
 
-from kf_calib.calibration import Calibration, calibrate
+from kf_calib.bench.streams import Stream
 from kf_calib.errors import KfCalibError
-from kf_calib.samples import Stream
-from kf_calib.sources.recorder import Recorder
-from kf_calib.sources.recording import Recording
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.results import Calibration
+from kf_calib.sources.files.recorder import Recorder
+from kf_calib.sources.files.recording import Recording
 
 RUN = Run(seed=1, dwells=14, count=100, batch=100)
 PAGE = 512  # bytes that a disk loses or mixes up at once

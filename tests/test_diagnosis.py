@@ -13,21 +13,23 @@ from click.testing import CliRunner
 from long_runs import slow
 from synthetic import Run, plan_of
 
-from kf_calib import assessment
-from kf_calib.assessment import EQUAL, assessed, detectable, independent_tests, price
-from kf_calib.bench import Bench, axes_of
-from kf_calib.calibration import Calibration, calibrate
+from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.cli import cli
-from kf_calib.diagnosis import diagnose, next_orientation, with_effects
+from kf_calib.diagnosis import candidate_tests
+from kf_calib.diagnosis.candidate_tests import EQUAL, assessed, detectable, independent_tests, price
+from kf_calib.diagnosis.missing_effect import diagnose, next_orientation
+from kf_calib.diagnosis.results import with_effects
 from kf_calib.effects import effect_named
-from kf_calib.scan import Candidate, Scan, scan
-from kf_calib.sources.hidden import parse
-from kf_calib.sources.hidden.detectability import sized
-from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.physics import Ambient
-from kf_calib.sources.plans import six_faces
-from kf_calib.sources.sensors import GRADES
-from kf_calib.sources.simulator import Simulation
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.score_test import Candidate, Scan, scan
+from kf_calib.sources.simulation.detectability import sized
+from kf_calib.sources.simulation.injected import parse
+from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.physics import Ambient
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
+from kf_calib.sources.simulation.visit_plans import six_faces
 
 BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
 HAND = Path(__file__).resolve().parents[2] / "shared" / "recordings" / "ferraris_hand.mcap"
@@ -144,7 +146,9 @@ def test_noise_rarely_puts_a_rival_so_far_ahead_that_the_truth_is_out() -> None:
         readings[:3] = readings[3:] / np.tan(angle)  # no signal helps it more
         found = Scan(candidates, readings)
         scores = {str(c.effect): float(x) - price(c, 30.0) for c, x in zip(candidates, found.statistics, strict=True)}
-        test = assessment.Test(found, {"second-order": 0, "scale-asymmetry": 1}, scores, {}, None, "", 30.0, (), ())
+        test = candidate_tests.Test(
+            found, {"second-order": 0, "scale-asymmetry": 1}, scores, {}, None, "", 30.0, (), ()
+        )
         out += "second-order" not in test.rivals("scale-asymmetry")
         ahead += scores["scale-asymmetry"] - scores["second-order"] > EQUAL
     assert out < 0.01 * 4000 + 3.0 * np.sqrt(40.0) and ahead > 0.05 * 4000
@@ -167,7 +171,7 @@ def test_command_line(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not HAND.exists(), reason=f"{HAND} is not here")
 def test_a_hand_placed_run_claims_nothing() -> None:
-    from kf_calib.sources.recording import Recording
+    from kf_calib.sources.files.recording import Recording
 
     found = diagnose(calibrate(Recording(HAND)))
     assert not found.missing and not found.unknown and "third-order" in found.test.invisible

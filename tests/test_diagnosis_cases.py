@@ -11,17 +11,19 @@ from long_runs import slow
 from synthetic import Run, plan_of
 from test_diagnosis import BENCH
 
-from kf_calib.assessment import EQUAL, assessed
-from kf_calib.calibration import Calibration, calibrate
-from kf_calib.diagnosis import Diagnosis, diagnose, with_effects
-from kf_calib.drivers import IRREGULAR, JUMP
-from kf_calib.sources.hidden import parse
-from kf_calib.sources.hidden.detectability import sized
-from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.physics import Ambient
-from kf_calib.sources.plans import Visit, six_faces
-from kf_calib.sources.sensors import GRADES
-from kf_calib.sources.simulator import Simulation
+from kf_calib.diagnosis.candidate_tests import EQUAL, assessed
+from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.results import Diagnosis, with_effects
+from kf_calib.diagnosis.unknown_effect import IRREGULAR, JUMP
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.results import Calibration
+from kf_calib.sources.simulation.detectability import sized
+from kf_calib.sources.simulation.injected import parse
+from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.physics import Ambient
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
+from kf_calib.sources.simulation.visit_plans import Visit, six_faces
 from kf_calib.views.diagnosis import description
 
 WHITE = 5e-5

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from synthetic import Run
 
-from kf_calib.calibration import Calibration, Settings, calibrate
-from kf_calib.diagnosis import diagnose
-from kf_calib.live import Session
-from kf_calib.samples import Stream
+from kf_calib.bench.streams import Stream
+from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.settings import Settings
+from kf_calib.online.session import Session
 from kf_calib.views import console
 from kf_calib.views import live as live_view
 from kf_calib.views.diagnosis import diagnosis_report

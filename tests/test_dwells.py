@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from synthetic import G, Run
 
-from kf_calib.bench import Bench, axes_of
-from kf_calib.calibration import calibrate
-from kf_calib.dwells import Segmenter, dwell_blocks
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.bench.streams import Batch, Stream
+from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
+from kf_calib.dwells.stationarity import Stillness
 from kf_calib.errors import InputError
-from kf_calib.samples import Batch, Stream
-from kf_calib.stillness import Stillness
+from kf_calib.estimation.calibration import calibrate
 
 S = 1_000_000_000
 BENCH = Bench(axes_of("zx"), 9.81)
@@ -238,10 +238,10 @@ def test_temperature_goes_on_as_it_went_last() -> None:
 
 def test_a_gentle_start_of_a_slew_is_not_in_the_dwell() -> None:
     """A minimum-jerk slew stays within the tolerance for tenths of a second: none of it may reach the fit."""
-    from kf_calib.calibration import calibrate
-    from kf_calib.sources.plans import spread_plan
-    from kf_calib.sources.sensors import GRADES
-    from kf_calib.sources.simulator import Simulation
+    from kf_calib.estimation.calibration import calibrate
+    from kf_calib.sources.simulation.sensors import GRADES
+    from kf_calib.sources.simulation.simulator import Simulation
+    from kf_calib.sources.simulation.visit_plans import spread_plan
 
     grade, bench = GRADES["navigation"], Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
     p_values = []

@@ -15,25 +15,31 @@ from scipy.optimize import brentq
 from scipy.stats import chi2
 from synthetic import plan_of
 
-from kf_calib import information
-from kf_calib.bench import Bench, axes_of
-from kf_calib.calibration import Calibration, Estimate, Pass, Settings, calibrate, evaluate
-from kf_calib.comparison import compare
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import SensorEffect, Stimulus, effect_named, names
 from kf_calib.errors import InputError
-from kf_calib.fitting import WALK, Fit, fit
-from kf_calib.folding import Carried, DwellFactor
-from kf_calib.model import PRIORS, Model
-from kf_calib.noise import Noise as NoiseModel
-from kf_calib.noise import within_dwells
-from kf_calib.running import Running
-from kf_calib.samples import Floats
-from kf_calib.sources.hidden import parse, sized
-from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.physics import Ambient
-from kf_calib.sources.plans import Visit, explicit_plan
-from kf_calib.sources.sensors import GRADES
-from kf_calib.sources.simulator import Simulation
+from kf_calib.estimation import square_root_information
+from kf_calib.estimation.calibration import calibrate, evaluate
+from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.engine_comparison import compare
+from kf_calib.estimation.fit import WALK, Fit, fit
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.noise_model import Noise as NoiseModel
+from kf_calib.estimation.noise_model import within_dwells
+from kf_calib.estimation.prior import PRIORS
+from kf_calib.estimation.results import Calibration, Estimate
+from kf_calib.estimation.settings import Settings
+from kf_calib.online.running_filter import Running
+from kf_calib.sources.simulation.detectability import sized
+from kf_calib.sources.simulation.injected import parse
+from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.physics import Ambient
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
+from kf_calib.sources.simulation.visit_plans import Visit, explicit_plan
 
 BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
 PLAN = plan_of(30, dwell_s=6.0, seed=4)
@@ -248,7 +254,7 @@ def test_rank_of_the_information_lacks_what_is_degenerate(name: str) -> None:
     nothing = {*INVISIBLE, "vibration-rectification"}  # nothing vibrates in this run
     seen = 0 if name in nothing else len(effect_named(name, BENCH).coefficients)
     unknown = effect_named(name, BENCH).unknown is not None  # its derivative is nothing where the coefficients are
-    rank = information.rank(information.accumulated(fitted.rows())[:-1])
+    rank = square_root_information.rank(square_root_information.accumulated(fitted.rows())[:-1])
     assert 12 + seen <= rank <= 12 + seen + unknown
 
 
@@ -299,8 +305,8 @@ def test_left_out_effect_biases_the_twelve_and_the_effect_in_the_model_mends_it(
 def estimated(fitted: Fit) -> dict[str, tuple[float, float]]:
     """Value and sigma (NaN: not seen) of all but the twelve, without the rest of a calibration."""
     model = fitted.carried.model
-    factor = information.accumulated(fitted.rows(), fitted.steps)[:-1]
-    estimate = Estimate(*information.solve(factor, model.nominal_state()))
+    factor = square_root_information.accumulated(fitted.rows(), fitted.steps)[:-1]
+    estimate = Estimate(*square_root_information.solve(factor, model.nominal_state()))
     found, gains = model.natural(estimate.state)
     out = {c.symbol: own for c, *own in zip(model.coefficients, found, estimate.effect_sigma * gains, strict=True)}
     if model.walks:
@@ -387,11 +393,13 @@ def test_a_factor_restricted_equals_that_of_fewer_columns(navigation, name: str)
 
     def factor_of(model: Model) -> Floats:
         at = np.concatenate([state, np.zeros(model.count - 12)])
-        rows = information.whitened(dwells, Carried(dwells, model, at).columns, noise, at, at)
-        return information.accumulated(rows)[:-1]
+        rows = square_root_information.whitened(dwells, Carried(dwells, model, at).columns, noise, at, at)
+        return square_root_information.accumulated(rows)[:-1]
 
-    few, chosen = factor_of(small), information.restricted(factor_of(large), list(range(small.count)))
-    (one, covariance, _), (other, reference, _) = (information.solve(f, np.zeros(small.count)) for f in (chosen, few))
+    few, chosen = factor_of(small), square_root_information.restricted(factor_of(large), list(range(small.count)))
+    (one, covariance, _), (other, reference, _) = (
+        square_root_information.solve(f, np.zeros(small.count)) for f in (chosen, few)
+    )
     sigma = np.sqrt(np.diag(reference))
     assert sigma[:12].all() and np.abs(one - other).max() > 0  # made in two ways
     np.testing.assert_allclose(one / sigma, other / sigma, rtol=0, atol=1e-12)

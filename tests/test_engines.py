@@ -10,12 +10,14 @@ from filterpy.kalman import SquareRootKalmanFilter
 from scipy.optimize import least_squares
 from synthetic import Run, sensitivities
 
-from kf_calib import paper
-from kf_calib.bench import Bench, axes_of
-from kf_calib.calibration import Pass, Settings, calibrate, evaluate, filterpy_estimate
-from kf_calib.comparison import compare
-from kf_calib.folding import Folder
-from kf_calib.model import PRIORS
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.dwells.sufficient_statistics import Folder
+from kf_calib.estimation.calibration import calibrate, evaluate, filterpy_estimate
+from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.engine_comparison import compare
+from kf_calib.estimation.prior import PRIORS
+from kf_calib.estimation.settings import Settings
 
 CASES = {
     "paper grade": Run(seed=1, dwells=8, count=150),
@@ -87,7 +89,7 @@ def test_mems_grade_equals_nonlinear_least_squares_on_the_papers_parameters() ->
         rows, biases = sensitivities(parameters)
         return ((means[:, 4:] - means[:, 1:4] @ rows.T - biases) * weight).ravel()
 
-    found = least_squares(misfit, paper.nominal(), xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac").x
+    found = least_squares(misfit, paper_parameters.nominal(), xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac").x
     np.testing.assert_allclose(result.estimate.parameters, found, rtol=1e-6)
 
 

@@ -8,11 +8,12 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from kf_calib.bench import Bench, axes_of
-from kf_calib.calibration import Pass, Settings
-from kf_calib.folding import DwellFactor, Folder
-from kf_calib.model import Rows
-from kf_calib.samples import Batch, Stream
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.bench.streams import Batch, Stream
+from kf_calib.dwells.rows import Rows
+from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder
+from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.settings import Settings
 
 BLOCKS = 24
 
@@ -64,9 +65,7 @@ def test_a_dwell_asked_for_at_every_block_is_the_same_to_the_last_bit(rows: list
         np.testing.assert_array_equal(one, other)
 
 
-def test_no_piece_of_a_long_dwell_is_taken_up_at_every_block(
-    rows: list[Rows], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_piece_of_a_long_dwell_is_taken_up_at_every_block(rows: list[Rows], monkeypatch: pytest.MonkeyPatch) -> None:
     handled, merged = [0], DwellFactor.merged
 
     def counted(self: DwellFactor, others: Sequence[DwellFactor]) -> DwellFactor:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from synthetic import Run
 
-from kf_calib.calibration import Settings, calibrate
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.settings import Settings
 
 
 def test_nothing_is_rejected_from_clean_noise() -> None:
@@ -39,13 +40,13 @@ def test_an_orientation_that_disagrees_is_kept_as_evidence() -> None:
 
 
 def test_varying_columns_are_fitted_before_judging() -> None:
-    from kf_calib import gate
+    from kf_calib.dwells import innovation_gate
 
     rng = np.random.default_rng(4)
     turning = np.linspace(0, 0.2, 500)
     columns = np.column_stack([np.ones(500), np.sin(turning), np.cos(turning), np.zeros(500)])
     values = columns @ rng.normal(size=(4, 3)) * 10 + rng.normal(size=(500, 3)) * 1e-4
     values[77] += 0.01
-    innovation = gate.innovations(columns, values, static=False)
-    keep = gate.inliers(columns, values, innovation, False, 6.0)
+    innovation = innovation_gate.innovations(columns, values, static=False)
+    keep = innovation_gate.inliers(columns, values, innovation, False, 6.0)
     assert keep is not None and list(np.flatnonzero(~keep)) == [77]

@@ -15,21 +15,25 @@ from long_runs import slow
 from scipy.stats import chi2
 from test_diagnosis import BENCH, run
 
-from kf_calib import improvement, journal
-from kf_calib.calibration import Calibration, Settings, calibrate, evaluate
 from kf_calib.cli import cli
+from kf_calib.diagnosis import selection_journal
+from kf_calib.diagnosis.nested_cross_validation import honest
+from kf_calib.diagnosis.selection_journal import figures
+from kf_calib.diagnosis.stepwise_selection import Improvement, Step, improve, removals, stepped, undone
+from kf_calib.dwells.sufficient_statistics import without
 from kf_calib.errors import InputError
-from kf_calib.fitting import fit
-from kf_calib.folding import stimulus_of, without
-from kf_calib.improvement import Improvement, Step, honest, improve, removals, stepped, undone
-from kf_calib.journal import figures
-from kf_calib.model import Model
-from kf_calib.sources.hidden import parse
-from kf_calib.sources.hidden.detectability import sized
-from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.plans import spread_plan
-from kf_calib.sources.sensors import GRADES
-from kf_calib.sources.simulator import Simulation
+from kf_calib.estimation.calibration import calibrate, evaluate, refitted
+from kf_calib.estimation.dwell_columns import stimulus_of
+from kf_calib.estimation.fit import fit
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.settings import Settings
+from kf_calib.sources.simulation.detectability import sized
+from kf_calib.sources.simulation.injected import parse
+from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
+from kf_calib.sources.simulation.visit_plans import spread_plan
 
 
 def ratio(result: Calibration) -> float:
@@ -108,16 +112,16 @@ def test_equal_explanations_are_left_to_a_person() -> None:
 def test_removals_are_the_rise_of_chi_squared(improved: Improvement) -> None:
     """Against refits; of effects that stand still in a dwell, so that all models have the same rows."""
     model = ("second-order", "cross-coupling-ip")
-    full = improvement.refitted(improved.start.before, model)
+    full = refitted(improved.start.before, model)
     for name, test in zip(model, removals(full.fit), strict=True):
-        less = improvement.refitted(full, [other for other in model if other != name])
+        less = refitted(full, [other for other in model if other != name])
         rises = less.consistency.statistic - full.consistency.statistic
         assert test.name == name and test.dof == 3 and test.statistic == pytest.approx(rises, rel=0.02, abs=0.05)
 
 
 def test_what_is_not_needed_goes_unless_it_was_asked_for(improved: Improvement) -> None:
     """A step that explained nothing is taken out when the true effect comes in; the user's own stays."""
-    useless, start = improvement.refitted(improved.start.before, ("hysteresis",)), Improvement(improved.start)
+    useless, start = refitted(improved.start.before, ("hysteresis",)), Improvement(improved.start)
     stands = replace(improved.start, before=useless)
     asked = stepped(Improvement(stands), "second-order", None, "diagnosis")
     assert asked.effects == ("hysteresis", "second-order") and not asked.steps[-1].dropped
@@ -175,7 +179,7 @@ def test_the_honest_error_repeats_the_choice(second_order: Calibration, quiet: C
 def test_honest_errors_are_those_of_orientations_left_out() -> None:
     """As many folds as orientations and nothing to choose: leave-one-out of the fixed model, history and all."""
     before = run("hysteresis=15sigma", plan=spread_plan(12, dwell_s=8.0, seed=5))
-    cured = improvement.refitted(before, ("hysteresis",))
+    cured = refitted(before, ("hysteresis",))
     checked = honest(cured, folds=12)
     assert checked.chosen == {"hysteresis": 12}
     assert checked.rms_mps2 == pytest.approx(cured.held_out_rms_mps2, rel=0.02)
@@ -322,13 +326,15 @@ def test_bad_usage(run, recording: Path, tmp_path: Path) -> None:
 def test_a_figure_that_differs_is_told(improved: Improvement) -> None:
     one = figures(improved.found)
     other = one | {"K1": one["K1"] * (1 + 1e-12)}
-    assert journal._difference(one, one) == 0.0 and journal._difference(one, other) == pytest.approx(1e-12, rel=1e-3)
-    assert journal._difference(one, {}) == float("inf")
+    assert selection_journal._difference(one, one) == 0.0 and selection_journal._difference(
+        one, other
+    ) == pytest.approx(1e-12, rel=1e-3)
+    assert selection_journal._difference(one, {}) == float("inf")
 
 
 def test_a_refit_is_a_replay(second_order: Calibration) -> None:
     settings = Settings(effects=("second-order",))
     anew = evaluate(second_order.fit.dwells, BENCH, settings)
-    refit = improvement.refitted(second_order, settings.effects)
+    refit = refitted(second_order, settings.effects)
     np.testing.assert_array_equal(anew.estimate.state, refit.estimate.state)
     assert fit(second_order.fit.dwells, Model.of(BENCH, settings.effects)).noise.sigma_mps2[0] > 0

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from synthetic import Run
 
-from kf_calib import banded
-from kf_calib.calibration import Calibration, Settings, calibrate
-from kf_calib.folding import Means
-from kf_calib.likelihood import restricted_log_likelihood, with_dwell_parts
-from kf_calib.noise import Noise
-from kf_calib.restricted import Restricted
-from kf_calib.samples import Floats
+from kf_calib.bench.arrays import Floats
+from kf_calib.estimation import banded
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.dwell_columns import Means
+from kf_calib.estimation.noise_model import Noise
+from kf_calib.estimation.reml import restricted_log_likelihood, with_dwell_parts
+from kf_calib.estimation.restricted_likelihood import Restricted
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.settings import Settings
 
 
 def dense(columns: Floats) -> Floats:

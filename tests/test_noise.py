@@ -10,13 +10,13 @@ from long_runs import slow
 from scipy.signal import lfilter
 from synthetic import Run, plan_of
 
-from kf_calib.bench import Bench, axes_of
-from kf_calib.calibration import calibrate
-from kf_calib.folding import Autocovariance, less_curve
-from kf_calib.likelihood import restricted_log_likelihood
-from kf_calib.sources.noise_sources import Noise as SimulatedNoise
-from kf_calib.sources.sensors import GRADES
-from kf_calib.sources.simulator import Simulation
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.dwells.sufficient_statistics import Autocovariance, less_curve
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.reml import restricted_log_likelihood
+from kf_calib.sources.simulation.noise_processes import Noise as SimulatedNoise
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
 
 
 def test_autocovariance_is_the_sum_of_lagged_products() -> None:

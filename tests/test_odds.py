@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kf_calib import assessment
-from kf_calib.odds import as_fall, log_odds
+from kf_calib.diagnosis import candidate_tests
+from kf_calib.diagnosis.bayes_factor import as_fall, log_odds
 
 
 @pytest.mark.parametrize("dof", [1, 2, 3, 6])
@@ -59,10 +59,10 @@ def test_a_walk_is_ahead_of_a_column_where_its_likelihood_is() -> None:
     """Its score is that of the best column where its fall is what the column's is worth; none without a column."""
     own = [SimpleNamespace(effect="drift", dof=3, tried=1)]
     found: Any = SimpleNamespace(candidates=own, statistics=np.array([60.0]))
-    scores = {"drift": 60.0 - assessment.threshold(3, 30.0)}
-    paths = assessment._beside_best(found, scores, 30.0)
+    scores = {"drift": 60.0 - candidate_tests.threshold(3, 30.0)}
+    paths = candidate_tests._beside_best(found, scores, 30.0)
     worth = as_fall(np.array([3]), np.array([60.0]))
-    assert worth - assessment.threshold(1, 30.0) + paths == pytest.approx(scores["drift"])
+    assert worth - candidate_tests.threshold(1, 30.0) + paths == pytest.approx(scores["drift"])
     assert 2.0 < paths < 8.0
-    assert assessment._beside_best(found, {"drift": -1.0}, 30.0) == 0.0
-    assert assessment._beside_best(found, {}, 30.0) == 0.0
+    assert candidate_tests._beside_best(found, {"drift": -1.0}, 30.0) == 0.0
+    assert candidate_tests._beside_best(found, {}, 30.0) == 0.0

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from altered import Altered, mistyped, short_run
 
-from kf_calib.calibration import Settings, calibrate
-from kf_calib.diagnosis import diagnose
+from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.errors import InputError
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.settings import Settings
 
 
 @pytest.mark.parametrize("options", [{}, {"unstated": True}, {"setting_sigma_deg": 0.01}, {"grade": "mems"}], ids=str)

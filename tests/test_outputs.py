@@ -20,14 +20,14 @@ import numpy as np
 import pytest
 
 from kf_calib import effects
-from kf_calib.bench import Bench, parse_axes
+from kf_calib.bench.bench import Bench, parse_axes
+from kf_calib.bench.streams import Batch, Stream
 from kf_calib.cli import cli
 from kf_calib.cli.files import OutputFile
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.outputs import Growing, Outputs, whole, write_whole
-from kf_calib.samples import Batch, Stream
-from kf_calib.sources.recorder import Recorder
-from kf_calib.sources.recording import Recording
+from kf_calib.sources.files.recorder import Recorder
+from kf_calib.sources.files.recording import Recording
+from kf_calib.support.output_files import Growing, Outputs, whole, write_whole
 from kf_calib.views.screenshot import ScreenshotError
 
 QUICK = ["--orientations", "12", "--dwell-s", "6", "--slew-degps", "360", "--sample-hz", "50", "--seed", "3"]
@@ -157,9 +157,10 @@ def idle(monkeypatch: pytest.MonkeyPatch) -> None:
     def begun(*_: object, **__: object) -> None:
         pytest.fail("the work began")
 
-    for place in ("kf_calib.calibration.calibrate", "kf_calib.planner.plan", "kf_calib.experiment.repeat",
-                  "kf_calib.sources.live.open_live", "kf_calib.sources.lines.Lines.__iter__",
-                  "kf_calib.sources.simulator.Simulation.__iter__"):  # fmt: skip
+    for place in ("kf_calib.estimation.calibration.calibrate", "kf_calib.design.orientation_plan.plan",
+                  "kf_calib.reproduction.grebenkin2019.repeat",
+                  "kf_calib.sources.live.open_live", "kf_calib.sources.files.lines.Lines.__iter__",
+                  "kf_calib.sources.simulation.simulator.Simulation.__iter__"):  # fmt: skip
         monkeypatch.setattr(place, begun)
 
 
@@ -293,7 +294,7 @@ def test_one_file_that_fails_does_not_keep_others_from_being_written(
     def refuse(*_: object) -> None:
         raise InputError("no room for the journal.")
 
-    monkeypatch.setattr("kf_calib.journal.write", refuse)
+    monkeypatch.setattr("kf_calib.diagnosis.selection_journal.write", refuse)
     code, out, err = run("improve", "run.mcap", "--journal", "j.toml", "--save-model", "m.toml", "--unattended")
     assert code == 2 and err.count("no room") == 1 and "Stopped" in out and "saved m.toml" in out
     assert Path("m.toml").exists() and "saved j.toml" not in out
@@ -386,7 +387,7 @@ def test_of_two_that_begin_at_once_one_is_refused(tmp_path: Path, monkeypatch: p
     path = tmp_path / "run.mcap"
     if there:
         path.write_bytes(MINE)
-    monkeypatch.setattr("kf_calib.sources.recorder.refuse", lambda *_: None)
+    monkeypatch.setattr("kf_calib.sources.files.recorder.refuse", lambda *_: None)
     with Recorder(path, BENCH, overwrite=True) as recorder:
         second = Growing(path) if there else None
         with pytest.raises(InputError, match="being written by another run"):
@@ -461,7 +462,7 @@ def test_whatever_goes_wrong_is_one_sentence_and_exit_2(
     monkeypatch.setattr("kf_calib.views.console.summary", fail)
     code, out, err = run("replay", "run.mcap")
     assert code == 2 and out == "" and err.startswith("kf-calib: ") and says in err and err.count("\n") == 1
-    assert "kf_calib/cli/runs.py:" in err or isinstance(error, MemoryError)
+    assert "kf_calib/cli/evaluate.py:" in err or isinstance(error, MemoryError)
     monkeypatch.setenv("KF_CALIB_TRACEBACK", "1")
     code, _, err = run("replay", "run.mcap")
     assert code == 2 and "Traceback" in err and says in err.splitlines()[-1]

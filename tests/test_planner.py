@@ -13,23 +13,24 @@ import numpy as np
 import pytest
 from synthetic import Run
 
-from kf_calib import aims, paper
-from kf_calib.bench import Bench, axes_of
-from kf_calib.calibration import calibrate
-from kf_calib.designs import Scheme, Search
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.design import optimality_criteria
+from kf_calib.design.exact_design import Scheme, Search
+from kf_calib.design.gimbal_limits import Reach, ranges
+from kf_calib.design.orientation_plan import fewest, papers_sigma, plan
+from kf_calib.design.predicted_information import Prospect
+from kf_calib.design.visit_order import Timing, middles_s, order, slews_s, time_correlation
+from kf_calib.dwells.qr import triangle
 from kf_calib.errors import InputError, UnobservableError
-from kf_calib.planner import fewest, papers_sigma, plan
-from kf_calib.prospect import Prospect
-from kf_calib.reach import Reach, ranges
-from kf_calib.tour import Timing, middles_s, order, slews_s, time_correlation
-from kf_calib.triangle import triangle
+from kf_calib.estimation.calibration import calibrate
 
 G, SIGMA, READINGS = 9.81, 1e-4, 100
 BENCH = Bench(axes_of("yzx"), G)
 TIMING = Timing(30.0, 20.0)
-ANGLES = [k for k, unit in enumerate(paper.UNITS) if unit == "rad"]
-SCALES = [k for k, unit in enumerate(paper.UNITS) if unit == "1"]
-BIASES = [k for k, unit in enumerate(paper.UNITS) if unit == "m/s^2"]
+ANGLES = [k for k, unit in enumerate(paper_parameters.UNITS) if unit == "rad"]
+SCALES = [k for k, unit in enumerate(paper_parameters.UNITS) if unit == "1"]
+BIASES = [k for k, unit in enumerate(paper_parameters.UNITS) if unit == "m/s^2"]
 TABLE_2_OPTIMAL = [0.7152, 0.6555, 1.1370, 12.0713, 0.6982, 0.6816, 1.2563, 10.7666, 0.7201, 0.6652, 1.0919, 11.4856]
 
 
@@ -37,7 +38,12 @@ def prospect(**keys: float) -> Prospect:
     return Prospect.of_bench(Bench(axes_of("yzx"), G, **keys), SIGMA, READINGS, 30.0)
 
 
-def search(reach: Reach | None = None, aim: aims.Aim = aims.D, scheme: Scheme | None = None, **keys: float) -> Search:
+def search(
+    reach: Reach | None = None,
+    aim: optimality_criteria.Aim = optimality_criteria.D,
+    scheme: Scheme | None = None,
+    **keys: float,
+) -> Search:
     return Search(prospect(**keys), reach or Reach(BENCH), aim, scheme or Scheme())
 
 
@@ -77,15 +83,15 @@ def test_five_orientations_cannot_be_balanced_and_the_efficiency_says_so() -> No
 
 @pytest.mark.parametrize("name", ["A", "E", "minimax", "condition"])
 def test_every_criterion_has_the_balanced_set_for_its_optimum(name: str) -> None:
-    made = plan(search(aim=aims.NAMED[name]), 6, TIMING)
-    balanced = aims.NAMED[name](triangle(made.prospect.balanced(6).reshape(-1, 12)))
+    made = plan(search(aim=optimality_criteria.NAMED[name]), 6, TIMING)
+    balanced = optimality_criteria.NAMED[name](triangle(made.prospect.balanced(6).reshape(-1, 12)))
     assert made.cost == pytest.approx(math.exp(float(balanced)), rel=5e-3)
 
 
 def test_four_orientations_for_three_accelerometers_beat_the_papers_sets() -> None:
     """Angles, biases and generalised variance of Table 2's optimal column; its scale factors it does not."""
     made = plan(search(), 4, TIMING)
-    deviations = np.array([{"rad": math.radians(30 / 3600)}.get(unit, 5e-5) for unit in paper.UNITS])
+    deviations = np.array([{"rad": math.radians(30 / 3600)}.get(unit, 5e-5) for unit in paper_parameters.UNITS])
     percent = 100 * math.sqrt(2 / math.pi) * made.sigma[-1] / deviations
     assert (percent < TABLE_2_OPTIMAL)[ANGLES + BIASES].all()
     theirs = papers_sigma(made.prospect)
@@ -102,7 +108,7 @@ def test_four_orientations_for_three_accelerometers_beat_the_papers_sets() -> No
 @pytest.mark.parametrize("name", ["D", "A", "minimax"])
 def test_exchange_finds_what_brute_force_finds_on_a_small_grid(name: str) -> None:
     reach = Reach(BENCH, {1: (-60.0, 60.0), 2: (-45.0, 90.0)}, grid_deg=45.0)
-    tried = search(reach, aims.NAMED[name])
+    tried = search(reach, optimality_criteria.NAMED[name])
     rows = tried.candidate_rows
     every = np.array(list(itertools.combinations_with_replacement(range(len(rows)), 5)))
     stacked = rows[every].reshape(len(every), -1, 12)
@@ -119,7 +125,7 @@ def test_the_bound_of_limited_gimbals_is_above_all_designs_and_near_the_best() -
     for _ in range(20):
         poses = rng.uniform(-np.pi / 3, np.pi / 3, (12, 3))
         rows = limited.rows(poses)
-        assert -2 * float(aims.D(limited.factor(rows))) < limited.d_bound(rows)
+        assert -2 * float(optimality_criteria.D(limited.factor(rows))) < limited.d_bound(rows)
         assert limited.cost(poses) > limited.cost(made.poses)
 
 
@@ -208,31 +214,33 @@ def test_repeats_and_antipodes() -> None:
 
 def test_fewest_dwells_by_the_closed_form() -> None:
     wanted = SIGMA * math.sqrt(3 / (8.5 * READINGS)) / G
-    aim = aims.minimax(aims.tolerated((f"K={1e6 * wanted:.6f}ppm", f"angles={wanted!r}rad"), G))
+    aim = optimality_criteria.minimax(
+        optimality_criteria.tolerated((f"K={1e6 * wanted:.6f}ppm", f"angles={wanted!r}rad"), G)
+    )
     made = fewest(search(aim=aim), TIMING)
     assert len(made.poses) == 9 and made.cost <= 1.0
     with pytest.raises(InputError, match="need about"):
-        fewest(search(aim=aims.minimax(aims.tolerated(("K=0.001ppm",), G))), TIMING)
+        fewest(search(aim=optimality_criteria.minimax(optimality_criteria.tolerated(("K=0.001ppm",), G))), TIMING)
 
 
 def test_targets_in_the_units_of_the_field() -> None:
-    out = aims.tolerated(("K=2ppm", "b2=20ug", "theta1=0.1 arcsec", "nu=1e-6rad"), G)
-    named = dict(zip(paper.SYMBOLS, out, strict=True))
+    out = optimality_criteria.tolerated(("K=2ppm", "b2=20ug", "theta1=0.1 arcsec", "nu=1e-6rad"), G)
+    named = dict(zip(paper_parameters.SYMBOLS, out, strict=True))
     assert named["K1"] == named["K3"] == 2e-6 and named["b2"] == pytest.approx(20e-6 * 9.80665 / G)
     assert named["theta1"] == pytest.approx(math.radians(0.1 / 3600)) and named["nu2"] == 1e-6
     assert np.isinf(named["b1"]) and np.isinf(named["theta3"])
     for bad in ("Q=2ppm", "K=2arcsec", "K=-1ppm", "K", "b=ug"):
         with pytest.raises(InputError, match="target"):
-            aims.tolerated((bad,), G)
+            optimality_criteria.tolerated((bad,), G)
     with pytest.raises(InputError, match="AXIS=LOW:HIGH"):
         ranges("z=5:2", BENCH)
     with pytest.raises(InputError, match="not known"):
         ranges("w=1:2", BENCH)
 
 
-@pytest.mark.parametrize("name", list(aims.NAMED))
+@pytest.mark.parametrize("name", list(optimality_criteria.NAMED))
 def test_slopes_by_finite_differences(name: str) -> None:
-    rng, aim = np.random.default_rng(2), aims.NAMED[name]
+    rng, aim = np.random.default_rng(2), optimality_criteria.NAMED[name]
     factor, power = triangle(rng.normal(size=(40, 12))), aim.powers[0]
     change = rng.normal(size=(12, 12))
     change = 1e-6 * (change + change.T)
@@ -240,7 +248,7 @@ def test_slopes_by_finite_differences(name: str) -> None:
     def cost(sign: float) -> float:
         return float(aim(np.linalg.cholesky(np.eye(12) + sign * change).T @ factor, power))
 
-    got = float(np.sum(aims.slope(aim, factor, power) * change))
+    got = float(np.sum(optimality_criteria.slope(aim, factor, power) * change))
     assert got == pytest.approx(0.5 * (cost(1) - cost(-1)), rel=1e-4, abs=1e-12)
 
 
@@ -252,24 +260,26 @@ def eight():
 
 def test_next_orientation_starts_from_the_filters_covariance(eight) -> None:
     ahead = Prospect.after(eight.fit)
-    np.testing.assert_allclose(aims.sigmas(ahead.start) * ahead.units, eight.estimate.sigma, rtol=1e-6)
-    looking = Search(ahead, Reach(eight.bench), aims.NAMED["A"])
+    np.testing.assert_allclose(optimality_criteria.sigmas(ahead.start) * ahead.units, eight.estimate.sigma, rtol=1e-6)
+    looking = Search(ahead, Reach(eight.bench), optimality_criteria.NAMED["A"])
     spent = []
     for _ in range(5):
         begin = time.perf_counter()
-        made = plan(Search(ahead, Reach(eight.bench), aims.NAMED["A"]), 1, TIMING)
+        made = plan(Search(ahead, Reach(eight.bench), optimality_criteria.NAMED["A"]), 1, TIMING)
         _ = made.sigma
         spent.append(time.perf_counter() - begin)
     assert min(spent) < 0.1
     cost = looking.measure(made.poses)
     grid = np.radians(np.random.default_rng(0).uniform(-180, 180, (2000, 3)))
     assert cost <= min(looking.measure(pose[None]) for pose in grid) + 1e-3
-    assert (made.sigma[-1] < made.sigma[0] * (1 + 1e-9)).all() and made.cost < math.exp(float(aims.A(ahead.start)))
+    assert (made.sigma[-1] < made.sigma[0] * (1 + 1e-9)).all() and made.cost < math.exp(
+        float(optimality_criteria.A(ahead.start))
+    )
 
 
 def test_predicted_sigma_after_the_next_dwell_is_what_the_filter_then_has(eight) -> None:
     """The same recording with one more dwell, there."""
-    made = plan(Search(Prospect.after(eight.fit), Reach(eight.bench), aims.D), 1, TIMING)
+    made = plan(Search(Prospect.after(eight.fit), Reach(eight.bench), optimality_criteria.D), 1, TIMING)
     poses = np.vstack([np.random.default_rng(5).uniform(-0.6, 0.6, (8, 3)), made.poses])
     after = calibrate(Run(seed=4, dwells=9, poses=poses))
     np.testing.assert_allclose(made.sigma[-1], after.estimate.sigma, rtol=0.03)
@@ -289,10 +299,10 @@ def test_a_plan_is_run_by_the_simulator_and_its_sigmas_hold(run, tmp_path: Path)
     dwells = calibrate_file(out).fit.dwells
     np.testing.assert_allclose(np.degrees([each.pose for each in dwells]), made["gimbal_deg"], atol=0.01)
 
-    from kf_calib.sources.noise_sources import Noise
-    from kf_calib.sources.plans import explicit_plan
-    from kf_calib.sources.sensors import GRADES
-    from kf_calib.sources.simulator import Simulation
+    from kf_calib.sources.simulation.noise_processes import Noise
+    from kf_calib.sources.simulation.sensors import GRADES
+    from kf_calib.sources.simulation.simulator import Simulation
+    from kf_calib.sources.simulation.visit_plans import explicit_plan
 
     bench = Bench(axes_of("yzx"), G, angle_sigma_deg=0.001, scatter_sigma_mps2=0.0)
     visits, ratios = explicit_plan(made["gimbal_deg"], 5.0), []
@@ -301,14 +311,16 @@ def test_a_plan_is_run_by_the_simulator_and_its_sigmas_hold(run, tmp_path: Path)
         sensors = GRADES["navigation"].sensors(seed)
         source = Simulation(bench, sensors, noise, visits, sample_hz=50.0, slew_rate_degps=1000.0, seed=seed)
         found = calibrate(source)
-        truth = [sensors.parameters[symbol] for symbol in paper.SYMBOLS]
-        ratios.append((found.estimate.parameters - truth) / [made["sigma"][symbol] for symbol in paper.SYMBOLS])
+        truth = [sensors.parameters[symbol] for symbol in paper_parameters.SYMBOLS]
+        ratios.append(
+            (found.estimate.parameters - truth) / [made["sigma"][symbol] for symbol in paper_parameters.SYMBOLS]
+        )
     total = float(np.sum(np.square(ratios)))
     assert 0.75 * 360 < total < 1.25 * 360
 
 
 def calibrate_file(path: Path):
-    from kf_calib.sources.recording import Recording
+    from kf_calib.sources.files.recording import Recording
 
     return calibrate(Recording(path))
 

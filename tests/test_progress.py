@@ -12,13 +12,13 @@ import pytest
 from click.testing import CliRunner
 from synthetic import Run
 
-from kf_calib import stage
-from kf_calib.calibration import calibrate
 from kf_calib.cli import cli
 from kf_calib.cli.options import progress
-from kf_calib.comparison import compare
-from kf_calib.diagnosis import diagnose
-from kf_calib.improvement import improve
+from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.stepwise_selection import improve
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.engine_comparison import compare
+from kf_calib.support import stage
 
 FRAME = re.compile(r"[━╺] +(?:(\d+)% )?\d:\d\d:\d\d (.+?) *$")
 

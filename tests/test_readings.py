@@ -11,10 +11,10 @@ import pytest
 from long_runs import slow
 from synthetic import Run
 
-from kf_calib.calibration import calibrate, refitted
-from kf_calib.readings import Readings, clustering, common_step, missing_above
-from kf_calib.samples import Stream
-from kf_calib.sources.recording import Recording
+from kf_calib.bench.streams import Stream
+from kf_calib.estimation.calibration import calibrate, refitted
+from kf_calib.estimation.signal_quality import Readings, clustering, common_step, missing_above
+from kf_calib.sources.files.recording import Recording
 
 QUICK = ["--orientations", "24", "--dwell-s", "8", "--slew-degps", "360", "--sample-hz", "100", "--seed", "3"]
 FACES = np.array([(0, b, c) for b, c in itertools.product(np.radians([0.0, 90, 180, 270]), np.radians([0.0, 45, 90]))])

@@ -9,19 +9,21 @@ import pytest
 from scipy.interpolate import Akima1DInterpolator
 from synthetic import plan_of
 
-from kf_calib.assessment import candidates
-from kf_calib.bench import Bench, axes_of
-from kf_calib.calibration import Calibration, calibrate
-from kf_calib.diagnosis import diagnose, with_effects
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.diagnosis.candidate_tests import candidates
+from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.results import with_effects
+from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import effect_named
 from kf_calib.effects.stimulus import smooth_between
-from kf_calib.model import Model
-from kf_calib.scan import Frame, scan
-from kf_calib.sources.hidden import parse
-from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.sensors import GRADES
-from kf_calib.sources.simulator import Simulation
-from kf_calib.triangle import orthonormal
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.score_test import Frame, scan
+from kf_calib.sources.simulation.injected import parse
+from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
 
 BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
 

@@ -27,24 +27,26 @@ from long_runs import slow
 from synthetic import Run, plan_of
 from test_diagnosis import BENCH
 
-from kf_calib import standing
-from kf_calib.calibration import Pass, Settings, calibrate
+from kf_calib.bench.streams import Batch
 from kf_calib.cli import cli
 from kf_calib.cli.echo import Printer
 from kf_calib.cli.live import _targets
-from kf_calib.diagnosis import diagnose
+from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.dwells.sufficient_statistics import Folder
 from kf_calib.errors import InputError
-from kf_calib.folding import Folder
-from kf_calib.live import Session
-from kf_calib.samples import Batch
-from kf_calib.sources.hidden import parse
-from kf_calib.sources.hidden.detectability import sized
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.settings import Settings
+from kf_calib.online import status
+from kf_calib.online.session import Session
+from kf_calib.online.status import Judgement, current, judged, targets
+from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import Status
-from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.recording import Recording
-from kf_calib.sources.sensors import GRADES
-from kf_calib.sources.simulator import Simulation
-from kf_calib.standing import Judgement, current, judged, targets
+from kf_calib.sources.simulation.detectability import sized
+from kf_calib.sources.simulation.injected import parse
+from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.views import live as views
 from kf_calib.views.console import plain
 from kf_calib.views.json import replay_object
@@ -147,8 +149,8 @@ def test_the_look_into_a_dwell_takes_nothing_from_it() -> None:
 def test_candidates_are_tried_again_only_where_that_may_say_something_else(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where nothing is beyond chance only if somebody asks; then until three diagnoses agree, and as the run grows."""
     diagnosed = list[int]()
-    monkeypatch.setattr(standing, "diagnose", lambda result: diagnosed.append(len(result.visits)) or diagnose(result))
-    monkeypatch.setattr(standing, "assessed", lambda *_: pytest.fail("nobody has asked"))
+    monkeypatch.setattr(status, "diagnose", lambda result: diagnosed.append(len(result.visits)) or diagnose(result))
+    monkeypatch.setattr(status, "assessed", lambda *_: pytest.fail("nobody has asked"))
     judgements = judged_one_by_one(bench("second-order=15sigma", orientations=24))
     alarmed = [k for k, each in judgements.items() if each.watch is not None and each.watch.alarmed is not None]
     assert 5 < alarmed[0], (alarmed, diagnosed)

@@ -12,18 +12,21 @@ from scipy.stats import binom
 from synthetic import plan_of
 from test_effects import BENCH
 
-from kf_calib.bench import Bench
-from kf_calib.calibration import Calibration, Settings, calibrate
-from kf_calib.comparison import compare
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.dwells.line_spectrum import Line, Spectrum, lines
+from kf_calib.dwells.sufficient_statistics import less_curve
 from kf_calib.effects import checks, effect_named
-from kf_calib.folding import Carried, less_curve, stimulus_of
-from kf_calib.samples import Floats
-from kf_calib.scan import Frame, falls, scan
-from kf_calib.sources.hidden import parse
-from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.sensors import GRADES
-from kf_calib.sources.simulator import Simulation
-from kf_calib.spectrum import Line, Spectrum, lines
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.dwell_columns import Carried, stimulus_of
+from kf_calib.estimation.engine_comparison import compare
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.score_test import Frame, falls, scan
+from kf_calib.estimation.settings import Settings
+from kf_calib.sources.simulation.injected import parse
+from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
 
 SIGMA = 5e-5
 SHARES = (1.0, -0.6, 0.8)

@@ -9,16 +9,19 @@ import pytest
 from long_runs import slow
 from synthetic import plan_of
 
-from kf_calib.bench import Bench, axes_of
-from kf_calib.calibration import Calibration, Pass, Settings, calibrate
-from kf_calib.comparison import compare
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.dwells.slew_kinematics import Curve
 from kf_calib.errors import InputError
-from kf_calib.model import Model
-from kf_calib.slews import Curve
-from kf_calib.sources.hidden import parse
-from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.sensors import GRADES
-from kf_calib.sources.simulator import Simulation
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.engine_comparison import compare
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.settings import Settings
+from kf_calib.sources.simulation.injected import parse
+from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
 
 BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
 ARMS_M = [0.01, -0.02, 0.03, 0.015, 0.012, -0.011, 0.02, -0.01, 0.03]

@@ -8,7 +8,7 @@ from long_runs import slow
 from scipy.stats import chi2
 from synthetic import Run
 
-from kf_calib.calibration import calibrate
+from kf_calib.estimation.calibration import calibrate
 
 RUNS = 1000
 CASES = {

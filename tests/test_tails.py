@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import chdtrc, fdtrc
 
-from kf_calib.tails import chi_squared_tail, f_tail
+from kf_calib.support.tail_probabilities import chi_squared_tail, f_tail
 
 
 @pytest.mark.parametrize("freedom", [1, 2, 7, 60, 1000])

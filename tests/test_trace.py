@@ -11,8 +11,8 @@ from long_runs import slow
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from kf_calib.samples import Floats
-from kf_calib.trace import Cells, Trace, _kept, band_hz, tone
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.coherent_tone import Cells, Trace, _kept, band_hz, tone
 
 RATE_HZ, DWELL_S = 6.0, 58.0
 

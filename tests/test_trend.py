@@ -11,15 +11,17 @@ from scipy import stats
 from synthetic import plan_of
 from test_diagnosis_cases import BENCH, run
 
-from kf_calib.calibration import Calibration, calibrate
-from kf_calib.diagnosis import diagnose, with_effects
-from kf_calib.drivers import WITHIN
-from kf_calib.sources.sensors import GRADES
-from kf_calib.sources.simulator import Simulation
-from kf_calib.trend import Trend, shapes, trend, variances
+from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.results import with_effects
+from kf_calib.diagnosis.unknown_effect import WITHIN
+from kf_calib.diagnosis.within_dwell_trend import Trend, shapes, trend, variances
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.results import Calibration
+from kf_calib.online.sequential_test import Watch
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.views.console import plain
 from kf_calib.views.diagnosis import description, diagnosis_object, diagnosis_report
-from kf_calib.watch import Watch
 
 
 def found_in(result: Calibration) -> Trend:

@@ -11,14 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kf_calib import effects, journal, model_file
-from kf_calib.bench import Bench, axes_of
+from kf_calib import effects
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.bench.streams import Batch
 from kf_calib.cli import cli
+from kf_calib.diagnosis import selection_journal
 from kf_calib.errors import InputError
-from kf_calib.samples import Batch
-from kf_calib.sources.recorder import Recorder
-from kf_calib.sources.recording import Recording
-from kf_calib.text import LONGEST, cut, printable, sentence
+from kf_calib.estimation import model_file
+from kf_calib.sources.files.recorder import Recorder
+from kf_calib.sources.files.recording import Recording
+from kf_calib.support.plain_text import LONGEST, cut, printable, sentence
 
 ESCAPES = "\x1b[31m\x1b]0;title\x07\x9b2J\x7f\u202e[red]"
 ALARM = """
@@ -117,7 +119,7 @@ def test_the_rest_of_a_file_is_checked_first(received: Path, line: str) -> None:
 
 def test_in_python_too(received: Path) -> None:
     found = model_file.read(received / "model.toml")
-    assert journal.read(received / "journal.toml").origin.programs[0].path == received / "own.txt"
+    assert selection_journal.read(received / "journal.toml").origin.programs[0].path == received / "own.txt"
     with pytest.raises(InputError, match="would run"):
         found.load()
     assert not (received / "RAN").exists()

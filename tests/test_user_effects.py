@@ -16,9 +16,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kf_calib import effects, model_file
-from kf_calib.bench import Bench, axes_of
-from kf_calib.calibration import Settings, calibrate
+from kf_calib import effects
+from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.cli import main
 from kf_calib.effects import (
     FrameEffect,
@@ -35,13 +34,16 @@ from kf_calib.effects.checks import EXAMPLE, trial
 from kf_calib.effects.expression import LENGTH_LIMIT
 from kf_calib.effects.formula import Formula, quantities
 from kf_calib.errors import InputError
-from kf_calib.model import Model
-from kf_calib.sources.hidden import parse
-from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.physics import Ambient
-from kf_calib.sources.plans import spread_plan
-from kf_calib.sources.sensors import GRADES
-from kf_calib.sources.simulator import Simulation
+from kf_calib.estimation import model_file
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.settings import Settings
+from kf_calib.sources.simulation.injected import parse
+from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.physics import Ambient
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
+from kf_calib.sources.simulation.visit_plans import spread_plan
 from kf_calib.views.console import model_table, plain
 
 BENCH = checks.EXAMPLE
@@ -550,7 +552,7 @@ def test_a_users_own_effect_is_reported_on_at_once(run, recording: Path) -> None
 def test_a_bad_effect_is_refused_before_a_reading_is_read(
     run, recording: Path, monkeypatch: pytest.MonkeyPatch, command: str, effect: str, says: str
 ) -> None:
-    from kf_calib.sources.recording import Recording
+    from kf_calib.sources.files.recording import Recording
 
     monkeypatch.setattr(Recording, "__iter__", lambda self: pytest.fail("the recording was read"))
     place = ["--recording", recording] if command == "effects" else [recording]

@@ -10,12 +10,16 @@ from long_runs import slow
 from scipy.stats import chi2, multivariate_normal
 from synthetic import Run
 
-from kf_calib import information, walk
-from kf_calib.calibration import Calibration, Settings, calibrate
-from kf_calib.held_out import held_out
-from kf_calib.likelihood import restricted_log_likelihood
-from kf_calib.noise import mean_covariances, steps
-from kf_calib.samples import Floats, Stream
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.streams import Stream
+from kf_calib.dwells import walk_path
+from kf_calib.estimation import random_walk, square_root_information
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.cross_validation import held_out
+from kf_calib.estimation.noise_model import mean_covariances, steps
+from kf_calib.estimation.reml import restricted_log_likelihood
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.settings import Settings
 
 Q = 1e-5
 
@@ -50,7 +54,7 @@ def test_a_path_has_the_covariance_of_its_readings() -> None:
         orthogonal, upper = np.linalg.qr(np.column_stack([np.ones_like(u), u, u * u]))
         onto.append(orthogonal.T)
         triangles.append(upper)
-    path = walk.path(
+    path = walk_path.path(
         np.array([part[0] for part in parts]), np.array([part[-1] for part in parts]), [11, 7, 25], np.array(triangles)
     )
     full, project, first = covariance_at(times), np.zeros((9, len(times))), 0
@@ -198,10 +202,10 @@ def test_going_back_in_time_is_going_forward_on_reversed_dwells() -> None:
     rows, variances = fit.rows(), steps(fit.dwells, fit.noise)
     factor = np.zeros((12, 13))
     for own, variance in zip(rows[::-1], variances[::-1], strict=True):
-        factor = walk.receded(factor, variance, own)
-    forward = information.accumulated(rows, variances)[:-1]
+        factor = random_walk.receded(factor, variance, own)
+    forward = square_root_information.accumulated(rows, variances)[:-1]
     gains = [k for k in range(12) if k % 4 != 3]
-    one, other = (information.solve(each, np.zeros(12)) for each in (factor, forward))
+    one, other = (square_root_information.solve(each, np.zeros(12)) for each in (factor, forward))
     sigma = np.sqrt(np.diag(other[1]))[gains]
     np.testing.assert_allclose(one[0][gains] / sigma, other[0][gains] / sigma, rtol=0, atol=1e-6)
     covariances = (each[1][np.ix_(gains, gains)] / np.outer(sigma, sigma) for each in (one, other))

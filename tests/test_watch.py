@@ -8,12 +8,13 @@ from long_runs import slow
 from synthetic import Run
 from test_diagnosis import run
 
-from kf_calib.assessment import candidates
-from kf_calib.calibration import Calibration, calibrate
-from kf_calib.folding import Carried
-from kf_calib.running import Running
-from kf_calib.scan import scan
-from kf_calib.watch import Watch
+from kf_calib.diagnosis.candidate_tests import candidates
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.score_test import scan
+from kf_calib.online.running_filter import Running
+from kf_calib.online.sequential_test import Watch
 
 
 def quiet(seed: int, **kwargs: float) -> Calibration:

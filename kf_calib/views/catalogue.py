@@ -11,9 +11,9 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.effects import Effect, as_text, remarks_of
+from kf_calib.estimation.observability import Sight
 from kf_calib.views.console import effect_rows, symbol
 from kf_calib.views.tables import Table
-from kf_calib.visibility import Sight
 
 
 def overview(effects: Sequence[Effect]) -> RenderableType:

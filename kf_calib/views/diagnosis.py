@@ -8,12 +8,14 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib.advice import Advice
-from kf_calib.assessment import LEVEL, Detectable, detectable
-from kf_calib.calibration import format_p
-from kf_calib.diagnosis import Diagnosis, Suspect, next_orientation
-from kf_calib.drivers import Description, described
-from kf_calib.trend import Trend
+from kf_calib.design.next_orientation import Advice
+from kf_calib.diagnosis.candidate_tests import LEVEL, Detectable, detectable
+from kf_calib.diagnosis.missing_effect import next_orientation
+from kf_calib.diagnosis.results import Diagnosis, Suspect
+from kf_calib.diagnosis.unknown_effect import Description, described
+from kf_calib.diagnosis.within_dwell_trend import Trend
+from kf_calib.estimation.results import format_p
+from kf_calib.support.printing import printed
 from kf_calib.views.console import plain, rounded, symbol
 from kf_calib.views.json import clean, outlying_object, readings_object
 from kf_calib.views.tables import Table
@@ -164,6 +166,7 @@ def of_what_p_is(found: Diagnosis) -> list[str]:
     ]
 
 
+@printed.register
 def plain_report(found: Diagnosis) -> str:
     """The same as plain text."""
     return plain(diagnosis_report(found))

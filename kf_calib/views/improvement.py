@@ -11,11 +11,14 @@ from typing import Any
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib.calibration import Calibration, evaluated, format_p
-from kf_calib.diagnosis import Diagnosis, next_orientation
+from kf_calib.diagnosis.missing_effect import next_orientation
+from kf_calib.diagnosis.nested_cross_validation import Honest
+from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, Spread, Step, extended, stepped, undone
 from kf_calib.errors import InputError
-from kf_calib.improvement import Honest, Improvement, Removal, Spread, Step, extended, stepped, undone
-from kf_calib.text import sentence
+from kf_calib.estimation.calibration import evaluated
+from kf_calib.estimation.results import Calibration, format_p
+from kf_calib.support.plain_text import sentence
 from kf_calib.views.console import effect_table, parameter_table, rounded, symbol
 from kf_calib.views.diagnosis import description, description_object, of_what_p_is, orientation_object
 from kf_calib.views.json import clean

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from mcap.writer import Writer
 
-from kf_calib.bench import Bench, axes_of
-from kf_calib.samples import Batch, Source, Stream
-from kf_calib.sources import cdr
-from kf_calib.sources.recorder import Recorder
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.bench.streams import Batch, Source, Stream
+from kf_calib.sources.files import cdr
+from kf_calib.sources.files.recorder import Recorder
 
 START_NS = 1_750_000_000_123_456_789
 BENCH = Bench(axes_of("yzx"), gravity_mps2=9.8153, latitude_deg=59.9, angle_sigma_deg=0.01, nominal={"theta1": 0.0})

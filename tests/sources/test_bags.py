@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from made_recordings import ACCEL, ANGLES, BATCH, HEAT, Topic, assert_equal, read, write_officially
 
+from kf_calib.bench.streams import Stream
+from kf_calib.diagnosis.selection_journal import Origin
 from kf_calib.errors import InputError
-from kf_calib.journal import Origin
-from kf_calib.samples import Stream
-from kf_calib.sources.recording import Recording
+from kf_calib.sources.files.recording import Recording
 
 METADATA = """rosbag2_bagfile_information:
   version: 5

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from mcap_ros2._dynamic import serialize_dynamic
 
-from kf_calib.samples import Stream
-from kf_calib.sources import cdr
+from kf_calib.bench.streams import Stream
+from kf_calib.sources.files import cdr
 
 FRAMES = ["", "a", "ab", "accelerometer", "platform", "some/long_frame-é"]
 NAMES = [[], ["q"], ["outer", "inner"], ["outer", "middle", "inner"], ["a", "bb", "ccc", "dddd", "eeeee"]]

@@ -12,15 +12,17 @@ import numpy as np
 import pytest
 from long_runs import slow
 
-from kf_calib.bench import Bench, axes_of
+from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.errors import InputError
-from kf_calib.sources.hidden import Hidden, NoSizeError, catalogue, parse, sized, sizes_in_sigma
-from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.physics import Ambient
-from kf_calib.sources.plans import Visit, spread_plan
-from kf_calib.sources.recorder import Recorder
-from kf_calib.sources.sensors import GRADES, Sensors
-from kf_calib.sources.simulator import Simulation
+from kf_calib.sources.files.recorder import Recorder
+from kf_calib.sources.simulation.detectability import sized, sizes_in_sigma
+from kf_calib.sources.simulation.injected import Hidden, NoSizeError, catalogue, parse
+from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.physics import Ambient
+from kf_calib.sources.simulation.sensors import GRADES, Sensors
+from kf_calib.sources.simulation.simulator import Simulation
+from kf_calib.sources.simulation.truth import truth_of, write_truth
+from kf_calib.sources.simulation.visit_plans import Visit, spread_plan
 
 G = 9.81
 BENCH = Bench(axes=axes_of("yzx"), gravity_mps2=G, latitude_deg=50.0)
@@ -335,12 +337,12 @@ def test_truth_tells_the_size_of_every_effect_and_the_recording_none(tmp_path):
     with Recorder(path, BENCH) as recorder:
         for batch in run:
             recorder.write(batch)
-    effects = {effect["name"]: effect for effect in json.loads(run.write_truth(path).read_text())["effects"]}
+    effects = {effect["name"]: effect for effect in json.loads(write_truth(run, path).read_text())["effects"]}
     assert effects["second-order"]["size_sigma"] == pytest.approx(10, rel=0.01)
     assert effects["bias-drift"]["size_sigma"] == pytest.approx(size(bare, "bias-drift=2e-5"), rel=1e-9)
     assert effects["gravity-error"]["size_sigma"] is None and effects["outliers"]["size_sigma"] is None
     assert not any(word in path.read_bytes() for word in (b"second-order", b"sigma_", b"size", b"hidden", b"10sigma"))
-    assert simulation().truth["effects"] == []
+    assert truth_of(simulation())["effects"] == []
 
 
 def test_hiding_leaves_the_run_as_it_was():

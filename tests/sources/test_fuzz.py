@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from kf_calib.samples import Batch
+from kf_calib.bench.streams import Batch
 from kf_calib.sources.live import frames
 from kf_calib.sources.live.clock import Clock
 from kf_calib.sources.live.continuity import Continuity

@@ -11,17 +11,18 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from kf_calib.bench import Bench, axes_of, parse_axes
+from kf_calib.bench.bench import Bench, axes_of, parse_axes
+from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
-from kf_calib.samples import Batch
-from kf_calib.sources.hidden import FAMILIES, catalogue, parse, si
-from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.physics import Ambient
-from kf_calib.sources.plans import YZX, explicit_plan, spread_plan
-from kf_calib.sources.recorder import Recorder
-from kf_calib.sources.recording import Recording
-from kf_calib.sources.sensors import GRADES, Sensors
-from kf_calib.sources.simulator import START_NS, Simulation
+from kf_calib.sources.files.recorder import Recorder
+from kf_calib.sources.files.recording import Recording
+from kf_calib.sources.simulation.injected import FAMILIES, catalogue, parse, si
+from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.physics import Ambient
+from kf_calib.sources.simulation.sensors import GRADES, Sensors
+from kf_calib.sources.simulation.simulator import START_NS, Simulation
+from kf_calib.sources.simulation.truth import truth_of, write_truth
+from kf_calib.sources.simulation.visit_plans import YZX, explicit_plan, spread_plan
 
 G = 9.81
 BENCH = Bench(axes=axes_of("yzx"), gravity_mps2=G)
@@ -220,11 +221,11 @@ def test_the_truth_says_where_biases_have_walked_to(noise):
     plan, hidden = explicit_plan([(0, 0, 0)], 300.0), parse(["bias-walk=1e-3,0,2e-3"], BENCH.axes)
     run = Simulation(BENCH, ORTHOGONAL, noise, plan, sample_hz=4.0, seed=3, hidden=hidden, batch_samples=500)
     still = run.hiding((), QUIET)
-    truth = run.truth
+    truth = truth_of(run)
     moved = np.array([truth["parameters_at_end"][name] - truth["parameters"][name] for name in ("b1", "b2", "b3")])
     np.testing.assert_allclose(read(run).accel.values[-1] - read(still).accel.values[-1], moved, atol=1e-12)
     assert np.all(moved[[0, 2]] != 0.0) and bool(moved[1]) == bool(noise.walk_mps2_per_sqrt_s)
-    assert "parameters_at_end" not in still.truth
+    assert "parameters_at_end" not in truth_of(still)
 
 
 def test_vibration_is_seen_and_rectified():
@@ -531,7 +532,7 @@ def test_truth_tells_and_the_recording_does_not(tmp_path):
         with Recorder(path, BENCH) as recorder:
             for batch in simulation:
                 recorder.write(batch)
-        truth = json.loads(simulation.write_truth(path).read_text())
+        truth = json.loads(write_truth(simulation, path).read_text())
         recorded[label] = Recording(path).bench, truth["effects"]
         assert not any(word in path.read_bytes() for word in (b"second-order", b"harmonic", b"warm-up", b"hidden"))
     assert recorded["with"][0].to_metadata() == recorded["without"][0].to_metadata()

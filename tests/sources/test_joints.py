@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from made_recordings import ACCEL, BATCH, BENCH, made_batch, read, record, write_officially
 
-from kf_calib.bench import Bench, axes_of
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.bench.streams import Stream
 from kf_calib.errors import BenchError, InputError
-from kf_calib.samples import Stream
-from kf_calib.sources import cdr
-from kf_calib.sources.joints import Joints, JointsError
-from kf_calib.sources.lines import Lines
-from kf_calib.sources.recorder import Recorder
-from kf_calib.sources.recording import Recording
+from kf_calib.sources.files import cdr
+from kf_calib.sources.files.joints import Joints, JointsError
+from kf_calib.sources.files.lines import Lines
+from kf_calib.sources.files.recorder import Recorder
+from kf_calib.sources.files.recording import Recording
 
 POSE = BATCH.pose
 USUAL = ["outer", "middle", "inner"]

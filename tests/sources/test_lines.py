@@ -15,9 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
-from kf_calib.samples import Batch
-from kf_calib.sources.lines import Lines
+from kf_calib.sources.files.lines import Lines
 
 BENCH = {"axes": "y z x", "gravity_mps2": "9.81"}
 HEADER = "time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c"

@@ -26,19 +26,19 @@ from made_recordings import BENCH, START_NS, assert_equal, made_batch, read, str
 from mcap.reader import make_reader
 from serial.rfc2217 import PortManager
 
-from kf_calib.bench import Bench
-from kf_calib.calibration import calibrate
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
-from kf_calib.samples import Batch
-from kf_calib.sources.line_parts import Account
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.sources.files.line_parts import Account
+from kf_calib.sources.files.recorder import Recorder
+from kf_calib.sources.files.recording import GAP_RECORD, Recording
 from kf_calib.sources.live import LiveSource, Status, frames, open_live
 from kf_calib.sources.live.continuity import Continuity
 from kf_calib.sources.live.feed import Feed, Lost, Regained
 from kf_calib.sources.live.links import Link
 from kf_calib.sources.live.protocols import Protocol
 from kf_calib.sources.live.streamed import StreamedFeed
-from kf_calib.sources.recorder import Recorder
-from kf_calib.sources.recording import GAP_RECORD, Recording
 
 KEYS = {"axes": "y z x", "gravity_mps2": "9.81"}
 HEADER = "time_ns,ax_mps2,ay_mps2,az_mps2,outer_rad,middle_rad,inner_rad"

@@ -19,16 +19,16 @@ from hypothesis import strategies as st
 from made_recordings import START_NS, assert_equal, made_batch, read
 from test_live import HEADER, KEYS, Given, Script, csv_rows, joined, json_rows, numbers, scripted, wait_for
 
-from kf_calib.bench import Bench
-from kf_calib.calibration import calibrate
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError
-from kf_calib.samples import Batch, Stream
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import LiveSource, open_live
 from kf_calib.sources.live.clock import Clock
 from kf_calib.sources.live.links import Tcp
 from kf_calib.sources.live.streamed import StreamedFeed
-from kf_calib.sources.recording import Recording
-from kf_calib.sources.simulated import options_from_query, simulation
+from kf_calib.sources.simulation.options import options_from_query, simulation
 
 SECOND_NS = 1_000_000_000
 TCP_REPAIR = 19  # Linux: a connection under repair sends nothing

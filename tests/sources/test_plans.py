@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from long_runs import slow
 
-from kf_calib.bench import Bench, axes_of, parse_axes
+from kf_calib.bench.bench import Bench, axes_of, parse_axes
 from kf_calib.errors import InputError
-from kf_calib.sources.plans import YZX, explicit_plan, six_faces, spread_plan, up_directions
+from kf_calib.sources.simulation.visit_plans import YZX, explicit_plan, six_faces, spread_plan, up_directions
 
 OBLIQUE = parse_axes("1,1,0 z x")
 

@@ -25,14 +25,15 @@ from mcap.records import Channel
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 
-from kf_calib.bench import Bench, parse_axes
+from kf_calib.bench.bench import Bench, parse_axes
+from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError, InputError, KfCalibError
-from kf_calib.samples import Batch, Stream
-from kf_calib.sources import recorder as recorder_module
-from kf_calib.sources.contents import BENCH_RECORD, CHECKSUM_KEY
-from kf_calib.sources.mcap_file import HEAD, MAGIC
-from kf_calib.sources.recorder import Recorder
-from kf_calib.sources.recording import Recording
+from kf_calib.sources.files import recorder as recorder_module
+from kf_calib.sources.files.contents import BENCH_RECORD, CHECKSUM_KEY
+from kf_calib.sources.files.mcap_file import MAGIC
+from kf_calib.sources.files.mcap_messages import HEAD
+from kf_calib.sources.files.recorder import Recorder
+from kf_calib.sources.files.recording import Recording
 
 KILLS = int(os.environ.get("KF_CALIB_KILLS", "8"))
 

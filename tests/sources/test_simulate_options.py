@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from kf_calib.errors import InputError
-from kf_calib.sources.hidden import catalogue
-from kf_calib.sources.physics import Ambient
-from kf_calib.sources.recording import Recording
+from kf_calib.sources.files.recording import Recording
+from kf_calib.sources.simulation.injected import catalogue
+from kf_calib.sources.simulation.physics import Ambient
 
 QUICK = ["--orientations", "12", "--dwell-s", "6", "--slew-degps", "360", "--sample-hz", "20"]
 

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from scipy.signal import welch
 
-from kf_calib.bench import Bench, axes_of, parse_axes
+from kf_calib.bench.bench import Bench, axes_of, parse_axes
+from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.samples import Batch, Stream
-from kf_calib.sources.noise_sources import Noise
-from kf_calib.sources.plans import Visit, explicit_plan, six_faces, spread_plan
-from kf_calib.sources.sensors import GRADES, NOMINAL, Sensors
-from kf_calib.sources.simulator import START_NS, Ambient, Simulation
+from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.sensors import GRADES, NOMINAL, Sensors
+from kf_calib.sources.simulation.simulator import START_NS, Ambient, Simulation
+from kf_calib.sources.simulation.truth import write_truth
+from kf_calib.sources.simulation.visit_plans import Visit, explicit_plan, six_faces, spread_plan
 
 G = 9.81
 BENCH = Bench(axes=axes_of("yzx"), gravity_mps2=G)
@@ -333,14 +334,14 @@ def test_grades_draw_normal_deviations_of_their_size(name):
 def test_truth_goes_into_a_file_beside_the_recording(tmp_path):
     sensors = GRADES["navigation"].sensors(7)
     simulation = Simulation(BENCH, sensors, EVERYTHING, STILL, seed=7, grade="navigation")
-    path = simulation.write_truth(tmp_path / "run.mcap")
+    path = write_truth(simulation, tmp_path / "run.mcap")
     assert path == tmp_path / "run.truth.json"
     truth = json.loads(path.read_text())
     assert truth["parameters"] == dict(sensors.parameters)
     assert (truth["seed"], truth["grade"], truth["effects"]) == (7, "navigation", [])
     assert Noise(**truth["noise"]) == EVERYTHING
     with pytest.raises(KfCalibError, match="cannot be written"):
-        simulation.write_truth(tmp_path / "absent" / "run.mcap")
+        write_truth(simulation, tmp_path / "absent" / "run.mcap")
 
 
 @pytest.mark.parametrize(
