@@ -38,9 +38,9 @@ class Settings:
         if self.engine not in get_args(Engine):
             raise InputError(f"engine {self.engine!r} is not known: use {' or '.join(get_args(Engine))}.")
         if not isinstance(self.prior, Prior):
-            raise InputError(f'prior is {self.prior!r}: give a Prior, for example kf_calib.model.PRIORS["navigation"].')
+            raise InputError(f'prior is {self.prior!r}: give a Prior, for example kf_calib.estimation.prior.PRIORS["navigation"].')
         if not isinstance(self.stillness, Stillness):
-            raise InputError(f"stillness is {self.stillness!r}: give a kf_calib.stillness.Stillness.")
+            raise InputError(f"stillness is {self.stillness!r}: give a kf_calib.dwells.stationarity.Stillness.")
         if self.gate_sigma is not None:
             check_number("gate_sigma (--gate-sigma)", self.gate_sigma, 3.0)
         check_number("walk_mps2_per_sqrt_s (--bias-walk)", self.walk_mps2_per_sqrt_s)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
+from helpers.paths import ROOT
+from helpers.synthetic import Run
 from rich.console import RenderableType
-from synthetic import Run
 
 from kf_calib.bench.bench import Bench
 from kf_calib.cli.acquire import _hidden_table
@@ -34,7 +34,7 @@ from kf_calib.views import catalogue, console, diagnosis, improvement, live, pap
 from kf_calib.views import plan as plans
 from kf_calib.views.tables import Bar, Table
 
-HIDDEN = Path(__file__).parents[2] / "recordings" / "hidden.mcap"
+HIDDEN = ROOT / "recordings" / "hidden.mcap"
 BENCH = Bench.from_metadata({"axes": "y z x", "gravity_mps2": "9.81"})
 
 
