@@ -2,7 +2,7 @@
 
 The states are the paper's parameters about where they are thought to be, in rad, 1 and g, then the effects' in their
 scale. A row is divided by its noise: that of the readings, averaged over the dwell, and the setting error and scatter
-of the dwell (``noise.mean_covariances``).
+of the dwell (``noise_model.mean_covariances``).
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ class Prospect:
 
 
 def _less(factor: Floats, more: Floats) -> Floats:
-    """The factor (p, p) of the covariance P + P B P, B = ``more`` (p, p): what is considered only (``noise``)."""
+    """The factor (p, p) of the covariance P + P B P, B = ``more`` (p, p): what is considered only (``noise_model.considered``)."""
     if not more.any() or np.linalg.matrix_rank(
         square_root_information.scaled(np.column_stack([factor, factor[:, :1]]))[0]
     ) < len(factor):

@@ -2,7 +2,7 @@
 
 Scatter that was stated too small, or an orientation that was set worse than stated, looks like whatever effect comes
 nearest, and of many effects one comes near. Likelihoods say which of the two it is: that of scatter of any size against
-that of the effect, averaged over the directions and constants that it could have (``odds``).
+that of the effect, averaged over the directions and constants that it could have (``bayes_factor``).
 """
 
 from __future__ import annotations

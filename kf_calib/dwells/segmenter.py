@@ -1,6 +1,6 @@
 """Dwells: the stretches in which the platform stands still, cut from the raw streams as they arrive.
 
-What is still is judged on the platform angles (``stillness``). Where angles are absent during a motion (two messages
+What is still is judged on the platform angles (``stationarity``). Where angles are absent during a motion (two messages
 far apart in time and in angle) the readings decide where the one dwell ended and the next began, if they rest at all: a
 slew may be slow for messages that are seldom. Samples of a slew stay in the recording and out of the static fit; so do
 ``settle_s`` after each arrival and ``lead_s`` before each departure (of short dwells no more than a third and a tenth).

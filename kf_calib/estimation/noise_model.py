@@ -4,7 +4,7 @@ Three parts (all 1 sigma). sigma_w: the noise of a reading within a dwell, with 
 autocorrelation (kappa = spectral density at zero frequency / that of white noise of the same variance, so that the
 mean of n readings has variance kappa sigma_w^2 / n). sigma_alpha: the setting error, one small rotation a dwell, common
 to the three accelerometers. sigma_s: the scatter of each sensor from dwell to dwell. Each is stated or estimated
-(``likelihood``). Beside them the biases may walk at random, by q times the square root of the time.
+(``reml``). Beside them the biases may walk at random, by q times the square root of the time.
 """
 
 from __future__ import annotations

@@ -136,7 +136,7 @@ class Frame:
         return _key(effect) in map(_key, self.effects)
 
     def lines(self, level: float) -> tuple[Line, ...]:
-        """Oscillations in the readings of the dwells (``folding.lines_of``), whatever the model."""
+        """Oscillations in the readings of the dwells (``sufficient_statistics.lines_of``), whatever the model."""
         if level not in self._lines:
             self._lines[level] = lines_of(self.dwells, level)
         return self._lines[level]
@@ -288,7 +288,7 @@ def batches(sizes: Sequence[int], columns: int) -> list[list[int]]:
 def _judged(
     dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats, width: int
 ) -> tuple[list[Floats], int]:
-    """``information.judged`` with all rows that the dwells have."""
+    """``square_root_information.judged`` with all rows that the dwells have."""
     return square_root_information.judged(dwells, columns, noise, state, width, reduced=False)
 
 

@@ -38,7 +38,8 @@ class Settings:
         if self.engine not in get_args(Engine):
             raise InputError(f"engine {self.engine!r} is not known: use {' or '.join(get_args(Engine))}.")
         if not isinstance(self.prior, Prior):
-            raise InputError(f'prior is {self.prior!r}: give a Prior, for example kf_calib.estimation.prior.PRIORS["navigation"].')
+            known = 'kf_calib.estimation.prior.PRIORS["navigation"]'
+            raise InputError(f"prior is {self.prior!r}: give a Prior, for example {known}.")
         if not isinstance(self.stillness, Stillness):
             raise InputError(f"stillness is {self.stillness!r}: give a kf_calib.dwells.stationarity.Stillness.")
         if self.gate_sigma is not None:

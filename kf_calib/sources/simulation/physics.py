@@ -2,7 +2,7 @@
 
 A ``State`` goes through steps in three groups: the platform (angles -> attitude -> specific force), the response of the
 accelerometers (specific force -> input acceleration -> readings), and the recording (noise). They share no formula with
-the estimator. Hidden effects (``hidden``) are further steps between these.
+the estimator. Hidden effects (``injected``) are further steps between these.
 """
 
 from __future__ import annotations

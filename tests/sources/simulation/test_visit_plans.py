@@ -92,7 +92,10 @@ def test_an_empty_plan_is_refused():
 
 def test_a_plan_does_not_depend_on_the_processor() -> None:
     """The angle that moves no gravity is where it was drawn: kernels that round otherwise do not choose it."""
-    code = "from kf_calib.sources.simulation.visit_plans import spread_plan; print([v.gimbal_deg for v in spread_plan(12, seed=3)])"
+    code = (
+        "from kf_calib.sources.simulation.visit_plans import spread_plan; "
+        "print([v.gimbal_deg for v in spread_plan(12, seed=3)])"
+    )
     plans = [
         subprocess.run(
             [sys.executable, "-c", code], env={**os.environ, "OPENBLAS_CORETYPE": kernel}, capture_output=True,
