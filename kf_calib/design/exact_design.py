@@ -1,7 +1,8 @@
 """Exact designs: which orientations serve an aim best, and how far they are from the best that could be.
 
 A start by exchange over candidates, then scipy's L-BFGS-B over the continuous angles within their bounds. The slope
-comes from the aim as a function of the factor alone (``optimality_criteria.slope``), so that any aim can be planned for.
+comes from the aim as a function of the factor alone (``optimality_criteria.slope``), so that any aim can be planned
+for.
 
 D-optimality has a bound that needs no optimum (Kiefer and Wolfowitz, 1960): with M the information of any design of N
 dwells, M0 what is known already and I(x) the information of a dwell at x,

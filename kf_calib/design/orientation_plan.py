@@ -5,8 +5,8 @@
     made = plan(search, 12, Timing(dwell_s=30.0, slew_degps=20.0))
     made.gimbal_deg, made.sigma[-1], made.d_efficiency
 
-Whatever is a function of the information factor can be planned for (``optimality_criteria``); the sigmas predicted are those of the
-filter after each dwell, the dwells in their order.
+Whatever is a function of the information factor can be planned for (``optimality_criteria``); the sigmas predicted are
+those of the filter after each dwell, the dwells in their order.
 """
 
 from __future__ import annotations
@@ -217,7 +217,8 @@ def plan(search: Search, count: int, timing: Timing, seed: int = 0) -> Plan:
 
 
 def fewest(search: Search, timing: Timing, seed: int = 0, on_try: Callable[[int], None] = lambda count: None) -> Plan:
-    """The plan of fewest dwells whose aim, relative sigmas, is at most 1 (``optimality_criteria.minimax`` of what is tolerated)."""
+    """The plan of fewest dwells whose aim, relative sigmas, is at most 1 (``optimality_criteria.minimax`` of what is
+    tolerated)."""
     copies, tried = search.scheme.copies, dict[int, float]()
 
     def ratio(count: int) -> float:

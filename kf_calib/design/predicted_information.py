@@ -201,7 +201,8 @@ class Prospect:
 
 
 def _less(factor: Floats, more: Floats) -> Floats:
-    """The factor (p, p) of the covariance P + P B P, B = ``more`` (p, p): what is considered only (``noise_model.considered``)."""
+    """The factor (p, p) of the covariance P + P B P, B = ``more`` (p, p): what is considered only
+    (``noise_model.considered``)."""
     if not more.any() or np.linalg.matrix_rank(
         square_root_information.scaled(np.column_stack([factor, factor[:, :1]]))[0]
     ) < len(factor):

@@ -1,8 +1,9 @@
 """Which physical effect is missing: what the misfit says, and what it cannot say.
 
-The candidates of the catalogue are projected off the model (``score_test``) and tested together: the p-value of a suspect
-is that of the run, the chance that any of them would look as good with nothing missing. A suspect is named only where
-the model with it fits; where several fit equally well they are all named; where none does the answer is *unknown*.
+The candidates of the catalogue are projected off the model (``score_test``) and tested together: the p-value of a
+suspect is that of the run, the chance that any of them would look as good with nothing missing. A suspect is named only
+where the model with it fits; where several fit equally well they are all named; where none does the answer is
+*unknown*.
 """
 
 from __future__ import annotations

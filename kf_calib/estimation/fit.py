@@ -94,7 +94,8 @@ class Fit:
 
     @cached_property
     def families(self) -> dict[Any, Any]:
-        """The formulas that were tried on what this fit leaves (``unknown_effect.families``), by what else was tried."""
+        """The formulas that were tried on what this fit leaves (``unknown_effect.families``), by what else was
+        tried."""
         return {}
 
     @cached_property

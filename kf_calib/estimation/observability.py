@@ -1,6 +1,7 @@
 """What a run can say of an effect before anyone fits it: is it visible, how small may it be, what is it confused with.
 
-All from the columns, nothing from the misfit: the effect and the catalogue are projected off the model (``score_test``).
+All from the columns, nothing from the misfit: the effect and the catalogue are projected off the model
+(``score_test``).
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 The means of the readings of D dwells scatter about the model by V_d = diag(kappa sigma_w^2 / n + sigma_s^2) +
 sigma_alpha^2 S (|f|^2 I - f f^T) S^T; a walk of the biases by steps from one to the next. The squares of the sizes are
-the variances of ``restricted_likelihood``; of each mean less its share of the one before, a walk leaves those beside each other
-correlated, and no others.
+the variances of ``restricted_likelihood``; of each mean less its share of the one before, a walk leaves those beside
+each other correlated, and no others.
 """
 
 from __future__ import annotations

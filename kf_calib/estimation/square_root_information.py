@@ -134,8 +134,8 @@ def judged(
 ) -> tuple[list[Floats], int]:
     """Rows [H | W | G | z] by which a misfit is judged, and how many columns come before G (of the first ``width``: H).
 
-    W: what a stated scatter may have in common in dwells that follow each other (``noise_model.wander``); its coefficients
-    have a prior, the rows of which come first. Within dwells it may go on as 1/f noise does.
+    W: what a stated scatter may have in common in dwells that follow each other (``noise_model.wander``); its
+    coefficients have a prior, the rows of which come first. Within dwells it may go on as 1/f noise does.
     """
     slow, sigma = wander(dwells, noise)
     if not sigma.size:

@@ -1,8 +1,9 @@
 """A filter in the course of a run that takes effects in and out without a restart.
 
 Its factor [R | z] carries the columns of more effects than its model has. The estimate of any choice of them is one
-small QR (``square_root_information.restricted``), and equals that of a filter that had run with this choice from the start. A dwell
-that closes is one update of the factor; effects whose columns were not carried are folded in from the dwell factors.
+small QR (``square_root_information.restricted``), and equals that of a filter that had run with this choice from the
+start. A dwell that closes is one update of the factor; effects whose columns were not carried are folded in from the
+dwell factors.
 
     running = Running.over(dwells, model, noise, state, candidates)
     running = running.after(dwell)               # as each dwell closes

@@ -5,8 +5,8 @@ finite errors with gravity fixed, because two of its four orientations show the 
 where the platform is held in inertial space and the Earth turns gravity in it. How long the readings take, and where
 and which way the bench stands, the paper does not say: ``Conditions`` are inferred from Table 2, and marked so.
 
-Readings are nonlinear in the parameters (``paper_parameters.state_of``); least squares is the paper's, linear in the deviations
-with its D; the filter is the package's, on the affine state, without linearisation.
+Readings are nonlinear in the parameters (``paper_parameters.state_of``); least squares is the paper's, linear in the
+deviations with its D; the filter is the package's, on the affine state, without linearisation.
 """
 
 from __future__ import annotations
