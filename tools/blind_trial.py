@@ -441,7 +441,7 @@ def power(task: Task) -> Outcome:
 
     By the test that ``diagnose`` begins with; to name what it has noticed takes it most of its time.
     """
-    from kf_calib.diagnosis.candidate_tests import assessed
+    from kf_calib.diagnosis.candidate_tests import assess_candidates
 
     (name,) = task.hidden
     stated = stated_sizes(dataclasses.replace(task, hidden=()))
@@ -454,7 +454,7 @@ def power(task: Task) -> Outcome:
     path, times = Path("trial.mcap"), dict[str, float]()
     effects = simulated(dataclasses.replace(task, hidden=(f"{name}={','.join(sizes)}",)), path, times)["effects"]
     with _timed(times, "notice"):
-        test = assessed(calibrate(Recording(path)).fit)
+        test = assess_candidates(calibrate(Recording(path)).fit)
     extra = {"sizes": [effect["size_sigma"] for effect in effects], "size": size, "worst": worst}
     return Outcome(task, task.names, consistent=test.consistent, p_value=test.p_value, extra=extra, seconds=times)
 

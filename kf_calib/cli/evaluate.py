@@ -157,7 +157,7 @@ def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, option
     from kf_calib.effects import effect_named
     from kf_calib.effects import names as known
     from kf_calib.estimation.calibration import calibrate
-    from kf_calib.estimation.observability import sights
+    from kf_calib.estimation.observability import visibility_of
     from kf_calib.views import catalogue
     from kf_calib.views.json import clean
 
@@ -165,7 +165,7 @@ def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, option
     chosen = [effect_named(name, source.bench) for name in names or known(source.bench)]
     with progress(f"reading {recording.name}", as_json) as tick:
         result = calibrate(source, settings, tick)
-    seen = sights(result.fit, chosen)
+    seen = visibility_of(result.fit, chosen)
     if as_json:
         print_json(clean(catalogue.sights_object(seen, [str(effect) for effect in result.model.effects])))
     else:
@@ -265,7 +265,7 @@ def improve(
             if earlier is not None:
                 state, difference = selection_journal.replayed(earlier, start)
             elif interactive:
-                state = stepwise_selection.begun(start)
+                state = stepwise_selection.begin(start)
             else:
                 state = stepwise_selection.improve(start, accept_first, keep)
         if interactive:
@@ -274,7 +274,7 @@ def improve(
                 lambda: progress("improving"),
             )  # fmt: skip
         with progress("holding out orientations", as_json or not honest) as tick:
-            checked = nested_cross_validation.honest(start, on_fold=tick) if honest else None
+            checked = nested_cross_validation.nested_cross_validation(start, on_fold=tick) if honest else None
         if as_json:
             files = {"saved_model": save_model, "journal": journal_file}
             print_json(views.improvement_object(state, checked, difference, files))

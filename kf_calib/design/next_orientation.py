@@ -19,7 +19,7 @@ from kf_calib.estimation.dwell_columns import candidate_columns
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise, steps
-from kf_calib.estimation.square_root_information import accumulated, whitened
+from kf_calib.estimation.square_root_information import accumulate, whiten
 
 ENOUGH = 6.0
 """Sigma apart: of two equally likely the wrong one is taken once in a thousand, and more tells no more."""
@@ -214,6 +214,6 @@ def _with_next(
     model, state = carried.model, carried.state
     added = candidate_columns(carried.dwells, effects, model.bench, state)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
-    upper = accumulated(whitened(carried.dwells, columns, noise, state), steps(carried.dwells, noise))
+    upper = accumulate(whiten(carried.dwells, columns, noise, state), steps(carried.dwells, noise))
     prospect = replace(Prospect.following(fitted), noise=noise)
     return upper[:-1, :-1], np.array([prospect.columns(effects, poses, float(wait_s)) for wait_s in waits_s])

@@ -25,7 +25,7 @@ from kf_calib.estimation import random_walk, square_root_information
 from kf_calib.estimation.dwell_columns import Means
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model, effect_columns
-from kf_calib.estimation.noise_model import Noise, considered, lifted, mean_covariances
+from kf_calib.estimation.noise_model import Noise, considered_information, lift_rounding, mean_covariances
 from kf_calib.estimation.prior import Prior
 
 PAUSE_S = 60.0
@@ -104,8 +104,8 @@ class Prospect:
         first = square_root_information.start(prior or Prior(), carried.model)
         steps = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)
         waited = noise.walk_mps2_per_sqrt_s**2 * (made.pause_s + made.dwell_s / 3.0)
-        known = random_walk.predicted(steps[-1].factor, waited)[:, :-1]
-        more = considered(noise, carried.means, carried.state).sum(axis=0) + fitted.considered
+        known = random_walk.predict(steps[-1].factor, waited)[:, :-1]
+        more = considered_information(noise, carried.means, carried.state).sum(axis=0) + fitted.considered
         return replace(made, known=_less(known, more))
 
     @cached_property
@@ -170,7 +170,7 @@ class Prospect:
         count = len(stimulus)
         means = Means(design, np.zeros((count, 3)), stimulus.force_mps2, np.full(count, self.readings),
                       np.zeros((count, 2)))  # fmt: skip
-        root = np.linalg.cholesky(lifted(mean_covariances(self.noise, means, self.state)))
+        root = np.linalg.cholesky(lift_rounding(mean_covariances(self.noise, means, self.state)))
         return np.asarray(np.linalg.solve(root, design), float)
 
     def stimulus(self, poses: Floats, at_s: Floats | None = None) -> Stimulus:
@@ -202,9 +202,9 @@ class Prospect:
 
 def _less(factor: Floats, more: Floats) -> Floats:
     """The factor (p, p) of the covariance P + P B P, B = ``more`` (p, p): what is considered only
-    (``noise_model.considered``)."""
+    (``noise_model.considered_information``)."""
     if not more.any() or np.linalg.matrix_rank(
-        square_root_information.scaled(np.column_stack([factor, factor[:, :1]]))[0]
+        square_root_information.scale_columns(np.column_stack([factor, factor[:, :1]]))[0]
     ) < len(factor):
         return factor
     inverse = np.linalg.inv(factor)  # P = inverse inverse^T; P + P B P = inverse (1 + inverse^T B inverse) inverse^T

@@ -38,7 +38,7 @@ EQUAL = 6.63
 
 
 @functools.cache
-def lead(dof: int, tried: int = 1) -> float:
+def rival_margin(dof: int, tried: int = 1) -> float:
     """By so much noise lets an effect explain more than the one that is really missing, in 1 of 100 runs at most.
 
     tried: it is the best of so many values of its constant.
@@ -51,11 +51,11 @@ def lead(dof: int, tried: int = 1) -> float:
     return float(chdtri(dof, 0.01 / tried))
 
 
-def ahead_of(candidate: Candidate | None) -> float:
+def margin_of(candidate: Candidate | None) -> float:
     """The lead of a candidate, its constant being looked for, too; None: a walk, a line, of one number."""
     if candidate is None:
-        return lead(1)
-    return lead(candidate.dof + (candidate.effect.unknown is not None), candidate.tried)
+        return rival_margin(1)
+    return rival_margin(candidate.dof + (candidate.effect.unknown is not None), candidate.tried)
 
 
 _DRAWS = 4000
@@ -64,7 +64,7 @@ _FEWEST_WALKED = 8  # dwells: a walk of the biases is looked for in that many
 
 
 @dataclass(frozen=True)
-class Test:
+class CandidateTests:
     """All candidates against one fit: a candidate an effect, the best of the values where it has an unknown.
 
     scores: chi-squared falls less the threshold of their degrees of freedom: above zero is beyond chance.
@@ -88,7 +88,7 @@ class Test:
     lines: tuple[Line, ...]
     oscillating: str = ""
     vibration: tuple[Line, ...] = ()
-    without_lines: Test | None = None
+    without_lines: CandidateTests | None = None
     between: str = ""
     paths: float = 0.0
     trend: Trend | None = None
@@ -130,11 +130,11 @@ class Test:
         if name not in self.best:
             return self.scores[name]
         own, tests = self.candidate(name), self.effective_tests
-        return self.scores[name] + price(own, tests) - price(replace(own, tried=1), tests)
+        return self.scores[name] + chance_fall(own, tests) - chance_fall(replace(own, tried=1), tests)
 
     def rivals(self, first: str) -> list[str]:
         """Effects that noise could have let the first get ahead of, the likeliest first."""
-        ahead, out = ahead_of(self.candidate(first) if first in self.best else None), list[str]()
+        ahead, out = margin_of(self.candidate(first) if first in self.best else None), list[str]()
         for name in self.ranked:
             behind = self.scores[first] - self.nearness(name)
             if first in self.best and name in self.best:  # more coefficients cost what chance gives them, at most
@@ -168,7 +168,9 @@ def candidates(model: Model) -> list[Effect]:
     return out
 
 
-def assessed(fitted: Fit, tests: float | None = None, seed: int = 0, frames: list[Frame] | None = None) -> Test:
+def assess_candidates(
+    fitted: Fit, tests: float | None = None, seed: int = 0, frames: list[Frame] | None = None
+) -> CandidateTests:
     """Score tests of all candidates, calibrated on their own columns by drawing residuals as noise alone makes them.
 
     tests: as how many independent ones they count, where that is known from nearly the same columns. frames: where a
@@ -177,14 +179,14 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0, frames: lis
     from scipy.special import chdtrc
 
     model, agreed = fitted.carried.model, consistency(fitted)
-    frame = frame_of(fitted, [] if frames is None else frames)
+    frame = candidate_frame(fitted, [] if frames is None else frames)
     found = _scanned(fitted, frame)
     statistics = found.statistics
     tests = tests or independent_tests(found, seed)
     best, scores, p_values = dict[str, int](), dict[str, float](), dict[str, float]()
     for k, candidate in enumerate(found.candidates):
         name = str(candidate.effect)
-        score = float(statistics[k]) - price(candidate, tests) if candidate.dof else -np.inf
+        score = float(statistics[k]) - chance_fall(candidate, tests) if candidate.dof else -np.inf
         if name not in best or score > scores.get(name, -np.inf):
             best[name] = k
             if candidate.dof:
@@ -199,11 +201,11 @@ def assessed(fitted: Fit, tests: float | None = None, seed: int = 0, frames: lis
         paths = _beside_best(found, scores, tests) if beyond > 0.0 else 0.0
         scores[name] = beyond + paths
     slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
-    test = Test(found, best, scores, p_values, agreed.p_value, name, tests, slewing, (), paths=paths)
+    test = CandidateTests(found, best, scores, p_values, agreed.p_value, name, tests, slewing, (), paths=paths)
     return _with_lines(test, fitted, frame)
 
 
-def frame_of(fitted: Fit, frames: list[Frame]) -> Frame:
+def candidate_frame(fitted: Fit, frames: list[Frame]) -> Frame:
     """The columns of all candidates of the catalogue in the noise of a fit: those in ``frames``, where they serve."""
     carried, noise = fitted.carried, fitted.noise.judging
     for known in frames:
@@ -247,7 +249,7 @@ def _searched_hz(dwells: Sequence[DwellFactor]) -> tuple[float, float, float]:
     return *steady, first
 
 
-def _with_lines(test: Test, fitted: Fit, frame: Frame) -> Test:
+def _with_lines(test: CandidateTests, fitted: Fit, frame: Frame) -> CandidateTests:
     """The test with the lines of the spectrum: they speak for an oscillation, whatever of it is slow."""
     from scipy.special import chdtri
 
@@ -275,7 +277,7 @@ def _with_lines(test: Test, fitted: Fit, frame: Frame) -> Test:
     )
 
 
-def price(candidate: Candidate, tests: float) -> float:
+def chance_fall(candidate: Candidate, tests: float) -> float:
     """The fall of chi-squared that chance gives one of so many candidates.
 
     A constant looked for counts as one degree of freedom more, or, where it takes many tests, as these.
@@ -339,13 +341,13 @@ def _beside_best(found: Scan, scores: Mapping[str, float], tests: float) -> floa
     if not best or scores[best] <= 0.0:
         return 0.0
     own = values_of(found, best)
-    return for_all_paths(found, own, found.statistics[own], scores[best], tests)
+    return walk_path_margin(found, own, found.statistics[own], scores[best], tests)
 
 
-def for_all_paths(found: Scan, own: Sequence[int], falls: Floats, score: float, tests: float) -> float:
+def walk_path_margin(found: Scan, own: Sequence[int], falls: Floats, score: float, tests: float) -> float:
     """The same against the candidates ``own`` of one effect, by what each lowers chi-squared and the best one's score,
     alone or beside another effect."""
-    return score + threshold(1, tests) - worth(found, own, falls)
+    return score + threshold(1, tests) - evidence_as_fall(found, own, falls)
 
 
 def values_of(found: Scan, name: str) -> list[int]:
@@ -353,7 +355,7 @@ def values_of(found: Scan, name: str) -> list[int]:
     return [k for k, each in enumerate(found.candidates) if str(each.effect) == name and each.dof]
 
 
-def worth(found: Scan, own: Sequence[int], falls: Floats) -> float:
+def evidence_as_fall(found: Scan, own: Sequence[int], falls: Floats) -> float:
     """What it is worth beside a likelihood (``as_fall``) that the candidates ``own`` of one effect, at values of its
     constant, lower chi-squared by ``falls``."""
     each = [found.candidates[k] for k in own]
@@ -361,7 +363,7 @@ def worth(found: Scan, own: Sequence[int], falls: Floats) -> float:
     return as_fall(np.array([one.dof for one in each]), falls, tried)
 
 
-def worth_together(found: Scan, own: Sequence[int]) -> float:
+def joint_evidence_as_fall(found: Scan, own: Sequence[int]) -> float:
     """The same of effects together, each at one value of its constant, the best of all of them."""
     each = [found.candidates[k] for k in own]
     fall, dof = found.explained(np.concatenate([one.basis for one in each], axis=1))
@@ -384,7 +386,7 @@ class Detectable:
     shown_unit: str
 
 
-def detectable(test: Test) -> list[Detectable]:
+def detectable(test: CandidateTests) -> list[Detectable]:
     """Of every visible effect, from the columns alone."""
     from scipy.special import chdtri, chndtrinc
 

@@ -21,10 +21,10 @@ from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.bayes_factor import as_fall
 from kf_calib.diagnosis.candidate_tests import (
     EQUAL,
-    Test,
-    assessed,
-    frame_of,
-    price,
+    CandidateTests,
+    assess_candidates,
+    candidate_frame,
+    chance_fall,
     threshold,
 )
 from kf_calib.diagnosis.effect_pairs import (
@@ -32,31 +32,31 @@ from kf_calib.diagnosis.effect_pairs import (
     WALKS,
     Pair,
     Pairs,
-    alike,
-    as_good,
-    exchanged,
-    likeliest,
+    candidate_overlap,
+    candidate_pairs,
+    equal_pairs,
+    exchangeable_effects,
+    likeliest_pairs,
     names_of,
-    pairs_of,
-    paths_beside,
+    walk_path_margin_beside,
 )
-from kf_calib.diagnosis.refit_checks import comes_back_s, fits_the_run
+from kf_calib.diagnosis.refit_checks import fits_the_run, restoring_time_s
 from kf_calib.diagnosis.results import Diagnosis, Suspect, with_effects
 from kf_calib.diagnosis.scatter_hypothesis import (
-    as_if_stated,
-    as_scatter,
-    beyond_any_path,
-    beyond_scatter,
-    is_stated,
-    may_scatter,
-    quietest,
+    could_be_scatter,
+    dwell_noise_is_stated,
+    explains_more_than_scatter,
+    least_noisy,
+    passes_f_test,
+    scatter_is_possible,
+    with_noise_as_stated,
 )
 from kf_calib.diagnosis.unknown_effect import JUMP, Family, families
 from kf_calib.diagnosis.verdict import verdict_in_words
 from kf_calib.dwells import window_average
 from kf_calib.effects import walk_named
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.outlying_dwell import in_words
+from kf_calib.estimation.outlying_dwell import outlying_in_words
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.estimation.score_test import scan
 
@@ -73,10 +73,10 @@ def diagnose(run: Calibration | Source | str | PathLike[str]) -> Diagnosis:
 
 def _diagnosed(before: Calibration) -> Diagnosis:
     if before.outlying:  # a dwell that is wrong is no effect, and looks like many
-        test = assessed(before.fit, frames=before.frames)
-        verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {in_words(before.outlying)}"
+        test = assess_candidates(before.fit, frames=before.frames)
+        verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {outlying_in_words(before.outlying)}"
         return Diagnosis(before, test, (), (), test.consistent is False, (), {}, None, verdict)
-    test = _without_vibration(before, assessed(before.fit, frames=before.frames))
+    test = _without_vibration(before, assess_candidates(before.fit, frames=before.frames))
     found = _explained(before, test)
     if found.unknown and test.without_lines:  # of one phase all along and not of one amplitude
         test = test.without_lines
@@ -84,17 +84,17 @@ def _diagnosed(before: Calibration) -> Diagnosis:
     if test.vibration and not before.fit.dwells[0].averaged and before.reread is not None:
         window_s = window_average.window_s(test.vibration)
         rested = before.reread(replace(before.settings, window_s=window_s))
-        still = assessed(rested.fit, frames=rested.frames)
+        still = assess_candidates(rested.fit, frames=rested.frames)
         still = still.without_lines or still  # what the windows let through is vibration, too
         found = _explained(rested, replace(still, vibration=test.vibration))
-    found = replace(found, back_s=comes_back_s(found))
+    found = replace(found, back_s=restoring_time_s(found))
     return replace(found, verdict=verdict_in_words(found))
 
 
-def _explained(before: Calibration, test: Test) -> Diagnosis:
+def _explained(before: Calibration, test: CandidateTests) -> Diagnosis:
     """What explains the misfit, one effect or two, and what could as well; or nothing does."""
     found = _or_walk(_likeliest(before, test))
-    if test.consistent is not False or is_stated(before):
+    if test.consistent is not False or dwell_noise_is_stated(before):
         return found
     return _told_in_its_noise(found)
 
@@ -105,13 +105,17 @@ def _told_in_its_noise(found: Diagnosis) -> Diagnosis:
     Estimated without it, or left out, the noise is another, and what is little in one is much in the other.
     """
     before, test = found.before, found.test
-    fitting = [s.refit for s in found.suspects if s.fits and beyond_scatter(before, test, (s.name,), s.refit)]
+    fitting = [
+        s.refit for s in found.suspects if s.fits and explains_more_than_scatter(before, test, (s.name,), s.refit)
+    ]
     formulas = [with_effects(before, each.formulas) for _, each in _formulas(found)[:1]]
-    refit = quietest([*([found.after] if found.after else []), *fitting, *formulas])
+    refit = least_noisy([*([found.after] if found.after else []), *fitting, *formulas])
     if refit is None or not (found.missing or found.unknown or fitting):
         return found
-    stated = as_if_stated(before, refit)
-    again = _or_walk(_likeliest(stated, _without_vibration(stated, assessed(stated.fit, frames=stated.frames))))
+    stated = with_noise_as_stated(before, refit)
+    again = _or_walk(
+        _likeliest(stated, _without_vibration(stated, assess_candidates(stated.fit, frames=stated.frames)))
+    )
     if not (again.missing or again.unknown):
         return found
     suspects = tuple(replace(each, refit=found.refit_with(each.name)) for each in again.suspects)
@@ -119,7 +123,7 @@ def _told_in_its_noise(found: Diagnosis) -> Diagnosis:
     return replace(again, before=before, judged=stated, suspects=suspects, after=after)
 
 
-def _likeliest(before: Calibration, test: Test) -> Diagnosis:
+def _likeliest(before: Calibration, test: CandidateTests) -> Diagnosis:
     """One effect or two that explain the misfit, and those that look like them."""
     nothing = Diagnosis(before, test, (), (), False, (), {}, None, "")
     if test.consistent is not False:
@@ -130,9 +134,9 @@ def _likeliest(before: Calibration, test: Test) -> Diagnosis:
     leading = [test.scores[each.name] for each in suspects if each.fits or each.name != test.walking]
     least = max(leading, default=0.0) - 2.0 * EQUAL
     fitting = [each for each in suspects if each.fits and test.scores[each.name] > least]
-    explaining = [each for each in fitting if beyond_scatter(before, test, (each.name,), each.refit)]
+    explaining = [each for each in fitting if explains_more_than_scatter(before, test, (each.name,), each.refit)]
     found = replace(nothing, suspects=suspects, as_scatter=bool(fitting) and not explaining)
-    pairs = pairs_of(test) if not explaining or explaining[0].name in (*test.best, test.walking) else {}
+    pairs = candidate_pairs(test) if not explaining or explaining[0].name in (*test.best, test.walking) else {}
     if explaining:
         first = explaining[0].name
         clearly = _clearly_better(found, pairs, first)
@@ -140,7 +144,7 @@ def _likeliest(before: Calibration, test: Test) -> Diagnosis:
         standing = (each for each in (explaining[0], *walks) if not _is_outdone(found, each))
         return _two(found, clearly, first) or _one(found, next(standing, None), pairs)
     several = _two(found, pairs | _pairs_with_walk(found, pairs)) or _beside_lines(found)
-    return several or replace(found, unknown=not may_scatter(before))
+    return several or replace(found, unknown=not scatter_is_possible(before))
 
 
 def _clearly_better(found: Diagnosis, pairs: Pairs, first: str) -> Pairs:
@@ -162,7 +166,7 @@ def _or_walk(found: Diagnosis) -> Diagnosis:
     walk = walk_named(model.bench)
     if not walk or not found.missing or model.walks or walk in found.ambiguity:
         return found
-    if beyond_any_path(found.before, found.test, found.missing):
+    if passes_f_test(found.before, found.test, found.missing):
         return found
     alone = walk if len(found.missing) > 1 else ""
     return replace(found, ambiguity=(*found.ambiguity, walk), overlaps={**found.overlaps, walk: 1.0}, alone=alone)
@@ -174,7 +178,7 @@ def _beside_lines(found: Diagnosis) -> Diagnosis | None:
     if not test.oscillating:
         return None
     known = found.refit_with(test.oscillating)
-    rest = _explained(known, assessed(known.fit, test.effective_tests, frames=found.before.frames))
+    rest = _explained(known, assess_candidates(known.fit, test.effective_tests, frames=found.before.frames))
     if not rest.missing:
         return None
     both = (*rest.missing, test.oscillating)
@@ -186,7 +190,7 @@ def _beside_lines(found: Diagnosis) -> Diagnosis | None:
     )  # fmt: skip
 
 
-def _without_vibration(before: Calibration, test: Test) -> Test:
+def _without_vibration(before: Calibration, test: CandidateTests) -> CandidateTests:
     """The test as it is where an oscillation of one amplitude explains its lines; else they are vibration."""
     if test.without_lines is None:
         return test
@@ -216,11 +220,13 @@ def _one(found: Diagnosis, first: Suspect | None, pairs: Pairs) -> Diagnosis:
     close = test.rivals(first.name)
     close += [name for name in test.holding(first.name) if name not in close]
     numbers = {name: test.best.get(name, WALKS) for name in (first.name, *close)}  # a walk, a line: no columns
-    overlaps = {name: alike(test, numbers[first.name], numbers[name]) for name in close if name != first.name}
+    overlaps = {
+        name: candidate_overlap(test, numbers[first.name], numbers[name]) for name in close if name != first.name
+    }
     overlaps = {name: overlap for name, overlap in overlaps.items() if overlap > _ALIKE}
     single = replace(found, missing=(first.name,), ambiguity=(first.name, *overlaps), overlaps=overlaps)
-    single = replace(single, as_scatter=as_scatter(found.before, test, (first.name,), first.refit))
-    together = as_good(test, pairs, test.scores[first.name], {first.name})
+    single = replace(single, as_scatter=could_be_scatter(found.before, test, (first.name,), first.refit))
+    together = equal_pairs(test, pairs, test.scores[first.name], {first.name})
     return replace(_beside(single, [pair for pair in together if _both_fit(found, pair)]), after=first.refit)
 
 
@@ -243,7 +249,7 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
     effects = [effect for effect in refit.model.effects if str(effect) in names and not effect.walks]
     scanned = scan(fitted.carried, fitted.noise.judging, effects)
     own, _ = scanned.explained(np.concatenate([each.basis for each in scanned.candidates], axis=1))
-    own -= sum(price(each, tests) for each in scanned.candidates)
+    own -= sum(chance_fall(each, tests) for each in scanned.candidates)
     if found.test.walking in names:
         own += 2.0 * refit.fit.walk_gain - threshold(1, tests)
     better = [each for gain, each in _formulas(found) if gain > own + EQUAL]
@@ -256,7 +262,7 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
 def _refits_compare(found: Diagnosis, names: Sequence[str]) -> bool:
     """Whether refits have one noise, so that it can be said what each leaves: what is large is not linear, and a scan
     that says what each would lower chi-squared by is off by many times what noise does."""
-    return is_stated(found.before) and all(name in found.test.best for name in names)
+    return dwell_noise_is_stated(found.before) and all(name in found.test.best for name in names)
 
 
 def _clearly_less_left(found: Diagnosis, refit: Calibration, names: Sequence[str], alone: str) -> bool:
@@ -269,7 +275,7 @@ def _clearly_less_left(found: Diagnosis, refit: Calibration, names: Sequence[str
 def _left(found: Diagnosis, refit: Calibration, names: Sequence[str], dof: int = 0) -> float:
     """Chi-squared that effects, and a formula of ``dof``, leave, and what chance would have lowered it by."""
     test = found.test
-    prices = [price(test.candidate(name), test.effective_tests) for name in names]
+    prices = [chance_fall(test.candidate(name), test.effective_tests) for name in names]
     return refit.consistency.statistic + sum(prices) + (threshold(dof, test.effective_tests) if dof else 0.0)
 
 
@@ -279,7 +285,7 @@ def _formulas(found: Diagnosis) -> list[tuple[float, Family]]:
     test = found.test
     known = [test.candidate(name).effect for name in test.best]
     fitted = found.before.fit
-    frame = frame_of(fitted, found.before.frames)
+    frame = candidate_frame(fitted, found.before.frames)
     tried = [each for each in families(fitted, known, frame) if each.dof and not each.known]
     out = [(each.fall - threshold(each.dof, test.effective_tests), each) for each in tried]
     return sorted(out, key=lambda each: -each[0])
@@ -310,20 +316,22 @@ def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:
     alone: a single one that would do, if not as well; a walk can take any path, so it stays in the set.
     """
     test = found.test
-    for pair in likeliest(test, pairs):
+    for pair in likeliest_pairs(test, pairs):
         both = names_of(test, pair)
         refit = with_effects(found.before, both)
         if alone and not _clearly_less_left(found, refit, both, alone):
             continue
-        if not (beyond_scatter(found.before, test, both, refit) and fits_the_run(refit, test, len(both))):
+        if not (explains_more_than_scatter(found.before, test, both, refit) and fits_the_run(refit, test, len(both))):
             continue
         if _outdone(found, refit, both):
             return None
         walks = bool(alone) and alone == test.walking and alone not in both
-        overlaps = ({alone: 1.0} if walks else {}) | exchanged(test, pairs, pair, _ALIKE)
+        overlaps = ({alone: 1.0} if walks else {}) | exchangeable_effects(test, pairs, pair, _ALIKE)
         named = replace(found, missing=both, ambiguity=(*both, *overlaps), overlaps=overlaps, after=refit)
-        named = replace(named, alone=alone if walks else "", as_scatter=as_scatter(found.before, test, both, refit))
-        return _beside(named, as_good(test, pairs, pairs[pair], both))
+        named = replace(
+            named, alone=alone if walks else "", as_scatter=could_be_scatter(found.before, test, both, refit)
+        )
+        return _beside(named, equal_pairs(test, pairs, pairs[pair], both))
     return None
 
 
@@ -337,19 +345,19 @@ def _pairs_with_walk(found: Diagnosis, pairs: Pairs, beyond: bool = False) -> di
     if not test.walking:
         return {}
     candidates, tests, out = test.scan.candidates, test.effective_tests, dict[Pair, float]()
-    beside = assessed(found.refit_with(test.walking).fit, tests, frames=found.before.frames)
+    beside = assess_candidates(found.refit_with(test.walking).fit, tests, frames=found.before.frames)
     least = test.scores[test.walking] - test.paths + (EQUAL if beyond else 0.0)
     likely = [name for name in beside.ranked if name in test.best and (beside.scores[name] > 0.0 or not beyond)]
     for name in likely[:MOST]:
         k = test.best[name]
-        own = float(test.scan.statistics[k]) - price(candidates[k], tests)
+        own = float(test.scan.statistics[k]) - chance_fall(candidates[k], tests)
         walk = 2.0 * with_effects(before, (name, test.walking)).fit.walk_gain - threshold(1, tests)
         if walk > 0.0 and own + walk > least:
-            out[k, WALKS] = own + walk + paths_beside(test, pairs, k)
+            out[k, WALKS] = own + walk + walk_path_margin_beside(test, pairs, k)
     return out
 
 
-def _suspects(before: Calibration, test: Test) -> tuple[Suspect, ...]:
+def _suspects(before: Calibration, test: CandidateTests) -> tuple[Suspect, ...]:
     """The likeliest candidates, each refitted and judged anew."""
     out = list[Suspect]()
     for name in [name for name in test.ranked if test.scores[name] > 0][:_SHOWN]:

@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.stepwise_selection import improve
-from kf_calib.dwells.sufficient_statistics import without
+from kf_calib.dwells.sufficient_statistics import dwells_without
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.calibration import evaluate
 from kf_calib.estimation.cross_validation import orientations
@@ -20,7 +20,7 @@ from kf_calib.estimation.results import Calibration
 
 
 @dataclass(frozen=True)
-class Honest:
+class NestedCrossValidation:
     """The held-out error with everything done anew without what is held out, the choice of the effects too.
 
     expected_mps2: what noise alone would give. chosen: in how many of the ``folds`` each effect was in the last model.
@@ -32,7 +32,9 @@ class Honest:
     chosen: dict[str, int]
 
 
-def honest(start: Calibration, folds: int = 6, on_fold: Callable[[float], None] | None = None) -> Honest:
+def nested_cross_validation(
+    start: Calibration, folds: int = 6, on_fold: Callable[[float], None] | None = None
+) -> NestedCrossValidation:
     """Leave out every ``folds``-th orientation, improve on the others, predict it; each is left out once.
 
     Of equal explanations the first is taken: they predict alike, and a fold that stopped to ask would predict nothing.
@@ -44,7 +46,7 @@ def honest(start: Calibration, folds: int = 6, on_fold: Callable[[float], None] 
     for number in range(folds):
         left = sorted(k for group in groups[number::folds] for k in group)
         with threadpool_limits(1, user_api="blas"):
-            kept = evaluate(without(start.fit.dwells, left), start.bench, start.settings, start.carried.slews)
+            kept = evaluate(dwells_without(start.fit.dwells, left), start.bench, start.settings, start.carried.slews)
         result = improve(kept, accept_first=True).result
         squares, variances = _predicted(start, result, left)
         errors.append(squares)
@@ -54,7 +56,7 @@ def honest(start: Calibration, folds: int = 6, on_fold: Callable[[float], None] 
         if on_fold is not None:
             on_fold((number + 1) / folds)
     rms, floor = (float(np.sqrt(np.mean(np.concatenate(own)))) for own in (errors, expected))
-    return Honest(rms, floor, folds, counts)
+    return NestedCrossValidation(rms, floor, folds, counts)
 
 
 def _predicted(start: Calibration, result: Calibration, left: list[int]) -> tuple[Floats, Floats]:

@@ -10,19 +10,19 @@ from kf_calib.diagnosis.candidate_tests import (
     EQUAL,
     LEVEL,
     SHARE,
-    Test,
-    assessed,
+    CandidateTests,
+    assess_candidates,
     run_level,
 )
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.estimation.fit import behind_within
+from kf_calib.estimation.fit import loss_within_range
 from kf_calib.estimation.results import Calibration
 
 _REFUSED = 0.002  # chance that what is really missing is turned down because noise beside it looks like something more
 _NEARLY = 2.71  # of chi-squared, of one constant: 10 %
 
 
-def fits_the_run(refit: Calibration, before: Test, added: int = 1) -> bool:
+def fits_the_run(refit: Calibration, before: CandidateTests, added: int = 1) -> bool:
     """Whether nothing is left that noise would not leave, by means an effect of that kind has.
 
     A walk, or two effects ``added`` at once, can take up most of what is neither: what is left is judged more strictly.
@@ -31,7 +31,7 @@ def fits_the_run(refit: Calibration, before: Test, added: int = 1) -> bool:
     least = LEVEL if walks else _REFUSED
     if (misfit is not None and misfit < SHARE * least) or (walks and _no_walk(refit)) or _at_an_end(refit):
         return False
-    left = assessed(refit.fit, before.effective_tests, frames=refit.frames)
+    left = assess_candidates(refit.fit, before.effective_tests, frames=refit.frames)
     if left.trend and misfit is not None:
         free = walks or added > 1
         if _together(misfit, left.trend.p_value) < SHARE * (LEVEL if free else _REFUSED):
@@ -51,7 +51,7 @@ def _at_an_end(refit: Calibration) -> bool:
     another, simpler effect is meant then."""
     for effect in refit.model.effects:
         known = effect.unknown is None or effect.unknown.low * 1.01 < effect.value < effect.unknown.high * 0.99
-        if not known and behind_within(refit.fit, effect) > _NEARLY:
+        if not known and loss_within_range(refit.fit, effect) > _NEARLY:
             return True
     return False
 
@@ -67,7 +67,7 @@ def _no_walk(refit: Calibration) -> bool:
     return leaps or 2.0 * refit.fit.back_gain[0] > EQUAL
 
 
-def comes_back_s(found: Diagnosis) -> float | None:
+def restoring_time_s(found: Diagnosis) -> float | None:
     """The time constant with which what is taken for a walk more likely comes back, s, where that is not too likely for
     a walk: of walks one in twenty looks so."""
     if found.after is None or not found.after.noise.walk_mps2_per_sqrt_s or found.test.walking not in found.missing:

@@ -9,7 +9,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.candidate_tests import (
-    Test,
+    CandidateTests,
 )
 from kf_calib.estimation.calibration import refitted
 from kf_calib.estimation.noise_model import mean_covariances
@@ -51,7 +51,7 @@ class Diagnosis:
     """
 
     before: Calibration
-    test: Test
+    test: CandidateTests
     suspects: tuple[Suspect, ...]
     missing: tuple[str, ...]
     unknown: bool

@@ -13,29 +13,39 @@ from dataclasses import replace
 
 import numpy as np
 
-from kf_calib.diagnosis.candidate_tests import LEVEL, Test, run_level, threshold, values_of, worth, worth_together
+from kf_calib.diagnosis.candidate_tests import (
+    LEVEL,
+    CandidateTests,
+    evidence_as_fall,
+    joint_evidence_as_fall,
+    run_level,
+    threshold,
+    values_of,
+)
 from kf_calib.estimation.calibration import refitted
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.reml import FEWEST
 from kf_calib.estimation.results import Calibration
 
 
-def beyond_scatter(before: Calibration, test: Test, names: Sequence[str], refit: Calibration) -> bool:
+def explains_more_than_scatter(
+    before: Calibration, test: CandidateTests, names: Sequence[str], refit: Calibration
+) -> bool:
     """Whether effects, with which the run was refitted, explain more than scatter from dwell to dwell would.
 
     Where not all of it was stated, it is there in any case: effects have to stand out of it. Of a walk of the biases
     and scatter that explain as much the scatter is likelier where none was stated.
     """
     noise, walks = before.noise, test.walking in names
-    if not is_stated(before) and not beyond_any_path(before, test, names):
+    if not dwell_noise_is_stated(before) and not passes_f_test(before, test, names):
         return False
     if not noise.scatter_stated:
         least = threshold(1, test.effective_tests)
-        return not walks or ahead_of_scatter(before, test, names, refit) > least
-    return ahead_of_scatter(before, test, names, refit) > 0.0
+        return not walks or fall_beyond_scatter(before, test, names, refit) > least
+    return fall_beyond_scatter(before, test, names, refit) > 0.0
 
 
-def as_scatter(before: Calibration, test: Test, names: Sequence[str], refit: Calibration) -> bool:
+def could_be_scatter(before: Calibration, test: CandidateTests, names: Sequence[str], refit: Calibration) -> bool:
     """Whether the odds of effects, with which the run was refitted, against scatter from dwell to dwell of more than is
     stated are less than 99 to 1, where one of the effects is as likely to be missing as that.
 
@@ -43,10 +53,10 @@ def as_scatter(before: Calibration, test: Test, names: Sequence[str], refit: Cal
     """
     columns = sum(name in test.best for name in names)
     least = columns * math.log(len(test.scores)) - math.log(LEVEL)
-    return ahead_of_scatter(before, test, names, refit) < 2.0 * least
+    return fall_beyond_scatter(before, test, names, refit) < 2.0 * least
 
 
-def ahead_of_scatter(before: Calibration, test: Test, names: Sequence[str], refit: Calibration) -> float:
+def fall_beyond_scatter(before: Calibration, test: CandidateTests, names: Sequence[str], refit: Calibration) -> float:
     """By how much -2 log-likelihood is lower with effects than with scatter from dwell to dwell, or with setting error,
     of more than is stated; infinite for what shows within dwells.
 
@@ -63,25 +73,25 @@ def ahead_of_scatter(before: Calibration, test: Test, names: Sequence[str], refi
     return min(own + walk, walk - 2.0 * refit.fit.scatter_gain)
 
 
-def _worth(test: Test, columns: Sequence[str]) -> float:
+def _worth(test: CandidateTests, columns: Sequence[str]) -> float:
     own = [test.best[name] for name in columns]
     if len(own) > 1:
-        return worth_together(test.scan, own)
+        return joint_evidence_as_fall(test.scan, own)
     values = values_of(test.scan, columns[0])
-    return worth(test.scan, values, test.scan.statistics[values])
+    return evidence_as_fall(test.scan, values, test.scan.statistics[values])
 
 
-def _beyond_linear(before: Calibration, test: Test, columns: Sequence[str], refit: Calibration) -> float:
+def _beyond_linear(before: Calibration, test: CandidateTests, columns: Sequence[str], refit: Calibration) -> float:
     """What a refit lowers chi-squared of the dwells' means by, beyond what the scan says: what is large is not linear,
     and its chi-squared is not that of the means to a part in a hundred."""
-    if not is_stated(before):
+    if not dwell_noise_is_stated(before):
         return 0.0  # a noise of its own
     bases = [test.candidate(name).basis for name in columns]
     linear, _ = test.scan.explained(np.concatenate(bases, axis=1))
     return max(before.fit.misfit - refit.fit.misfit - linear, 0.0)
 
 
-def beyond_any_path(before: Calibration, test: Test, names: Sequence[str]) -> bool:
+def passes_f_test(before: Calibration, test: CandidateTests, names: Sequence[str]) -> bool:
     """Whether effects explain more than they would of whatever goes on from dwell to dwell, by however much: scatter, a
     walk of the biases; few dwells cannot show it.
 
@@ -103,12 +113,12 @@ def beyond_any_path(before: Calibration, test: Test, names: Sequence[str]) -> bo
     return run_level(float(fdtrc(dof, freedom, fall / dof / (rest / freedom))), test.effective_tests) < LEVEL
 
 
-def is_stated(before: Calibration) -> bool:
+def dwell_noise_is_stated(before: Calibration) -> bool:
     """Whether all noise from dwell to dwell was stated."""
     return before.noise.scatter_stated and before.noise.setting_stated
 
 
-def as_if_stated(before: Calibration, refit: Calibration) -> Calibration:
+def with_noise_as_stated(before: Calibration, refit: Calibration) -> Calibration:
     """The run without the effects that a refit has, as if the bench had stated the noise from dwell to dwell that was
     estimated with them: without them it would be estimated from what they explain."""
     noise, bench = refit.noise, before.bench
@@ -119,7 +129,7 @@ def as_if_stated(before: Calibration, refit: Calibration) -> Calibration:
     return refitted(replace(before, bench=bench), before.settings.effects)
 
 
-def quietest(refits: Iterable[Calibration]) -> Calibration | None:
+def least_noisy(refits: Iterable[Calibration]) -> Calibration | None:
     """Of fits of a run that with the least noise, by the determinants of its dwells' covariances."""
 
     def size(refit: Calibration) -> float:
@@ -129,7 +139,7 @@ def quietest(refits: Iterable[Calibration]) -> Calibration | None:
     return min(refits, key=size, default=None)
 
 
-def may_scatter(before: Calibration) -> bool:
+def scatter_is_possible(before: Calibration) -> bool:
     """Whether dwells may scatter by more than was stated: it was found that they do, or so few cannot show it."""
     noise, few = before.noise, before.consistency.dof < FEWEST
     return (not noise.scatter_stated and (few or bool(noise.scatter_mps2.any()))) or (not noise.setting_stated and few)

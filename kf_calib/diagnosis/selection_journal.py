@@ -38,7 +38,7 @@ from typing import Any, NotRequired
 from typing_extensions import TypedDict
 
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.stepwise_selection import By, Improvement, Step, begun, stepped
+from kf_calib.diagnosis.stepwise_selection import By, Improvement, SelectionStep, begin, take_step
 from kf_calib.effects import refuse_unfit
 from kf_calib.effects.programs import Program
 from kf_calib.errors import InputError
@@ -133,7 +133,7 @@ def write(path: Path, state: Improvement, origin: Origin) -> None:
     write_whole(path, (head + tomli_w.dumps(table)).encode())
 
 
-def _entry(step: Step) -> dict[str, Any]:
+def _entry(step: SelectionStep) -> dict[str, Any]:
     out: dict[str, Any] = {} if step.added is None else {"added": step.added}
     tests = [vars(each) for each in step.dropped]
     return out | {"by": step.by, "undone": step.undone, "dropped": tests, "figures": figures(step.found)}
@@ -194,10 +194,10 @@ def replayed(
     journal: Journal, start: Calibration, on_step: Callable[[Improvement], None] | None = None
 ) -> tuple[Improvement, float]:
     """The steps of a journal taken again, and the largest relative difference from its figures: 0 to the last bit."""
-    state = begun(start)
+    state = begin(start)
     differences = [_difference(journal.start, figures(state.found))]
     for choice in journal.choices:
-        state = stepped(state, choice.added, choice.dropped, choice.by)
+        state = take_step(state, choice.added, choice.dropped, choice.by)
         differences.append(_difference(choice.figures, figures(state.found)))
         if on_step is not None:
             on_step(state)

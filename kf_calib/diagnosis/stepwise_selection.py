@@ -52,7 +52,7 @@ class Removal:
 
 
 @dataclass(frozen=True)
-class Step:
+class SelectionStep:
     """One change of the model: what was added (as it was written; None: nothing) and taken out, and what is so then.
 
     found: the diagnosis of the model after the step. undone: the user took the step back.
@@ -121,14 +121,14 @@ class Improvement:
     """The steps from a first model to the last one, and why they ended there (``because``; None: still going on)."""
 
     start: Diagnosis
-    history: tuple[Step, ...] = ()
+    history: tuple[SelectionStep, ...] = ()
     asked: bool = False
 
     def __repr__(self) -> str:
         return f"<Improvement: {self.result.model.sum}, {self.because}>"
 
     @property
-    def steps(self) -> tuple[Step, ...]:
+    def steps(self) -> tuple[SelectionStep, ...]:
         """Those that hold."""
         return tuple(step for step in self.history if not step.undone)
 
@@ -233,15 +233,15 @@ def improve(
 
     accept_first: of effects that explain the misfit equally well, take the first instead of stopping.
     """
-    state = begun(run)
+    state = begin(run)
     while (name := next_effect(state.found, accept_first)) is not None:
-        state = stepped(state, name, None, "diagnosis")
+        state = take_step(state, name, None, "diagnosis")
         if on_step is not None:
             on_step(state)
     return state
 
 
-def begun(run: Calibration | Source | str | PathLike[str]) -> Improvement:
+def begin(run: Calibration | Source | str | PathLike[str]) -> Improvement:
     return Improvement(diagnose(run))
 
 
@@ -272,14 +272,14 @@ def _rivals(found: Diagnosis) -> list[str]:
     return [name for name in found.ambiguity if found.missing and name not in found.missing]
 
 
-def extended(state: Improvement, names: Sequence[str], by: By) -> Improvement:
+def extend(state: Improvement, names: Sequence[str], by: By) -> Improvement:
     """The effects added, a step each; after the last one whatever is not needed any more is taken out."""
     for name in names[:-1]:
-        state = stepped(state, name, (), by)
-    return stepped(state, names[-1], None, by)
+        state = take_step(state, name, (), by)
+    return take_step(state, names[-1], None, by)
 
 
-def stepped(state: Improvement, added: str | None, dropped: Sequence[str] | None, by: By) -> Improvement:
+def take_step(state: Improvement, added: str | None, dropped: Sequence[str] | None, by: By) -> Improvement:
     """One step: ``added`` goes in, then each of ``dropped`` out, by name; None: whatever is not needed.
 
     Raises InputError, in one sentence, where an effect cannot be added or is not there.
@@ -292,7 +292,7 @@ def stepped(state: Improvement, added: str | None, dropped: Sequence[str] | None
     while (weak := _next_out(result, kept, dropped, len(out))) is not None:
         result = refitted(result, _less(result, weak.name))
         out.append(weak)
-    return replace(state, history=(*state.history, Step(added, tuple(out), by, diagnose(result))))
+    return replace(state, history=(*state.history, SelectionStep(added, tuple(out), by, diagnose(result))))
 
 
 def undone(state: Improvement) -> Improvement:
@@ -313,7 +313,7 @@ def removals(fitted: Fit) -> tuple[Removal, ...]:
     from scipy.special import chdtrc
 
     carried = fitted.carried
-    upper = square_root_information.accumulated(fitted.all_rows(), fitted.steps)
+    upper = square_root_information.accumulate(fitted.all_rows(), fitted.steps)
     rank, least, out = square_root_information.rank(upper[:-1]), upper[-1, -1] ** 2, list[Removal]()
     for effect in carried.model.effects:
         if effect.walks:
@@ -321,7 +321,7 @@ def removals(fitted: Fit) -> tuple[Removal, ...]:
             out.append(Removal(str(effect), gain, 1, 0.5 * float(chdtrc(1, max(gain, 0.0)))))
             continue
         rest = np.delete(upper, carried.model.parts[str(effect)], axis=1)
-        corner = square_root_information.accumulated([rest])
+        corner = square_root_information.accumulate([rest])
         rise, dof = float(max(corner[-1, -1] ** 2 - least, 0.0)), rank - square_root_information.rank(corner[:-1])
         out.append(Removal(str(effect), rise, dof, float(chdtrc(dof, rise)) if dof > 0 else 1.0))
     return tuple(out)

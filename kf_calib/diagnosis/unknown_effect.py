@@ -74,7 +74,7 @@ class Family:
     @property
     def dof(self) -> int:
         """One more where the moment of a jump, a time constant or a period is looked for, as an effect's constant
-        (``price``)."""
+        (``chance_fall``)."""
         return self.rank + (self.rank > 0 and self.driver in (JUMP, DECAY, ARRIVAL, PERIODIC))
 
     @property
@@ -89,7 +89,7 @@ class Family:
         return self.fall - float(chdtri(self.dof, _CHANCE)) if self.dof else 0.0
 
 
-def described(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Description | None:
+def describe(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Description | None:
     """The family of formulas that explains most of what the model leaves, if any explains more than chance would.
 
     None of them does where the dwells are likelier to scatter or their biases to walk: to try is the walk, then. What
@@ -107,7 +107,7 @@ def described(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Des
     if name and (within or irregular - float(chdtri(1, _CHANCE)) > max(best.score, 0.0)):
         share = irregular / max(excess, irregular, 1.0)
         back_s = _back_s(fitted, name) if 2.0 * (walk - scatter) > EQUAL else None
-        driver = f"time (irregular, back within about {roughly(back_s)})" if back_s else IRREGULAR
+        driver = f"time (irregular, back within about {one_digit_seconds(back_s)})" if back_s else IRREGULAR
         return Description(_channel(residuals), WITHIN if within and not back_s else driver, share, (name,))
     if best.score <= 0.0:
         return None
@@ -118,7 +118,7 @@ def described(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Des
     return Description(_channel(residuals), best.driver, share, formulas)
 
 
-def roughly(duration_s: float) -> str:
+def one_digit_seconds(duration_s: float) -> str:
     """To one digit, as 30 s."""
     return f"{float(f'{duration_s:.1g}'):g} s"
 

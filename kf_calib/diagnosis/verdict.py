@@ -6,9 +6,9 @@ import numpy as np
 
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.scatter_hypothesis import (
-    is_stated,
+    dwell_noise_is_stated,
 )
-from kf_calib.diagnosis.unknown_effect import roughly
+from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.estimation.fit import WALK
 from kf_calib.estimation.results import format_p
 
@@ -40,7 +40,7 @@ def verdict_in_words(found: Diagnosis) -> str:
             *told,
             *(f"{' and '.join(pair)} together" for pair in found.together),
             *([_scattering(found)] if found.as_scatter else []),
-            *([f"biases that come back within about {roughly(found.back_s)}"] if found.back_s else []),
+            *([f"biases that come back within about {one_digit_seconds(found.back_s)}"] if found.back_s else []),
         ]
         if told:
             named += f". Cannot yet be told from {', '.join(told)}"
@@ -67,7 +67,7 @@ def verdict_in_words(found: Diagnosis) -> str:
 
 
 def _scattering(found: Diagnosis) -> str:
-    return f"dwells that scatter by more than is {'stated' if is_stated(found.before) else 'estimated'}"
+    return f"dwells that scatter by more than is {'stated' if dwell_noise_is_stated(found.before) else 'estimated'}"
 
 
 def _size(found: Diagnosis) -> str:

@@ -24,7 +24,7 @@ from kf_calib.dwells.coherent_tone import Cells, Trace, tone
 from kf_calib.dwells.line_spectrum import Line, Spectrum, lines
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.rows import Nodes, Rows, basis, parabola
-from kf_calib.dwells.walk_path import Path, path
+from kf_calib.dwells.walk_path import WalkPath, walk_path_of
 
 _LAGS = 64
 _CORRELATED_SAMPLES = 8192  # readings of a dwell whose autocovariance is accumulated
@@ -149,11 +149,11 @@ class DwellFactor:
         return np.where(spare >= 8, squares / np.maximum(spare, 1), pooled)
 
     @cached_property
-    def walk(self) -> Path:
+    def walk(self) -> WalkPath:
         """What a walk of the biases does in it."""
         ends = np.array([piece.nodes.elapsed_s[[0, -1]] for piece in self.pieces])
         triangles = self.triangles[:, : self.width, : self.width]
-        return path(ends[:, 0], ends[:, 1], [piece.count for piece in self.pieces], triangles)
+        return walk_path_of(ends[:, 0], ends[:, 1], [piece.count for piece in self.pieces], triangles)
 
     @property
     def averaged(self) -> bool:
@@ -288,7 +288,7 @@ def dwells_before(dwells: Sequence[DwellFactor]) -> list[DwellFactor]:
     return out
 
 
-def without(dwells: Sequence[DwellFactor], left_out: Collection[int]) -> list[DwellFactor]:
+def dwells_without(dwells: Sequence[DwellFactor], left_out: Collection[int]) -> list[DwellFactor]:
     """The dwells but those at the places ``left_out``; each still knows the step by which it was reached."""
     told = [replace(dwell, came_from=last) for dwell, last in zip(dwells, dwells_before(dwells), strict=True)]
     return [dwell for k, dwell in enumerate(told) if k not in left_out]

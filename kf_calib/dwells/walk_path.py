@@ -21,7 +21,7 @@ _LEAST = 1e-12  # of the largest variance: smaller modes are rounding
 
 
 @dataclass(frozen=True)
-class Path:
+class WalkPath:
     """What a walk of q = 1 does in a dwell, on the r rows of its pieces' triangles.
 
     step (r,): rows per unit of the bias's step s over the dwell, b at its end being known. modes (r, k), variances
@@ -40,7 +40,7 @@ class Path:
         return rows - self.modes @ (shrink[:, None] * (self.modes.T @ rows))
 
 
-def path(begins_s: Floats, ends_s: Floats, counts: Sequence[int], triangles: Floats) -> Path:
+def walk_path_of(begins_s: Floats, ends_s: Floats, counts: Sequence[int], triangles: Floats) -> WalkPath:
     """Of a dwell whose pieces last from ``begins_s`` to ``ends_s`` and have ``triangles`` (pieces, K, K) over [1 u u^2
     ...], K the rows kept of each."""
     root, end = _root(begins_s, ends_s, counts)
@@ -51,7 +51,7 @@ def path(begins_s: Floats, ends_s: Floats, counts: Sequence[int], triangles: Flo
     kept = sizes**2 > _LEAST * max(float(sizes[0]) ** 2, 1e-300)
     spans = np.maximum(ends_s - begins_s, 0.0)
     rest = spans * np.array([_moments(count)[1] / max(count - 1, 1) for count in counts])
-    return Path(share - triangles[:, :, 0].ravel(), left[:, kept], sizes[kept] ** 2, rest)
+    return WalkPath(share - triangles[:, :, 0].ravel(), left[:, kept], sizes[kept] ** 2, rest)
 
 
 def _root(begins_s: Floats, ends_s: Floats, counts: Sequence[int]) -> tuple[Floats, Floats]:

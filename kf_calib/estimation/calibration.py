@@ -31,15 +31,15 @@ from kf_calib.estimation.dwell_columns import Carried, Samples, samples_of
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
-from kf_calib.estimation.noise_model import considered, mean_covariances
-from kf_calib.estimation.observability import sights
+from kf_calib.estimation.noise_model import considered_information, mean_covariances
+from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.oscillation_carrier import fitted_to, holds_its_oscillation, on_carrier
-from kf_calib.estimation.outlying_dwell import in_words, outlying_dwells
-from kf_calib.estimation.random_walk import predicted, to_mean
+from kf_calib.estimation.outlying_dwell import outlying_dwells, outlying_in_words
+from kf_calib.estimation.random_walk import predict, to_mean
 from kf_calib.estimation.remarks import misfit_remark, remarks_on
 from kf_calib.estimation.results import Calibration, Estimate, Visit, consistency, estimate_of, estimates
 from kf_calib.estimation.settings import Settings
-from kf_calib.estimation.square_root_information import Step
+from kf_calib.estimation.square_root_information import FilterStep
 from kf_calib.sources.files.recording import opened
 from kf_calib.support import stage
 
@@ -64,7 +64,7 @@ def calibrate(
         passed = Pass(source, settings)
         if plain is None:
             passed.fold(on_progress)
-        return concluded(passed, source, on_progress, plain)
+        return conclude(passed, source, on_progress, plain)
 
 
 def _window_s(source: Source, settings: Settings, on_progress: Callable[[float], None] | None) -> float:
@@ -73,7 +73,7 @@ def _window_s(source: Source, settings: Settings, on_progress: Callable[[float],
     return window_average.window_s(lines_of(plain.fold(on_progress)))
 
 
-def concluded(
+def conclude(
     passed: Pass,
     again: Source | None = None,
     on_progress: Callable[[float], None] | None = None,
@@ -94,22 +94,22 @@ def concluded(
         passed, fitted = on_carrier(replace(passed, source=again), dwells, plain, on_progress)
     else:
         fitted = fitted_to(passed, dwells)
-    result = evaluated(fitted, settings)
+    result = evaluate_fit(fitted, settings)
     refuse_unseen(result)
     if again is not None and settings.engine == "filterpy":
         stage.say("filterpy, reading by reading")
         result = replace(result, estimate=filterpy_estimate(again, result, on_progress=on_progress))
     reread = None if again is None else partial(calibrate, again)
-    return replace(told(result, passed), reread=reread)
+    return replace(with_remarks(result, passed), reread=reread)
 
 
-def told(result: Calibration, passed: Pass) -> Calibration:
+def with_remarks(result: Calibration, passed: Pass) -> Calibration:
     """The result with what its pass counted and saw, and a sentence on each thing that a user must know."""
-    outlying = outlying_dwells(result, lambda some: evaluated(_fit_again(result, some), result.settings))
+    outlying = outlying_dwells(result, lambda some: evaluate_fit(_fit_again(result, some), result.settings))
     own = [effect for effect in result.model.effects if of_the_users(effect)]
-    notes = [f"{sight}." for sight in sights(result.fit, own)]
+    notes = [f"{sight}." for sight in visibility_of(result.fit, own)]
     readings = passed.watch.judged(result.fit.dwells, result.noise)
-    found = [in_words(outlying)] if outlying else []
+    found = [outlying_in_words(outlying)] if outlying else []
     misfit = misfit_remark(result.consistency, result.residuals_mps2, result.bench, result.noise)
     usual = [each for each in result.warnings if each != misfit or not (outlying or readings.saturation)]
     counted = [*passed.tally.sentences(), *passed.tally.unmet(passed.settings.stillness)]
@@ -145,7 +145,7 @@ def _refitted(before: Calibration, effects: tuple[str, ...]) -> Calibration:
         fitted = fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews)
         if before.reread is not None and not holds_its_oscillation(fitted):
             return before.reread(settings, None, None if fitted.dwells[0].averaged else fitted)
-        again = evaluated(fitted, settings)
+        again = evaluate_fit(fitted, settings)
         return replace(again, tally=before.tally, readings=before.readings, reread=before.reread)
 
 
@@ -153,15 +153,15 @@ def evaluate(
     dwells: list[DwellFactor], bench: Bench, settings: Settings, slews: Sequence[DwellFactor] = ()
 ) -> Calibration:
     """The calibration from dwell factors alone, and those of slews if effects show in them; no pass over the data."""
-    return evaluated(fit(dwells, Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s, slews), settings)
+    return evaluate_fit(fit(dwells, Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s, slews), settings)
 
 
-def evaluated(fitted: Fit, settings: Settings) -> Calibration:
+def evaluate_fit(fitted: Fit, settings: Settings) -> Calibration:
     """The filter run over a fit, its innovations, and the judgement of the misfit."""
     carried, noise, model = fitted.carried, fitted.noise, fitted.carried.model
     first = square_root_information.start(settings.prior, model)
     steps = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)
-    extra = considered(noise, carried.means, carried.state)
+    extra = considered_information(noise, carried.means, carried.state)
     final = estimate_of(steps[-1].factor, model.nominal_state(), extra.sum(axis=0) + fitted.considered)
     residuals = carried.means.readings - carried.means.design @ final.state
     visits = _visits(fitted, steps, residuals, extra, settings)
@@ -235,7 +235,9 @@ def refuse_unseen(result: Calibration) -> None:
         )
 
 
-def _visits(fitted: Fit, steps: list[Step], residuals: Floats, extra: Floats, settings: Settings) -> tuple[Visit, ...]:
+def _visits(
+    fitted: Fit, steps: list[FilterStep], residuals: Floats, extra: Floats, settings: Settings
+) -> tuple[Visit, ...]:
     carried, means, around = fitted.carried, fitted.carried.means, fitted.carried.model.nominal_state()
     own, walked = mean_covariances(fitted.noise, means, carried.state), to_mean(fitted.steps)
     first, extra = (
@@ -246,7 +248,7 @@ def _visits(fitted: Fit, steps: list[Step], residuals: Floats, extra: Floats, se
     reached = estimates(factors, around, extra)
     known, visits = reached[:-1], list[Visit]()
     if walked.any():
-        before = [predicted(factor, float(step)) for factor, step in zip(factors, walked, strict=False)]
+        before = [predict(factor, float(step)) for factor, step in zip(factors, walked, strict=False)]
         known = estimates(np.array(before), around, extra[:-1])
     for k, (dwell, step) in enumerate(zip(carried.dwells, steps, strict=True)):
         innovation, sigma = np.full(3, np.nan), np.full(3, np.nan)

@@ -12,7 +12,7 @@ from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import random_walk, square_root_information
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.noise_model import considered, lifted, mean_covariances
+from kf_calib.estimation.noise_model import considered_information, lift_rounding, mean_covariances
 from kf_calib.estimation.prior import Prior
 
 SAME_POSE_DEG = 1.0
@@ -54,7 +54,7 @@ class HeldOut:
     @property
     def statistics(self) -> Floats:
         """Chi-squared (D,) of each dwell's error, of 3 degrees of freedom."""
-        solved = np.linalg.solve(lifted(self.covariance), self.errors_mps2[:, :, None])[:, :, 0]
+        solved = np.linalg.solve(lift_rounding(self.covariance), self.errors_mps2[:, :, None])[:, :, 0]
         return np.asarray(np.einsum("di,di->d", self.errors_mps2, solved))
 
 
@@ -74,7 +74,10 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
     """
     carried, noise, around = fitted.carried, fitted.noise.judging, fitted.carried.model.nominal_state()
     rows = fitted.rows(noise.weights)
-    extra, own = considered(noise, carried.means, carried.state), mean_covariances(noise, carried.means, carried.state)
+    extra, own = (
+        considered_information(noise, carried.means, carried.state),
+        mean_covariances(noise, carried.means, carried.state),
+    )
     empty = square_root_information.start(Prior(), carried.model)
     slews = square_root_information.update(empty, np.concatenate(fitted.following))[0] if carried.slews else empty
     heads, tails = [slews], [empty]
@@ -83,7 +86,7 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
     for group in groups[:0:-1]:
         tails.append(square_root_information.update(tails[-1], np.concatenate([rows[k] for k in group]))[0])
     merged = triangle(np.concatenate([heads, tails[::-1]], axis=1))[:, : len(empty)]
-    states, covariances, lost = zip(*square_root_information.solved(merged, around), strict=True)
+    states, covariances, lost = zip(*square_root_information.solve_all(merged, around), strict=True)
     if any(each.size for each in lost):
         return None
     place = np.empty(len(rows), np.intp)
@@ -109,12 +112,12 @@ def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | Non
     for group in groups:
         heads, tails = alone if len(group) == 1 else _passes(rows, steps, group)
         for k in group:
-            upper, count = random_walk.advanced(heads[k], steps[k], np.hstack([np.zeros((len(around), 3)), tails[k]]))
+            upper, count = random_walk.advance(heads[k], steps[k], np.hstack([np.zeros((len(around), 3)), tails[k]]))
             order = [*range(count, upper.shape[1] - 1), *range(count), upper.shape[1] - 1]
             ways.setdefault(count, []).append((k, upper[: len(around) + count, order]))
     for count, own in ways.items():
         half = np.hstack([-0.5 * np.eye(3), np.zeros((3, count - 3))])  # the mean is half a step short of the end
-        found = square_root_information.solved(
+        found = square_root_information.solve_all(
             np.array([upper for _, upper in own]), np.append(around, np.zeros(count))
         )
         for (k, _), (state, covariance, lost) in zip(own, found, strict=True):
@@ -132,8 +135,8 @@ def _passes(rows: Sequence[Floats], steps: Floats, left_out: Sequence[int]) -> t
     known = [own[:0] if k in left_out else own for k, own in enumerate(rows)]
     heads, tails = [np.zeros((width, width + 1))], [np.zeros((width, width + 1))]
     for own, variances in zip(known[:-1], steps, strict=False):
-        upper, count = random_walk.advanced(heads[-1], variances, own)
+        upper, count = random_walk.advance(heads[-1], variances, own)
         heads.append(upper[count : count + width, count:])
     for own, variances in zip(known[:0:-1], steps[:0:-1], strict=True):
-        tails.insert(0, random_walk.receded(tails[0], variances, own))
+        tails.insert(0, random_walk.recede(tails[0], variances, own))
     return heads, tails

@@ -14,12 +14,12 @@ from kf_calib.dwells import window_average
 from kf_calib.dwells.blocks import LARGEST_RAD, Block, Tally
 from kf_calib.dwells.rows import Rows, model_rows
 from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
-from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder, without
+from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder, dwells_without
 from kf_calib.errors import InputError
 from kf_calib.estimation import setup_blunders
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
-from kf_calib.estimation.signal_quality import Watch
+from kf_calib.estimation.signal_quality import ReadingsMonitor
 
 
 @dataclass
@@ -30,7 +30,7 @@ class Pass:
     settings: Settings
     tally: Tally = field(default_factory=Tally)
     folder: Folder = field(default_factory=Folder)
-    watch: Watch = field(default_factory=Watch)
+    watch: ReadingsMonitor = field(default_factory=ReadingsMonitor)
 
     def segmenter(self) -> Segmenter:
         """What cuts the source into dwells, and into slews where an effect of the model shows in them."""
@@ -66,7 +66,7 @@ class Pass:
         if not left_out:
             return [dwell for dwell in self.folder.dwells if dwell.count >= 8]
         unused = {k for k, each in enumerate(self.folder.dwells) if each.count < 8 or each.number in left_out}
-        return without(self.folder.dwells, unused)
+        return dwells_without(self.folder.dwells, unused)
 
 
 def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> None:

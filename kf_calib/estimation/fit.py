@@ -25,7 +25,7 @@ from kf_calib.estimation import square_root_information
 from kf_calib.estimation.dwell_columns import Carried, Means, candidate_columns, stimulus_of
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, steps, within_dwells
-from kf_calib.estimation.reml import Part, gain_of, held_gain, misfit, wandering, with_dwell_parts
+from kf_calib.estimation.reml import Part, gain_of, misfit, restoring_gain, with_dwell_parts, with_slow_scatter
 from kf_calib.estimation.score_test import falls
 
 WALK = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5, "µg/√s", 1e6 / 9.80665)
@@ -60,14 +60,14 @@ class Fit:
     @cached_property
     def state(self) -> Floats:
         """The estimate (p,) by these columns; where biases walk, those after the last dwell."""
-        factor = square_root_information.accumulated(self.all_rows(), self.steps)[:-1]
+        factor = square_root_information.accumulate(self.all_rows(), self.steps)[:-1]
         return square_root_information.solve(factor, self.carried.model.nominal_state())[0]
 
     @cached_property
     def judged(self) -> list[Floats]:
         """Rows [H | W | z] by which the misfit is judged."""
         carried = self.carried
-        return square_root_information.judged(
+        return square_root_information.misfit_rows(
             self.dwells, carried.columns, self.noise.judging, carried.state, carried.model.count
         )[0]
 
@@ -77,7 +77,7 @@ class Fit:
         carried, noise = self.carried, self.noise.weights.of(moving=True)
         out = [np.zeros((0, carried.model.count + 1))] * len(self.dwells)
         if carried.slews:
-            rows = square_root_information.whitened(carried.slews, carried.slew_columns, noise, carried.state)
+            rows = square_root_information.whiten(carried.slews, carried.slew_columns, noise, carried.state)
             numbers = [dwell.number for dwell in self.dwells]
             for slew, own in zip(carried.slews, rows, strict=True):
                 place = bisect.bisect_right(numbers, slew.number) - 1
@@ -112,8 +112,8 @@ class Fit:
             more, less = (candidate_columns(carried.dwells, [end], carried.model.bench, carried.state) for end in ends)
             changes = [0.5 * (a - b) @ carried.state[part, None] for a, b in zip(more, less, strict=True)]
             columns = [np.concatenate(both, axis=3) for both in zip(carried.columns, changes, strict=True)]
-            rows = square_root_information.whitened(carried.dwells, columns, self.noise.weights, carried.state)
-            upper = square_root_information.accumulated(rows, self.steps)
+            rows = square_root_information.whiten(carried.dwells, columns, self.noise.weights, carried.state)
+            upper = square_root_information.accumulate(rows, self.steps)
             gain = upper[: len(out), : len(out)].T @ upper[: len(out), len(out)]
             out += np.outer(gain, gain)
         return out
@@ -144,18 +144,18 @@ class Fit:
     @cached_property
     def _wandering(self) -> tuple[Noise, Means, Floats]:
         noise, carried = replace(self.noise.judging, walk_mps2_per_sqrt_s=0.0), self.carried
-        return noise, *wandering(carried.dwells, noise, carried.means)
+        return noise, *with_slow_scatter(carried.dwells, noise, carried.means)
 
     @cached_property
     def back_gain(self) -> tuple[float, float]:
         """What a walk that comes back gains in log-likelihood over the walk of the biases that the fit has, beside what
         a stated scatter may be; and the time constant with which it comes back, s."""
         _, means, prior = self._wandering
-        return held_gain(self.noise.judging, means, self.carried.state, prior)
+        return restoring_gain(self.noise.judging, means, self.carried.state, prior)
 
     def rows(self, noise: Noise | None = None) -> list[Floats]:
         """Whitened rows [H | z] of each dwell, by the weights of the fit or by another noise."""
-        return square_root_information.whitened(
+        return square_root_information.whiten(
             self.dwells, self.carried.columns, noise or self.noise.weights, self.carried.state
         )
 
@@ -234,7 +234,7 @@ def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
         own[:, : slew.width] -= slew.triangles[:, : slew.width, : slew.width] @ on_basis(np.moveaxis(model, 1, 2))
         squares, counts = squares + (own**2).sum(axis=(0, 1)), counts + slew.count
     sizes = np.sqrt(squares / counts) + FLOOR_MPS2
-    factor = square_root_information.accumulated(fitted.all_rows(), fitted.steps)[:-1]
+    factor = square_root_information.accumulate(fitted.all_rows(), fitted.steps)[:-1]
     covariance = square_root_information.solve(factor, state)[1]
     freedom = square_root_information.row_rank(rows) - float(
         np.einsum("rp,pq,rq->", rows[:, :-1], covariance, rows[:, :-1])
@@ -283,7 +283,7 @@ def _falls(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> Floats:
     return falls(Carried(fitted.dwells, rest, state), fitted.noise.weights, grid)
 
 
-def behind_within(fitted: Fit, effect: Effect) -> float:
+def loss_within_range(fitted: Fit, effect: Effect) -> float:
     """By how much chi-squared is larger with the constant of an effect at the best value well within its range, by a
     factor of two, than where it is."""
     assert effect.unknown is not None

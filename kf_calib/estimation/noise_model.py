@@ -171,7 +171,7 @@ def _of_averages(total: Autocovariance, channel: int) -> tuple[float, float]:
     return kappa, float(total.products[0, channel] / total.pairs[0] / max(kept, 1e-3))
 
 
-def wander(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floats], Floats]:
+def slow_scatter(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floats], Floats]:
     """The slow part of a stated scatter: columns at the nodes of each dwell (pieces, nodes, 3, q), constant in it, and
     the sigma (q,) of their coefficients.
 
@@ -204,24 +204,24 @@ def mean_covariances(noise: Noise, means: Means, state: Floats) -> Floats:
     diag(kappa sigma_w^2 / n + sigma_s^2) + sigma_alpha^2 S (|f|^2 I - f f^T) S^T, S the sensitivities (rows).
     """
     own = noise.effective_sigma_mps2**2 / means.counts[:, None] + noise.scatter_mps2**2
-    return own[:, :, None] * np.eye(3) + noise.setting_rad**2 * turned(means, state)
+    return own[:, :, None] * np.eye(3) + noise.setting_rad**2 * setting_covariances(means, state)
 
 
-def lifted(covariances: Floats) -> Floats:
+def lift_rounding(covariances: Floats) -> Floats:
     """Covariances (D, 3, 3) with as much more in all directions as is rounding: a setting error alone does not turn the
     force along itself, and where noise is far below it, rounding decides whether there is a root."""
     least = _ROUNDING * np.einsum("dii->d", covariances)
     return np.asarray(covariances + least[:, None, None] * np.eye(3), float)
 
 
-def turned(means: Means, state: Floats) -> Floats:
+def setting_covariances(means: Means, state: Floats) -> Floats:
     """Covariance (D, 3, 3) of the mean readings per unit variance of a random small rotation."""
     force, sensitivity = means.force_mps2, state[:12].reshape(3, 4)[:, :3]
     across = np.einsum("di,di->d", force, force)[:, None, None] * np.eye(3) - force[:, :, None] * force[:, None, :]
     return sensitivity @ across @ sensitivity.T
 
 
-def considered(noise: Noise, means: Means, state: Floats) -> Floats:
+def considered_information(noise: Noise, means: Means, state: Floats) -> Floats:
     """What each dwell's setting error adds to the information about the gain, (D, p, p); zeros where it is weighted.
 
     With weights W and design A, the covariance is P + P B P, B = sum A^T W dV W A, dV the setting error's part: the
@@ -232,4 +232,4 @@ def considered(noise: Noise, means: Means, state: Floats) -> Floats:
         return np.zeros((len(means.counts), count, count))
     weight = 1.0 / np.einsum("dii->di", mean_covariances(noise.weights, means, state))
     weighted = weight[:, :, None] * means.design
-    return noise.setting_rad**2 * np.swapaxes(weighted, 1, 2) @ turned(means, state) @ weighted
+    return noise.setting_rad**2 * np.swapaxes(weighted, 1, 2) @ setting_covariances(means, state) @ weighted

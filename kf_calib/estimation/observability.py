@@ -26,7 +26,7 @@ _CONFUSED, _TWINS, _NAMED = 0.5, 0.99, 3  # overlaps worth naming; that cannot b
 
 
 @dataclass(frozen=True)
-class Sight:
+class Visibility:
     """One effect as these orientations show it beside a model.
 
     share: the largest part of one of its columns that the model leaves (0: invisible); None where it has no column in
@@ -76,7 +76,7 @@ class Sight:
         return f" with {unknown.symbol} at {self.effect.value * unknown.per_si:.3g} {unknown.shown_unit}"
 
 
-def sights(fitted: Fit, effects: Sequence[Effect]) -> list[Sight]:
+def visibility_of(fitted: Fit, effects: Sequence[Effect]) -> list[Visibility]:
     """Of each effect, beside the model without it; an effect with a constant at that value where it shows best."""
     with threadpool_limits(1, user_api="blas"):  # small decompositions
         model = fitted.carried.model
@@ -87,7 +87,7 @@ def sights(fitted: Fit, effects: Sequence[Effect]) -> list[Sight]:
         return [seen[str(each)] for each in effects]
 
 
-def _beside(fitted: Fit, model: Model, effects: Sequence[Effect]) -> list[Sight]:
+def _beside(fitted: Fit, model: Model, effects: Sequence[Effect]) -> list[Visibility]:
     """Of effects that are not in ``model``, against each other and the catalogue."""
     bench, named = model.bench, {str(each) for each in effects}
     others = [effect_named(name, bench) for name in names(bench) if name not in named | set(model.parts)]
@@ -106,17 +106,17 @@ def _values(effect: Effect) -> list[Effect]:
     return [effect] if effect.unknown is None else [effect.at(value) for value in effect.unknown.grid(2.0)]
 
 
-def _sight(found: Scan, effect: Effect) -> Sight:
+def _sight(found: Scan, effect: Effect) -> Visibility:
     if effect.dynamic:
-        return Sight(effect, None, why="shows in slews only, which are not looked at here")
+        return Visibility(effect, None, why="shows in slews only, which are not looked at here")
     if effect.walks:
-        return Sight(effect, None, why="is noise of the biases, not a column: fit it to see it")
+        return Visibility(effect, None, why="is noise of the biases, not a column: fit it to see it")
     own = [each for each in found.candidates if str(each.effect) == str(effect)]
     tests = len({str(each.effect) for each in found.candidates if each.dof})
     sized = [(smallest_size(each, tests), each) for each in own]
     size, best = min(sized, key=lambda pair: np.inf if pair[0] is None else pair[0][1])
     if not best.dof:
-        return Sight(best.effect, 0.0)
+        return Visibility(best.effect, 0.0)
     overlaps = dict[str, float]()
     for other in found.candidates:
         name = str(other.effect)
@@ -124,7 +124,7 @@ def _sight(found: Scan, effect: Effect) -> Sight:
             overlaps[name] = max(overlaps.get(name, 0.0), best.overlap(other))
     near = sorted((pair for pair in overlaps.items() if pair[1] > _CONFUSED), key=lambda pair: -pair[1])[:_NAMED]
     unseen = [c.symbol for c, hidden in zip(best.effect.coefficients, best.hidden, strict=True) if hidden]
-    return Sight(best.effect, min(best.visibility, 1.0), tuple(unseen), size, tuple(near))
+    return Visibility(best.effect, min(best.visibility, 1.0), tuple(unseen), size, tuple(near))
 
 
 def smallest_size(candidate: Candidate, tests: int) -> tuple[Coefficient, float] | None:

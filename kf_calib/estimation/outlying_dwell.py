@@ -16,9 +16,9 @@ from dataclasses import replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.sufficient_statistics import DwellFactor, without
+from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_without
 from kf_calib.estimation.dwell_columns import Carried, Means
-from kf_calib.estimation.noise_model import lifted, mean_covariances
+from kf_calib.estimation.noise_model import lift_rounding, mean_covariances
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Turn
 from kf_calib.support.tail_probabilities import f_tail
 
@@ -33,7 +33,7 @@ _STEP = 1e-4  # rad, of its differences
 _FARTHEST = 0.02  # rad, of one of its steps
 
 
-def in_words(found: Sequence[OutlyingDwell]) -> str:
+def outlying_in_words(found: Sequence[OutlyingDwell]) -> str:
     """What is said of the dwells of which any one could be it; '' where there are none."""
     return " Or ".join(map(str, found))
 
@@ -54,7 +54,7 @@ def outlying_dwells(
     ratios = (statistics / statistics.max()).round(9)  # of dwells as far off, to rounding, the first comes first
     order = np.argsort(-ratios, kind="stable")[:_TRIED]
     tried = [k for k in order.tolist() if ratios[k] > _NEARLY]
-    found = [_judged(result, k, evaluate(without(dwells, (k,)))) for k in tried]
+    found = [_judged(result, k, evaluate(dwells_without(dwells, (k,)))) for k in tried]
     return tuple(each for each in found if each is not None)
 
 
@@ -80,7 +80,7 @@ def _covariance(rest: Calibration, means: Means) -> Floats:
     """Of the mean reading of one dwell less its prediction, (3, 3)."""
     design, estimate = means.design[0], rest.estimate
     own = mean_covariances(rest.noise, means, estimate.state)
-    return lifted(own + design @ estimate.covariance @ design.T)[0]
+    return lift_rounding(own + design @ estimate.covariance @ design.T)[0]
 
 
 def _turns(dwell: DwellFactor, means: Means, rest: Calibration) -> Iterator[Turn]:

@@ -46,7 +46,9 @@ class Periodogram:
             np.concatenate([own[..., :STATE_COUNT], more], axis=3)
             for own, more in zip(carried.columns, waves, strict=True)
         ]
-        rows, width = square_root_information.judged(dwells, columns, noise, carried.state, STATE_COUNT, reduced=False)
+        rows, width = square_root_information.misfit_rows(
+            dwells, columns, noise, carried.state, STATE_COUNT, reduced=False
+        )
         rows = rows[len(rows) - len(dwells) :]
         self._ends = np.cumsum([0, *map(len, rows)]).tolist()
         stacked, inside = np.concatenate(rows), 3 if noise.walk_mps2_per_sqrt_s else 0

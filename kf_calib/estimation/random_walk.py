@@ -26,7 +26,7 @@ class Links:
     beside: Floats
 
 
-def links(ends_s: Floats, held_s: float = math.inf) -> Links:
+def mean_links(ends_s: Floats, held_s: float = math.inf) -> Links:
     """Of dwells from ``ends_s`` (D, 2), of a walk that comes back with the time constant ``held_s``."""
     return _free(ends_s) if math.isinf(held_s) else _held(ends_s, held_s)
 
@@ -66,7 +66,7 @@ def to_mean(steps: Floats) -> Floats:
     return steps[:, 0] + steps[:, 1] / 3.0
 
 
-def advanced(factor: Floats, steps: Floats, rows: Floats) -> tuple[Floats, int]:
+def advance(factor: Floats, steps: Floats, rows: Floats) -> tuple[Floats, int]:
     """Time and measurement update: the triangle [w | H | z], and how many steps w lead it, to be left out.
 
     factor [R | z] (p, p + 1) of the biases at the end of the dwell before; ``steps`` (2,): variances of each bias's
@@ -91,9 +91,9 @@ def advanced(factor: Floats, steps: Floats, rows: Floats) -> tuple[Floats, int]:
     return triangle(out), count
 
 
-def receded(factor: Floats, steps: Floats, rows: Floats) -> Floats:
+def recede(factor: Floats, steps: Floats, rows: Floats) -> Floats:
     """The factor of the biases before a dwell and its pause, from that of the biases at its end (from what came later)
-    and its rows: ``advanced`` backward in time."""
+    and its rows: ``advance`` backward in time."""
     width, biases = len(factor), [3, 7, 11]
     sigma = _sigmas(steps, rows.shape[1] - width - 1)
     out = np.zeros((len(sigma) + width + len(rows), len(sigma) + width + 1))
@@ -112,7 +112,7 @@ def _sigmas(steps: Floats, inside: int) -> Floats:
     return np.sqrt(np.repeat(variances, 3))
 
 
-def whitened(rows: Sequence[Floats], steps: Floats) -> Floats:
+def whiten_walk(rows: Sequence[Floats], steps: Floats) -> Floats:
     """Rows (m, c) of unit noise from rows [S | X] of each dwell, the walk being in their noise; X (r, c): any columns,
     of which the first twelve are the parameters', the biases those at the end of the dwell.
 
@@ -143,9 +143,9 @@ def whitened(rows: Sequence[Floats], steps: Floats) -> Floats:
     return np.concatenate(out)
 
 
-def predicted(factor: Floats, variance: float) -> Floats:
+def predict(factor: Floats, variance: float) -> Floats:
     """Time update alone: the three biases take a step of that variance, 0: none."""
     if variance <= 0:
         return factor
-    upper, count = advanced(factor, np.array([variance, 0.0]), np.zeros((0, factor.shape[1])))
+    upper, count = advance(factor, np.array([variance, 0.0]), np.zeros((0, factor.shape[1])))
     return upper[count : count + len(factor), count:]

@@ -14,7 +14,7 @@ from kf_calib.effects import remarks_of
 from kf_calib.estimation import setup_blunders
 from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.noise_model import TOO_SHORT, Noise
-from kf_calib.estimation.reml import ENOUGH_DIRECTIONS, FEWEST, directions, freedom
+from kf_calib.estimation.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, directions
 from kf_calib.estimation.results import Consistency, Estimate
 
 
@@ -99,7 +99,7 @@ def remarks_on(
             f"({noise.scatter_mps2[0]:.2g} m/s^2) counts in every sigma; {ENOUGH_DIRECTIONS} directions, spread, would "
             "tell."
         )
-    if unstated(noise) and freedom(carried.means) < FEWEST:
+    if unstated(noise) and degrees_of_freedom(carried.means) < FEWEST:
         yield (
             f"{len(dwells)} dwell{'s are' if len(dwells) > 1 else ' is'} too few to estimate what was not stated "
             f"({' and '.join(unstated(noise))}): it is taken as zero, and where it is not, sigmas are too small."

@@ -19,8 +19,8 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.dwell_columns import Means
-from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, mean_covariances, turned, wander
-from kf_calib.estimation.random_walk import Links, links
+from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, mean_covariances, setting_covariances, slow_scatter
+from kf_calib.estimation.random_walk import Links, mean_links
 from kf_calib.estimation.restricted_likelihood import Point, Restricted
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
@@ -159,7 +159,7 @@ def directions(force_mps2: Floats) -> int:
     return len(np.unique(np.round(unit, 2) + 0.0, axis=0))
 
 
-def freedom(means: Means) -> int:
+def degrees_of_freedom(means: Means) -> int:
     """Degrees of freedom of the dwells' means beside the model's coefficients."""
     return means.readings.size - _reduced(means)[0].design.shape[2]
 
@@ -167,7 +167,7 @@ def freedom(means: Means) -> int:
 def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats) -> float:
     """What more of a part of the noise, as much as is likeliest, gains in log-likelihood.
 
-    ``means`` and ``prior`` as ``wandering`` has them.
+    ``means`` and ``prior`` as ``with_slow_scatter`` has them.
     """
     means, prior = _reduced(means, prior)
     likelihood = _likelihood(noise, {part}, means, state, prior)
@@ -175,11 +175,11 @@ def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats
     return max(likelihood.without().cost - point.cost, 0.0)
 
 
-def held_gain(noise: Noise, means: Means, state: Floats, prior: Floats) -> tuple[float, float]:
+def restoring_gain(noise: Noise, means: Means, state: Floats, prior: Floats) -> tuple[float, float]:
     """What a walk that is held back gains in log-likelihood over the walk that is in the noise, and the time constant
     with which it comes back, s (a Gauss-Markov process of any variance; that of infinite time constant is the walk).
 
-    ``means`` and ``prior`` as ``wandering`` has them.
+    ``means`` and ``prior`` as ``with_slow_scatter`` has them.
     """
     means, prior = _reduced(means, prior)
     free, still = _likelihood(noise, (), means, state, prior).without(), replace(noise, walk_mps2_per_sqrt_s=0.0)
@@ -193,10 +193,10 @@ def held_gain(noise: Noise, means: Means, state: Floats, prior: Floats) -> tuple
     return max(free.cost - costs[least], 0.0), times_s[least]
 
 
-def wandering(dwells: Sequence[DwellFactor], noise: Noise, means: Means) -> tuple[Means, Floats]:
+def with_slow_scatter(dwells: Sequence[DwellFactor], noise: Noise, means: Means) -> tuple[Means, Floats]:
     """Means with the columns of what a stated scatter may have in common in dwells that follow each other, and the
     rows of their prior (q, p + q + 1)."""
-    columns, sigma = wander(dwells, noise)
+    columns, sigma = slow_scatter(dwells, noise)
     design = np.concatenate([means.design, [own[0, 0] for own in columns]], axis=2)
     prior = np.zeros((len(sigma), design.shape[2] + 1))
     prior[:, means.design.shape[2] : -1] = np.diag(1.0 / sigma)
@@ -249,7 +249,7 @@ def _likelihood(
     """Of reduced means."""
     count, units = len(means.counts), _units(means)
     standing = "walk" not in parts and not noise.walk_mps2_per_sqrt_s
-    path = Links(*(np.zeros(count - k) for k in (1, 0, 1))) if standing else links(means.ends_s, held_s)
+    path = Links(*(np.zeros(count - k) for k in (1, 0, 1))) if standing else mean_links(means.ends_s, held_s)
     design = np.concatenate([means.design, means.readings[:, :, None]], axis=2)
     rows = design.copy()
     rows[1:] -= path.share[:, None, None] * design[:-1]
@@ -258,7 +258,7 @@ def _likelihood(
     walk[0, :, :3] = path.alone[:, None, None] * np.eye(3)
     walk[0, :-1, 3:] = path.beside[:, None, None] * np.eye(3)
     shapes: dict[Part, Floats] = {
-        "setting": _linked(turned(means, state)[None], path),
+        "setting": _linked(setting_covariances(means, state)[None], path),
         "common": _linked(each.sum(axis=0, keepdims=True), path),
         "scatter": _linked(each, path),
         "walk": walk,

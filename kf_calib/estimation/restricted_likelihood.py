@@ -12,7 +12,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation import banded
-from kf_calib.estimation.noise_model import lifted
+from kf_calib.estimation.noise_model import lift_rounding
 
 _LEAST = 1e-4  # of the size that a search begins with: as small is none
 _NEAR = 0.5  # ln of a size: a search that moves it by more did not begin close to its end
@@ -46,7 +46,7 @@ class Restricted:
         y' K_k P K_l y / 2 is the mean of the information observed and expected (Gilmour, Thompson and Cullis, 1995)."""
         wider = variances @ self.shapes.reshape(len(variances), self.fixed.size)
         covariance = self.fixed + wider.reshape(self.fixed.shape)
-        covariance[:, :3] = lifted(covariance[:, :3])
+        covariance[:, :3] = lift_rounding(covariance[:, :3])
         lower, known = banded.root(covariance), len(self.prior)
         whitened = np.concatenate([self.prior, banded.solved(lower, self.rows)])
         basis, upper = np.linalg.qr(whitened[:, :-1])

@@ -20,7 +20,7 @@ from kf_calib.estimation.cross_validation import HeldOut, held_out
 from kf_calib.estimation.dwell_columns import Carried, columns_of, means_of
 from kf_calib.estimation.fit import WALK, Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
-from kf_calib.estimation.noise_model import Noise, considered, steps
+from kf_calib.estimation.noise_model import Noise, considered_information, steps
 from kf_calib.estimation.score_test import Frame
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings
@@ -287,7 +287,9 @@ class Calibration:
 
     def considering(self, state: Floats, covariance: Floats) -> Estimate:
         """Another engine's state and covariance, the latter enlarged by what is considered only."""
-        extra = considered(self.noise, self.carried.means, self.carried.state).sum(axis=0) + self.fit.considered
+        extra = (
+            considered_information(self.noise, self.carried.means, self.carried.state).sum(axis=0) + self.fit.considered
+        )
         return Estimate(state, covariance + covariance @ extra @ covariance, self.estimate.undetermined)
 
     def __str__(self) -> str:
@@ -307,10 +309,10 @@ class Calibration:
             before, extra_before = factor, extra
             for part in dwell.prefixes():
                 own = [columns[: len(part.pieces)]]
-                rows = square_root_information.whitened([part], own, self.noise.weights, state)[0]
+                rows = square_root_information.whiten([part], own, self.noise.weights, state)[0]
                 walked = np.array([pause, steps([part], self.noise)[0, 1]])
                 factor, _ = square_root_information.update(before, rows, walked)
-                extra = extra_before + considered(self.noise, means_of([part], own), state)[0]
+                extra = extra_before + considered_information(self.noise, means_of([part], own), state)[0]
                 yield part.end_s, dwell.number, estimate_of(factor, around, extra)
             if len(self.fit.following[index]):
                 factor, _ = square_root_information.update(factor, self.fit.following[index])
@@ -320,9 +322,9 @@ class Calibration:
         fitted, (factor, extra) = self.fit, self.reached
         both, state = [fitted.dwells[-1], dwell], self.carried.state
         own = columns_of(both, self.model, state)[1:]
-        rows = square_root_information.whitened([dwell], own, self.noise.weights, state)[0]
+        rows = square_root_information.whiten([dwell], own, self.noise.weights, state)[0]
         factor, _ = square_root_information.update(factor, rows, steps(both, self.noise)[-1])
-        extra = extra + considered(self.noise, means_of([dwell], own), state)[0]
+        extra = extra + considered_information(self.noise, means_of([dwell], own), state)[0]
         return estimate_of(factor, self.model.nominal_state(), extra)
 
     @cached_property
@@ -330,7 +332,7 @@ class Calibration:
         """The filter's factor after the last dwell, and what is considered only, as in the covariance."""
         fitted, first = self.fit, square_root_information.start(self.settings.prior, self.model)
         last = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)[-1]
-        extra = considered(self.noise, self.carried.means, self.carried.state)
+        extra = considered_information(self.noise, self.carried.means, self.carried.state)
         return last.factor, extra.sum(axis=0) + fitted.considered
 
 
@@ -341,7 +343,7 @@ def estimate_of(factor: Floats, nominal_state: Floats, extra: Floats) -> Estimat
 
 def estimates(factors: Floats, nominal_state: Floats, extra: Floats) -> list[Estimate]:
     """The same of many factors (n, p, p + 1), ``extra`` (n, p, p)."""
-    states, covariances, undetermined = zip(*square_root_information.solved(factors, nominal_state), strict=True)
+    states, covariances, undetermined = zip(*square_root_information.solve_all(factors, nominal_state), strict=True)
     covariance = np.array(covariances)
     covariance = covariance + covariance @ extra @ covariance
     return [Estimate(*each) for each in zip(states, covariance, undetermined, strict=True)]
@@ -350,7 +352,7 @@ def estimates(factors: Floats, nominal_state: Floats, extra: Floats) -> list[Est
 def consistency(fitted: Fit) -> Consistency:
     """Whether the dwells agree with the fitted model within the noise it is judged by."""
     noise, dwells, rows = fitted.noise, fitted.dwells, fitted.judged
-    upper = square_root_information.accumulated(rows, fitted.steps)
+    upper = square_root_information.accumulate(rows, fitted.steps)
     statistic = float(upper[-1, -1] ** 2)
     dof = sum(square_root_information.row_rank(own) for own in rows) - square_root_information.rank(upper[:-1])
     dof -= int(not noise.setting_stated and noise.setting_rad > 0)

@@ -115,7 +115,7 @@ class Frame:
     def __init__(self, carried: Carried, noise: Noise, effects: Sequence[Effect]) -> None:
         self.dwells, self.noise, self.state, self.effects = carried.dwells, noise, carried.state, list(effects)
         self.parts = _parts(effects)
-        self.basis, self.coordinates = orthonormal(columns_of(carried, noise, effects))
+        self.basis, self.coordinates = orthonormal(whitened_columns(carried, noise, effects))
         self._periodogram: Periodogram | None = None
         self._lines: dict[float, tuple[Line, ...]] = {}
         self._last: tuple[Carried, Floats, Floats, int] | None = None
@@ -150,8 +150,8 @@ class Frame:
         """Those of the effects that the model carried does not have, and ``more`` behind them, beside that model."""
         kept = [k for k, effect in enumerate(self.effects) if str(effect) not in carried.model.parts]
         inside, outside, width = self._model(carried)
-        more_inside, more_outside = self._split(columns_of(carried, self.noise, more, self.state))
-        beside = square_root_information.accumulated([np.hstack([outside[:, :-1], more_outside, outside[:, -1:]])])
+        more_inside, more_outside = self._split(whitened_columns(carried, self.noise, more, self.state))
+        beside = square_root_information.accumulate([np.hstack([outside[:, :-1], more_outside, outside[:, -1:]])])
         own = [self.coordinates[:, self.parts[k]] for k in kept]
         count = sum(each.shape[1] for each in own)
         small = np.vstack([
@@ -159,8 +159,8 @@ class Frame:
             np.hstack([beside[:, :width], np.zeros((len(beside), count)), beside[:, width:]]),
         ])  # fmt: skip
         effects = [*(self.effects[k] for k in kept), *more]
-        return projected(
-            square_root_information.accumulated([small]),
+        return project(
+            square_root_information.accumulate([small]),
             width,
             effects,
             [len(effect.coefficients) for effect in effects],
@@ -170,7 +170,7 @@ class Frame:
         """[H | W | z] of a model in the frame and beside it, and how many columns come before z; kept for the next
         scan beside the same."""
         if self._last is None or self._last[0] is not carried:
-            rows, width = whitened(carried, self.noise, [], self.state)
+            rows, width = whiten_model(carried, self.noise, [], self.state)
             self._last = carried, *self._split(rows), width
         return self._last[1:]
 
@@ -208,13 +208,13 @@ def _is(one: object, other: object) -> bool:
 
 def scan(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Scan:
     """Project ``effects`` off the model carried."""
-    rows, width = whitened(carried, noise, effects)
-    return projected(
-        square_root_information.accumulated([rows]), width, effects, [len(effect.coefficients) for effect in effects]
+    rows, width = whiten_model(carried, noise, effects)
+    return project(
+        square_root_information.accumulate([rows]), width, effects, [len(effect.coefficients) for effect in effects]
     )
 
 
-def projected(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
+def project(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
     """The scan of a triangle [H | G | z] whose first ``width`` columns are the model's, then ``counts`` an effect."""
     sizes, rest = np.linalg.norm(upper[:, width:-1], axis=0), _beside(upper, width)
     units = np.where(sizes > 0, sizes, 1.0)
@@ -227,7 +227,9 @@ def projected(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequ
 
 def _beside(rows: Floats, width: int) -> Floats:
     """What rows [H | G | z] hold of G and z beside the first ``width`` columns."""
-    left, singular, _ = np.linalg.svd(square_root_information.scaled(rows[:, : width + 1])[0], full_matrices=False)
+    left, singular, _ = np.linalg.svd(
+        square_root_information.scale_columns(rows[:, : width + 1])[0], full_matrices=False
+    )
     explained, rest = left[:, singular > 1e-9], rows[:, width:]
     for _ in range(2):  # twice, or the rounding of what is large stays in what is left
         rest = rest - explained @ (explained.T @ rest)
@@ -246,7 +248,7 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
         return many.falls(_stacked(rows, carried.dwells, noise), own, width)
     out = list[Floats]()
     for part in batches([len(effect.coefficients) for effect in effects], _OF_ONE_KIND):
-        rows, width = whitened(carried, noise, [effects[k] for k in part])
+        rows, width = whiten_model(carried, noise, [effects[k] for k in part])
         sizes, rest = np.linalg.norm(rows[:, width:-1], axis=0), _beside(rows, width)
         columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
         columns = columns.T.reshape(len(part), -1, len(rest))
@@ -256,7 +258,7 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
     return np.concatenate(out)
 
 
-def whitened(
+def whiten_model(
     carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats | None = None
 ) -> tuple[Floats, int]:
     """Rows [H | W | G | z] (m, c) of unit noise of the model carried and of ``effects``, and how many columns come
@@ -268,11 +270,11 @@ def whitened(
     return _stacked(rows, dwells, noise), width
 
 
-def columns_of(carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats | None = None) -> Floats:
-    """G (m, q) of ``whitened``, some effects at a time: it takes no more memory than the result."""
+def whitened_columns(carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats | None = None) -> Floats:
+    """G (m, q) of ``whiten``, some effects at a time: it takes no more memory than the result."""
     sizes, out, first = [len(effect.coefficients) for effect in effects], np.zeros((0, 0)), 0
     for part in batches(sizes, _TOGETHER) or [[]]:
-        rows, width = whitened(carried, noise, [effects[k] for k in part], state)
+        rows, width = whiten_model(carried, noise, [effects[k] for k in part], state)
         out = out if len(out) else np.empty((len(rows), sum(sizes)))
         count = rows.shape[1] - width - 1
         out[:, first : first + count], first = rows[:, width:-1], first + count
@@ -288,13 +290,13 @@ def batches(sizes: Sequence[int], columns: int) -> list[list[int]]:
 def _judged(
     dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats, width: int
 ) -> tuple[list[Floats], int]:
-    """``square_root_information.judged`` with all rows that the dwells have."""
-    return square_root_information.judged(dwells, columns, noise, state, width, reduced=False)
+    """``square_root_information.misfit_rows`` with all rows that the dwells have."""
+    return square_root_information.misfit_rows(dwells, columns, noise, state, width, reduced=False)
 
 
 def _stacked(rows: Sequence[Floats], dwells: Sequence[DwellFactor], noise: Noise) -> Floats:
     """All rows, a walk of the biases taken out of their noise."""
-    return random_walk.whitened(rows, steps(dwells, noise)) if _inside(noise) else np.concatenate(rows)
+    return random_walk.whiten_walk(rows, steps(dwells, noise)) if _inside(noise) else np.concatenate(rows)
 
 
 def _inside(noise: Noise) -> int:

@@ -11,7 +11,7 @@ Three defects that no column of a model stands for are found from the values of 
 - *outliers*: readings the gate rejected. Spread at random over the run, their number in any stretch of dwells is
   binomial.
 
-``Watch`` looks at each block as it passes and keeps a few numbers a dwell; ``judged`` says what they mean.
+``ReadingsMonitor`` looks at each block as it passes and keeps a few numbers a dwell; ``judged`` says what they mean.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ class _Seen:
     out: Floats = field(default_factory=lambda: np.zeros(3))
 
 
-class Watch:
+class ReadingsMonitor:
     """Accumulates what the readings show, block by block; slews are passed over."""
 
     def __init__(self) -> None:

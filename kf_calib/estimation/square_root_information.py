@@ -20,7 +20,7 @@ from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
 from kf_calib.estimation import random_walk
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model, dwell_map
-from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, flicker_sigma, wander
+from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, flicker_sigma, slow_scatter
 from kf_calib.estimation.prior import Prior
 
 _SLOW = np.arange(1, 5)
@@ -28,7 +28,7 @@ _STILL = np.zeros(2)
 _AT_ONCE = 1 << 17  # numbers of rows worked on together, so that they stay in the cache
 
 
-def whitened(
+def whiten(
     dwells: Sequence[DwellFactor],
     columns: Sequence[Floats],
     noise: Noise,
@@ -124,7 +124,7 @@ def _less(rows: Floats, count: int) -> Floats:
     return rows[..., count:] - nuisances @ (np.swapaxes(nuisances, 1, 2) @ rows[..., count:])
 
 
-def judged(
+def misfit_rows(
     dwells: Sequence[DwellFactor],
     columns: Sequence[Floats],
     noise: Noise,
@@ -134,12 +134,12 @@ def judged(
 ) -> tuple[list[Floats], int]:
     """Rows [H | W | G | z] by which a misfit is judged, and how many columns come before G (of the first ``width``: H).
 
-    W: what a stated scatter may have in common in dwells that follow each other (``noise_model.wander``); its
+    W: what a stated scatter may have in common in dwells that follow each other (``noise_model.slow_scatter``); its
     coefficients have a prior, the rows of which come first. Within dwells it may go on as 1/f noise does.
     """
-    slow, sigma = wander(dwells, noise)
+    slow, sigma = slow_scatter(dwells, noise)
     if not sigma.size:
-        return whitened(dwells, columns, noise, state, reduced=reduced), width
+        return whiten(dwells, columns, noise, state, reduced=reduced), width
     flicker = flicker_sigma(noise, len(dwells))
     count, places = columns[0].shape[3] + len(sigma) + 1, width + np.arange(len(sigma))
     prior = np.zeros((len(sigma), count))
@@ -148,7 +148,7 @@ def judged(
         np.concatenate([own[..., :width], more, own[..., width:]], axis=3)
         for own, more in zip(columns, slow, strict=True)
     ]
-    return [prior, *whitened(dwells, both, noise, state, flicker_mps2=flicker, reduced=reduced)], width + len(sigma)
+    return [prior, *whiten(dwells, both, noise, state, flicker_mps2=flicker, reduced=reduced)], width + len(sigma)
 
 
 def _waves(dwell: DwellFactor) -> Floats:
@@ -177,7 +177,7 @@ def _informative(rows: Floats, units: Floats) -> list[Floats]:
 
 
 @dataclass(frozen=True)
-class Step:
+class FilterStep:
     """The filter after one dwell and its slew: factor [R | z] (p, p + 1); the dwell's normalised innovation squared and
     its degrees of freedom."""
 
@@ -206,12 +206,12 @@ def update(factor: Floats, rows: Floats, walked: Floats = _STILL) -> tuple[Float
 
     ``walked`` (2,): variances of the biases' steps in the pause before the dwell and in the dwell.
     """
-    width, (upper, count) = len(factor), random_walk.advanced(factor, walked, rows)
+    width, (upper, count) = len(factor), random_walk.advance(factor, walked, rows)
     left = upper[count + width :, -1]
     return upper[count : count + width, count:], float(left @ left)
 
 
-def restricted(factor: Floats, kept: Sequence[int]) -> Floats:
+def restrict(factor: Floats, kept: Sequence[int]) -> Floats:
     """The factor [R | z] (k, k + 1) of the states ``kept``, in that order, the others held at zero: one small QR.
 
     What a filter carries of effects that are not in its model is conditioned away, and is there when they are added.
@@ -224,7 +224,9 @@ def row_rank(rows: Floats) -> int:
     return int(rows[:, :-1].any(axis=1).sum())
 
 
-def run(first: Floats, rows: Iterable[Floats], walked: Iterable[Floats], following: Iterable[Floats]) -> list[Step]:
+def run(
+    first: Floats, rows: Iterable[Floats], walked: Iterable[Floats], following: Iterable[Floats]
+) -> list[FilterStep]:
     """The recursion over dwells, ``walked`` the variances of the biases' steps of each; rows ``following`` of its slew.
 
     A step's factor is that after the slew, its innovation that of the dwell.
@@ -237,12 +239,12 @@ def run(first: Floats, rows: Iterable[Floats], walked: Iterable[Floats], followi
         factors.append(update(own, more)[0] if len(more) else own)
     gained = ranks(np.array(after)) - ranks(np.array(factors[:-1]))
     return [
-        Step(factor, nis, count - new)
+        FilterStep(factor, nis, count - new)
         for factor, (nis, count), new in zip(factors[1:], told, gained.tolist(), strict=True)
     ]
 
 
-def accumulated(rows: Sequence[Floats], walked: Floats | None = None) -> Floats:
+def accumulate(rows: Sequence[Floats], walked: Floats | None = None) -> Floats:
     """The triangle [H | z] of all rows (a diffuse prior), the residual in its last row.
 
     ``walked`` (D, 2): variances of the biases' steps before and in each dwell, the last D of the rows; without a walk
@@ -256,12 +258,12 @@ def accumulated(rows: Sequence[Floats], walked: Floats | None = None) -> Floats:
     factor, left = np.zeros((width, width + 1)), 0.0
     padded = np.vstack([np.zeros((len(rows) - len(walked), 2)), walked])
     for own, variances in zip(rows, padded, strict=True):
-        upper, count = random_walk.advanced(factor, variances, own)
+        upper, count = random_walk.advance(factor, variances, own)
         factor, left = upper[count : count + width, count:], np.hypot(left, np.linalg.norm(upper[count + width :, -1]))
     return np.vstack([factor, np.append(np.zeros(width), left)])
 
 
-def scaled(factor: Floats) -> tuple[Floats, Floats]:
+def scale_columns(factor: Floats) -> tuple[Floats, Floats]:
     """R (..., p, p) of a factor in units in which its columns are of the same order, and those units (..., p).
 
     One unit for all sensitivities and one for all biases: a column of rounding size must stay small.
@@ -282,7 +284,7 @@ def rank(factor: Floats, tolerance: float = 1e-9) -> int:
 
 def ranks(factors: Floats, tolerance: float = 1e-9) -> NDArray[np.intp]:
     """The same of many factors (..., p, p + 1)."""
-    singular = np.linalg.svd(scaled(factors)[0], compute_uv=False)
+    singular = np.linalg.svd(scale_columns(factors)[0], compute_uv=False)
     return np.asarray((singular > tolerance).sum(axis=-1))
 
 
@@ -291,12 +293,12 @@ def solve(factor: Floats, around: Floats, tolerance: float = 1e-9) -> tuple[Floa
 
     Undetermined combinations keep their value ``around``; their variance is not in the covariance.
     """
-    return solved(factor[None], around, tolerance)[0]
+    return solve_all(factor[None], around, tolerance)[0]
 
 
-def solved(factors: Floats, around: Floats, tolerance: float = 1e-9) -> list[tuple[Floats, Floats, Floats]]:
+def solve_all(factors: Floats, around: Floats, tolerance: float = 1e-9) -> list[tuple[Floats, Floats, Floats]]:
     """The same of many factors (n, p, p + 1)."""
-    upper, scale = scaled(factors)
+    upper, scale = scale_columns(factors)
     left, singular, right = np.linalg.svd(upper)
     seen = singular > tolerance
     back = np.swapaxes(right, 1, 2) / scale[:, :, None]

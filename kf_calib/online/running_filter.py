@@ -1,7 +1,7 @@
 """A filter in the course of a run that takes effects in and out without a restart.
 
 Its factor [R | z] carries the columns of more effects than its model has. The estimate of any choice of them is one
-small QR (``square_root_information.restricted``), and equals that of a filter that had run with this choice from the
+small QR (``square_root_information.restrict``), and equals that of a filter that had run with this choice from the
 start. A dwell that closes is one update of the factor; effects whose columns were not carried are folded in from the
 dwell factors.
 
@@ -33,7 +33,7 @@ from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import Noise, steps
 from kf_calib.estimation.prior import Prior
-from kf_calib.estimation.score_test import Scan, projected
+from kf_calib.estimation.score_test import Scan, project
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class Running:
         kept = self._kept
         around = self.model.nominal_state() - self.about[kept]
         moved, covariance, undetermined = square_root_information.solve(
-            square_root_information.restricted(self.factor, kept), around
+            square_root_information.restrict(self.factor, kept), around
         )
         return self.about[kept] + moved, covariance, undetermined
 
@@ -140,12 +140,12 @@ class Running:
         theirs = [range(*parts[str(effect)].indices(len(self.about))) for effect in outside]
         order = [*kept, *itertools.chain(*theirs), len(self.about)]
         upper = np.vstack([triangle(self.factor[:, order]), np.zeros((1, len(order)))])
-        return projected(upper, len(kept), outside, [len(own) for own in theirs])
+        return project(upper, len(kept), outside, [len(own) for own in theirs])
 
     @property
     def misfit(self) -> tuple[float, int]:
         """What the model as it stands leaves: sum of squares, chi-squared of so many degrees of freedom."""
-        restricted = square_root_information.restricted(self.factor, self._kept)
+        restricted = square_root_information.restrict(self.factor, self._kept)
         squares = self.left + float(np.sum(self.factor[:, -1] ** 2) - np.sum(restricted[:, -1] ** 2))
         return squares, self.rows - square_root_information.rank(restricted)
 
@@ -175,4 +175,4 @@ class Running:
         """Whitened rows of all dwells, or of those chosen."""
         chosen = range(len(self.dwells)) if chosen is None else chosen
         dwells, columns = [self.dwells[k] for k in chosen], [self.carried.columns[k] for k in chosen]
-        return square_root_information.whitened(dwells, columns, self.noise.weights, self.about, self.about)
+        return square_root_information.whiten(dwells, columns, self.noise.weights, self.about, self.about)

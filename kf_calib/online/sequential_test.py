@@ -19,7 +19,7 @@ from functools import cached_property
 from threadpoolctl import threadpool_limits
 
 from kf_calib.bench.bench import Bench
-from kf_calib.diagnosis.candidate_tests import LEVEL, REST, SHARE, candidates, independent_tests, price, run_level
+from kf_calib.diagnosis.candidate_tests import LEVEL, REST, SHARE, candidates, chance_fall, independent_tests, run_level
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend_beside
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect
@@ -107,7 +107,7 @@ class Watch:
         """Names of what is beyond chance at this look, the likeliest first."""
         scan = self.running.scan
         scores = {
-            str(each.effect): float(fall) - price(each, self.tests)
+            str(each.effect): float(fall) - chance_fall(each, self.tests)
             for each, fall in zip(scan.candidates, scan.statistics, strict=True)
             if each.dof
         }

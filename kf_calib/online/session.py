@@ -27,7 +27,7 @@ from kf_calib.errors import InputError, KfCalibError
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
-from kf_calib.online.status import Judgement, Standing, concluding, current, judged, targets
+from kf_calib.online.status import Judgement, Standing, current, judge_whole_run, judged, targets
 
 _FIRST_LOOK_S = 1.0
 
@@ -242,7 +242,7 @@ class Session:
         before = self.standing.judgement
         passed = replace(self._passed, settings=self.settings)
         again = None if self.again is None else self.again()
-        final = concluding(passed, self.wanted, None if before is None else before.watch, again)
+        final = judge_whole_run(passed, self.wanted, None if before is None else before.watch, again)
         self._told(final, self.standing.elapsed_s)
         return final
 

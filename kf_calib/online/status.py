@@ -20,11 +20,11 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
 from kf_calib.design.gimbal_limits import wrapped
 from kf_calib.design.next_orientation import Advice, Course, course
-from kf_calib.diagnosis.candidate_tests import LEVEL, assessed
+from kf_calib.diagnosis.candidate_tests import LEVEL, assess_candidates
 from kf_calib.diagnosis.missing_effect import diagnose, next_orientation
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation.calibration import concluded, evaluate, told
+from kf_calib.estimation.calibration import conclude, evaluate, with_remarks
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.noise_model import mean_covariances
@@ -258,7 +258,7 @@ def judged(passed: Pass, wanted: Floats, before: Judgement | None = None) -> Jud
     settings, bench, dwells = passed.settings, passed.source.bench, passed.dwells
     with threadpool_limits(1, user_api="blas"):
         refuse_unusable(dwells, passed.tally, bench)
-        result = told(evaluate(dwells, bench, settings, passed.folder.slews), passed)
+        result = with_remarks(evaluate(dwells, bench, settings, passed.folder.slews), passed)
         watch = _watched(dwells, result, None if before is None else before.watch)
         look = _look(result, watch) if before is None else before.look.again(result, watch)
         return Judgement(result, look, watch, wanted, _course(result, wanted))
@@ -283,17 +283,17 @@ def _least(result: Calibration) -> int:
 
 def _not_judged(result: Calibration, watch: Watch | None) -> Diagnosis:
     """What can be said without an alarm: what the run could show so far, and that nothing is beyond chance."""
-    test = assessed(result.fit, None if watch is None else watch.tests, frames=result.frames)
+    test = assess_candidates(result.fit, None if watch is None else watch.tests, frames=result.frames)
     said = "Nothing is beyond chance so far: no effect is missing that this run has shown."
     if watch is None:
         said = "Too few orientations so far to judge the model by: visit more."
     return Diagnosis(result, test, (), (), False, (), {}, None, said)
 
 
-def concluding(passed: Pass, wanted: Floats, watch: Watch | None, again: Source | None = None) -> Judgement:
+def judge_whole_run(passed: Pass, wanted: Floats, watch: Watch | None, again: Source | None = None) -> Judgement:
     """The last judgement: the calibration and the diagnosis of the whole run, as of its recording (``again``)."""
     with threadpool_limits(1, user_api="blas"):
-        result = concluded(passed, again)
+        result = conclude(passed, again)
         look = Look(result, watch, diagnose(result))
         return Judgement(result, look, watch, wanted, _course(result, wanted), final=True)
 
@@ -343,4 +343,4 @@ def _saturated(before: Floats, now: Floats, doubled: Floats) -> bool | None:
     return bool(further.max() < _LITTLE * gained.max())
 
 
-__all__ = ["LEVEL", "Current", "Judgement", "Standing", "concluding", "current", "judged", "targets"]
+__all__ = ["LEVEL", "Current", "Judgement", "Standing", "current", "judge_whole_run", "judged", "targets"]

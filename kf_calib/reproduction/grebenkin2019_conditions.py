@@ -40,7 +40,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Search:
+class ConditionSearch:
     """The nearest conditions of all that were tried: accelerometers read together, and one after another.
 
     floor: the least rms log-ratio of any conditions in which all three accelerometers see the same vectors.
@@ -55,7 +55,7 @@ class Search:
     bias_excess: Floats
 
 
-def search(latitude_deg: float = Conditions.latitude_deg) -> Search:
+def search(latitude_deg: float = Conditions.latitude_deg) -> ConditionSearch:
     """Every reading of the turns, order of sampling, azimuth in steps of 15 deg, and 48 periods from 2 to 60 s."""
     found = [each for azimuth in AZIMUTHS_DEG.tolist() for each in _tried(Conditions(1.0, latitude_deg, azimuth))]
     together, in_turn = (
@@ -64,7 +64,9 @@ def search(latitude_deg: float = Conditions.latitude_deg) -> Search:
     )
     excess = bias_excess(grebenkin2019.printed(grebenkin2019.NONOPTIMAL_PRINTED))
     tried = len(found) * len(PERIODS_S)
-    return Search(tried, together, in_turn, shared_floor(), grebenkin2019.scatter(grebenkin2019.REPETITIONS), excess)
+    return ConditionSearch(
+        tried, together, in_turn, shared_floor(), grebenkin2019.scatter(grebenkin2019.REPETITIONS), excess
+    )
 
 
 def _tried(base: Conditions) -> Iterator[Found]:

@@ -16,7 +16,7 @@ from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.fit import WALK
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.remarks import beyond_stated
-from kf_calib.estimation.reml import FEWEST, freedom
+from kf_calib.estimation.reml import FEWEST, degrees_of_freedom
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Parameter, format_p
 from kf_calib.support.printing import printed
 from kf_calib.views.tables import Table
@@ -151,7 +151,7 @@ def noise_table(result: Calibration) -> Table:
 
 def noise_origins(result: Calibration) -> tuple[str, str]:
     """Where the scatter from dwell to dwell and the setting error of the angles come from."""
-    noise, few = result.noise, freedom(result.carried.means) < FEWEST
+    noise, few = result.noise, degrees_of_freedom(result.carried.means) < FEWEST
     scatter = "stated" if noise.scatter_stated else _NOT_ESTIMATED if few else "estimated"
     if not noise.setting_stated:
         return scatter, _NOT_ESTIMATED if few or not noise.checked else "estimated"

@@ -12,7 +12,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.reproduction import grebenkin2019
 from kf_calib.reproduction.grebenkin2019 import NONOPTIMAL_PRINTED, OPTIMAL_PRINTED, TOGETHER, Conditions, Experiment
-from kf_calib.reproduction.grebenkin2019_conditions import AZIMUTHS_DEG, PERIODS_S, Found, Search
+from kf_calib.reproduction.grebenkin2019_conditions import AZIMUTHS_DEG, PERIODS_S, ConditionSearch, Found
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Table
@@ -26,7 +26,7 @@ _ABOUT = {
 _WORDS = {1: "one", 2: "two", 3: "three"}
 
 
-def paper_object(found: Experiment, searched: Search) -> dict[str, Any]:
+def paper_object(found: Experiment, searched: ConditionSearch) -> dict[str, Any]:
     """What ``paper --json`` prints; figures of table2 are per cent, ``optimal`` and ``nonoptimal`` by least squares."""
     sets = {"optimal": found.optimal, "nonoptimal": found.nonoptimal}
     return clean(
@@ -97,7 +97,7 @@ def _turning(found: Experiment) -> tuple[float, float]:
     return float(grebenkin2019.log_ratio(figures[0], column)), float(grebenkin2019.log_ratio(figures[1], column))
 
 
-def paper_report(found: Experiment, searched: Search) -> RenderableType:
+def paper_report(found: Experiment, searched: ConditionSearch) -> RenderableType:
     """What ``paper`` prints."""
     return Group(table2(found), *map(Text, sentences(found, searched)))
 
@@ -115,7 +115,7 @@ def table2(found: Experiment) -> Table:
     return table
 
 
-def markdown(found: Experiment, searched: Search) -> str:
+def markdown(found: Experiment, searched: ConditionSearch) -> str:
     """The same in one page for the Rerun view."""
     head = "| | optimal % | batch | non-opt. % | batch |\n|:--|--:|--:|--:|--:|\n"
     rows = [f"| {symbol(name)} | " + " | ".join(np.array(_both(found, name))[[0, 2, 4, 6]]) + " |" for name in _order()]
@@ -140,7 +140,7 @@ def _both(found: Experiment, name: str) -> list[str]:
     return cells
 
 
-def sentences(found: Experiment, searched: Search) -> list[str]:
+def sentences(found: Experiment, searched: ConditionSearch) -> list[str]:
     """What the figures say, what they rest on, and what is inferred."""
     return [_scatter(found), rank_sentence(found), _inferred(found), *_searched(searched), _earth(found),
             _conditioning(found), _filter(found)]  # fmt: skip
@@ -188,7 +188,7 @@ def _described(conditions: Conditions) -> str:
     )
 
 
-def _searched(searched: Search) -> list[str]:
+def _searched(searched: ConditionSearch) -> list[str]:
     together, in_turn, worst = searched.together, searched.in_turn, int(searched.bias_excess.argmax())
     return [
         f"Of {searched.tried} conditions tried ({len(AZIMUTHS_DEG)} azimuths, {len(PERIODS_S)} periods, "

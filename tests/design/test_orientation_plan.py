@@ -300,7 +300,7 @@ def test_a_plan_is_run_by_the_simulator_and_its_sigmas_hold(run, tmp_path: Path)
     dwells = calibrate_file(out).fit.dwells
     np.testing.assert_allclose(np.degrees([each.pose for each in dwells]), made["gimbal_deg"], atol=0.01)
 
-    from kf_calib.sources.simulation.noise_processes import Noise
+    from kf_calib.sources.simulation.noise_processes import TrueNoise
     from kf_calib.sources.simulation.sensors import GRADES
     from kf_calib.sources.simulation.simulator import Simulation
     from kf_calib.sources.simulation.visit_plans import explicit_plan
@@ -308,7 +308,7 @@ def test_a_plan_is_run_by_the_simulator_and_its_sigmas_hold(run, tmp_path: Path)
     bench = Bench(axes_of("yzx"), G, angle_sigma_deg=0.001, scatter_sigma_mps2=0.0)
     visits, ratios = explicit_plan(made["gimbal_deg"], 5.0), []
     for seed in range(30):
-        noise = Noise(white_mps2=1e-3, setting_sigma_deg=0.001)
+        noise = TrueNoise(white_mps2=1e-3, setting_sigma_deg=0.001)
         sensors = GRADES["navigation"].sensors(seed)
         source = Simulation(bench, sensors, noise, visits, sample_hz=50.0, slew_rate_degps=1000.0, seed=seed)
         found = calibrate(source)

@@ -16,7 +16,7 @@ from helpers.synthetic import Run, plan_of
 
 from kf_calib.cli import cli
 from kf_calib.diagnosis import candidate_tests
-from kf_calib.diagnosis.candidate_tests import EQUAL, assessed, detectable, independent_tests, price
+from kf_calib.diagnosis.candidate_tests import EQUAL, assess_candidates, chance_fall, detectable, independent_tests
 from kf_calib.diagnosis.missing_effect import diagnose, next_orientation
 from kf_calib.diagnosis.results import with_effects
 from kf_calib.effects import effect_named
@@ -48,7 +48,10 @@ def test_a_hidden_effect_is_named(name: str) -> None:
 @pytest.mark.parametrize("runs", [4, *slow(15)])
 def test_nothing_is_found_in_noise(case: dict, runs: int) -> None:
     """Of 15 runs at a level of 1 %, two or more alarms have a chance of 1 %; of 4, one has 4 %."""
-    tests = [assessed(calibrate(Run(seed=4000 + k, **{"dwells": 24, "count": 200, **case})).fit) for k in range(runs)]
+    tests = [
+        assess_candidates(calibrate(Run(seed=4000 + k, **{"dwells": 24, "count": 200, **case})).fit)
+        for k in range(runs)
+    ]
     assert sum(not each.consistent for each in tests) <= runs // 15
     assert np.median([min(each.p_values.values()) for each in tests]) > 0.2
 
@@ -65,7 +68,7 @@ def test_what_is_in_no_catalogue_is_unknown(name: str, driver: str) -> None:
     assert shape is not None and driver in shape.driver
     shown = diagnosis_object(found)
     assert shown["missing"] == "unknown" and shown["unknown"]["formula"] == shape.formulas[0]
-    assert assessed(with_effects(found.before, shape.formulas).fit).consistent
+    assert assess_candidates(with_effects(found.before, shape.formulas).fit).consistent
 
 
 def test_a_formula_that_explains_more_than_a_known_effect_speaks_against_it() -> None:
@@ -104,10 +107,10 @@ def test_scores_are_falls_of_chi_squared() -> None:
 @pytest.mark.parametrize("runs", [5, *slow(20)])
 def test_smallest_sizes_are_met(runs: int) -> None:
     """Power at the stated size, one coefficient hidden: about 0.9 of the runs."""
-    sizes = {each.name: each.minimum for each in detectable(assessed(run().fit))}
+    sizes = {each.name: each.minimum for each in detectable(assess_candidates(run().fit))}
     seen = 0
     for seed in range(runs):
-        test = assessed(run(f"second-order={sizes['second-order']},0,0", seed=seed).fit)
+        test = assess_candidates(run(f"second-order={sizes['second-order']},0,0", seed=seed).fit)
         seen += test.consistent is False
     assert seen >= 0.7 * runs
 
@@ -126,8 +129,10 @@ def test_noise_rarely_puts_a_rival_so_far_ahead_that_the_truth_is_out() -> None:
         readings = rng.standard_normal(6)
         readings[:3] = readings[3:] / np.tan(angle)  # no signal helps it more
         found = Scan(candidates, readings)
-        scores = {str(c.effect): float(x) - price(c, 30.0) for c, x in zip(candidates, found.statistics, strict=True)}
-        test = candidate_tests.Test(
+        scores = {
+            str(c.effect): float(x) - chance_fall(c, 30.0) for c, x in zip(candidates, found.statistics, strict=True)
+        }
+        test = candidate_tests.CandidateTests(
             found, {"second-order": 0, "scale-asymmetry": 1}, scores, {}, None, "", 30.0, (), ()
         )
         out += "second-order" not in test.rivals("scale-asymmetry")
@@ -160,7 +165,7 @@ def test_a_hand_placed_run_claims_nothing() -> None:
 
 def test_the_p_value_of_a_run_does_not_depend_on_how_its_frame_is_turned() -> None:
     """Which way it is turned is up to rounding: draws in it would be those of the machine."""
-    found = assessed(run().fit).scan
+    found = assess_candidates(run().fit).scan
     turn = np.linalg.qr(np.random.default_rng(0).standard_normal((len(found.residual),) * 2))[0]
 
     def turned(each: Candidate) -> Candidate:

@@ -11,12 +11,12 @@ from helpers.hidden_effects import noisy_run as run
 from helpers.long_runs import slow
 from helpers.synthetic import Run, plan_of
 
-from kf_calib.diagnosis.candidate_tests import EQUAL, assessed
+from kf_calib.diagnosis.candidate_tests import EQUAL, assess_candidates
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.results import Diagnosis, with_effects
 from kf_calib.diagnosis.unknown_effect import IRREGULAR, JUMP
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import six_faces
@@ -57,7 +57,7 @@ def test_an_effect_is_named_in_noise_of_other_kinds(noise: dict[str, float]) -> 
 @pytest.mark.parametrize("runs", [3, *slow(8)])
 @pytest.mark.parametrize("noise", [{"flicker_mps2": 1e-5}, {"scatter_mps2": 5e-5}], ids=lambda noise: "+".join(noise))
 def test_stated_scatter_and_flicker_name_nothing(noise: dict[str, float], runs: int) -> None:
-    tests = [assessed(run(seed=70 + k, **noise).fit) for k in range(runs)]
+    tests = [assess_candidates(run(seed=70 + k, **noise).fit) for k in range(runs)]
     assert sum(not each.consistent for each in tests) == 0
 
 
@@ -108,9 +108,9 @@ def test_pairs_that_explain_as_much_as_a_single_effect_are_said() -> None:
 
 def test_what_the_run_has_no_sight_of_is_said() -> None:
     """40 readings a dwell have no spectrum: what is faster than their cells show is not seen."""
-    test = assessed(calibrate(Run(count=40, rate_hz=1.0)).fit)
+    test = assess_candidates(calibrate(Run(count=40, rate_hz=1.0)).fit)
     assert test.between == "sinusoid above 0.38 Hz" and test.between in test.invisible
-    assert not assessed(run().fit).between
+    assert not assess_candidates(run().fit).between
 
 
 @pytest.mark.slow
@@ -181,7 +181,7 @@ def test_scatter_that_is_not_stated_gets_no_name() -> None:
     """It looks like an unknown effect, and is named neither; in few dwells, below, at once."""
     unstated = replace(BENCH, scatter_sigma_mps2=None)
     visits = plan_of(24, dwell_s=8.0, seed=9)
-    noise = Noise(white_mps2=WHITE, scatter_mps2=5e-5)
+    noise = TrueNoise(white_mps2=WHITE, scatter_mps2=5e-5)
     source = Simulation(unstated, GRADES["navigation"].sensors(9), noise, visits, sample_hz=50.0, angle_hz=20.0,
                         slew_rate_degps=90.0, seed=9)  # fmt: skip
     found = diagnose(calibrate(source))

@@ -17,10 +17,10 @@ from scipy.stats import chi2
 
 from kf_calib.cli import cli
 from kf_calib.diagnosis import selection_journal
-from kf_calib.diagnosis.nested_cross_validation import honest
+from kf_calib.diagnosis.nested_cross_validation import nested_cross_validation
 from kf_calib.diagnosis.selection_journal import figures
-from kf_calib.diagnosis.stepwise_selection import Improvement, Step, improve, removals, stepped, undone
-from kf_calib.dwells.sufficient_statistics import without
+from kf_calib.diagnosis.stepwise_selection import Improvement, SelectionStep, improve, removals, take_step, undone
+from kf_calib.dwells.sufficient_statistics import dwells_without
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate, evaluate, refitted
 from kf_calib.estimation.dwell_columns import stimulus_of
@@ -30,7 +30,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
-from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import spread_plan
@@ -105,7 +105,7 @@ def test_equal_explanations_are_left_to_a_person() -> None:
     assert [each.name for each in first.alternatives] == [each.name for each in state.alternatives]
     assert [each.sigmas for each in first.spreads] == pytest.approx([each.sigmas for each in state.spreads], rel=0.01)
     assert "second-order and scale-asymmetry" in first.reason and f"{widest.sigmas:.1f} sigma" in first.reason
-    other = stepped(state, "scale-asymmetry", None, "user")
+    other = take_step(state, "scale-asymmetry", None, "user")
     assert other.alternatives[0].name == "scale-asymmetry" and other.alternatives[1].name == "second-order"
 
 
@@ -123,10 +123,10 @@ def test_what_is_not_needed_goes_unless_it_was_asked_for(improved: Improvement) 
     """A step that explained nothing is taken out when the true effect comes in; the user's own stays."""
     useless, start = refitted(improved.start.before, ("hysteresis",)), Improvement(improved.start)
     stands = replace(improved.start, before=useless)
-    asked = stepped(Improvement(stands), "second-order", None, "diagnosis")
+    asked = take_step(Improvement(stands), "second-order", None, "diagnosis")
     assert asked.effects == ("hysteresis", "second-order") and not asked.steps[-1].dropped
-    taken = replace(start, history=(Step("hysteresis", (), "diagnosis", stands),))
-    found = stepped(taken, "second-order", None, "diagnosis")
+    taken = replace(start, history=(SelectionStep("hysteresis", (), "diagnosis", stands),))
+    found = take_step(taken, "second-order", None, "diagnosis")
     assert found.effects == ("second-order",)
     gone = found.steps[-1].dropped[0]
     assert gone.name == "hysteresis" and gone.p_value > 0.01 and not gone.needed
@@ -143,18 +143,18 @@ def test_a_result_shows_what_it_is_and_not_its_arrays(improved: Improvement) -> 
 
 def test_undo_and_drop(improved: Improvement) -> None:
     start = Improvement(improved.start)
-    taken = stepped(stepped(start, "mine = fx*fz", None, "user"), "second-order", None, "user")
+    taken = take_step(take_step(start, "mine = fx*fz", None, "user"), "second-order", None, "user")
     assert taken.effects == ("mine = fx*fz", "second-order")
     back = undone(taken)
     assert back.effects == ("mine = fx*fz",) and len(back.history) == 2 and undone(back).effects == ()
-    dropped = stepped(taken, None, ("mine",), "user")
+    dropped = take_step(taken, None, ("mine",), "user")
     assert dropped.effects == ("second-order",) and figures(dropped.found) == figures(improved.found)
     for bad, says in [
         (lambda: undone(start), "no step to undo"),
-        (lambda: stepped(taken, None, ("hysteresis",), "user"), "it has mine, second-order"),
-        (lambda: stepped(taken, "second-order", None, "user"), "in the model already"),
-        (lambda: stepped(start, "second-ordr", None, "user"), "did you mean second-order"),
-        (lambda: stepped(start, "latency", None, "user"), "start with --with"),
+        (lambda: take_step(taken, None, ("hysteresis",), "user"), "it has mine, second-order"),
+        (lambda: take_step(taken, "second-order", None, "user"), "in the model already"),
+        (lambda: take_step(start, "second-ordr", None, "user"), "did you mean second-order"),
+        (lambda: take_step(start, "latency", None, "user"), "start with --with"),
     ]:
         with pytest.raises(InputError, match=says):
             bad()
@@ -162,16 +162,16 @@ def test_undo_and_drop(improved: Improvement) -> None:
 
 def test_dwells_left_out_are_still_where_others_came_from(quiet: Calibration) -> None:
     every, state = quiet.fit.dwells, quiet.carried.state
-    some = without(every, {3, 4, 10})
+    some = dwells_without(every, {3, 4, 10})
     whole, part = (stimulus_of(dwells, BENCH, state) for dwells in (every, some))
     kept = np.repeat([k not in {3, 4, 10} for k, dwell in enumerate(every) for _ in dwell.pieces], 3)
     np.testing.assert_array_equal(part.previous_force_mps2, whole.previous_force_mps2[kept])
 
 
 def test_the_honest_error_repeats_the_choice(second_order: Calibration, quiet: Calibration) -> None:
-    checked = honest(second_order, folds=3)
+    checked = nested_cross_validation(second_order, folds=3)
     assert checked.chosen == {"second-order": 3} and 0.7 < checked.rms_mps2 / checked.expected_mps2 < 1.3
-    empty = honest(quiet, folds=3)
+    empty = nested_cross_validation(quiet, folds=3)
     assert empty.chosen == {} and 0.7 < empty.rms_mps2 / empty.expected_mps2 < 1.3
     assert quiet.held_out_rms_mps2 == pytest.approx(empty.rms_mps2, rel=0.15)
 
@@ -180,7 +180,7 @@ def test_honest_errors_are_those_of_orientations_left_out() -> None:
     """As many folds as orientations and nothing to choose: leave-one-out of the fixed model, history and all."""
     before = run("hysteresis=15sigma", plan=spread_plan(12, dwell_s=8.0, seed=5))
     cured = refitted(before, ("hysteresis",))
-    checked = honest(cured, folds=12)
+    checked = nested_cross_validation(cured, folds=12)
     assert checked.chosen == {"hysteresis": 12}
     assert checked.rms_mps2 == pytest.approx(cured.held_out_rms_mps2, rel=0.02)
     assert checked.expected_mps2 == pytest.approx(cured.held_out_floor_mps2, rel=0.02)
@@ -195,7 +195,7 @@ def test_sigmas_are_honest_after_improvement(runs: int) -> None:
     before, after = list[float](), list[float]()
     for seed in range(runs):
         source = Simulation(
-            replace(BENCH), GRADES["navigation"].sensors(seed), Noise(white_mps2=5e-5),
+            replace(BENCH), GRADES["navigation"].sensors(seed), TrueNoise(white_mps2=5e-5),
             spread_plan(20, dwell_s=4.0, seed=seed), sample_hz=50.0, angle_hz=20.0, slew_rate_degps=360.0, seed=seed,
         )  # fmt: skip
         source = source.hiding(parse(["second-order=15sigma"], BENCH.axes, seed=seed, sized=partial(sized, source)))

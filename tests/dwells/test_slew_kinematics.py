@@ -19,7 +19,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.simulation.injected import parse
-from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
 
@@ -33,7 +33,7 @@ def run(
     rate: float = 20.0, angle_hz: float = 10.0, batch: int = 65536, **noise: float,
 ) -> Simulation:  # fmt: skip
     return Simulation(
-        bench, GRADES["navigation"].sensors(seed), Noise(white_mps2=5e-5, **noise),
+        bench, GRADES["navigation"].sensors(seed), TrueNoise(white_mps2=5e-5, **noise),
         plan_of(dwells, dwell_s=6.0, seed=4),
         sample_hz=sample_hz, angle_hz=angle_hz, slew_rate_degps=rate, seed=seed, batch_samples=batch,
         hidden=parse(hidden, BENCH.axes, seed=seed),

@@ -35,7 +35,7 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.online.running_filter import Running
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
-from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
@@ -84,7 +84,7 @@ def run(
     period_s: float = 150.0, angle_hz: float = 10.0, slew_degps: float = 90.0,
 ) -> Simulation:  # fmt: skip
     made = Simulation(
-        BENCH, GRADES["navigation"].sensors(seed), Noise(white_mps2=white_mps2), plan,
+        BENCH, GRADES["navigation"].sensors(seed), TrueNoise(white_mps2=white_mps2), plan,
         sample_hz=sample_hz, angle_hz=angle_hz, slew_rate_degps=slew_degps, seed=seed,
         ambient=Ambient(swing_c=5.0, period_s=period_s, sigma_c=0.0),
     )  # fmt: skip
@@ -254,7 +254,7 @@ def test_rank_of_the_information_lacks_what_is_degenerate(name: str) -> None:
     nothing = {*INVISIBLE, "vibration-rectification"}  # nothing vibrates in this run
     seen = 0 if name in nothing else len(effect_named(name, BENCH).coefficients)
     unknown = effect_named(name, BENCH).unknown is not None  # its derivative is nothing where the coefficients are
-    rank = square_root_information.rank(square_root_information.accumulated(fitted.rows())[:-1])
+    rank = square_root_information.rank(square_root_information.accumulate(fitted.rows())[:-1])
     assert 12 + seen <= rank <= 12 + seen + unknown
 
 
@@ -305,7 +305,7 @@ def test_left_out_effect_biases_the_twelve_and_the_effect_in_the_model_mends_it(
 def estimated(fitted: Fit) -> dict[str, tuple[float, float]]:
     """Value and sigma (NaN: not seen) of all but the twelve, without the rest of a calibration."""
     model = fitted.carried.model
-    factor = square_root_information.accumulated(fitted.rows(), fitted.steps)[:-1]
+    factor = square_root_information.accumulate(fitted.rows(), fitted.steps)[:-1]
     estimate = Estimate(*square_root_information.solve(factor, model.nominal_state()))
     found, gains = model.natural(estimate.state)
     out = {c.symbol: own for c, *own in zip(model.coefficients, found, estimate.effect_sigma * gains, strict=True)}
@@ -393,10 +393,10 @@ def test_a_factor_restricted_equals_that_of_fewer_columns(navigation, name: str)
 
     def factor_of(model: Model) -> Floats:
         at = np.concatenate([state, np.zeros(model.count - 12)])
-        rows = square_root_information.whitened(dwells, Carried(dwells, model, at).columns, noise, at, at)
-        return square_root_information.accumulated(rows)[:-1]
+        rows = square_root_information.whiten(dwells, Carried(dwells, model, at).columns, noise, at, at)
+        return square_root_information.accumulate(rows)[:-1]
 
-    few, chosen = factor_of(small), square_root_information.restricted(factor_of(large), list(range(small.count)))
+    few, chosen = factor_of(small), square_root_information.restrict(factor_of(large), list(range(small.count)))
     (one, covariance, _), (other, reference, _) = (
         square_root_information.solve(f, np.zeros(small.count)) for f in (chosen, few)
     )

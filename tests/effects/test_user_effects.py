@@ -39,7 +39,7 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.simulation.injected import parse
-from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
@@ -98,7 +98,7 @@ def test_a_formula_is_the_class_it_spells_out(expression: str, name: str) -> Non
 def test_a_formula_gives_the_calibration_of_its_class() -> None:
     source = Simulation(
         Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0), GRADES["navigation"].sensors(5),
-        Noise(white_mps2=5e-5), spread_plan(16, dwell_s=4.0, seed=4), sample_hz=20.0, slew_rate_degps=360.0, seed=5,
+        TrueNoise(white_mps2=5e-5), spread_plan(16, dwell_s=4.0, seed=4), sample_hz=20.0, slew_rate_degps=360.0, seed=5,
         ambient=Ambient(swing_c=5.0, period_s=60.0), hidden=parse(["cross-coupling-ip=4ug/g^2"], BENCH.axes, seed=5),
     )  # fmt: skip
     ours, theirs = (calibrate(source, Settings(effects=(name,))) for name in ("mine = a*p", "cross-coupling-ip"))

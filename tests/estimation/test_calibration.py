@@ -194,19 +194,19 @@ def test_dwells_whitened_together_are_those_whitened_alone() -> None:
     fitted = fit(dwells, Model.of(Run(dwells=1).bench, ("bias-drift",)))
     columns, state = fitted.carried.columns, fitted.carried.state
     for noise in (fitted.noise, replace(fitted.noise, scatter_mps2=np.full(3, 1e-5), walk_mps2_per_sqrt_s=1e-5)):
-        together = square_root_information.whitened(dwells, columns, noise, state, reduced=False)
+        together = square_root_information.whiten(dwells, columns, noise, state, reduced=False)
         for dwell, own, rows in zip(dwells, columns, together, strict=True):
-            (alone,) = square_root_information.whitened([dwell], [own], noise, state, reduced=False)
+            (alone,) = square_root_information.whiten([dwell], [own], noise, state, reduced=False)
             np.testing.assert_array_equal(rows, alone)
-        few = square_root_information.whitened(dwells, columns, noise, state)
+        few = square_root_information.whiten(dwells, columns, noise, state)
         for whole, rows in zip(together, few, strict=True):
             assert len(rows) < len(whole)
             left, right = rows[:, :-1].T @ rows, whole[:, :-1].T @ whole
             np.testing.assert_allclose(left, right, rtol=0, atol=1e-9 * np.abs(right).max())
-    factors = [square_root_information.accumulated(fitted.rows()[:count])[:-1] for count in (1, 3, 14)]
+    factors = [square_root_information.accumulate(fitted.rows()[:count])[:-1] for count in (1, 3, 14)]
     around = fitted.carried.model.nominal_state()
     for factor, (state, covariance, lost) in zip(
-        factors, square_root_information.solved(np.array(factors), around), strict=True
+        factors, square_root_information.solve_all(np.array(factors), around), strict=True
     ):
         assert lost.shape[1] == len(factor) - square_root_information.rank(factor)
         np.testing.assert_allclose(factor[:, :-1] @ lost, 0.0, atol=1e-6 * np.abs(factor).max())

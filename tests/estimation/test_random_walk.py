@@ -54,7 +54,7 @@ def test_a_path_has_the_covariance_of_its_readings() -> None:
         orthogonal, upper = np.linalg.qr(np.column_stack([np.ones_like(u), u, u * u]))
         onto.append(orthogonal.T)
         triangles.append(upper)
-    path = walk_path.path(
+    path = walk_path.walk_path_of(
         np.array([part[0] for part in parts]), np.array([part[-1] for part in parts]), [11, 7, 25], np.array(triangles)
     )
     full, project, first = covariance_at(times), np.zeros((9, len(times))), 0
@@ -202,8 +202,8 @@ def test_going_back_in_time_is_going_forward_on_reversed_dwells() -> None:
     rows, variances = fit.rows(), steps(fit.dwells, fit.noise)
     factor = np.zeros((12, 13))
     for own, variance in zip(rows[::-1], variances[::-1], strict=True):
-        factor = random_walk.receded(factor, variance, own)
-    forward = square_root_information.accumulated(rows, variances)[:-1]
+        factor = random_walk.recede(factor, variance, own)
+    forward = square_root_information.accumulate(rows, variances)[:-1]
     gains = [k for k in range(12) if k % 4 != 3]
     one, other = (square_root_information.solve(each, np.zeros(12)) for each in (factor, forward))
     sigma = np.sqrt(np.diag(other[1]))[gains]

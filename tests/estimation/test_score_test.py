@@ -21,7 +21,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import Frame, scan
 from kf_calib.sources.simulation.injected import parse
-from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
 
@@ -30,7 +30,7 @@ BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scat
 
 def run(*hidden: str, seed: int = 5) -> Calibration:
     base = Simulation(
-        BENCH, GRADES["navigation"].sensors(seed), Noise(white_mps2=5e-5), plan_of(12, dwell_s=8.0, seed=seed),
+        BENCH, GRADES["navigation"].sensors(seed), TrueNoise(white_mps2=5e-5), plan_of(12, dwell_s=8.0, seed=seed),
         sample_hz=20.0, angle_hz=20.0, slew_rate_degps=90.0, seed=seed,
     )  # fmt: skip
     return calibrate(base.hiding(parse(hidden, BENCH.axes, seed=seed)))

@@ -24,7 +24,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import Frame, falls, scan
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.simulation.injected import parse
-from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
 
@@ -38,7 +38,7 @@ def run(
 ) -> Simulation:
     sizes = ",".join(str(size_sigma * SIGMA * share) for share in SHARES)
     return Simulation(
-        bench, GRADES["navigation"].sensors(seed), Noise(white_mps2=SIGMA),
+        bench, GRADES["navigation"].sensors(seed), TrueNoise(white_mps2=SIGMA),
         plan_of(dwells, dwell_s=dwell_s, seed=4), sample_hz=100.0, slew_rate_degps=90.0, seed=seed,
         hidden=parse([f"sinusoid={sizes};frequency={frequency_hz}"], BENCH.axes, seed=seed),
     )  # fmt: skip

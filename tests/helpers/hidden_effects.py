@@ -12,7 +12,7 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
-from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
@@ -24,7 +24,7 @@ BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scat
 def run(*hidden: str, seed: int = 5, plan: list | None = None) -> Calibration:
     """A calibration without the hidden effects in its model. A diagnosis takes as long as there are dwells."""
     base = Simulation(
-        BENCH, GRADES["navigation"].sensors(seed), Noise(white_mps2=5e-5),
+        BENCH, GRADES["navigation"].sensors(seed), TrueNoise(white_mps2=5e-5),
         plan or plan_of(16, dwell_s=8.0, seed=seed),
         sample_hz=50.0, angle_hz=20.0, slew_rate_degps=90.0, seed=seed,
         ambient=Ambient(swing_c=5.0, period_s=300.0, sigma_c=0.0),
@@ -43,7 +43,7 @@ def noisy_run(
 
     A diagnosis takes as long as there are dwells; what goes with time rather than with gravity needs more of them.
     """
-    made = Noise(**{"white_mps2": WHITE, **noise})
+    made = TrueNoise(**{"white_mps2": WHITE, **noise})
     visits = plan or plan_of(dwells, dwell_s=8.0, seed=seed)
     scatter = made.dwell_sigma_mps2(len(visits))
     stated: dict[str, Any] = {"angle_sigma_deg": made.setting_sigma_deg, "scatter_sigma_mps2": scatter} | (states or {})

@@ -45,7 +45,7 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import Status
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
-from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.views import live as views
@@ -56,7 +56,7 @@ from kf_calib.views.rerun.growing import GrowingView
 
 def bench(*hidden: str, orientations: int = 12, batch: int = 40) -> Simulation:
     base = Simulation(
-        BENCH, GRADES["navigation"].sensors(5), Noise(white_mps2=5e-5), plan_of(orientations, dwell_s=6.0, seed=5),
+        BENCH, GRADES["navigation"].sensors(5), TrueNoise(white_mps2=5e-5), plan_of(orientations, dwell_s=6.0, seed=5),
         sample_hz=50.0, angle_hz=20.0, slew_rate_degps=180.0, seed=5, batch_samples=batch,
     )  # fmt: skip
     return base.hiding(parse(hidden, BENCH.axes, seed=5, sized=partial(sized, base)))
@@ -149,7 +149,7 @@ def test_candidates_are_tried_again_only_where_that_may_say_something_else(monke
     """Where nothing is beyond chance only if somebody asks; then until three diagnoses agree, and as the run grows."""
     diagnosed = list[int]()
     monkeypatch.setattr(status, "diagnose", lambda result: diagnosed.append(len(result.visits)) or diagnose(result))
-    monkeypatch.setattr(status, "assessed", lambda *_: pytest.fail("nobody has asked"))
+    monkeypatch.setattr(status, "assess_candidates", lambda *_: pytest.fail("nobody has asked"))
     judgements = judged_one_by_one(bench("second-order=15sigma", orientations=24))
     alarmed = [k for k, each in judgements.items() if each.watch is not None and each.watch.alarmed is not None]
     assert 5 < alarmed[0], (alarmed, diagnosed)

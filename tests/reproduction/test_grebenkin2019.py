@@ -150,7 +150,7 @@ def found() -> grebenkin2019.Experiment:
 
 
 @pytest.fixture(scope="module")
-def searched() -> grebenkin2019_conditions.Search:
+def searched() -> grebenkin2019_conditions.ConditionSearch:
     return grebenkin2019_conditions.search()
 
 
@@ -211,7 +211,7 @@ def test_vectors_are_those_of_scipys_rotations(turns, sampled: str) -> None:
         np.testing.assert_allclose(force[i, k], attitudes[place].inv().apply(up), atol=1e-9)
 
 
-def test_search_is_the_closed_form_at_what_it_found(searched: grebenkin2019_conditions.Search) -> None:
+def test_search_is_the_closed_form_at_what_it_found(searched: grebenkin2019_conditions.ConditionSearch) -> None:
     printed = grebenkin2019.printed(NONOPTIMAL_PRINTED)
     for each in (searched.together, searched.in_turn):
         assert each.log_ratio == pytest.approx(
@@ -223,7 +223,7 @@ def test_search_is_the_closed_form_at_what_it_found(searched: grebenkin2019_cond
     assert near == Conditions(), "the defaults are what the search finds, the period rounded"
 
 
-def test_nothing_read_together_comes_below_the_floor(searched: grebenkin2019_conditions.Search) -> None:
+def test_nothing_read_together_comes_below_the_floor(searched: grebenkin2019_conditions.ConditionSearch) -> None:
     rng, printed = np.random.default_rng(7), grebenkin2019.printed(NONOPTIMAL_PRINTED)
     for _ in range(100):
         vectors = Rotation.random(400, random_state=rng).apply([0.0, 9.81, 0.0]) * [1.0, rng.uniform(0.02, 1), 1.0]
@@ -295,7 +295,7 @@ def test_bad_usage_is_one_sentence(words: list[object], says: str) -> None:
 
 
 def test_readme_shows_what_the_command_prints(
-    found: grebenkin2019.Experiment, searched: grebenkin2019_conditions.Search
+    found: grebenkin2019.Experiment, searched: grebenkin2019_conditions.ConditionSearch
 ) -> None:
     """Pages break long lines where they like."""
     readme = (ROOT / "README.md").read_text()

@@ -24,7 +24,7 @@ from kf_calib.diagnosis.stepwise_selection import improve
 from kf_calib.effects import effect_named, names
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.engine_comparison import Comparison, Way
-from kf_calib.estimation.observability import sights
+from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.session import Session
@@ -61,7 +61,7 @@ def _plan(result: Calibration) -> RenderableType:
 
 def _visible(result: Calibration) -> RenderableType:
     chosen = [effect_named(name, result.bench) for name in ("magnetic", "thermal-bias", "warm-up")]
-    return catalogue.sight_report(sights(result.fit, chosen), "What a recording shows")
+    return catalogue.sight_report(visibility_of(result.fit, chosen), "What a recording shows")
 
 
 SAID: dict[str, Callable[[Calibration], RenderableType]] = {

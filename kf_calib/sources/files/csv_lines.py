@@ -17,7 +17,7 @@ from kf_calib.sources.files.line_parts import (
     Account,
     LineError,
     LineReader,
-    Rows,
+    LineRows,
     number_of,
     stamp_ns,
 )
@@ -79,7 +79,7 @@ class CsvLines(LineReader):
         """How columns have to be named."""
         return f"a header such as {_EXAMPLE} is wanted"
 
-    def _read_line(self, line: str, accel: Rows, pose: Rows, temperature: Rows) -> None:
+    def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
         is_plain = '"' not in line and " " not in line
         row = line.split(self._delimiter) if is_plain else _cells(line, self._delimiter)
         if len(row) != len(self._names):

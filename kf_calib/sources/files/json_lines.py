@@ -16,7 +16,7 @@ from kf_calib.sources.files.line_parts import (
     Account,
     LineError,
     LineReader,
-    Rows,
+    LineRows,
     number_of,
     stamp_ns,
 )
@@ -56,7 +56,7 @@ class JsonLines(LineReader):
         """How readings and poses have to be named."""
         return "name the readings accel_mps2 or accel_g, and the poses angles_rad, angles_deg or attitude_xyzw"
 
-    def _read_line(self, line: str, accel: Rows, pose: Rows, temperature: Rows) -> None:
+    def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
         if not line.lstrip().startswith("{"):  # found out at a tenth of the cost, where a link brings much of it
             raise LineError("it is not a JSON object")
         is_tiny = ("e-" in line or "E-" in line) and _find_tiny(line)

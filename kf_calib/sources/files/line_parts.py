@@ -61,7 +61,7 @@ class Account:
         return out
 
 
-class Rows:
+class LineRows:
     """Stamped rows on their way to a stream."""
 
     def __init__(self) -> None:
@@ -102,7 +102,7 @@ class LineReader(ABC):
 
     def read(self, lines: Sequence[str], first_line: int) -> Batch:
         """The batch of consecutive lines, the first of them of that number."""
-        accel, pose, temperature = Rows(), Rows(), Rows()
+        accel, pose, temperature = LineRows(), LineRows(), LineRows()
         faults = tuple(kind for kind, _ in self._faults)
         for number, line in enumerate(lines, start=first_line):
             if not line or line.isspace():
@@ -117,7 +117,7 @@ class LineReader(ABC):
         return Batch(accel.stream(3), pose.stream(self.pose_width), temperature.stream(1))
 
     @abstractmethod
-    def _read_line(self, line: str, accel: Rows, pose: Rows, temperature: Rows) -> None:
+    def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
         """Adds what one line holds, all of it or nothing; raises LineError or one of ``_faults``."""
 
 

@@ -31,7 +31,7 @@ from mcap.records import Channel, ChunkIndex, Header, Metadata, MetadataIndex, S
 
 from kf_calib.errors import InputError
 from kf_calib.sources.files.foreign import HEAD_BYTES, advice
-from kf_calib.sources.files.mcap_messages import HEAD, MESSAGE_FIELDS, Block
+from kf_calib.sources.files.mcap_messages import HEAD, MESSAGE_FIELDS, RecordBlock
 
 MAGIC = b"\x89MCAP0\r\n"
 MAX_CHUNK_MB = 256.0
@@ -241,7 +241,9 @@ class McapFile:
                 raise DamagedError("a record is not where it should be")
             return file.read(length)
 
-    def blocks(self, warn: Warn, start: int = 0, end: int | None = None, growing: bool = False) -> Iterator[Block]:
+    def blocks(
+        self, warn: Warn, start: int = 0, end: int | None = None, growing: bool = False
+    ) -> Iterator[RecordBlock]:
         """Every whole stretch of records, from the start; ``warn`` is told what is lost. Raises InputError.
 
         start, end: bytes between which whole records lie, where not all are wanted. growing: the file is being written;
@@ -265,10 +267,10 @@ class _Parcel:
     end: int = 0
 
 
-def _ahead(unpack: Callable[[_Parcel], Block], parcels: Iterable[_Parcel]) -> Iterator[Block]:
+def _ahead(unpack: Callable[[_Parcel], RecordBlock], parcels: Iterable[_Parcel]) -> Iterator[RecordBlock]:
     """``map(unpack, parcels)``, some MB ahead in a thread: unpacking and checksums leave the interpreter free."""
     with ThreadPoolExecutor(max_workers=1) as worker:
-        coming: deque[tuple[int, Future[Block]]] = deque()
+        coming: deque[tuple[int, Future[RecordBlock]]] = deque()
         for parcel in parcels:
             coming.append((parcel.size, worker.submit(unpack, parcel)))
             while sum(size for size, _ in coming) > _AHEAD:
@@ -319,7 +321,7 @@ class _Walk:
         stated = _CHUNK.unpack_from(content)[2] if opcode == Opcode.CHUNK else len(content)
         return stated if stated <= self.max_chunk else 0  # a chunk of more is passed over
 
-    def unpack(self, parcel: _Parcel) -> Block:
+    def unpack(self, parcel: _Parcel) -> RecordBlock:
         parts: list[bytes] = []
         borders = [0]
         index = [np.empty(0, np.int64)]
@@ -331,7 +333,7 @@ class _Walk:
             parts.append(part)
             borders.append(borders[-1] + len(part))
         data = parts[0] if len(parts) == 1 else b"".join(parts)
-        return Block(data, tuple(borders[1:]), np.sort(np.concatenate(index), kind="stable"), parcel.end)
+        return RecordBlock(data, tuple(borders[1:]), np.sort(np.concatenate(index), kind="stable"), parcel.end)
 
     def compare_checksum(self) -> None:
         """Checks what lies outside chunks, once all has been read and unpacked."""

@@ -17,7 +17,7 @@ _MOST_OTHERS = 1 << 17  # records of a block that are no messages: every schema 
 
 
 @dataclass(frozen=True)
-class Block:
+class RecordBlock:
     """Records of the file as they lie in it: what some chunks hold, and what lies outside chunks, joined together.
 
     borders: bytes of ``data`` where its parts end, ascending, the last one its size; damage does not spread over them.
@@ -32,7 +32,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Group:
+class MessageGroup:
     """Messages of one channel and one length: byte of the block where each starts (n,), bytes that each takes."""
 
     channel: int
@@ -44,7 +44,7 @@ class Group:
 class Messages:
     """What a block holds: messages, opcode and content of other records, and how many bytes make no sense."""
 
-    groups: list[Group]
+    groups: list[MessageGroup]
     others: list[tuple[int, bytes]]
     lost: int
 
@@ -67,7 +67,7 @@ class MessageFinder:
     def __init__(self) -> None:
         self._known: list[int] = []
 
-    def __call__(self, block: Block) -> Messages:
+    def __call__(self, block: RecordBlock) -> Messages:
         data = block.data
         return self._chain(data, block.index) or self._chain(data, _candidates(data)) or self._walk(data, block.borders)
 
@@ -128,6 +128,6 @@ def _kinds(data: bytes, start: Integers) -> Integers:
     return (heads["length"][start] << _LENGTH_SHIFT) | channel | heads["opcode"][start]
 
 
-def _group(kind: int, start: Integers) -> Group:
+def _group(kind: int, start: Integers) -> MessageGroup:
     channel, length = (kind >> _CHANNEL_SHIFT) & 0xFFFF, kind >> _LENGTH_SHIFT
-    return Group(channel, start + _LEAST_MESSAGE, length - MESSAGE_FIELDS)
+    return MessageGroup(channel, start + _LEAST_MESSAGE, length - MESSAGE_FIELDS)

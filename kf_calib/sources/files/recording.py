@@ -26,8 +26,8 @@ from kf_calib.sources.files.bags import files_of
 from kf_calib.sources.files.cdr import JOINT_STATE, CdrError, Decoder
 from kf_calib.sources.files.contents import BENCH_RECORD, POSES, READINGS, TEMPERATURES, Contents, Parts, Role
 from kf_calib.sources.files.joints import Joints
-from kf_calib.sources.files.mcap_file import MAX_CHUNK_MB, Block, DamagedError, McapFile, Warn, parse
-from kf_calib.sources.files.mcap_messages import MessageFinder, Messages
+from kf_calib.sources.files.mcap_file import MAX_CHUNK_MB, DamagedError, McapFile, Warn, parse
+from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, RecordBlock
 
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
 GAP_RECORD = "kf_calib.gap"
@@ -234,7 +234,7 @@ class _Passage:
         self._tracks.append(track)
         return track
 
-    def find(self, block: Block) -> Messages:
+    def find(self, block: RecordBlock) -> Messages:
         messages = self._find(block)
         for opcode, content in messages.others:
             self.contents.add(opcode, content, self.warn)
@@ -270,7 +270,7 @@ class _Track:
     topic: str
     decode: Decoder
 
-    def read(self, block: Block, messages: Messages) -> Stream:
+    def read(self, block: RecordBlock, messages: Messages) -> Stream:
         """The topic's samples in ``block``. Raises InputError where a message is not what its schema says."""
         ids = self.contents.ids(self.topic)
         groups = [group for group in messages.groups if group.channel in ids]

@@ -31,7 +31,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Times
 from kf_calib.errors import InputError
 from kf_calib.sources.simulation.injected.kinds import Hidden, NoSizeError
-from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 
 _SETTLE_NS, _LEAD_NS = 1_000_000_000, 250_000_000
@@ -76,7 +76,7 @@ def sizes_in_sigma(simulation: Simulation, effects: Sequence[Hidden]) -> list[fl
     return [next(found) if effect.kind.stage != "record" else None for effect in effects]
 
 
-def _refuse_without_white_noise(noise: Noise) -> None:
+def _refuse_without_white_noise(noise: TrueNoise) -> None:
     if not noise.white_mps2:
         raise InputError("a size in sigma needs white noise of the readings: give some, or a size with a unit.")
 
@@ -150,7 +150,7 @@ def _rows(simulation: Simulation, effects: Sequence[Hidden]) -> Iterator[tuple[T
     """
     hidden = [[], *([effect.counted] for effect in effects)]
     first_ns: int | None = None
-    for batches in zip(*(simulation.hiding(one, Noise()) for one in hidden), strict=True):
+    for batches in zip(*(simulation.hiding(one, TrueNoise()) for one in hidden), strict=True):
         time_ns, values = batches[0].accel.time_ns, [batch.accel.values for batch in batches]
         first_ns = int(time_ns[0]) if first_ns is None else first_ns
         yield time_ns - first_ns, np.hstack([values[0], *(own - values[0] for own in values[1:])])

@@ -24,7 +24,7 @@ _FLICKER_RATIO = 4.0
 
 
 @dataclass(frozen=True)
-class Noise:
+class TrueNoise:
     """What disturbs readings and angles. All are 1 sigma and independent between accelerometers and axes; 0: absent.
 
     white_mps2: noise of a reading; with ``ar1_phi`` an AR(1) process of that correlation from sample to sample and the

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.errors import InputError
-from kf_calib.sources.simulation.noise_processes import Noise, generator
+from kf_calib.sources.simulation.noise_processes import TrueNoise, generator
 
 SYMBOLS = ("theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3")
 NOMINAL: Mapping[str, float] = {
@@ -80,7 +80,7 @@ class Grade:
     angle_rad: float
     scale: float
     bias_mps2: float
-    noise: Noise
+    noise: TrueNoise
     fixed: bool = False
 
     def sensors(self, seed: int = 0) -> Sensors:
@@ -92,9 +92,9 @@ class Grade:
 
 
 GRADES: Mapping[str, Grade] = {
-    "paper": Grade(math.radians(30 / 3600), 5e-5, 5e-5, Noise(white_mps2=1e-4), fixed=True),
-    "navigation": Grade(1e-3, 3e-4, 1e-3, Noise(white_mps2=5e-5, vibration_mps2=5e-3)),
-    "mems": Grade(math.radians(3.0), 0.05, 0.5, Noise(white_mps2=0.02, vibration_mps2=0.05)),
+    "paper": Grade(math.radians(30 / 3600), 5e-5, 5e-5, TrueNoise(white_mps2=1e-4), fixed=True),
+    "navigation": Grade(1e-3, 3e-4, 1e-3, TrueNoise(white_mps2=5e-5, vibration_mps2=5e-3)),
+    "mems": Grade(math.radians(3.0), 0.05, 0.5, TrueNoise(white_mps2=0.02, vibration_mps2=0.05)),
 }
 """The paper's Table 1; a quartz-flexure accelerometer (100 ug, 300 ppm, 1 mrad); a consumer chip (50 mg, 5 %, 3 deg).
 The noise is what every reading has; flicker, scatter and the positioner's errors are a run's: ``replace`` adds them.

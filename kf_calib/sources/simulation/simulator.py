@@ -22,7 +22,7 @@ from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError
 from kf_calib.sources.simulation.gimbal_motion import Motion, attitude
 from kf_calib.sources.simulation.injected import Hidden, Rig, Stage, steps_of
-from kf_calib.sources.simulation.noise_processes import Noise, generator
+from kf_calib.sources.simulation.noise_processes import TrueNoise, generator
 from kf_calib.sources.simulation.physics import (
     Ambient,
     BiasWalk,
@@ -61,7 +61,7 @@ class Simulation:
         self,
         bench: Bench,
         sensors: Sensors,
-        noise: Noise,
+        noise: TrueNoise,
         plan: Sequence[Visit],
         *,
         sample_hz: float = 100.0,
@@ -113,7 +113,7 @@ class Simulation:
             )
             self.fraction = last / len(self)
 
-    def hiding(self, hidden: Sequence[Hidden], noise: Noise | None = None) -> Simulation:
+    def hiding(self, hidden: Sequence[Hidden], noise: TrueNoise | None = None) -> Simulation:
         """The same run with these hidden effects in place of its own, and with other noise where some is given."""
         other = copy.copy(self)
         other.hidden, other.noise, other.fraction = tuple(hidden), noise or self.noise, 0.0
@@ -122,7 +122,7 @@ class Simulation:
 
     def parameters_at_end(self) -> dict[str, float] | None:
         """The parameters at the last reading, where the biases have walked there; None where they have not."""
-        rig, noise = self._rig, Noise(walk_mps2_per_sqrt_s=self.noise.walk_mps2_per_sqrt_s)
+        rig, noise = self._rig, TrueNoise(walk_mps2_per_sqrt_s=self.noise.walk_mps2_per_sqrt_s)
         processes = noise.processes(self.seed, rig.period_s, rig.duration_s)
         hidden = chain.from_iterable(self._hidden_steps().values())
         processes += [step.process for step in hidden if isinstance(step, BiasWalk)]

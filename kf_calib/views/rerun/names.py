@@ -32,7 +32,7 @@ MICRO = 1e6
 
 
 @dataclass(frozen=True)
-class Group:
+class EntityGroup:
     """Parameters of one kind: what is shown is the SI value times ``per_si``, in ``unit``."""
 
     title: str
@@ -48,9 +48,9 @@ def _of_unit(unit: str) -> tuple[str, ...]:
 
 
 GROUPS = (
-    Group("angles", "arcsec", float(np.degrees(3600.0)), _of_unit("rad")),
-    Group("scale factors", "ppm", MICRO, _of_unit("1")),
-    Group("biases", "µm/s²", MICRO, _of_unit("m/s^2")),
+    EntityGroup("angles", "arcsec", float(np.degrees(3600.0)), _of_unit("rad")),
+    EntityGroup("scale factors", "ppm", MICRO, _of_unit("1")),
+    EntityGroup("biases", "µm/s²", MICRO, _of_unit("m/s^2")),
 )
 GROUP_OF = {symbol: group for group in GROUPS for symbol in group.symbols}
 PER_SI = np.array([GROUP_OF[symbol].per_si for symbol in paper_parameters.SYMBOLS])

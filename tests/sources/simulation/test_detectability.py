@@ -17,7 +17,7 @@ from kf_calib.errors import InputError
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.simulation.detectability import sized, sizes_in_sigma
 from kf_calib.sources.simulation.injected import Hidden, NoSizeError, catalogue, parse
-from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES, Sensors
 from kf_calib.sources.simulation.simulator import Simulation
@@ -27,20 +27,20 @@ from kf_calib.sources.simulation.visit_plans import Visit, spread_plan
 G = 9.81
 BENCH = Bench(axes=axes_of("yzx"), gravity_mps2=G, latitude_deg=50.0)
 SENSORS = GRADES["mems"].sensors(1)
-WHITE = Noise(white_mps2=2e-4)
+WHITE = TrueNoise(white_mps2=2e-4)
 NOISES = {
     "white": WHITE,
     "AR(1)": replace(WHITE, ar1_phi=0.6),
     "setting error": replace(WHITE, setting_sigma_deg=0.002),
     "scatter": replace(WHITE, scatter_mps2=1e-4),
-    "all": Noise(2e-4, ar1_phi=0.3, flicker_mps2=7e-5, scatter_mps2=1e-4, setting_sigma_deg=0.001),
+    "all": TrueNoise(2e-4, ar1_phi=0.3, flicker_mps2=7e-5, scatter_mps2=1e-4, setting_sigma_deg=0.001),
 }
 DWELL_S, HZ, COUNT = 6.0, 2.5, 12
 PLAN = spread_plan(COUNT, dwell_s=DWELL_S, seed=2)
 AMBIENT = Ambient(swing_c=3.0, period_s=40.0)
 
 
-def simulation(noise: Noise = WHITE, bench: Bench = BENCH, **options) -> Simulation:
+def simulation(noise: TrueNoise = WHITE, bench: Bench = BENCH, **options) -> Simulation:
     """Platform jumps: dwell k lasts from 6 k s to 6 (k + 1) s."""
     options = {"sample_hz": HZ, "slew_rate_degps": math.inf, "ambient": AMBIENT, "seed": 5} | options
     return Simulation(bench, options.pop("sensors", SENSORS), noise, options.pop("plan", PLAN), **options)
@@ -89,7 +89,7 @@ ADDED = {
 }
 
 
-def covariance(noise: Noise, force: np.ndarray, dwell: np.ndarray, sensors: Sensors = SENSORS) -> np.ndarray:
+def covariance(noise: TrueNoise, force: np.ndarray, dwell: np.ndarray, sensors: Sensors = SENSORS) -> np.ndarray:
     """V (3 n, 3 n), sample after sample."""
     together = dwell[:, None] == dwell
     flicker = noise.flicker_mps2**2 * max(np.log(COUNT) / (2 * np.log(2)), 1)  # means of dwells about their mean
@@ -124,7 +124,7 @@ def test_what_is_asked_for_is_what_generalised_least_squares_finds(name, noise):
     run = simulation(NOISES[noise])
     effect = asked(run, f"{name}=10sigma")
     with_effect, without = (
-        np.concatenate([batch.accel.values for batch in run.hiding(hidden, Noise())]) for hidden in ([effect], [])
+        np.concatenate([batch.accel.values for batch in run.hiding(hidden, TrueNoise())]) for hidden in ([effect], [])
     )
     v = covariance(NOISES[noise], FORCE[COUNTS], DWELL[COUNTS])
     assert np.linalg.norm(left_over((with_effect - without)[COUNTS], v, FORCE[COUNTS])) == pytest.approx(10, rel=0.02)
@@ -137,9 +137,9 @@ def test_on_a_stabilised_platform_the_force_turns_within_a_dwell():
     felt, without, with_effect = (
         np.concatenate([batch.accel.values for batch in some])
         for some in (
-            simulation(Noise(), bench, plan=run.plan, sample_hz=0.5, sensors=nominal),
-            run.hiding([], Noise()),
-            run.hiding(parse(["earth-rotation=0.01"], BENCH.axes), Noise()),
+            simulation(TrueNoise(), bench, plan=run.plan, sample_hz=0.5, sensors=nominal),
+            run.hiding([], TrueNoise()),
+            run.hiding(parse(["earth-rotation=0.01"], BENCH.axes), TrueNoise()),
         )
     )
     counts = (np.arange(len(felt)) % 30 >= 1) & (np.arange(len(felt)) % 30 * 2 < 60 - 0.25)
@@ -253,7 +253,7 @@ def test_memory_stays_flat():
 
 
 def test_without_white_noise_there_is_no_size():
-    run = simulation(Noise(scatter_mps2=1e-4))
+    run = simulation(TrueNoise(scatter_mps2=1e-4))
     assert size(run, "second-order=1e-5") is None
     for text in ("second-order=10sigma", "random=10sigma"):
         with pytest.raises(InputError, match="white noise"):

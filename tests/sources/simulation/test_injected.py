@@ -17,7 +17,7 @@ from kf_calib.errors import InputError
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.simulation.injected import FAMILIES, catalogue, parse, si
-from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES, Sensors
 from kf_calib.sources.simulation.simulator import START_NS, Simulation
@@ -27,7 +27,7 @@ from kf_calib.sources.simulation.visit_plans import YZX, explicit_plan, spread_p
 G = 9.81
 BENCH = Bench(axes=axes_of("yzx"), gravity_mps2=G)
 ORTHOGONAL = Sensors({"theta1": 0.0, "theta3": 0.0})
-QUIET = Noise()
+QUIET = TrueNoise()
 C = 1.0 / math.sqrt(2.0)
 
 KNOWN = """
@@ -216,7 +216,7 @@ def test_bias_walk_grows_by_the_square_root_of_time():
     assert abs(np.corrcoef(paths[399], paths[1599])[0, 1] - 0.5) < 0.15
 
 
-@pytest.mark.parametrize("noise", [QUIET, Noise(walk_mps2_per_sqrt_s=1e-3)])
+@pytest.mark.parametrize("noise", [QUIET, TrueNoise(walk_mps2_per_sqrt_s=1e-3)])
 def test_the_truth_says_where_biases_have_walked_to(noise):
     plan, hidden = explicit_plan([(0, 0, 0)], 300.0), parse(["bias-walk=1e-3,0,2e-3"], BENCH.axes)
     run = Simulation(BENCH, ORTHOGONAL, noise, plan, sample_hz=4.0, seed=3, hidden=hidden, batch_samples=500)
@@ -415,7 +415,7 @@ def test_magnetic_field_is_fixed_to_the_earth():
 
 
 def test_saturation_quantisation_and_outliers():
-    poses, noise = [POSES["+x"], POSES["-x"], (0, 20, 30)], Noise(white_mps2=1e-2)
+    poses, noise = [POSES["+x"], POSES["-x"], (0, 20, 30)], TrueNoise(white_mps2=1e-2)
     options = {"noise": noise, "dwell_s": 500.0, "sample_hz": 2.0}
     free = readings("", poses, **options)
     np.testing.assert_array_equal(readings("saturation=9,0,0", poses, **options)[:, 0], np.clip(free[:, 0], -9, 9))
@@ -441,7 +441,7 @@ def run(text: str | list[str], batch_samples: int = 1 << 20, inertial: bool = Fa
     texts = [text] if isinstance(text, str) else text
     return read(
         Simulation(
-            bench, GRADES["mems"].sensors(3), Noise(1e-3, setting_sigma_deg=0.01), spread_plan(4, dwell_s=2.0),
+            bench, GRADES["mems"].sensors(3), TrueNoise(1e-3, setting_sigma_deg=0.01), spread_plan(4, dwell_s=2.0),
             ambient=AMBIENT, sample_hz=25.0, slew_rate_degps=90.0, seed=8, batch_samples=batch_samples,
             hidden=parse(texts, BENCH.axes),
         )

@@ -14,7 +14,7 @@ from scipy.signal import welch
 from kf_calib.bench.bench import Bench, axes_of, parse_axes
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.sources.simulation.noise_processes import Noise
+from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import GRADES, NOMINAL, Sensors
 from kf_calib.sources.simulation.simulator import START_NS, Ambient, Simulation
 from kf_calib.sources.simulation.truth import write_truth
@@ -23,7 +23,7 @@ from kf_calib.sources.simulation.visit_plans import Visit, explicit_plan, six_fa
 G = 9.81
 BENCH = Bench(axes=axes_of("yzx"), gravity_mps2=G)
 ORTHOGONAL = Sensors({"theta1": 0.0, "theta3": 0.0})
-QUIET = Noise()
+QUIET = TrueNoise()
 STILL = explicit_plan([(0, 0, 0)], dwell_s=1000.0)
 
 
@@ -34,7 +34,7 @@ def read(simulation: Simulation) -> Batch:
     return Batch(*(sum(streams[1:], streams[0]) for streams in parts))
 
 
-def noise_of(noise: Noise, count: int = 100_000, rate_hz: float = 100.0, seed: int = 1) -> np.ndarray:
+def noise_of(noise: TrueNoise, count: int = 100_000, rate_hz: float = 100.0, seed: int = 1) -> np.ndarray:
     """The noise alone (n, 3): readings of a still, orthogonal block less their level."""
     plan = explicit_plan([(0, 0, 0)], dwell_s=count / rate_hz)
     values = read(Simulation(BENCH, ORTHOGONAL, noise, plan, sample_hz=rate_hz, seed=seed)).accel.values
@@ -147,7 +147,7 @@ def test_streams_have_their_rates_and_end_with_the_plan():
     assert simulation.fraction == 1.0 and simulation.warnings == []
 
 
-EVERYTHING = Noise(1e-3, 0.5, 1e-4, 1e-5, 1e-3, 0.01, 1e-3, 1e-4, 1e-2, 1.0, 0.01)
+EVERYTHING = TrueNoise(1e-3, 0.5, 1e-4, 1e-5, 1e-3, 0.01, 1e-3, 1e-4, 1e-2, 1.0, 0.01)
 
 
 @pytest.mark.parametrize("batch_samples", [7, 97, 1000])
@@ -172,7 +172,7 @@ def test_a_run_repeats_itself_and_another_seed_differs():
 def test_memory_does_not_grow_with_the_run():
     def peak(dwell_s: float) -> int:
         plan = explicit_plan([(0, 0, 0), (0, 90, 0)], dwell_s)
-        simulation = Simulation(BENCH, ORTHOGONAL, Noise(1e-4), plan, sample_hz=1000.0, batch_samples=2000)
+        simulation = Simulation(BENCH, ORTHOGONAL, TrueNoise(1e-4), plan, sample_hz=1000.0, batch_samples=2000)
         tracemalloc.start()
         for _ in simulation:
             pass
@@ -192,23 +192,23 @@ def _streams(batch: Batch) -> list[Stream]:
 
 
 def test_white_noise_has_its_sigma_and_no_memory():
-    noise = noise_of(Noise(white_mps2=2e-3))
+    noise = noise_of(TrueNoise(white_mps2=2e-3))
     np.testing.assert_allclose(noise.std(axis=0), 2e-3, rtol=0.01)
     assert np.abs(np.corrcoef(noise.T) - np.eye(3)).max() < 0.015
     assert np.abs(_lag_one(noise)).max() < 0.015
 
 
 def test_ar1_noise_keeps_the_sigma_and_has_its_correlation():
-    noise = noise_of(Noise(white_mps2=2e-3, ar1_phi=0.9), count=400_000)
+    noise = noise_of(TrueNoise(white_mps2=2e-3, ar1_phi=0.9), count=400_000)
     np.testing.assert_allclose(noise.std(axis=0), 2e-3, rtol=0.02)
     np.testing.assert_allclose(_lag_one(noise), 0.9, atol=0.005)
-    first = np.array([noise_of(Noise(2e-3, 0.9), count=1, seed=seed)[0] for seed in range(400)])
+    first = np.array([noise_of(TrueNoise(2e-3, 0.9), count=1, seed=seed)[0] for seed in range(400)])
     np.testing.assert_allclose(first.std(), 2e-3, rtol=0.07)  # stationary from the first sample on
 
 
 def test_flicker_has_a_spectrum_of_slope_minus_one_and_its_level():
     floor = 1e-4
-    noise = noise_of(Noise(flicker_mps2=floor), count=1 << 19)
+    noise = noise_of(TrueNoise(flicker_mps2=floor), count=1 << 19)
     frequency, density = welch(noise, fs=100.0, nperseg=1 << 14, axis=0)
     band = (frequency > 0.02) & (frequency < 5.0)  # three decades short of both corners
     log_f, log_density = np.log(frequency[band]), np.log(density[band].mean(axis=1))
@@ -218,26 +218,26 @@ def test_flicker_has_a_spectrum_of_slope_minus_one_and_its_level():
 
 
 def test_flicker_has_a_flat_allan_deviation_and_goes_on_over_dwells():
-    noise = noise_of(Noise(flicker_mps2=1e-4), count=1 << 19)
+    noise = noise_of(TrueNoise(flicker_mps2=1e-4), count=1 << 19)
     for length in (64, 512, 4096):
         means = noise.reshape(-1, length, 3).mean(axis=1)
         allan = np.sqrt(np.mean(np.diff(means, axis=0) ** 2) / 2)
         assert allan == pytest.approx(1e-4, rel=0.12)
     plan = explicit_plan([(0, 0, 0)] * 20, dwell_s=100.0)
-    same = read(Simulation(BENCH, ORTHOGONAL, Noise(flicker_mps2=1e-4), plan, seed=1)).accel.values - [0, G, 0]
-    once = read(Simulation(BENCH, ORTHOGONAL, Noise(flicker_mps2=1e-4), [Visit((0, 0, 0), 2000.0)], seed=1)).accel
+    same = read(Simulation(BENCH, ORTHOGONAL, TrueNoise(flicker_mps2=1e-4), plan, seed=1)).accel.values - [0, G, 0]
+    once = read(Simulation(BENCH, ORTHOGONAL, TrueNoise(flicker_mps2=1e-4), [Visit((0, 0, 0), 2000.0)], seed=1)).accel
     np.testing.assert_array_equal(same, once.values - [0, G, 0])
 
 
 def test_bias_walks_by_the_square_root_of_time():
-    runs = [noise_of(Noise(walk_mps2_per_sqrt_s=1e-4), count=401, rate_hz=4.0, seed=seed) for seed in range(150)]
+    runs = [noise_of(TrueNoise(walk_mps2_per_sqrt_s=1e-4), count=401, rate_hz=4.0, seed=seed) for seed in range(150)]
     paths = np.concatenate(runs, axis=1)  # (401, 450)
     assert paths[-1].std() == pytest.approx(1e-4 * math.sqrt(401 / 4), rel=0.12)
     assert paths[100].std() == pytest.approx(1e-4 * math.sqrt(101 / 4), rel=0.12)
 
 
 def test_outliers_have_their_rate_and_size():
-    noise = noise_of(Noise(outlier_rate=0.01, outlier_mps2=0.5))
+    noise = noise_of(TrueNoise(outlier_rate=0.01, outlier_mps2=0.5))
     assert set(np.unique(noise.round(9))) == {-0.5, 0.0, 0.5}
     assert np.mean(noise != 0) == pytest.approx(0.01, rel=0.06)
     assert np.mean(noise[noise != 0] > 0) == pytest.approx(0.5, abs=0.04)
@@ -245,7 +245,7 @@ def test_outliers_have_their_rate_and_size():
 
 def test_scatter_is_constant_in_a_dwell_and_independent_between_them():
     plan = explicit_plan([(0, 0, 0), (0, 1, 0)] * 150, dwell_s=1.0)
-    simulation = Simulation(BENCH, ORTHOGONAL, Noise(scatter_mps2=1e-3), plan, slew_rate_degps=math.inf, seed=3)
+    simulation = Simulation(BENCH, ORTHOGONAL, TrueNoise(scatter_mps2=1e-3), plan, slew_rate_degps=math.inf, seed=3)
     quiet = Simulation(BENCH, ORTHOGONAL, QUIET, plan, slew_rate_degps=math.inf)
     offsets = (read(simulation).accel.values - read(quiet).accel.values).reshape(300, 100, 3)
     assert np.ptp(offsets, axis=1).max() < 1e-14
@@ -257,7 +257,7 @@ def test_scatter_is_constant_in_a_dwell_and_independent_between_them():
 def test_setting_error_turns_the_force_and_keeps_its_size():
     plan = explicit_plan(np.random.default_rng(0).uniform(-180, 180, (300, 3)), dwell_s=1.0)
     sigma_deg = 0.05
-    simulation = Simulation(BENCH, ORTHOGONAL, Noise(setting_sigma_deg=sigma_deg), plan, sample_hz=2.0, seed=2)
+    simulation = Simulation(BENCH, ORTHOGONAL, TrueNoise(setting_sigma_deg=sigma_deg), plan, sample_hz=2.0, seed=2)
     batch = read(simulation)
     np.testing.assert_allclose(np.linalg.norm(batch.accel.values, axis=1), G, rtol=1e-12)
     means = dwell_means(simulation, batch)
@@ -271,7 +271,7 @@ def test_setting_error_turns_the_force_and_keeps_its_size():
 
 def test_a_platform_that_is_not_moved_is_not_set_anew():
     """Visits in a row at the same angles are one dwell, whatever is drawn for each dwell."""
-    noise = Noise(setting_sigma_deg=0.05, scatter_mps2=1e-3)
+    noise = TrueNoise(setting_sigma_deg=0.05, scatter_mps2=1e-3)
     rows, settings = [(0, 0, 0), (0, 90, 0), (0, 90, 0), (0, 90, 0), (0, 0, 0)], {"sample_hz": 2.0, "seed": 2}
     again = Simulation(BENCH, ORTHOGONAL, noise, explicit_plan(rows, dwell_s=5.0), **settings)
     once = [
@@ -283,7 +283,7 @@ def test_a_platform_that_is_not_moved_is_not_set_anew():
 
 
 def test_encoders_err_and_round_without_moving_the_platform():
-    noise = Noise(encoder_sigma_deg=0.01, encoder_step_deg=0.002)
+    noise = TrueNoise(encoder_sigma_deg=0.01, encoder_step_deg=0.002)
     batch = read(Simulation(BENCH, ORTHOGONAL, noise, explicit_plan([(10, 20, 30)], 1000.0)))
     degrees = np.degrees(batch.pose.values)
     np.testing.assert_allclose(degrees / 0.002, np.rint(degrees / 0.002), atol=1e-6)
@@ -292,7 +292,7 @@ def test_encoders_err_and_round_without_moving_the_platform():
 
 
 def test_vibration_is_felt_in_slews_only():
-    simulation = Simulation(BENCH, ORTHOGONAL, Noise(vibration_mps2=0.1), spread_plan(3, dwell_s=10.0))
+    simulation = Simulation(BENCH, ORTHOGONAL, TrueNoise(vibration_mps2=0.1), spread_plan(3, dwell_s=10.0))
     quiet = Simulation(BENCH, ORTHOGONAL, QUIET, simulation.plan)
     batch = read(simulation)
     added = batch.accel.values - read(quiet).accel.values
@@ -339,7 +339,7 @@ def test_truth_goes_into_a_file_beside_the_recording(tmp_path):
     truth = json.loads(path.read_text())
     assert truth["parameters"] == dict(sensors.parameters)
     assert (truth["seed"], truth["grade"], truth["effects"]) == (7, "navigation", [])
-    assert Noise(**truth["noise"]) == EVERYTHING
+    assert TrueNoise(**truth["noise"]) == EVERYTHING
     with pytest.raises(KfCalibError, match="cannot be written"):
         write_truth(simulation, tmp_path / "absent" / "run.mcap")
 
@@ -365,9 +365,9 @@ def test_impossible_sensors_and_noise_are_refused():
     with pytest.raises(InputError, match="theta2"):
         Sensors({"theta2": 0.0})
     with pytest.raises(InputError, match="white_mps2"):
-        Noise(white_mps2=-1.0)
+        TrueNoise(white_mps2=-1.0)
     with pytest.raises(InputError, match="ar1_phi"):
-        Noise(white_mps2=1.0, ar1_phi=1.0)
+        TrueNoise(white_mps2=1.0, ar1_phi=1.0)
 
 
 def _lag_one(noise: np.ndarray) -> np.ndarray:
