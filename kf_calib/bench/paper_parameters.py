@@ -19,6 +19,8 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.errors import BenchError
 
 SYMBOLS = ("theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3")
+BIASES = [3, 7, 11]
+"""Where the three biases are in the affine state (s1, b1, s2, b2, s3, b3)."""
 UNITS = ("rad", "rad", "1", "m/s^2") * 3
 NOMINAL: dict[str, float] = dict.fromkeys(SYMBOLS, 0.0) | {
     "theta1": math.radians(0.5), "theta3": math.radians(0.5), "phi3": -math.pi / 2, "K1": 1.0, "K2": 1.0, "K3": 1.0,

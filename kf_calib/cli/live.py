@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import math
-import os
 import queue
-import select
 import signal
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +36,7 @@ from kf_calib.cli.options import (
     strict_option,
 )
 from kf_calib.cli.signals import answered
-from kf_calib.errors import InputError, KfCalibError, how_to_write
+from kf_calib.errors import InputError, KfCalibError
 from kf_calib.support.plain_text import sentence
 
 if TYPE_CHECKING:
@@ -50,12 +46,11 @@ if TYPE_CHECKING:
     from kf_calib.online.status import Judgement
     from kf_calib.sources.live import LiveSource
     from kf_calib.views.rerun.growing import GrowingView
+from kf_calib.cli.live_keys import pressed_keys
+from kf_calib.cli.live_targets import parsed_targets
 
 RUNNING = "While it runs"
 _REFRESH_S = 0.25
-_SIZES = {"rad": 1.0, "deg": math.pi / 180, "arcmin": math.pi / 10800, "arcsec": math.pi / 648000, "1": 1.0,
-          "ppm": 1e-6, "m/s^2": 1.0, "mg": 9.80665e-3, "ug": 9.80665e-6, "µg": 9.80665e-6}  # fmt: skip
-_KINDS = {"rad": ("rad", "deg", "arcmin", "arcsec"), "1": ("1", "ppm"), "m/s^2": ("m/s^2", "mg", "ug", "µg")}
 
 
 @click.command(
@@ -155,7 +150,7 @@ def live(
     from kf_calib.sources.live import files_of, open_live
 
     outputs = claimed(files_of(source), overwrite=overwrite)
-    settings, wanted = settings_of(options), _targets(targets)
+    settings, wanted = settings_of(options), parsed_targets(targets)
     _refuse(settings)
     opening = open_live(
         source, overrides(options), record, overwrite, columns=dict(map(pair, columns)), header=header,
@@ -339,7 +334,7 @@ def _on_screen(run: _Run, name: str, record: Path | None) -> None:
     from kf_calib.views.terminal import PlainConsole
 
     display = Live(console=PlainConsole(), auto_refresh=False, transient=True, redirect_stderr=sys.stderr.isatty())
-    with _keys(use=name != "-") as pressed, display:
+    with pressed_keys(use=name != "-") as pressed, display:
         while run.going:
             with contextlib.suppress(queue.Empty):
                 run.judgements.get_nowait()
@@ -352,38 +347,6 @@ def _on_screen(run: _Run, name: str, record: Path | None) -> None:
                 run.accept()
             elif key == "q":
                 run.stop()
-
-
-@contextlib.contextmanager
-def _keys(use: bool) -> Iterator[Callable[[float], str]]:
-    """A function that waits for a key so long, and gives it or nothing."""
-    if not (use and sys.stdin.isatty()):
-        yield _no_key
-        return
-    import termios
-    import tty
-
-    before = termios.tcgetattr(sys.stdin)
-    tty.setcbreak(sys.stdin)
-    try:
-        yield _key
-    finally:
-        with contextlib.suppress(termios.error):  # the terminal is gone
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
-
-
-def _key(seconds: float) -> str:
-    if not select.select([0], [], [], seconds)[0]:
-        return ""
-    key = os.read(0, 1)
-    if not key:
-        raise OSError(errno.EIO, os.strerror(errno.EIO))  # as a terminal says that is gone
-    return key.decode(errors="replace")
-
-
-def _no_key(seconds: float) -> str:
-    time.sleep(seconds)
-    return ""
 
 
 def _outcome(run: _Run, as_json: bool) -> Judgement | None:
@@ -432,31 +395,3 @@ def _refuse(settings: Settings) -> None:
             "live evaluates folded dwells, as the block engine does: leave out --engine, and check the recording with "
             "replay --engine filterpy."
         )
-
-
-def _targets(texts: tuple[str, ...]) -> dict[str, float]:
-    """Sigmas wanted by symbol, SI; a kind (theta, K ...) stands for all its parameters."""
-    from kf_calib.bench import paper_parameters
-
-    out = dict[str, float]()
-    for text in texts:
-        name, _, size = text.partition("=")
-        symbols = [s for s in paper_parameters.SYMBOLS if name == s or name == s.rstrip("123")]
-        if not symbols:
-            raise InputError(
-                f"--target {text!r} names no parameter: use one of {', '.join(paper_parameters.SYMBOLS)}, or theta, "
-                "phi, nu, K, b."
-            )
-        kinds = _KINDS[paper_parameters.UNITS[paper_parameters.SYMBOLS.index(symbols[0])]]
-        unit = next((unit for unit in sorted(kinds, key=len, reverse=True) if size.endswith(unit) and unit != "1"), "")
-        try:
-            value = float(size.removesuffix(unit)) * _SIZES[unit or kinds[0]]
-        except ValueError:
-            value = math.nan
-        if not 0.0 < value < math.inf:
-            raise InputError(
-                f"--target {text!r}: give a sigma above zero in {', '.join(kinds)}, as {name}=1{kinds[-1]}"
-                f"{how_to_write(size)}."
-            )
-        out |= dict.fromkeys(symbols, value)
-    return out

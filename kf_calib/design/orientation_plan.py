@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
@@ -29,6 +28,7 @@ from kf_calib.dwells.qr import triangle
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.reml import directions
+from kf_calib.support.threads import one_blas_thread
 
 _DIGITS = 2  # of an angle in deg
 _LITTLE = 1  # of degrees of freedom: no judgement of a model
@@ -203,7 +203,7 @@ def plan(search: Search, count: int, timing: Timing, seed: int = 0) -> Plan:
     copies = search.scheme.copies
     if count < 1 or count % copies:
         raise InputError(f"{count} dwells are no whole number of {copies} visits each: ask for a multiple of {copies}.")
-    with threadpool_limits(1, user_api="blas"):  # small decompositions
+    with one_blas_thread():
         search.refuse_unseen()
         adaptive = count == 1 and search.prospect.last is not None
         chosen = search.next()[None] if adaptive else search.best(count // copies)
@@ -229,7 +229,7 @@ def fewest(search: Search, timing: Timing, seed: int = 0, on_try: Callable[[int]
             tried[count] = math.exp(search.measure(search.best(count))) if enough else math.inf
         return tried[count]
 
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         search.refuse_unseen()
         count = 1
         while (excess := ratio(count)) > 1.0:

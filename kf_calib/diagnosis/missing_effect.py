@@ -13,7 +13,6 @@ from dataclasses import replace
 from os import PathLike
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from kf_calib.bench.streams import Source
 from kf_calib.design import next_orientation as advise
@@ -59,6 +58,7 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.outlying_dwell import outlying_in_words
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.estimation.score_test import scan
+from kf_calib.support.threads import one_blas_thread
 
 _ALIKE = 0.5  # overlap above which two suspects may be taken for each other
 _SHOWN = 6  # suspects that are refitted and shown
@@ -67,7 +67,7 @@ _SHOWN = 6  # suspects that are refitted and shown
 def diagnose(run: Calibration | Source | str | PathLike[str]) -> Diagnosis:
     """What is missing in the model of a calibration, from its dwell factors alone; a recording is calibrated first."""
     before = run if isinstance(run, Calibration) else calibrate(run)
-    with threadpool_limits(1, user_api="blas"):  # small decompositions
+    with one_blas_thread():
         return _diagnosed(before)
 
 

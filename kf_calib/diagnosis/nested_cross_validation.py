@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.stepwise_selection import improve
@@ -17,6 +16,7 @@ from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration
+from kf_calib.support.threads import one_blas_thread
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def nested_cross_validation(
     errors, expected, counts = list[Floats](), list[Floats](), dict[str, int]()
     for number in range(folds):
         left = sorted(k for group in groups[number::folds] for k in group)
-        with threadpool_limits(1, user_api="blas"):
+        with one_blas_thread():
             kept = evaluate(dwells_without(start.fit.dwells, left), start.bench, start.settings, start.carried.slews)
         result = improve(kept, accept_first=True).result
         squares, variances = _predicted(start, result, left)

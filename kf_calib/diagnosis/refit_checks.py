@@ -6,14 +6,7 @@ import math
 
 import numpy as np
 
-from kf_calib.diagnosis.candidate_tests import (
-    EQUAL,
-    LEVEL,
-    SHARE,
-    CandidateTests,
-    assess_candidates,
-    run_level,
-)
+from kf_calib.diagnosis.candidate_tests import EQUAL, LEVEL, SHARE, CandidateTests, assess_candidates, run_level
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.fit import loss_within_range
 from kf_calib.estimation.results import Calibration

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.candidate_tests import (
-    CandidateTests,
-)
+from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.estimation.calibration import refitted
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration, Parameter

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.scatter_hypothesis import (
-    dwell_noise_is_stated,
-)
+from kf_calib.diagnosis.scatter_hypothesis import dwell_noise_is_stated
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.estimation.fit import WALK
 from kf_calib.estimation.results import format_p

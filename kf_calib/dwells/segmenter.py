@@ -13,7 +13,6 @@ import copy
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from enum import Enum
 
 import numpy as np
 
@@ -21,96 +20,19 @@ from kf_calib.bench.arrays import Floats, Mask, Times
 from kf_calib.bench.bench import Bench, interpolate_pose, mean_pose, pose_distance, unwrap_pose
 from kf_calib.bench.streams import Batch, Source, Stream
 from kf_calib.dwells.blocks import LARGEST_C, LARGEST_MPS2, LARGEST_RAD, Block, Tally, within
+from kf_calib.dwells.dwell_events import SECOND_NS, DwellEvent, OpenDwell, StampOrder, carry_on
 from kf_calib.dwells.slew_kinematics import Curve
 from kf_calib.dwells.stationarity import HISTORY, Stillness, encoder_sigma
 from kf_calib.errors import InputError
 
 BLOCK_SAMPLES = 4000
 """Samples of one block at the most: few enough for the cache; no power of two, whose columns would evict each other."""
-
-_SECOND_NS = 1_000_000_000
 _LAST_NS = 1 << 62  # after every stamp
-_HOLD_NS = _SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
-_LEAP_NS = 10 * _SECOND_NS  # a stamp this far ahead, with the next one behind it, is a damaged stamp
+_HOLD_NS = SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
 _SLEW_READINGS = 8  # of a slew, at least
-_REST_NS = 2 * _SECOND_NS  # a dwell that readings alone tell of, between angles that differ, lasts at least
+_REST_NS = 2 * SECOND_NS  # a dwell that readings alone tell of, between angles that differ, lasts at least
 _PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
 _SURE = 3  # messages: of fewer the noise of an encoder cannot be taken
-
-
-class _Order:
-    """Keeps the samples of a stream whose stamps advance; counts the others."""
-
-    def __init__(self) -> None:
-        self.last_ns: int | None = None
-        self._held = Stream.empty(0)
-        self._ended = False
-
-    def __call__(self, stream: Stream, tally: Tally | None = None, first_ns: int | None = None) -> Stream:
-        if self._held.time_ns.size:
-            stream, self._held = self._held + stream, Stream.empty(0)
-        if not len(stream):
-            return stream
-        begun = 1 if self.last_ns is None else stream.time_ns[0] - self.last_ns
-        steps = np.diff(stream.time_ns)
-        if min(begun, steps.min(initial=1)) > 0 and max(begun, steps.max(initial=1)) < _LEAP_NS:
-            self.last_ns = int(stream.time_ns[-1])
-            return stream
-        return self._one_by_one(stream, tally or Tally(), first_ns)
-
-    def _one_by_one(self, stream: Stream, tally: Tally, first_ns: int | None) -> Stream:
-        stamps: list[int] = stream.time_ns.tolist()
-        keep = np.zeros(len(stamps), bool)
-        for i, stamp in enumerate(stamps):
-            if self.last_ns is not None and stamp <= self.last_ns:
-                if stamp == self.last_ns:
-                    tally.repeated += 1
-                else:
-                    tally.backward += 1
-                    if tally.first_backward_s is None:
-                        tally.first_backward_s = (self.last_ns - (first_ns or stamps[0])) / _SECOND_NS
-                continue
-            if self.last_ns is not None and stamp - self.last_ns >= _LEAP_NS:
-                if i + 1 == len(stamps) and not self._ended:  # only the next stamp can tell a gap from a damaged stamp
-                    self._held = stream[i:]
-                    break
-                if i + 1 < len(stamps) and stamps[i + 1] < stamp:
-                    tally.leaping += 1
-                    continue
-            keep[i] = True
-            self.last_ns = stamp
-        return stream[keep]
-
-    def flush(self) -> Stream:
-        """What was held back at the end of the stream; to be passed through once more."""
-        self._ended = True
-        held, self._held = self._held, Stream.empty(0)
-        return held
-
-
-class _Event(Enum):
-    LEAVE = 0
-    ARRIVE = 1
-
-
-@dataclass
-class _Dwell:
-    """The open dwell: its number, its arrival, and the first pose message that belongs to it.
-
-    felt_ns: the arrival as the readings tell it; what settles counts from there.
-    settling_ns: what is left out after the arrival; None while the dwell may still be too short for the whole margin.
-    pose (1, k): where the platform stands, from the messages of the dwell's first block; pose_sigma_rad: of these.
-    turns: by which its poses go beyond the angles as they were recorded.
-    """
-
-    number: int
-    arrival_ns: int
-    felt_ns: int
-    first_pose_ns: int
-    settling_ns: int | None
-    pose: Floats | None = None
-    pose_sigma_rad: float = 0.0
-    turns: tuple[int, ...] | None = None
 
 
 @dataclass
@@ -139,10 +61,10 @@ class Segmenter:
         self._early = list[Stream]()  # poses, as recorded, that the readings have not reached
         self._before: tuple[Floats, Floats] | None = None  # the last pose as recorded, and its turns
         self._temperature = Stream.empty(1)
-        self._orders = (_Order(), _Order(), _Order())
+        self._orders = (StampOrder(), StampOrder(), StampOrder())
         self._decided_ns: int | None = None  # intervals of poses before this stamp have been judged
         self._cover_ns = -_LAST_NS  # a still window judged earlier reaches to here
-        self._dwell: _Dwell | None = None
+        self._dwell: OpenDwell | None = None
         self._encoder_rad = 0.0  # noise of a message, as the dwell before showed it
         self._begun = False
 
@@ -167,7 +89,7 @@ class Segmenter:
         """When the open dwell began, since the first sample; NaN where none is open."""
         if self._dwell is None or self.first_ns is None:
             return math.nan
-        return (self._dwell.arrival_ns - self.first_ns) / _SECOND_NS
+        return (self._dwell.arrival_ns - self.first_ns) / SECOND_NS
 
     def waiting(self) -> list[Block]:
         """The readings of the open dwell that wait for their block to fill, in a block that is not taken from it."""
@@ -239,13 +161,13 @@ class Segmenter:
 
     def _advance(self, final: bool) -> Iterator[Block]:
         for stamp, event, settles in self._judge(final):
-            if event is _Event.ARRIVE:
+            if event is DwellEvent.ARRIVE:
                 felt_ns = self._felt_ns(stamp)
                 yield from self._slew(stamp)
                 self._discard(stamp)
                 self.dwell_count += 1
                 settling_ns = None if settles else 0
-                self._dwell = _Dwell(self.dwell_count, stamp, felt_ns, self._next_pose_ns(stamp), settling_ns)
+                self._dwell = OpenDwell(self.dwell_count, stamp, felt_ns, self._next_pose_ns(stamp), settling_ns)
             else:
                 lead_ns = min(self.stillness.lead_ns, (stamp - self._dwell.arrival_ns) // 10) if self._dwell else 0
                 yield from self._emit(stamp - lead_ns, closing=True, left=True)
@@ -266,7 +188,7 @@ class Segmenter:
             self.tally.without_pose += len(self._accel)
             self._accel = Stream.empty(3)
 
-    def _judge(self, final: bool) -> list[tuple[int, _Event, bool]]:
+    def _judge(self, final: bool) -> list[tuple[int, DwellEvent, bool]]:
         """Arrivals and departures in the pose intervals that can be judged by now: (stamp, event, has to settle)."""
         times, poses = self._pose.time_ns, self._pose.values
         start = 0 if self._decided_ns is None else int(np.searchsorted(times, self._decided_ns))
@@ -284,15 +206,15 @@ class Segmenter:
         self._decided_ns = int(times[count])
         return events
 
-    def _lone_pose(self, times: Times) -> list[tuple[int, _Event, bool]]:
+    def _lone_pose(self, times: Times) -> list[tuple[int, DwellEvent, bool]]:
         """A single pose message makes one dwell of all the readings around it."""
         if self._begun or not len(times) or not len(self._accel):
             return []
         self._begun, self._decided_ns = True, int(times[0])
-        return [(int(min(self._accel.time_ns[0], times[0])), _Event.ARRIVE, False)]
+        return [(int(min(self._accel.time_ns[0], times[0])), DwellEvent.ARRIVE, False)]
 
-    def _events(self, times: Times, still: Mask) -> list[tuple[int, _Event, bool]]:
-        in_dwell, events = self._dwell is not None, list[tuple[int, _Event, bool]]()
+    def _events(self, times: Times, still: Mask) -> list[tuple[int, DwellEvent, bool]]:
+        in_dwell, events = self._dwell is not None, list[tuple[int, DwellEvent, bool]]()
         arrived_ns = self._dwell.arrival_ns if self._dwell else 0
         unresolved = ~still & (np.diff(times[: len(still) + 1]) > self.stillness.window_ns)
         after_unresolved = np.concatenate([[False], unresolved[:-1]])
@@ -302,19 +224,19 @@ class Segmenter:
             if still[j] and not in_dwell:
                 first = not self._begun
                 arrived_ns, in_dwell = begin - (_HOLD_NS if first else 0), True
-                events.append((arrived_ns, _Event.ARRIVE, not first))
+                events.append((arrived_ns, DwellEvent.ARRIVE, not first))
             elif unresolved[j]:
                 leave, arrive = self.stillness.moved_between(self._accel, begin, end, self.bench.gravity_mps2)
                 if not in_dwell and leave - begin >= _REST_NS:
                     arrived_ns, in_dwell = begin - (0 if self._begun else _HOLD_NS), True
-                    events.append((arrived_ns, _Event.ARRIVE, False))
+                    events.append((arrived_ns, DwellEvent.ARRIVE, False))
                 if in_dwell:
-                    events.append((self._departed_ns(arrived_ns, leave), _Event.LEAVE, False))
+                    events.append((self._departed_ns(arrived_ns, leave), DwellEvent.LEAVE, False))
                 arrived_ns, in_dwell = arrive, end - arrive >= _REST_NS
                 if in_dwell:
-                    events.append((arrive, _Event.ARRIVE, True))
+                    events.append((arrive, DwellEvent.ARRIVE, True))
             elif not still[j] and in_dwell:
-                events.append((self._departed_ns(arrived_ns, begin), _Event.LEAVE, False))
+                events.append((self._departed_ns(arrived_ns, begin), DwellEvent.LEAVE, False))
                 in_dwell = False
             self._begun = True
         return events
@@ -379,8 +301,8 @@ class Segmenter:
             return
         if np.abs(np.diff(poses, axis=0)).max() > np.ptp(poses, axis=0).max() / 4.0:  # too fast for its messages
             return
-        curve = Curve.through(self.bench, (times - self.first_ns) / _SECOND_NS, poses)
-        warm, elapsed_s = _carried_on(self._temperature, accel.time_ns), (accel.time_ns - self.first_ns) / _SECOND_NS
+        curve = Curve.through(self.bench, (times - self.first_ns) / SECOND_NS, poses)
+        warm, elapsed_s = carry_on(self._temperature, accel.time_ns), (accel.time_ns - self.first_ns) / SECOND_NS
         for part in np.array_split(np.arange(count), -(-count // BLOCK_SAMPLES)):
             own = elapsed_s[part]
             yield Block(
@@ -404,7 +326,7 @@ class Segmenter:
             dwell.settling_ns = rest_ns - dwell.arrival_ns + min(settle_ns, length_ns // 3)
             if settle_ns > length_ns // 3 and left:
                 self.tally.short_dwells += 1
-                self.tally.least_settling_s = min(self.tally.least_settling_s, length_ns // 3 / _SECOND_NS)
+                self.tally.least_settling_s = min(self.tally.least_settling_s, length_ns // 3 / SECOND_NS)
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
         first = min(int(np.searchsorted(self._accel.time_ns, dwell.arrival_ns + dwell.settling_ns)), count)
         if closing and dwell.pose is None and self._is_unsure(self._accel.time_ns[first:count]):
@@ -425,11 +347,11 @@ class Segmenter:
     def _block(self, accel: Stream) -> Block:
         assert self._dwell is not None and self.first_ns is not None
         self.tally.used += len(accel)
-        elapsed_s = (accel.time_ns - self.first_ns) / _SECOND_NS
+        elapsed_s = (accel.time_ns - self.first_ns) / SECOND_NS
         arrival_s, felt_s = (
-            max((stamp - self.first_ns) / _SECOND_NS, 0.0) for stamp in (self._dwell.arrival_ns, self._dwell.felt_ns)
+            max((stamp - self.first_ns) / SECOND_NS, 0.0) for stamp in (self._dwell.arrival_ns, self._dwell.felt_ns)
         )
-        pose, warm = self._block_pose(accel.time_ns), _carried_on(self._temperature, accel.time_ns)
+        pose, warm = self._block_pose(accel.time_ns), carry_on(self._temperature, accel.time_ns)
         return Block(
             self._dwell.number, arrival_s, elapsed_s, accel.values, pose, warm, felt_s=felt_s,
             pose_sigma_rad=self._dwell.pose_sigma_rad, turns=self._dwell_turns(),
@@ -485,23 +407,6 @@ class Segmenter:
         kept = slice(max(int(np.searchsorted(self._pose.time_ns, oldest)) - HISTORY, 0), None)
         self._pose, self._turns = self._pose[kept], self._turns[kept]
         self._temperature = self._temperature[max(int(np.searchsorted(self._temperature.time_ns, oldest)) - 2, 0) :]
-
-
-def _carried_on(slow: Stream, at_ns: Times) -> Floats:
-    """A slow quantity at ``at_ns`` (n,): the line through its last two samples, for as long as they lie apart.
-
-    Nothing waits for the next sample, and holding the last would be late by half their distance. NaN before the first.
-    """
-    if not len(slow):
-        return np.full(len(at_ns), np.nan)
-    counts = np.diff(np.searchsorted(at_ns, slow.time_ns), prepend=0, append=len(at_ns))  # before the first, of each
-    begins_ns, levels = np.append(0, slow.time_ns), np.append(np.nan, slow.values[:, 0])
-    steps_ns = np.append([1, 1], np.diff(slow.time_ns))
-    rises = np.where(steps_ns > 0, np.append([0.0, 0.0], np.diff(slow.values[:, 0])), 0.0)
-    begin_ns, level, step_ns, rise = (
-        np.repeat(each, counts) for each in (begins_ns, levels, np.maximum(steps_ns, 1), rises)
-    )
-    return level + np.minimum((at_ns - begin_ns) / step_ns, 1.0) * rise
 
 
 def dwell_blocks(source: Source, segmenter: Segmenter) -> Iterator[Block]:

@@ -15,7 +15,6 @@ from os import PathLike
 from typing import Literal
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
@@ -42,6 +41,7 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.square_root_information import FilterStep
 from kf_calib.sources.files.recording import opened
 from kf_calib.support import stage
+from kf_calib.support.threads import one_blas_thread
 
 
 def calibrate(
@@ -56,7 +56,7 @@ def calibrate(
     Raises InputError where the source holds nothing usable, UnobservableError where one orientation was visited only.
     """
     source, settings = opened(source), settings or Settings()
-    with threadpool_limits(1, user_api="blas"):  # small decompositions: with threads they take three times as long
+    with one_blas_thread():
         if Model.of(source.bench, settings.effects).averages and not settings.window_s:
             stage.say("reading how it vibrates")
             settings = replace(settings, window_s=_window_s(source, settings, on_progress))
@@ -141,7 +141,7 @@ def _refitted(before: Calibration, effects: tuple[str, ...]) -> Calibration:
     other = model.averages and not all(dwell.averaged for dwell in before.fit.dwells)
     if before.reread is not None and (other or (model.dynamic and not before.carried.slews)):
         return before.reread(settings)
-    with threadpool_limits(1, user_api="blas"):  # small decompositions, and the same bits every time
+    with one_blas_thread():
         fitted = fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews)
         if before.reread is not None and not holds_its_oscillation(fitted):
             return before.reread(settings, None, None if fitted.dwells[0].averaged else fitted)

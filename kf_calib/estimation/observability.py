@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.effects import Coefficient, Effect, effect_named, names
@@ -18,6 +17,7 @@ from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.score_test import Candidate, Scan, scan
+from kf_calib.support.threads import one_blas_thread
 
 LEVEL, POWER = 0.01, 0.9
 """Found is what a run in which nothing is missing shows with this chance; smallest sizes are found in this share."""
@@ -78,7 +78,7 @@ class Visibility:
 
 def visibility_of(fitted: Fit, effects: Sequence[Effect]) -> list[Visibility]:
     """Of each effect, beside the model without it; an effect with a constant at that value where it shows best."""
-    with threadpool_limits(1, user_api="blas"):  # small decompositions
+    with one_blas_thread():
         model = fitted.carried.model
         inside = [each for each in effects if str(each) in model.parts]
         seen = {str(each): _beside(fitted, model - each, [each])[0] for each in inside}

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import BIASES
 from kf_calib.effects import Effect
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.dwell_columns import Carried, candidate_columns
@@ -179,7 +180,7 @@ class _Path:
         from scipy.linalg import cholesky_banded
 
         self._unit, self._ends = float(np.sqrt(steps.max())), ends
-        inside, biases = rows[:, :3], rows[:, 3:][:, [3, 7, 11]]
+        inside, biases = rows[:, :3], rows[:, 3:][:, BIASES]
         self._columns = self._unit * np.concatenate([biases, inside + biases], axis=1)
         self._columns[: ends[1], :3] = 0.0  # the first dwell is where the way begins
         self._root = cholesky_banded(self._bands(steps / self._unit**2), lower=True)

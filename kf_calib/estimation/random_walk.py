@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import BIASES
 from kf_calib.dwells.qr import triangle
 
 
@@ -79,7 +80,7 @@ def advance(factor: Floats, steps: Floats, rows: Floats) -> tuple[Floats, int]:
     count = len(sigma)
     if not count:
         return triangle(np.vstack([factor, rows])), 0
-    biases = [3, 7, 11]
+    biases = BIASES
     out = np.zeros((count + width + len(rows), count + width + 1))
     out[:count, :count] = np.diag(1.0 / sigma)
     before = out[count : count + width]
@@ -94,7 +95,7 @@ def advance(factor: Floats, steps: Floats, rows: Floats) -> tuple[Floats, int]:
 def recede(factor: Floats, steps: Floats, rows: Floats) -> Floats:
     """The factor of the biases before a dwell and its pause, from that of the biases at its end (from what came later)
     and its rows: ``advance`` backward in time."""
-    width, biases = len(factor), [3, 7, 11]
+    width, biases = len(factor), BIASES
     sigma = _sigmas(steps, rows.shape[1] - width - 1)
     out = np.zeros((len(sigma) + width + len(rows), len(sigma) + width + 1))
     out[: len(sigma), : len(sigma)] = np.diag(1.0 / sigma)
@@ -126,7 +127,7 @@ def whiten_walk(rows: Sequence[Floats], steps: Floats) -> Floats:
     for own, (pause, inside) in zip(dwells, steps, strict=True):
         unknown = ([pause] if pause > 0 and len(upper) else []) + ([inside] if len(upper) else [])
         first, count = 3 * len(unknown), 3 * len(unknown) + len(upper)
-        biases = own[:, 3:][:, [3, 7, 11]]
+        biases = own[:, 3:][:, BIASES]
         design = np.zeros((count + len(own) + (0 if len(upper) else 3), first + 3))
         design[:first, :first] = np.diag(np.repeat(1.0 / np.sqrt(unknown), 3))
         if len(upper):  # w before is w less the steps in the pause and in the dwell

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, Mask
@@ -26,6 +25,7 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings
 from kf_calib.support.printing import printed
 from kf_calib.support.tail_probabilities import f_tail
+from kf_calib.support.threads import one_blas_thread
 
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # a larger sigma means: not seen by this run
 _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
@@ -214,7 +214,7 @@ class Calibration:
     @cached_property
     def held_out(self) -> HeldOut | None:
         """What each orientation is predicted to read by a fit without it; None where there are too few."""
-        with threadpool_limits(1, user_api="blas"):  # small decompositions
+        with one_blas_thread():
             return held_out(self.fit)
 
     @property

@@ -16,8 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from threadpoolctl import threadpool_limits
-
 from kf_calib.bench.bench import Bench
 from kf_calib.diagnosis.candidate_tests import LEVEL, REST, SHARE, candidates, chance_fall, independent_tests, run_level
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend_beside
@@ -27,6 +25,7 @@ from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.running_filter import Running
+from kf_calib.support.threads import one_blas_thread
 
 _GROWN = 1.25
 _FEWEST = 4
@@ -63,12 +62,12 @@ class Watch:
         settings = settings or Settings()
         if len(dwells) < _FEWEST:
             raise ValueError(f"a watch begins with {_FEWEST} dwells, not {len(dwells)}")
-        with threadpool_limits(1, user_api="blas"):
+        with one_blas_thread():
             return cls(bench, settings, *_begun(dwells, bench, settings, fitted), looks)._looked()
 
     def after(self, dwell: DwellFactor, fitted: Fit | None = None) -> Watch:
         """The watch after one more dwell. fitted: the model fitted to the dwells with it, where that is known."""
-        with threadpool_limits(1, user_api="blas"):
+        with one_blas_thread():
             running = self.running.after(dwell, exact=False)  # made anew when it has grown by a quarter
             if len(running.dwells) < _GROWN * self.fitted_at:
                 return replace(self, running=running)._looked()

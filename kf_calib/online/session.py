@@ -17,8 +17,6 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from threadpoolctl import threadpool_limits
-
 from kf_calib.bench.streams import Batch, Source
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.sufficient_statistics import Folder
@@ -28,6 +26,7 @@ from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.status import Judgement, Standing, current, judge_whole_run, judged, targets
+from kf_calib.support.threads import one_blas_thread
 
 _FIRST_LOOK_S = 1.0
 
@@ -73,7 +72,7 @@ class Session:
     def run(self) -> Judgement:
         """Evaluate the source to its end; the final judgement. Raises KfCalibError where nothing can be said."""
         failure: Exception | None = None
-        with threadpool_limits(1, user_api="blas"):  # for both threads: setting it in one would change the other's
+        with one_blas_thread():  # for both threads: setting it in one would change the other's
             judge = threading.Thread(target=self._judge, name="judge", daemon=True)
             judge.start()
             try:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
@@ -30,6 +29,7 @@ from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.online.sequential_test import Watch
+from kf_calib.support.threads import one_blas_thread
 
 _FEWEST = 5  # dwells: with fewer nothing is left over to judge by
 _FEWEST_UNSTATED = 12  # where the noise from dwell to dwell has to be told from a misfit
@@ -256,7 +256,7 @@ def judged(passed: Pass, wanted: Floats, before: Judgement | None = None) -> Jud
     """The run after the dwells folded so far, ``before``: after fewer of them. Raises InputError where the readings
     cannot be used as they are."""
     settings, bench, dwells = passed.settings, passed.source.bench, passed.dwells
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         refuse_unusable(dwells, passed.tally, bench)
         result = with_remarks(evaluate(dwells, bench, settings, passed.folder.slews), passed)
         watch = _watched(dwells, result, None if before is None else before.watch)
@@ -292,7 +292,7 @@ def _not_judged(result: Calibration, watch: Watch | None) -> Diagnosis:
 
 def judge_whole_run(passed: Pass, wanted: Floats, watch: Watch | None, again: Source | None = None) -> Judgement:
     """The last judgement: the calibration and the diagnosis of the whole run, as of its recording (``again``)."""
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         result = conclude(passed, again)
         look = Look(result, watch, diagnose(result))
         return Judgement(result, look, watch, wanted, _course(result, wanted), final=True)

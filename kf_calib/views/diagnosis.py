@@ -9,7 +9,8 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.design.next_orientation import Advice
-from kf_calib.diagnosis.candidate_tests import LEVEL, Detectable, detectable
+from kf_calib.diagnosis.candidate_tests import LEVEL
+from kf_calib.diagnosis.detectability import Detectable, detectable
 from kf_calib.diagnosis.missing_effect import next_orientation
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description, describe

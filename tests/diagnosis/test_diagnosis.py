@@ -16,7 +16,8 @@ from helpers.synthetic import Run, plan_of
 
 from kf_calib.cli import cli
 from kf_calib.diagnosis import candidate_tests
-from kf_calib.diagnosis.candidate_tests import EQUAL, assess_candidates, chance_fall, detectable, independent_tests
+from kf_calib.diagnosis.candidate_tests import EQUAL, assess_candidates, chance_fall, independent_tests
+from kf_calib.diagnosis.detectability import detectable
 from kf_calib.diagnosis.missing_effect import diagnose, next_orientation
 from kf_calib.diagnosis.results import with_effects
 from kf_calib.effects import effect_named

@@ -31,7 +31,6 @@ from helpers.synthetic import Run, plan_of
 from kf_calib.bench.streams import Batch
 from kf_calib.cli import cli
 from kf_calib.cli.echo import Printer
-from kf_calib.cli.live import _targets
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.dwells.sufficient_statistics import Folder
 from kf_calib.errors import InputError
@@ -507,7 +506,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(words: list[str], sentence: str
 
 
 def test_targets_by_symbol_and_by_kind() -> None:
-    found = _targets(("theta=2arcsec", "theta1=1arcsec", "K=5ppm", "b2=1e-4"))
+    found = parsed_targets(("theta=2arcsec", "theta1=1arcsec", "K=5ppm", "b2=1e-4"))
     assert found["theta3"] == pytest.approx(np.radians(2 / 3600)) and found["theta1"] == found["theta3"] / 2
     assert found["K2"] == pytest.approx(5e-6) and found["b2"] == 1e-4 and "b1" not in found
 

@@ -12,7 +12,8 @@ from mcap.records import Channel, Metadata, Schema
 
 from kf_calib.errors import InputError
 from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, MessageType
-from kf_calib.sources.files.mcap_file import DamagedError, McapFile, Warn, parse
+from kf_calib.sources.files.mcap_chunks import DamagedError, parse
+from kf_calib.sources.files.mcap_file import McapFile, Warn
 
 BENCH_RECORD = "kf_calib.bench"
 CHECKSUM_KEY = "crc32"

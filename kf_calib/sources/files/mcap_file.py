@@ -9,44 +9,44 @@ one chunk where that is larger: what claims to unpack to more than is allowed is
 
 from __future__ import annotations
 
-import re
-import struct
 import zlib
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
-from typing import IO, TypeVar
+from typing import IO
 
-import lz4.frame
 import numpy as np
-import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Header, Metadata, MetadataIndex, Schema, Statistics
+from mcap.records import Channel, Header, Metadata, Schema
 
 from kf_calib.errors import InputError
 from kf_calib.sources.files.foreign import HEAD_BYTES, advice
+from kf_calib.sources.files.mcap_chunks import (
+    CHUNK,
+    MAX_CHUNK_MB,
+    DamagedError,
+    allowed_sizes,
+    chunk_heads,
+    chunk_times,
+    megabytes,
+    packed_start,
+    parse,
+    unpack_chunk,
+)
 from kf_calib.sources.files.mcap_messages import HEAD, MESSAGE_FIELDS, RecordBlock
+from kf_calib.sources.files.mcap_summary import Summary
 
 MAGIC = b"\x89MCAP0\r\n"
-MAX_CHUNK_MB = 256.0
-"""A chunk that unpacks to more is passed over: recorders write some MB, and a few kB of zeros claim a GB."""
 
 Warn = Callable[[str], None]
-
-_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of its offsets, CRC
-_CHUNK = struct.Struct("<QQQII")  # first and last time, size and CRC uncompressed, length of the compression's name
-_SUMMARY_LIMIT = 1 << 28
 _BLOCK = 1 << 22  # smaller chunks are joined: every block costs some hundred microseconds besides its messages
 _PIECE = 1 << 20
 _AHEAD = 2 * _BLOCK  # bytes unpacked and not yet asked for
 _LONGEST_SPAN_S = 1e7  # a longer one is damage itself
-_PACKED_HEADS = tuple(struct.pack("<I", len(name)) + name for name in (b"zstd", b"lz4"))
 
 # What may stand in the data section, with the least length of its content
 _LEAST: dict[int, int] = {
@@ -59,142 +59,6 @@ _PARSED: dict[int, Callable[[ReadDataStream], object]] = {
 }  # fmt: skip
 _FIRST_PRIVATE_OPCODE = 0x80
 _NOTHING_YET = -1  # in place of an opcode: the next record of a growing file is not whole
-_Record = TypeVar("_Record")
-
-
-class DamagedError(Exception):
-    """A stretch of the file is not what MCAP says it must be; the text says how."""
-
-
-class _ExactStream(ReadDataStream):
-    def read(self, length: int) -> bytes:
-        data = super().read(length)
-        if len(data) != length:
-            raise EndOfFile
-        return data
-
-
-def parse(read: Callable[[ReadDataStream], _Record], content: bytes) -> _Record:
-    """The record in ``content``; ``read`` is its class's reader. Raises DamagedError unless it fits exactly."""
-    stream = _ExactStream(BytesIO(content))
-    try:
-        record = read(stream)
-    except (McapError, struct.error, ValueError) as error:
-        raise DamagedError("a record does not parse") from error
-    if stream.count != len(content):
-        raise DamagedError("a record is longer than what it holds")
-    return record
-
-
-def unpack_chunk(content: bytes, max_chunk: int) -> bytes:
-    """The records in the content of a chunk record. Raises DamagedError where size or checksum do not fit."""
-    _, _, size, crc, _ = _CHUNK.unpack_from(content)
-    start = _packed_start(content)
-    if not start:
-        raise DamagedError("its lengths contradict each other")
-    if size > max_chunk:
-        raise DamagedError(f"it claims to hold {_mb(size)} MB, {_allowed(max_chunk)}")
-    data = _decompress(content[_CHUNK.size : start - 8], content[start:], size)
-    if len(data) != size:
-        raise DamagedError(f"it holds {len(data)} bytes in place of {size}")
-    if crc and zlib.crc32(data) != crc:
-        raise DamagedError("its checksum does not fit")
-    return data
-
-
-def _packed_start(content: bytes) -> int:
-    """Where the packed records begin in the content of a chunk record; 0 where its lengths contradict each other."""
-    start = _CHUNK.size + _CHUNK.unpack_from(content)[-1] + 8
-    fits = start <= len(content) and int.from_bytes(content[start - 8 : start], "little") == len(content) - start
-    return start if fits else 0
-
-
-def _mb(size: int) -> str:
-    return f"{size / (1 << 20):.0f}"
-
-
-def _allowed(max_chunk: int) -> str:
-    return f"more than the {_mb(max_chunk)} MB that --max-chunk-mb allows"
-
-
-def _decompress(compression: bytes, data: bytes, size: int) -> bytes:
-    try:
-        match compression:
-            case b"":
-                return data
-            case b"zstd":
-                if zstandard.frame_content_size(data) not in (-1, size):  # the frame's claim is what gets allocated
-                    raise DamagedError("its sizes contradict each other")
-                return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
-            case b"lz4":
-                return lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
-            case _:
-                raise DamagedError(f"its compression {compression.decode(errors='replace')!r} is not known")
-    except (zstandard.ZstdError, RuntimeError, MemoryError) as error:
-        raise DamagedError("it does not decompress") from error
-
-
-@dataclass
-class Summary:
-    """What the end of a finished file tells of the whole; ``start`` is the byte where that end begins."""
-
-    start: int
-    schemas: list[Schema] = field(default_factory=list[Schema])
-    channels: list[Channel] = field(default_factory=list[Channel])
-    chunks: list[ChunkIndex] = field(default_factory=list[ChunkIndex])
-    metadata: list[MetadataIndex] = field(default_factory=list[MetadataIndex])
-    message_counts: dict[int, int] = field(default_factory=dict[int, int])
-
-    @classmethod
-    def read(cls, file: IO[bytes], size: int) -> Summary:
-        """The summary of a file of ``size`` bytes. Raises DamagedError where there is none or it is not whole."""
-        footer_start = size - _FOOTER.size - len(MAGIC)
-        if footer_start < len(MAGIC):
-            raise DamagedError("it has no footer")
-        file.seek(footer_start)
-        footer, magic = file.read(_FOOTER.size), file.read(len(MAGIC))
-        opcode, length, start, _, crc = _FOOTER.unpack(footer)
-        if magic != MAGIC or (opcode, length) != (Opcode.FOOTER, _FOOTER.size - HEAD.size):
-            raise DamagedError("it has no footer")
-        start = start or footer_start
-        if not footer_start - _SUMMARY_LIMIT <= start <= footer_start or start < len(MAGIC):
-            raise DamagedError("its footer is damaged")
-        file.seek(start)
-        content = file.read(footer_start - start)
-        if crc and zlib.crc32(footer[:-4], zlib.crc32(content)) != crc:
-            raise DamagedError("the checksum of its summary does not fit")
-        summary = cls(start)
-        summary._fill(content)
-        return summary
-
-    def _fill(self, content: bytes) -> None:
-        position = 0
-        while position < len(content):
-            opcode, record, position = _record_at(content, position)
-            match opcode:
-                case Opcode.SCHEMA:
-                    self.schemas.append(parse(Schema.read, record))
-                case Opcode.CHANNEL:
-                    self.channels.append(parse(Channel.read, record))
-                case Opcode.CHUNK_INDEX:
-                    self.chunks.append(parse(ChunkIndex.read, record))
-                case Opcode.METADATA_INDEX:
-                    self.metadata.append(parse(MetadataIndex.read, record))
-                case Opcode.STATISTICS:
-                    self.message_counts = parse(Statistics.read, record).channel_message_counts
-                case _:
-                    pass
-        self.chunks.sort(key=lambda index: index.chunk_start_offset)
-
-
-def _record_at(data: bytes, position: int) -> tuple[int, bytes, int]:
-    if position + HEAD.size > len(data):
-        raise DamagedError("a record has no room for its head")
-    opcode, length = HEAD.unpack_from(data, position)
-    start = position + HEAD.size
-    if start + length > len(data):
-        raise DamagedError("a record ends outside its section")
-    return opcode, data[start : start + length], start + length
 
 
 class McapFile:
@@ -318,7 +182,7 @@ class _Walk:
             yield parcel
 
     def _unpacked_size(self, opcode: int, content: bytes) -> int:
-        stated = _CHUNK.unpack_from(content)[2] if opcode == Opcode.CHUNK else len(content)
+        stated = CHUNK.unpack_from(content)[2] if opcode == Opcode.CHUNK else len(content)
         return stated if stated <= self.max_chunk else 0  # a chunk of more is passed over
 
     def unpack(self, parcel: _Parcel) -> RecordBlock:
@@ -409,7 +273,7 @@ class _Walk:
     def _pass_over(self, opcode: int, length: int) -> None:
         start = self.position - HEAD.size
         if opcode == Opcode.CHUNK:
-            what = f"the chunk at byte {start} takes {_mb(length)} MB, {_allowed(self.max_chunk)}"
+            what = f"the chunk at byte {start} takes {megabytes(length)} MB, {allowed_sizes(self.max_chunk)}"
             self.warn(f"{self.path}: {what}: it is passed over.")
         elif opcode != Opcode.ATTACHMENT:
             self.warn(f"{self.path}: the record of kind {opcode} at byte {start} ({length} bytes) is passed over.")
@@ -420,7 +284,7 @@ class _Walk:
         """Goes on at ``limit``, or the next chunk: nothing tells where the record at ``start`` ends."""
         self.whole = False
         index, times = self.chunks.get(start), self.file.read(16) if opcode == Opcode.CHUNK else b""
-        span = _span(index.message_start_time, index.message_end_time) if index else _span(*_times(times))
+        span = _span(index.message_start_time, index.message_end_time) if index else _span(*chunk_times(times))
         resumed = limit if self.indexed else self._chunk_after(start)
         count = resumed - start
         if self.indexed or resumed < limit:
@@ -438,12 +302,12 @@ class _Walk:
         """Where the first packed chunk behind ``start`` begins, by all of its head; the end where there is none."""
         if self.next_chunk > start:
             return self.next_chunk
-        overlap = HEAD.size + _CHUNK.size + 4 + 8  # the longest head
+        overlap = HEAD.size + CHUNK.size + 4 + 8  # the longest head
         place, self.next_chunk = start + 1, self.end
         while place < self.end and self.next_chunk == self.end:
             self.file.seek(place)
             piece = self.file.read(min(_PIECE + overlap, self.end - place))
-            found = (place + at for at in _chunk_heads(piece) if place + at + self._chunk_length(piece, at) <= self.end)
+            found = (place + at for at in chunk_heads(piece) if place + at + self._chunk_length(piece, at) <= self.end)
             self.next_chunk = next(found, self.end)
             place += _PIECE
         return self.next_chunk
@@ -457,7 +321,7 @@ class _Walk:
         return HEAD.pack(opcode, len(content)) + content
 
     def _unpack_chunk(self, start: int, content: bytes) -> bytes:
-        first_ns, last_ns, _, crc, _ = _CHUNK.unpack_from(content)
+        first_ns, last_ns, _, crc, _ = CHUNK.unpack_from(content)
         self.unchecked |= crc == 0
         try:
             return unpack_chunk(content, self.max_chunk)
@@ -474,30 +338,11 @@ def _consistent(opcode: int, content: bytes) -> bool:
         size = len(content) - 6
         return int.from_bytes(content[2:6], "little") == size and size % 16 == 0
     if opcode == Opcode.CHUNK:
-        return bool(_packed_start(content))
+        return bool(packed_start(content))
     try:
         return opcode not in _PARSED or bool(parse(_PARSED[opcode], content))
     except DamagedError:
         return False
-
-
-def _chunk_heads(piece: bytes) -> Iterator[int]:
-    """Where heads of packed chunks begin in ``piece``, ascending: opcode, name and both lengths agree."""
-    before = HEAD.size + _CHUNK.size - 4
-    places = sorted(hit.start() - before for head in _PACKED_HEADS for hit in re.finditer(re.escape(head), piece))
-    for at in places:
-        if at < 0 or piece[at] != Opcode.CHUNK:
-            continue
-        name = piece[at + before]  # the length of the name, one byte of it
-        rest = at + HEAD.size + _CHUNK.size + name + 8
-        length = HEAD.unpack_from(piece, at)[1]
-        if int.from_bytes(piece[rest - 8 : rest], "little") == length - (rest - at - HEAD.size):
-            yield at
-
-
-def _times(content: bytes) -> tuple[int, int]:
-    """First and last time in the first bytes of a chunk's content; no times at all where they are not there."""
-    return struct.unpack("<QQ", content) if len(content) == 16 else (1, 0)
 
 
 def _span(first_ns: int, last_ns: int) -> str:

@@ -26,7 +26,8 @@ from kf_calib.sources.files.bags import files_of
 from kf_calib.sources.files.cdr import JOINT_STATE, CdrError, Decoder
 from kf_calib.sources.files.contents import BENCH_RECORD, POSES, READINGS, TEMPERATURES, Contents, Parts, Role
 from kf_calib.sources.files.joints import Joints
-from kf_calib.sources.files.mcap_file import MAX_CHUNK_MB, DamagedError, McapFile, Warn, parse
+from kf_calib.sources.files.mcap_chunks import MAX_CHUNK_MB, DamagedError, parse
+from kf_calib.sources.files.mcap_file import McapFile, Warn
 from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, RecordBlock
 
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
