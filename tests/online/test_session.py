@@ -31,6 +31,7 @@ from helpers.synthetic import Run, plan_of
 from kf_calib.bench.streams import Batch
 from kf_calib.cli import cli
 from kf_calib.cli.echo import Printer
+from kf_calib.cli.live_targets import parsed_targets
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.dwells.sufficient_statistics import Folder
 from kf_calib.errors import InputError

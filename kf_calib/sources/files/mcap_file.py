@@ -37,10 +37,8 @@ from kf_calib.sources.files.mcap_chunks import (
     parse,
     unpack_chunk,
 )
-from kf_calib.sources.files.mcap_messages import HEAD, MESSAGE_FIELDS, RecordBlock
+from kf_calib.sources.files.mcap_messages import HEAD, MAGIC, MESSAGE_FIELDS, RecordBlock
 from kf_calib.sources.files.mcap_summary import Summary
-
-MAGIC = b"\x89MCAP0\r\n"
 
 Warn = Callable[[str], None]
 _BLOCK = 1 << 22  # smaller chunks are joined: every block costs some hundred microseconds besides its messages

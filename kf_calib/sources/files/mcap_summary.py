@@ -14,8 +14,7 @@ from kf_calib.sources.files.mcap_chunks import (
     DamagedError,
     parse,
 )
-from kf_calib.sources.files.mcap_file import MAGIC
-from kf_calib.sources.files.mcap_messages import HEAD
+from kf_calib.sources.files.mcap_messages import HEAD, MAGIC
 
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of its offsets, CRC
 _SUMMARY_LIMIT = 1 << 28

@@ -33,8 +33,8 @@ from kf_calib.sources.files.contents import (
     bench_checksum,
 )
 from kf_calib.sources.files.joints import Joints, gimbal_names
-from kf_calib.sources.files.mcap_file import MAGIC, McapFile
-from kf_calib.sources.files.mcap_messages import HEAD, MessageFinder
+from kf_calib.sources.files.mcap_file import McapFile
+from kf_calib.sources.files.mcap_messages import HEAD, MAGIC, MessageFinder
 from kf_calib.support.output_files import Growing, refuse
 
 _REPEAT_BYTES = 1 << 26

@@ -44,8 +44,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files import cdr, mcap_file, mcap_messages
-from kf_calib.sources.files.mcap_file import MAGIC
-from kf_calib.sources.files.mcap_messages import HEAD
+from kf_calib.sources.files.mcap_messages import HEAD, MAGIC
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
 
