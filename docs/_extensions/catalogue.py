@@ -40,7 +40,7 @@ def _name(effect: dict[str, Any]) -> str:
 
 
 def _overview(every: list[list[dict[str, Any]]]) -> Iterator[str]:
-    yield from ("## All effects", "", "| effect | what it is | looks like |", "|---|---|---|")
+    yield from ("## All effects", "", "| effect | what it is | confused with, shown by |", "|---|---|---|")
     for own in every:
         first = own[0]
         yield f"| [`{_name(first)}`](#{_name(first)}) | {first['title']} | {_plain(first['confused_with'])} |"
@@ -50,26 +50,32 @@ def _details(every: list[list[dict[str, Any]]]) -> Iterator[str]:
     for own in every:
         first = own[0]
         yield from ("", f"## {_name(first)}", "", f"{_sentence(first['title'])}", "")
-        yield from ("A reading is larger by", "", "```text", first["formula"], "```", "")
+        yield from ("```text", first["formula"], "```", "")
         if len(own) > 1:
             names = ", ".join(f"`{each['effect']}`" for each in own)
             yield f"One effect for each gimbal: {names}.\n"
         yield from _coefficients(first)
         if first["confused_with"]:
-            yield f"\n**Looks like:** {_plain(first['confused_with'])}."
+            yield f"\n**Confused with, shown by:** {_plain(first['confused_with'])}."
         yield f"\n**Source:** {_plain(first['source'])}."
 
 
 def _coefficients(effect: dict[str, Any]) -> Iterator[str]:
+    """Coefficients of one unit and size share a row."""
     if not effect["coefficients"] and not effect["unknown"]:
         return
-    yield from ("| coefficient | unit | shown in | large is |", "|---|---|---|---|")
-    for own in effect["coefficients"]:
-        shown = f"{own['scale'] * own['per_si']:.3g} {own['shown_unit']}"
-        yield f"| `{own['symbol']}` | `{own['unit']}` | {own['shown_unit']} | {shown} |"
+    yield from ("| coefficient | unit | large is |", "|---|---|---|")
+    alike = groupby(effect["coefficients"], key=lambda c: (c["unit"], c["scale"] * c["per_si"], c["shown_unit"]))
+    for (unit, size, shown_unit), own in alike:
+        symbols = " ".join(f"`{each['symbol']}`" for each in own)
+        yield f"| {symbols} | `{unit}` | {_number(size)} {shown_unit} |"
     if unknown := effect["unknown"]:
-        between = f"looked for from {unknown['low']:.3g} to {unknown['high']:.3g} {unknown['unit']}"
-        yield f"| `{unknown['symbol']}` | `{unknown['unit']}` | {unknown['unit']} | {between} |"
+        between = f"looked for from {_number(unknown['low'])} to {_number(unknown['high'])} {unknown['unit']}"
+        yield f"| `{unknown['symbol']}` | `{unknown['unit']}` | {between} |"
+
+
+def _number(value: float) -> str:
+    return f"{float(f'{value:.3g}'):g}"
 
 
 def _sentence(text: str) -> str:
