@@ -29,9 +29,9 @@ def _said(*words: str) -> str:
 
 
 def _typical_sizes() -> Iterator[str]:
-    yield from ("", "## Typical sizes", "", "What can be hidden in a simulated run (`simulate --hide EFFECT=SIZE`), and")
-    yield from ("how large it is in sensors of navigation grade and, below, in MEMS sensors:", "", "```text")
-    yield from (_said("simulate", "--hide", "help").rstrip(), "```")
+    yield from ("", "## Typical sizes", "")
+    yield "What `simulate --hide EFFECT=SIZE` can hide, and how large it is in sensors of navigation grade and, below"
+    yield from ("that, in MEMS sensors:", "", "```text", _said("simulate", "--hide", "help").rstrip(), "```")
 
 
 def _name(effect: dict[str, Any]) -> str:
