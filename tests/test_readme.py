@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from long_runs import slow
+from helpers.long_runs import slow
+from helpers.paths import ROOT
 
 import kf_calib
 from kf_calib.cli import cli
 
-ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 WITH_COMMANDS = [page for page in PAGES if "```console" in page.read_text()]
