@@ -101,6 +101,12 @@ def test_a_decimal_number_in_the_prose_of_a_page_is_quoted_from_what_is_printed(
     assert re.findall(r"\d+\.\d+", re.sub(r"`[^`]+`", "", prose)) == []
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_of_the_project_that_a_page_names_are_there(page: Path) -> None:
+    named = re.findall(r"`((?:kf_calib|docs|recordings|tests|tools)/[\w./-]*)", page.read_text())
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
 def test_the_effect_that_was_hidden_spoils_the_scale_factors_until_it_is_in_the_model() -> None:
     """What the tutorial says of the side file: 4 to 7 sigma before, within 1 after."""
     recordings = ROOT / "recordings"
