@@ -20,6 +20,9 @@ from kf_calib.cli import cli
 
 README = (ROOT / "README.md").read_text()
 PAGES = sorted((ROOT / "docs").glob("*.md"))
+WITH_COMMANDS = [page for page in PAGES if "```console" in page.read_text()]
+BLOCK = re.compile(r"^```(\S*)(?: \S+)?\n(.*?)^```", re.DOTALL | re.MULTILINE)
+FILE = re.compile(r"^:caption: (\S+)\n\n(.*)", re.DOTALL)
 GAP = "\n...\n"
 
 
@@ -55,14 +58,17 @@ def test_the_demo_does_the_main_job_and_prints_the_tables_that_are_shown(tmp_pat
     assert all((out / f"demo.{kind}").exists() for kind in ("mcap", "truth.json", "rrd"))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda page: page.name)
 @pytest.mark.parametrize("left_out", ["--honest", *slow(None)])
 def test_the_commands_of_a_page_print_what_is_shown(
     page: Path, left_out: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    text = page.read_text()
     shutil.copytree(ROOT / "recordings", tmp_path / "recordings")
     monkeypatch.chdir(tmp_path)
-    for command, shown in consoles(page.read_text()):
+    for name, content in files(text):
+        Path(name).write_text(content)
+    for command, shown in consoles(text):
         if left_out and left_out in command:
             continue
         printed = _said(command)
@@ -76,13 +82,29 @@ def test_the_commands_of_a_page_print_what_is_shown(
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_page_is_narrow_and_its_pictures_and_links_are_there(page: Path) -> None:
     text = page.read_text()
-    blocks = re.findall(r"^```\w*\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
-    assert all(len(line) <= 100 for block in blocks for line in block.splitlines())
+    assert all(len(line) <= 102 for _, block in BLOCK.findall(text) for line in block.splitlines())
     links = [link.partition("#")[0] for link in re.findall(r"\]\(([^)]+)\)", text) if "://" not in link]
     for link in filter(None, links):
         assert (page.parent / link).is_file(), link
     for picture in (page.parent / link for link in links if link.endswith(".png")):
         assert picture.stat().st_size < 150_000
+
+
+@pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda page: page.name)
+def test_a_decimal_number_in_the_prose_of_a_page_is_quoted_from_what_is_printed(page: Path) -> None:
+    """Quoted in code font, word for word. Options that a reader is told of are no quotation."""
+    text = page.read_text()
+    shown = _words(" ".join(block for _, block in BLOCK.findall(text)))
+    prose = re.sub(r"\$\$.*?\$\$|\$[^$\n]+\$", "", BLOCK.sub("", text), flags=re.DOTALL)
+    quoted = [words for words in re.findall(r"`([^`]+)`", prose) if not words.startswith("-")]
+    assert [words for words in quoted if re.search(r"\d[.e]-?\d", words) and _words(words) not in shown] == []
+    assert re.findall(r"\d+\.\d+", re.sub(r"`[^`]+`", "", prose)) == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_of_the_project_that_a_page_names_are_there(page: Path) -> None:
+    named = re.findall(r"`((?:kf_calib|docs|recordings|tests|tools)/[\w./-]*)", page.read_text())
+    assert [name for name in named if not (ROOT / name).exists()] == []
 
 
 def test_the_effect_that_was_hidden_spoils_the_scale_factors_until_it_is_in_the_model() -> None:
@@ -103,21 +125,31 @@ def test_the_effect_that_was_hidden_spoils_the_scale_factors_until_it_is_in_the_
         assert abs(given.value - size) < 1.5 * given.sigma
 
 
+def files(text: str) -> list[tuple[str, str]]:
+    """Every file that a page shows, by its caption, which commands may read."""
+    found = [FILE.match(block) for _, block in BLOCK.findall(text)]
+    return [(each[1], each[2]) for each in found if each]
+
+
 def consoles(text: str) -> list[tuple[str, str]]:
     """Every command of the console blocks, with what is shown below it; a backslash goes on in the next line."""
-    blocks = re.findall(r"^```console\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    blocks = [block for kind, block in BLOCK.findall(text) if kind == "console"]
     parts = [part for block in blocks for part in re.split(r"^\$ ", block.replace("\\\n", " "), flags=re.MULTILINE)[1:]]
     return [(command, shown) for command, _, shown in (part.partition("\n") for part in parts)]
 
 
 def _said(command: str) -> str:
-    """What a command line of a page prints in this folder; ours in this process, since many starts take long."""
+    """What a command line of a page prints in this folder; ours in this process, since many starts take long.
+
+    Not where it loads effects: they would stay in the catalogue of all tests that follow.
+    """
     program, *words = shlex.split(command)
-    if program == "kf-calib":
+    if program == "kf-calib" and "--effects-from" not in words:
         ours = CliRunner().invoke(cli, words)
         assert ours.exit_code == 0, f"{command}: {ours.output} {ours.exception}"
         return _words(ours.stdout)
-    return _words(subprocess.run([program, *words], capture_output=True, text=True, check=True, timeout=120).stdout)
+    start = {"kf-calib": [sys.executable, "-m", "kf_calib.cli"], "python": [sys.executable]}.get(program, [program])
+    return _words(subprocess.run([*start, *words], capture_output=True, text=True, check=True, timeout=120).stdout)
 
 
 def _words(text: str) -> str:
