@@ -490,7 +490,7 @@ def test_no_other_file_knows_an_effects_name() -> None:
     package = ROOT / "kf_calib"
     known = {name.split(":")[0] for name in NAMES}
     for path in package.rglob("*.py"):
-        if {"effects", "hidden"} & set(path.relative_to(package).parts):
+        if {"effects", "injected"} & set(path.relative_to(package).parts):
             continue
         mentions = known & strings(ast.parse(path.read_text()))
         assert not mentions, f"{path} knows {mentions}"
