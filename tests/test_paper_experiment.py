@@ -18,7 +18,6 @@ from kf_calib.bench import Bench
 from kf_calib.experiment import NONOPTIMAL_PRINTED, OPTIMAL_PRINTED, Conditions
 from kf_calib.model import PRIORS
 from kf_calib.views import paper as views
-from kf_calib.views.console import plain
 
 ANGLES = np.array([0.01, 0.3, 1.1, 0.0, 0.2, 0.3, 0.9, 0.0, 0.02, -1.4, 1.05, 0.0])
 """Away from the nominal, where several misprints happen to vanish."""
@@ -286,11 +285,3 @@ def test_bad_usage_is_one_sentence(words: list[object], says: str) -> None:
     done = command(*words)
     assert (done.returncode, done.stdout) == (2, "")
     assert says in done.stderr and done.stderr.count("\n") == 1
-
-
-def test_readme_shows_what_the_command_prints(found: experiment.Experiment, searched: inferred.Search) -> None:
-    """Pages break long lines where they like."""
-    readme = (Path(__file__).resolve().parents[1] / "README.md").read_text()
-    shown = readme.split("$ kf-calib paper\n")[1].split("\n```")[0]
-    printed = plain(views.paper_report(found, searched))
-    assert shown.split() == printed.split()
