@@ -104,7 +104,7 @@ KEYS_OF = {
     "paper": "paper --repetitions 2 --json",
     "record": "record faces.mcap faces.csv --axes 'y z x' --gravity 9.81 --json",
     "simulate": "simulate made.mcap --dwell-s 2 --slew-degps 180 --json",
-    "live": "live hidden.mcap --json",
+    "live": "live navigation_24.mcap --json",
 }
 
 
