@@ -353,7 +353,7 @@ def test_a_plan_says_where_it_leaves_little_to_go_by(run) -> None:
 
 
 def test_the_page_shows_what_the_command_prints(run) -> None:
-    text = (Path(__file__).resolve().parents[1] / "docs" / "planning.md").read_text()
+    text = (Path(__file__).resolve().parents[1] / "docs" / "plan.md").read_text()
     shown = text[text.index("$ kf-calib plan --count 4") :].split("```")[0]
     line, _, body = shown.partition("\n")
     code, out, _ = run(*line.split()[2:])

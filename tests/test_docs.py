@@ -1,0 +1,134 @@
+"""The documentation as a reader has it: it builds, its links lead somewhere, a browser shows it without the network."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+import kf_calib
+
+pytest.importorskip("sphinx", reason="Sphinx is not there: the documentation is not built")
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = pytest.mark.xdist_group("docs")  # built once
+
+
+class Page(HTMLParser):
+    """What an HTML page links to, what it loads, and its anchors."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.links, self.loads, self.anchors = list[str](), list[str](), set[str]()
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        self.anchors |= {name for name in (given.get("id"), given.get("name")) if name}
+        self.loads += [given["src"]] if given.get("src") else []
+        if href := given.get("href"):
+            (self.links if tag == "a" else self.loads).append(href)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built as tools/docs does, with warnings as errors."""
+    out = tmp_path_factory.mktemp("site")
+    words = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-d", out / "doctrees", DOCS, out / "html"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return out / "html"
+
+
+@pytest.fixture(scope="module")
+def pages(site: Path) -> dict[Path, Page]:
+    return {path: Page(path) for path in site.rglob("*.html")}
+
+
+def test_every_source_is_a_page(site: Path) -> None:
+    assert {path.stem for path in DOCS.glob("*.md")} <= {path.stem for path in site.glob("*.html")}
+
+
+def test_every_link_within_the_site_leads_to_a_page_and_a_place_in_it(pages: dict[Path, Page]) -> None:
+    dead = [
+        (path.name, link)
+        for path, page in pages.items()
+        for link in [*page.links, *page.loads]
+        if not urlsplit(link).scheme and not _leads_somewhere(path, link, pages)
+    ]
+    assert dead == []
+
+
+def test_a_page_loads_nothing_from_elsewhere(pages: dict[Path, Page]) -> None:
+    loads = [(path.name, each) for path, page in pages.items() for each in page.loads]
+    assert loads and [each for each in loads if urlsplit(each[1]).scheme not in ("", "data")] == []
+
+
+def test_commands_effects_and_public_names_are_all_there(pages: dict[Path, Page]) -> None:
+    anchors = {path.name: page.anchors for path, page in pages.items()}
+    assert {f"kf_calib.{name}" for name in kf_calib.__all__} <= anchors["api.html"]
+    listed = json.loads(_printed("effects", "--json"))["effects"]
+    assert {each["effect"].partition(":")[0] for each in listed} <= anchors["effects.html"]
+    commands = {"demo", "simulate", "record", "live", "replay", "compare", "diagnose", "improve", "plan", "paper"}
+    assert {f"kf-calib-{name}" for name in commands} <= anchors["command_line.html"]
+
+
+def test_equations_are_mathml_without_a_command_of_tex_left_over(site: Path) -> None:
+    for path in site.glob("*.html"):
+        equations = re.findall(r"<math .*?</math>", path.read_text(), re.DOTALL)
+        assert len(equations) > 50 or path.stem != "filter"
+        assert [each for each in equations if "\\" in each] == [], path.name
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Chromium without a window; skipped where it, or playwright, is not there."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not there: no browser is asked")
+    if BROWSER is None:
+        pytest.skip("no Chromium is there (Debian: apt-get install chromium): no browser is asked")
+    with playwright.sync_playwright() as running:
+        opened = running.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])  # root in a container
+        yield opened
+        opened.close()
+
+
+def test_a_browser_shows_every_page_without_an_error_and_asks_nobody(browser: Any, site: Path) -> None:
+    told, asked, shown = list[str](), list[str](), browser.new_page()
+    shown.on("console", lambda message: told.append(f"{shown.url}: {message.text}"))
+    shown.on("pageerror", lambda error: told.append(f"{shown.url}: {error}"))
+    shown.on("requestfailed", lambda request: told.append(f"{shown.url}: {request.url} cannot be loaded"))
+    shown.on("request", lambda request: asked.append(request.url))
+    for path in sorted(site.glob("*.html")):
+        shown.goto(path.as_uri())
+        assert shown.locator("h1").first.is_visible() or path.stem in ("search", "genindex"), path.name
+    assert told == []
+    assert asked and [url for url in asked if urlsplit(url).scheme not in ("file", "data")] == []
+
+
+def test_the_search_of_the_site_finds_a_page(browser: Any, site: Path) -> None:
+    shown = browser.new_page()
+    shown.goto(f"{(site / 'search.html').as_uri()}?q=innovation")
+    shown.wait_for_selector("#search-results li a")
+    assert "From a reading to the posterior" in shown.locator("#search-results").inner_text()
+
+
+def _leads_somewhere(page: Path, link: str, pages: dict[Path, Page]) -> bool:
+    parts = urlsplit(link)
+    target = (page.parent / unquote(parts.path)).resolve() if parts.path else page
+    place = unquote(parts.fragment)
+    return target.is_file() and (not place or target not in pages or place in pages[target].anchors)
+
+
+def _printed(*words: str) -> str:
+    command = [sys.executable, "-m", "kf_calib.cli", *words]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -1,0 +1,65 @@
+"""The keys of every command's JSON are those of docs/json.md: none is missing there, none is made up."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SECTIONS = re.split(r"^## (\w+)\n", (ROOT / "docs" / "json.md").read_text(), flags=re.MULTILINE)[1:]
+DOCUMENTED = dict(zip(SECTIONS[::2], SECTIONS[1::2], strict=True))
+HIDDEN = ROOT / "recordings" / "hidden.mcap"
+QUICK = ("--orientations", 6, "--dwell-s", 4, "--slew-degps", 360, "--sample-hz", 20)
+CSV = "time_s,ax_g,ay_g,az_g,outer_deg,middle_deg,inner_deg\n0,0,1,0,0,0,0\n1,0,1,0,0,0,0\n"
+COMMANDS: dict[str, tuple[object, ...]] = {
+    "replay": (HIDDEN,),
+    "compare": (HIDDEN,),
+    "diagnose": (HIDDEN,),
+    "improve": (HIDDEN, "--unattended"),
+    "live": ("sim://?speed=500&orientations=6&dwell_s=4&slew_degps=360&sample_hz=20",),
+    "simulate": ("made.mcap", *QUICK),
+    "record": ("recorded.mcap", "lines.csv", "--axes", "y z x", "--gravity", "9.81"),
+    "effects": (),
+    "plan": ("--count", 4),
+    "paper": ("--repetitions", 2),
+}
+
+
+def test_every_command_that_prints_json_is_in_the_page() -> None:
+    assert DOCUMENTED.keys() == COMMANDS.keys()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_keys_are_those_of_the_page(command: str, run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("lines.csv").write_text(CSV)
+    code, out, err = run(command, *COMMANDS[command], "--json")
+    assert code == 0, err
+    printed = json.loads(out.splitlines()[-1])
+    documented = documented_keys(command)
+    missing = {key for key in documented if not _is_there(printed, key)}
+    assert missing == set()
+    if command == "live":
+        documented |= documented_keys("replay") | documented_keys("diagnose")
+    assert set(printed) - {re.split(r"[.\[]", key)[0] for key in documented} == set()
+
+
+def documented_keys(command: str) -> set[str]:
+    """What the first column of a command's table names."""
+    rows = re.findall(r"^\| (`[^|]*`) \|", DOCUMENTED[command], flags=re.MULTILINE)
+    return {key for row in rows for key in re.findall(r"`([^`]+)`", row)}
+
+
+def _is_there(value: Any, key: str) -> bool:
+    """Whether an object has the key ``a.b``, or ``a[].b`` in an object of the list; the inner object may be null."""
+    head, _, rest = key.partition(".")
+    if not isinstance(value, dict) or head.removesuffix("[]") not in value:
+        return False
+    inner = value[head.removesuffix("[]")]
+    if not rest or inner is None:
+        return True
+    return any(_is_there(each, rest) for each in inner) if head.endswith("[]") else _is_there(inner, rest)
