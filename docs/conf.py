@@ -5,7 +5,7 @@ import sys
 from importlib.metadata import version as version_of
 from pathlib import Path
 
-os.environ["COLUMNS"] = "100"  # of tables that commands print while the pages are built
+os.environ.pop("COLUMNS", None)  # commands that print into the pages would make their tables that narrow
 sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
 
 project = "kf_calib"

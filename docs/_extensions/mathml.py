@@ -11,7 +11,7 @@ from sphinx.util.logging import getLogger
 from sphinx.util.math import get_node_equation_number
 from sphinx.writers.html5 import HTML5Translator
 
-_LATEX = LatexToMathML()
+_LATEX = LatexToMathML(fancy_error=False)  # one line, for a log
 _LOGGER = getLogger(__name__)
 
 
