@@ -25,40 +25,46 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from kf_calib.bench import Bench
-    from kf_calib.calibration import Calibration, Parameter, Settings, calibrate
-    from kf_calib.comparison import compare
-    from kf_calib.diagnosis import Diagnosis, diagnose
+    from kf_calib.bench.bench import Bench
+    from kf_calib.diagnosis.missing_effect import diagnose
+    from kf_calib.diagnosis.results import Diagnosis
+    from kf_calib.diagnosis.stepwise_selection import Improvement, improve
     from kf_calib.errors import InputError, KfCalibError, UnobservableError
-    from kf_calib.improvement import Improvement, improve
-    from kf_calib.live import Session
-    from kf_calib.running import Running
-    from kf_calib.sources.recorder import Recorder
-    from kf_calib.sources.recording import Recording as open_recording
+    from kf_calib.estimation.calibration import calibrate
+    from kf_calib.estimation.engine_comparison import compare
+    from kf_calib.estimation.results import Calibration, Parameter
+    from kf_calib.estimation.settings import Settings
+    from kf_calib.online.running_filter import Running
+    from kf_calib.online.sequential_test import Watch
+    from kf_calib.online.session import Session
+    from kf_calib.sources.files.recorder import Recorder
+    from kf_calib.sources.files.recording import Recording as open_recording
     from kf_calib.views.rerun import save as save_view
-    from kf_calib.watch import Watch
 
 _HOMES = {
-    "Bench": ("bench", "Bench"),
-    "Calibration": ("calibration", "Calibration"),
-    "Parameter": ("calibration", "Parameter"),
-    "Settings": ("calibration", "Settings"),
-    "calibrate": ("calibration", "calibrate"),
-    "compare": ("comparison", "compare"),
-    "Diagnosis": ("diagnosis", "Diagnosis"),
-    "diagnose": ("diagnosis", "diagnose"),
-    "Improvement": ("improvement", "Improvement"),
-    "improve": ("improvement", "improve"),
+    "Bench": ("bench.bench", "Bench"),
+    "Calibration": ("estimation.results", "Calibration"),
+    "Parameter": ("estimation.results", "Parameter"),
+    "Settings": ("estimation.settings", "Settings"),
+    "calibrate": ("estimation.calibration", "calibrate"),
+    "compare": ("estimation.engine_comparison", "compare"),
+    "Diagnosis": ("diagnosis.results", "Diagnosis"),
+    "diagnose": ("diagnosis.missing_effect", "diagnose"),
+    "Improvement": ("diagnosis.stepwise_selection", "Improvement"),
+    "improve": ("diagnosis.stepwise_selection", "improve"),
     "InputError": ("errors", "InputError"),
     "KfCalibError": ("errors", "KfCalibError"),
     "UnobservableError": ("errors", "UnobservableError"),
-    "Running": ("running", "Running"),
-    "Session": ("live", "Session"),
-    "Recorder": ("sources.recorder", "Recorder"),
-    "open_recording": ("sources.recording", "Recording"),
+    "Running": ("online.running_filter", "Running"),
+    "Session": ("online.session", "Session"),
+    "Recorder": ("sources.files.recorder", "Recorder"),
+    "open_recording": ("sources.files.recording", "Recording"),
     "save_view": ("views.rerun", "save"),
-    "Watch": ("watch", "Watch"),
+    "Watch": ("online.sequential_test", "Watch"),
 }
+
+_PRINTING = ("views.console", "views.diagnosis")
+"""What prints the results of these."""
 
 __all__ = [
     "Bench", "Calibration", "Diagnosis", "Improvement", "InputError", "KfCalibError", "Parameter", "Recorder",
@@ -73,5 +79,7 @@ def __getattr__(name: str) -> Any:
 
     if name not in _HOMES:
         raise AttributeError(f"module 'kf_calib' has no attribute {name!r}")
+    for module in _PRINTING:
+        import_module(f"kf_calib.{module}")
     module, attribute = _HOMES[name]
     return getattr(import_module(f"kf_calib.{module}"), attribute)

@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.paths import ROOT
 
 import kf_calib
+from kf_calib.dwells.stationarity import Stillness
 from kf_calib.errors import InputError
-from kf_calib.model import Prior
-from kf_calib.stillness import Stillness
+from kf_calib.estimation.prior import Prior
 
-RECORDING = Path(__file__).resolve().parents[1] / "recordings" / "mems_faces.mcap"
+RECORDING = ROOT / "recordings" / "mems_faces.mcap"
 
 
 @pytest.fixture(scope="module")

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from long_runs import slow
+from helpers.long_runs import slow
+from helpers.paths import ROOT
 
 import kf_calib
 from kf_calib.cli import cli
 
-ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 WITH_COMMANDS = [page for page in PAGES if "```console" in page.read_text()]
@@ -95,6 +95,12 @@ def test_a_decimal_number_in_the_prose_of_a_page_is_quoted_from_what_is_printed(
     quoted = [words for words in re.findall(r"`([^`]+)`", prose) if not words.startswith("-")]
     assert [words for words in quoted if re.search(r"\d[.e]-?\d", words) and _words(words) not in shown] == []
     assert re.findall(r"\d+\.\d+", re.sub(r"`[^`]+`", "", prose)) == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_of_the_project_that_a_page_names_are_there(page: Path) -> None:
+    named = re.findall(r"`((?:kf_calib|docs|recordings|tests|tools)/[\w./-]*)", page.read_text())
+    assert [name for name in named if not (ROOT / name).exists()] == []
 
 
 def test_the_effect_that_was_hidden_spoils_the_scale_factors_until_it_is_in_the_model() -> None:

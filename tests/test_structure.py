@@ -6,83 +6,80 @@ import ast
 import json
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from helpers.paths import ROOT
 
-PACKAGE = Path(__file__).resolve().parents[1] / "kf_calib"
-LEVELS = [
-    ["errors", "lock", "stage", "tails", "text"],
-    ["toml_file"],
-    ["outputs", "samples"],
-    ["paper", "schema"],
-    ["bench_keys"],
-    ["bench"],
-    ["effects", "mountings", "slews", "stillness"],
-    ["triangle", "banded", "autoregression", "dwells", "gate", "spectrum"],
-    ["averaging", "trace", "walk"],
-    ["model"],
-    ["folding"],
-    ["noise", "blunders"],
-    ["restricted"],
-    ["information", "kalman", "batch", "readings", "likelihood", "odds"],
-    ["periodogram"],
-    ["aims", "scan", "experiment"],
-    ["fitting", "inferred"],
-    ["prospect", "reach", "trend"],
-    ["designs", "held_out", "outlying", "tour"],
-    ["planner"],
-    ["advice", "running", "visibility"],
-    ["sources"],
-    ["calibration"],
-    ["comparison", "model_file"],
-    ["assessment"],
-    ["drivers", "pairs", "scattering", "watch"],
-    ["diagnosis"],
-    ["improvement"],
-    ["journal", "standing"],
-    ["live"],
-    ["views"],
-    ["cli"],
-]
-LEVEL = {name: k for k, names in enumerate(LEVELS) for name in names}
+PACKAGE = ROOT / "kf_calib"
+MODULES = {
+    ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in PACKAGE.rglob("*.py")
+}
+CORE = {"bench", "dwells", "effects", "estimation", "design", "diagnosis", "online"}
 
 
 def imported(path: Path) -> set[str]:
-    """Modules of the package a file imports at run time, by their first part."""
-    tree = ast.parse(path.read_text())
-    typing_only = {
-        node
-        for branch in ast.walk(tree)
-        if isinstance(branch, ast.If) and getattr(branch.test, "id", "") == "TYPE_CHECKING"
-        for node in ast.walk(branch)
-    }
-    found = set()
-    for node in ast.walk(tree):
-        if node in typing_only:
-            continue
+    """Modules of the package that a file imports, wherever in it: at its top, in a function, for types only."""
+    found = set[str]()
+    for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "kf_calib":
-            parts = node.module.split(".")
-            found |= {parts[1]} if len(parts) > 1 else {alias.name for alias in node.names}
+            assert node.module is not None
+            found |= {
+                name if (name := f"{node.module}.{alias.name}") in MODULES else node.module for alias in node.names
+            }
         elif isinstance(node, ast.Import):
-            found |= {alias.name.split(".")[1] for alias in node.names if alias.name.startswith("kf_calib.")}
+            found |= {alias.name for alias in node.names if alias.name.split(".")[0] == "kf_calib"}
     return found
 
 
-@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_imports_point_one_way(path: Path) -> None:
-    own = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-    if own == "__init__":
-        return
-    if own == "sources":
-        assert imported(path) <= {"bench", "samples", "errors", "outputs", "sources"} | (
-            {"dwells"} if path.stem == "recorder" else set()
-        )
-        return
-    below = {name for name in LEVEL if LEVEL[name] < LEVEL[own]} | {own}
-    if own in ("calibration", "diagnosis", "model"):
-        below |= {"views"}  # they print themselves
-    assert imported(path) <= below, imported(path) - below
+def room(module: str) -> str:
+    """The package that a module is in, or the module itself where it lies beside the packages."""
+    return ".".join(module.split(".")[:2])
+
+
+GRAPH = {name: imported(path) - {name} for name, path in MODULES.items()}
+ROOMS = {
+    own: {room(other) for name in MODULES if room(name) == own for other in GRAPH[name]} - {own}
+    for own in sorted(set(map(room, MODULES)))
+}
+
+
+@pytest.mark.parametrize("graph", [GRAPH, ROOMS], ids=["modules", "packages"])
+def test_imports_go_in_no_circle(graph: dict[str, set[str]]) -> None:
+    try:
+        order = list(TopologicalSorter(graph).static_order())
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
+    assert set(graph) <= set(order)
+
+
+@pytest.mark.parametrize("own", sorted(ROOMS))
+def test_imports_point_the_way_that_data_flow(own: str) -> None:
+    """Sources know the bench alone; what is simulated and its truth are known to no estimator; views to the commands
+    and to the names of the package itself."""
+    name = own.removeprefix("kf_calib").removeprefix(".")
+    seen = {other.removeprefix("kf_calib.") for other in ROOMS[own]}
+    if name in ("errors", "support", "bench", "effects", "sources"):
+        assert seen <= {"errors": set(), "support": {"errors"}, "bench": {"errors", "support"},
+                        "effects": {"errors", "support", "bench"},
+                        "sources": {"errors", "support", "bench"}}[name]  # fmt: skip
+    if name in CORE:
+        assert not seen & {"views", "cli", "reproduction"}
+        for module in MODULES:
+            if room(module) == own:
+                assert not any(other.startswith("kf_calib.sources.simulation") for other in GRAPH[module]), module
+    if name not in ("cli", "views", ""):
+        assert "views" not in seen and "cli" not in seen
+
+
+def test_nothing_lies_beside_the_packages() -> None:
+    flat = sorted(path.name for path in PACKAGE.iterdir() if path.is_file() and path.suffix == ".py")
+    assert set(flat) <= {"__init__.py", "__main__.py", "errors.py"}
+    for package in (path for path in PACKAGE.rglob("*") if path.is_dir() and path.name != "__pycache__"):
+        text = (package / "__init__.py").read_text()
+        assert ast.get_docstring(ast.parse(text)), package
 
 
 def test_import_is_cheap_and_leaves_filterpy_and_rerun_alone() -> None:
@@ -92,9 +89,9 @@ def test_import_is_cheap_and_leaves_filterpy_and_rerun_alone() -> None:
 
 
 HEAVY = (
-    "pydantic", "scipy.linalg", "scipy.optimize", "scipy.stats", "scipy.signal", "scipy.interpolate", "filterpy",
+    "pydantic", "scipy", "filterpy",
     "rerun", "rich.console", "pint", "simpleeval", "serial", "tomli_w", "matplotlib", "kf_calib.diagnosis",
-    "kf_calib.cli.live", "kf_calib.cli.plan", "kf_calib.model_file", "kf_calib.comparison",
+    "kf_calib.cli.live", "kf_calib.cli.plan", "kf_calib.estimation.model_file", "kf_calib.estimation.engine_comparison",
 )  # fmt: skip
 
 

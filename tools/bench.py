@@ -31,11 +31,11 @@ import numpy as np
 
 def make_recording(path: Path, samples: int, rate_hz: float = 1000.0, dwells: int = 24) -> None:
     """A simulated run with angles at a tenth of the rate."""
-    from kf_calib.bench import Bench, axes_of
-    from kf_calib.sources.plans import spread_plan
-    from kf_calib.sources.recorder import Recorder
-    from kf_calib.sources.sensors import GRADES
-    from kf_calib.sources.simulator import Simulation
+    from kf_calib.bench.bench import Bench, axes_of
+    from kf_calib.sources.files.recorder import Recorder
+    from kf_calib.sources.simulation.sensors import GRADES
+    from kf_calib.sources.simulation.simulator import Simulation
+    from kf_calib.sources.simulation.visit_plans import spread_plan
 
     grade = GRADES["navigation"]
     bench = Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0)
@@ -50,21 +50,22 @@ def make_recording(path: Path, samples: int, rate_hz: float = 1000.0, dwells: in
 
 
 def decode(path: Path) -> int:
-    from kf_calib.sources.recording import Recording
+    from kf_calib.sources.files.recording import Recording
 
     return sum(len(batch.accel) for batch in Recording(path))
 
 
 def replay(path: Path) -> int:
-    from kf_calib.calibration import calibrate
-    from kf_calib.sources.recording import Recording
+    from kf_calib.estimation.calibration import calibrate
+    from kf_calib.sources.files.recording import Recording
 
     return calibrate(Recording(path)).tally.read
 
 
 def fold(path: Path) -> int:
-    from kf_calib.calibration import Pass, Settings
-    from kf_calib.sources.recording import Recording
+    from kf_calib.estimation.dwell_pass import Pass
+    from kf_calib.estimation.settings import Settings
+    from kf_calib.sources.files.recording import Recording
 
     passed = Pass(Recording(path), Settings())
     passed.fold()
@@ -85,9 +86,9 @@ def candidates(dwells: list[Any], bench: Any, columns: int = 70) -> list[Any]:
 
 
 def scanned(dwells: list[Any], bench: Any, effects: list[Any]) -> Sequence[Any]:
-    from kf_calib.fitting import fit
-    from kf_calib.model import Model
-    from kf_calib.scan import scan
+    from kf_calib.estimation.fit import fit
+    from kf_calib.estimation.measurement_model import Model
+    from kf_calib.estimation.score_test import scan
 
     fitted = fit(dwells, Model(bench))
     return scan(fitted.carried, fitted.noise, effects).candidates
@@ -97,8 +98,9 @@ def fold_and_scan(path: Path) -> tuple[int, int]:
     """Readings, and columns beside the twelve."""
     from threadpoolctl import threadpool_limits
 
-    from kf_calib.calibration import Pass, Settings
-    from kf_calib.sources.recording import Recording
+    from kf_calib.estimation.dwell_pass import Pass
+    from kf_calib.estimation.settings import Settings
+    from kf_calib.sources.files.recording import Recording
 
     passed = Pass(Recording(path), Settings())
     with threadpool_limits(1, user_api="blas"):
@@ -118,7 +120,7 @@ def textbook(path: Path, samples: int) -> int:
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    from kf_calib.bench import Bench, axes_of
+    from kf_calib.bench.bench import Bench, axes_of
 
     bench, force, done = Bench(axes_of("yzx"), 9.81), np.zeros(3), 0
     kf = KalmanFilter(dim_x=12, dim_z=3)

@@ -58,7 +58,7 @@ def told(command: str, path: Path, runs: int) -> Cost:
 
 def decoding_s(path: Path) -> float:
     """Of decoding alone, without the start of a process."""
-    from kf_calib.sources.recording import Recording
+    from kf_calib.sources.files.recording import Recording
 
     times = list[float]()
     for _ in range(3):
@@ -71,8 +71,10 @@ def decoding_s(path: Path) -> float:
 
 def after_reading_s(path: Path) -> float:
     """What follows the reading of a recording: the fit, the filter, its judgement."""
-    from kf_calib.calibration import Pass, Settings, evaluate
-    from kf_calib.sources.recording import Recording
+    from kf_calib.estimation.calibration import evaluate
+    from kf_calib.estimation.dwell_pass import Pass
+    from kf_calib.estimation.settings import Settings
+    from kf_calib.sources.files.recording import Recording
 
     passed = Pass(Recording(path), Settings())
     dwells = passed.fold()

@@ -27,10 +27,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from kf_calib.samples import Batch
+from kf_calib.bench.streams import Batch
 from kf_calib.sources.live import frames
-from kf_calib.sources.simulated import options_from_query, simulation
-from kf_calib.sources.simulator import START_NS, Simulation
+from kf_calib.sources.simulation.options import options_from_query, simulation
+from kf_calib.sources.simulation.simulator import START_NS, Simulation
 
 FAULTS = ("drop", "garbage", "damage", "stall", "burst", "disconnect", "vanish", "step", "restart", "freeze")
 _STEP_S = 0.001

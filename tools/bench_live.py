@@ -27,16 +27,17 @@ from typing import Any
 import numpy as np
 from bench_emulator import Emulator, Tcp
 
-from kf_calib.calibration import Pass, Settings
-from kf_calib.folding import Folder
-from kf_calib.live import Session
-from kf_calib.samples import Batch
+from kf_calib.bench.streams import Batch
+from kf_calib.dwells.sufficient_statistics import Folder
+from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.settings import Settings
+from kf_calib.online.session import Session
+from kf_calib.online.status import judged, targets
+from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import LiveSource, frames, open_live
 from kf_calib.sources.live.links import Link
 from kf_calib.sources.live.streamed import StreamedFeed
-from kf_calib.sources.recording import Recording
-from kf_calib.sources.simulated import options_from_query, simulation
-from kf_calib.standing import judged, targets
+from kf_calib.sources.simulation.options import options_from_query, simulation
 from kf_calib.views.live import line
 
 HERE = Path(__file__).resolve().parent

@@ -17,8 +17,8 @@ from typing import Protocol
 
 import numpy as np
 
-from kf_calib import odds
-from kf_calib.samples import Floats
+from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis import bayes_factor
 
 _NEAR = 12.0  # of the logarithm of the odds: of pairs further behind none is the likeliest
 _DRAWN = 400
@@ -33,7 +33,7 @@ class Sphere:
 
     def log_odds(self, readings: Floats, sigmas: float) -> Floats:
         """log of the mean likelihood ratio (m,) against none, readings (m, d)."""
-        return odds.log_odds(self.basis.shape[1], np.sum((readings @ self.basis) ** 2, axis=1), sigmas)
+        return bayes_factor.log_odds(self.basis.shape[1], np.sum((readings @ self.basis) ** 2, axis=1), sigmas)
 
     def spread(self, sigmas: float) -> Floats:
         """Root (d, k) of the covariance of normal signals of the same mean square."""

@@ -40,15 +40,17 @@ import click
 import numpy as np
 from best_possible import Columns, Effect, Process, best_possible, best_possible_pairs
 
-from kf_calib.advice import ENOUGH
-from kf_calib.calibration import Calibration, Settings, calibrate
+from kf_calib.bench.arrays import Floats
+from kf_calib.design.next_orientation import ENOUGH
 from kf_calib.effects import Effect as Known
 from kf_calib.effects import effect_named, names
 from kf_calib.errors import KfCalibError
-from kf_calib.samples import Floats
-from kf_calib.scan import Candidate, scan
-from kf_calib.sources.hidden import Kind, NoSizeError, catalogue
-from kf_calib.sources.recording import Recording
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.score_test import Candidate, scan
+from kf_calib.estimation.settings import Settings
+from kf_calib.sources.files.recording import Recording
+from kf_calib.sources.simulation.injected import Kind, NoSizeError, catalogue
 
 # Few readings, and time enough for drifts and time constants to show: half an hour in about a second of computing.
 BENCH = (
@@ -265,7 +267,7 @@ def simulated(task: Task, path: Path, times: dict[str, float] | None = None) -> 
 @lru_cache(maxsize=2 * _SPREAD_PLANS)
 def _orientations(kind: str, seed: int) -> list[tuple[float, ...]]:
     """Gimbal angles, deg: spread over the sphere; ``monotone``: in the order of the middle one."""
-    from kf_calib.sources.plans import spread_plan
+    from kf_calib.sources.simulation.visit_plans import spread_plan
 
     rows = [visit.gimbal_deg for visit in spread_plan(24, seed=seed)]
     return rows if kind == "spread" else sorted(rows, key=lambda row: row[1])
@@ -368,7 +370,7 @@ def _calibrated(path: Path) -> Calibration:
 
 def _with_columns(result: Calibration, wanted: Sequence[str] | None = None, looked_for: bool = False) -> list[Known]:
     """Effects of the program that are columns, one with an unknown at the values of a grid."""
-    from kf_calib.assessment import slow_hz
+    from kf_calib.diagnosis.candidate_tests import slow_hz
 
     bench, out = result.model.bench, list[Known]()
     for name in names(bench):
@@ -439,7 +441,7 @@ def power(task: Task) -> Outcome:
 
     By the test that ``diagnose`` begins with; to name what it has noticed takes it most of its time.
     """
-    from kf_calib.assessment import assessed
+    from kf_calib.diagnosis.candidate_tests import assess_candidates
 
     (name,) = task.hidden
     stated = stated_sizes(dataclasses.replace(task, hidden=()))
@@ -452,7 +454,7 @@ def power(task: Task) -> Outcome:
     path, times = Path("trial.mcap"), dict[str, float]()
     effects = simulated(dataclasses.replace(task, hidden=(f"{name}={','.join(sizes)}",)), path, times)["effects"]
     with _timed(times, "notice"):
-        test = assessed(calibrate(Recording(path)).fit)
+        test = assess_candidates(calibrate(Recording(path)).fit)
     extra = {"sizes": [effect["size_sigma"] for effect in effects], "size": size, "worst": worst}
     return Outcome(task, task.names, consistent=test.consistent, p_value=test.p_value, extra=extra, seconds=times)
 
@@ -515,7 +517,7 @@ def advice(task: Task, advised: int = 4, random: int = 12) -> Outcome:
 
     Fewer than four where nothing more is advised.
     """
-    from kf_calib.sources.plans import spread_plan
+    from kf_calib.sources.simulation.visit_plans import spread_plan
 
     rows = [visit.gimbal_deg for visit in spread_plan(_FEW, seed=task.seed)]
     truth, said = _on_plan(task, rows)
@@ -620,7 +622,7 @@ def _separation(task: Task, truth: dict[str, Any], rivals: Sequence[str], rows: 
 
 def confusable(names: Sequence[str]) -> list[str]:
     """Effects that another one nearly mimics in a dozen orientations."""
-    from kf_calib.sources.plans import spread_plan
+    from kf_calib.sources.simulation.visit_plans import spread_plan
 
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         _through(Task("", "", 1), [visit.gimbal_deg for visit in spread_plan(_FEW, seed=1)], Path("few.mcap"))

@@ -14,8 +14,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from kf_calib.bench import Bench, parse_axes
-from kf_calib.samples import Floats
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench, parse_axes
 
 COLOURS = {"x": "#d55e00", "y": "#009e73", "z": "#0072b2"}  # told apart by the colour-blind, too
 GIMBALS = ("outer", "middle", "inner")

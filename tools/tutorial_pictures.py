@@ -16,9 +16,10 @@ import rerun.blueprint as rrb
 from PIL import Image
 
 import kf_calib
-from kf_calib import paper
-from kf_calib.diagnosis import Diagnosis, diagnose
-from kf_calib.samples import Floats
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.views.rerun.names import ACCELEROMETERS, GOLD, GREY, GROUPS, LABELS, MICRO, ORIENTATION, PER_SI, colour_of
 from kf_calib.views.screenshot import screenshot
 
@@ -90,7 +91,7 @@ def draw_sigmas(result: kf_calib.Calibration, png: Path) -> None:
         for k, group in enumerate(GROUPS):
             for symbol in group.symbols:
                 style = rr.SeriesLines(names=LABELS[symbol], colors=colour_of(symbol), widths=2.0)
-                send(stream, f"{k}/{symbol}", np.log10(twelve[:, paper.SYMBOLS.index(symbol)]), style)
+                send(stream, f"{k}/{symbol}", np.log10(twelve[:, paper_parameters.SYMBOLS.index(symbol)]), style)
             panels.append(
                 panel(f"{k}", f"σ of {group.title} by orientation: log₁₀ of {group.unit}", len(twelve), legend=True)
             )

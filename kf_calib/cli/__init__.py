@@ -16,11 +16,11 @@ from kf_calib.cli.echo import fall_silent, open_streams
 from kf_calib.cli.failures import tell
 
 SECTIONS = {
-    "Evaluate a recording": {"replay": "runs.replay", "diagnose": "runs.diagnose", "improve": "runs.improve",
-                             "compare": "runs.compare"},
-    "Run a bench": {"plan": "plan.plan", "record": "making.record", "live": "live.live"},
-    "Try it without a bench": {"demo": "making.demo", "simulate": "making.simulate"},
-    "Look up": {"effects": "runs.list_effects", "paper": "paper.paper"},
+    "Evaluate a recording": {"replay": "evaluate.replay", "diagnose": "evaluate.diagnose",
+                             "improve": "evaluate.improve", "compare": "evaluate.compare"},
+    "Run a bench": {"plan": "plan.plan", "record": "acquire.record", "live": "live.live"},
+    "Try it without a bench": {"demo": "acquire.demo", "simulate": "acquire.simulate"},
+    "Look up": {"effects": "evaluate.list_effects", "paper": "paper.paper"},
 }  # fmt: skip
 """The commands, as ``--help`` has them, and where in this package each is."""
 
@@ -47,9 +47,7 @@ _HELP = {
     "options_table_column_types": ["opt_all_metavar", "help"],
     "options_table_help_sections": ["help", "default"],
     "default_string": r"\[default: {}]",
-    "command_groups": {
-        "*": [{"name": name, "commands": [*own]} for name, own in SECTIONS.items()]
-    },
+    "command_groups": {"*": [{"name": name, "commands": [*own]} for name, own in SECTIONS.items()]},
 }
 
 

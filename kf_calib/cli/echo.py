@@ -9,7 +9,7 @@ from contextlib import suppress
 import click
 
 from kf_calib.errors import KfCalibError
-from kf_calib.text import printable, sentence
+from kf_calib.support.plain_text import printable, sentence
 
 
 def echo(text: str) -> None:

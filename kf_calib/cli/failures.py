@@ -11,7 +11,7 @@ import click
 
 from kf_calib.cli.echo import complain
 from kf_calib.errors import KfCalibError
-from kf_calib.text import printable
+from kf_calib.support.plain_text import printable
 
 TRACEBACK = "KF_CALIB_TRACEBACK"
 
@@ -52,7 +52,7 @@ def _said(error: BaseException) -> str:
 
 
 def _place(error: BaseException) -> str:
-    """The innermost line of this package that was at work, as ``kf_calib/kalman.py:88``."""
+    """The innermost line of this package that was at work, as ``kf_calib/estimation/fit.py:88``."""
     package = Path(__file__).parents[1]
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if package in Path(frame.filename).parents]

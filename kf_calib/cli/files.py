@@ -13,10 +13,10 @@ from click import get_current_context  # rich_click declares that there may be n
 
 from kf_calib.cli.echo import complain, echo
 from kf_calib.cli.failures import tell
-from kf_calib.outputs import Outputs
+from kf_calib.support.output_files import Outputs
 
 if TYPE_CHECKING:
-    from kf_calib.calibration import Calibration
+    from kf_calib.estimation.results import Calibration
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -50,7 +50,7 @@ def claimed(
             read += [each for each in (value if isinstance(value, tuple) else [value]) if isinstance(each, Path)]
     outputs = Outputs(files, read, overwrite)
     if ctx.params.get("model_file"):
-        from kf_calib import model_file
+        from kf_calib.estimation import model_file
 
         outputs.spare([each.path for each in model_file.read(ctx.params["model_file"]).programs])
     return outputs
@@ -83,7 +83,7 @@ class Delivery:
     def model(self, path: Path | None, result: Calibration) -> None:
         """Write the model of a result, if there is to be a file of it."""
         if path is not None:
-            from kf_calib import model_file
+            from kf_calib.estimation import model_file
 
             self.file(path, lambda path: model_file.write(path, result))
 

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
+from kf_calib.cli.acquire import pair
 from kf_calib.cli.echo import Printer, complain
 from kf_calib.cli.files import claimed, delivery, output_option
-from kf_calib.cli.making import pair
 from kf_calib.cli.numbers import NOT_NEGATIVE, POSITIVE
 from kf_calib.cli.options import (
     INPUT,
@@ -41,14 +41,14 @@ from kf_calib.cli.options import (
 )
 from kf_calib.cli.signals import answered
 from kf_calib.errors import InputError, KfCalibError, how_to_write
-from kf_calib.text import sentence
+from kf_calib.support.plain_text import sentence
 
 if TYPE_CHECKING:
-    from kf_calib.calibration import Settings
-    from kf_calib.live import Session
-    from kf_calib.samples import Source
+    from kf_calib.bench.streams import Source
+    from kf_calib.estimation.settings import Settings
+    from kf_calib.online.session import Session
+    from kf_calib.online.status import Judgement
     from kf_calib.sources.live import LiveSource
-    from kf_calib.standing import Judgement
     from kf_calib.views.rerun.growing import GrowingView
 
 RUNNING = "While it runs"
@@ -66,25 +66,58 @@ _KINDS = {"rad": ("rad", "deg", "arcmin", "arcsec"), "1": ("1", "ppm"), "m/s^2":
 )
 @click.argument("source", metavar="SOURCE")
 @output_option("--record", metavar="OUT.mcap", panel=RUNNING, help="Record the run here.")
-@click.option("--target", "targets", multiple=True, metavar="SYMBOL=SIGMA", panel=RUNNING,
-              help="The sigma wanted of a parameter (theta1) or of a kind (theta, phi, nu, K, b), with a unit: "
-              "theta1=2arcsec, K=5ppm, b=10ug; repeatable.")
-@click.option("--auto", is_flag=True, panel=RUNNING,
-              help="Accept a missing effect when it can be told from all others.")
-@click.option("--rerun", "with_viewer", is_flag=True, panel=RUNNING,
-              help="Show the run in the Rerun viewer, opened if none is.")
-@click.option("--rerun-port", type=click.IntRange(1, 65535), default=9876, show_default=True, metavar="PORT",
-              panel=RUNNING,
-              help="The viewer's port.")
-@click.option("--rerun-bind", default="127.0.0.1", show_default=True, panel=RUNNING, metavar="ADDRESS",
-              help="Address a viewer that is opened listens on.")
+@click.option(
+    "--target",
+    "targets",
+    multiple=True,
+    metavar="SYMBOL=SIGMA",
+    panel=RUNNING,
+    help="The sigma wanted of a parameter (theta1) or of a kind (theta, phi, nu, K, b), with a unit: "
+    "theta1=2arcsec, K=5ppm, b=10ug; repeatable.",
+)
+@click.option(
+    "--auto", is_flag=True, panel=RUNNING, help="Accept a missing effect when it can be told from all others."
+)
+@click.option(
+    "--rerun", "with_viewer", is_flag=True, panel=RUNNING, help="Show the run in the Rerun viewer, opened if none is."
+)
+@click.option(
+    "--rerun-port",
+    type=click.IntRange(1, 65535),
+    default=9876,
+    show_default=True,
+    metavar="PORT",
+    panel=RUNNING,
+    help="The viewer's port.",
+)
+@click.option(
+    "--rerun-bind",
+    default="127.0.0.1",
+    show_default=True,
+    panel=RUNNING,
+    metavar="ADDRESS",
+    help="Address a viewer that is opened listens on.",
+)
 @columns_option
-@click.option("--header", default="", metavar="NAMES", panel=INPUT,
-              help="Names of the columns of CSV rows that come without any.")
-@click.option("--give-up-s", type=NOT_NEGATIVE, default=600.0, show_default=True, panel=INPUT,
-              help="Seconds for which a lost link is tried again.")
-@click.option("--idle-s", type=POSITIVE, default=math.inf, show_default="never", panel=INPUT,
-              help="End the run when nothing has come for so long.")
+@click.option(
+    "--header", default="", metavar="NAMES", panel=INPUT, help="Names of the columns of CSV rows that come without any."
+)
+@click.option(
+    "--give-up-s",
+    type=NOT_NEGATIVE,
+    default=600.0,
+    show_default=True,
+    panel=INPUT,
+    help="Seconds for which a lost link is tried again.",
+)
+@click.option(
+    "--idle-s",
+    type=POSITIVE,
+    default=math.inf,
+    show_default="never",
+    panel=INPUT,
+    help="End the run when nothing has come for so long.",
+)
 @bench_options
 @filter_options
 @overwrite_option
@@ -118,7 +151,7 @@ def live(
     SOURCE: a serial port, socket://HOST:PORT, rfc2217://HOST:PORT, - (standard input), a file that grows, or sim://.
     Ctrl-C ends the run: the recording is finished and the summary printed.
     """
-    from kf_calib import model_file
+    from kf_calib.estimation import model_file
     from kf_calib.sources.live import files_of, open_live
 
     outputs = claimed(files_of(source), overwrite=overwrite)
@@ -225,10 +258,10 @@ class _Run:
     def _work(
         self, settings: Settings, wanted: Mapping[str, float], auto: bool, record: Path | None, every: bool
     ) -> None:
-        from kf_calib.live import Session
+        from kf_calib.online.session import Session
 
         def again() -> Source | None:
-            from kf_calib.sources.recording import Recording
+            from kf_calib.sources.files.recording import Recording
 
             return Recording(record) if record and not self.source.status.recording_trouble else None
 
@@ -301,7 +334,7 @@ def _echo(run: _Run, text: str) -> None:
 def _on_screen(run: _Run, name: str, record: Path | None) -> None:
     from rich.live import Live
 
-    from kf_calib.standing import Standing
+    from kf_calib.online.status import Standing
     from kf_calib.views.live import screen
     from kf_calib.views.terminal import PlainConsole
 
@@ -403,17 +436,18 @@ def _refuse(settings: Settings) -> None:
 
 def _targets(texts: tuple[str, ...]) -> dict[str, float]:
     """Sigmas wanted by symbol, SI; a kind (theta, K ...) stands for all its parameters."""
-    from kf_calib import paper
+    from kf_calib.bench import paper_parameters
 
     out = dict[str, float]()
     for text in texts:
         name, _, size = text.partition("=")
-        symbols = [s for s in paper.SYMBOLS if name == s or name == s.rstrip("123")]
+        symbols = [s for s in paper_parameters.SYMBOLS if name == s or name == s.rstrip("123")]
         if not symbols:
             raise InputError(
-                f"--target {text!r} names no parameter: use one of {', '.join(paper.SYMBOLS)}, or theta, phi, nu, K, b."
+                f"--target {text!r} names no parameter: use one of {', '.join(paper_parameters.SYMBOLS)}, or theta, "
+                "phi, nu, K, b."
             )
-        kinds = _KINDS[paper.UNITS[paper.SYMBOLS.index(symbols[0])]]
+        kinds = _KINDS[paper_parameters.UNITS[paper_parameters.SYMBOLS.index(symbols[0])]]
         unit = next((unit for unit in sorted(kinds, key=len, reverse=True) if size.endswith(unit) and unit != "1"), "")
         try:
             value = float(size.removesuffix(unit)) * _SIZES[unit or kinds[0]]

@@ -20,8 +20,9 @@ from kf_calib.cli.numbers import NOT_NEGATIVE, NUMBER, POSITIVE, NumberInRange
 from kf_calib.errors import BenchError
 
 if TYPE_CHECKING:
-    from kf_calib.calibration import Calibration, Settings
-    from kf_calib.sources.recording import Recording
+    from kf_calib.estimation.results import Calibration
+    from kf_calib.estimation.settings import Settings
+    from kf_calib.sources.files.recording import Recording
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -166,9 +167,9 @@ def overrides(options: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _bench_from_toml(path: Path) -> dict[str, str]:
-    from kf_calib.bench import metadata_of
-    from kf_calib.bench_keys import known
-    from kf_calib.toml_file import table_of
+    from kf_calib.bench.bench import metadata_of
+    from kf_calib.bench.keys import known
+    from kf_calib.support.toml_files import table_of
 
     content = table_of(path, "gravity_mps2 = 9.81, numbers with a point")
     table = content.get("bench", content) if isinstance(content.get("bench"), dict) else content
@@ -183,7 +184,7 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
 
 
 def recording_of(path: Path, options: Mapping[str, Any]) -> Recording:
-    from kf_calib.sources.recording import Recording
+    from kf_calib.sources.files.recording import Recording
 
     return Recording(
         path,
@@ -198,9 +199,9 @@ def recording_of(path: Path, options: Mapping[str, Any]) -> Recording:
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
-    from kf_calib.calibration import Settings
-    from kf_calib.model import PRIORS
-    from kf_calib.stillness import Stillness
+    from kf_calib.dwells.stationarity import Stillness
+    from kf_calib.estimation.prior import PRIORS
+    from kf_calib.estimation.settings import Settings
 
     return Settings(
         engine=options["engine"],
@@ -215,7 +216,7 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
 
 def opened(path: Path, options: Mapping[str, Any]) -> tuple[Recording, Settings]:
     """A recording and how to evaluate it; a model that cannot be made is refused before any reading is read."""
-    from kf_calib.model import Model
+    from kf_calib.estimation.measurement_model import Model
 
     settings = settings_of(options)
     source = recording_of(path, options)
@@ -229,7 +230,7 @@ def effects_of(options: Mapping[str, Any]) -> tuple[str, ...]:
 
     model = None
     if options["model_file"] is not None:
-        from kf_calib import model_file
+        from kf_calib.estimation import model_file
 
         model = model_file.read(options["model_file"])
     for path in options["effects_from"]:
@@ -286,7 +287,7 @@ def progress(text: str, quiet: bool = False) -> Iterator[Callable[[float], None]
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-    from kf_calib import stage
+    from kf_calib.support import stage
     from kf_calib.views.terminal import PlainConsole
 
     columns = BarColumn(20), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False)

@@ -22,28 +22,50 @@ from kf_calib.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from kf_calib.experiment import Experiment
+    from kf_calib.reproduction.grebenkin2019 import Experiment
 
 of_the_run = partial(click.option, panel="Run")
 inferred = partial(click.option, panel="Conditions that the paper does not print: inferred")
 
 
 @click.command(epilog=examples("paper", "paper --repetitions 1000 --rrd paper.rrd"))
-@of_the_run("--repetitions", type=click.IntRange(1, 20000), default=200, show_default=True, metavar="N",
-            help="Runs of each set.")
+@of_the_run(
+    "--repetitions",
+    type=click.IntRange(1, 20000),
+    default=200,
+    show_default=True,
+    metavar="N",
+    help="Runs of each set.",
+)
 @of_the_run("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="N", help="Seed of the noise.")
-@inferred("--period-s", type=NumberInRange(min=0, min_open=True, max=3600), default=25.0, show_default=True,
-          help="From reading to reading in the non-optimal set, s.")
+@inferred(
+    "--period-s",
+    type=NumberInRange(min=0, min_open=True, max=3600),
+    default=25.0,
+    show_default=True,
+    help="From reading to reading in the non-optimal set, s.",
+)
 @inferred("--latitude", type=NumberInRange(-85, 85), default=55.75, show_default=True, help="Of the bench, deg.")
-@inferred("--azimuth", type=NumberInRange(-360, 360), default=0.0, show_default=True,
-          help="Of the bench's x axis, deg.")
-@inferred("--turns", type=click.Choice(["platform", "platform-after-2", "bench", "bench-after-2"]), default="platform",
-          show_default=True, metavar="WORD",
-          help="Whose axes the turns are about, and whether the third orientation goes on after the second: platform, "
-          "platform-after-2, bench or bench-after-2.")
-@inferred("--sampled", type=click.Choice(["together", "123", "132", "213", "231", "312", "321"]), default="together",
-          show_default=True, metavar="WORD",
-          help="Accelerometers read together, or in turn in each orientation: 123, 132 ... 321.")
+@inferred(
+    "--azimuth", type=NumberInRange(-360, 360), default=0.0, show_default=True, help="Of the bench's x axis, deg."
+)
+@inferred(
+    "--turns",
+    type=click.Choice(["platform", "platform-after-2", "bench", "bench-after-2"]),
+    default="platform",
+    show_default=True,
+    metavar="WORD",
+    help="Whose axes the turns are about, and whether the third orientation goes on after the second: platform, "
+    "platform-after-2, bench or bench-after-2.",
+)
+@inferred(
+    "--sampled",
+    type=click.Choice(["together", "123", "132", "213", "231", "312", "321"]),
+    default="together",
+    show_default=True,
+    metavar="WORD",
+    help="Accelerometers read together, or in turn in each orientation: 123, 132 ... 321.",
+)
 @rrd_option
 @png_option
 @overwrite_option
@@ -53,8 +75,8 @@ def paper(
     rrd: Path | None, png: Path | None, overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """The seed paper's experiment again: its Table 2, by least squares and by the filter, beside the print."""
-    from kf_calib.experiment import Conditions, repeat
-    from kf_calib.inferred import search
+    from kf_calib.reproduction.grebenkin2019 import Conditions, repeat
+    from kf_calib.reproduction.grebenkin2019_conditions import search
     from kf_calib.views import paper as views
 
     outputs = claimed(overwrite=overwrite)

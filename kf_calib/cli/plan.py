@@ -31,11 +31,11 @@ from kf_calib.cli.options import (
 from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
-    from kf_calib.aims import Aim
-    from kf_calib.bench import Bench
-    from kf_calib.planner import Plan
-    from kf_calib.prospect import Prospect
-    from kf_calib.reach import Reach
+    from kf_calib.bench.bench import Bench
+    from kf_calib.design.gimbal_limits import Reach
+    from kf_calib.design.optimality_criteria import Aim
+    from kf_calib.design.orientation_plan import Plan
+    from kf_calib.design.predicted_information import Prospect
 
 _CRITERIA = ("D", "A", "E", "minimax", "condition")
 
@@ -108,9 +108,9 @@ def plan(
     as_json: bool, csv_file: Path | None, rrd: Path | None, png: Path | None, overwrite: bool, **options: Any
 ) -> None:  # fmt: skip
     """Orientations that determine the parameters best: which, in which order, and the sigmas to expect."""
-    from kf_calib import planner
-    from kf_calib.designs import Scheme, Search
-    from kf_calib.tour import Timing
+    from kf_calib.design import orientation_plan
+    from kf_calib.design.exact_design import Scheme, Search
+    from kf_calib.design.visit_order import Timing
     from kf_calib.views import plan as views
 
     _refuse_contradictions(options)
@@ -122,10 +122,10 @@ def plan(
     timing = Timing(prospect.dwell_s, options["slew_degps"], options["time_correlation"])
     with progress("planning", as_json):
         if options["fewest"]:
-            made = planner.fewest(search, timing, options["seed"])
+            made = orientation_plan.fewest(search, timing, options["seed"])
         else:
             count = options["count"] or (scheme.copies if options["recording"] else 12)
-            made = planner.plan(search, count, timing, options["seed"])
+            made = orientation_plan.plan(search, count, timing, options["seed"])
     if as_json:
         print_json(views.plan_object(made, options["beside_paper"]))
     else:
@@ -157,8 +157,8 @@ def _refuse_contradictions(options: Mapping[str, Any]) -> None:
 
 
 def _prospect(options: Mapping[str, Any], quiet: bool) -> Prospect:
-    from kf_calib.bench import Bench
-    from kf_calib.prospect import Prospect
+    from kf_calib.bench.bench import Bench
+    from kf_calib.design.predicted_information import Prospect
 
     if options["recording"] is not None:
         return _after(options["recording"], options, quiet)
@@ -171,8 +171,8 @@ def _prospect(options: Mapping[str, Any], quiet: bool) -> Prospect:
 
 
 def _after(recording: Path, options: Mapping[str, Any], quiet: bool) -> Prospect:
-    from kf_calib.calibration import calibrate
-    from kf_calib.prospect import Prospect
+    from kf_calib.design.predicted_information import Prospect
+    from kf_calib.estimation.calibration import calibrate
 
     source, settings = opened(recording, options)
     if not source.bench.axes:
@@ -185,8 +185,8 @@ def _after(recording: Path, options: Mapping[str, Any], quiet: bool) -> Prospect
 
 
 def _reach(bench: Bench, options: Mapping[str, Any]) -> Reach:
-    from kf_calib.reach import Reach, ranges
-    from kf_calib.sources.plans import angles_from_csv
+    from kf_calib.design.gimbal_limits import Reach, ranges
+    from kf_calib.sources.simulation.visit_plans import angles_from_csv
 
     limits = {j: ends for text in options["limits"] for j, ends in ranges(text, bench).items()}
     zones = [ranges(text, bench) for text in options["zones"]]
@@ -196,8 +196,8 @@ def _reach(bench: Bench, options: Mapping[str, Any]) -> Reach:
 
 
 def _aim(options: Mapping[str, Any], gravity_mps2: float) -> Aim:
-    from kf_calib import aims
+    from kf_calib.design import optimality_criteria
 
     if options["targets"]:
-        return aims.minimax(aims.tolerated(options["targets"], gravity_mps2))
-    return aims.NAMED[options["criterion"]]
+        return optimality_criteria.minimax(optimality_criteria.tolerated(options["targets"], gravity_mps2))
+    return optimality_criteria.NAMED[options["criterion"]]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from kf_calib.bench import Bench
+from kf_calib.bench.bench import Bench
 from kf_calib.effects import checks, drift, dynamic, formula, frame, sensor, surroundings, thermal, user
 from kf_calib.effects.effect import Coefficient, Effect, FrameEffect, SensorEffect, Unknown
 from kf_calib.effects.programs import Program

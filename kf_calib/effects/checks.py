@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from kf_calib.bench import Bench, axes_of
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.effects.effect import Effect, FrameEffect
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C, Stimulus
 from kf_calib.errors import InputError
-from kf_calib.samples import Floats
 
 EXAMPLE = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0)
 """The bench of the trial where no other is at hand."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from kf_calib.bench.arrays import Floats
 from kf_calib.effects.effect import Coefficient, Effect, G, SensorEffect, Unknown
 from kf_calib.effects.stimulus import Stimulus
-from kf_calib.samples import Floats
 
 _HELD = 2.5  # cycles in a piece, of which its parabola holds a fourteenth of the power
 

@@ -14,9 +14,9 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from kf_calib.bench import Bench
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
 from kf_calib.effects.stimulus import Stimulus
-from kf_calib.samples import Floats
 
 G = 9.80665
 

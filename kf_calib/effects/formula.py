@@ -32,14 +32,14 @@ from functools import lru_cache
 
 import numpy as np
 
-from kf_calib.bench import Bench, Vector
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench, Vector
 from kf_calib.effects import checks
 from kf_calib.effects.effect import Coefficient, FrameEffect, SensorEffect
 from kf_calib.effects.expression import Expression
 from kf_calib.effects.frame import about_axis, gimbal_number
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
-from kf_calib.samples import Floats
 
 NAME_RULE = "letters, digits, - and _, a letter first, at most 40 of them"
 BASE = "base"

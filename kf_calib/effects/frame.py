@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from kf_calib.bench import Bench
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
 from kf_calib.effects.effect import Coefficient, Effect, FrameEffect, G
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
-from kf_calib.samples import Floats
 
 ARCSEC = ("arcsec", np.degrees(1.0) * 3600.0)
 
@@ -195,7 +195,7 @@ class AxisNonorthogonality(_GimbalEffect):
         return tuple(Coefficient(f"tau{part}_{self.variant}", "rad", 1e-3, *ARCSEC) for part in "AB")
 
     def rotations(self, s: Stimulus) -> Floats:
-        from kf_calib.bench import turn
+        from kf_calib.bench.bench import turn
 
         axis = np.array(s.bench.axes[self.gimbal])
         tilts = np.linalg.svd(axis[None])[2][1:]  # two directions across the axis

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from kf_calib.bench.arrays import Floats
 from kf_calib.effects.effect import G, SensorEffect, Unknown
 from kf_calib.effects.stimulus import Stimulus
-from kf_calib.samples import Floats
 
 IEEE = "IEEE Std 1293, model equation"
 _EDGES = 500

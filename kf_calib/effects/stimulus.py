@@ -10,8 +10,8 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from kf_calib.bench import Bench, turn
-from kf_calib.samples import Floats
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench, turn
 
 REFERENCE_TEMPERATURE_C = 25.0
 """T of the catalogue is the temperature less this."""

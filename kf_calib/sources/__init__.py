@@ -1,0 +1,1 @@
+"""Where samples come from: files, live links, and the simulated bench."""

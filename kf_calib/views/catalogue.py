@@ -11,9 +11,9 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.effects import Effect, as_text, remarks_of
+from kf_calib.estimation.observability import Visibility
 from kf_calib.views.console import effect_rows, symbol
 from kf_calib.views.tables import Table
-from kf_calib.visibility import Sight
 
 
 def overview(effects: Sequence[Effect]) -> RenderableType:
@@ -68,7 +68,7 @@ def formula_of(effect: Effect) -> str:
     return " ".join(own.split("\n\n")[0].split()).rstrip(".")
 
 
-def sight_report(sights: Sequence[Sight], about: str) -> RenderableType:
+def sight_report(sights: Sequence[Visibility], about: str) -> RenderableType:
     """What ``effects --recording`` prints: each effect in a line, then what cannot be put into a cell."""
     table = Table(title=about, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for heading in ("effect", "visible", "left of it", "smallest size", "confused with (overlap)"):
@@ -82,7 +82,7 @@ def sight_report(sights: Sequence[Sight], about: str) -> RenderableType:
     return Group(table, Text(explained), *map(Text, notes))
 
 
-def _sight_cells(sight: Sight) -> list[str]:
+def _sight_cells(sight: Visibility) -> list[str]:
     visible = {True: "yes", False: "no", None: "-"}[sight.visible]
     cells = [str(sight.effect), visible, "" if sight.share is None else f"{sight.share:.2g}"]
     if sight.smallest is None:
@@ -93,12 +93,12 @@ def _sight_cells(sight: Sight) -> list[str]:
     return [*cells, ", ".join(f"{name} ({overlap:.2f})" for name, overlap in sight.rivals)]
 
 
-def sights_object(sights: Sequence[Sight], model: Sequence[str]) -> dict[str, Any]:
+def sights_object(sights: Sequence[Visibility], model: Sequence[str]) -> dict[str, Any]:
     """What ``effects --recording --json`` prints: beside what is known of each effect, how this run shows it."""
     return {"model": list(model), "effects": [{**_object(each.effect), **_seen_object(each)} for each in sights]}
 
 
-def _seen_object(sight: Sight) -> dict[str, Any]:
+def _seen_object(sight: Visibility) -> dict[str, Any]:
     smallest = None
     if sight.smallest is not None:
         own, size = sight.smallest

@@ -9,15 +9,16 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib import paper
-from kf_calib.calibration import Calibration, Parameter, beyond_stated, format_p
-from kf_calib.comparison import Comparison
+from kf_calib.bench import paper_parameters
 from kf_calib.effects import Effect, as_text
-from kf_calib.fitting import WALK
-from kf_calib.held_out import orientations
-from kf_calib.likelihood import FEWEST, freedom
-from kf_calib.model import Model
-from kf_calib.outlying import OutlyingDwell
+from kf_calib.estimation.cross_validation import orientations
+from kf_calib.estimation.engine_comparison import Comparison
+from kf_calib.estimation.fit import WALK
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.remarks import beyond_stated
+from kf_calib.estimation.reml import FEWEST, degrees_of_freedom
+from kf_calib.estimation.results import Calibration, OutlyingDwell, Parameter, format_p
+from kf_calib.support.printing import printed
 from kf_calib.views.tables import Table
 from kf_calib.views.terminal import PlainConsole, note
 
@@ -103,7 +104,10 @@ def model_table(model: Model) -> Table:
     table = Table(title="Model", title_justify="left")
     for heading in ("effect", "what it is", "coefficient", "unit", "prior scale"):
         table.add_column(heading)
-    about = "misalignments, scale factors and biases", f"{symbol(paper.SYMBOLS[0])} ... {paper.SYMBOLS[-1]}"
+    about = (
+        "misalignments, scale factors and biases",
+        f"{symbol(paper_parameters.SYMBOLS[0])} ... {paper_parameters.SYMBOLS[-1]}",
+    )
     table.add_row("twelve parameters", *about, "rad, 1, m/s^2", "as stated", end_section=True)
     for effect in model.effects:
         rows = effect_rows(effect) or [("", "", "")]
@@ -147,7 +151,7 @@ def noise_table(result: Calibration) -> Table:
 
 def noise_origins(result: Calibration) -> tuple[str, str]:
     """Where the scatter from dwell to dwell and the setting error of the angles come from."""
-    noise, few = result.noise, freedom(result.carried.means) < FEWEST
+    noise, few = result.noise, degrees_of_freedom(result.carried.means) < FEWEST
     scatter = "stated" if noise.scatter_stated else _NOT_ESTIMATED if few else "estimated"
     if not noise.setting_stated:
         return scatter, _NOT_ESTIMATED if few or not noise.checked else "estimated"
@@ -210,5 +214,12 @@ def plain(renderable: RenderableType, width: int = 110) -> str:
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines())
 
 
+@printed.register
 def plain_summary(result: Calibration) -> str:
+    """What ``print`` shows of a calibration."""
     return plain(summary(result))
+
+
+@printed.register
+def _plain_model(model: Model) -> str:
+    return plain(model_table(model))

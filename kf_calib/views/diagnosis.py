@@ -8,12 +8,14 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib.advice import Advice
-from kf_calib.assessment import LEVEL, Detectable, detectable
-from kf_calib.calibration import format_p
-from kf_calib.diagnosis import Diagnosis, Suspect, next_orientation
-from kf_calib.drivers import Description, described
-from kf_calib.trend import Trend
+from kf_calib.design.next_orientation import Advice
+from kf_calib.diagnosis.candidate_tests import LEVEL, Detectable, detectable
+from kf_calib.diagnosis.missing_effect import next_orientation
+from kf_calib.diagnosis.results import Diagnosis, Suspect
+from kf_calib.diagnosis.unknown_effect import Description, describe
+from kf_calib.diagnosis.within_dwell_trend import Trend
+from kf_calib.estimation.results import format_p
+from kf_calib.support.printing import printed
 from kf_calib.views.console import plain, rounded, symbol
 from kf_calib.views.json import clean, outlying_object, readings_object
 from kf_calib.views.tables import Table
@@ -24,7 +26,7 @@ def description(found: Diagnosis) -> Description | None:
     """What an unknown misfit looks like; None where the misfit is known (one dwell, too), or there is none."""
     if not found.unknown or found.before.outlying:
         return None
-    return described(found.before.fit, found.before.residuals_mps2, found.test.trend)
+    return describe(found.before.fit, found.before.residuals_mps2, found.test.trend)
 
 
 def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
@@ -164,6 +166,7 @@ def of_what_p_is(found: Diagnosis) -> list[str]:
     ]
 
 
+@printed.register
 def plain_report(found: Diagnosis) -> str:
     """The same as plain text."""
     return plain(diagnosis_report(found))

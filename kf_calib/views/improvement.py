@@ -11,11 +11,14 @@ from typing import Any
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib.calibration import Calibration, evaluated, format_p
-from kf_calib.diagnosis import Diagnosis, next_orientation
+from kf_calib.diagnosis.missing_effect import next_orientation
+from kf_calib.diagnosis.nested_cross_validation import NestedCrossValidation
+from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, SelectionStep, Spread, extend, take_step, undone
 from kf_calib.errors import InputError
-from kf_calib.improvement import Honest, Improvement, Removal, Spread, Step, extended, stepped, undone
-from kf_calib.text import sentence
+from kf_calib.estimation.calibration import evaluate_fit
+from kf_calib.estimation.results import Calibration, format_p
+from kf_calib.support.plain_text import sentence
 from kf_calib.views.console import effect_table, parameter_table, rounded, symbol
 from kf_calib.views.diagnosis import description, description_object, of_what_p_is, orientation_object
 from kf_calib.views.json import clean
@@ -27,7 +30,10 @@ _EIGHTHS = " ▏▎▍▌▋▊▉"
 
 
 def improvement_object(
-    state: Improvement, honest: Honest | None, replay_difference: float | None, files: Mapping[str, Path | None]
+    state: Improvement,
+    honest: NestedCrossValidation | None,
+    replay_difference: float | None,
+    files: Mapping[str, Path | None],
 ) -> dict[str, Any]:
     """What ``improve --json`` prints. A step's errors are those after it; p-values are those of the run.
 
@@ -91,7 +97,7 @@ def _figures(found: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _step_object(step: Step, before: Diagnosis) -> dict[str, Any]:
+def _step_object(step: SelectionStep, before: Diagnosis) -> dict[str, Any]:
     """p_value: of what was added, by the diagnosis before it; p_value_after: of the model then."""
     return {
         "added": step.added,
@@ -121,12 +127,14 @@ def _parameters(result: Calibration) -> list[dict[str, Any]]:
 def notes(state: Improvement) -> list[str]:
     """What was said of the recording, and of the last model."""
     first = state.start.before
-    of_models = evaluated(first.fit, first.settings).warnings
+    of_models = evaluate_fit(first.fit, first.settings).warnings
     said = [sentence for sentence in first.warnings if sentence not in of_models]
     return [*said, *state.result.warnings]
 
 
-def improvement_report(state: Improvement, honest: Honest | None, replay_difference: float | None) -> RenderableType:
+def improvement_report(
+    state: Improvement, honest: NestedCrossValidation | None, replay_difference: float | None
+) -> RenderableType:
     """What ``improve`` prints: the errors falling, why it stopped, what would settle it, the parameters."""
     style = "bold green" if state.because == "consistent" else "bold yellow"
     parts: list[RenderableType] = [
@@ -188,7 +196,7 @@ def bar(value: float, longest: float) -> str:
     return "█" * (eighths // 8) + _EIGHTHS[eighths % 8].strip()
 
 
-def _label(step: Step) -> str:
+def _label(step: SelectionStep) -> str:
     said = [f"+ {step.added}"] if step.added else []
     return ", ".join([*said, *(f"- {each.name}" for each in step.dropped)])
 
@@ -238,7 +246,7 @@ def _settling(state: Improvement) -> list[str]:
     return out
 
 
-def honest_sentence(honest: Honest) -> str:
+def honest_sentence(honest: NestedCrossValidation) -> str:
     times = ", ".join(f"{name} in {count}" for name, count in honest.chosen.items()) or "no effect in any"
     return (
         f"With the choice of effects repeated without what is held out ({honest.folds} folds): "
@@ -286,13 +294,13 @@ def answered(state: Improvement, answer: str, options: list[tuple[str, ...]]) ->
     if answer == "u":
         return undone(state)
     if word == "d" and rest:
-        return stepped(state, None, (rest,), "user")
+        return take_step(state, None, (rest,), "user")
     if word == "f" and rest:
-        return extended(state, (rest if "=" in rest else f"mine = {rest}",), "user")
+        return extend(state, (rest if "=" in rest else f"mine = {rest}",), "user")
     if word == "a" and rest:
-        return extended(state, (rest,), "user")
+        return extend(state, (rest,), "user")
     if answer.isdigit() and 1 <= int(answer) <= len(options):
-        return extended(state, options[int(answer) - 1], "user")
+        return extend(state, options[int(answer) - 1], "user")
     raise InputError(f"{answer!r} is no answer: {HOW}.")
 
 

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kf_calib.calibration import Calibration
-from kf_calib.held_out import orientations
-from kf_calib.outlying import OutlyingDwell
-from kf_calib.readings import Readings
+from kf_calib.estimation.cross_validation import orientations
+from kf_calib.estimation.results import Calibration, OutlyingDwell
+from kf_calib.estimation.signal_quality import Readings
 
 if TYPE_CHECKING:
-    from kf_calib.comparison import Comparison
+    from kf_calib.estimation.engine_comparison import Comparison
 
 
 def replay_object(result: Calibration) -> dict[str, Any]:

@@ -10,10 +10,10 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib import paper
-from kf_calib.samples import Floats, Mask
-from kf_calib.standing import Judgement, Standing
-from kf_calib.text import sentence
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.online.status import Judgement, Standing
+from kf_calib.support.plain_text import sentence
 from kf_calib.views.console import symbol
 from kf_calib.views.diagnosis import found_object, orientation_object
 from kf_calib.views.json import clean, replay_object
@@ -30,8 +30,8 @@ _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": (
 
 def live_object(judgement: Judgement, standing: Standing, status: Status | None) -> dict[str, Any]:
     """One line of ``live --json``: the keys of replay and of diagnose as they stand, and what is of a live run only."""
-    left = dict(zip(paper.SYMBOLS, judgement.left_s, strict=True))
-    wanted = dict(zip(paper.SYMBOLS, judgement.wanted, strict=True))
+    left = dict(zip(paper_parameters.SYMBOLS, judgement.left_s, strict=True))
+    wanted = dict(zip(paper_parameters.SYMBOLS, judgement.wanted, strict=True))
     own = {
         "consistent": judgement.consistent,
         "p_value": judgement.p_value,
@@ -70,9 +70,9 @@ def line(judgement: Judgement) -> str:
     seen = "sigmas not determined yet"
     if np.isfinite(sigma).any():
         k = int(np.nanargmax(sigma / np.where(np.isfinite(judgement.worst), judgement.worst, np.inf)))
-        unit, per_si = _SHOWN[paper.UNITS[k]]
+        unit, per_si = _SHOWN[paper_parameters.UNITS[k]]
         left = f", {span(judgement.left_s[k])} to its target" if np.isfinite(judgement.wanted[k]) else ""
-        seen = f"worst sigma {paper.SYMBOLS[k]} {sigma[k] * per_si:.3g} {unit}{left}"
+        seen = f"worst sigma {paper_parameters.SYMBOLS[k]} {sigma[k] * per_si:.3g} {unit}{left}"
     going = judgement.next_orientation
     following = f"; next {_angles(going[0])} deg ({going[1]})" if going else ""
     per_dof = result.consistency.nis_per_dof
@@ -151,8 +151,8 @@ def _sigmas(standing: Standing) -> RenderableType:
     for justify in ("left", "right", "left", "right", "right", "left"):
         table.add_column(justify=justify, no_wrap=True)
     table.add_row("", "σ", "", "target", "left", "", style="dim")
-    for k, name in enumerate(paper.SYMBOLS):
-        unit, per_si = _SHOWN[paper.UNITS[k]]
+    for k, name in enumerate(paper_parameters.SYMBOLS):
+        unit, per_si = _SHOWN[paper_parameters.UNITS[k]]
         sigma, left = standing.sigma[k], standing.left_s[k]
         if not math.isfinite(sigma):
             table.add_row(symbol(name), "-", unit, "", "", "")
@@ -174,7 +174,7 @@ def _bar(sigma: float, wanted: float, k: int) -> Bar:
     if math.isfinite(wanted):
         share = math.log10(max(sigma / wanted, 1e-9)) / _TARGET_DECADES
     else:
-        size = _COARSE * (9.80665 if paper.UNITS[k] == "m/s^2" else 1.0)
+        size = _COARSE * (9.80665 if paper_parameters.UNITS[k] == "m/s^2" else 1.0)
         share = 1.0 + math.log10(max(sigma / size, 1e-30)) / _DECADES
     if math.isfinite(wanted) and share <= 0:
         return Bar("reached", style="green")

@@ -8,10 +8,11 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib import experiment, paper
-from kf_calib.experiment import NONOPTIMAL_PRINTED, OPTIMAL_PRINTED, TOGETHER, Conditions, Experiment
-from kf_calib.inferred import AZIMUTHS_DEG, PERIODS_S, Found, Search
-from kf_calib.samples import Floats
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.reproduction import grebenkin2019
+from kf_calib.reproduction.grebenkin2019 import NONOPTIMAL_PRINTED, OPTIMAL_PRINTED, TOGETHER, Conditions, Experiment
+from kf_calib.reproduction.grebenkin2019_conditions import AZIMUTHS_DEG, PERIODS_S, ConditionSearch, Found
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Table
@@ -25,19 +26,19 @@ _ABOUT = {
 _WORDS = {1: "one", 2: "two", 3: "three"}
 
 
-def paper_object(found: Experiment, searched: Search) -> dict[str, Any]:
+def paper_object(found: Experiment, searched: ConditionSearch) -> dict[str, Any]:
     """What ``paper --json`` prints; figures of table2 are per cent, ``optimal`` and ``nonoptimal`` by least squares."""
     sets = {"optimal": found.optimal, "nonoptimal": found.nonoptimal}
     return clean(
         {
-            "table2": [_row_object(found, symbol) for symbol in paper.SYMBOLS],
+            "table2": [_row_object(found, symbol) for symbol in paper_parameters.SYMBOLS],
             "repetitions": found.repetitions,
             "seed": found.seed,
-            "scatter": experiment.scatter(found.repetitions),
+            "scatter": grebenkin2019.scatter(found.repetitions),
             **{
                 name: {
-                    "log_ratio": float(experiment.log_ratio(column.least_squares, _printed(name))),
-                    "expected_log_ratio": float(experiment.log_ratio(column.orientations.expected, _printed(name))),
+                    "log_ratio": float(grebenkin2019.log_ratio(column.least_squares, _printed(name))),
+                    "expected_log_ratio": float(grebenkin2019.log_ratio(column.orientations.expected, _printed(name))),
                     "condition_numbers": column.orientations.condition_numbers,
                     "condition_numbers_in_g": column.orientations.condition_numbers_in_g,
                     "rank": column.orientations.rank,
@@ -66,11 +67,11 @@ def paper_object(found: Experiment, searched: Search) -> dict[str, Any]:
 
 
 def _printed(name: str) -> Floats:
-    return experiment.printed(OPTIMAL_PRINTED if name == "optimal" else NONOPTIMAL_PRINTED)
+    return grebenkin2019.printed(OPTIMAL_PRINTED if name == "optimal" else NONOPTIMAL_PRINTED)
 
 
 def _row_object(found: Experiment, name: str) -> dict[str, Any]:
-    k, row = paper.SYMBOLS.index(name), {"parameter": name}
+    k, row = paper_parameters.SYMBOLS.index(name), {"parameter": name}
     for key, column in (("optimal", found.optimal), ("nonoptimal", found.nonoptimal)):
         row |= {
             key: column.least_squares[k],
@@ -92,11 +93,11 @@ def _found_object(found: Found) -> dict[str, Any]:
 def _turning(found: Experiment) -> tuple[float, float]:
     """Log-ratio of the optimal set's expectation to the print while the Earth turns: turned after gravity, or not."""
     column = _printed("optimal")
-    figures = [experiment.optimal(found.conditions, each).expected for each in (True, False)]
-    return float(experiment.log_ratio(figures[0], column)), float(experiment.log_ratio(figures[1], column))
+    figures = [grebenkin2019.optimal(found.conditions, each).expected for each in (True, False)]
+    return float(grebenkin2019.log_ratio(figures[0], column)), float(grebenkin2019.log_ratio(figures[1], column))
 
 
-def paper_report(found: Experiment, searched: Search) -> RenderableType:
+def paper_report(found: Experiment, searched: ConditionSearch) -> RenderableType:
     """What ``paper`` prints."""
     return Group(table2(found), *map(Text, sentences(found, searched)))
 
@@ -114,7 +115,7 @@ def table2(found: Experiment) -> Table:
     return table
 
 
-def markdown(found: Experiment, searched: Search) -> str:
+def markdown(found: Experiment, searched: ConditionSearch) -> str:
     """The same in one page for the Rerun view."""
     head = "| | optimal % | batch | non-opt. % | batch |\n|:--|--:|--:|--:|--:|\n"
     rows = [f"| {symbol(name)} | " + " | ".join(np.array(_both(found, name))[[0, 2, 4, 6]]) + " |" for name in _order()]
@@ -123,23 +124,23 @@ def markdown(found: Experiment, searched: Search) -> str:
 
 def _order() -> list[str]:
     """The rows of the paper: angles, scale factors, biases."""
-    return [name for unit in dict.fromkeys(paper.UNITS) for name in _of_unit(unit)]
+    return [name for unit in dict.fromkeys(paper_parameters.UNITS) for name in _of_unit(unit)]
 
 
 def _of_unit(unit: str) -> list[str]:
-    return [name for name, own in zip(paper.SYMBOLS, paper.UNITS, strict=True) if own == unit]
+    return [name for name, own in zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True) if own == unit]
 
 
 def _both(found: Experiment, name: str) -> list[str]:
     """Print, expectation, least squares and filter of the optimal set, then of the other."""
-    k, cells = paper.SYMBOLS.index(name), list[str]()
+    k, cells = paper_parameters.SYMBOLS.index(name), list[str]()
     for key, column in (("optimal", found.optimal), ("nonoptimal", found.nonoptimal)):
         figures = (column.orientations.expected[k], column.least_squares[k], column.kalman[k])
         cells += [f"{_printed(key)[k]:.4f}", *(f"{figure:#.4g}" for figure in figures)]
     return cells
 
 
-def sentences(found: Experiment, searched: Search) -> list[str]:
+def sentences(found: Experiment, searched: ConditionSearch) -> list[str]:
     """What the figures say, what they rest on, and what is inferred."""
     return [_scatter(found), rank_sentence(found), _inferred(found), *_searched(searched), _earth(found),
             _conditioning(found), _filter(found)]  # fmt: skip
@@ -151,7 +152,7 @@ def _scatter(found: Experiment) -> str:
     off = np.abs(found.optimal.least_squares / column - 1).max()
     return (
         f"Expected is sqrt(2/pi) σ / deviation; a mean of {found.repetitions} runs scatters about it by "
-        f"{_percent(experiment.scatter(found.repetitions))} (1σ). Optimal set: the print is within "
+        f"{_percent(grebenkin2019.scatter(found.repetitions))} (1σ). Optimal set: the print is within "
         f"{_percent(expected)} of the expectation, these runs within {_percent(off)} of the print."
     )
 
@@ -168,8 +169,8 @@ def rank_sentence(found: Experiment) -> str:
 
 def _inferred(found: Experiment) -> str:
     column, hours = _printed("nonoptimal"), found.conditions.duration_s / 3600
-    closed = experiment.log_ratio(found.nonoptimal.orientations.expected, column)
-    ran = experiment.log_ratio(found.nonoptimal.least_squares, column)
+    closed = grebenkin2019.log_ratio(found.nonoptimal.orientations.expected, column)
+    ran = grebenkin2019.log_ratio(found.nonoptimal.least_squares, column)
     return (
         "They are finite where the platform is held in inertial space and the Earth turns gravity in it. Under which "
         f"conditions the paper does not say; INFERRED from its table: {_described(found.conditions)} ({hours:.1f} h in "
@@ -187,11 +188,12 @@ def _described(conditions: Conditions) -> str:
     )
 
 
-def _searched(searched: Search) -> list[str]:
+def _searched(searched: ConditionSearch) -> list[str]:
     together, in_turn, worst = searched.together, searched.in_turn, int(searched.bias_excess.argmax())
     return [
         f"Of {searched.tried} conditions tried ({len(AZIMUTHS_DEG)} azimuths, {len(PERIODS_S)} periods, "
-        f"{len(experiment.TURNS)} readings of the turns, {len(experiment.SAMPLED)} orders of sampling) the nearest are "
+        f"{len(grebenkin2019.TURNS)} readings of the turns, {len(grebenkin2019.SAMPLED)} orders of sampling) the "
+        "nearest are "
         f"{together.log_ratio:.3f}: {_described(together.conditions)}; and {in_turn.log_ratio:.3f}: "
         f"{_described(in_turn.conditions)}.",
         f"Read together, nothing can come below {searched.floor:.3f}, because θ1 and θ3, φ1 and ν2, ν1 and φ3 then "

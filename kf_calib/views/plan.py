@@ -10,12 +10,12 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib import paper
-from kf_calib.experiment import DEVIATIONS
-from kf_calib.model import STATE_COUNT
-from kf_calib.outputs import write_whole
-from kf_calib.planner import Plan, papers_sigma
-from kf_calib.samples import Floats
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.design.orientation_plan import Plan, papers_sigma
+from kf_calib.estimation.measurement_model import STATE_COUNT
+from kf_calib.reproduction.grebenkin2019 import DEVIATIONS
+from kf_calib.support.output_files import write_whole
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Table
@@ -57,9 +57,11 @@ def plan_object(made: Plan, beside_paper: bool = False) -> dict[str, Any]:
     if beside_paper:
         theirs = papers_sigma(made.prospect)
         out["paper"] = {
-            "sigma": dict(zip(paper.SYMBOLS, theirs, strict=True)),
-            "mean_error_percent": dict(zip(paper.SYMBOLS, mean_error_percent(theirs), strict=True)),
-            "plan_mean_error_percent": dict(zip(paper.SYMBOLS, mean_error_percent(made.sigma[-1, :12]), strict=True)),
+            "sigma": dict(zip(paper_parameters.SYMBOLS, theirs, strict=True)),
+            "mean_error_percent": dict(zip(paper_parameters.SYMBOLS, mean_error_percent(theirs), strict=True)),
+            "plan_mean_error_percent": dict(
+                zip(paper_parameters.SYMBOLS, mean_error_percent(made.sigma[-1, :12]), strict=True)
+            ),
             "generalised_sigma_ratio": generalised_ratio(made),
         }
     return clean(out)
@@ -106,7 +108,7 @@ def _sigmas(made: Plan, beside_paper: bool) -> Table:
     columns = _columns(made, beside_paper)
     for heading in ("parameter", *columns, "unit"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    units = [_SHOWN[unit] for unit in paper.UNITS]
+    units = [_SHOWN[unit] for unit in paper_parameters.UNITS]
     units += [(c.shown_unit, c.per_si) for c in made.prospect.model.coefficients]
     for k, (name, (unit, per_si)) in enumerate(zip(made.prospect.symbols, units, strict=True)):
         values = [_figure(values[k], percent, per_si) for values, percent in columns.values()]

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kf_calib.errors import KfCalibError
-from kf_calib.outputs import whole
+from kf_calib.support.output_files import whole
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient

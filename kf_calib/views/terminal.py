@@ -9,7 +9,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.text import Text
 
-from kf_calib.text import printable, sentence
+from kf_calib.support.plain_text import printable, sentence
 
 
 class PlainConsole(Console):

@@ -9,12 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kf_calib import paper
-from kf_calib.bench import Bench, axes_of
-from kf_calib.calibration import Calibration, Settings, calibrate
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError
-from kf_calib.model import PRIORS
-from kf_calib.samples import Batch, Floats, Stream
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.prior import PRIORS
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.settings import Settings
 from kf_calib.views import rerun as view
 from kf_calib.views.rerun.correlation import correlation, picture
 from kf_calib.views.rerun.layout import power
@@ -34,7 +37,7 @@ class Dwells:
     def __init__(self, count: int, bench: Bench, samples: int = 300, sigma_mps2: float = 1e-4) -> None:
         self.bench, self.warnings, self.fraction = bench, list[str](), 1.0
         random = np.random.default_rng(7)
-        state = paper.state_of(paper.nominal() + 1e-3 * random.normal(size=12)).reshape(3, 4)
+        state = paper_parameters.state_of(paper_parameters.nominal() + 1e-3 * random.normal(size=12)).reshape(3, 4)
         accel, pose, at_ns = list[Stream](), list[Stream](), 0
         for _ in range(count):
             time_ns = at_ns + STEP_NS * np.arange(samples)
@@ -102,15 +105,15 @@ def by_orientation(rows: Rows) -> dict[int, list]:
     return {number: values for _, number, values in rows if number is not None}
 
 
-@pytest.mark.parametrize("symbol", paper.SYMBOLS)
+@pytest.mark.parametrize("symbol", paper_parameters.SYMBOLS)
 def test_parameters_are_those_of_the_trace(result: Calibration, recording: Path, symbol: str) -> None:
-    k = paper.SYMBOLS.index(symbol)
+    k = paper_parameters.SYMBOLS.index(symbol)
     scalars, per_si = rows_of(recording), PER_SI[k]
     trace = [(t, e.parameters[k], e.sigma[k]) for t, _, e in result.trace() if not e.unseen[k]]
     sigma = scalars[f"/{path_of(symbol)}/log10_sigma"]
     np.testing.assert_allclose([row[0] for row in sigma], [t for t, _, _ in trace], atol=1e-9)
     np.testing.assert_allclose([10 ** row[2][0] for row in sigma], [s * per_si for _, _, s in trace], rtol=1e-9)
-    nominal = paper.nominal(result.bench.nominal)[k]
+    nominal = paper_parameters.nominal(result.bench.nominal)[k]
     band = np.array([row[2] for row in scalars[f"/{path_of(symbol)}/band"]])
     np.testing.assert_allclose(band.mean(axis=1), [(v - nominal) * per_si for _, v, _ in trace], rtol=1e-9, atol=1e-7)
     np.testing.assert_allclose(np.ptp(band, axis=1) / 2, [s * per_si for _, _, s in trace], rtol=1e-6)

@@ -5,34 +5,36 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
+from helpers.paths import ROOT
+from helpers.synthetic import Run
 from rich.console import RenderableType
-from synthetic import Run
 
-from kf_calib import aims
-from kf_calib.bench import Bench
-from kf_calib.calibration import Calibration, Settings, calibrate
-from kf_calib.cli.making import _hidden_table
-from kf_calib.comparison import Comparison, Way
-from kf_calib.designs import Search
-from kf_calib.diagnosis import diagnose
+from kf_calib.bench.bench import Bench
+from kf_calib.cli.acquire import _hidden_table
+from kf_calib.design import optimality_criteria
+from kf_calib.design.exact_design import Search
+from kf_calib.design.gimbal_limits import Reach
+from kf_calib.design.orientation_plan import plan
+from kf_calib.design.predicted_information import Prospect
+from kf_calib.design.visit_order import Timing
+from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.stepwise_selection import improve
 from kf_calib.effects import effect_named, names
-from kf_calib.experiment import repeat
-from kf_calib.improvement import improve
-from kf_calib.live import Session
-from kf_calib.planner import plan
-from kf_calib.prospect import Prospect
-from kf_calib.reach import Reach
-from kf_calib.sources.recording import Recording
-from kf_calib.tour import Timing
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.engine_comparison import Comparison, Way
+from kf_calib.estimation.observability import visibility_of
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.settings import Settings
+from kf_calib.online.session import Session
+from kf_calib.reproduction.grebenkin2019 import repeat
+from kf_calib.sources.files.recording import Recording
 from kf_calib.views import catalogue, console, diagnosis, improvement, live, paper
 from kf_calib.views import plan as plans
 from kf_calib.views.tables import Bar, Table
-from kf_calib.visibility import sights
 
-HIDDEN = Path(__file__).parents[2] / "recordings" / "hidden.mcap"
+HIDDEN = ROOT / "recordings" / "hidden.mcap"
 BENCH = Bench.from_metadata({"axes": "y z x", "gravity_mps2": "9.81"})
 
 
@@ -53,13 +55,13 @@ def _compared(result: Calibration) -> RenderableType:
 
 
 def _plan(result: Calibration) -> RenderableType:
-    search = Search(Prospect.of_bench(BENCH, 1e-4, 100, 30.0), Reach(BENCH), aims.D)
+    search = Search(Prospect.of_bench(BENCH, 1e-4, 100, 30.0), Reach(BENCH), optimality_criteria.D)
     return plans.plan_report(plan(search, 4, Timing(30.0, 20.0)), beside_paper=True)
 
 
 def _visible(result: Calibration) -> RenderableType:
     chosen = [effect_named(name, result.bench) for name in ("magnetic", "thermal-bias", "warm-up")]
-    return catalogue.sight_report(sights(result.fit, chosen), "What a recording shows")
+    return catalogue.sight_report(visibility_of(result.fit, chosen), "What a recording shows")
 
 
 SAID: dict[str, Callable[[Calibration], RenderableType]] = {

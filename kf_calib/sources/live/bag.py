@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from kf_calib.bench import Bench
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Batch
 from kf_calib.errors import BenchError, InputError
-from kf_calib.samples import Batch
+from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live.feed import IDLE_S, Feed
-from kf_calib.sources.recording import Recording
 
 _SURVEY_S = 0.2
 

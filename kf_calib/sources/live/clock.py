@@ -10,7 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from kf_calib.samples import Batch, Mask, Stream, Times
+from kf_calib.bench.arrays import Mask, Times
+from kf_calib.bench.streams import Batch, Stream
 
 _SECOND_NS = 1_000_000_000
 _BACK_NS = 5 * _SECOND_NS  # less is a late sample, or a bench that sends its last readings again after a lost link

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kf_calib.samples import Times
+from kf_calib.bench.arrays import Times
 
 _ENOUGH = 16  # steps that give a period
 _REMEMBERED = 256

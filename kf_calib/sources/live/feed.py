@@ -7,9 +7,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from kf_calib.bench import Bench
-from kf_calib.samples import Batch, Stream
-from kf_calib.sources.line_parts import Account
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Batch, Stream
+from kf_calib.sources.files.line_parts import Account
 
 IDLE_S = 0.02
 """How long is waited for more where nothing has come."""

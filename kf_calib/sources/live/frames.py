@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench import metadata_of
-from kf_calib.samples import Batch, Floats, Mask, Stream, Times
-from kf_calib.sources.line_parts import Account
+from kf_calib.bench.arrays import Floats, Mask, Times
+from kf_calib.bench.bench import metadata_of
+from kf_calib.bench.streams import Batch, Stream
+from kf_calib.sources.files.line_parts import Account
 
 VERSION = 1
 BENCH, ACCEL, ANGLES, ATTITUDE, TEMPERATURE = b"BAGQT"

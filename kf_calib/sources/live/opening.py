@@ -10,15 +10,15 @@ from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from kf_calib.errors import InputError
-from kf_calib.outputs import Outputs
-from kf_calib.sources.foreign import folder_advice
-from kf_calib.sources.joints import as_columns
+from kf_calib.sources.files.foreign import folder_advice
+from kf_calib.sources.files.joints import as_columns
+from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live.bag import BagFeed
 from kf_calib.sources.live.feed import Feed
 from kf_calib.sources.live.links import GrowingFile, Link, SerialPort, StandardInput, Tcp
 from kf_calib.sources.live.source import QUEUED, LiveSource
 from kf_calib.sources.live.streamed import StreamedFeed
-from kf_calib.sources.recording import Recording
+from kf_calib.support.output_files import Outputs
 
 _TEXT_FILES = (".csv", ".jsonl", ".txt", ".tsv", ".log")
 _PORT_SETTINGS: dict[str, tuple[str, Callable[[str], Any]]] = {
@@ -143,7 +143,7 @@ def _tcp(address: str) -> Tcp:
 
 def _simulated(rest: str, overrides: Mapping[str, str]) -> Feed:
     from kf_calib.sources.live.simulated import SimulatedFeed, batch_samples
-    from kf_calib.sources.simulated import DEFAULTS, options_from_query, simulation
+    from kf_calib.sources.simulation.options import DEFAULTS, options_from_query, simulation
 
     pairs = parse_qsl(rest.partition("?")[2], keep_blank_values=True)
     speeds = [text for key, text in pairs if key == "speed"]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 
+from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
-from kf_calib.samples import Batch
-from kf_calib.sources.csv_lines import CsvLines
-from kf_calib.sources.json_lines import JsonLines
-from kf_calib.sources.line_parts import Account, LineReader
-from kf_calib.sources.lines import Cutter
+from kf_calib.sources.files.csv_lines import CsvLines
+from kf_calib.sources.files.json_lines import JsonLines
+from kf_calib.sources.files.line_parts import Account, LineReader
+from kf_calib.sources.files.lines import Cutter
 from kf_calib.sources.live.feed import nothing
 from kf_calib.sources.live.frames import FrameReader
 

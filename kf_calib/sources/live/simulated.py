@@ -6,10 +6,10 @@ import math
 import time
 from collections.abc import Iterator
 
-from kf_calib.bench import Bench
-from kf_calib.samples import Batch
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Batch
 from kf_calib.sources.live.feed import Feed, nothing
-from kf_calib.sources.simulator import Simulation
+from kf_calib.sources.simulation.simulator import Simulation
 
 BATCH_S = 0.01
 """How much of the time on the wall one batch of a simulated bench holds."""

@@ -11,15 +11,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from kf_calib.bench import Bench
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.outputs import refuse
-from kf_calib.samples import Batch, Stream
+from kf_calib.sources.files.recorder import Recorder
+from kf_calib.sources.files.recording import CLOCK_RECORD, GAP_RECORD
 from kf_calib.sources.live.clock import Clock, Restart
 from kf_calib.sources.live.continuity import Continuity
 from kf_calib.sources.live.feed import Feed, Lost, Regained
-from kf_calib.sources.recorder import Recorder
-from kf_calib.sources.recording import CLOCK_RECORD, GAP_RECORD
+from kf_calib.support.output_files import refuse
 
 _FLUSH_S = 0.5  # with the time that flushing takes, less than the second that a kill may cost
 QUEUED = 200_000

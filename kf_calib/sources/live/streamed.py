@@ -10,10 +10,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 
-from kf_calib.bench import Bench
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError, InputError
-from kf_calib.samples import Batch, Stream
-from kf_calib.sources.lines import described
+from kf_calib.sources.files.lines import described
 from kf_calib.sources.live.feed import IDLE_S, Feed, Lost, Regained, nothing
 from kf_calib.sources.live.links import Link
 from kf_calib.sources.live.protocols import Protocol

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import rerun as rr
 
-from kf_calib.calibration import Calibration
-from kf_calib.text import printable
+from kf_calib.estimation.results import Calibration
+from kf_calib.support.plain_text import printable
 from kf_calib.views.rerun.correlation import log_correlation
 from kf_calib.views.rerun.file import rrd_file
 from kf_calib.views.rerun.layout import TABS, layout

@@ -8,15 +8,15 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from kf_calib import paper
-from kf_calib.calibration import Estimate, Visit
-from kf_calib.samples import Floats
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.estimation.results import Estimate, Visit
 from kf_calib.views.rerun.names import LABELS, colour_of
 from kf_calib.views.rerun.series import ends, times
 
 NEGATIVE, ZERO, POSITIVE = np.array([70, 140, 255]), np.array([18, 18, 22]), np.array([255, 110, 50])
 UNKNOWN = np.array([80, 80, 84])
-COUNT = len(paper.SYMBOLS)
+COUNT = len(paper_parameters.SYMBOLS)
 LIFT = 0.45  # a label hangs below its point
 
 
@@ -45,10 +45,10 @@ def log_correlation(visits: Sequence[Visit], stream: rr.RecordingStream) -> None
     rr.send_columns("correlation/picture", index, image, recording=stream)
     numbers = rr.Scalars.columns(scalars=np.array(matrices).ravel()).partition([COUNT**2] * len(visits))
     rr.send_columns("correlation/matrix", index, numbers, recording=stream)
-    names = [LABELS[symbol] for symbol in paper.SYMBOLS]
+    names = [LABELS[symbol] for symbol in paper_parameters.SYMBOLS]
     middle = np.arange(COUNT) + 0.5
     for side, places in (("rows", np.column_stack([np.full(COUNT, -0.7), middle - LIFT])),
                          ("columns", np.column_stack([middle, np.full(COUNT, -0.6) - LIFT]))):  # fmt: skip
-        colours = [colour_of(symbol) for symbol in paper.SYMBOLS]
+        colours = [colour_of(symbol) for symbol in paper_parameters.SYMBOLS]
         points = rr.Points2D(places, labels=names, show_labels=True, radii=0.0, colors=colours)
         stream.log(f"correlation/{side}", points, static=True)

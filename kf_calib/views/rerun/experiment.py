@@ -16,10 +16,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from kf_calib import paper
-from kf_calib.experiment import GRAVITY_MPS2, READINGS, Column, Experiment, shrinking
-from kf_calib.model import PRIORS
-from kf_calib.samples import Floats
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.estimation.prior import PRIORS
+from kf_calib.reproduction.grebenkin2019 import GRAVITY_MPS2, READINGS, Column, Experiment, shrinking
 from kf_calib.views.rerun.correlation import LIFT, picture
 from kf_calib.views.rerun.file import rrd_file
 from kf_calib.views.rerun.names import (
@@ -60,8 +60,8 @@ def _columns(found: Experiment) -> dict[str, Column]:
 
 def _sigmas(column: Column) -> Floats:
     """log10 of sigma in shown units (n + 1, 12): of the prior, and after every reading."""
-    nominal = paper.nominal()
-    jacobian = paper.jacobian(paper.state_of(nominal))
+    nominal = paper_parameters.nominal()
+    jacobian = paper_parameters.jacobian(paper_parameters.state_of(nominal))
     covariances = shrinking(column.orientations, PRIORS["navigation"].covariance(nominal))
     variance = np.diagonal(jacobian @ covariances @ jacobian.T, axis1=1, axis2=2)
     return np.log10(np.sqrt(variance) * PER_SI)
@@ -70,7 +70,7 @@ def _sigmas(column: Column) -> Floats:
 def _log_sigmas(stream: rr.RecordingStream, name: str, logs: Floats) -> None:
     reading = np.arange(len(logs))
     last = reading % READINGS == 0
-    for k, symbol in enumerate(paper.SYMBOLS):
+    for k, symbol in enumerate(paper_parameters.SYMBOLS):
         path = f"{name}/{path_of(symbol)}/log10_sigma"
         for rows, index in ((last, [rr.TimeColumn(ORIENTATION, sequence=reading[last] // READINGS)]), (~last, [])):
             times = [rr.TimeColumn(READING, sequence=reading[rows]), *index]
@@ -108,7 +108,7 @@ def _log_design(stream: rr.RecordingStream, found: Experiment) -> None:
         labels.append((left + width / 2, -66.0, SETS[name], WHITE))
         for i, design in enumerate(column.orientations.design):
             panels += [_blocks(design), _blank(_GAP if i < 2 else _BETWEEN)]
-            for k, symbol in enumerate(paper.SYMBOLS[4 * i : 4 * i + 4]):
+            for k, symbol in enumerate(paper_parameters.SYMBOLS[4 * i : 4 * i + 4]):
                 labels.append((left + (k + 0.5) * _COLUMN, -36.0, LABELS[symbol], colour_of(symbol)))
             left += 4 * _COLUMN + (_GAP if i < 2 else _BETWEEN)
     whole = np.concatenate(panels[:-1], axis=1)
@@ -161,7 +161,7 @@ def _layout(sigmas: dict[str, Floats]) -> rrb.Blueprint:
 
 def _curves(name: str, unit: str, symbols: Sequence[str], sigmas: dict[str, Floats]) -> rrb.TimeSeriesView:
     """sigma of one kind of parameter over the readings; the same scale in both sets."""
-    places = [paper.SYMBOLS.index(symbol) for symbol in symbols]
+    places = [paper_parameters.SYMBOLS.index(symbol) for symbol in symbols]
     logs = np.concatenate([each[:, places] for each in sigmas.values()])
     low, high = float(logs.min()), float(logs.max())
     ends = rr.TimeRangeBoundary.infinite()

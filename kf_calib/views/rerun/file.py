@@ -14,7 +14,7 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
-from kf_calib.outputs import write_whole
+from kf_calib.support.output_files import write_whole
 
 
 def new_stream() -> rr.RecordingStream:

@@ -17,9 +17,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
-from kf_calib.calibration import Calibration
 from kf_calib.errors import InputError
-from kf_calib.outputs import Growing
+from kf_calib.estimation.results import Calibration
+from kf_calib.support.output_files import Growing
 from kf_calib.views.rerun import grow
 from kf_calib.views.rerun.file import new_stream
 from kf_calib.views.screenshot import binary, obituary

@@ -6,9 +6,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from kf_calib import paper
-from kf_calib.bench import Bench, Vector
-from kf_calib.calibration import Calibration
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.bench import Bench, Vector
+from kf_calib.estimation.results import Calibration
 from kf_calib.views.rerun.names import BENCH_TIME, CHANNELS, GROUP_OF, GROUPS, LABELS, MICRO, ORIENTATION, path_of
 from kf_calib.views.rerun.platform import magnification
 from kf_calib.views.rerun.series import History, nis_band
@@ -136,11 +136,13 @@ def _correlation() -> rrb.Spatial2DView:
 
 
 def _parameters(history: History) -> rrb.Grid:
-    return rrb.Grid(*(_parameter(history, k) for k in range(len(paper.SYMBOLS))), grid_columns=4, name=TABS[1])
+    return rrb.Grid(
+        *(_parameter(history, k) for k in range(len(paper_parameters.SYMBOLS))), grid_columns=4, name=TABS[1]
+    )
 
 
 def _parameter(history: History, k: int) -> rrb.TimeSeriesView:
-    symbol, sigma = paper.SYMBOLS[k], history.sigma[:, k]
+    symbol, sigma = paper_parameters.SYMBOLS[k], history.sigma[:, k]
     path, label = path_of(symbol), LABELS[symbol]
     name = f"{label} − nominal ± σ, {GROUP_OF[symbol].unit}" if np.isfinite(sigma).any() else f"{label}: not determined"
     around = _readable(history.deviation[:, k], sigma, history.orientation)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kf_calib import paper
+from kf_calib.bench import paper_parameters
 
 BENCH_TIME = "bench_time"
 ORIENTATION = "orientation"
@@ -32,7 +32,7 @@ MICRO = 1e6
 
 
 @dataclass(frozen=True)
-class Group:
+class EntityGroup:
     """Parameters of one kind: what is shown is the SI value times ``per_si``, in ``unit``."""
 
     title: str
@@ -42,24 +42,26 @@ class Group:
 
 
 def _of_unit(unit: str) -> tuple[str, ...]:
-    return tuple(symbol for symbol, own in zip(paper.SYMBOLS, paper.UNITS, strict=True) if own == unit)
+    return tuple(
+        symbol for symbol, own in zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True) if own == unit
+    )
 
 
 GROUPS = (
-    Group("angles", "arcsec", float(np.degrees(3600.0)), _of_unit("rad")),
-    Group("scale factors", "ppm", MICRO, _of_unit("1")),
-    Group("biases", "µm/s²", MICRO, _of_unit("m/s^2")),
+    EntityGroup("angles", "arcsec", float(np.degrees(3600.0)), _of_unit("rad")),
+    EntityGroup("scale factors", "ppm", MICRO, _of_unit("1")),
+    EntityGroup("biases", "µm/s²", MICRO, _of_unit("m/s^2")),
 )
 GROUP_OF = {symbol: group for group in GROUPS for symbol in group.symbols}
-PER_SI = np.array([GROUP_OF[symbol].per_si for symbol in paper.SYMBOLS])
+PER_SI = np.array([GROUP_OF[symbol].per_si for symbol in paper_parameters.SYMBOLS])
 
 
 def colour_of(symbol: str) -> Colour:
     """The accelerometer's colour, paler for its second angle."""
-    accelerometer, place = divmod(paper.SYMBOLS.index(symbol), 4)
+    accelerometer, place = divmod(paper_parameters.SYMBOLS.index(symbol), 4)
     return PALE[accelerometer] if place == 1 else ACCELEROMETERS[accelerometer]
 
 
 def path_of(symbol: str) -> str:
     """The parameter's entity; the accelerometer comes first, so that legends list one after the other."""
-    return f"parameters/a{paper.SYMBOLS.index(symbol) // 4 + 1}/{symbol}"
+    return f"parameters/a{paper_parameters.SYMBOLS.index(symbol) // 4 + 1}/{symbol}"

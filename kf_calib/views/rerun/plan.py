@@ -14,11 +14,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 from scipy.spatial.transform import Rotation
 
-from kf_calib import aims, paper
-from kf_calib.bench import slerp
-from kf_calib.model import STATE_COUNT
-from kf_calib.planner import Plan
-from kf_calib.samples import Floats
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import slerp
+from kf_calib.design import optimality_criteria
+from kf_calib.design.orientation_plan import Plan
+from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.views.plan import gimbal_names, sentences
 from kf_calib.views.rerun.file import rrd_file
 from kf_calib.views.rerun.layout import WHOLE_RUN, power
@@ -65,7 +66,7 @@ def _summary(made: Plan) -> str:
     ]
     sigmas = [
         f"| {LABELS[symbol]} | {made.sigma[-1, k] * PER_SI[k]:.3g} | {GROUP_OF[symbol].unit} |"
-        for k, symbol in enumerate(paper.SYMBOLS)
+        for k, symbol in enumerate(paper_parameters.SYMBOLS)
     ]
     head = f"| | begins, s |{gimbals}\n|--:|--:|{'--:|' * made.poses.shape[1]}"
     told = "\n\n".join([*sentences(made), *(f"**Note**: {remark}" for remark in made.remarks)])
@@ -125,7 +126,7 @@ def _sensitivities(made: Plan) -> tuple[Floats, Floats]:
     transform = made.prospect.transform[:STATE_COUNT]
     out = np.full((len(made.factors), 3, 3, 3), np.nan)
     for k, factor in enumerate(made.factors):
-        if not aims.unseen(factor).any():
+        if not optimality_criteria.unseen(factor).any():
             root = transform @ np.linalg.inv(factor)
             covariance = (root @ root.T).reshape(3, 4, 3, 4)
             out[k] = np.array([covariance[i, :3, i, :3] for i in range(3)])
@@ -166,7 +167,7 @@ def _log_uncertainty(made: Plan, stream: rr.RecordingStream) -> None:
 
 def _log_sigmas(made: Plan, stream: rr.RecordingStream) -> None:
     logs = np.log10(made.sigma[:, :STATE_COUNT] * PER_SI)
-    for k, symbol in enumerate(paper.SYMBOLS):
+    for k, symbol in enumerate(paper_parameters.SYMBOLS):
         seen = np.isfinite(logs[:, k])
         path = f"{path_of(symbol)}/log10_sigma"
         index = [rr.TimeColumn(BENCH_TIME, duration=_ends_ns(made)[seen]),

@@ -10,8 +10,8 @@ import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from kf_calib.calibration import Calibration, Estimate
-from kf_calib.samples import Floats
+from kf_calib.bench.arrays import Floats
+from kf_calib.estimation.results import Calibration, Estimate
 from kf_calib.views.rerun.names import ACCELEROMETERS, GOLD, GREY, RED, WHITE
 from kf_calib.views.rerun.series import above, crowd, ends, nis_band, times
 

@@ -10,9 +10,10 @@ import rerun as rr
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from kf_calib import information, paper
-from kf_calib.calibration import Calibration, Estimate, Visit
-from kf_calib.samples import Floats
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.estimation import square_root_information
+from kf_calib.estimation.results import Calibration, Estimate, Visit
 from kf_calib.views.rerun.names import (
     ACCELEROMETERS,
     BENCH_TIME,
@@ -60,7 +61,9 @@ class History:
         steps = [(0.0, 0, _prior(result)), *result.trace()]
         orientation = np.array([number for _, number, _ in steps])
         sigma = np.array([estimate.sigma for _, _, estimate in steps])
-        deviation = np.array([estimate.parameters for _, _, estimate in steps]) - paper.nominal(result.bench.nominal)
+        deviation = np.array([estimate.parameters for _, _, estimate in steps]) - paper_parameters.nominal(
+            result.bench.nominal
+        )
         return cls(
             elapsed_s=np.array([elapsed_s for elapsed_s, _, _ in steps]),
             orientation=orientation,
@@ -71,8 +74,8 @@ class History:
 
 
 def _prior(result: Calibration) -> Estimate:
-    factor = information.start(result.settings.prior, result.model)
-    return Estimate(*information.solve(factor, result.model.nominal_state()))
+    factor = square_root_information.start(result.settings.prior, result.model)
+    return Estimate(*square_root_information.solve(factor, result.model.nominal_state()))
 
 
 def times(elapsed_s: Floats, orientation: Counts | None = None) -> list[rr.TimeColumn]:
@@ -92,7 +95,7 @@ def log_parameters(history: History, stream: rr.RecordingStream) -> None:
     """log10 of sigma, deviation from nominal, and the deviation less and plus one sigma."""
     with np.errstate(divide="ignore"):
         logs = np.log10(history.sigma)  # an exact prior has no logarithm, and no point
-    for k, symbol in enumerate(paper.SYMBOLS):
+    for k, symbol in enumerate(paper_parameters.SYMBOLS):
         path, colour, label = path_of(symbol), colour_of(symbol), LABELS[symbol]
         value, sigma = history.deviation[:, k], history.sigma[:, k]
         _log_curve(stream, f"{path}/log10_sigma", history, logs[:, k])

@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from kf_calib.calibration import Calibration, Parameter
+from kf_calib.estimation.results import Calibration, Parameter
 from kf_calib.views.console import noise_origins
 from kf_calib.views.rerun.correlation import correlation
 from kf_calib.views.rerun.names import GROUP_OF, LABELS, MICRO

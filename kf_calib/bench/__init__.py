@@ -1,0 +1,1 @@
+"""What the platform makes the block feel: gimbals, rotations, gravity, sample streams, the twelve parameters."""

@@ -1,0 +1,343 @@
+"""The bench: gimbal chain, Earth and gravity; platform angles in, specific force of the platform out.
+
+Frames (right-handed): n = North, Up, East; b = bench, n turned about the vertical by the azimuth;
+u = the frame in which gimbal axes and sensors are named, b turned so that its axis ``up`` points up (u = b for y);
+p = platform. ``C_bp = C_bu Rot(axis1, q1) Rot(axis2, q2) ...``, outer axis first, each gimbal turning about
+that axis of its parent; ``f_p = C_bp^T f_b``. All angles zero: the axis ``up`` of the platform points up, by default y,
+and accelerometer 2 reads +g; with ``up`` z, as ROS has it, accelerometer 3 does.
+
+Reference ``base``: angles are relative to the bench, ``f_b = (0, g, 0)``. Reference ``inertial``: the platform is
+held in inertial space, angles are relative to the bench frame as it stood at the first sample, and gravity turns
+with the Earth: ``f_b(t) = Rot(omega, |omega| t) (0, g, 0)``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kf_calib.bench.arrays import Floats, Times
+from kf_calib.errors import BenchError
+from kf_calib.support.plain_text import cut
+
+EARTH_RATE_RADPS = 7.292115e-5
+"""Earth's rotation in inertial space (WGS 84), rad/s: 15.041 deg/h."""
+
+Vector = tuple[float, float, float]
+_LETTERS: dict[str, Vector] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+CHANNELS = (1, 2, 3)
+
+
+def normal_gravity(latitude_deg: float, height_m: float = 0.0) -> float:
+    """Normal gravity on the WGS 84 ellipsoid, m/s^2 (Somigliana), continued to ``height_m`` above it.
+
+    gamma = gamma_e (1 + k sin^2 B) / sqrt(1 - e^2 sin^2 B);
+    gamma_h = gamma (1 - 2 (1 + f + m - 2 f sin^2 B) h/a + 3 h^2/a^2).
+    Source: NGA.STND.0036 (WGS 84, 2014), eq. 4-1 and 4-3. Local gravity differs by up to about 1e-3 m/s^2:
+    a metrologist states a measured value instead.
+    """
+    if not abs(latitude_deg) <= 90.0:
+        raise BenchError(f"latitude {latitude_deg:g} deg is not between -90 and 90: give latitude_deg in degrees.")
+    semi_major_m, flattening, m = 6378137.0, 1 / 298.257223563, 0.00344978650684
+    sin2 = math.sin(math.radians(latitude_deg)) ** 2
+    surface = 9.7803253359 * (1 + 0.001931852652458 * sin2) / math.sqrt(1 - 6.694379990141e-3 * sin2)
+    ratio = height_m / semi_major_m
+    return surface * (1 - 2 * (1 + flattening + m - 2 * flattening * sin2) * ratio + 3 * ratio**2)
+
+
+def parse_axes(text: str) -> tuple[Vector, ...]:
+    """Axes, outer to inner, from ``"y z x"``: letters (a minus sign reverses) or three comma-separated numbers."""
+    return tuple(_parse_axis(word) for word in text.split())
+
+
+def _parse_axis(word: str) -> Vector:
+    sign, letter = (-1.0, word[1:]) if word.startswith("-") else (1.0, word)
+    if letter.lower() in _LETTERS:
+        x, y, z = _LETTERS[letter.lower()]
+        return (sign * x + 0.0, sign * y + 0.0, sign * z + 0.0)
+    try:
+        numbers = [float(part) for part in word.split(",")]
+    except ValueError:
+        numbers = []
+    length = math.hypot(*numbers) if len(numbers) == 3 else 0.0
+    if not (math.isfinite(length) and length > 0):
+        raise BenchError(
+            f"axis {cut(word, 60)!r} is not known: give each gimbal axis, outer first, as x, y, z or three "
+            'comma-separated numbers, for example --axes "y z x".'
+        )
+    if abs(length - 1.0) < 1e-12:  # a unit vector survives being written and read again
+        length = 1.0
+    return (numbers[0] / length, numbers[1] / length, numbers[2] / length)
+
+
+def parse_channels(text: str) -> tuple[int, int, int]:
+    """``"1,-2,3"``: which channel of the recording each accelerometer is, with a minus where its sign is reversed."""
+    words = text.strip("[] ").replace(",", " ").split()
+    try:
+        first, second, third = (int(word) for word in words)
+    except ValueError:
+        first, second, third = 0, 0, 0
+    if sorted(map(abs, (first, second, third))) != [1, 2, 3]:
+        raise BenchError(
+            f"channels {cut(text, 60)!r} name no order: give the channel of accelerometer 1, 2 and 3, each once, with "
+            "a minus where it is reversed, for example --channels 1,-2,3."
+        )
+    return first, second, third
+
+
+def _format_axis(axis: Vector) -> str:
+    for letter, unit in _LETTERS.items():
+        if axis == unit:
+            return letter
+        if axis == tuple(-part for part in unit):
+            return f"-{letter}"
+    return ",".join(repr(float(part)) for part in axis)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What is known of the bench before the first sample (metadata record ``kf_calib.bench``).
+
+    axes: unit vectors, outer to inner; empty where an attitude quaternion is recorded instead of angles.
+    angle_sigma_deg: repeatability of setting an orientation, 1 sigma; None: not known, to be estimated.
+    scatter_sigma_mps2: scatter of each sensor from dwell to dwell, 1 sigma; None: not known, to be estimated.
+    joints: names of the gimbals' joints where angles come as joint states, outer to inner; empty: told by their names.
+    nominal: nominal parameters that differ from the paper's, in the units of the estimates (rad, 1, m/s^2).
+    up: the axis that points up when all angles are zero; the azimuth is that of x (of y where x is vertical).
+    channels: which channel of the recording accelerometers 1, 2, 3 are, negative where the sign is reversed.
+    """
+
+    axes: tuple[Vector, ...]
+    gravity_mps2: float
+    reference: Literal["base", "inertial"] = "base"
+    latitude_deg: float | None = None
+    height_m: float = 0.0
+    azimuth_deg: float = 0.0
+    angle_sigma_deg: float | None = None
+    scatter_sigma_mps2: float | None = None
+    nominal: Mapping[str, float] = field(default_factory=dict[str, float])
+    notes: Mapping[str, str] = field(default_factory=dict[str, str])
+    up: str = "y"
+    channels: tuple[int, int, int] = CHANNELS
+    joints: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        from kf_calib.bench.keys import FREE_TEXT, NUMBERS, checked
+
+        own = {key: getattr(self, key) for key in ("reference", "up", *NUMBERS)}
+        stated = {key: value for key, value in own.items() if value is not None or key == "gravity_mps2"}
+        notes = {key: value for key, value in self.notes.items() if key in FREE_TEXT}
+        for key, value in {**stated, "nominal": self.nominal, "joints": " ".join(self.joints), **notes}.items():
+            checked(key, value)
+        if self.reference == "inertial" and self.latitude_deg is None:
+            raise BenchError(
+                "an inertially held platform needs the latitude, because gravity turns with the Earth in it: "
+                "give latitude_deg (--latitude)."
+            )
+        if self.joints and (len(self.joints) != len(self.axes) or len(set(self.joints)) < len(self.joints)):
+            raise BenchError(
+                f"joints names {len(self.joints)} gimbals ({' '.join(self.joints)}) where there are {len(self.axes)} "
+                "axes: name each once, outer to inner."
+            )
+
+    @property
+    def axis_letters(self) -> tuple[str, ...]:
+        """Letters of the gimbal axes, outer to inner; empty where one has none, or two have the same."""
+        letters = tuple(_format_axis(axis).removeprefix("-") for axis in self.axes)
+        return letters if len(set(letters)) == len(letters) and set(letters) <= set(_LETTERS) else ()
+
+    @property
+    def pose_width(self) -> int:
+        return len(self.axes) or 4
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, str], has_angles: bool = True) -> Bench:
+        """The bench from the strings of a metadata record (docs/format.md), or from options of the same names."""
+        from kf_calib.bench.keys import FREE_TEXT, NUMBERS, known
+
+        given = known(metadata)
+        numbers = {key: given[key] for key in NUMBERS if key in given}
+        if has_angles and not given.get("axes", "").strip():
+            raise BenchError(
+                "the gimbal axes are not stated, so the angles cannot be used: give them outer to inner, "
+                'for example --axes "y z x".'
+            )
+        if "gravity_mps2" not in numbers:
+            if "latitude_deg" not in numbers:
+                raise BenchError(
+                    "neither gravity nor latitude is stated: give --gravity in m/s^2 (best), or --latitude in degrees."
+                )
+            numbers["gravity_mps2"] = normal_gravity(numbers["latitude_deg"], numbers.get("height_m", 0.0))
+        return cls(
+            axes=parse_axes(given["axes"]) if has_angles else (),
+            reference=given.get("reference", "base"),
+            nominal=given.get("nominal", {}),
+            joints=tuple(given.get("joints", "").replace(",", " ").split()) if has_angles else (),
+            notes={key: given[key] for key in FREE_TEXT if given.get(key)},
+            up=given.get("up", "y"),
+            channels=parse_channels(given.get("channels", "1,2,3")),
+            **numbers,
+        )
+
+    def to_metadata(self) -> dict[str, str]:
+        """The strings of a metadata record; ``from_metadata`` of it gives this bench again."""
+        from kf_calib.bench.keys import FORMAT_VERSION, NUMBERS
+
+        numbers = {key: getattr(self, key) for key in NUMBERS}
+        return {
+            "format_version": FORMAT_VERSION,
+            **({"axes": " ".join(map(_format_axis, self.axes))} if self.axes else {}),
+            **({"joints": " ".join(self.joints)} if self.joints else {}),
+            "reference": self.reference,
+            **{key: repr(float(value)) for key, value in numbers.items() if value is not None},
+            **({"nominal": json.dumps(dict(self.nominal))} if self.nominal else {}),
+            **({"up": self.up} if self.up != "y" else {}),
+            **({"channels": ",".join(map(str, self.channels))} if self.channels != CHANNELS else {}),
+            **self.notes,
+        }
+
+    def attitude(self, pose: ArrayLike) -> Floats:
+        """C_bp (n, 3, 3) of poses (n, k): gimbal angles in rad, or quaternions x y z w."""
+        columns = [self.to_platform(np.eye(3)[:, i], np.asarray(pose, float)) for i in range(3)]
+        return np.stack(columns, axis=1)  # row i of C_bp is bench axis i seen in the platform
+
+    def readings(self, channels: Floats) -> Floats:
+        """Readings (n, 3) of accelerometers 1, 2, 3 from the channels (n, 3) of a recording."""
+        if self.channels == CHANNELS:
+            return channels
+        places = np.array(self.channels)
+        return channels[:, np.abs(places) - 1] * np.sign(places)
+
+    def to_platform(self, vector: Floats, pose: Floats) -> Floats:
+        """C_bp^T vector: a bench vector (3,) or (n, 3) seen in the platform at poses (n, k); returns (n, 3)."""
+        if self.up != "y":
+            vector = vector @ _frame_with_up(self.up).T
+        if not self.axes:
+            x, y, z, w = np.moveaxis(pose / np.linalg.norm(pose, axis=-1, keepdims=True), -1, 0)
+            return _turn_by_quaternion(vector, np.stack([-x, -y, -z], axis=-1), w[..., None])
+        for axis, angle_rad in zip(self.axes, np.moveaxis(pose, -1, 0), strict=True):
+            vector = turn(vector, np.array(axis), -angle_rad)
+        return vector
+
+    @property
+    def earth_rate_radps(self) -> Floats:
+        """Earth's rotation seen from the bench frame, (3,) rad/s; needs the latitude."""
+        if self.latitude_deg is None:
+            raise BenchError("the Earth's rotation needs the latitude: give latitude_deg (--latitude).")
+        latitude, azimuth = math.radians(self.latitude_deg), math.radians(self.azimuth_deg)
+        north, up = math.cos(latitude), math.sin(latitude)
+        return EARTH_RATE_RADPS * np.array([north * math.cos(azimuth), up, -north * math.sin(azimuth)])
+
+    def specific_force(self, elapsed_s: Floats, pose: Floats) -> Floats:
+        """f_p (n, 3), m/s^2, at ``elapsed_s`` (n,) since the first sample and poses (n, k)."""
+        up = np.broadcast_to([0.0, self.gravity_mps2, 0.0], (len(elapsed_s), 3))
+        if self.reference == "inertial":
+            rate = self.earth_rate_radps
+            speed = float(np.linalg.norm(rate))
+            up = turn(up, rate / speed, speed * elapsed_s)
+        return self.to_platform(up, np.asarray(pose, float))
+
+
+def metadata_of(values: Mapping[str, Any]) -> dict[str, str]:
+    """The strings of a metadata record from values of JSON or TOML.
+
+    Raises ValueError or RecursionError for integers of thousands of digits and for lists in lists without end.
+    """
+    return {key: value if isinstance(value, str) else json.dumps(value, default=str) for key, value in values.items()}
+
+
+def _frame_with_up(up: str) -> Floats:
+    """C_ub (3, 3): bench vectors seen in the frame u whose axis ``up`` points up and whose x (y where x is vertical)
+    points where the bench's x does."""
+    vertical = np.array(_parse_axis(up))
+    level = np.array(_LETTERS["y" if up.endswith("x") else "x"])
+    return np.column_stack([level, vertical, np.cross(level, vertical)])  # the bench's x, y, z as seen in u
+
+
+def turn(vector: Floats, axis: Floats, angle_rad: Floats | float) -> Floats:
+    """Rot(axis, angle) vector by Rodrigues' formula; vector (3,) or (n, 3), angle scalar or (n,); returns (..., 3)."""
+    cos, sin = np.cos(angle_rad)[..., None], np.sin(angle_rad)[..., None]
+    along = (vector @ axis)[..., None] * axis
+    x, y, z = axis.tolist()
+    across = vector @ np.array(
+        [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+    )  # axis x vector; np.cross costs ten times more
+    return along + cos * (vector - along) + sin * across
+
+
+def _turn_by_quaternion(vector: Floats, imaginary: Floats, real: Floats) -> Floats:
+    shape = np.broadcast_shapes(vector.shape, imaginary.shape)
+    vector, imaginary = np.broadcast_to(vector, shape), np.broadcast_to(imaginary, shape)
+    doubled = 2.0 * np.cross(imaginary, vector)
+    return vector + real * doubled + np.cross(imaginary, doubled)
+
+
+def unwrap_pose(
+    pose: Floats, is_quaternion: bool, before: tuple[Floats, Floats] | None = None
+) -> tuple[Floats, Floats]:
+    """Poses (n, k) made continuous: angles within half a turn, quaternions on the sign, of the pose before.
+
+    And what makes them so: whole turns (n, k) that are added, or signs (n, 1). before: the last pose of those before
+    these, as it was recorded, and its turns or sign. Poses that come in parts become the same to the last bit.
+    """
+    last, made_so = (pose[0], np.ones(1) if is_quaternion else np.zeros(pose.shape[1])) if before is None else before
+    stacked = np.vstack([last, pose])
+    if is_quaternion:
+        signs = made_so * np.cumprod(np.where(np.einsum("ij,ij->i", stacked[1:], stacked[:-1]) < 0, -1.0, 1.0))
+        return pose * signs[:, None], signs[:, None]
+    turns = made_so - np.cumsum(np.rint(np.diff(stacked, axis=0) / (2.0 * np.pi)), axis=0)
+    return pose + 2.0 * np.pi * turns, turns
+
+
+def interpolate_pose(at_ns: Times, time_ns: Times, pose: Floats, is_quaternion: bool) -> Floats:
+    """Poses at ``at_ns``: straight lines between continuous angles, slerp between quaternions; held at the ends."""
+    before = np.clip(np.searchsorted(time_ns, at_ns, side="right") - 1, 0, max(len(time_ns) - 2, 0))
+    after = np.minimum(before + 1, len(time_ns) - 1)
+    span = np.maximum(time_ns[after] - time_ns[before], 1)
+    weight = np.clip((at_ns - time_ns[before]) / span, 0.0, 1.0)[:, None]
+    start, end = pose[before], pose[after]
+    if not is_quaternion:
+        return start + weight * (end - start)
+    return slerp(start, end, weight)
+
+
+def slerp(start: Floats, end: Floats, weight: Floats) -> Floats:
+    """Quaternions (n, 4) on the great arc from ``start`` to ``end`` at ``weight`` (n, 1); the shorter way round."""
+    start = start / np.linalg.norm(start, axis=-1, keepdims=True)
+    end = end / np.linalg.norm(end, axis=-1, keepdims=True)
+    end = np.where(np.sum(start * end, axis=-1, keepdims=True) < 0, -end, end)
+    # atan2 of the chord halves keeps small arcs exact, where acos of a dot product near 1 loses half the digits
+    half = np.arctan2(np.linalg.norm(end - start, axis=-1), np.linalg.norm(end + start, axis=-1))[:, None]
+    arc = 2.0 * half
+    near = arc < 1e-12
+    safe = np.where(near, 1.0, np.sin(arc))
+    left = np.where(near, 1.0 - weight, np.sin((1.0 - weight) * arc) / safe)
+    right = np.where(near, weight, np.sin(weight * arc) / safe)
+    return left * start + right * end
+
+
+def pose_distance(one: Floats, other: Floats, is_quaternion: bool) -> Floats:
+    """How far apart two poses (..., k) are, rad: the largest angle difference, or the angle of the rotation."""
+    if not is_quaternion:
+        return np.max(np.abs(one - other), axis=-1)
+    one = one / np.linalg.norm(one, axis=-1, keepdims=True)
+    other = other / np.linalg.norm(other, axis=-1, keepdims=True)
+    other = np.where(np.sum(one * other, axis=-1, keepdims=True) < 0, -other, other)
+    chord = np.linalg.norm(one - other, axis=-1), np.linalg.norm(one + other, axis=-1)
+    return 4.0 * np.arctan2(*chord)
+
+
+def mean_pose(pose: Floats) -> Floats:
+    """The mean (k,) of continuous poses (n, k) that lie close together (quaternions: of one sign, then normalised)."""
+    return pose.mean(axis=0)
+
+
+def axes_of(names: Iterable[str]) -> tuple[Vector, ...]:
+    """Axes from single words: ``axes_of("yzx")``."""
+    return parse_axes(" ".join(names))

@@ -1,0 +1,155 @@
+"""What each key that describes a bench must be: for records in recordings, streams, TOML files, options and Python."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Mapping
+from functools import partial
+from numbers import Real
+from typing import Any, NamedTuple
+
+from kf_calib.bench import paper_parameters
+from kf_calib.errors import BenchError, how_to_write
+from kf_calib.support.plain_text import COMMANDS, LONGEST, cut
+
+FORMAT_VERSION = "1"
+UP = ("y", "z", "x", "-y", "-z", "-x")
+"""Axes that can point up when all angles are zero."""
+NUMBERS = ("gravity_mps2", "latitude_deg", "height_m", "azimuth_deg", "angle_sigma_deg", "scatter_sigma_mps2")
+FREE_TEXT = ("block_serial", "bench", "operator", "note")
+
+_COMMAND = re.compile(f"[{COMMANDS}]")
+_OF_SYMBOL = {
+    "theta": (-6.3, 6.3), "phi": (-6.3, 6.3), "K": (-10.0, 10.0), "b": (-100.0, 100.0),
+    "nu": (-0.78, 0.78),  # accelerometer 2 has an axis with y above zero: within 45 deg
+}  # fmt: skip
+
+
+def _between(least: float, most: float, value: Any) -> float:
+    """The value as a number within limits; text is none, nor is true."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise ValueError("it must be a valid number")
+    if not (isinstance(value, int) or math.isfinite(value)):
+        raise ValueError("it must be a finite number")
+    if value < least:
+        raise ValueError(f"it must be greater than or equal to {least:g}")
+    if value > most:
+        raise ValueError(f"it must be less than or equal to {most:g}")
+    return float(value)
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or len(value) > LONGEST or _COMMAND.search(value):
+        raise ValueError("it must be text without control characters")
+    value.encode()  # raises a ValueError where half a character is in it
+    return value
+
+
+def _one_of(known: tuple[str, ...], value: Any) -> str:
+    if value not in known:
+        raise ValueError(f"it must be one of {', '.join(known)}")
+    return value
+
+
+def _nominal(value: Any) -> dict[str, float]:
+    """Values of the paper's parameters by symbol."""
+    if not isinstance(value, dict):
+        raise ValueError("it must be a valid dictionary")
+    out = dict[str, float]()
+    for symbol, size in value.items():
+        place = cut(str(symbol), 100)
+        if symbol not in paper_parameters.SYMBOLS:
+            raise ValueError(f"{place}: it is unknown")
+        try:
+            out[symbol] = _between(*_OF_SYMBOL[symbol.rstrip("123")], size)
+        except ValueError as error:
+            raise ValueError(f"{place}: {error}") from None
+    return out
+
+
+class Key(NamedTuple):
+    """read: gives the value as its type, or raises ValueError. words: what it must be, for people."""
+
+    read: Callable[[Any], Any]
+    words: str
+
+
+def _number(least: float, most: float, words: str) -> Key:
+    return Key(partial(_between, least, most), f"a finite number from {least:g} to {most:g}, {words}")
+
+
+_WORDS = "text of at most 1000 characters without control characters"
+KEYS: Mapping[str, Key] = {
+    "format_version": Key(partial(_one_of, (FORMAT_VERSION,)), "1, all that this program reads: update kf_calib"),
+    "axes": Key(_text, 'axes, outer to inner, such as "y z x"'),
+    "joints": Key(_text, 'names, outer to inner, such as "outer middle inner"'),
+    "channels": Key(_text, 'the channels of accelerometers 1, 2, 3, such as "1,-2,3"'),
+    "up": Key(
+        partial(_one_of, UP),
+        f"the axis that points up when all angles are zero, one of {', '.join(UP)}: z for sensors and angles as ROS "
+        "names them",
+    ),
+    "reference": Key(
+        partial(_one_of, ("base", "inertial")),
+        "base (angles relative to the bench) or inertial (stabilised platform)",
+    ),
+    "gravity_mps2": _number(1, 30, "local gravity in m/s^2, about 9.8"),
+    "latitude_deg": _number(-90, 90, "the latitude in deg"),
+    "height_m": _number(-12000, 100000, "the height in m"),
+    "azimuth_deg": _number(-360, 360, "the azimuth of the bench's x axis from North toward East in deg"),
+    "angle_sigma_deg": _number(0, 180, "the setting error of an orientation, 1 sigma, in deg; leave it out where it is "
+                               "not known"),
+    "scatter_sigma_mps2": _number(0, 100, "the scatter from dwell to dwell, 1 sigma, in m/s^2; leave it out where it "
+                                  "is not known"),
+    "nominal": Key(
+        _nominal,
+        f'a JSON object such as {{"theta1": 0}} of parameters ({", ".join(paper_parameters.SYMBOLS)}) in rad, 1 or '
+        "m/s^2, nu within 0.78 rad",
+    ),
+    **dict.fromkeys(FREE_TEXT, Key(_text, _WORDS)),
+}  # fmt: skip
+
+
+def known(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a bench's keys, checked, without numbers that are left empty. Raises BenchError, with the key."""
+    for key in metadata:
+        if key not in KEYS:
+            raise BenchError(f"bench key {cut(key, 60)!r} is not known: use one of {', '.join(sorted(KEYS))}.")
+    return {key: checked(key, value) for key, value in metadata.items() if not (key in NUMBERS and value == "")}
+
+
+def checked(key: str, value: Any) -> Any:
+    """The value of a key as its type; numbers and the nominal parameters may be text. Raises BenchError."""
+    read, words = KEYS[key]
+    try:
+        return read(_plain(key, value))
+    except ValueError as error:
+        hint = how_to_write(value) if isinstance(value, str) and key in NUMBERS else ""
+        said = cut(repr(value) if isinstance(value, str | Real) else str(value), 60)
+        why = f" ({error})" if key == "nominal" else ""
+        raise BenchError(f"bench key {key} is {said}{why}, and must be {words}{hint}.") from None
+
+
+def _plain(key: str, value: Any) -> Any:
+    """Text that stands for a number, for JSON or for an axis as that; numbers of numpy as Python's."""
+    match value:
+        case str() if key == "nominal":
+            try:
+                return json.loads(value)
+            except (ValueError, RecursionError):
+                raise ValueError("not JSON") from None
+        case str() if key == "up":
+            return value.strip().lower().removeprefix("+")
+        case str() if key in NUMBERS:
+            try:
+                return float(value)
+            except ValueError:
+                return value
+        case Mapping():
+            return {each: _plain("", size) for each, size in value.items()}
+        case Real() if not isinstance(value, int):
+            return float(value)
+        case _:
+            return value

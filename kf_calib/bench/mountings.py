@@ -1,0 +1,131 @@
+"""What the recorded poses of a run could mean: the bench as it is stated, or with a few things other than stated.
+
+The senses and the order of the gimbals, the order and the unit of their angles, the axis that is up, and of attitude
+quaternions their sense and the order of their parts.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.keys import UP
+
+_MOST_CHANGES = 2
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """A guess at what the recording means: the bench as it would have to be stated.
+
+    order: column of the recorded angles that belongs to each gimbal; angle_unit: rad per unit of the recorded angles;
+    changes: how many things differ from what is stated; conjugate, real_first: of attitude quaternions, those of the
+    opposite rotation, with the real part before the others.
+    """
+
+    bench: Bench
+    order: tuple[int, ...] = ()
+    angle_unit: float = 1.0
+    conjugate: bool = False
+    real_first: bool = False
+    words: tuple[str, ...] = ()
+    changes: int = 0
+
+    @classmethod
+    def stated(cls, bench: Bench) -> Mounting:
+        """As the bench says."""
+        return cls(bench, tuple(range(len(bench.axes))))
+
+    def poses(self, recorded: Floats) -> Floats:
+        """Poses (D, k) in rad, or quaternions x y z w, from the recorded ones."""
+        if self.bench.axes:
+            return recorded[:, self.order] * self.angle_unit
+        x, y, z, w = recorded[:, [1, 2, 3, 0]].T if self.real_first else recorded.T
+        sign = -1.0 if self.conjugate else 1.0
+        return np.column_stack([sign * x, sign * y, sign * z, w])
+
+
+def mountings(stated: Mounting) -> Iterator[Mounting]:
+    """What the recorded poses could mean, the fewest changes first; as stated first of all."""
+    possible = [*_of_up(stated.bench), *(_of_gimbals(stated.bench) if stated.bench.axes else _of_attitude())]
+    for count in range(_MOST_CHANGES + 1):
+        for chosen in itertools.combinations(possible, count):
+            if len({change.kind for change in chosen}) == count:
+                mounting = stated
+                for change in chosen:
+                    mounting = change.made(mounting)
+                yield replace(mounting, words=tuple(change.words for change in chosen), changes=count)
+
+
+@dataclass(frozen=True)
+class _Change:
+    """One thing that may be other than stated; of one kind there is one change at a time."""
+
+    kind: str
+    words: str
+    made: Callable[[Mounting], Mounting]
+
+
+def _of_gimbals(bench: Bench) -> Iterator[_Change]:
+    """Sense and order of the gimbals, order and unit of the recorded angles."""
+    every, letters = range(len(bench.axes)), bench.to_metadata()["axes"].split()
+    for k in every:
+        yield _Change(f"sense {k}", f"gimbal {letters[k]} turns the other way", _reversed_gimbals((k,)))
+    if len(every) > 1:
+        yield _Change("sense", "all angles have the opposite sign", _reversed_gimbals(every))
+    for order in itertools.permutations(every):
+        if order != tuple(every):
+            axes, columns = " ".join(letters[k] for k in order), ", ".join(str(k + 1) for k in order)
+            yield _Change("axes", f"the gimbal axes are, outer to inner, {axes}", _reordered_axes(order))
+            yield _Change("order", f"gimbals {' '.join(letters)} have the angles {columns}", _reordered(order))
+    yield _Change("unit", "the angles are in degrees", _with_unit(math.radians(1.0)))
+    yield _Change("unit", "the angles were turned from degrees into radians twice", _with_unit(math.degrees(1.0)))
+
+
+def _of_up(bench: Bench) -> Iterator[_Change]:
+    for up in UP:
+        if up != bench.up:
+            yield _Change("up", f"{up} is up when all angles are zero", _with_up(up))
+
+
+def _of_attitude() -> Iterator[_Change]:
+    inverted, first = "the attitude is that of the bench in the platform", "the quaternion has its real part first"
+    yield _Change("sense", inverted, lambda mounting: replace(mounting, conjugate=True))
+    yield _Change("order", first, lambda mounting: replace(mounting, real_first=True))
+
+
+def _reversed_gimbals(gimbals: Collection[int]) -> Callable[[Mounting], Mounting]:
+    def made(mounting: Mounting) -> Mounting:
+        axes = list(mounting.bench.axes)
+        for k in gimbals:
+            x, y, z = axes[k]
+            axes[k] = (0.0 - x, 0.0 - y, 0.0 - z)
+        return replace(mounting, bench=replace(mounting.bench, axes=tuple(axes)))
+
+    return made
+
+
+def _reordered_axes(order: Sequence[int]) -> Callable[[Mounting], Mounting]:
+    def made(mounting: Mounting) -> Mounting:
+        axes = tuple(mounting.bench.axes[k] for k in order)
+        return replace(mounting, bench=replace(mounting.bench, axes=axes))
+
+    return made
+
+
+def _reordered(order: tuple[int, ...]) -> Callable[[Mounting], Mounting]:
+    return lambda mounting: replace(mounting, order=order)
+
+
+def _with_unit(angle_unit: float) -> Callable[[Mounting], Mounting]:
+    return lambda mounting: replace(mounting, angle_unit=angle_unit)
+
+
+def _with_up(up: str) -> Callable[[Mounting], Mounting]:
+    return lambda mounting: replace(mounting, bench=replace(mounting.bench, up=up))

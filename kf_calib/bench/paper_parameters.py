@@ -1,0 +1,143 @@
+"""The seed paper's twelve parameters and the affine state they are a closed form of.
+
+Reading i = s_i . f + b_i with the sensitivity s_i = K_i E_i. For accelerometers 1 and 3
+``E = (cos phi cos theta, sin theta, -sin phi cos theta)``, for 2
+``E = (sin nu1, sqrt(1 - sin^2 nu1 - sin^2 nu2), -sin nu2)`` (M. D. Grebenkin, Vestnik MEPhI 8(3), 2019, eq. 1-6).
+E_2 always has a positive y, so an accelerometer 2 that points the other way has a negative K2: parameters and state
+are one to one.
+State order: s1x s1y s1z b1, s2x s2y s2z b2, s3x s3y s3z b3. Angles in rad, K without unit, b in m/s^2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.errors import BenchError
+
+SYMBOLS = ("theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3")
+UNITS = ("rad", "rad", "1", "m/s^2") * 3
+NOMINAL: dict[str, float] = dict.fromkeys(SYMBOLS, 0.0) | {
+    "theta1": math.radians(0.5), "theta3": math.radians(0.5), "phi3": -math.pi / 2, "K1": 1.0, "K2": 1.0, "K3": 1.0,
+}  # fmt: skip
+
+
+def nominal(differing: Mapping[str, float] | None = None) -> Floats:
+    """The nominal parameters (12,): the paper's, except for those given (rad, 1, m/s^2)."""
+    unknown = sorted(set(differing or ()) - set(SYMBOLS))
+    if unknown:
+        raise BenchError(f"nominal names {unknown[0]!r}, which is no parameter: use {', '.join(SYMBOLS)}.")
+    values = NOMINAL | dict(differing or {})
+    return np.array([values[symbol] for symbol in SYMBOLS])
+
+
+def state_of(parameters: Floats) -> Floats:
+    """The affine state (12,) of the paper's parameters (12,)."""
+    state = np.empty(12)
+    for i, (p1, p2, scale, bias) in enumerate(np.reshape(parameters, (3, 4))):
+        state[4 * i : 4 * i + 3] = scale * _axis(i, p1, p2)
+        state[4 * i + 3] = bias
+    return state
+
+
+def _axis(i: int, p1: float, p2: float) -> Floats:
+    if i == 1:
+        return np.array([math.sin(p1), math.sqrt(1 - math.sin(p1) ** 2 - math.sin(p2) ** 2), -math.sin(p2)])
+    return np.array([math.cos(p2) * math.cos(p1), math.sin(p1), -math.sin(p2) * math.cos(p1)])
+
+
+def parameters_of(state: Floats) -> Floats:
+    """The paper's parameters (..., 12) of affine states (..., 12); ``state_of`` gives these states again, whatever way
+    the axes point: K1, K3 are positive, K2 has the sign of s2y."""
+    out = np.empty_like(state)
+    for i in range(3):
+        s = state[..., 4 * i : 4 * i + 3]
+        scale = np.linalg.norm(s, axis=-1)
+        if i == 1:
+            scale = np.copysign(scale, s[..., 1])
+        x, y, z = np.moveaxis(s / scale[..., None], -1, 0)
+        angles = (np.arcsin(x), -np.arcsin(z)) if i == 1 else (np.arcsin(y), np.arctan2(-z, x))
+        out[..., 4 * i], out[..., 4 * i + 1] = angles
+        out[..., 4 * i + 2], out[..., 4 * i + 3] = scale, state[..., 4 * i + 3]
+    return out
+
+
+def jacobian(state: Floats) -> Floats:
+    """d parameters / d state (12, 12) at an affine state, in closed form; carries a covariance over."""
+    out = np.zeros((12, 12))
+    for i in range(3):
+        rows = slice(4 * i, 4 * i + 4)
+        s = state[4 * i : 4 * i + 3]
+        scale = math.copysign(np.linalg.norm(s), s[1] if i == 1 else 1.0)
+        axis = s / scale
+        block = np.eye(4)
+        if i == 1:
+            block[0, :3] = _arcsine_gradient(axis, 0) / scale
+            block[1, :3] = -_arcsine_gradient(axis, 2) / scale
+        else:
+            block[0, :3] = _arcsine_gradient(axis, 1) / scale
+            block[1, :3] = np.array([axis[2], 0.0, -axis[0]]) / (scale * (axis[0] ** 2 + axis[2] ** 2))
+        block[2, :3] = axis
+        out[rows, rows] = block
+    return out
+
+
+def _arcsine_gradient(axis: Floats, k: int) -> Floats:
+    """Gradient of asin(s_k / K) with respect to s, times K; ``axis`` = s / K."""
+    return (np.eye(3)[k] - axis[k] * axis) / math.sqrt(1 - axis[k] ** 2)
+
+
+def sensitivity_jacobian(parameters: Floats) -> Floats:
+    """d state / d parameters (12, 12), in closed form: its blocks are the paper's H transposed (see ``h_rows``)."""
+    out = np.zeros((12, 12))
+    for i, (p1, p2, scale, _) in enumerate(np.reshape(parameters, (3, 4))):
+        c1, s1, c2, s2 = math.cos(p1), math.sin(p1), math.cos(p2), math.sin(p2)
+        axis = _axis(i, p1, p2)
+        if i == 1:
+            first, second = (c1, -c1 * s1 / axis[1], 0.0), (0.0, -c2 * s2 / axis[1], -c2)
+        else:
+            first, second = (-c2 * s1, c1, s2 * s1), (-s2 * c1, 0.0, -c2 * c1)
+        block = np.eye(4)
+        block[:3, :3] = np.column_stack([scale * np.array(first), scale * np.array(second), axis])
+        out[4 * i : 4 * i + 4, 4 * i : 4 * i + 4] = block
+    return out
+
+
+def h_rows(parameters: Floats) -> Floats:
+    """The paper's H (3, 3, 3), eq. 8-10: of each accelerometer the rows d(KE)/dp1, d(KE)/dp2, E.
+
+    What the paper prints differs. Each of these is checked by finite differences in tests/test_paper_experiment.py:
+
+    - (5) has g_j on the right-hand side again, although the left-hand side is the reading less g_j.
+    - (8): d E_z / d theta and d E_z / d phi have the sign of the opposite Z axis; the row of K has the right one.
+    - (9): the root sqrt(1 - sin nu1 - sin nu2) lacks the squares.
+    - (10): both derivatives of E_z have a sqrt(1 - sin^2 psi3) where sqrt(1 - cos^2 psi3) = -sin psi3 is meant, as in
+      its row of K: at psi3 = -90 deg d E_z / d theta is 0 instead of -sin theta3, d E_z / d phi is 0/0 instead of 0.
+      The figures were not computed so: K3 of Table 2 would be off by 2.5 %.
+    - psi is phi; Table 1 names nu2 a second nu1, and has 30 arcsec as the nominal value of both, where (3) has 0.
+    """
+    jacobian = sensitivity_jacobian(parameters)
+    return np.stack([jacobian[4 * i : 4 * i + 3, 4 * i : 4 * i + 3].T for i in range(3)])
+
+
+def design(force_mps2: Floats, parameters: Floats) -> Floats:
+    """The paper's D (3, n, 4), eq. 6-7: d reading / d (p1, p2, K, b) of each accelerometer, a row [H f, 1] a reading.
+
+    force_mps2 (3, n, 3): the specific force at each reading of each accelerometer; (n, 3): the same for all three.
+    """
+    slopes = np.broadcast_to(force_mps2, (3, *np.shape(force_mps2)[-2:])) @ h_rows(parameters).transpose(0, 2, 1)
+    return np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=2)
+
+
+def optimal_directions(parameters: Floats) -> Floats:
+    """The paper's optimal set: unit vectors (3, 4, 3), the specific force in four orientations for each accelerometer.
+
+    Along h2 x h3, h1 x h3 and h1 x h2 one parameter alone is excited; the fourth is opposite to the third.
+    """
+    h1, h2, h3 = np.moveaxis(h_rows(parameters), 1, 0)
+    along = np.stack([np.cross(h2, h3), np.cross(h1, h3), np.cross(h1, h2)], axis=1)
+    along /= np.linalg.norm(along, axis=2, keepdims=True)
+    return np.concatenate([along, -along[:, 2:]], axis=1)

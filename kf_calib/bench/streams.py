@@ -1,0 +1,81 @@
+"""What a bench delivers: streams of stamped values, and the sources they come from.
+
+Stamps are integer nanoseconds (``time_ns``); readings are specific force in m/s^2 (+g when the sensitive
+axis points up); gimbal angles are in rad, outer axis first. A *pose* is either the gimbal angles (k columns)
+or, where the bench has no gimbal axes, the attitude quaternion platform -> bench (x, y, z, w).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from kf_calib.bench.bench import Bench
+from kf_calib.bench.arrays import Floats, Times
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """Stamped values of one quantity: ``time_ns`` (n,), ``values`` (n, k)."""
+
+    time_ns: Times
+    values: Floats
+
+    @classmethod
+    def empty(cls, width: int) -> Stream:
+        return cls(np.empty(0, np.int64), np.empty((0, width)))
+
+    @classmethod
+    def joined(cls, streams: Sequence[Stream]) -> Stream:
+        """One after another; there is at least one."""
+        if len(streams) == 1:
+            return streams[0]
+        times, values = zip(*((each.time_ns, each.values) for each in streams), strict=True)
+        return cls(np.concatenate(times), np.concatenate(values))
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    def __getitem__(self, part: slice | NDArray[np.bool_]) -> Stream:
+        return Stream(self.time_ns[part], self.values[part])
+
+    def __add__(self, later: Stream) -> Stream:
+        if not len(self):
+            return later
+        if not len(later):
+            return self
+        return Stream(np.concatenate([self.time_ns, later.time_ns]), np.concatenate([self.values, later.values]))
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """One stretch of the raw streams as they arrived, each with stamps of its own; any may be empty."""
+
+    accel: Stream  # (n, 3) m/s^2
+    pose: Stream  # (m, k) rad, or (m, 4) quaternion x y z w
+    temperature: Stream = field(default_factory=lambda: Stream.empty(1))  # (l, 1) degC
+
+
+class Source(Protocol):
+    """Where batches come from: a recording, a live bench, the simulator.
+
+    ``warnings`` grows while the source is read (what was lost, what was not understood).
+    ``fraction`` is how much has been read, 0 to 1 (NaN where the end is not known).
+    A recording can be iterated again from its start.
+    """
+
+    @property
+    def bench(self) -> Bench: ...
+
+    @property
+    def warnings(self) -> list[str]: ...
+
+    @property
+    def fraction(self) -> float: ...
+
+    def __iter__(self) -> Iterator[Batch]: ...

@@ -1,0 +1,303 @@
+"""Commands that make a recording: simulate, record, demo."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import rich_click as click
+
+from kf_calib.cli.echo import complain, echo
+from kf_calib.cli.files import OutputFile, claimed, delivery
+from kf_calib.cli.numbers import NUMBER, POSITIVE
+from kf_calib.cli.options import (
+    OUTPUT,
+    F,
+    bench_options,
+    columns_option,
+    examples,
+    json_option,
+    overrides,
+    overwrite_option,
+    print_json,
+    progress,
+    save_view,
+    show,
+)
+from kf_calib.cli.signals import answered, interrupt
+from kf_calib.errors import InputError
+from kf_calib.support.output_files import Outputs
+from kf_calib.support.plain_text import sentence
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from kf_calib.bench.streams import Source
+    from kf_calib.sources.simulation.simulator import Simulation
+
+
+_LARGE_BYTES = 1e9  # of a recording: minutes of work
+_HOW_TO_HIDE = """\
+--hide NAME=SIZE: one size for all coefficients, with signs drawn from the seed, or SIZE,SIZE,... one for each;
+constants after semicolons: 'warm-up=20ug;tau=600'. Without :AXIS an effect is on every gimbal axis.
+SIZE: a number in the SI unit, one with a unit (4ug/g^2), or 10sigma: 10 times what the noise of the run leaves
+uncertain, after what the twelve parameters absorb.
+--hide random, random-known (in the catalogue), random-unknown (not in it), also with =10sigma: drawn from the seed."""
+
+
+def _hidden_table() -> RenderableType:
+    """Every kind of hidden effect, in two lines or more."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Group
+
+    from kf_calib.sources.simulation.injected import INNER, catalogue
+    from kf_calib.views.tables import Table
+
+    kinds = catalogue().values()
+    table = Table(title=f"{len(kinds)} effects to hide", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("effect\nwhat it is")
+    for heading in ("in the\ncatalogue", "SI unit\ncoefficients", "constants", "navigation grade\nMEMS"):
+        table.add_column(heading, no_wrap=True)
+    for kind in kinds:
+        names = kind.coefficients if len(kind.coefficients) < 7 else (*kind.coefficients[:2], "...")
+        constants = [f"{name}={value:.4g} {INNER[name].unit}" for name, value in kind.inner.items()]
+        sizes = [" to ".join(dict.fromkeys(sizes)) for sizes in (kind.navigation, kind.mems)]
+        table.add_row(
+            f"{kind.name}{':AXIS' * kind.per_axis}\n{kind.title}", "yes" if kind.known else "no",
+            f"{kind.unit}\n{' '.join(names)}", "\n".join(constants), "\n".join(sizes),
+        )  # fmt: skip
+    return Group(table, _HOW_TO_HIDE)
+
+
+def _list_hidden(ctx: click.Context, _: click.Parameter, texts: tuple[str, ...]) -> tuple[str, ...]:
+    """``--hide help`` prints what can be hidden, and ends."""
+    if "help" in texts:
+        show(_hidden_table())
+        ctx.exit()
+    return texts
+
+
+def simulation_options(command: F) -> F:
+    """What the simulated bench is and does."""
+    run_option, hidden_option, noise_option, warmth_option = (
+        partial(click.option, panel=panel) for panel in ("Run", "Hidden effects", "Noise", "Temperature")
+    )
+    options = [
+        run_option("--grade", type=click.Choice(["paper", "navigation", "mems"]), default="navigation",
+                   show_default=True, help="Grade of the simulated sensors."),
+        run_option("--plan", default="spread", show_default=True,
+                   help="spread, faces, or a CSV file of gimbal angles in deg, an orientation a line."),
+        run_option("--orientations", "count", type=click.IntRange(min=1), metavar="N", default=24, show_default=True,
+                   help="Orientations of a spread plan."),
+        run_option("--dwell-s", type=POSITIVE, default=30.0, show_default=True,
+                   help="Seconds in each orientation."),
+        run_option("--sample-hz", type=POSITIVE, default=100.0, show_default=True,
+                   help="Rate of the readings."),
+        run_option("--angle-hz", type=POSITIVE, default=10.0, show_default=True,
+                   help="Rate of the platform angles."),
+        run_option("--slew-degps", type=POSITIVE, default=20.0, show_default=True,
+                   help="Greatest speed between orientations, deg/s."),
+        run_option("--seed", type=int, metavar="N", default=0, show_default=True,
+                   help="Seed of sensors, plan and noise."),
+        run_option("--unstated", is_flag=True, help="Do not state the setting error and scatter in the recording."),
+        hidden_option("--hide", "hidden", multiple=True, metavar="NAME=SIZE", is_eager=True, callback=_list_hidden,
+                      help="Hide an effect in the truth, for example second-order=4ug/g^2, second-order=10sigma (10 "
+                      "times what noise leaves uncertain), random or random=10sigma; repeatable; help lists them all."),
+        noise_option("--white", "white_mps2", type=NUMBER, help="White noise of a reading, m/s^2."),
+        noise_option("--ar1", "ar1_phi", type=NUMBER, help="Correlation of that noise from one reading to the next."),
+        noise_option("--flicker", "flicker_mps2", type=NUMBER, help="1/f noise: floor of the Allan deviation, m/s^2."),
+        noise_option("--walk", "walk_mps2_per_sqrt_s", type=NUMBER, help="Random walk of the biases, m/s^2/sqrt(s)."),
+        noise_option("--scatter", "scatter_mps2", type=NUMBER, help="Offset of each sensor in each dwell, m/s^2."),
+        noise_option("--setting", "setting_sigma_deg", type=NUMBER, help="Setting error of each orientation, deg."),
+        noise_option("--encoder-sigma", "encoder_sigma_deg", type=NUMBER, help="Noise of the encoders, deg."),
+        noise_option("--encoder-step", "encoder_step_deg", type=NUMBER, help="Resolution of the encoders, deg."),
+        noise_option("--outlier-rate", type=NUMBER, help="Share of readings that are outliers."),
+        noise_option("--outlier-size", "outlier_mps2", type=NUMBER, help="Size of an outlier, m/s^2."),
+        warmth_option("--temperature", "constant_c", type=NUMBER, default=25.0, show_default=True,
+                      help="Temperature about which it swings, degC."),
+        warmth_option("--temperature-swing", "swing_c", type=NUMBER, default=0.0, show_default=True,
+                      help="Swing of the temperature to either side, K."),
+        warmth_option("--temperature-period-s", "period_s", type=NUMBER, default=3600.0, show_default=True,
+                      help="Period of that swing, s."),
+        warmth_option("--warm-up-c", "warm_up_c", type=NUMBER, default=0.0, show_default=True,
+                      help="How much colder the start is, K."),
+        warmth_option("--warm-up-s", "warm_up_s", type=NUMBER, default=1800.0, show_default=True,
+                      help="Time constant of the warming up, s."),
+    ]  # fmt: skip
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+class _Recorded(NamedTuple):
+    """notes: what an evaluation will not use of it."""
+
+    readings: int
+    dwells: int
+    duration_s: float
+    notes: list[str]
+
+    def __str__(self) -> str:
+        return f"{self.readings} readings, {self.dwells} dwell{'s' * (self.dwells != 1)}, {self.duration_s:.0f} s"
+
+    @property
+    def keys(self) -> dict[str, Any]:
+        return {"samples": self.readings, "dwells": self.dwells, "duration_s": self.duration_s}
+
+
+def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], None]) -> _Recorded:
+    """Write a source to a recording as it is, a chunk closed at the end of each dwell."""
+    from kf_calib.dwells.segmenter import Segmenter
+    from kf_calib.sources.files.recorder import Recorder
+
+    readings, first_ns, last_ns, segmenter = 0, None, 0, Segmenter(source.bench)
+    with answered(interrupt), Recorder(out, source.bench, overwrite=overwrite) as recorder:
+        for batch in source:
+            recorder.write(batch)
+            before = segmenter.dwell_count
+            for _ in segmenter.push(batch):
+                pass
+            if segmenter.dwell_count > before > 0:
+                recorder.end_dwell()
+            readings += len(batch.accel)
+            if len(batch.accel):
+                first_ns = int(batch.accel.time_ns[0]) if first_ns is None else first_ns
+                last_ns = int(batch.accel.time_ns[-1])
+            tick(source.fraction)
+        for _ in segmenter.finish():
+            pass
+    duration_s = 0.0 if first_ns is None else (last_ns - first_ns) / 1e9
+    notes = [f"recorded, and not used when it is evaluated: {text}" for text in segmenter.tally.sentences()]
+    return _Recorded(readings, segmenter.dwell_count, duration_s, notes)
+
+
+@click.command(
+    epilog=examples("simulate run.mcap", "simulate run.mcap --seed 3 --hide second-order=10sigma --temperature-swing 5")
+)
+@click.argument("out", type=OutputFile())
+@simulation_options
+@bench_options
+@overwrite_option
+@click.option("--large", is_flag=True, panel=OUTPUT, help="Begin even where the disk would not hold the recording.")
+@json_option
+def simulate(out: Path, overwrite: bool, large: bool, as_json: bool, **options: Any) -> None:
+    """Record a simulated bench run to OUT; its truth goes to a side file that no estimator opens."""
+    from kf_calib.sources.simulation.options import simulation
+    from kf_calib.sources.simulation.truth import truth_file, write_truth
+
+    claimed([Path(options["plan"])], {"OUT, whose truth goes there": truth_file(out)}, overwrite)
+    source = simulation(options, overrides(options), begin=partial(_foresee, out=out, large=large))
+    with progress(f"simulating {out.name}", as_json) as tick:
+        made = _record(source, out, overwrite, tick)
+    truth = write_truth(source, out)
+    if as_json:
+        print_json({"recording": str(out), "truth": str(truth), **made.keys})
+    else:
+        echo(f"{out}: {made}; truth in {truth}")
+
+
+def _foresee(run: Simulation, out: Path, large: bool) -> None:
+    """Say how large a large run becomes, before it begins; refuse what the disk does not hold."""
+    free = shutil.disk_usage(next(folder for folder in out.absolute().parents if folder.is_dir())).free
+    told = f"{len(run):.3g} readings, {run.duration_s / 3600:.3g} h of the bench, about {_size(run.file_bytes)}"
+    if run.file_bytes > free and not large:
+        raise InputError(
+            f"{out}: {told}, and the disk has {_size(free)} left: dwell shorter (--dwell-s), visit or read less "
+            "(--orientations, --sample-hz), or begin nevertheless with --large."
+        )
+    if run.file_bytes > _LARGE_BYTES:
+        complain(f"{out}: {told}.")
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e9:.3g} GB" if count < 1e12 else f"{count / 1e12:.3g} TB"
+
+
+@click.command(
+    epilog=examples(
+        'record run.mcap bench.csv --axes "y z x" --gravity 9.8123',
+        'record run.mcap - --bench bench.toml --column "acc x [g]=ax_g" < bench.csv',
+    )
+)
+@click.argument("out", type=OutputFile())
+@click.argument("lines", type=click.Path(path_type=Path, allow_dash=True), default="-")
+@columns_option
+@bench_options
+@overwrite_option
+@json_option
+def record(
+    out: Path, lines: Path, columns: tuple[str, ...], overwrite: bool, as_json: bool, **options: Any
+) -> None:  # fmt: skip
+    """Record CSV or JSON LINES (a file, or - for standard input) to the MCAP file OUT."""
+    from kf_calib.sources.files.lines import Lines
+
+    claimed(overwrite=overwrite)
+    renamed = dict(pair(text) for text in columns)
+    source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, overrides(options), renamed)
+    with progress(f"recording {out.name}", as_json or str(lines) == "-") as tick:
+        made = _record(source, out, overwrite, tick)
+    warnings = [*source.warnings, *made.notes]
+    if as_json:
+        print_json({"recording": str(out), **made.keys, "warnings": warnings})
+        return
+    echo(f"{out}: {made}")
+    for warning in warnings:
+        echo(f"Note: {sentence(warning)}")
+
+
+def pair(text: str) -> tuple[str, str]:
+    theirs, equals, ours = text.rpartition("=")
+    if not (equals and theirs and ours):
+        raise InputError(f"--column {text!r} names no pair: write --column THEIRS=OURS, for example acc_x=ax_g.")
+    return theirs, ours
+
+
+@click.command(epilog=examples("demo", "demo somewhere"))
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default="out")
+@json_option
+def demo(folder: Path, as_json: bool) -> None:
+    """The main job on a simulated run: record, replay, compare with least squares, save the view; files in FOLDER.
+
+    Files of an earlier demo there are replaced.
+    """
+    from rich.console import Group
+
+    from kf_calib.estimation.calibration import calibrate
+    from kf_calib.estimation.engine_comparison import compare as run
+    from kf_calib.sources.files.recording import Recording
+    from kf_calib.sources.simulation.options import simulation
+    from kf_calib.sources.simulation.truth import truth_file, write_truth
+    from kf_calib.views.console import comparison_table, summary
+    from kf_calib.views.json import compare_object, replay_object
+
+    def say(shown: Any) -> None:
+        if not as_json:
+            show(shown)
+
+    folder.mkdir(parents=True, exist_ok=True)
+    recording, rrd = folder / "demo.mcap", folder / "demo.rrd"
+    outputs = Outputs({"FOLDER": recording, "the truth": truth_file(recording), "the view": rrd}, overwrite=True)
+    options = simulate.make_context("simulate", [str(recording)]).params
+    source = simulation(options | {"dwell_s": 15.0, "slew_degps": 90.0, "seed": 2019}, overrides(options))
+    with progress("recording a simulated run", as_json) as tick:
+        made = _record(source, recording, True, tick)
+        truth = write_truth(source, recording)
+    say(f"Recorded a simulated bench run to {recording}: {made}.\n")
+    with progress("replaying", as_json) as tick:
+        result = calibrate(Recording(recording), on_progress=tick)
+    say(summary(result))
+    with progress("comparing", as_json) as tick:
+        compared = run(Recording(recording), on_progress=tick)
+    say(Group("", comparison_table(compared)))
+    say(f"\nTruth: {truth}.")
+    if as_json:
+        files = {"recording": str(recording), "truth": str(truth), "view": str(rrd)}
+        print_json({**files, "replay": replay_object(result), "compare": compare_object(compared)})
+    with delivery(outputs, as_json) as deliver, progress("saving the view", as_json):
+        kept = deliver.keep(rrd, lambda path: save_view(result, path))
+    if kept:
+        say(f"View: {rrd} (open it with .venv/bin/rerun {rrd}).")

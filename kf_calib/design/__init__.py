@@ -1,0 +1,1 @@
+"""Where to point: criteria, limits, exact designs, the next orientation."""

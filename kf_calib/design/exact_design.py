@@ -1,0 +1,311 @@
+"""Exact designs: which orientations serve an aim best, and how far they are from the best that could be.
+
+A start by exchange over candidates, then scipy's L-BFGS-B over the continuous angles within their bounds. The slope
+comes from the aim as a function of the factor alone (``optimality_criteria.slope``), so that any aim can be planned
+for.
+
+D-optimality has a bound that needs no optimum (Kiefer and Wolfowitz, 1960): with M the information of any design of N
+dwells, M0 what is known already and I(x) the information of a dwell at x,
+
+    det M*^(1/p) <= det M^(1/p) (tr(M0 M^-1) + N max_x tr(I(x) M^-1)) / p.
+
+Where nothing is known already, N tr(I(x) M^-1) is the variance function; its maximum is p at the
+optimum, and there only.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import minimize
+
+from kf_calib.bench.arrays import Floats, Ints, Mask
+from kf_calib.design import optimality_criteria
+from kf_calib.design.gimbal_limits import Reach, wrapped
+from kf_calib.design.optimality_criteria import Aim, Score
+from kf_calib.design.predicted_information import Prospect
+from kf_calib.dwells.qr import triangle
+from kf_calib.errors import InputError, UnobservableError
+
+_TIE = 1e-3
+_UNTIL = {"maxiter": 200, "ftol": 1e-11, "gtol": 1e-9}
+_FIRST = 32  # candidates that promise most, tried exactly
+_SWEEPS = 12
+_SCATTERED, _ABOUT = 256, 48
+_OTHERS = 6  # random starts of an exchange that no polishing follows
+_FEW = 16  # orientations that one start may lead into a corner
+_STEP_RAD = 1e-5
+_WEIGHINGS = 1000
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """What is visited for every orientation chosen: it, ``repeats`` times, and its antipode (gravity turned over).
+
+    turned: the gimbal that turns gravity over when it goes half a turn and the others as ``signs`` say (-1: to the
+    other side of zero); None: no antipodes.
+    """
+
+    repeats: int = 1
+    turned: int | None = None
+    signs: tuple[float, ...] = ()
+
+    @property
+    def copies(self) -> int:
+        return self.repeats * (1 if self.turned is None else 2)
+
+    def visits(self, poses: Floats) -> Floats:
+        """Poses (copies * n, k) of orientations (n, k), those of one together."""
+        if self.turned is None:
+            return np.repeat(poses, self.repeats, axis=0)
+        both = np.stack([poses, self.antipodes(poses)], axis=1)
+        return np.repeat(both, self.repeats, axis=0).reshape(-1, poses.shape[1])
+
+    def antipodes(self, poses: Floats) -> Floats:
+        other = poses * np.array(self.signs)
+        other[:, self.turned] += np.pi
+        return wrapped(other)
+
+    @classmethod
+    def of(cls, reach: Reach, repeats: int, antipodal: bool) -> Scheme:
+        if not antipodal:
+            return cls(repeats)
+        bench, width = reach.bench, len(reach.bench.axes)
+        poses = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, width))
+        found = list[tuple[int, Scheme]]()
+        for j, signs in itertools.product(range(width), itertools.product((1.0, -1.0), repeat=width)):
+            scheme = cls(repeats, j, signs)
+            forces = (bench.specific_force(np.zeros(32), each) for each in (poses, scheme.antipodes(poses)))
+            if np.abs(sum(forces)).max() < 1e-9 * bench.gravity_mps2:
+                found.append((int(reach.allowed(scheme.antipodes(reach.candidates)).sum()), scheme))
+        if not found:
+            raise InputError(
+                "no gimbal of these axes turns gravity over by half a turn, so there are no antipodal pairs: leave out "
+                "--antipodal."
+            )
+        return max(found, key=lambda each: each[0])[1]
+
+
+@dataclass(frozen=True)
+class Search:
+    """Orientations are looked for within ``reach`` that make ``aim`` of the factor least."""
+
+    prospect: Prospect
+    reach: Reach
+    aim: Aim
+    scheme: Scheme = Scheme()
+    at_s: Floats | None = None
+    """The middles of the dwells where the orientations are a sequence of visits; None: each might be the next."""
+
+    @cached_property
+    def candidates(self) -> Floats:
+        """Orientations (n, k) to choose from, of those that tell the same the least turned one."""
+        poses = self.reach.candidates
+        if self.scheme.turned is not None:
+            poses = poses[self.reach.allowed(self.scheme.antipodes(poses))]
+            if not len(poses):
+                raise InputError("no orientation has its antipode within the limits: leave out --antipodal.")
+        rows = self.rows(poses).reshape(len(poses), -1)
+        _, first = np.unique((rows / np.abs(rows).max()).round(9) + 0.0, axis=0, return_index=True)
+        return poses[np.sort(first)]
+
+    @cached_property
+    def candidate_rows(self) -> Floats:
+        return self.rows(self.candidates)
+
+    def rows(self, poses: Floats) -> Floats:
+        """Whitened rows (n, r, p) of all visits for each orientation (n, k)."""
+        rows = self.prospect.rows(self.scheme.visits(poses), self.at_s)
+        return rows.reshape(len(poses), -1, rows.shape[2])
+
+    def factor(self, rows: Floats) -> Floats:
+        """Factor (p, p) of what is known and rows (n, r, p)."""
+        return triangle(np.vstack([self.prospect.start, rows.reshape(-1, rows.shape[-1])]))
+
+    def refuse_unseen(self) -> None:
+        """Raise UnobservableError where even all candidates together leave parameters undetermined."""
+        if not optimality_criteria.unseen(self.prospect.start).any():
+            return
+        lost = optimality_criteria.unseen(self.factor(self.candidate_rows))
+        if lost.any():
+            names = ", ".join(symbol for symbol, own in zip(self.prospect.symbols, lost, strict=True) if own)
+            raise UnobservableError(
+                f"no set of the orientations that can be reached determines {names}: widen the limits (--limit, "
+                "--forbid, --positions), or add a gimbal axis."
+            )
+
+    def best(self, count: int) -> Floats:
+        """``count`` orientations (count, k)."""
+        chosen = self.exchanged(count)
+        poses = self.candidates[chosen]
+        if not self.reach.continuous:
+            return poses
+        starts = [poses, *(self._scattered(count, seed) for seed in range(2 if count <= _FEW else 0))]
+        polished = [self.polished(start) for start in starts]
+        return min([poses, *polished], key=self.cost)
+
+    def measure(self, poses: Floats) -> float:
+        """The aim of orientations (n, k)."""
+        return float(self.aim(self.factor(self.rows(poses))))
+
+    def cost(self, poses: Floats) -> float:
+        return float(self._score(self.factor(self.rows(poses))))
+
+    def _score(self, factors: Floats, power: float = math.inf) -> Floats:
+        """The aim; of sets that serve it alike the one that tells more of everything is better."""
+        return self.aim(factors, power) + _TIE * optimality_criteria.D(factors)
+
+    def _scattered(self, count: int, seed: int) -> Floats:
+        return np.random.default_rng(seed).choice(self.candidates, count)
+
+    def exchanged(self, count: int) -> list[int]:
+        """Numbers of candidates: greedy, then exchanged; where they are all there is, from random starts as well.
+
+        Greedy by D, which every dwell can improve: a largest sigma falls only when all that is as large does.
+        """
+        rows, greedy = self.candidate_rows, list[int]()
+        for _ in range(count):
+            greedy.append(self._choice(optimality_criteria.D, rows[greedy])[0])
+        rng = np.random.default_rng(0)
+        others = [] if self.reach.continuous else [rng.choice(len(rows), count).tolist() for _ in range(_OTHERS)]
+        found = [self._exchanged(start) for start in (greedy, *others)]
+        return min(found, key=lambda each: float(self._score(self.factor(rows[each]))))
+
+    def _exchanged(self, start: list[int]) -> list[int]:
+        """Each dwell exchanged for the best there is, until none changes."""
+        rows, chosen = self.candidate_rows, list(start)
+        for _ in range(_SWEEPS):
+            before = list(chosen)
+            for place in range(len(chosen)):
+                rest = chosen[:place] + chosen[place + 1 :]
+                best, cost = self._choice(self._score, rows[rest])
+                if cost < float(self._score(self.factor(rows[chosen]))) - 1e-9:
+                    chosen[place] = best
+            if chosen == before:
+                break
+        return chosen
+
+    def _choice(self, score: Score, rest: Floats) -> tuple[int, float]:
+        """The candidate to go with rows ``rest`` (n, r, p), and the cost of both; those that promise most are tried."""
+        rows, upper = self.candidate_rows, self.factor(rest)
+        wide = len(rows) > 8 * _FIRST
+        tried = self._promising(score, upper) if wide else np.arange(len(rows))
+        both = np.concatenate([np.broadcast_to(upper, (len(tried), *upper.shape)), rows[tried]], axis=1)
+        costs = score(triangle(both), math.inf)
+        k = int(np.argmin(costs))
+        return int(tried[k]), float(costs[k])
+
+    def _promising(self, score: Score, upper: Floats) -> Ints:
+        """Candidates that the slope of the aim favours, a little of all of them added to what there is."""
+        rows = self.candidate_rows
+        some = (0.1 / math.sqrt(len(rows))) * rows.reshape(-1, rows.shape[2])
+        spread = triangle(np.vstack([upper, some]))
+        white = rows @ np.linalg.inv(spread)
+        promise = np.einsum("nri,ij,nrj->n", white, optimality_criteria.slope(score, spread, self.aim.powers[0]), white)
+        return np.argsort(promise)[:_FIRST]
+
+    def polished(self, poses: Floats) -> Floats:
+        """The orientations moved within their rooms to the least cost."""
+        shape, rooms = poses.shape, self._rooms(poses)
+        for power in self.aim.powers:
+            found = minimize(
+                self._with_slope, poses.ravel(), (shape, power), "L-BFGS-B", jac=True, bounds=rooms.reshape(-1, 2),
+                options=_UNTIL,
+            )  # fmt: skip
+            poses = found.x.reshape(shape)
+        return np.where(np.isfinite(rooms).any(axis=2), poses, wrapped(poses))
+
+    def _rooms(self, poses: Floats) -> Floats:
+        rooms = self.reach.rooms(poses)
+        if self.scheme.turned is None:
+            return rooms
+        other = self.scheme.antipodes(poses)
+        theirs = self.reach.rooms(other) - other[:, :, None]
+        mirrored = np.array(self.scheme.signs) < 0
+        theirs[:, mirrored] = -theirs[:, mirrored, ::-1]
+        theirs += poses[:, :, None]
+        return np.stack([np.maximum(rooms, theirs)[..., 0], np.minimum(rooms, theirs)[..., 1]], axis=2)
+
+    def _with_slope(self, flat: Floats, shape: tuple[int, int], power: float) -> tuple[float, Floats]:
+        poses, gradient = flat.reshape(shape), np.empty(shape)
+        rows = self.rows(poses)
+        upper = self.factor(rows)
+        inverse = np.linalg.inv(optimality_criteria.regular(upper))
+        weights = rows @ inverse @ optimality_criteria.slope(self._score, upper, power) @ inverse.T
+        for j in range(shape[1]):
+            step = _STEP_RAD * np.eye(shape[1])[j]
+            change = (self.rows(poses + step) - self.rows(poses - step)) / (2.0 * _STEP_RAD)
+            gradient[:, j] = 2.0 * np.einsum("nrp,nrp->n", weights, change)
+        return float(self._score(upper, power)), gradient.ravel()
+
+    def variance_function(self, rows: Floats, poses: Floats) -> tuple[float, float]:
+        """tr(M0 M^-1), and the largest tr(I(x) M^-1) that can be reached, M of the design ``rows`` (n, r, p)."""
+        inverse = np.linalg.inv(self.factor(rows))
+
+        def at(poses: Floats) -> Floats:
+            return np.square(self.rows(poses) @ inverse).sum(axis=(1, 2))
+
+        there = at(poses)
+        largest = float(there.max())
+        if self.reach.continuous:
+            for k in np.argsort(there)[-3:]:
+                room = self._rooms(poses[k : k + 1])[0]
+                found = minimize(lambda q: -float(at(q[None])[0]), poses[k], method="L-BFGS-B", bounds=room)
+                largest = max(largest, -float(found.fun))
+        return float(np.square(self.prospect.start @ inverse).sum()), largest
+
+    def d_bound(self, rows: Floats) -> float:
+        """An upper bound of log det M*^(1/p) over all designs of as many orientations as ``rows`` (n, r, p).
+
+        Of three: by the design itself, which is tight where that is the optimum, by the best weights of candidates, and
+        by balanced directions.
+        """
+        bounds, balanced = list[float](), self.prospect.balanced(len(rows) * self.scheme.copies)
+        for design in (rows, self._weighted(len(rows)), *([] if balanced is None else [balanced])):
+            known, largest = self.variance_function(design, self.candidates)
+            width = design.shape[2]
+            ratio = (known + len(rows) * largest) / width
+            bounds.append(-float(optimality_criteria.D(self.factor(design))) * 2.0 + math.log(ratio))
+        return min(bounds)
+
+    def _weighted(self, count: int) -> Floats:
+        """Rows (c, r, p) of the candidates times the roots of their D-optimal weights, by multiplicative steps."""
+        rows = self.candidate_rows
+        weights = np.full(len(rows), 1.0 / len(rows))
+        for _ in range(_WEIGHINGS):
+            upper = self.factor(np.sqrt(count * weights)[:, None, None] * rows)
+            gain = np.square(rows @ np.linalg.inv(upper)).sum(axis=(1, 2))
+            mean = float(weights @ gain)
+            weights = weights * gain / mean
+            if gain.max() < mean * (1.0 + 1e-6):
+                break
+        return np.sqrt(count * weights)[:, None, None] * rows
+
+    def next(self) -> Floats:
+        """The orientation (k,) after which the cost is least: scattered ones first, then ever closer about the best."""
+        if not self.reach.continuous:
+            return self._first_of(self.candidates)
+        rng, (low, high) = np.random.default_rng(0), self.reach.bounds.T
+        scattered = rng.uniform(low, high, (_SCATTERED, len(low)))
+        best = self._first_of(np.vstack([scattered[self._allowed(scattered)], self.reach.candidates[:1]]))
+        for reach_deg in (24.0, 8.0, 2.5, 0.8):
+            about = best + np.radians(rng.uniform(-reach_deg, reach_deg, (_ABOUT, len(best))))
+            best = self._first_of(np.vstack([best, about[self._allowed(about)]]))
+        return wrapped(best)
+
+    def _allowed(self, poses: Floats) -> Mask:
+        inside = self.reach.allowed(wrapped(poses))
+        return inside if self.scheme.turned is None else inside & self.reach.allowed(self.scheme.antipodes(poses))
+
+    def _first_of(self, poses: Floats) -> Floats:
+        rows, start = self.rows(poses), self.prospect.start
+        so_far = np.broadcast_to(start, (len(rows), *start.shape))
+        return poses[int(np.argmin(self._score(triangle(np.concatenate([so_far, rows], axis=1)))))]
+
+    def without_limits(self) -> Search:
+        """The same over all that the axes can reach."""
+        return replace(self, reach=Reach(self.reach.bench), scheme=Scheme())

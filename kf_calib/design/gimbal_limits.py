@@ -1,0 +1,168 @@
+"""Which orientations a bench can take: limits of its gimbals, forbidden zones, a grid or a list of positions.
+
+Angles are between -180 and 180 deg, and a gimbal goes from one to the next by the straight way between the numbers, as
+a simulated bench does. ``poses`` are (n, k), rad.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.bench import Bench
+from kf_calib.errors import InputError
+
+_POSES = 4096
+_PLACES = ("outer", "middle", "inner")
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Reach:
+    """limits_deg: of gimbals, by their number. zones_deg: boxes, each of ranges by gimbal, no angle of which is taken.
+
+    grid_deg: angles are multiples of it; positions_deg: the list there is; neither: any angle.
+    """
+
+    bench: Bench
+    limits_deg: Mapping[int, Range] = field(default_factory=dict[int, Range])
+    zones_deg: Sequence[Mapping[int, Range]] = ()
+    grid_deg: float | None = None
+    positions_deg: Sequence[Sequence[float]] | None = None
+
+    @property
+    def continuous(self) -> bool:
+        return self.grid_deg is None and self.positions_deg is None
+
+    @property
+    def free(self) -> bool:
+        """Whether nothing but the axes binds."""
+        return self.continuous and not self.limits_deg and not self.zones_deg
+
+    @cached_property
+    def bounds(self) -> Floats:
+        """Lowest and highest angle (k, 2) of each gimbal, rad."""
+        return np.radians([self.limits_deg.get(j, (-180.0, 180.0)) for j in range(len(self.bench.axes))])
+
+    @cached_property
+    def candidates(self) -> Floats:
+        """Allowed poses (n, k) to choose from, the least turned first; raises InputError where there is none."""
+        if self.positions_deg is not None:
+            poses = np.radians(np.asarray(self.positions_deg, float))
+        else:
+            each = [self._values(j) for j in range(len(self.bench.axes))]
+            total = math.prod(map(len, each))
+            if total > 200_000:
+                raise InputError(f"a grid of {self.grid_deg:g} deg has {total} orientations: take a coarser one.")
+            poses = np.stack(np.meshgrid(*each, indexing="ij"), axis=-1).reshape(-1, len(each))
+        poses = poses[self.allowed(poses)]
+        if not len(poses):
+            raise InputError("no orientation is left within the limits and outside the forbidden zones: widen them.")
+        return poses[np.argsort(np.abs(poses).sum(axis=1).round(9), kind="stable")]
+
+    def _values(self, j: int) -> Floats:
+        low, high = self.bounds[j]
+        if self.grid_deg is not None:
+            step = math.radians(self.grid_deg)
+            values: Floats = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
+            twice = j not in self.limits_deg and len(values) > 1 and _turns(values)  # -180 and 180 deg are one
+            return values[: len(values) - twice]
+        count = int(_POSES ** (1.0 / len(self.bench.axes)) + 1e-9)
+        if j not in self.limits_deg:
+            return np.asarray((np.arange(count) - count // 2) * (2.0 * np.pi / count), np.float64)
+        values = np.append(np.linspace(low, high, count), np.clip(0.0, low, high))
+        return np.unique(values)
+
+    def allowed(self, poses: Floats) -> Mask:
+        """Which poses (n, k) are within the limits and in no forbidden zone, (n,) bool."""
+        low, high = self.bounds.T
+        inside = ((poses >= low - 1e-9) & (poses <= high + 1e-9)).all(axis=1)
+        for zone in self.zones_deg:
+            there = np.ones(len(poses), bool)
+            for j, ends in zone.items():
+                begin, end = np.radians(ends)
+                there &= (poses[:, j] - begin) % (2.0 * np.pi) <= end - begin
+            inside &= ~there
+        return inside
+
+    def rooms(self, poses: Floats) -> Floats:
+        """About each allowed pose (n, k) a box of allowed ones, (n, k, 2); unlimited gimbals may go round in it."""
+        out = np.repeat(self.bounds[None], len(poses), axis=0)
+        out[:, [j for j in range(poses.shape[1]) if j not in self.limits_deg]] = [-np.inf, np.inf]
+        for room, pose in zip(out, poses, strict=True):
+            for zone in self.zones_deg:
+                away = {j: _aside(pose[j], np.radians(ends)) for j, ends in zone.items()}
+                j = max(away, key=lambda each: min(away[each]))
+                below, above = away[j]  # to the zone's begin going up, to its end going down
+                room[j] = max(room[j, 0], pose[j] - above + 1e-9), min(room[j, 1], pose[j] + below - 1e-9)
+        return out
+
+    def crosses(self, start: Floats, end: Floats) -> Mask:
+        """Which straight ways from ``start`` (..., k) to ``end`` (..., k) lead through a forbidden zone."""
+        hit = np.zeros(np.broadcast_shapes(start.shape, end.shape)[:-1], bool)
+        step = end - start
+        for zone in self.zones_deg:
+            for round_deg in (-360.0, 0.0, 360.0) if all(j not in self.limits_deg for j in zone) else (0.0,):
+                enter, leave = np.zeros(hit.shape), np.ones(hit.shape)
+                for j, ends in zone.items():
+                    low, high = np.radians(np.array(ends) + round_deg)
+                    still = np.abs(step[..., j]) < 1e-12
+                    share = np.where(still, 1.0, step[..., j])
+                    one, other = (low - start[..., j]) / share, (high - start[..., j]) / share
+                    outside = still & ((start[..., j] < low) | (start[..., j] > high))
+                    first = np.where(still, np.where(outside, np.inf, -np.inf), np.minimum(one, other))
+                    enter = np.maximum(enter, first)
+                    leave = np.minimum(leave, np.where(still, np.inf, np.maximum(one, other)))
+                hit |= enter <= leave
+        return hit
+
+
+def _turns(values: Floats) -> bool:
+    """Whether the last of evenly spaced angles is the first again."""
+    return bool(abs(values[-1] - values[0] - 2.0 * np.pi) < 1e-9)
+
+
+def _aside(angle: float, zone: Floats) -> tuple[float, float]:
+    """How far up an angle may go before a zone begins, and how far down before it ends; negative inside."""
+    below, above = (zone[0] - angle) % (2.0 * np.pi), (angle - zone[1]) % (2.0 * np.pi)
+    inside = (angle - zone[0]) % (2.0 * np.pi) <= zone[1] - zone[0]
+    return (-1.0, -1.0) if inside else (float(below), float(above))
+
+
+def wrapped(poses: Floats) -> Floats:
+    """Angles from -180 up to 180 deg, rad."""
+    return np.pi - (np.pi - poses) % (2.0 * np.pi)
+
+
+def gimbal_named(text: str, bench: Bench) -> int:
+    """The number of a gimbal from its number (1: outer), its place (outer, middle, inner) or its axis (x, y, z)."""
+    names = bench.to_metadata()["axes"].split()
+    count = len(names)
+    places = dict(zip(_PLACES if count == 3 else ("outer", "inner")[:count], range(count), strict=False))
+    numbers = {str(j + 1): j for j in range(count)}
+    letters = {name.lstrip("-"): j for j, name in enumerate(names) if [n.lstrip("-") for n in names].count(name) == 1}
+    known = numbers | places | letters
+    if text not in known:
+        raise InputError(f"gimbal {text!r} is not known: use one of {', '.join(known)}.")
+    return known[text]
+
+
+def ranges(text: str, bench: Bench) -> dict[int, Range]:
+    """Ranges in deg by gimbal from ``z=-90:90`` or ``outer=0:30,x=-10:10``; raises InputError."""
+    out = dict[int, Range]()
+    for part in text.split(","):
+        name, equals, ends = part.strip().partition("=")
+        low, colon, high = ends.partition(":")
+        try:
+            own = float(low), float(high)
+        except ValueError:
+            own = math.nan, math.nan
+        if not (equals and colon and -360.0 <= own[0] <= own[1] <= 360.0 and own[1] - own[0] <= 360.0):
+            raise InputError(f"{part.strip()!r} is no range of a gimbal: write AXIS=LOW:HIGH in deg, as in z=-90:90.")
+        out[gimbal_named(name, bench)] = own
+    return out

@@ -1,0 +1,180 @@
+"""What a set of orientations is good for: a number for an information factor, the smaller the better.
+
+An ``Aim`` is a function of the factor R (p, p), R^T R the information about the states. The planner asks for no more,
+so whatever can be told from R may be an aim: sizes of the twelve, or how far an effect or two can be told apart.
+The factors are those of a ``Prospect``: of parameters in their units (rad, 1, g; effects: their scale).
+
+    D          log of the geometric mean of the principal sigmas: the generalised variance
+    A          log of the rms of all sigmas
+    E          log of the largest principal sigma, of any combination of the parameters
+    minimax    log of the largest sigma of a parameter, relative to what is tolerated
+    condition  log of the condition number of R
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.errors import InputError, how_to_write
+
+G = 9.80665
+_KINDS = {"rad": ("theta", "phi", "nu"), "1": ("K",), "m/s^2": ("b",)}
+_UNITS = {
+    "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.radians(1), "arcsec": math.radians(1 / 3600)},
+    "1": {"": 1.0, "ppm": 1e-6, "%": 1e-2},
+    "m/s^2": {"m/s^2": 1.0, "m/s2": 1.0, "um/s2": 1e-6, "g": G, "mg": 1e-3 * G, "ug": 1e-6 * G},
+}
+_TINY = 1e-12
+_SOFT = (16.0, 400.0)
+
+
+Score = Callable[[Floats, float], Floats]
+
+
+@dataclass(frozen=True)
+class Aim:
+    """cost(factors (..., p, p), power) -> (...): smaller is better; a logarithm, so that what it measures is exp(cost).
+
+    powers: where the cost has kinks it is led there by power means of these exponents; infinity: the cost itself.
+    """
+
+    name: str
+    measures: str
+    cost: Score
+    powers: tuple[float, ...] = (math.inf,)
+
+    def __call__(self, factors: Floats, power: float = math.inf) -> Floats:
+        return self.cost(factors, power)
+
+
+def _geometric(factors: Floats, power: float) -> Floats:
+    return -np.log(np.abs(np.einsum("...ii->...i", regular(factors)))).mean(axis=-1)
+
+
+def _root_mean_square(factors: Floats, power: float) -> Floats:
+    return 0.5 * np.log((sigmas(factors) ** 2).mean(axis=-1))
+
+
+def _principal(factors: Floats, power: float) -> Floats:
+    return _largest(-np.log(_singular(factors)), power)
+
+
+def _condition(factors: Floats, power: float) -> Floats:
+    logs = np.log(_singular(factors))
+    return _largest(logs, power) + _largest(-logs, power)
+
+
+D = Aim("D", "geometric mean of the principal sigmas", _geometric)
+A = Aim("A", "rms of all sigmas", _root_mean_square)
+E = Aim("E", "largest principal sigma", _principal, _SOFT)
+CONDITION = Aim("condition", "condition number", _condition, _SOFT)
+
+
+def minimax(tolerated: Floats) -> Aim:
+    """The largest sigma over what is tolerated of it, (p,) in the units of the factors; infinity: anything is."""
+    asked = np.isfinite(tolerated)
+
+    def cost(factors: Floats, power: float) -> Floats:
+        count = len(asked)
+        return _largest(np.log(sigmas(factors)[..., :count][..., asked] / tolerated[asked]), power)
+
+    return Aim("minimax", "largest sigma relative to what is tolerated", cost, _SOFT)
+
+
+NAMED: dict[str, Aim] = {aim.name: aim for aim in (D, A, E, minimax(np.ones(12)), CONDITION)}
+
+
+def _largest(logs: Floats, power: float) -> Floats:
+    """Of logarithms (..., n): the largest, or the logarithm of the power mean, which has no kinks."""
+    top = logs.max(axis=-1)
+    if not math.isfinite(power):
+        return top
+    return top + np.log(np.exp(power * (logs - top[..., None])).mean(axis=-1)) / power
+
+
+def regular(factors: Floats) -> Floats:
+    """Triangles with no zero on the diagonal: what is not seen gets a sigma of 1e12 of the best seen, not infinity."""
+    size = np.abs(factors).max(axis=(-2, -1))[..., None, None]
+    floor = _TINY * np.where(size > 0, size, 1.0)
+    diagonal = np.abs(factors) < floor
+    return np.where(diagonal & np.eye(factors.shape[-1], dtype=bool), floor, factors)
+
+
+def _singular(factors: Floats) -> Floats:
+    values = np.linalg.svd(factors, compute_uv=False)
+    return np.maximum(values, _TINY * np.maximum(values[..., :1], 1e-300))
+
+
+def sigmas(factors: Floats) -> Floats:
+    """1 sigma (..., p) of the states of factors (..., p, p)."""
+    return np.linalg.norm(np.linalg.inv(regular(factors)), axis=-1)
+
+
+def unseen(factor: Floats) -> Mask:
+    """Which states (p,) a factor does not determine."""
+    _, singular, right = np.linalg.svd(factor)
+    lost = right[singular <= 1e-9 * max(float(singular[0]), 1e-300)]
+    return np.asarray((np.abs(lost) > 1e-6).any(axis=0))
+
+
+def slope(aim: Score, factor: Floats, power: float) -> Floats:
+    """G (p, p), symmetric: what an aim changes by when the information becomes R^T (1 + B) R is tr(G B).
+
+    By central differences R (1 +- h N), upper triangular N; relative to R itself, so that it holds however badly the
+    parameters are seen.
+    """
+    count, h = len(factor), 1e-5
+    rows, columns = np.triu_indices(count)
+    changes = np.zeros((len(rows), count, count))
+    changes[np.arange(len(rows)), rows] = h * factor[columns]
+    up, down = aim(factor + changes, power), aim(factor - changes, power)
+    out = np.zeros((count, count))
+    out[rows, columns] = (up - down) / (4.0 * h)
+    return out + np.triu(out, 1).T
+
+
+def tolerated(texts: tuple[str, ...], gravity_mps2: float) -> Floats:
+    """What is tolerated of each parameter (12,), in rad, 1, g, from ``K=2ppm``, ``b2=20ug``, ``angles=0.1arcsec``."""
+    out = np.full(len(paper_parameters.SYMBOLS), np.inf)
+    for text in texts:
+        name, equals, size = text.replace(" ", "").partition("=")
+        chosen = [k for k, symbol in enumerate(paper_parameters.SYMBOLS) if name in _names_of(symbol)]
+        if not equals or not chosen:
+            raise InputError(
+                f"target {text!r} names no parameter: write for example K=2ppm, b2=20ug, theta1=0.1arcsec or "
+                "angles=0.1arcsec."
+            )
+        for k in chosen:
+            out[k] = _size(text, size, paper_parameters.UNITS[k]) / (
+                gravity_mps2 if paper_parameters.UNITS[k] == "m/s^2" else 1.0
+            )
+    return out
+
+
+def _names_of(symbol: str) -> set[str]:
+    """A parameter goes by its symbol, by that without its number, and the angles together as ``angles``."""
+    kind = symbol.rstrip("123")
+    return {symbol, kind, *(["angles"] if kind in _KINDS["rad"] else [])}
+
+
+def _size(text: str, size: str, kind: str) -> float:
+    unit = size.lstrip("+-.0123456789")
+    if unit[:1] in ("e", "E") and unit[1:2] and unit[1] in "+-0123456789":
+        unit = unit[1:].lstrip("+-0123456789")
+    number, units = size[: len(size) - len(unit)], _UNITS[kind]
+    try:
+        value = float(number) * units[unit]
+    except (ValueError, KeyError):
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        known = ", ".join(filter(None, units))
+        raise InputError(
+            f"target {text!r} has no size above zero that fits: give a number in one of {known}{how_to_write(size)}."
+        )
+    return value

@@ -1,0 +1,212 @@
+"""What dwells still to come would tell: whitened rows for any orientation, before it is visited.
+
+The states are the paper's parameters about where they are thought to be, in rad, 1 and g, then the effects' in their
+scale. A row is divided by its noise: that of the readings, averaged over the dwell, and the setting error and scatter
+of the dwell (``noise_model.mean_covariances``).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.dwells.qr import triangle
+from kf_calib.dwells.stationarity import Stillness
+from kf_calib.effects import Effect, Stimulus
+from kf_calib.estimation import random_walk, square_root_information
+from kf_calib.estimation.dwell_columns import Means
+from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.measurement_model import STATE_COUNT, Model, effect_columns
+from kf_calib.estimation.noise_model import Noise, considered_information, lift_rounding, mean_covariances
+from kf_calib.estimation.prior import Prior
+
+PAUSE_S = 60.0
+"""Until a plan begins that goes on with a run; or the next dwell, where there were no two that would tell."""
+
+_SINCE_ARRIVAL_S = 15.0
+
+
+def _icosahedron() -> Floats:
+    """Its vertices (12, 3): means over them of all polynomials up to degree 5 are those over the sphere."""
+    golden = 0.5 * (1.0 + math.sqrt(5.0))
+    corners = np.array([[0.0, one, other * golden] for one in (1.0, -1.0) for other in (1.0, -1.0)])
+    return np.concatenate([np.roll(corners, k, axis=1) for k in range(3)]) / math.hypot(1.0, golden)
+
+
+_ICOSAHEDRON = _icosahedron()
+
+
+@dataclass(frozen=True)
+class Last:
+    """The dwell before those to come: when it ended, pose (k,), specific force (3,), temperature, variances (3,)."""
+
+    end_s: float
+    pose: Floats
+    force_mps2: Floats
+    temperature_c: float = math.nan
+    variance_mps2_2: Floats = None  # type: ignore[assignment]  # set in __post_init__
+
+    def __post_init__(self) -> None:
+        if self.variance_mps2_2 is None:  # pyright: ignore[reportUnnecessaryComparison]
+            object.__setattr__(self, "variance_mps2_2", np.zeros(3))
+
+
+@dataclass(frozen=True)
+class Prospect:
+    """model, state (p,): what is estimated, and where it is linearised. noise, readings: of a dwell of ``dwell_s``.
+
+    known (p, p): factor of what is known already, of the states; zeros: nothing. last: the dwell before; None: none.
+    pause_s: from its end until the next dwell begins.
+    """
+
+    model: Model
+    state: Floats
+    noise: Noise
+    readings: float
+    dwell_s: float
+    known: Floats
+    last: Last | None = None
+    pause_s: float = PAUSE_S
+
+    @classmethod
+    def of_bench(cls, bench: Bench, sigma_mps2: float, readings: float, dwell_s: float) -> Prospect:
+        """Of a run that has not begun: nothing is known, and dwells scatter by what the bench states."""
+        model = Model(bench)
+        scatter = np.full(3, bench.scatter_sigma_mps2 or 0.0)
+        setting_rad = math.radians(bench.angle_sigma_deg or 0.0)
+        noise = Noise(np.full(3, sigma_mps2), np.ones(3), setting_rad, scatter, True, True)
+        return cls(model, model.nominal_state(), noise, readings, dwell_s, np.zeros((model.count, model.count)))
+
+    @classmethod
+    def following(cls, fitted: Fit) -> Prospect:
+        """Of a run so far, dwells to come like those it has had; what is known by it is left out."""
+        carried, last = fitted.carried, fitted.dwells[-1]
+        dwell_s = float(np.median([dwell.end_s - dwell.start_s for dwell in fitted.dwells]))
+        temperature_c = float(last.pieces[-1].nodes.temperature_c[-1])
+        before = Last(last.end_s, last.pose, last.means[1:4], temperature_c, last.variances[-1])
+        readings, nothing = float(np.median(carried.means.counts)), np.zeros((carried.model.count,) * 2)
+        pauses_s = [after.start_s - dwell.end_s for dwell, after in itertools.pairwise(fitted.dwells)]
+        pause_s = float(np.median(pauses_s)) if pauses_s else PAUSE_S
+        return cls(carried.model, carried.state, fitted.noise, readings, dwell_s, nothing, before, pause_s)
+
+    @classmethod
+    def after(cls, fitted: Fit, prior: Prior | None = None) -> Prospect:
+        """Of a run so far, with what is known by it: the filter's own factor."""
+        carried, noise, made = fitted.carried, fitted.noise, replace(cls.following(fitted), pause_s=PAUSE_S)
+        first = square_root_information.start(prior or Prior(), carried.model)
+        steps = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)
+        waited = noise.walk_mps2_per_sqrt_s**2 * (made.pause_s + made.dwell_s / 3.0)
+        known = random_walk.predict(steps[-1].factor, waited)[:, :-1]
+        more = considered_information(noise, carried.means, carried.state).sum(axis=0) + fitted.considered
+        return replace(made, known=_less(known, more))
+
+    @cached_property
+    def units(self) -> Floats:
+        """SI units (p,) a unit of each state is worth: rad, 1, g, and the scale of effects."""
+        scales = np.array([coefficient.scale for coefficient in self.model.coefficients])
+        return np.append(np.tile([1.0, 1.0, 1.0, self.model.bench.gravity_mps2], 3), scales)
+
+    @cached_property
+    def transform(self) -> Floats:
+        """d affine state / d state of the prospect, (p, p)."""
+        out = np.diag(self.units)
+        twelve = paper_parameters.sensitivity_jacobian(paper_parameters.parameters_of(self.state[:STATE_COUNT]))
+        out[:STATE_COUNT, :STATE_COUNT] = twelve * self.units[:STATE_COUNT]
+        return out
+
+    @cached_property
+    def start(self) -> Floats:
+        """Factor (p, p) of what is known already, of the states of the prospect."""
+        return triangle(self.known @ self.transform)
+
+    @property
+    def symbols(self) -> tuple[str, ...]:
+        return (*paper_parameters.SYMBOLS, *(coefficient.symbol for coefficient in self.model.coefficients))
+
+    @property
+    def still_s(self) -> float:
+        """The part of a dwell whose readings are used."""
+        margins = Stillness()
+        return max(self.dwell_s - margins.settle_s - margins.lead_s, 0.5 * self.dwell_s)
+
+    def rows(self, poses: Floats, at_s: Floats | None = None) -> Floats:
+        """Whitened rows (n, 3, p) of dwells at poses (n, k), rad.
+
+        ``at_s`` (n,): the middles of dwells that follow each other. Without it each would be the next.
+        """
+        stimulus = self.stimulus(poses, at_s)
+        return self.whitened(self.model.columns(stimulus, self.state), stimulus) @ self.transform
+
+    def balanced(self, count: int) -> Floats | None:
+        """Whitened rows (12, 3, p) that ``count`` dwells have in all, their directions spread as the vertices of an
+        icosahedron, wherever the gimbals may go; None where effects are in the model, which may depend on more."""
+        if self.model.effects:
+            return None
+        stimulus = self.stimulus(np.zeros((len(_ICOSAHEDRON), len(self.model.bench.axes))))
+        stimulus = replace(stimulus, force_mps2=self.model.bench.gravity_mps2 * _ICOSAHEDRON)
+        rows = self.whitened(self.model.columns(stimulus, self.state), stimulus) @ self.transform
+        return math.sqrt(count / len(_ICOSAHEDRON)) * rows
+
+    def columns(self, effects: Sequence[Effect], poses: Floats, wait_s: float = 0.0) -> Floats:
+        """Whitened columns (n, 3, p + q) of the affine model and further effects, of the next dwell at each pose.
+
+        wait_s: of the usual length, but so long after the arrival.
+        """
+        stimulus = self.stimulus(poses)
+        since_arrival_s = stimulus.since_arrival_s + wait_s
+        stimulus = replace(stimulus, elapsed_s=stimulus.elapsed_s + wait_s, since_arrival_s=since_arrival_s)
+        own = self.model.columns(stimulus, self.state), effect_columns(effects, stimulus)
+        return self.whitened(np.concatenate(own, axis=2), stimulus)
+
+    def whitened(self, design: Floats, stimulus: Stimulus) -> Floats:
+        count = len(stimulus)
+        means = Means(design, np.zeros((count, 3)), stimulus.force_mps2, np.full(count, self.readings),
+                      np.zeros((count, 2)))  # fmt: skip
+        root = np.linalg.cholesky(lift_rounding(mean_covariances(self.noise, means, self.state)))
+        return np.asarray(np.linalg.solve(root, design), float)
+
+    def stimulus(self, poses: Floats, at_s: Floats | None = None) -> Stimulus:
+        """What the block would feel at poses (n, k)."""
+        bench, count, last = self.model.bench, len(poses), self.last
+        following = at_s is not None
+        if at_s is None:
+            middle_s = (last.end_s + self.pause_s if last else 0.0) + 0.5 * self.dwell_s
+            at_s = np.linspace(middle_s, middle_s + 0.1, count)
+        force = bench.specific_force(at_s, poses)
+        before = last or Last(0.0, poses[0], force[0])
+        earlier = [
+            np.concatenate([own[None], those[:-1] if following else np.repeat(own[None], count - 1, axis=0)])
+            for own, those in ((before.force_mps2, force), (before.pose, poses))
+        ]
+        return Stimulus(
+            bench=bench,
+            elapsed_s=at_s,
+            since_arrival_s=np.full(count, _SINCE_ARRIVAL_S),
+            force_mps2=force,
+            previous_force_mps2=earlier[0],
+            pose=poses,
+            previous_pose=earlier[1],
+            temperature_c=np.full(count, before.temperature_c),
+            sensitivity=self.state[:STATE_COUNT].reshape(3, 4)[:, :3],
+            variance_mps2_2=np.repeat(before.variance_mps2_2[None], count, axis=0),
+        )
+
+
+def _less(factor: Floats, more: Floats) -> Floats:
+    """The factor (p, p) of the covariance P + P B P, B = ``more`` (p, p): what is considered only
+    (``noise_model.considered_information``)."""
+    if not more.any() or np.linalg.matrix_rank(
+        square_root_information.scale_columns(np.column_stack([factor, factor[:, :1]]))[0]
+    ) < len(factor):
+        return factor
+    inverse = np.linalg.inv(factor)  # P = inverse inverse^T; P + P B P = inverse (1 + inverse^T B inverse) inverse^T
+    inflated = np.linalg.cholesky(np.eye(len(factor)) + inverse.T @ more @ inverse)
+    return triangle(np.linalg.solve(inflated, factor))

@@ -1,0 +1,1 @@
+"""Which effect is missing: hypotheses, evidence, verdict, stepwise selection."""

@@ -1,0 +1,100 @@
+"""Two effects at once: they may mask each other, or explain together what neither does alone.
+
+A pair is two numbers of candidates of a test, or one and WALKS: a walk of the biases has no columns.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Mapping
+
+import numpy as np
+
+from kf_calib.diagnosis.candidate_tests import EQUAL, CandidateTests, chance_fall, margin_of, walk_path_margin
+
+WALKS = -1
+"""In a pair, in the place of a candidate's number."""
+
+_EQUAL_PAIR = 9.21  # as EQUAL, of pairs with neither effect in common: 1 %, 2 dof
+
+MOST = 3
+"""Pairs that are refitted, and that are said."""
+
+Pair = tuple[int, int]
+Pairs = Mapping[Pair, float]
+"""The scores of pairs: by how much they lower chi-squared, less the prices of both."""
+
+
+def candidate_pairs(test: CandidateTests) -> dict[Pair, float]:
+    """Pairs of candidates of which each is beyond chance beside the other."""
+    candidates, falls = test.scan.candidates, test.scan.statistics
+    prices = [chance_fall(each, test.effective_tests) if each.dof else 0.0 for each in candidates]
+    out = dict[Pair, float]()
+    for j, k in itertools.combinations([k for k, each in enumerate(candidates) if each.dof], 2):
+        one, two = candidates[j], candidates[k]
+        if str(one.effect) == str(two.effect):
+            continue
+        fall = falls[j] + test.scan.explained(two.basis - one.basis @ (one.basis.T @ two.basis))[0]
+        if fall - falls[j] > prices[k] and fall - falls[k] > prices[j]:
+            out[j, k] = float(fall - prices[j] - prices[k])
+    return out
+
+
+def walk_path_margin_beside(test: CandidateTests, pairs: Pairs, k: int) -> float:
+    """So much more than its fall less its threshold is the score of a walk beside a candidate, to be ahead of the best
+    column beside it where its likelihood is."""
+    candidates, tests = test.scan.candidates, test.effective_tests
+    scores = {j if i == k else i: score for (i, j), score in pairs.items() if k in (i, j)}
+    if not scores:
+        return 0.0
+    best = str(candidates[max(scores, key=lambda j: scores[j])].effect)
+    beside = [j for j in scores if str(candidates[j].effect) == best]
+    own = float(test.scan.statistics[k]) - chance_fall(candidates[k], tests)
+    falls = np.array([scores[j] - own + chance_fall(candidates[j], tests) for j in beside])
+    return walk_path_margin(test.scan, beside, falls, max(scores[j] for j in beside) - own, tests)
+
+
+def likeliest_pairs(test: CandidateTests, pairs: Pairs) -> list[Pair]:
+    """The best few pairs, of those of the same two effects the one of the best constants."""
+    named = dict[tuple[str, str], Pair]()
+    for pair in sorted(pairs, key=lambda pair: -pairs[pair]):
+        named.setdefault(names_of(test, pair), pair)
+    return list(named.values())[:MOST]
+
+
+def equal_pairs(test: CandidateTests, pairs: Pairs, score: float, but: Collection[str]) -> list[tuple[str, str]]:
+    """Names of the best few pairs that explain as much as what scores so much, none of them in ``but``: one or two."""
+    equal = EQUAL if len(but) == 1 else _EQUAL_PAIR
+    near = sorted((pair for pair in pairs if pairs[pair] > score - equal), key=lambda pair: -pairs[pair])
+    named = dict.fromkeys(names_of(test, pair) for pair in near)
+    return [pair for pair in named if not set(pair) & set(but)][:MOST]
+
+
+def exchangeable_effects(test: CandidateTests, pairs: Pairs, pair: Pair, least: float) -> dict[str, float]:
+    """Effects that do as well in the place of one of a pair, and the overlap with it, where that is above ``least``."""
+    both, out = names_of(test, pair), dict[str, float]()
+    for other in pairs:
+        shared = set(pair) & set(other)
+        if len(shared) != 1:
+            continue
+        (lost,), (new,) = set(pair) - shared, set(other) - shared
+        if pairs[other] > pairs[pair] - margin_of(None if lost == WALKS else test.scan.candidates[lost]):
+            name, overlap = name_of(test, new), candidate_overlap(test, lost, new)
+            if overlap > max(least, out.get(name, 0.0)) and name not in both:
+                out[name] = overlap
+    return out
+
+
+def names_of(test: CandidateTests, pair: Pair) -> tuple[str, str]:
+    one, two = (name_of(test, k) for k in pair)
+    return one, two
+
+
+def name_of(test: CandidateTests, k: int) -> str:
+    return test.walking if k == WALKS else str(test.scan.candidates[k].effect)
+
+
+def candidate_overlap(test: CandidateTests, one: int, other: int) -> float:
+    """The overlap of two candidates; 1 with a walk, which can take any path."""
+    candidates = test.scan.candidates
+    return 1.0 if WALKS in (one, other) else candidates[one].overlap(candidates[other])

@@ -1,0 +1,389 @@
+"""Which physical effect is missing: what the misfit says, and what it cannot say.
+
+The candidates of the catalogue are projected off the model (``score_test``) and tested together: the p-value of a
+suspect is that of the run, the chance that any of them would look as good with nothing missing. A suspect is named only
+where the model with it fits; where several fit equally well they are all named; where none does the answer is
+*unknown*.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from os import PathLike
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from kf_calib.bench.streams import Source
+from kf_calib.design import next_orientation as advise
+from kf_calib.design.next_orientation import Advice
+from kf_calib.diagnosis.bayes_factor import as_fall
+from kf_calib.diagnosis.candidate_tests import (
+    EQUAL,
+    CandidateTests,
+    assess_candidates,
+    candidate_frame,
+    chance_fall,
+    threshold,
+)
+from kf_calib.diagnosis.effect_pairs import (
+    MOST,
+    WALKS,
+    Pair,
+    Pairs,
+    candidate_overlap,
+    candidate_pairs,
+    equal_pairs,
+    exchangeable_effects,
+    likeliest_pairs,
+    names_of,
+    walk_path_margin_beside,
+)
+from kf_calib.diagnosis.refit_checks import fits_the_run, restoring_time_s
+from kf_calib.diagnosis.results import Diagnosis, Suspect, with_effects
+from kf_calib.diagnosis.scatter_hypothesis import (
+    could_be_scatter,
+    dwell_noise_is_stated,
+    explains_more_than_scatter,
+    least_noisy,
+    passes_f_test,
+    scatter_is_possible,
+    with_noise_as_stated,
+)
+from kf_calib.diagnosis.unknown_effect import JUMP, Family, families
+from kf_calib.diagnosis.verdict import verdict_in_words
+from kf_calib.dwells import window_average
+from kf_calib.effects import walk_named
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.outlying_dwell import outlying_in_words
+from kf_calib.estimation.results import Calibration, format_p
+from kf_calib.estimation.score_test import scan
+
+_ALIKE = 0.5  # overlap above which two suspects may be taken for each other
+_SHOWN = 6  # suspects that are refitted and shown
+
+
+def diagnose(run: Calibration | Source | str | PathLike[str]) -> Diagnosis:
+    """What is missing in the model of a calibration, from its dwell factors alone; a recording is calibrated first."""
+    before = run if isinstance(run, Calibration) else calibrate(run)
+    with threadpool_limits(1, user_api="blas"):  # small decompositions
+        return _diagnosed(before)
+
+
+def _diagnosed(before: Calibration) -> Diagnosis:
+    if before.outlying:  # a dwell that is wrong is no effect, and looks like many
+        test = assess_candidates(before.fit, frames=before.frames)
+        verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {outlying_in_words(before.outlying)}"
+        return Diagnosis(before, test, (), (), test.consistent is False, (), {}, None, verdict)
+    test = _without_vibration(before, assess_candidates(before.fit, frames=before.frames))
+    found = _explained(before, test)
+    if found.unknown and test.without_lines:  # of one phase all along and not of one amplitude
+        test = test.without_lines
+        found = _explained(before, test)
+    if test.vibration and not before.fit.dwells[0].averaged and before.reread is not None:
+        window_s = window_average.window_s(test.vibration)
+        rested = before.reread(replace(before.settings, window_s=window_s))
+        still = assess_candidates(rested.fit, frames=rested.frames)
+        still = still.without_lines or still  # what the windows let through is vibration, too
+        found = _explained(rested, replace(still, vibration=test.vibration))
+    found = replace(found, back_s=restoring_time_s(found))
+    return replace(found, verdict=verdict_in_words(found))
+
+
+def _explained(before: Calibration, test: CandidateTests) -> Diagnosis:
+    """What explains the misfit, one effect or two, and what could as well; or nothing does."""
+    found = _or_walk(_likeliest(before, test))
+    if test.consistent is not False or dwell_noise_is_stated(before):
+        return found
+    return _told_in_its_noise(found)
+
+
+def _told_in_its_noise(found: Diagnosis) -> Diagnosis:
+    """The same where noise from dwell to dwell was estimated: by the noise that is left beside what explains most.
+
+    Estimated without it, or left out, the noise is another, and what is little in one is much in the other.
+    """
+    before, test = found.before, found.test
+    fitting = [
+        s.refit for s in found.suspects if s.fits and explains_more_than_scatter(before, test, (s.name,), s.refit)
+    ]
+    formulas = [with_effects(before, each.formulas) for _, each in _formulas(found)[:1]]
+    refit = least_noisy([*([found.after] if found.after else []), *fitting, *formulas])
+    if refit is None or not (found.missing or found.unknown or fitting):
+        return found
+    stated = with_noise_as_stated(before, refit)
+    again = _or_walk(
+        _likeliest(stated, _without_vibration(stated, assess_candidates(stated.fit, frames=stated.frames)))
+    )
+    if not (again.missing or again.unknown):
+        return found
+    suspects = tuple(replace(each, refit=found.refit_with(each.name)) for each in again.suspects)
+    after = with_effects(before, again.missing) if again.missing else None
+    return replace(again, before=before, judged=stated, suspects=suspects, after=after)
+
+
+def _likeliest(before: Calibration, test: CandidateTests) -> Diagnosis:
+    """One effect or two that explain the misfit, and those that look like them."""
+    nothing = Diagnosis(before, test, (), (), False, (), {}, None, "")
+    if test.consistent is not False:
+        return nothing
+    suspects = _suspects(before, test)
+    # what explains all of it explains most: one that fits far behind the first has only made the noise large enough,
+    # but not one behind a walk that does not fit, which may take any path
+    leading = [test.scores[each.name] for each in suspects if each.fits or each.name != test.walking]
+    least = max(leading, default=0.0) - 2.0 * EQUAL
+    fitting = [each for each in suspects if each.fits and test.scores[each.name] > least]
+    explaining = [each for each in fitting if explains_more_than_scatter(before, test, (each.name,), each.refit)]
+    found = replace(nothing, suspects=suspects, as_scatter=bool(fitting) and not explaining)
+    pairs = candidate_pairs(test) if not explaining or explaining[0].name in (*test.best, test.walking) else {}
+    if explaining:
+        first = explaining[0].name
+        clearly = _clearly_better(found, pairs, first)
+        walks = [each for each in explaining[1:] if each.name == test.walking]
+        standing = (each for each in (explaining[0], *walks) if not _is_outdone(found, each))
+        return _two(found, clearly, first) or _one(found, next(standing, None), pairs)
+    several = _two(found, pairs | _pairs_with_walk(found, pairs)) or _beside_lines(found)
+    return several or replace(found, unknown=not scatter_is_possible(before))
+
+
+def _clearly_better(found: Diagnosis, pairs: Pairs, first: str) -> Pairs:
+    """Pairs that do clearly better than the one effect that explains the misfit alone; those with a walk of the biases
+    where that is the one, or where two columns do."""
+    test = found.test
+    least = test.scores[first] + EQUAL
+    if first == test.walking:  # two columns have more directions to choose, which a path has not
+        columns = {pair: score for pair, score in pairs.items() if score > least + EQUAL}
+        return columns | _pairs_with_walk(found, pairs, beyond=True)
+    columns = {pair: score for pair, score in pairs.items() if score > least}
+    walks = _pairs_with_walk(found, pairs) if columns else {}
+    return columns | {pair: score for pair, score in walks.items() if score > least}
+
+
+def _or_walk(found: Diagnosis) -> Diagnosis:
+    """With a walk of the biases in the set, where the dwells are too few to tell its path from what was named."""
+    model = found.before.fit.carried.model
+    walk = walk_named(model.bench)
+    if not walk or not found.missing or model.walks or walk in found.ambiguity:
+        return found
+    if passes_f_test(found.before, found.test, found.missing):
+        return found
+    alone = walk if len(found.missing) > 1 else ""
+    return replace(found, ambiguity=(*found.ambiguity, walk), overlaps={**found.overlaps, walk: 1.0}, alone=alone)
+
+
+def _beside_lines(found: Diagnosis) -> Diagnosis | None:
+    """What explains the misfit beside the oscillation that makes the lines: that has no column to be paired with."""
+    test = found.test
+    if not test.oscillating:
+        return None
+    known = found.refit_with(test.oscillating)
+    rest = _explained(known, assess_candidates(known.fit, test.effective_tests, frames=found.before.frames))
+    if not rest.missing:
+        return None
+    both = (*rest.missing, test.oscillating)
+    ambiguity = (*both, *(name for name in rest.ambiguity if name not in both))
+    after = with_effects(found.before, both)  # alone, an oscillation may have been drawn to what the others explain
+    return replace(
+        rest, before=found.before, test=test, suspects=found.suspects, missing=both, ambiguity=ambiguity,
+        after=after if fits_the_run(after, test, len(both)) else rest.after,
+    )  # fmt: skip
+
+
+def _without_vibration(before: Calibration, test: CandidateTests) -> CandidateTests:
+    """The test as it is where an oscillation of one amplitude explains its lines; else they are vibration."""
+    if test.without_lines is None:
+        return test
+    refit = with_effects(before, (test.oscillating,))
+    # what the coherent fit over the whole run finds of the amplitude that each stretch of readings shows
+    share = np.linalg.norm(refit.estimate.state[refit.model.parts[test.oscillating]]) / np.linalg.norm(
+        test.lines[0].amplitude_mps2
+    )
+    return test if share > 0.5 else test.without_lines
+
+
+def _is_outdone(found: Diagnosis, suspect: Suspect) -> bool:
+    """Whether a formula that is no known effect explains the misfit better."""
+    if suspect.name in found.test.best:
+        return _outdone(found, suspect.refit, (suspect.name,))
+    return _walks_not(found, suspect)
+
+
+def _one(found: Diagnosis, first: Suspect | None, pairs: Pairs) -> Diagnosis:
+    """One effect explains the misfit; with it, all that explain it as well and look like it, alone or in pairs.
+
+    None: a formula that is no known effect explains it better than any, and than a walk, which could take its path.
+    """
+    test = found.test
+    if first is None:
+        return replace(found, unknown=True)
+    close = test.rivals(first.name)
+    close += [name for name in test.holding(first.name) if name not in close]
+    numbers = {name: test.best.get(name, WALKS) for name in (first.name, *close)}  # a walk, a line: no columns
+    overlaps = {
+        name: candidate_overlap(test, numbers[first.name], numbers[name]) for name in close if name != first.name
+    }
+    overlaps = {name: overlap for name, overlap in overlaps.items() if overlap > _ALIKE}
+    single = replace(found, missing=(first.name,), ambiguity=(first.name, *overlaps), overlaps=overlaps)
+    single = replace(single, as_scatter=could_be_scatter(found.before, test, (first.name,), first.refit))
+    together = equal_pairs(test, pairs, test.scores[first.name], {first.name})
+    return replace(_beside(single, [pair for pair in together if _both_fit(found, pair)]), after=first.refit)
+
+
+def _both_fit(found: Diagnosis, names: tuple[str, str]) -> bool:
+    return fits_the_run(with_effects(found.before, names), found.test, len(names))
+
+
+def _beside(found: Diagnosis, together: Sequence[tuple[str, str]]) -> Diagnosis:
+    """With the pairs that explain as much in the ambiguity set."""
+    added = dict.fromkeys(name for pair in together for name in pair if name not in found.ambiguity)
+    return replace(found, together=tuple(together), ambiguity=(*found.ambiguity, *added))
+
+
+def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool:
+    """Whether some formula explains the misfit better than the effects at the constants that were found for them.
+
+    Formulas that are known effects themselves do not count: together they are no effect that is unknown.
+    """
+    fitted, tests = found.before.fit, found.test.effective_tests
+    effects = [effect for effect in refit.model.effects if str(effect) in names and not effect.walks]
+    scanned = scan(fitted.carried, fitted.noise.judging, effects)
+    own, _ = scanned.explained(np.concatenate([each.basis for each in scanned.candidates], axis=1))
+    own -= sum(chance_fall(each, tests) for each in scanned.candidates)
+    if found.test.walking in names:
+        own += 2.0 * refit.fit.walk_gain - threshold(1, tests)
+    better = [each for gain, each in _formulas(found) if gain > own + EQUAL]
+    if not _refits_compare(found, names):
+        return bool(better)
+    least = _left(found, refit, names) - EQUAL
+    return any(_left(found, with_effects(found.before, each.formulas), (), each.dof) < least for each in better[:MOST])
+
+
+def _refits_compare(found: Diagnosis, names: Sequence[str]) -> bool:
+    """Whether refits have one noise, so that it can be said what each leaves: what is large is not linear, and a scan
+    that says what each would lower chi-squared by is off by many times what noise does."""
+    return dwell_noise_is_stated(found.before) and all(name in found.test.best for name in names)
+
+
+def _clearly_less_left(found: Diagnosis, refit: Calibration, names: Sequence[str], alone: str) -> bool:
+    """Whether effects leave clearly less than one of them alone, or another, as far as refits can say that."""
+    if not _refits_compare(found, (*names, alone)):
+        return True
+    return _left(found, refit, names) < _left(found, found.refit_with(alone), (alone,)) - EQUAL
+
+
+def _left(found: Diagnosis, refit: Calibration, names: Sequence[str], dof: int = 0) -> float:
+    """Chi-squared that effects, and a formula of ``dof``, leave, and what chance would have lowered it by."""
+    test = found.test
+    prices = [chance_fall(test.candidate(name), test.effective_tests) for name in names]
+    return refit.consistency.statistic + sum(prices) + (threshold(dof, test.effective_tests) if dof else 0.0)
+
+
+def _formulas(found: Diagnosis) -> list[tuple[float, Family]]:
+    """Formulas that are no known effects, each with its fall of chi-squared less what chance would give it, the best
+    first."""
+    test = found.test
+    known = [test.candidate(name).effect for name in test.best]
+    fitted = found.before.fit
+    frame = candidate_frame(fitted, found.before.frames)
+    tried = [each for each in families(fitted, known, frame) if each.dof and not each.known]
+    out = [(each.fall - threshold(each.dof, test.effective_tests), each) for each in tried]
+    return sorted(out, key=lambda each: -each[0])
+
+
+def _walks_not(found: Diagnosis, first: Suspect) -> bool:
+    """Whether what could be a walk of the biases is one jump, or follows what the platform does rather than time.
+
+    A walk may take any path: what is simpler, likelier at whatever moment or of whatever shape it is, and leaves
+    nothing goes before it.
+    """
+    if not first.refit.noise.walk_mps2_per_sqrt_s:
+        return False
+    tried, test = [each for _, each in _formulas(found)], found.test
+    jumps, moved = ([each for each in tried if each.driver == JUMP], [each for each in tried if not each.of_time])
+    walk = test.scores[first.name] - test.paths + threshold(1, test.effective_tests)
+    for simpler in filter(None, (jumps, moved)):
+        ranks, falls = np.array([each.rank for each in simpler]), np.array([each.fall for each in simpler])
+        best = simpler[int(np.argmax(falls - ranks))]
+        if as_fall(ranks, falls) > walk + EQUAL and fits_the_run(with_effects(found.before, best.formulas), test):
+            return True
+    return False
+
+
+def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:
+    """Two effects explain the misfit where no single one does: they may mask each other. The best few are refitted.
+
+    alone: a single one that would do, if not as well; a walk can take any path, so it stays in the set.
+    """
+    test = found.test
+    for pair in likeliest_pairs(test, pairs):
+        both = names_of(test, pair)
+        refit = with_effects(found.before, both)
+        if alone and not _clearly_less_left(found, refit, both, alone):
+            continue
+        if not (explains_more_than_scatter(found.before, test, both, refit) and fits_the_run(refit, test, len(both))):
+            continue
+        if _outdone(found, refit, both):
+            return None
+        walks = bool(alone) and alone == test.walking and alone not in both
+        overlaps = ({alone: 1.0} if walks else {}) | exchangeable_effects(test, pairs, pair, _ALIKE)
+        named = replace(found, missing=both, ambiguity=(*both, *overlaps), overlaps=overlaps, after=refit)
+        named = replace(
+            named, alone=alone if walks else "", as_scatter=could_be_scatter(found.before, test, both, refit)
+        )
+        return _beside(named, equal_pairs(test, pairs, pairs[pair], both))
+    return None
+
+
+def _pairs_with_walk(found: Diagnosis, pairs: Pairs, beyond: bool = False) -> dict[Pair, float]:
+    """Pairs of an effect and a walk of the biases, for those effects that are likeliest beside a walk, where both do
+    better than the walk alone; ``beyond``: clearly so, and the effect is beyond chance beside the walk.
+
+    The walk beside the effect is judged by its likelihood, after a refit with both, against the ``pairs`` of columns.
+    """
+    before, test = found.before, found.test
+    if not test.walking:
+        return {}
+    candidates, tests, out = test.scan.candidates, test.effective_tests, dict[Pair, float]()
+    beside = assess_candidates(found.refit_with(test.walking).fit, tests, frames=found.before.frames)
+    least = test.scores[test.walking] - test.paths + (EQUAL if beyond else 0.0)
+    likely = [name for name in beside.ranked if name in test.best and (beside.scores[name] > 0.0 or not beyond)]
+    for name in likely[:MOST]:
+        k = test.best[name]
+        own = float(test.scan.statistics[k]) - chance_fall(candidates[k], tests)
+        walk = 2.0 * with_effects(before, (name, test.walking)).fit.walk_gain - threshold(1, tests)
+        if walk > 0.0 and own + walk > least:
+            out[k, WALKS] = own + walk + walk_path_margin_beside(test, pairs, k)
+    return out
+
+
+def _suspects(before: Calibration, test: CandidateTests) -> tuple[Suspect, ...]:
+    """The likeliest candidates, each refitted and judged anew."""
+    out = list[Suspect]()
+    for name in [name for name in test.ranked if test.scores[name] > 0][:_SHOWN]:
+        refit = with_effects(before, (name,))
+        dof = 1 if name not in test.best else test.candidate(name).dof
+        statistic = test.scores[name] if name not in test.best else float(test.scan.statistics[test.best[name]])
+        known = tuple(before.parameters)[12:]
+        out.append(Suspect(name, statistic, dof, test.p_values[name], fits_the_run(refit, test), refit, known))
+    return tuple(out)
+
+
+def next_orientation(found: Diagnosis) -> tuple[Advice, str] | None:
+    """Where to go next, and why: to tell equal suspects apart, to size the one there is, or to show what is hidden."""
+    fitted, test = (found.judged or found.before).fit, found.test
+    named = [name for name in found.ambiguity if name in test.best]
+    if named and not found.unknown:
+        first = test.candidate(named[0])
+        rivals = [test.candidate(name).effect for name in named[1:5]] if len(found.missing) == 1 else []
+        advice = advise.to_tell_apart(fitted, first.effect, test.scan.coefficients(first), rivals)
+        if advice is None:
+            return None
+        words = f"tells {named[0]} from {', '.join(advice.told)}" if advice.told else f"shows {named[0]} best"
+        stay = "" if advice.stay_s is None else f" in {advice.stay_s / 60.0:.0f} min there"
+        return advice, f"{words}: separation {advice.before:.1f} -> {advice.after:.1f} sigma{stay}"
+    hidden = [test.candidate(name).effect for name in test.invisible if name in test.best]
+    shown = advise.to_show(fitted, hidden)
+    if shown is None or not shown[1]:
+        return None
+    return shown[0], f"would show {shown[1]} of {len(hidden)} effects that these orientations cannot"

@@ -1,0 +1,217 @@
+"""Journals of improvement: every step with its figures as TOML, to keep beside a calibration and to replay.
+
+    version = "0.1.0"
+    stopped_because = "consistent"
+    reason = "Nothing is left that noise would not leave (p = 0.31)."
+    model = ["second-order"]
+
+    [recording]                             # replaying the journal asks for this very file
+    name = "hidden.mcap"
+    sha256 = "4f0e..."
+
+    [options]                               # of the command line, where they were given; a replay takes them from here
+    angle_sigma_deg = "0.002"
+
+    [sha256]                                # of the Python files under effects_from, which a replay asks leave to run
+    "/home/me/my_effects.py" = "9c1a..."
+
+    [start]                                 # figures of the first model: SI, every digit
+    held_out_rms_mps2 = 1.4e-5
+
+    [[steps]]
+    added = "second-order"
+    by = "diagnosis"
+    undone = false
+    ...
+
+Figures are kept to the last bit, and a replay says whether it found the same.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NotRequired
+
+from typing_extensions import TypedDict
+
+from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.diagnosis.stepwise_selection import By, Improvement, SelectionStep, begin, take_step
+from kf_calib.effects import refuse_unfit
+from kf_calib.effects.programs import Program
+from kf_calib.errors import InputError
+from kf_calib.estimation.results import Calibration
+from kf_calib.sources.files.bags import files_of
+from kf_calib.support.output_files import write_whole
+from kf_calib.support.toml_files import table_of
+from kf_calib.support.value_schema import FINITE, TEXT, Misfit, converted
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What an improvement was made from: the recording, its fingerprint, options, and Python files of effects."""
+
+    name: str
+    sha256: str
+    options: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    programs: tuple[Program, ...] = ()
+
+    @classmethod
+    def of(cls, recording: Path) -> Origin:
+        """Raises InputError where the recording cannot be read."""
+        try:
+            digest = hashlib.sha256()
+            for path in files_of(recording):
+                with path.open("rb") as file:
+                    hashlib.file_digest(file, lambda: digest)
+            return cls(recording.name, digest.hexdigest())
+        except OSError as error:
+            raise InputError(f"{recording}: cannot be read ({error.strerror}): name a recording.") from None
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A step as a journal tells it: what to add, what to take out, who chose it, and the figures it led to."""
+
+    added: str | None
+    dropped: tuple[str, ...]
+    by: By
+    figures: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Journal:
+    """What a journal says: steps that were taken back are left out; start: figures of the first model."""
+
+    origin: Origin
+    version: str
+    start: Mapping[str, float]
+    choices: tuple[Choice, ...]
+    asked: bool
+
+    def refuse_other(self, origin: Origin, path: Path | None) -> None:
+        """Raise InputError where the recording is not the one the journal was made from."""
+        if origin.sha256 != self.origin.sha256:
+            raise InputError(
+                f"{path}: is the journal of another recording, {self.origin.name}: name that one, or put the same "
+                "effects into this one with --model."
+            )
+
+
+def figures(found: Diagnosis) -> dict[str, float]:
+    """What is compared when a journal is replayed: the run's p-value, the errors, every parameter with its sigma."""
+    result, out = found.before, dict[str, float | None]()
+    out |= {
+        "p_value": found.test.p_value,
+        "residual_rms_mps2": result.residual_rms_mps2,
+        "held_out_rms_mps2": result.held_out_rms_mps2,
+        "held_out_floor_mps2": result.held_out_floor_mps2,
+    }
+    for parameter in result.parameters.values():
+        out |= {parameter.symbol: parameter.value, f"sigma {parameter.symbol}": parameter.sigma}
+    return {key: value for key, value in out.items() if value is not None}
+
+
+def write(path: Path, state: Improvement, origin: Origin) -> None:
+    """Write a journal of the steps so far; the file is whole or not there, and one of that name is replaced."""
+    import tomli_w
+
+    table: dict[str, Any] = {
+        "version": _version(),
+        "stopped_because": state.because,
+        "reason": state.reason,
+        "model": list(state.effects),
+        "recording": {"name": origin.name, "sha256": origin.sha256},
+        "options": {**origin.options, "effects_from": [str(each.path) for each in origin.programs]},
+        "sha256": {str(each.path): each.sha256 for each in origin.programs},
+        "start": figures(state.start),
+        "steps": [_entry(step) for step in state.history],
+    }
+    head = "# Journal of kf_calib: kf-calib improve RECORDING --from-journal THIS_FILE\n"
+    write_whole(path, (head + tomli_w.dumps(table)).encode())
+
+
+def _entry(step: SelectionStep) -> dict[str, Any]:
+    out: dict[str, Any] = {} if step.added is None else {"added": step.added}
+    tests = [vars(each) for each in step.dropped]
+    return out | {"by": step.by, "undone": step.undone, "dropped": tests, "figures": figures(step.found)}
+
+
+class _Recording(TypedDict):
+    name: TEXT
+    sha256: TEXT
+
+
+class _Dropped(TypedDict):
+    name: TEXT
+
+
+class _Step(TypedDict):
+    by: By
+    undone: bool
+    dropped: list[_Dropped]
+    figures: dict[str, FINITE]
+    added: NotRequired[TEXT]
+
+
+class _Content(TypedDict):
+    version: TEXT
+    stopped_because: TEXT
+    recording: _Recording
+    options: dict[str, TEXT | bool | int | FINITE | list[TEXT | int | FINITE]]
+    start: dict[str, FINITE]
+    steps: list[_Step]
+    sha256: NotRequired[dict[TEXT, TEXT]]
+
+
+def read(path: Path) -> Journal:
+    """Read a journal and check all that can be checked before the Python files that it names have run.
+
+    Raises InputError, with the path, where the file cannot be read or is no journal.
+    """
+    table = table_of(path, "those of improve --journal")
+    try:
+        content: _Content = converted(table, _Content)
+        options, sums = dict(content["options"]), content.get("sha256", {})
+        files = converted(options.pop("effects_from", []), list[TEXT])
+        programs = tuple(Program(Path(text), sums.get(text, "")) for text in files)
+        choices = tuple(_choice(step) for step in content["steps"] if not step["undone"])
+        given = converted(options.get("effects", []), list[TEXT])
+        refuse_unfit([*given, *(choice.added for choice in choices if choice.added)], programs)
+    except (Misfit, InputError) as error:
+        raise InputError(f"{path}: is no journal of improve ({error}): write one with --journal.") from None
+    origin = Origin(content["recording"]["name"], content["recording"]["sha256"], options, programs)
+    return Journal(origin, content["version"], content["start"], choices, content["stopped_because"] == "asked")
+
+
+def _choice(step: _Step) -> Choice:
+    return Choice(step.get("added"), tuple(each["name"] for each in step["dropped"]), step["by"], step["figures"])
+
+
+def replayed(
+    journal: Journal, start: Calibration, on_step: Callable[[Improvement], None] | None = None
+) -> tuple[Improvement, float]:
+    """The steps of a journal taken again, and the largest relative difference from its figures: 0 to the last bit."""
+    state = begin(start)
+    differences = [_difference(journal.start, figures(state.found))]
+    for choice in journal.choices:
+        state = take_step(state, choice.added, choice.dropped, choice.by)
+        differences.append(_difference(choice.figures, figures(state.found)))
+        if on_step is not None:
+            on_step(state)
+    return replace(state, asked=journal.asked), max(differences)
+
+
+def _difference(one: Mapping[str, float], other: Mapping[str, float]) -> float:
+    """The largest relative difference of two sets of figures; infinite where one has a figure the other lacks."""
+    if one.keys() != other.keys():
+        return float("inf")
+    return max(abs(one[key] - other[key]) / max(abs(one[key]), abs(other[key]), 1e-300) for key in one)
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("kf_calib")

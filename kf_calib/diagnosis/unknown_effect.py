@@ -1,0 +1,250 @@
+"""A misfit that no known effect explains, described: which channel, driven by what, a formula to begin with."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.diagnosis.candidate_tests import EQUAL
+from kf_calib.diagnosis.within_dwell_trend import Trend
+from kf_calib.diagnosis.within_dwell_trend import trend as trend_of
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.effects import Effect, effect_named, walk_named
+from kf_calib.effects.formula import formula
+from kf_calib.errors import InputError
+from kf_calib.estimation.fit import Fit, fit
+from kf_calib.estimation.results import consistency
+from kf_calib.estimation.score_test import Frame, batches
+from kf_calib.support import stage
+
+_CHANCE = 1e-4  # of a family to fall as much where nothing is missing: there are about a hundred
+_WITHIN = 0.01  # of trends within dwells
+_SAME = 0.99  # cosine above which a formula is a known effect
+_TOGETHER = 24  # columns of families that are tried at a time
+_DECAYS_S = (10, 30, 100, 300)
+_JUMPS = 100  # at most
+
+JUMP = "time (a jump)"
+DECAY = "time (a decay)"
+ARRIVAL = "time since arrival"
+PERIODIC = "time (periodic)"
+IRREGULAR = "nothing that was recorded (irregular from dwell to dwell)"
+WITHIN = "time (irregular, within dwells too)"
+
+
+@dataclass(frozen=True)
+class Description:
+    """channel: x, y, z or all; driver: in words; share: of what is beyond noise; formulas: to add as they stand."""
+
+    channel: str
+    driver: str
+    share: float
+    formulas: tuple[str, ...]
+
+    @property
+    def formula(self) -> str:
+        return self.formulas[0]
+
+
+@dataclass(frozen=True)
+class Family:
+    """Formulas with one driver, as a candidate of its own; fall: of chi-squared, with all of them; rank: of what they
+    see.
+
+    falls: with each of them alone; formulas: as they can be added. known: each of them is what some known effect is,
+    or nearly.
+    """
+
+    driver: str
+    texts: tuple[str, ...]
+    fall: float
+    rank: int
+    falls: tuple[float, ...]
+    known: bool = False
+
+    @property
+    def formulas(self) -> tuple[str, ...]:
+        return tuple(_named(text, number) for number, text in enumerate(self.texts))
+
+    @property
+    def dof(self) -> int:
+        """One more where the moment of a jump, a time constant or a period is looked for, as an effect's constant
+        (``chance_fall``)."""
+        return self.rank + (self.rank > 0 and self.driver in (JUMP, DECAY, ARRIVAL, PERIODIC))
+
+    @property
+    def of_time(self) -> bool:
+        return self.driver.startswith("time")
+
+    @property
+    def score(self) -> float:
+        """The fall less what chance gives so many columns."""
+        from scipy.special import chdtri
+
+        return self.fall - float(chdtri(self.dof, _CHANCE)) if self.dof else 0.0
+
+
+def describe(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Description | None:
+    """The family of formulas that explains most of what the model leaves, if any explains more than chance would.
+
+    None of them does where the dwells are likelier to scatter or their biases to walk: to try is the walk, then. What
+    goes on within dwells, too, is a matter of time. residuals: of the dwells, (D, 3).
+    """
+    from scipy.special import chdtri
+
+    found, misfit = families(fitted), consistency(fitted)
+    excess = misfit.statistic - misfit.dof
+    best = max(found, key=lambda family: family.score)
+    walk, scatter = fitted.walk_gain, fitted.scatter_gain
+    irregular = 2.0 * max(walk, scatter)
+    name = "" if fitted.carried.model.walks else walk_named(fitted.carried.model.bench)
+    within = name and _goes_on(trend) and (best.score <= 0.0 or _goes_on(_trend_beside(fitted, best)))
+    if name and (within or irregular - float(chdtri(1, _CHANCE)) > max(best.score, 0.0)):
+        share = irregular / max(excess, irregular, 1.0)
+        back_s = _back_s(fitted, name) if 2.0 * (walk - scatter) > EQUAL else None
+        driver = f"time (irregular, back within about {one_digit_seconds(back_s)})" if back_s else IRREGULAR
+        return Description(_channel(residuals), WITHIN if within and not back_s else driver, share, (name,))
+    if best.score <= 0.0:
+        return None
+    order = np.argsort(best.falls)[::-1]
+    enough = 1 if best.falls[order[0]] > 0.7 * best.fall else len(order)
+    formulas = tuple(_named(best.texts[k], number) for number, k in enumerate(order[:enough]))
+    share = min((best.fall - best.dof) / excess, 1.0) if excess > 0.0 else 1.0
+    return Description(_channel(residuals), best.driver, share, formulas)
+
+
+def one_digit_seconds(duration_s: float) -> str:
+    """To one digit, as 30 s."""
+    return f"{float(f'{duration_s:.1g}'):g} s"
+
+
+def _back_s(fitted: Fit, walk: str) -> float | None:
+    """With which time constant what goes to and fro comes back, s; None where it does so as a walk does."""
+    model = fitted.carried.model
+    walked = fit(fitted.dwells, model + effect_named(walk, model.bench), 0.0, fitted.carried.slews)
+    if not walked.noise.walk_mps2_per_sqrt_s:
+        return None
+    gain, back_s = walked.back_gain
+    return back_s if 2.0 * gain > EQUAL else None
+
+
+def _goes_on(trend: Trend | None) -> bool:
+    """Whether what is left goes on within dwells."""
+    return trend is not None and trend.p_value < _WITHIN
+
+
+def _trend_beside(fitted: Fit, family: Family) -> Trend | None:
+    """What is left of the trends with a family in the model."""
+    model = fitted.carried.model
+    for text in family.formulas:
+        model += effect_named(text, model.bench)
+    return trend_of(fit(fitted.dwells, model, fitted.noise.walk_mps2_per_sqrt_s, fitted.carried.slews))
+
+
+def families(fitted: Fit, known: Sequence[Effect] = (), frame: Frame | None = None) -> list[Family]:
+    """All families tried on what the model leaves, beside effects that are ``known``; once for each fit.
+
+    frame: that has the columns of all of these effects, or all but some.
+    """
+    key = tuple((str(effect), effect.value) for effect in known)
+    if key not in fitted.families:
+        frame = frame or Frame(fitted.carried, fitted.noise.judging, known)
+        had = [effect for effect in known if frame.has(effect)]
+        others = [effect for effect in known if not frame.has(effect)]
+        fitted.families[key] = _tried(fitted, frame.only(had), others)
+    return fitted.families[key]
+
+
+def _tried(fitted: Fit, frame: Frame, others: Sequence[Effect]) -> list[Family]:
+    bench, tried = fitted.carried.model.bench, list[tuple[str, list[str], list[Effect]]]()
+    for driver, texts in _families(bench, fitted.dwells):
+        with contextlib.suppress(InputError):  # a jump so late, a decay so fast that the trial of a formula misses it
+            own = [formula(_named(text), bench.axes, bench.gravity_mps2, checked=False) for text in texts]
+            tried.append((driver, texts, [*own]))
+    stage.say(f"trying {sum(len(texts) for _, texts, _ in tried)} formulas")
+    out, known = list[Family](), len(frame.effects) + len(others)
+    for part in batches([sum(len(each.coefficients) for each in effects) for _, _, effects in tried], _TOGETHER):
+        some = [tried[k] for k in part]
+        scanned = frame.scan(fitted.carried, [*others, *(effect for _, _, effects in some for effect in effects)])
+        beside, left = scanned.candidates[:known], iter(scanned.candidates[known:])
+        falls = iter(scanned.statistics[known:].tolist())
+        for driver, texts, effects in some:
+            parts = [next(left) for _ in effects]
+            same = all(any(own.within(each, _SAME) for each in beside) for own in parts)
+            fall, rank = scanned.explained(np.concatenate([own.basis for own in parts], axis=1))
+            out.append(Family(driver, tuple(texts), fall, rank, tuple(next(falls) for _ in effects), same))
+    return out
+
+
+def _named(text: str, number: int = 0) -> str:
+    """``:z = sin(q1)`` or ``sin(q1)`` as a formula with a name."""
+    name = f"mine{number + 1}" if number else "mine"
+    return f"{name}{text}" if text.startswith(":") else f"{name} = {text}"
+
+
+def _channel(residuals: Floats) -> str:
+    """The accelerometer with most of the squared residuals (D, 3) of the dwells; all, where none stands out."""
+    squares = np.sum(residuals**2, axis=0)
+    return "xyz"[int(np.argmax(squares))] if squares.max() > 0.7 * squares.sum() else "all"
+
+
+def _families(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
+    """What may drive a misfit, in words, and formulas of it; ``:place = ...`` turns a gimbal or the base."""
+    yield from _of_force()
+    yield from _of_gimbals(len(bench.axes))
+    yield from _of_time(dwells)
+    yield from _of_surroundings(bench)
+
+
+def _of_force() -> Iterator[tuple[str, list[str]]]:
+    yield "specific force, degree 2", ["a*a", "a*p", "a*o", "p*o", "p*p"]
+    for terms in (["a**3"], ["a*a*p"], ["a*a*o"], ["a*p*o"], ["p**3"], ["o**3"], ["a**3", "a*p*p", "p**3", "a*a*p"]):
+        yield "specific force, degree 3", terms
+    for terms in (["a**4"], ["a**4", "a*a"], ["p**4", "p*p"], ["a**2*p**2"]):
+        yield "specific force, degree 4", terms
+    for terms in (["a**5"], ["a**5", "a**3"], ["p**5", "p**3"]):
+        yield "specific force, degree 5", terms
+
+
+def _of_gimbals(count: int) -> Iterator[tuple[str, list[str]]]:
+    for k in range(1, count + 1):
+        for n in (1, 2, 3, 4, 6):
+            both = [f"{wave}({n}*q{k})" for wave in ("sin", "cos")]
+            yield f"angle of gimbal {k}, {n} a turn", both
+            if n > 2:
+                yield f"angle of gimbal {k}, {n} a turn", [f":{k} = {text}" for text in both]
+                yield f"angle of gimbal {k}, {n} a turn", [f"{text}*{axis}" for text in both for axis in ("p", "o")]
+        yield f"previous orientation (angle of gimbal {k})", [f"sin(q{k}_before)", f"cos(q{k}_before)"]
+
+
+def _of_time(dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
+    yield "time", ["t"]
+    yield "time", ["t", "t*t"]
+    moments_s = [moment for dwell in dwells for moment in (dwell.start_s, 0.5 * (dwell.start_s + dwell.end_s))][1:]
+    for moment_s in moments_s[:: len(moments_s) // _JUMPS + 1]:
+        yield JUMP, [f"t > {moment_s:.6g}*s"]
+    duration_s = dwells[-1].end_s
+    for decay_s in _DECAYS_S:
+        yield DECAY, [f"exp(-t/({10 * decay_s}*s))"]
+        yield ARRIVAL, [f"exp(-tau/({decay_s}*s))"]
+        yield ARRIVAL, [f"{axis}*exp(-tau/({decay_s}*s))" for axis in ("fx", "fy", "fz")]
+    for turns in (0.5, 1, 1.5, 2, 3, 4, 6, 8):
+        waves = [f"{wave}({turns}*2*pi*t/({duration_s:.0f}*s))" for wave in ("sin", "cos")]
+        yield PERIODIC, waves
+
+
+def _of_surroundings(bench: Bench) -> Iterator[tuple[str, list[str]]]:
+    for terms in (["T"], ["T*T"], ["T", "T*T", "T**3"], ["a*T"], ["a*T*T"], ["a*T", "a*T*T"], ["p*T", "o*T"]):
+        yield "temperature", terms
+    if bench.axes:
+        yield "temperature", [":base = T"]
+        yield "time", [":base = t"]
+    yield "rate of temperature", ["dT"]
+    yield "rate of temperature", ["a*dT"]
+    for terms in (["da"], ["da*abs(da)"], ["sign(da)"], ["a-da"], ["(a-da)**2"]):
+        yield "previous orientation", terms

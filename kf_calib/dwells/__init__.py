@@ -1,0 +1,1 @@
+"""From a stream of samples to square-root sufficient statistics of each dwell."""

@@ -1,0 +1,221 @@
+"""Rows of the readings of one block: model columns known at the nodes of its pieces, gated, averaged where asked."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.bench import Bench
+from kf_calib.dwells import innovation_gate
+from kf_calib.dwells.blocks import Block, Tally
+from kf_calib.dwells.slew_kinematics import Curve
+from kf_calib.dwells.window_average import averaged
+
+REGRESSORS = ("1", "f_x", "f_y", "f_z")
+
+
+@dataclass(frozen=True, slots=True)
+class Nodes:
+    """What the block feels at m instants.
+
+    elapsed_s, since_arrival_s, temperature_c (m,); force_mps2 (m, 3); pose (m, k). The three nodes of a
+    piece are its beginning, middle and end. temperature_c is NaN where it is not measured. rate_radps,
+    rate_change_radps2 (m, 3): the platform's omega in its own frame, and its derivative; None where it stands.
+    variance_mps2_2 (m, 3): of the readings, where averages of them were folded; else None.
+    """
+
+    elapsed_s: Floats
+    since_arrival_s: Floats
+    force_mps2: Floats
+    pose: Floats
+    temperature_c: Floats
+    rate_radps: Floats | None = None
+    rate_change_radps2: Floats | None = None
+    variance_mps2_2: Floats | None = None
+
+    @property
+    def regressors(self) -> Floats:
+        """1, f_x, f_y, f_z (m, 4)."""
+        return np.column_stack([np.ones(len(self.force_mps2)), self.force_mps2])
+
+
+def parabola(values: Floats) -> Floats:
+    """Coefficients (..., 3, c) on 1, u, u^2 of the parabola with ``values`` (..., 3, c) at u = -1, 0, 1.
+
+    Equal values give exact zeros: a column that stands still has no rows but its mean's.
+    """
+    first, middle, last = values[..., 0, :], values[..., 1, :], values[..., 2, :]
+    out = np.empty(values.shape)
+    out[..., 0, :], out[..., 1, :] = middle, 0.5 * (last - first)
+    out[..., 2, :] = 0.5 * (first - middle) + 0.5 * (last - middle)
+    return out
+
+
+def on_basis(values: Floats) -> Floats:
+    """Coefficients (..., K, c) on ``basis`` of columns known at their nodes (..., K, c), K = 3, or 9 on a carrier."""
+    if values.shape[-2] == 3:
+        return parabola(values)
+    return np.concatenate([parabola(part) for part in np.split(values, values.shape[-2] // 3, axis=-2)], axis=-2)
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Model columns and readings of one block: columns (n, 4), readings (n, 3), innovation within the block (3, n).
+
+    static: the columns are the same in every row, and the innovation is the readings less their mean.
+    pieces: parts of the rows, u (n',) from -1 to 1 over each, and its nodes. moving: of the slew after the dwell.
+    gated: in which channels each reading lay out that is not among them, (3, m) bool; None: there were none.
+    raw: the rows before they were averaged, where they were; taken: how many readings a row then stands for.
+    pose_sigma_rad: of the pose, by the noise of the angles. turns: by which it goes beyond the angles as recorded.
+    """
+
+    dwell: int
+    elapsed_s: Floats
+    columns: Floats
+    readings: Floats
+    innovation: Floats
+    static: bool
+    pieces: tuple[tuple[slice, Floats, Nodes], ...]
+    moving: bool = False
+    gated: Mask | None = None
+    raw: Rows | None = None
+    taken: int = 1
+    pose_sigma_rad: float = 0.0
+    turns: tuple[int, ...] = ()
+
+
+def model_rows(
+    blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0, window_s: float = 0.0
+) -> Iterator[Rows]:
+    """Rows of every block, outliers gated out; the same rows feed both engines and batch least squares.
+
+    window_s: rows of readings averaged over windows of that length, 0: they are not. Blocks too short for it are left
+    out, and outliers are sought among the averages: a vibration that comes and goes has its own in the readings.
+    """
+    standing: tuple[Floats, Floats] | None = None  # a pose and its force: the same for all blocks of a dwell
+    for block in blocks:
+        if block.curve is not None:  # not gated: what an effect in a slew adds is no outlier
+            yield _slew_rows(block, bench, block.curve)
+            continue
+        static = len(block.pose) == 1 and bench.reference == "base"
+        if static and (standing is None or standing[0] is not block.pose):
+            standing = block.pose, bench.specific_force(np.zeros(1), block.pose)
+        force = standing[1] if static and standing else None
+        raw = _rows(block, bench, force)
+        means = averaged(block, window_s) if window_s else block
+        if means is None:
+            continue
+        block, rows = means, _rows(means, bench, force) if window_s else raw
+        if gate_sigma is not None and (not window_s or len(rows.readings) >= _GATED):
+            keep = innovation_gate.inliers(rows.columns, rows.readings, rows.innovation, static, gate_sigma)
+            if keep is not None:
+                tally.gated += int((~keep).sum())
+                out = rows.innovation[:, ~keep]
+                block = _kept(block, keep)
+                rows = _rows(block, bench, force)
+                rows = replace(rows, gated=innovation_gate.channels(out, rows.innovation, gate_sigma))
+        yield replace(rows, raw=raw, taken=block.taken) if window_s else rows
+
+
+def _kept(block: Block, keep: Mask) -> Block:
+    pose = block.pose if len(block.pose) == 1 else block.pose[keep]
+    return replace(
+        block,
+        elapsed_s=block.elapsed_s[keep],
+        accel_mps2=block.accel_mps2[keep],
+        pose=pose,
+        temperature_c=block.temperature_c[keep],
+        variance_mps2_2=None if block.variance_mps2_2 is None else block.variance_mps2_2[keep],
+    )
+
+
+def _rows(block: Block, bench: Bench, force: Floats | None) -> Rows:
+    """The rows of a block; ``force`` (1, 3) where the platform stands and gravity with it, else None."""
+    since_s = block.elapsed_s - block.arrival_s
+    edges = _EDGES_S[: int(np.searchsorted(_EDGES_S, since_s[-1]))]
+    cuts = np.unique(np.concatenate([[0], np.searchsorted(since_s, edges), [len(since_s)]]))
+    pieces = tuple(_piece(block, slice(a, b), bench, force) for a, b in itertools.pairwise(cuts.tolist()))
+    if force is not None:
+        columns = np.broadcast_to(np.append(1.0, force), (len(since_s), len(REGRESSORS)))
+    else:
+        columns = np.concatenate([basis(u).T @ parabola(nodes.regressors) for _, u, nodes in pieces])
+    innovation = innovation_gate.innovations(columns, block.accel_mps2, force is not None)
+    return Rows(
+        block.dwell, block.elapsed_s, columns, block.accel_mps2, innovation, force is not None, pieces,
+        pose_sigma_rad=block.pose_sigma_rad, turns=block.turns,
+    )  # fmt: skip
+
+
+def _slew_rows(block: Block, bench: Bench, curve: Curve) -> Rows:
+    """The rows of a slew, in pieces of 2 deg."""
+    pieces = tuple(
+        _slew_piece(block, slice(a, b), bench, curve) for a, b in itertools.pairwise(curve.cuts(block.elapsed_s))
+    )
+    columns = np.concatenate([basis(u).T @ parabola(nodes.regressors) for _, u, nodes in pieces])
+    return Rows(block.dwell, block.elapsed_s, columns, block.accel_mps2, block.accel_mps2.T, False, pieces, moving=True)
+
+
+def _slew_piece(block: Block, part: slice, bench: Bench, curve: Curve) -> tuple[slice, Floats, Nodes]:
+    own = block.elapsed_s[part]
+    u, at = _spread(own)
+    pose = curve.angles(at)
+    nodes = Nodes(
+        at, at - block.arrival_s, bench.specific_force(at, pose), pose, _temperatures(u, block.temperature_c[part]),
+        curve.rate(at), curve.rate_change(at),
+    )  # fmt: skip
+    return part, u, nodes
+
+
+def _spread(elapsed_s: Floats) -> tuple[Floats, Floats]:
+    """u (n,) from -1 to 1 over readings, and the times of the nodes (3,)."""
+    middle, half = 0.5 * (elapsed_s[0] + elapsed_s[-1]), max(0.5 * (elapsed_s[-1] - elapsed_s[0]), 1e-9)
+    return (elapsed_s - middle) / half, np.array([elapsed_s[0], middle, elapsed_s[-1]])
+
+
+_GATED = 32  # averages of a block, at least, among which an outlier can be told
+_EDGES_S = np.concatenate([2.0 ** np.arange(6), 60.0 * np.arange(1, 20_000)])
+"""A dwell is cut into pieces where 1, 2, 4 ... s have passed since the arrival, and at every further minute."""
+
+
+def _piece(block: Block, part: slice, bench: Bench, force: Floats | None) -> tuple[slice, Floats, Nodes]:
+    own, warm = block.elapsed_s[part], block.temperature_c[part]
+    u, at = _spread(own)
+    pose = np.repeat(block.pose, 3, axis=0) if len(block.pose) == 1 else _values_at_nodes(u, block.pose[part])
+    if force is None:
+        force = bench.specific_force(at, pose)
+    variance = None if block.variance_mps2_2 is None else _values_at_nodes(u, block.variance_mps2_2[part])
+    since_s = at - (block.arrival_s if block.felt_s is None else block.felt_s)
+    nodes = Nodes(at, since_s, np.broadcast_to(force, (3, 3)), pose, _temperatures(u, warm), variance_mps2_2=variance)
+    return part, u, nodes
+
+
+def _temperatures(u: Floats, measured: Floats) -> Floats:
+    """Temperature (3,) at u = -1, 0, 1: the line nearest to what was measured; NaN where any of it is missing."""
+    level = measured.mean()
+    if not math.isfinite(level) or measured[0] == measured[-1] == level:
+        return np.full(3, level)
+    away = u - u.mean()
+    slope = (away @ measured) / max(away @ away, 1e-300)
+    return level + slope * (np.array([-1.0, 0.0, 1.0]) - u.mean())
+
+
+def basis(u: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -> Floats:
+    """1, u, u^2 as rows (3, n); on a carrier these, and these times its cosine and times its sine, (9, n)."""
+    if elapsed_s is not None and carrier_hz:
+        plain, phase = basis(u), 2.0 * np.pi * carrier_hz * elapsed_s
+        return np.concatenate([plain, plain * np.cos(phase), plain * np.sin(phase)])
+    out = np.empty((3, len(u)))
+    out[0], out[1] = 1.0, u
+    np.multiply(u, u, out=out[2])
+    return out
+
+
+def _values_at_nodes(u: Floats, values: Floats) -> Floats:
+    """Values (3, k) at u = -1, 0, 1 of the parabola nearest to samples (n, k)."""
+    fitted = np.linalg.lstsq(basis(u).T, values, rcond=1e-9)[0]
+    return basis(np.array([-1.0, 0.0, 1.0])).T @ fitted

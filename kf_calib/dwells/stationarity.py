@@ -1,0 +1,244 @@
+"""When the platform counts as still, and when exactly it came to rest and left: from its angles, and from the readings.
+
+Angles tell of a motion to their period only, and a slew that begins and ends gently is within any tolerance for some
+time: what is left over is looked for in the messages of the dwell itself, and in the readings. The noise of an encoder
+is taken from second differences of its messages, in which a platform that creeps does not show: sigma^2 = <d^2> / 6.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats, Mask, Times
+from kf_calib.bench.bench import mean_pose, pose_distance
+from kf_calib.bench.streams import Stream
+from kf_calib.errors import InputError, check_number
+
+_SECOND_NS = 1_000_000_000
+_BEFORE = 3  # messages, at least, that one is held against
+_APART_NS = 2 * _SECOND_NS  # messages that lie farther apart tell no departure
+_CREEPING_NS = 10 * _SECOND_NS  # from when on a platform that still creeps is taken as one that goes on so
+_LARGEST_DEG = 5.0  # of a tolerance: a platform that turns at 10 deg/s would be still
+_PARTS = 8  # of a block, whose mean poses are compared
+
+HISTORY = _BEFORE + 2
+"""Messages before those of ``Stillness.history_ns`` that are of use, where they are seldom."""
+
+
+@dataclass(frozen=True)
+class Stillness:
+    """Tolerance and window by which intervals are judged, margins that are left out after an arrival and before a
+    departure."""
+
+    tolerance_deg: float = 0.05
+    window_s: float = 0.5
+    settle_s: float = 1.0
+    lead_s: float = 0.25
+
+    def __post_init__(self) -> None:
+        check_number("tolerance_deg (--still-deg)", self.tolerance_deg, above=True)
+        if self.tolerance_deg > _LARGEST_DEG:
+            raise InputError(
+                f"a platform that turns by {self.tolerance_deg:g} deg in half a second does not stand still: give "
+                f"--still-deg (tolerance_deg) above 0 and up to {_LARGEST_DEG:g}."
+            )
+        check_number("window_s", self.window_s, above=True)
+        check_number("settle_s (--settle-s)", self.settle_s)
+        check_number("lead_s", self.lead_s)
+
+    @property
+    def tolerance_rad(self) -> float:
+        return math.radians(self.tolerance_deg)
+
+    @property
+    def rest_rad(self) -> float:
+        """Within which a platform is at rest, as far as a good encoder can tell: a fiftieth of the tolerance."""
+        return self.tolerance_rad / 50.0
+
+    @property
+    def window_ns(self) -> int:
+        return round(self.window_s * _SECOND_NS)
+
+    @property
+    def settle_ns(self) -> int:
+        return round(self.settle_s * _SECOND_NS)
+
+    @property
+    def lead_ns(self) -> int:
+        return round(self.lead_s * _SECOND_NS)
+
+    @property
+    def history_ns(self) -> int:
+        """How long before an interval messages are of use."""
+        return _CREEPING_NS + 6 * self.window_ns
+
+    def intervals(
+        self, times: Times, poses: Floats, is_quaternion: bool, known: Mask, covered_ns: int
+    ) -> tuple[Mask, int]:
+        """Which intervals between consecutive messages are still, (m - 1,) bool, and how far a still window reaches.
+
+        Still is what lies in a window over which no step and no difference of ends exceeds the tolerance. known (m,):
+        the window that begins with a message is over; covered_ns: how far one judged earlier reaches.
+        """
+        ends = np.minimum(np.searchsorted(times, times + self.window_ns), len(times) - 1)
+        steps = pose_distance(poses[1:], poses[:-1], is_quaternion) <= self.tolerance_rad
+        broken = np.concatenate([[0], np.cumsum(~steps)])
+        rest = pose_distance(poses[ends], poses, is_quaternion) <= self.tolerance_rad
+        rest &= (broken[ends] == broken) & known & (ends > np.arange(len(ends)))
+        reach = np.maximum.accumulate(np.where(rest, times[ends], covered_ns))
+        return (reach[:-1] > times[:-1]) & steps, int(reach[-1])
+
+    def departure_ns(self, pose: Stream, is_quaternion: bool, arrived_ns: int, end_ns: int) -> int:
+        """When, in a dwell from ``arrived_ns`` to ``end_ns``, the platform began to creep away.
+
+        It may have left, by what angles cannot tell, as long before as messages lie apart.
+        """
+        away = self.creeping_from(pose, is_quaternion, arrived_ns, end_ns)
+        if away is None:
+            return end_ns
+        early_ns, standing_ns = pose.time_ns[max(away - 2, 0)], pose.time_ns[max(away - 1, 0)]
+        apart_ns = min(int(standing_ns - early_ns), _APART_NS)
+        return max(int(standing_ns) - max(apart_ns - self.lead_ns, 0), arrived_ns)
+
+    def creeping_from(self, pose: Stream, is_quaternion: bool, arrived_ns: int, until_ns: int) -> int | None:
+        """Since which message the platform, in a dwell from ``arrived_ns`` on, has been creeping by ``until_ns``.
+
+        None: it rests, or creeps for so long that it is taken as one that goes on so.
+        """
+        arrived, last = np.searchsorted(pose.time_ns, (arrived_ns, until_ns + 1)).tolist()
+        begin = last
+        for span_ns in (self.window_ns, _CREEPING_NS + self.window_ns):  # most of the time nothing moves
+            judged = max(int(np.searchsorted(pose.time_ns, until_ns - span_ns)), arrived)
+            first = int(np.searchsorted(pose.time_ns, until_ns - span_ns - 4 * self.window_ns))
+            first = max(min(first, judged - HISTORY), arrived)
+            if last - judged < 1 or last - first < HISTORY:
+                return None
+            away = judged + np.flatnonzero(self._away(pose[first:last], is_quaternion)[judged - first :])
+            step = max(
+                1, round(self.window_ns * (last - 1 - first) / int(pose.time_ns[last - 1] - pose.time_ns[first]))
+            )
+            if not away.size or last - 1 - away[-1] > step:
+                return None
+            breaks = np.flatnonzero(np.diff(away) > step)
+            begin = int(away[breaks[-1] + 1 if breaks.size else 0])
+        return begin if pose.time_ns[last - 1] - pose.time_ns[begin] <= _CREEPING_NS else None
+
+    def _away(self, pose: Stream, is_quaternion: bool) -> Mask:
+        """Which messages are away from rest: not the mean of those half a window to two windows before, (m,) bool.
+
+        To ``rest_rad`` or four sigma of the encoder; where messages are seldom, of a few. The first are not judged.
+        """
+        times, own = pose.time_ns, pose.values - pose.values[0]
+        ends = np.minimum(np.searchsorted(times, times - self.window_ns), np.maximum(np.arange(len(times)) - 1, 0))
+        starts = np.minimum(np.searchsorted(times, times - 4 * self.window_ns), np.maximum(ends - _BEFORE, 0))
+        sums, counts = _summed(own), (ends - starts)[:, None]
+        means = (sums[ends] - sums[starts]) / np.maximum(counts, 1)
+        bent, bends = _summed(np.diff(own, 2, axis=0) ** 2), np.maximum(ends - starts - 2, 0)[:, None]
+        variance = (bent[starts + bends[:, 0]] - bent[starts]) / (6.0 * np.maximum(bends, 1))
+        allowed = np.maximum(self.rest_rad, 4.0 * np.sqrt(np.maximum(variance, 0.0).max(axis=1)))
+        apart = pose_distance(pose.values, means + pose.values[0], is_quaternion)
+        return (apart > allowed) & (bends[:, 0] > 0)
+
+    def rest_ns(self, pose: Stream, is_quaternion: bool, arrived_ns: int, until_ns: int) -> tuple[int, bool]:
+        """When, in a dwell from ``arrived_ns`` on, the platform had come to rest; whether what is known until
+        ``until_ns`` is enough to tell.
+
+        A message is of a platform at rest where it agrees with the mean of those of the next two margins for settling,
+        a few at least, to ``rest_rad`` or four sigma of them. A dwell that creeps all along is used from its arrival,
+        and so is one whose messages are farther apart than that.
+        """
+        first, last = np.searchsorted(pose.time_ns, (arrived_ns, until_ns)).tolist()
+        times, poses, span_ns = pose.time_ns[first:last], pose.values[first:last], 2 * self.settle_ns
+        for k, within in enumerate(np.searchsorted(times, times + span_ns, side="right").tolist()):
+            if times[k] > arrived_ns + _CREEPING_NS:
+                break
+            at_ns, end = int(times[k]) if k else arrived_ns, max(within, k + 1 + _BEFORE)
+            if times[k] + span_ns > until_ns or end > len(times):
+                return at_ns, False
+            coming = poses[k + 1 : end]
+            allowed = max(self.rest_rad, 4.0 * float(encoder_sigma(coming).max()))
+            apart = pose_distance(poses[k], mean_pose(coming), is_quaternion)
+            if apart <= allowed or np.diff(times[k:end]).max() > span_ns:
+                return at_ns, True
+        return arrived_ns, True
+
+    def creeps(self, poses: Floats) -> bool:
+        """Whether the messages (n, k) of a block tell of more than noise about one pose: by the means of its parts."""
+        count, spread = len(poses), np.ptp(poses, axis=0).max()
+        if count < 2 or spread <= self.rest_rad:
+            return False
+        if spread > max(self.tolerance_rad, 8.0 * float(encoder_sigma(poses).max())):
+            return True
+        parts = np.array_split(poses, min(_PARTS, count))
+        means = np.array([part.mean(axis=0) for part in parts])
+        sigma = np.sqrt(np.mean(np.diff(poses, axis=0) ** 2, axis=0) / 2.0 * len(parts) / count)
+        apart = np.abs(means - np.median(means, axis=0))
+        return bool((apart > np.maximum(self.rest_rad, 8.0 * sigma)).any())
+
+    def moved_between(self, accel: Stream, begin_ns: int, end_ns: int, gravity_mps2: float) -> tuple[int, int]:
+        """When a motion without angles began and ended, from the readings between two poses.
+
+        The readings are averaged over windows of a quarter of a second. The old dwell lasts while they stay at its
+        level, the new one reaches back as far as they are at the level they end on; then as far as they are there to
+        three sigma.
+        """
+        part = slice(*np.searchsorted(accel.time_ns, (begin_ns, end_ns)))
+        times, values = accel.time_ns[part], accel.values[part]
+        size = max(4, int(np.searchsorted(times, begin_ns + _SECOND_NS // 4)))
+        count = len(times) // size
+        if count < 4:
+            return begin_ns, end_ns
+        shaped = values[: count * size].reshape(count, size, 3)
+        means, scatter = shaped.mean(axis=1), np.median(shaped.std(axis=1), axis=0)
+        coarse = 6.0 * scatter + 1e-3 * gravity_mps2
+        fine = 3.0 * scatter / math.sqrt(size) + self.rest_rad * gravity_mps2
+        old, new = _standing(means, coarse, fine), _standing(means[::-1], coarse, fine)
+        leave = begin_ns if old < 2 else int(times[(old - 1) * size])
+        arrive = end_ns if new < 2 else int(times[(count - new + 1) * size])
+        return leave, max(arrive, leave)
+
+    def felt_ns(self, accel: Stream, since_ns: int, arrival_ns: int, gravity_mps2: float) -> int:
+        """When, since the last angle before an arrival, the readings came to the level they have just after it.
+
+        That level is of half a window, which begins a quarter of it after the arrival and is over before this is
+        judged.
+        """
+        quarter_ns = self.window_ns // 4
+        stamps = since_ns, arrival_ns + quarter_ns, arrival_ns + 3 * quarter_ns
+        first, there, end = np.searchsorted(accel.time_ns, stamps)
+        if there == end:
+            return arrival_ns
+        settled = accel.values[there:end]
+        allowed = 6.0 * float(settled.std(axis=0).max()) + self.rest_rad * gravity_mps2
+        apart = np.abs(accel.values[first:there] - settled.mean(axis=0)).max(axis=1, initial=0.0)
+        away = np.flatnonzero(apart > allowed)
+        if not away.size:
+            return arrival_ns
+        moving_ns, standing_ns = accel.time_ns[first + away[-1] :][:2].tolist()
+        return (moving_ns + standing_ns) // 2
+
+
+def encoder_sigma(poses: Floats) -> Floats:
+    """Noise of a message, 1 sigma (k,), rad, from poses (n, k); 0 for fewer than three."""
+    return (
+        np.sqrt(np.mean(np.diff(poses, 2, axis=0) ** 2, axis=0) / 6.0) if len(poses) > 2 else np.zeros(poses.shape[1])
+    )
+
+
+def _summed(values: Floats) -> Floats:
+    """Sums (n + 1, k) of the first values (n, k), of none at first."""
+    return np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
+
+
+def _standing(means: Floats, coarse: Floats, fine: Floats) -> int:
+    """In how many windows, from the first on, the means (n, 3) of readings say that the platform stood where it did;
+    none where they never leave that level, and cannot tell."""
+    near = np.all(np.abs(means - means[0]) <= coarse, axis=1)
+    if near.all():
+        return 0
+    own = means[: int(np.argmin(near))]
+    still = np.flatnonzero(np.all(np.abs(own - np.median(own, axis=0)) <= fine, axis=1))
+    return int(still[-1]) + 1 if still.size else 0

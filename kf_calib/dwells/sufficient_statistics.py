@@ -1,0 +1,385 @@
+"""Dwells folded into small triangles: all that is kept of the samples.
+
+A dwell is cut into pieces, short after the arrival and longer later (1, 1, 2, 4 ... 60 s). Over a piece every model
+column is smooth: it is taken as a parabola through its values at the piece's beginning, middle and end (its *nodes*).
+The readings are folded by QR against the parabola's basis, [1 u u^2 | z1 z2 z3] -> 6 x 6, unwhitened. Any column known
+at the nodes, of any model, then has its exact rows from the triangles: noise model, filter and diagnosis need no second
+pass over the data, and a column that changes (another tau, another E) is evaluated anew at a few hundred nodes.
+
+A column that oscillates within a piece is no parabola. For it the dwells are folded on a *carrier* f0 near its
+frequency: the basis is 1, u, u^2 and these times cos 2 pi f0 t and sin 2 pi f0 t, the triangle 12 x 12, and a column is
+known by nine nodes, three of its plain part and three of each envelope. K is 3 below, or 9 on a carrier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.coherent_tone import Cells, Trace, tone
+from kf_calib.dwells.line_spectrum import Line, Spectrum, lines
+from kf_calib.dwells.qr import triangle
+from kf_calib.dwells.rows import Nodes, Rows, basis, parabola
+from kf_calib.dwells.walk_path import WalkPath, walk_path_of
+
+_LAGS = 64
+_CORRELATED_SAMPLES = 8192  # readings of a dwell whose autocovariance is accumulated
+
+
+@dataclass(frozen=True)
+class Autocovariance:
+    """Sums of lagged products within blocks of readings less their parabola: products (L + 1, 3), pairs (L + 1,).
+
+    Without the parabola a drift would count as noise, and the test that should find it would be silenced.
+    """
+
+    products: Floats = field(default_factory=lambda: np.zeros((_LAGS + 1, 3)))
+    pairs: Floats = field(default_factory=lambda: np.zeros(_LAGS + 1))
+    count: int = 0
+    blocks: int = 0
+
+    def __add__(self, other: Autocovariance) -> Autocovariance:
+        return Autocovariance(
+            self.products + other.products,
+            self.pairs + other.pairs,
+            self.count + other.count,
+            self.blocks + other.blocks,
+        )
+
+    @classmethod
+    def of(cls, left: Floats) -> Autocovariance:
+        """Of innovations (3, n) less their parabola."""
+        count = left.shape[1]
+        padded = 1 << (count + _LAGS).bit_length()
+        spectrum = np.fft.rfft(left, padded, axis=1)
+        products = np.zeros((_LAGS + 1, 3))
+        lags = min(_LAGS, count - 1) + 1
+        products[:lags] = np.fft.irfft(np.abs(spectrum) ** 2, padded, axis=1)[:, :lags].T
+        return cls(products, np.maximum(count - np.arange(_LAGS + 1), 0).astype(float), count, 1)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A stretch of a dwell, folded: triangle (K + 3, K + 3) over [1 u u^2 ... | z1 z2 z3], and its nodes (3).
+
+    count: of what was folded, readings or averages of them; taken: of readings.
+    """
+
+    triangle: Floats
+    nodes: Nodes
+    count: int
+    carrier_hz: float = 0.0
+    taken: int = 0
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class DwellFactor:
+    """One dwell: its pieces in order of time, its readings in cells of the run's clock, and the autocovariance and the
+    spectrum of its first readings.
+
+    moving: it is the slew after the dwell of that number, folded like a dwell. came_from: the dwell before it, where
+    that one is left out (None: it is there, or there was none). pose_sigma_rad: of its pose, by noise of the angles.
+    turns: whole turns of each gimbal by which its pose goes beyond the angles as they were recorded.
+    """
+
+    number: int
+    pieces: tuple[Piece, ...]
+    autocovariance: Autocovariance = field(default_factory=Autocovariance)
+    spectrum: Spectrum = field(default_factory=Spectrum)
+    trace: Trace = field(default_factory=Trace)
+    moving: bool = False
+    came_from: DwellFactor | None = None
+    pose_sigma_rad: float = 0.0
+    turns: tuple[int, ...] = ()
+
+    @property
+    def carrier_hz(self) -> float:
+        """What it was folded on; 0: no carrier."""
+        return self.pieces[0].carrier_hz
+
+    @property
+    def width(self) -> int:
+        """K, functions in the basis of a piece."""
+        return self.pieces[0].triangle.shape[1] - 3
+
+    @cached_property
+    def triangles(self) -> Floats:
+        """Of the pieces, (pieces, K + 3, K + 3)."""
+        return np.array([piece.triangle for piece in self.pieces])
+
+    @cached_property
+    def nodes(self) -> Nodes:
+        """What it felt at the nodes of all its pieces, in order."""
+        every = [piece.nodes for piece in self.pieces]
+        return Nodes(
+            elapsed_s=np.concatenate([each.elapsed_s for each in every]),
+            since_arrival_s=np.concatenate([each.since_arrival_s for each in every]),
+            force_mps2=np.concatenate([each.force_mps2 for each in every]),
+            pose=np.concatenate([each.pose for each in every]),
+            temperature_c=np.concatenate([each.temperature_c for each in every]),
+            rate_radps=np.concatenate([rate_or_zero(each.rate_radps) for each in every]),
+            rate_change_radps2=np.concatenate([rate_or_zero(each.rate_change_radps2) for each in every]),
+        )
+
+    @cached_property
+    def regressors(self) -> Floats:
+        """Rows of 1, f_x, f_y, f_z of each piece, (pieces, K, 4)."""
+        values = self.nodes.regressors.reshape(len(self.pieces), 3, -1)
+        return self.triangles[:, : self.width, :3] @ parabola(values)
+
+    @cached_property
+    def squares(self) -> Floats:
+        """Sums of squares of the readings about the functions of the basis, (pieces, 3)."""
+        return (self.triangles[:, self.width :, self.width :] ** 2).sum(axis=1)
+
+    @cached_property
+    def counts(self) -> Floats:
+        """Readings of each piece, (pieces,)."""
+        return np.array([piece.count for piece in self.pieces], float)
+
+    @cached_property
+    def variances(self) -> Floats:
+        """Variance of the readings within each piece (pieces, 3), about a parabola; short pieces have their dwell's."""
+        squares, spare = self.squares, np.maximum(self.counts - float(self.width), 0.0)[:, None]
+        pooled = squares.sum(axis=0) / max(spare.sum(), 1)
+        return np.where(spare >= 8, squares / np.maximum(spare, 1), pooled)
+
+    @cached_property
+    def walk(self) -> WalkPath:
+        """What a walk of the biases does in it."""
+        ends = np.array([piece.nodes.elapsed_s[[0, -1]] for piece in self.pieces])
+        triangles = self.triangles[:, : self.width, : self.width]
+        return walk_path_of(ends[:, 0], ends[:, 1], [piece.count for piece in self.pieces], triangles)
+
+    @property
+    def averaged(self) -> bool:
+        """Whether averages of readings were folded."""
+        return self.pieces[0].nodes.variance_mps2_2 is not None
+
+    @cached_property
+    def shaking(self) -> tuple[Floats, Floats]:
+        """Variance of the readings at the nodes of each piece (pieces, 3, 3), and of how many, (pieces,)."""
+        taken = np.array([piece.taken for piece in self.pieces], float)
+        if not self.averaged:
+            return np.repeat(self.variances[:, None], 3, axis=1), taken
+        return np.array([piece.nodes.variance_mps2_2 for piece in self.pieces], float), taken
+
+    @property
+    def start_s(self) -> float:
+        return float(self.pieces[0].nodes.elapsed_s[0])
+
+    @property
+    def end_s(self) -> float:
+        return float(self.pieces[-1].nodes.elapsed_s[-1])
+
+    @cached_property
+    def count(self) -> int:
+        return sum(piece.count for piece in self.pieces)
+
+    @cached_property
+    def pose(self) -> Floats:
+        """Mean pose (k,)."""
+        weights = np.array([piece.count for piece in self.pieces]) / self.count
+        return weights @ np.array([piece.nodes.pose.mean(axis=0) for piece in self.pieces])
+
+    @cached_property
+    def recorded_pose(self) -> Floats:
+        """Mean pose (k,) with its angles as they were recorded, not continued beyond a turn from dwell to dwell."""
+        return self.pose - 2.0 * np.pi * np.array(self.turns) if self.turns else self.pose
+
+    @cached_property
+    def factor(self) -> Floats:
+        """Triangle (7, 7) over [1 f_x f_y f_z | z1 z2 z3]."""
+        return _folded(self.rows([piece.nodes.regressors for piece in self.pieces]))
+
+    @cached_property
+    def means(self) -> Floats:
+        """Means of the regressors and readings, (7,): 1, f (3), z (3)."""
+        return self.factor[0] / self.factor[0, 0]
+
+    def rows(self, columns: Sequence[Floats]) -> Floats:
+        """Rows [X | z1 z2 z3] of plain columns known at the nodes of each piece, (3, c): ((K + 3) pieces, c + 3)."""
+        width = columns[0].shape[1]
+        out = np.zeros((len(self.pieces), self.width + 3, width + 3))
+        out[:, :3, :width] = self.triangles[:, :3, :3] @ parabola(np.array(columns))
+        out[:, :, width:] = self.triangles[:, :, self.width :]
+        return out.reshape(-1, width + 3)
+
+    def merged(self, others: Sequence[DwellFactor]) -> DwellFactor:
+        """The same dwell from this and other stretches of samples."""
+        pieces = (piece for each in (self, *others) for piece in each.pieces)
+        return replace(
+            self,
+            pieces=tuple(sorted(pieces, key=lambda piece: piece.nodes.elapsed_s[0])),
+            autocovariance=sum((each.autocovariance for each in others), self.autocovariance),
+            spectrum=sum((each.spectrum for each in others), self.spectrum),
+            trace=sum((each.trace for each in others), self.trace),
+        )
+
+    def repeated(self, times: float) -> DwellFactor:
+        """The same dwell as if its readings had come that many times over."""
+        pieces = (
+            replace(own, triangle=own.triangle * times**0.5, count=round(own.count * times)) for own in self.pieces
+        )
+        return replace(self, pieces=tuple(pieces))
+
+    def prefixes(self) -> Iterator[DwellFactor]:
+        """The dwell as it stood after 1, 2, 4 ... of its pieces, and in the end."""
+        size = 1
+        while size < len(self.pieces):
+            yield replace(self, pieces=self.pieces[:size])
+            size = 2 * size if size > 7 else size + 1
+        yield self
+
+
+def fold(rows: Rows, carrier_hz: float = 0.0) -> tuple[Piece, ...]:
+    """The pieces of one block of rows."""
+    width = 9 if carrier_hz else 3
+    channels = rows.innovation if rows.static else rows.readings.T
+    level = rows.readings[0] - channels[:, 0]  # what the innovation of a standing platform lacks of the readings
+    pieces = list[Piece]()
+    for part, u, nodes in rows.pieces:
+        stacked = np.empty((width + 3, len(u)))  # rows along memory: what LAPACK wants, and faster to fill
+        stacked[:width], stacked[width:] = basis(u, rows.elapsed_s[part], carrier_hz), channels[:, part]
+        folded = _folded(stacked.T)
+        folded[0, width:] += folded[0, 0] * level
+        pieces.append(Piece(folded, nodes, len(u), carrier_hz, len(u) * rows.taken))
+    return tuple(pieces)
+
+
+def less_curve(innovation: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -> Floats:
+    """Innovations (3, n) less their parabola; what goes with a carrier is no noise either."""
+    count = innovation.shape[1]
+    curve = _parabola(count)
+    if carrier_hz:
+        curve = np.linalg.qr(basis(np.linspace(-1.0, 1.0, count), elapsed_s, carrier_hz).T)[0]
+    return innovation - (innovation @ curve) @ curve.T
+
+
+@lru_cache(maxsize=4)
+def _parabola(count: int) -> Floats:
+    """1, u, u^2 made orthonormal, (n, 3)."""
+    return np.linalg.qr(basis(np.linspace(-1.0, 1.0, count)).T)[0]
+
+
+def _folded(stacked: Floats) -> Floats:
+    """The square triangle of rows (n, c), padded with zeros where there are fewer rows than columns."""
+    width = stacked.shape[1]
+    if len(stacked) < width:
+        stacked = np.vstack([stacked, np.zeros((width - len(stacked), width))])
+    return triangle(stacked)
+
+
+def rate_or_zero(rate: Floats | None) -> Floats:
+    """The rate at the nodes of a piece; none where the platform stands."""
+    return np.zeros((3, 3)) if rate is None else rate
+
+
+def dwells_before(dwells: Sequence[DwellFactor]) -> list[DwellFactor]:
+    """The dwell before each dwell, itself in the first; before a slew, the dwell it left."""
+    out, last = list[DwellFactor](), dwells[0]
+    for dwell in dwells:
+        out.append(dwell.came_from or last)
+        last = last if dwell.moving else dwell
+    return out
+
+
+def dwells_without(dwells: Sequence[DwellFactor], left_out: Collection[int]) -> list[DwellFactor]:
+    """The dwells but those at the places ``left_out``; each still knows the step by which it was reached."""
+    told = [replace(dwell, came_from=last) for dwell, last in zip(dwells, dwells_before(dwells), strict=True)]
+    return [dwell for k, dwell in enumerate(told) if k not in left_out]
+
+
+def lines_of(dwells: Sequence[DwellFactor], level: float = 0.01) -> tuple[Line, ...]:
+    """Oscillations in the readings of dwells, by a test of ``level``: the lines of their spectra, else one that is too
+    weak for these and keeps its phase from dwell to dwell."""
+    seen = lines((dwell.spectrum for dwell in dwells), 0.5 * level)
+    steady = None if seen else tone([dwell.trace for dwell in dwells], 0.5 * level)
+    found = seen or ((steady,) if steady else ())
+    return tuple(replace(line, p_value=min(1.0, 2.0 * line.p_value)) for line in found)
+
+
+def alike(dwells: Sequence[DwellFactor]) -> list[list[int]]:
+    """Places of dwells that have as many pieces of one width: their arrays can be worked on together."""
+    places = dict[tuple[int, int], list[int]]()
+    for k, dwell in enumerate(dwells):
+        places.setdefault((len(dwell.pieces), dwell.width), []).append(k)
+    return list(places.values())
+
+
+class _Growing:
+    """Dwells, or slews, one after another; the last grows block by block.
+
+    Its blocks are merged when it is asked for: merged as they come, all that it holds would be copied at every block.
+    """
+
+    def __init__(self, folded: Iterable[DwellFactor] = ()) -> None:
+        self._folded, self._blocks = list(folded), list[DwellFactor]()
+
+    def add(self, block: DwellFactor) -> None:
+        if self._last(block.number) is None:
+            self.folded.append(block)
+        elif block.autocovariance.count:  # of its first readings: how many more are wanted is seen in the dwell
+            self._folded[-1] = self._folded[-1].merged([block])
+        else:
+            self._blocks.append(block)
+
+    def correlated(self, number: int) -> int:
+        """Readings in the autocovariance of the dwell of that number, which is the last or is still to come."""
+        last = self._last(number)
+        return last.autocovariance.count if last else 0
+
+    @property
+    def folded(self) -> list[DwellFactor]:
+        """All of them, each with all its blocks."""
+        if self._blocks:
+            self._folded[-1] = self._folded[-1].merged(self._blocks)
+            self._blocks = []
+        return self._folded
+
+    def _last(self, number: int) -> DwellFactor | None:
+        return self._folded[-1] if self._folded and self._folded[-1].number == number else None
+
+
+class Folder:
+    """Folds rows into the lists of dwell factors and of slews, one after another, on a carrier where one is given."""
+
+    def __init__(self, carrier_hz: float = 0.0) -> None:
+        self._dwells, self._slews = _Growing(), _Growing()
+        self.carrier_hz = carrier_hz
+        self._cells: Cells | None = None
+
+    @property
+    def dwells(self) -> list[DwellFactor]:
+        return self._dwells.folded
+
+    @dwells.setter
+    def dwells(self, dwells: Iterable[DwellFactor]) -> None:
+        self._dwells = _Growing(dwells)
+
+    @property
+    def slews(self) -> list[DwellFactor]:
+        return self._slews.folded
+
+    @slews.setter
+    def slews(self, slews: Iterable[DwellFactor]) -> None:
+        self._slews = _Growing(slews)
+
+    def add(self, rows: Rows) -> None:
+        growing = self._slews if rows.moving else self._dwells
+        block = DwellFactor(
+            rows.dwell, fold(rows, self.carrier_hz), moving=rows.moving, pose_sigma_rad=rows.pose_sigma_rad,
+            turns=rows.turns,
+        )  # fmt: skip
+        if not rows.moving and growing.correlated(rows.dwell) < _CORRELATED_SAMPLES:
+            left = less_curve(rows.innovation, rows.elapsed_s, self.carrier_hz)
+            own, spectrum = Autocovariance.of(left), Spectrum.of(left, rows.elapsed_s)
+            block = replace(block, autocovariance=own, spectrum=spectrum)
+        self._cells = self._cells or Cells.of(rows.elapsed_s)
+        if self._cells and not rows.moving and not block.averaged:
+            block = replace(block, trace=Trace.of(rows.readings, rows.elapsed_s, self._cells))
+        growing.add(block)

@@ -1,0 +1,101 @@
+"""A random walk of the biases: process noise between the dwells and within them.
+
+b(t) = b(t_0) + W(t), W a Brownian path of intensity q (m/s^2 per sqrt(s)) that steps from reading to reading. Kept of a
+dwell's piece are the coefficients of its parabola; those of W have a covariance known in closed form. The filter's bias
+is the one at the END of a dwell: its rows lead with the columns of the step that the biases take in it, and given that
+step what W does within the dwell is independent of all other dwells. What W does beside the parabolas is not used, and
+is taken out of the noise of a reading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+
+_LEAST = 1e-12  # of the largest variance: smaller modes are rounding
+
+
+@dataclass(frozen=True)
+class WalkPath:
+    """What a walk of q = 1 does in a dwell, on the r rows of its pieces' triangles.
+
+    step (r,): rows per unit of the bias's step s over the dwell, b at its end being known. modes (r, k), variances
+    (k,): principal axes of what is left of W given s. rest (pieces,): what W adds to the sums of squares about the
+    parabolas.
+    """
+
+    step: Floats
+    modes: Floats
+    variances: Floats
+    rest: Floats
+
+    def whiten(self, rows: Floats, ratio: float) -> Floats:
+        """Rows (r, c) of unit noise times V^(-1/2), V = I + ``ratio``^2 sum of variances times modes modes^T."""
+        shrink = 1.0 - 1.0 / np.sqrt(1.0 + ratio**2 * self.variances)
+        return rows - self.modes @ (shrink[:, None] * (self.modes.T @ rows))
+
+
+def walk_path_of(begins_s: Floats, ends_s: Floats, counts: Sequence[int], triangles: Floats) -> WalkPath:
+    """Of a dwell whose pieces last from ``begins_s`` to ``ends_s`` and have ``triangles`` (pieces, K, K) over [1 u u^2
+    ...], K the rows kept of each."""
+    root, end = _root(begins_s, ends_s, counts)
+    onto = (triangles[:, :, :3] @ root).reshape(-1, root.shape[2])
+    total = float(end @ end)
+    share = onto @ end / total if total > 0 else np.zeros(len(onto))
+    left, sizes, _ = np.linalg.svd(onto - np.outer(share, end), full_matrices=False)
+    kept = sizes**2 > _LEAST * max(float(sizes[0]) ** 2, 1e-300)
+    spans = np.maximum(ends_s - begins_s, 0.0)
+    rest = spans * np.array([_moments(count)[1] / max(count - 1, 1) for count in counts])
+    return WalkPath(share - triangles[:, :, 0].ravel(), left[:, kept], sizes[kept] ** 2, rest)
+
+
+def _root(begins_s: Floats, ends_s: Floats, counts: Sequence[int]) -> tuple[Floats, Floats]:
+    """W by independent unit normals: coefficients of its parabolas (pieces, 3, n), its last value (n,).
+
+    Four normals a piece: its parabola's coefficients, and where W is when the next piece begins.
+    """
+    size = len(counts)
+    pauses = np.maximum(np.append(begins_s[1:] - ends_s[:-1], 0.0), 0.0)
+    out, level = np.zeros((size, 3, 4 * size)), np.zeros(4 * size)
+    for k, count in enumerate(counts):
+        own = slice(4 * k, 4 * k + 4)
+        joint = _moments(count)[0] * max(ends_s[k] - begins_s[k], 0.0) / max(count - 1, 1)
+        joint[3, 3] += pauses[k]
+        values, vectors = np.linalg.eigh(joint)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        out[k, 0] = level
+        out[k, :, own] = root[:3]
+        level[own] = root[3]
+    return out, level
+
+
+@lru_cache(maxsize=4096)
+def _moments(count: int) -> tuple[Floats, float]:
+    """Of a walk with unit steps over ``count`` readings, from zero at the first.
+
+    Covariance (4, 4) of its parabola's coefficients on 1, u, u^2 and its last value; its mean sum of squares about the
+    parabola.
+    """
+    u = np.linspace(-1.0, 1.0, count)
+    design = np.column_stack([np.ones(count), u, u * u]) if count > 1 else np.array([[1.0, 0.0, 0.0]])
+    last = np.zeros((count, 1))
+    last[-1] = 1.0
+    weights = np.hstack([np.linalg.pinv(design).T, last])
+    later = np.cumsum(weights[::-1], axis=0)[::-1][1:]  # the sum over all readings that a step moves
+    covariance = later.T @ later
+    inside = float(np.trace(design.T @ design @ covariance[:3, :3]))
+    return covariance, max(0.5 * count * (count - 1) - inside, 0.0)
+
+
+def lagged(period_s: float, size: int, pairs: Floats) -> Floats:
+    """What a walk of q = 1 adds to the sums of lagged products (L + 1,) of ``pairs`` readings, about the parabola of
+    blocks of ``size``.
+
+    The residual has its mean square at lag 0 and loses half of q^2 times the lag, as the walk does.
+    """
+    return period_s * pairs * np.maximum(_moments(size)[1] / size - 0.5 * np.arange(len(pairs)), 0.0)

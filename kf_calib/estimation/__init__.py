@@ -1,0 +1,1 @@
+"""Noise model, filters, least squares, the fit and its results."""

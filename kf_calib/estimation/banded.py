@@ -1,0 +1,96 @@
+"""Covariances of 3 D numbers in which each three go with themselves and with the next three alone: linear in D.
+
+They are kept by their columns, (D, 6, 3): the covariance of the three with themselves, and below it that of the next
+three with them; zeros in the last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, cast
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+
+_BELOW = np.arange(6)[:, None] - np.arange(3)  # a place's distance from the diagonal
+_KEPT, _BAND = _BELOW >= 0, np.maximum(_BELOW, 0)
+_TWICE = np.repeat([1.0, 2.0], 3)[:, None]  # what is beside the diagonal is there on either side
+
+
+def root(columns: Floats) -> Floats:
+    """The lower triangular root as LAPACK keeps it, its diagonals (6, 3 D) from the main one down."""
+    padded = np.zeros((len(columns), 8, 3))
+    padded[:, :6] = columns
+    bands = padded[:, np.arange(3)[:, None] + np.arange(6), np.arange(3)[:, None]].reshape(-1, 6).T
+    lower, failed = _lapack("pbtrf")(bands, lower=1, overwrite_ab=1)
+    if failed:
+        raise np.linalg.LinAlgError("a covariance is not positive definite")
+    return cast("Floats", lower)
+
+
+def solved(lower: Floats, rows: Floats, transposed: bool = False) -> Floats:
+    """The inverse of the root, or of its transpose, times rows (3 D, c)."""
+    if not rows.size:
+        return rows  # scipy's wrapper would write beyond them
+    return cast("Floats", _lapack("tbtrs")(lower, rows, uplo="L", trans="T" if transposed else "N")[0])
+
+
+def inverse(columns: Floats, lower: Floats) -> Floats:
+    """The inverse's entries in the same places, from the roots L of the pivots forward and U of those backward.
+
+    Block elimination from both ends: X_d = L_d^-T (I - M' M)^-1 L_d^-1, M = U_{d+1}^-1 L_{d+1,d}; below it
+    -X_{d+1} L_{d+1,d} L_d^-1.
+    """
+    forward, out = _unbanded(lower), np.zeros_like(columns)
+    back, beside = np.linalg.inv(forward[:, :3]), forward[:-1, 3:]
+    out[:, :3] = np.swapaxes(back, 1, 2) @ back
+    if beside.any():
+        backward = _unbanded(root(_reversed(columns)))[::-1, 2::-1, ::-1]
+        share = np.linalg.solve(backward[1:], beside)
+        middle = np.linalg.inv(np.eye(3) - np.swapaxes(share, 1, 2) @ share)
+        out[:-1, :3] = np.swapaxes(back[:-1], 1, 2) @ middle @ back[:-1]
+        out[:-1, 3:] = -out[1:, :3] @ beside @ back[:-1]
+    return out
+
+
+def outer(rows: Floats) -> Floats:
+    """Of rows (3 D, c), the entries of rows rows^T in these places."""
+    blocks = rows.reshape(-1, 3, rows.shape[1])
+    later = np.concatenate([blocks[1:], np.zeros((1, *blocks.shape[1:]))])
+    return np.concatenate([blocks, later], axis=1) @ np.swapaxes(blocks, 1, 2)
+
+
+def traces(one: Floats, others: Floats) -> Floats:
+    """Of the products of one with others (k, D, 6, 3), (k,)."""
+    return others.reshape(len(others), one.size) @ (_TWICE * one).ravel()
+
+
+def products(columns: Floats, vector: Floats) -> Floats:
+    """Of matrices (k, D, 6, 3) with a vector (3 D,): (3 D, k)."""
+    blocks = vector.reshape(-1, 3)
+    both = columns @ blocks[:, :, None]
+    out = both[:, :, :3, 0]
+    out[:, 1:] += both[:, :-1, 3:, 0]
+    out[:, :-1] += (blocks[1:, None, :] @ columns[:, :-1, 3:])[:, :, 0]
+    return out.reshape(len(columns), vector.size).T
+
+
+def _reversed(columns: Floats) -> Floats:
+    """The same numbers in reverse order."""
+    out = np.zeros_like(columns)
+    out[:, :3] = columns[::-1, 2::-1, ::-1]
+    out[:-1, 3:] = np.swapaxes(columns[-2::-1, 3:], 1, 2)[:, ::-1, ::-1]
+    return out
+
+
+def _unbanded(lower: Floats) -> Floats:
+    return np.where(_KEPT, lower.T.reshape(-1, 3, 6)[:, np.arange(3), _BAND], 0.0)
+
+
+@lru_cache(maxsize=2)
+def _lapack(name: str) -> Callable[..., Any]:
+    from scipy.linalg import get_lapack_funcs
+
+    return cast("Callable[..., Any]", get_lapack_funcs(name, dtype=np.float64))

@@ -1,0 +1,58 @@
+"""Batch least squares on the same columns: every row of the recording in one dense system.
+
+The textbook's alternative to the filter, and its judge: generalised least squares with the noise model's covariance,
+solved by one call of LAPACK. Its memory grows with the recording; the filter's does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.estimation.dwell_columns import Samples
+from kf_calib.estimation.measurement_model import dwell_map
+from kf_calib.estimation.noise_model import Noise
+
+_SEEN = 1e-9  # a smaller singular value, beside the largest, is rounding
+
+
+def least_squares(
+    samples: Iterable[Samples], noise: Noise, linearised_at: Floats, around: Floats
+) -> tuple[Floats, Floats]:
+    """State (p,) and covariance (p, p) of all samples; diffuse prior, no process noise.
+
+    Combinations of the state that the samples do not determine keep their value ``around``, and are not in the
+    covariance.
+    Rows of a dwell have covariance V = I + B B^T after division by the white sigma, B the dwell's nuisance columns
+    times their sigmas; V^(-1/2) = I - U (1 - (1 + s^2)^(-1/2)) U^T from the thin SVD of B.
+    """
+    by_dwell: dict[tuple[int, bool], list[Samples]] = {}
+    for piece in samples:
+        by_dwell.setdefault((piece.dwell, piece.moving), []).append(piece)
+    whitened = (_whitened(pieces, noise.of(pieces[0].moving), linearised_at) for pieces in by_dwell.values())
+    stacked = np.concatenate(list(whitened))
+    design, readings = stacked[:, :-1], stacked[:, -1]
+    scale = np.linalg.norm(design, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    left, upper = np.linalg.qr(design / scale)
+    rotated, singular, right = np.linalg.svd(upper)
+    seen = singular > _SEEN * singular[0]
+    inverse = (right[seen].T / singular[seen]) / scale[:, None]
+    solution = around + inverse @ (rotated[:, seen].T @ (left.T @ (readings - design @ around)))
+    return np.asarray(solution, float), np.asarray(inverse @ inverse.T, float)
+
+
+def _whitened(pieces: list[Samples], noise: Noise, linearised_at: Floats) -> Floats:
+    """Whitened rows [H | z] (3 n, p + 1) of one dwell's samples."""
+    sigma, used = noise.effective_sigma_mps2, noise.dwell_sigmas > 0
+    nuisances = dwell_map(linearised_at)[:, :, used] * noise.dwell_sigmas[used]
+    rows = np.concatenate([np.concatenate([p.observation, p.readings[:, :, None]], axis=2) for p in pieces])
+    flat = (rows / sigma[:, None]).reshape(-1, rows.shape[2])
+    if used.any():
+        regressors = np.concatenate([p.regressors for p in pieces])
+        shared = (np.einsum("nc,icp->nip", regressors, nuisances) / sigma[:, None]).reshape(len(flat), -1)
+        left, singular, _ = np.linalg.svd(shared, full_matrices=False)
+        flat = flat - left @ ((1 - 1 / np.sqrt(1 + singular**2))[:, None] * (left.T @ flat))
+    return flat

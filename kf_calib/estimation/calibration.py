@@ -1,0 +1,261 @@
+"""The main job: a source in, the twelve parameters with their covariance, the noise and the misfit out.
+
+One pass folds the recording into a factor a dwell (``folding.Folder``); everything after it (noise model, filter
+steps, leave-one-orientation-out) works on the factors. The estimate after each dwell is reported with the noise model
+of the whole run, so the curves of a replay do not jump when the noise becomes better known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from os import PathLike
+from typing import Literal
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Source
+from kf_calib.dwells import window_average
+from kf_calib.dwells.blocks import Tally
+from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
+from kf_calib.effects import of_the_users
+from kf_calib.errors import InputError, UnobservableError
+from kf_calib.estimation import kalman_filterpy, square_root_information
+from kf_calib.estimation.dwell_columns import Carried, Samples, samples_of
+from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
+from kf_calib.estimation.fit import Fit, fit
+from kf_calib.estimation.measurement_model import STATE_COUNT, Model
+from kf_calib.estimation.noise_model import considered_information, mean_covariances
+from kf_calib.estimation.observability import visibility_of
+from kf_calib.estimation.oscillation_carrier import fitted_to, holds_its_oscillation, on_carrier
+from kf_calib.estimation.outlying_dwell import outlying_dwells, outlying_in_words
+from kf_calib.estimation.random_walk import predict, to_mean
+from kf_calib.estimation.remarks import misfit_remark, remarks_on
+from kf_calib.estimation.results import Calibration, Estimate, Visit, consistency, estimate_of, estimates
+from kf_calib.estimation.settings import Settings
+from kf_calib.estimation.square_root_information import FilterStep
+from kf_calib.sources.files.recording import opened
+from kf_calib.support import stage
+
+
+def calibrate(
+    source: Source | str | PathLike[str],
+    settings: Settings | None = None,
+    on_progress: Callable[[float], None] | None = None,
+    plain: Fit | None = None,
+) -> Calibration:
+    """Evaluate a source (or the recording at a path): fold dwells, model the noise, run the filter, judge the misfit.
+
+    plain: the fit of the same model to the dwells as they are, which is known to need them folded on a carrier.
+    Raises InputError where the source holds nothing usable, UnobservableError where one orientation was visited only.
+    """
+    source, settings = opened(source), settings or Settings()
+    with threadpool_limits(1, user_api="blas"):  # small decompositions: with threads they take three times as long
+        if Model.of(source.bench, settings.effects).averages and not settings.window_s:
+            stage.say("reading how it vibrates")
+            settings = replace(settings, window_s=_window_s(source, settings, on_progress))
+            stage.say("reading")
+        passed = Pass(source, settings)
+        if plain is None:
+            passed.fold(on_progress)
+        return conclude(passed, source, on_progress, plain)
+
+
+def _window_s(source: Source, settings: Settings, on_progress: Callable[[float], None] | None) -> float:
+    """Length of the windows that average the vibration in a source away: from a pass of its own."""
+    plain = Pass(source, replace(settings, effects=()))
+    return window_average.window_s(lines_of(plain.fold(on_progress)))
+
+
+def conclude(
+    passed: Pass,
+    again: Source | None = None,
+    on_progress: Callable[[float], None] | None = None,
+    plain: Fit | None = None,
+) -> Calibration:
+    """The calibration of a pass that has come to its end.
+
+    again: the same samples to be read once more, for models that need them folded otherwise; None: they are gone.
+    plain: the pass has not begun, since its fit is known, and does not do.
+    """
+    settings, bench = passed.settings, passed.source.bench
+    dwells = passed.dwells if plain is None else plain.dwells
+    if plain is None:
+        _refuse_absent(settings.left_out, passed.folder.dwells)
+        refuse_unusable(dwells, passed.tally, bench)
+    stage.say("estimating")
+    if again is not None and Model.of(bench, settings.effects).oscillates:
+        passed, fitted = on_carrier(replace(passed, source=again), dwells, plain, on_progress)
+    else:
+        fitted = fitted_to(passed, dwells)
+    result = evaluate_fit(fitted, settings)
+    refuse_unseen(result)
+    if again is not None and settings.engine == "filterpy":
+        stage.say("filterpy, reading by reading")
+        result = replace(result, estimate=filterpy_estimate(again, result, on_progress=on_progress))
+    reread = None if again is None else partial(calibrate, again)
+    return replace(with_remarks(result, passed), reread=reread)
+
+
+def with_remarks(result: Calibration, passed: Pass) -> Calibration:
+    """The result with what its pass counted and saw, and a sentence on each thing that a user must know."""
+    outlying = outlying_dwells(result, lambda some: evaluate_fit(_fit_again(result, some), result.settings))
+    own = [effect for effect in result.model.effects if of_the_users(effect)]
+    notes = [f"{sight}." for sight in visibility_of(result.fit, own)]
+    readings = passed.watch.judged(result.fit.dwells, result.noise)
+    found = [outlying_in_words(outlying)] if outlying else []
+    misfit = misfit_remark(result.consistency, result.residuals_mps2, result.bench, result.noise)
+    usual = [each for each in result.warnings if each != misfit or not (outlying or readings.saturation)]
+    counted = [*passed.tally.sentences(), *passed.tally.unmet(passed.settings.stillness)]
+    said = [*passed.source.warnings, *counted, *readings.warnings, *found, *usual, *notes]
+    return replace(result, tally=passed.tally, readings=readings, warnings=tuple(said), outlying=outlying)
+
+
+def _fit_again(result: Calibration, dwells: list[DwellFactor]) -> Fit:
+    """The same model fitted to some of the dwells."""
+    return fit(dwells, result.model, result.settings.walk_mps2_per_sqrt_s, result.carried.slews)
+
+
+def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
+    """The same run with these effects in the model, whatever was in it before: from the dwell factors alone.
+
+    Only effects that need other factors (an oscillation its carrier, some the slews, some averages of the readings)
+    cost another pass over the source.
+    """
+    key = tuple(effects)
+    if key not in before.refits:
+        before.refits[key] = replace(_refitted(before, key), frames=before.frames)
+    return before.refits[key]
+
+
+def _refitted(before: Calibration, effects: tuple[str, ...]) -> Calibration:
+    settings = replace(before.settings, effects=effects)
+    model = Model.of(before.bench, settings.effects)
+    stage.say(f"refitting with {' + '.join(map(str, model.effects))}" if model.effects else "refitting the twelve")
+    other = model.averages and not all(dwell.averaged for dwell in before.fit.dwells)
+    if before.reread is not None and (other or (model.dynamic and not before.carried.slews)):
+        return before.reread(settings)
+    with threadpool_limits(1, user_api="blas"):  # small decompositions, and the same bits every time
+        fitted = fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews)
+        if before.reread is not None and not holds_its_oscillation(fitted):
+            return before.reread(settings, None, None if fitted.dwells[0].averaged else fitted)
+        again = evaluate_fit(fitted, settings)
+        return replace(again, tally=before.tally, readings=before.readings, reread=before.reread)
+
+
+def evaluate(
+    dwells: list[DwellFactor], bench: Bench, settings: Settings, slews: Sequence[DwellFactor] = ()
+) -> Calibration:
+    """The calibration from dwell factors alone, and those of slews if effects show in them; no pass over the data."""
+    return evaluate_fit(fit(dwells, Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s, slews), settings)
+
+
+def evaluate_fit(fitted: Fit, settings: Settings) -> Calibration:
+    """The filter run over a fit, its innovations, and the judgement of the misfit."""
+    carried, noise, model = fitted.carried, fitted.noise, fitted.carried.model
+    first = square_root_information.start(settings.prior, model)
+    steps = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)
+    extra = considered_information(noise, carried.means, carried.state)
+    final = estimate_of(steps[-1].factor, model.nominal_state(), extra.sum(axis=0) + fitted.considered)
+    residuals = carried.means.readings - carried.means.design @ final.state
+    visits = _visits(fitted, steps, residuals, extra, settings)
+    judged = consistency(fitted)
+    return Calibration(
+        model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))),
+        Tally(), tuple(remarks_on(carried, noise, final, judged, residuals)),
+    )  # fmt: skip
+
+
+def filterpy_estimate(
+    source: Source,
+    result: Calibration,
+    form: Literal["square-root", "plain"] = "square-root",
+    on_progress: Callable[[float], None] | None = None,
+    at_most: float = math.inf,
+) -> Estimate:
+    """The same posterior by filterpy's filter, sample by sample: a second pass over the source.
+
+    on_progress: with the share of readings that are done. at_most: stop after about so many readings.
+    """
+    prior, model = result.settings.prior, result.model
+    scale = np.concatenate([np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), result.carried.sizes[STATE_COUNT:]])
+    samples = samples_of(Pass(source, result.settings).rows(), result.carried)
+    posterior = kalman_filterpy.estimate(
+        _counted(samples, result.carried, on_progress, at_most),
+        result.noise.weights,
+        model.nominal_state(),
+        None if prior.diffuse else square_root_information.prior_covariance(prior, model),
+        result.carried.state,
+        scale,
+        form,
+    )
+    return result.considering(posterior.state, posterior.covariance)
+
+
+def _counted(
+    samples: Iterable[Samples], carried: Carried, on_progress: Callable[[float], None] | None, at_most: float
+) -> Iterator[Samples]:
+    """The same samples, their share told as each stretch of them is done, up to a number of readings."""
+    total, done = sum(dwell.count for dwell in [*carried.dwells, *carried.slews]), 0
+    for piece in samples:
+        yield piece
+        done += len(piece.readings)
+        if on_progress is not None:
+            on_progress(done / total)
+        if done >= at_most:
+            return
+
+
+def _refuse_absent(left_out: Sequence[int], dwells: Sequence[DwellFactor]) -> None:
+    """Raise InputError where a dwell is to be left out that is not there: another one was meant."""
+    absent = sorted(set(left_out) - {dwell.number for dwell in dwells})
+    if absent and dwells:
+        raise InputError(
+            f"there is no dwell {absent[0]} to leave out (--leave-out): the run has dwells {dwells[0].number} to "
+            f"{dwells[-1].number}."
+        )
+
+
+def refuse_unseen(result: Calibration) -> None:
+    """Raise UnobservableError where the orientations determine none of the twelve parameters."""
+    if result.estimate.unseen.all():
+        dwells = (
+            "1 dwell of this run shows" if len(result.visits) == 1 else f"{len(result.visits)} dwells of this run show"
+        )
+        raise UnobservableError(
+            f"the {dwells} too few different directions of gravity, so none "
+            f"of the parameters can be seen ({', '.join(paper_parameters.SYMBOLS)}): visit at least four spread "
+            "orientations, or state a --prior."
+        )
+
+
+def _visits(
+    fitted: Fit, steps: list[FilterStep], residuals: Floats, extra: Floats, settings: Settings
+) -> tuple[Visit, ...]:
+    carried, means, around = fitted.carried, fitted.carried.means, fitted.carried.model.nominal_state()
+    own, walked = mean_covariances(fitted.noise, means, carried.state), to_mean(fitted.steps)
+    first, extra = (
+        square_root_information.start(settings.prior, carried.model),
+        np.concatenate([0.0 * extra[:1], extra]),
+    )
+    factors, extra = np.array([first, *(step.factor for step in steps)]), np.cumsum(extra, axis=0)
+    reached = estimates(factors, around, extra)
+    known, visits = reached[:-1], list[Visit]()
+    if walked.any():
+        before = [predict(factor, float(step)) for factor, step in zip(factors, walked, strict=False)]
+        known = estimates(np.array(before), around, extra[:-1])
+    for k, (dwell, step) in enumerate(zip(carried.dwells, steps, strict=True)):
+        innovation, sigma = np.full(3, np.nan), np.full(3, np.nan)
+        if not known[k].undetermined.size:
+            rows = means.design[k]
+            innovation = means.readings[k] - rows @ known[k].state
+            predicted_by = np.maximum(np.diag(rows @ known[k].covariance @ rows.T), 0.0)  # rounding, where known little
+            sigma = np.sqrt(predicted_by + np.diag(own[k]))
+        visits.append(Visit(dwell, reached[k + 1], step.nis, step.dof, innovation, sigma, residuals[k]))
+    return tuple(visits)

@@ -1,0 +1,142 @@
+"""Leave one orientation out: how far its mean readings are from what all other dwells predict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.qr import triangle
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.estimation import random_walk, square_root_information
+from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.noise_model import considered_information, lift_rounding, mean_covariances
+from kf_calib.estimation.prior import Prior
+
+SAME_POSE_DEG = 1.0
+"""Dwells whose gravity directions are closer than this are visits of one orientation."""
+
+
+def orientations(dwells: Sequence[DwellFactor]) -> list[list[int]]:
+    """Dwells grouped by orientation: the same direction of gravity in the platform, and nearly the same pose."""
+    means = np.array([dwell.means for dwell in dwells])
+    direction = means[:, 1:4] / np.linalg.norm(means[:, 1:4], axis=1, keepdims=True)
+    place = np.column_stack([direction, [dwell.pose for dwell in dwells]])
+    groups, heads = list[list[int]](), np.empty_like(place)
+    for k, here in enumerate(place):
+        near = np.abs(heads[: len(groups)] - here).max(axis=1, initial=0.0) < np.radians(SAME_POSE_DEG)
+        if near.any():
+            groups[int(near.argmax())].append(k)
+        else:
+            heads[len(groups)] = here
+            groups.append([k])
+    return groups
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Mean readings of the dwells less what all other orientations predict, (D, 3), and its covariance (D, 3, 3)."""
+
+    errors_mps2: Floats
+    covariance: Floats
+
+    @property
+    def rms_mps2(self) -> float:
+        return float(np.sqrt(np.mean(self.errors_mps2**2)))
+
+    @property
+    def floor_mps2(self) -> float:
+        """The rms that noise alone would give."""
+        return float(np.sqrt(np.mean(np.einsum("dii->di", self.covariance))))
+
+    @property
+    def statistics(self) -> Floats:
+        """Chi-squared (D,) of each dwell's error, of 3 degrees of freedom."""
+        solved = np.linalg.solve(lift_rounding(self.covariance), self.errors_mps2[:, :, None])[:, :, 0]
+        return np.asarray(np.einsum("di,di->d", self.errors_mps2, solved))
+
+
+def held_out(fitted: Fit) -> HeldOut | None:
+    """Errors of the dwell means of orientations left out of the fit.
+
+    None where a fit without one of the orientations is undetermined. Slews are left out of no fit.
+    """
+    predicted = (_beside if fitted.noise.walk_mps2_per_sqrt_s else _without)(fitted, orientations(fitted.dwells))
+    return None if predicted is None else HeldOut(*predicted)
+
+
+def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | None:
+    """Errors (D, 3) and their covariance (D, 3, 3) where the biases stand.
+
+    Factors of the orientations before and after the one left out are merged: no refit from the start.
+    """
+    carried, noise, around = fitted.carried, fitted.noise.judging, fitted.carried.model.nominal_state()
+    rows = fitted.rows(noise.weights)
+    extra, own = (
+        considered_information(noise, carried.means, carried.state),
+        mean_covariances(noise, carried.means, carried.state),
+    )
+    empty = square_root_information.start(Prior(), carried.model)
+    slews = square_root_information.update(empty, np.concatenate(fitted.following))[0] if carried.slews else empty
+    heads, tails = [slews], [empty]
+    for group in groups[:-1]:
+        heads.append(square_root_information.update(heads[-1], np.concatenate([rows[k] for k in group]))[0])
+    for group in groups[:0:-1]:
+        tails.append(square_root_information.update(tails[-1], np.concatenate([rows[k] for k in group]))[0])
+    merged = triangle(np.concatenate([heads, tails[::-1]], axis=1))[:, : len(empty)]
+    states, covariances, lost = zip(*square_root_information.solve_all(merged, around), strict=True)
+    if any(each.size for each in lost):
+        return None
+    place = np.empty(len(rows), np.intp)
+    for k, group in enumerate(groups):
+        place[group] = k
+    left_out = np.zeros_like(covariances)
+    np.add.at(left_out, place, extra)
+    covariance = np.array(covariances)
+    covariance = (covariance + covariance @ (extra.sum(axis=0) - left_out) @ covariance)[place]
+    design = carried.means.design
+    errors = carried.means.readings - (design @ np.array(states)[place, :, None])[:, :, 0]
+    return errors, own + design @ covariance @ np.swapaxes(design, 1, 2)
+
+
+def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | None:
+    """The same where the biases walk: they are known by the dwells before and after the one left out (a smoother of two
+    filters, one forward and one backward in time; Fraser and Potter, 1969)."""
+    carried, noise, steps = fitted.carried, fitted.noise.judging, fitted.steps
+    rows, means, around = fitted.all_rows(noise.weights), carried.means, carried.model.nominal_state()
+    errors, spreads = np.zeros((len(rows), 3)), mean_covariances(noise, means, carried.state)
+    spreads += (steps[:, 1] / 12.0)[:, None, None] * np.eye(3)  # of a path's mean about the middle of its ends
+    alone, ways = _passes(rows, steps, ()), dict[int, list[tuple[int, Floats]]]()
+    for group in groups:
+        heads, tails = alone if len(group) == 1 else _passes(rows, steps, group)
+        for k in group:
+            upper, count = random_walk.advance(heads[k], steps[k], np.hstack([np.zeros((len(around), 3)), tails[k]]))
+            order = [*range(count, upper.shape[1] - 1), *range(count), upper.shape[1] - 1]
+            ways.setdefault(count, []).append((k, upper[: len(around) + count, order]))
+    for count, own in ways.items():
+        half = np.hstack([-0.5 * np.eye(3), np.zeros((3, count - 3))])  # the mean is half a step short of the end
+        found = square_root_information.solve_all(
+            np.array([upper for _, upper in own]), np.append(around, np.zeros(count))
+        )
+        for (k, _), (state, covariance, lost) in zip(own, found, strict=True):
+            if lost.size:
+                return None
+            design = np.hstack([means.design[k], half])
+            errors[k] = means.readings[k] - design @ state
+            spreads[k] += design @ covariance @ design.T
+    return errors, spreads
+
+
+def _passes(rows: Sequence[Floats], steps: Floats, left_out: Sequence[int]) -> tuple[list[Floats], list[Floats]]:
+    """Factors of the biases before each dwell from the dwells before, and at its end from those after it."""
+    width = rows[0].shape[1] - 4
+    known = [own[:0] if k in left_out else own for k, own in enumerate(rows)]
+    heads, tails = [np.zeros((width, width + 1))], [np.zeros((width, width + 1))]
+    for own, variances in zip(known[:-1], steps, strict=False):
+        upper, count = random_walk.advance(heads[-1], variances, own)
+        heads.append(upper[count : count + width, count:])
+    for own, variances in zip(known[:0:-1], steps[:0:-1], strict=True):
+        tails.insert(0, random_walk.recede(tails[0], variances, own))
+    return heads, tails

@@ -1,0 +1,198 @@
+"""Columns of a model, or of effects, over dwells that are kept as sufficient statistics; their means, and their rows
+sample by sample."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.dwells.rows import Rows, basis, on_basis
+from kf_calib.dwells.sufficient_statistics import DwellFactor, alike, dwells_before, rate_or_zero
+from kf_calib.effects import Effect, Stimulus
+from kf_calib.estimation.measurement_model import Model, effect_columns
+
+_VIBRATING = 15.0  # mean squared deviation of the variances in their own sigma; autocorrelation alone makes up to 10
+
+
+def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> Stimulus:
+    """The nodes of all pieces of all dwells and slews, in order; rotations are linearised at the affine ``state``."""
+    nodes = [dwell.nodes for dwell in dwells]
+    before = [last for dwell, last in zip(dwells, dwells_before(dwells), strict=True) for _ in dwell.pieces]
+    elapsed_s = np.concatenate([each.elapsed_s for each in nodes])
+    return Stimulus(
+        bench=bench,
+        elapsed_s=elapsed_s,
+        since_arrival_s=np.concatenate([each.since_arrival_s for each in nodes]),
+        force_mps2=np.concatenate([each.force_mps2 for each in nodes]),
+        previous_force_mps2=np.repeat([each.means[1:4] for each in before], 3, axis=0),
+        pose=np.concatenate([each.pose for each in nodes]),
+        previous_pose=np.repeat([each.pose for each in before], 3, axis=0),
+        temperature_c=_signal_only(dwells, np.concatenate([each.temperature_c for each in nodes])),
+        sensitivity=state[:12].reshape(3, 4)[:, :3],
+        variance_mps2_2=_varying(dwells).reshape(-1, 3),
+        rate_radps=np.concatenate([rate_or_zero(each.rate_radps) for each in nodes]),
+        rate_change_radps2=np.concatenate([rate_or_zero(each.rate_change_radps2) for each in nodes]),
+        half_s=np.repeat(0.5 * (elapsed_s[2::3] - elapsed_s[::3]), 3),
+        within=np.tile([-1.0, 0.0, 1.0], len(before)),
+        carrier_hz=dwells[0].carrier_hz,
+    )
+
+
+def _signal_only(dwells: Sequence[DwellFactor], temperature_c: Floats) -> Floats:
+    """Temperatures (m,) at the nodes; their mean where they only scatter, as a thermometer does in a steady room.
+
+    Means of dwells that follow each other differ as much as any two (von Neumann's ratio near 1), and by no more than
+    temperatures within a dwell.
+    """
+    counts = np.array([3 * len(dwell.pieces) for dwell in dwells])
+    firsts = np.cumsum(counts) - counts
+    means = np.add.reduceat(temperature_c, firsts) / counts
+    if len(means) < 4 or not np.isfinite(means).all():
+        return temperature_c
+    spread = np.add.reduceat((temperature_c - np.repeat(means, counts)) ** 2, firsts) / counts
+    between, within = means.var(), float(spread.mean())
+    alike = np.mean(np.diff(means) ** 2) > between  # 2 var on average where one says nothing of the next
+    if alike and between < 2.0 * within:
+        return np.full(len(temperature_c), means.mean())
+    return temperature_c
+
+
+def _varying(dwells: Sequence[DwellFactor]) -> Floats:
+    """Variances of the readings (pieces, nodes, 3) where they vary beyond what their estimates scatter by, else their
+    mean."""
+    at_nodes, counts = (np.concatenate(parts) for parts in zip(*(dwell.shaking for dwell in dwells), strict=True))
+    variances = at_nodes.mean(axis=1)
+    mean = np.average(variances, axis=0, weights=counts)
+    excess = np.mean(0.5 * counts[:, None] * (variances / np.where(mean > 0, mean, 1.0) - 1.0) ** 2, axis=0)
+    return np.where(excess > _VIBRATING, at_nodes, mean)
+
+
+def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[Floats]:
+    """The model's columns at the nodes of each dwell, (pieces, K nodes, 3 channels, p)."""
+    return _by_dwell(dwells, lambda s: model.columns(s, state), stimulus_of(dwells, model.bench, state))
+
+
+def candidate_columns(
+    dwells: Sequence[DwellFactor], effects: Sequence[Effect], bench: Bench, state: Floats
+) -> list[Floats]:
+    """Columns of effects that are in no model yet, like ``columns_of``."""
+    return _by_dwell(dwells, lambda s: effect_columns(effects, s), stimulus_of(dwells, bench, state))
+
+
+def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> list[Floats]:
+    """Columns of a stimulus (m, 3, p) by dwell; on a carrier the plain part's nodes, then those of the envelopes."""
+    parts = [columns(stimulus)]
+    if stimulus.carrier_hz:
+        parts += [columns(replace(stimulus, part=part)) for part in (1, 2)]
+    shaped = np.concatenate([part.reshape(len(part) // 3, 3, *part.shape[1:]) for part in parts], axis=1)
+    return np.split(shaped, np.cumsum([len(dwell.pieces) for dwell in dwells])[:-1])
+
+
+@dataclass(frozen=True, repr=False)
+class Means:
+    """Of D dwells: mean model columns (D, 3, p), readings (D, 3), specific force (D, 3); counts of readings (D,), when
+    each begins and ends (D, 2)."""
+
+    design: Floats
+    readings: Floats
+    force_mps2: Floats
+    counts: Floats
+    ends_s: Floats
+
+    def __getitem__(self, part: int | list[int]) -> Means:
+        return Means(*(getattr(self, each.name)[part] for each in fields(self)))
+
+
+def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
+    design = np.zeros((len(dwells), *columns[0].shape[2:]))
+    for places in alike(dwells):
+        own, batch = np.array([columns[k] for k in places]), [dwells[k] for k in places]
+        triangles, width = np.array([dwell.triangles for dwell in batch]), batch[0].width
+        first = triangles[:, :, 0, :width] / triangles[:, :, :1, 0]  # means of the basis
+        weights = np.array([dwell.counts / dwell.count for dwell in batch])
+        coefficients = on_basis(own.reshape(*own.shape[:3], -1))
+        design[places] = np.einsum("db,dbk,dbkc->dc", weights, first, coefficients).reshape(-1, *own.shape[3:])
+    means = np.array([dwell.means for dwell in dwells])
+    counts = np.array([dwell.count for dwell in dwells], float)
+    ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
+    return Means(design, means[:, 4:], means[:, 1:4], counts, ends)
+
+
+class Carried:
+    """Dwells with the columns of a model: all that noise model, filter and diagnosis work on.
+
+    ``state`` (p,): where small rotations and input axes are linearised. slews, slew_columns: of the motions, where an
+    effect in the model shows in them; everything else is of dwells only.
+    """
+
+    def __init__(
+        self, dwells: Sequence[DwellFactor], model: Model, state: Floats, slews: Sequence[DwellFactor] = ()
+    ) -> None:
+        self.dwells, self.slews, self.model, self.state = list(dwells), list(slews), model, state
+        every = sorted((*dwells, *slews), key=lambda each: (each.number, each.moving)) if slews else self.dwells
+        columns = columns_of(every, model, state)
+        self.columns = [own for each, own in zip(every, columns, strict=True) if not each.moving]
+        self.slew_columns = [own for each, own in zip(every, columns, strict=True) if each.moving]
+
+    def followed_by(self, dwell: DwellFactor) -> Carried:
+        """With one more dwell; the columns of the others stay as they are."""
+        out = Carried.__new__(Carried)
+        out.dwells, out.slews, out.model, out.state = [*self.dwells, dwell], self.slews, self.model, self.state
+        last = stimulus_of(out.dwells, self.model.bench, self.state).ending(3 * len(dwell.pieces))
+        out.columns = [*self.columns, *_by_dwell([dwell], lambda s: self.model.columns(s, self.state), last)]
+        out.slew_columns = self.slew_columns
+        return out
+
+    @cached_property
+    def means(self) -> Means:
+        return means_of(self.dwells, self.columns)
+
+    @property
+    def carrier_hz(self) -> float:
+        """What the dwells were folded on; 0: no carrier."""
+        return self.dwells[0].carrier_hz
+
+    @property
+    def sizes(self) -> Floats:
+        """What a unit of each state makes in a reading, about, (p,); 1 where nothing."""
+        largest = np.abs(self.means.design).max(axis=(0, 1))
+        seen_within = [own[:, 3:] for own in self.columns if self.carrier_hz]  # envelopes leave little in a mean
+        for own in (*seen_within, *self.slew_columns):
+            largest = np.maximum(largest, np.abs(own).max(axis=(0, 1, 2)))
+        return np.where(largest > 0, largest, 1.0)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Rows of one piece, sample by sample: H (n, 3, p), regressors of the dwell states (n, 4), readings (n, 3).
+
+    elapsed_s (n,). moving: of the slew after the dwell.
+    """
+
+    dwell: int
+    elapsed_s: Floats
+    observation: Floats
+    regressors: Floats
+    readings: Floats
+    moving: bool = False
+
+
+def samples_of(rows: Iterable[Rows], carried: Carried) -> Iterator[Samples]:
+    """A second pass over the rows with the columns of the first: what filterpy and batch least squares work on."""
+    every, columns = [*carried.dwells, *carried.slews], [*carried.columns, *carried.slew_columns]
+    known = {(each.number, each.moving): iter(own) for each, own in zip(every, columns, strict=True)}
+    for block in rows:
+        key = block.dwell, block.moving
+        if key not in known:
+            continue
+        for part, u, _ in block.pieces:
+            own = next(known[key])
+            functions = basis(u, block.elapsed_s[part], carried.carrier_hz)
+            observation = (functions.T @ on_basis(own.reshape(len(own), -1))).reshape(len(u), *own.shape[1:])
+            regressors, readings = block.columns[part], block.readings[part]
+            yield Samples(block.dwell, block.elapsed_s[part], observation, regressors, readings, block.moving)

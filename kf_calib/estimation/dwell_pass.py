@@ -1,0 +1,110 @@
+"""One pass over a source: readings in, dwells out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Source
+from kf_calib.dwells import window_average
+from kf_calib.dwells.blocks import LARGEST_RAD, Block, Tally
+from kf_calib.dwells.rows import Rows, model_rows
+from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
+from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder, dwells_without
+from kf_calib.errors import InputError
+from kf_calib.estimation import setup_blunders
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.settings import Settings
+from kf_calib.estimation.signal_quality import ReadingsMonitor
+
+
+@dataclass
+class Pass:
+    """One pass over a source: the rows as they come, what was counted and seen, and the dwells folded so far."""
+
+    source: Source
+    settings: Settings
+    tally: Tally = field(default_factory=Tally)
+    folder: Folder = field(default_factory=Folder)
+    watch: ReadingsMonitor = field(default_factory=ReadingsMonitor)
+
+    def segmenter(self) -> Segmenter:
+        """What cuts the source into dwells, and into slews where an effect of the model shows in them."""
+        slews = bool(Model.of(self.source.bench, self.settings.effects).dynamic)
+        return Segmenter(self.source.bench, self.settings.stillness, self.tally, slews)
+
+    def rows(self) -> Iterator[Rows]:
+        return self.rows_of(dwell_blocks(self.source, self.segmenter()))
+
+    def rows_of(self, blocks: Iterable[Block]) -> Iterator[Rows]:
+        model = Model.of(self.source.bench, self.settings.effects)
+        usual_s = window_average.WINDOW_S if model.averages else 0.0
+        window_s = 0.0 if model.oscillates else self.settings.window_s or usual_s
+        return model_rows(blocks, self.source.bench, self.tally, self.settings.gate_sigma, window_s)
+
+    def add(self, rows: Rows) -> None:
+        self.folder.add(rows)
+        self.watch.add(rows.raw or rows)
+
+    def fold(self, on_progress: Callable[[float], None] | None = None) -> list[DwellFactor]:
+        """All dwells of the source that hold enough readings to be used."""
+        for rows in self.rows():
+            self.add(rows)
+            if on_progress is not None:
+                on_progress(self.source.fraction)
+        return self.dwells
+
+    @property
+    def dwells(self) -> list[DwellFactor]:
+        """Those folded so far that are used: of at least 8 readings, fewer cannot show their own noise, and not left
+        out by the settings."""
+        left_out = self.settings.left_out
+        if not left_out:
+            return [dwell for dwell in self.folder.dwells if dwell.count >= 8]
+        unused = {k for k, each in enumerate(self.folder.dwells) if each.count < 8 or each.number in left_out}
+        return dwells_without(self.folder.dwells, unused)
+
+
+def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> None:
+    """Raise InputError where there is nothing to calibrate from, or where the readings are not in m/s^2."""
+    if not tally.read:
+        raise InputError("the recording holds no accelerometer readings: check that the logger wrote any.")
+    if tally.poses_dropped and not tally.poses:
+        raise InputError(
+            f"none of the {tally.poses_dropped} angle messages can be used: they are not finite, beyond "
+            f"{LARGEST_RAD:.0e} rad (counts of an encoder?) or no unit quaternions; record angles in rad or deg, or "
+            "unit quaternions."
+        )
+    if not tally.poses:
+        raise InputError(
+            "the recording holds no platform angles (or attitude), so the direction of gravity is not known: "
+            "record them on /platform/angles, at any rate."
+        )
+    if not dwells:
+        turns = tally.farthest_rad / (2.0 * math.pi)
+        unit = f"; angles of up to {turns:.0f} turns look like degrees (--angle-unit deg)" if turns > 3.0 else ""
+        raise InputError(
+            f"no dwell was found in {tally.read} readings ({tally.moving} moving, {tally.settling} settling, "
+            f"{tally.not_finite} not finite, {tally.too_large} too large, {tally.without_pose} without an angle): the "
+            f"platform must stand still; if it did, raise --still-deg or lower --settle-s{unit}."
+        )
+    level = float(np.median([np.linalg.norm(dwell.means[4:]) for dwell in dwells])) / bench.gravity_mps2
+    if 0.5 <= level <= 2.0:
+        setup_blunders.refuse(dwells, bench)
+        return
+    units = {"g": 1 / 9.80665, "mg": 1e3 / 9.80665, "ug": 1e6 / 9.80665}
+    measured = level * bench.gravity_mps2
+    for unit, per_mps2 in units.items():
+        if 0.8 <= measured / (bench.gravity_mps2 * per_mps2) <= 1.25:
+            raise InputError(
+                f"the readings have a norm of {measured:.4g} at rest, which is gravity in {unit}, not in m/s^2: "
+                f"state it with --accel-unit {unit}."
+            )
+    raise InputError(
+        f"the readings have a norm of {measured:.4g} at rest where gravity is {bench.gravity_mps2:.4g} m/s^2: they "
+        "look like counts; give the size of one count in m/s^2 with --accel-scale."
+    )

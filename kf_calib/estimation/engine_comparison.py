@@ -1,0 +1,133 @@
+"""The same recording three ways: block engine, filterpy sample by sample, batch least squares.
+
+The three agree to rounding on a diffuse prior without process noise. Where they may differ, and why: a stated prior
+and a walk of the biases are known to the filters only; the gate is shared by all three.
+"""
+
+from __future__ import annotations
+
+import time
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import TypeVar
+
+import numpy as np
+
+from kf_calib.bench.streams import Source
+from kf_calib.estimation.batch_least_squares import least_squares
+from kf_calib.estimation.calibration import calibrate, filterpy_estimate
+from kf_calib.estimation.dwell_columns import samples_of
+from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.results import Calibration, Estimate
+from kf_calib.estimation.settings import Settings
+from kf_calib.sources.files.recording import opened
+from kf_calib.support import stage
+
+Result = TypeVar("Result")
+
+_TRACED = 300  # readings over which the memory of filterpy is traced
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way of estimating: wall seconds, peak memory in MB (numpy's and Python's), distance from the block engine.
+
+    Tracing memory makes many small steps several times slower, so it is traced in a run of its own; filterpy's over its
+    first few hundred readings, since it keeps none of them.
+    max_difference_sigma: largest |difference| of the twelve parameters in sigma; max_relative_variance: of diag P.
+    """
+
+    estimate: Estimate
+    wall_s: float
+    peak_mb: float
+    max_difference_sigma: float = 0.0
+    max_relative_variance: float = 0.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    result: Calibration
+    ways: dict[str, Way]
+    remarks: tuple[str, ...]
+
+    @property
+    def max_difference_sigma(self) -> float:
+        return max(way.max_difference_sigma for way in self.ways.values())
+
+
+def compare(
+    source: Source | str | PathLike[str],
+    settings: Settings | None = None,
+    on_progress: Callable[[float], None] | None = None,
+) -> Comparison:
+    """Run all three ways, each over a source (or the recording at a path) from its start, and measure them.
+
+    on_progress: how much of each way is done; it begins anew with each.
+    """
+    source = opened(source)
+    settings = replace(settings or Settings(), engine="block")
+    stage.say("block engine")
+    result, block_s = _timed(lambda: calibrate(source, settings, on_progress))
+
+    def batch() -> Estimate:
+        around = result.model.nominal_state()
+        samples = samples_of(Pass(source, settings).rows(), result.carried)
+        return result.considering(*least_squares(samples, result.noise.weights, result.carried.state, around))
+
+    stage.say("filterpy, reading by reading")
+    filterpy, filterpy_s = _timed(lambda: filterpy_estimate(source, result, on_progress=on_progress))
+    stage.say("batch least squares")
+    least, batch_s = _timed(batch)
+    stage.say("memory of each")
+    ways = {
+        "block": Way(result.estimate, block_s, _peak_mb(lambda: calibrate(source, settings))),
+        "filterpy": Way(filterpy, filterpy_s, _peak_mb(lambda: filterpy_estimate(source, result, at_most=_TRACED))),
+        "batch": Way(least, batch_s, _peak_mb(batch)),
+    }
+    ways = {name: _against(way, result.estimate) for name, way in ways.items()}
+    return Comparison(result, ways, tuple(_remarks(settings, result)))
+
+
+def _timed(run: Callable[[], Result]) -> tuple[Result, float]:
+    begin = time.perf_counter()
+    return run(), time.perf_counter() - begin
+
+
+def _peak_mb(run: Callable[[], object]) -> float:
+    tracemalloc.start()
+    run()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak / 1e6
+
+
+def _against(way: Way, reference: Estimate) -> Way:
+    """Distances over the twelve parameters and the effects, as far as they are determined."""
+    ones = np.concatenate([way.estimate.parameters, way.estimate.effects])
+    others = np.concatenate([reference.parameters, reference.effects])
+    sigma = np.concatenate([reference.sigma, reference.effect_sigma])
+    seen, known = np.isfinite(sigma), reference.determined
+    variance = np.diag(way.estimate.covariance)[known] / np.diag(reference.covariance)[known]
+    return replace(
+        way,
+        max_difference_sigma=float((np.abs(ones - others)[seen] / sigma[seen]).max(initial=0.0)),
+        max_relative_variance=float(np.abs(variance - 1).max(initial=0.0)),
+    )
+
+
+def _remarks(settings: Settings, result: Calibration) -> list[str]:
+    said = []
+    if not settings.prior.diffuse:
+        said.append("a prior was stated: the filters use it, batch least squares does not, so it may differ.")
+    if result.noise.walk_mps2_per_sqrt_s:
+        said.append(
+            "the biases walk: the filters follow them (the block engine by what parabolas see of a path, some 0.001 "
+            "sigma), batch least squares holds them still, so it may differ."
+        )
+    if result.tally.gated:
+        said.append(f"the gate rejected {result.tally.gated} readings, the same ones for all three.")
+    if not said:
+        said.append("diffuse prior, no process noise, the same gate: the three may differ by rounding only.")
+    return said

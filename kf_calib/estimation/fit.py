@@ -1,0 +1,293 @@
+"""The model and the noise model fitted to the dwells, in turn: what the filter then runs on.
+
+Small rotations and input axes are linearised at the estimate; constants inside an effect's columns (time constants,
+frequencies) are looked for on a grid and refined by Gauss-Newton, their derivative being one more column; the dwell
+parts of the noise and a walk of the biases are found by likelihood.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.dwells.rows import on_basis
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.effects import Coefficient, Effect
+from kf_calib.estimation import square_root_information
+from kf_calib.estimation.dwell_columns import Carried, Means, candidate_columns, stimulus_of
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, steps, within_dwells
+from kf_calib.estimation.reml import Part, gain_of, misfit, restoring_gain, with_dwell_parts, with_slow_scatter
+from kf_calib.estimation.score_test import falls
+
+WALK = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5, "µg/√s", 1e6 / 9.80665)
+"""The intensity of a walk of the biases as a parameter."""
+
+_PASSES = 3
+_PASSES_WITH_UNKNOWNS = 10
+_EXACT_RAD = 1e-9
+_STILL = 2.5e-4  # a step of ln(value), in reaches, that ends the search
+
+
+@dataclass(frozen=True, repr=False)
+class Fit:
+    """Dwells with the fitted model's columns, and the noise they are weighted by.
+
+    spreads: 1 sigma of ln(value) of each constant without derivative, by its effect.
+    """
+
+    carried: Carried
+    noise: Noise
+    spreads: Mapping[str, float] = field(default_factory=dict[str, float])
+
+    @property
+    def dwells(self) -> list[DwellFactor]:
+        return self.carried.dwells
+
+    @property
+    def steps(self) -> Floats:
+        """Variances (D, 2) of the biases' steps before and in each dwell; zeros where they do not walk."""
+        return steps(self.dwells, self.noise)
+
+    @cached_property
+    def state(self) -> Floats:
+        """The estimate (p,) by these columns; where biases walk, those after the last dwell."""
+        factor = square_root_information.accumulate(self.all_rows(), self.steps)[:-1]
+        return square_root_information.solve(factor, self.carried.model.nominal_state())[0]
+
+    @cached_property
+    def judged(self) -> list[Floats]:
+        """Rows [H | W | z] by which the misfit is judged."""
+        carried = self.carried
+        return square_root_information.misfit_rows(
+            self.dwells, carried.columns, self.noise.judging, carried.state, carried.model.count
+        )[0]
+
+    @cached_property
+    def following(self) -> list[Floats]:
+        """Whitened rows [H | z] of what slew follows each dwell; (0, p + 1) where none does."""
+        carried, noise = self.carried, self.noise.weights.of(moving=True)
+        out = [np.zeros((0, carried.model.count + 1))] * len(self.dwells)
+        if carried.slews:
+            rows = square_root_information.whiten(carried.slews, carried.slew_columns, noise, carried.state)
+            numbers = [dwell.number for dwell in self.dwells]
+            for slew, own in zip(carried.slews, rows, strict=True):
+                place = bisect.bisect_right(numbers, slew.number) - 1
+                out[place] = np.vstack([out[place], own])
+        return out
+
+    def all_rows(self, noise: Noise | None = None) -> list[Floats]:
+        """Whitened rows of each dwell and the slew after it, in which the biases stand."""
+        out = list[Floats]()
+        for own, more in zip(self.rows(noise), self.following, strict=True):
+            standing = np.zeros((len(more), own.shape[1] - more.shape[1]))
+            out.append(np.vstack([own, np.hstack([standing, more])]) if len(more) else own)
+        return out
+
+    @cached_property
+    def families(self) -> dict[Any, Any]:
+        """The formulas that were tried on what this fit leaves (``unknown_effect.families``), by what else was
+        tried."""
+        return {}
+
+    @cached_property
+    def considered(self) -> Floats:
+        """What the constants without derivative add to the information about the gain, (p, p).
+
+        b b^T times the variance, b = A^T W g, g the change of the readings from 1 sigma below to 1 sigma above: with it
+        the covariance is P + P b b^T P, as a Schmidt-Kalman filter's that knows of a parameter it does not estimate.
+        """
+        carried, out = self.carried, np.zeros((self.carried.model.count,) * 2)
+        for effect in carried.model.stepped:
+            spread, part = self.spreads.get(str(effect), 0.0), carried.model.parts[str(effect)]
+            ends = [effect.at(effect.value * math.exp(step)) for step in (spread, -spread)]
+            more, less = (candidate_columns(carried.dwells, [end], carried.model.bench, carried.state) for end in ends)
+            changes = [0.5 * (a - b) @ carried.state[part, None] for a, b in zip(more, less, strict=True)]
+            columns = [np.concatenate(both, axis=3) for both in zip(carried.columns, changes, strict=True)]
+            rows = square_root_information.whiten(carried.dwells, columns, self.noise.weights, carried.state)
+            upper = square_root_information.accumulate(rows, self.steps)
+            gain = upper[: len(out), : len(out)].T @ upper[: len(out), len(out)]
+            out += np.outer(gain, gain)
+        return out
+
+    @cached_property
+    def walk_gain(self) -> float:
+        """What a walk of the biases gains in log-likelihood over none, beside what a stated scatter may be.
+
+        Scatter that was estimated from the same misfit is left out.
+        """
+        return self._gain_of("walk")
+
+    @cached_property
+    def scatter_gain(self) -> float:
+        """The same of more than is stated of what is anew in every dwell: scatter of the sensors, or setting error."""
+        return max(self._gain_of("common"), self._gain_of("setting"))
+
+    @cached_property
+    def misfit(self) -> float:
+        """Chi-squared of the dwells' means, in the likelihood that these are gains in."""
+        noise, means, prior = self._wandering
+        return misfit(noise, means, self.carried.state, prior)
+
+    def _gain_of(self, part: Part) -> float:
+        noise, means, prior = self._wandering
+        return gain_of(part, noise, means, self.carried.state, prior)
+
+    @cached_property
+    def _wandering(self) -> tuple[Noise, Means, Floats]:
+        noise, carried = replace(self.noise.judging, walk_mps2_per_sqrt_s=0.0), self.carried
+        return noise, *with_slow_scatter(carried.dwells, noise, carried.means)
+
+    @cached_property
+    def back_gain(self) -> tuple[float, float]:
+        """What a walk that comes back gains in log-likelihood over the walk of the biases that the fit has, beside what
+        a stated scatter may be; and the time constant with which it comes back, s."""
+        _, means, prior = self._wandering
+        return restoring_gain(self.noise.judging, means, self.carried.state, prior)
+
+    def rows(self, noise: Noise | None = None) -> list[Floats]:
+        """Whitened rows [H | z] of each dwell, by the weights of the fit or by another noise."""
+        return square_root_information.whiten(
+            self.dwells, self.carried.columns, noise or self.noise.weights, self.carried.state
+        )
+
+
+def fit(
+    dwells: list[DwellFactor], model: Model, walk_mps2_per_sqrt_s: float = 0.0, slews: Sequence[DwellFactor] = ()
+) -> Fit:
+    """Noise, linearisation and the model's unknowns, each given the others, until they stand still."""
+    within, bench = within_dwells(dwells, walk_mps2_per_sqrt_s), model.bench
+    within = replace(within, walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
+    slews = [slew for slew in slews if slew.number >= dwells[0].number] if model.dynamic else []
+    fitted = Fit(Carried(dwells, model, model.nominal_state(), slews), within)
+    searching, sizes = False, None
+    for number in range(_PASSES_WITH_UNKNOWNS if model.unknowns or model.stepped else _PASSES):
+        if number == 1 and model.unknowns:
+            model, searching = _placed(fitted), True
+            fitted = replace(fitted, carried=Carried(dwells, model, fitted.carried.state, slews))
+        if number and model.stepped:
+            model, spreads = _averaged(fitted)
+            fitted = replace(fitted, carried=Carried(dwells, model, fitted.carried.state, slews), spreads=spreads)
+        state, moved = _solved(fitted)
+        reach = _reach(fitted)
+        if searching:
+            model = model.moved(np.clip(moved, -reach, reach))
+        carried = Carried(dwells, model, state, slews)
+        stated = _setting_deg(dwells, bench), bench.scatter_sigma_mps2
+        noise, sizes = with_dwell_parts(within, carried.means, state, *stated, walks=model.walks, near=sizes)
+        noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
+        fitted = replace(fitted, carried=carried, noise=noise)
+        if model.walks:
+            within = within_dwells(dwells, noise.walk_mps2_per_sqrt_s)
+        # where columns step, they hold the input axes to where they are taken to be: that gives way slowly
+        if number >= _PASSES - 1 and (np.abs(moved) <= _STILL * reach).all() and not model.stepped:
+            break
+    return fitted
+
+
+def _setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:
+    """The setting error that is stated, and beside it what the angles' noise leaves uncertain of the dwells' poses."""
+    pose_rad = float(np.sqrt(np.mean([dwell.pose_sigma_rad**2 for dwell in dwells])))
+    if bench.angle_sigma_deg is None or pose_rad < _EXACT_RAD:
+        return bench.angle_sigma_deg
+    return math.hypot(bench.angle_sigma_deg, math.degrees(pose_rad))
+
+
+def _solved(fitted: Fit) -> tuple[Floats, Floats]:
+    """The estimate (p,) with unknowns at zero, and how far these would move (p,), zeros elsewhere."""
+    state = fitted.state.copy()
+    moved = np.zeros_like(state)
+    places = list(fitted.carried.model.unknowns)
+    moved[places], state[places] = state[places], 0.0
+    return state, moved
+
+
+def _reach(fitted: Fit) -> Floats:
+    """How far each state may move in one step (p,): unknowns by their kind, the others are not moved."""
+    model, reach = fitted.carried.model, np.ones(fitted.carried.model.count)
+    if model.unknowns:
+        stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
+        for k, effect in model.unknowns.items():
+            reach[k] = effect.reach(stimulus)
+    return reach
+
+
+def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
+    """Sigma (3,) of white readings that would leave the slews' rows as far from ``state`` as they are.
+
+    The channels' ratio is that of their residuals; the level makes the mean square of the whitened rows' residuals one.
+    These rows are weighted sums over whole slews, so that what is correlated along a slew (angles, vibration) counts.
+    """
+    carried, rows = fitted.carried, np.concatenate(fitted.following)
+    squares, counts = np.zeros(3), 0
+    for slew, columns in zip(carried.slews, carried.slew_columns, strict=True):
+        model = np.moveaxis(columns @ state, 2, 1)  # (pieces, channels, nodes)
+        own = slew.triangles[:, :, slew.width :].copy()
+        own[:, : slew.width] -= slew.triangles[:, : slew.width, : slew.width] @ on_basis(np.moveaxis(model, 1, 2))
+        squares, counts = squares + (own**2).sum(axis=(0, 1)), counts + slew.count
+    sizes = np.sqrt(squares / counts) + FLOOR_MPS2
+    factor = square_root_information.accumulate(fitted.all_rows(), fitted.steps)[:-1]
+    covariance = square_root_information.solve(factor, state)[1]
+    freedom = square_root_information.row_rank(rows) - float(
+        np.einsum("rp,pq,rq->", rows[:, :-1], covariance, rows[:, :-1])
+    )
+    level = np.linalg.norm(rows[:, -1] - rows[:, :-1] @ state) / np.sqrt(max(freedom, 1.0))
+    before = fitted.noise.of(moving=True).effective_sigma_mps2
+    return np.maximum(level * sizes * np.exp(np.mean(np.log(before / sizes))), FLOOR_MPS2)
+
+
+def _placed(fitted: Fit) -> Model:
+    """The model with each unknown at that value of its grid at which its effect explains most."""
+    model = fitted.carried.model
+    stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
+    for effect in model.unknowns.values():
+        grid = [effect.at(value) for value in effect.grid(stimulus)]
+        model = model.with_effect(grid[_best(fitted, model - effect, grid)])
+    return model
+
+
+def _averaged(fitted: Fit) -> tuple[Model, dict[str, float]]:
+    """The model with each constant without derivative at its mean by likelihood, and 1 sigma of its logarithm.
+
+    Likelihood exp(fall of chi^2 / 2), the prior flat in ln(value): between two poses no value is likelier than another.
+    """
+    model, spreads = fitted.carried.model, dict[str, float]()
+    stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
+    for effect in model.stepped:
+        edges = np.log(effect.edges(stimulus))
+        middles, widths = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+        falls = _falls(fitted, model - effect, [effect.at(value) for value in np.exp(middles)])
+        weights = np.exp(0.5 * (falls - falls.max())) * widths
+        mean = float(np.average(middles, weights=weights))
+        spreads[str(effect)] = float(np.sqrt(np.average((middles - mean) ** 2 + widths**2 / 12.0, weights=weights)))
+        model = model.with_effect(effect.at(math.exp(mean)))
+    return model, spreads
+
+
+def _best(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> int:
+    """Which of the same effect at several values explains most beside the ``rest`` of the model."""
+    return int(np.argmax(_falls(fitted, rest, grid)))
+
+
+def _falls(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> Floats:
+    """By how much the same effect at several values would lower chi-squared beside the ``rest`` of the model."""
+    state = np.concatenate([fitted.carried.state[:12], np.zeros(rest.count - 12)])
+    return falls(Carried(fitted.dwells, rest, state), fitted.noise.weights, grid)
+
+
+def loss_within_range(fitted: Fit, effect: Effect) -> float:
+    """By how much chi-squared is larger with the constant of an effect at the best value well within its range, by a
+    factor of two, than where it is."""
+    assert effect.unknown is not None
+    stimulus = stimulus_of(fitted.dwells, fitted.carried.model.bench, fitted.carried.state)
+    within = [v for v in effect.grid(stimulus) if 2.0 * effect.unknown.low < v < 0.5 * effect.unknown.high]
+    falls = _falls(fitted, fitted.carried.model - effect, [effect, *(effect.at(value) for value in within)])
+    return float(falls[0] - falls[1:].max(initial=-np.inf))

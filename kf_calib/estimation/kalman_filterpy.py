@@ -1,0 +1,151 @@
+"""The reference engine: filterpy's Kalman filter, sample by sample, as a textbook has it.
+
+The state is in units of m/s^2 (g s_i, b_i, effects), followed by the nuisance states of the current dwell, which
+start again from their prior at each new dwell. filterpy's square-root form is used: its plain form loses digits of
+the covariance after tens of thousands of static samples with a wide prior (``form="plain"`` shows it).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.estimation.dwell_columns import Samples
+from kf_calib.estimation.measurement_model import STATE_COUNT, dwell_map
+from kf_calib.estimation.noise_model import Noise
+
+_DIFFUSE = 1e5
+"""A diffuse prior's sigma in sigmas of one reading: wide enough to bias nothing, narrow enough for doubles."""
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """State (p,), covariance (p, p), sum of the samples' normalised innovations squared and their number."""
+
+    state: Floats
+    covariance: Floats
+    nis: float
+    samples: int
+
+
+def estimate(
+    samples: Iterable[Samples],
+    noise: Noise,
+    nominal_state: Floats,
+    prior_covariance: Floats | None,
+    linearised_at: Floats,
+    scale: Floats,
+    form: Literal["square-root", "plain"] = "square-root",
+) -> Posterior:
+    """Run the filter over all samples.
+
+    prior_covariance None: diffuse. scale (p,): m/s^2 that a unit of each state makes in a reading, about.
+    The biases walk by the noise's intensity from reading to reading (process noise Q).
+    """
+    count, used = len(nominal_state), np.flatnonzero(noise.dwell_sigmas > 0)
+    nuisances = dwell_map(linearised_at)[:, :, used]
+    if prior_covariance is None:
+        gravity = scale[0]
+        widest = max(noise.effective_sigma_mps2.max(), noise.scatter_mps2.max(), gravity * noise.setting_rad)
+        root = _DIFFUSE * widest * np.eye(count)
+    else:
+        root = np.linalg.cholesky(prior_covariance * np.outer(scale, scale))
+    kf = _Filter(form, nominal_state * scale, root, noise.dwell_sigmas[used])
+    place, nis, done, previous_s = (-1, False), 0.0, 0, math.nan
+    for piece in samples:
+        if (piece.dwell, piece.moving) != place:
+            kf.enter_dwell(noise.of(piece.moving).effective_sigma_mps2)
+            place = (piece.dwell, piece.moving)
+        own = np.einsum("nc,icp->nip", piece.regressors, nuisances)
+        observations = np.concatenate([piece.observation / scale, own], axis=2)
+        for observation, reading, now_s in zip(observations, piece.readings, piece.elapsed_s.tolist(), strict=True):
+            if noise.walk_mps2_per_sqrt_s and now_s > previous_s:
+                kf.walk(noise.walk_mps2_per_sqrt_s**2 * (now_s - previous_s))
+            previous_s = now_s
+            nis += kf.update(observation, reading)
+        done += len(piece.readings)
+    state, covariance = kf.posterior()
+    return Posterior(state / scale, covariance / np.outer(scale, scale), nis, done)
+
+
+def repeated(
+    observations: Floats, readings: Floats, sigma_mps2: float, start: Floats, start_root: Floats
+) -> tuple[Floats, Floats]:
+    """One experiment many times over: its final states (p, r) and the covariance (n, p, p) after every sample.
+
+    observations (n, m, p) and the prior, ``start`` (p,) with covariance L L^T, L = ``start_root`` (p, p), are the same
+    in all repetitions, and so are gains and covariance: filterpy's filter runs once, its state a column a repetition.
+    readings (n, m, r).
+    """
+    from filterpy.kalman import SquareRootKalmanFilter
+
+    samples, channels, count = observations.shape
+    kf: Any = SquareRootKalmanFilter(dim_x=count, dim_z=channels)
+    kf.x = np.repeat(start[:, None], readings.shape[2], axis=1)
+    kf._P1_2, kf._R1_2 = start_root, sigma_mps2 * np.eye(channels)  # setters would lose half the digits
+    covariances = np.empty((samples, count, count))
+    for k in range(samples):
+        kf.H = observations[k]
+        kf.update(readings[k])
+        covariances[k] = kf.P
+    return kf.x, covariances
+
+
+class _Filter:
+    """One of filterpy's two filters behind the few calls needed here."""
+
+    def __init__(self, form: str, state: Floats, root: NDArray[np.floating[Any]], dwell_sigmas: Floats) -> None:
+        from filterpy.kalman import KalmanFilter, SquareRootKalmanFilter
+
+        self.plain = form == "plain"
+        self.dwell_sigmas = dwell_sigmas
+        self.count = len(state)
+        size = self.count + len(dwell_sigmas)
+        kf: Any = (KalmanFilter if self.plain else SquareRootKalmanFilter)(dim_x=size, dim_z=3)
+        kf.x = np.concatenate([state, np.zeros(len(dwell_sigmas))])  # 1-D: a column would broadcast to (n, 3)
+        full = np.zeros((size, size))
+        full[: self.count, : self.count] = root
+        if self.plain:
+            kf.P = full @ full.T
+        else:
+            kf._P1_2 = full  # its setter would square the root and lose half the digits
+        self.kf = kf
+
+    def enter_dwell(self, sigma_mps2: Floats) -> None:
+        """The nuisance states start from their prior, independent of everything before; readings have this sigma."""
+        if self.plain:
+            self.kf.R = np.diag(sigma_mps2**2)
+        else:
+            self.kf._R1_2 = np.diag(sigma_mps2)  # its setter would square the root and lose half the digits
+        own = slice(self.count, None)
+        self.kf.x[own] = 0.0
+        matrix, sigma = (self.kf.P, self.dwell_sigmas**2) if self.plain else (self.kf._P1_2, self.dwell_sigmas)
+        matrix[own, :] = 0.0
+        matrix[:, own] = 0.0  # the root is lower triangular: its leading block is the root of the leading covariance
+        matrix[own, own] = np.diag(sigma)
+
+    def walk(self, variance: float) -> None:
+        """Time update with F = I, the biases' steps of that variance; filterpy's Q is the identity until it is set."""
+        steps = np.zeros(len(self.kf.x))
+        steps[3:STATE_COUNT:4] = variance
+        if self.plain:
+            self.kf.Q = np.diag(steps)
+        else:
+            self.kf._Q1_2 = np.diag(np.sqrt(steps))  # the setter needs a positive definite Q
+        self.kf.predict()
+
+    def update(self, observation: Floats, reading: Floats) -> float:
+        """One sample; returns its normalised innovation squared, y S^-1 y."""
+        self.kf.H = observation
+        self.kf.update(reading)
+        return float(self.kf.y @ self.kf.SI @ self.kf.y)
+
+    def posterior(self) -> tuple[Floats, Floats]:
+        part = slice(0, self.count)
+        return self.kf.x[part].copy(), self.kf.P[part, part].copy()

@@ -1,0 +1,181 @@
+"""The measurement model: what each accelerometer reads per unit of each state, of the twelve parameters and effects."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.dwells.rows import REGRESSORS
+from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named
+from kf_calib.errors import InputError
+from kf_calib.support.printing import printed
+
+STATE_COUNT = 12
+_ROUNDING_MPS2 = 1e-13
+DWELL_STATES = 6
+"""Nuisance states of a dwell: three small rotations (setting error), three offsets (sensor scatter)."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """The twelve parameters and any effects; immutable, composed by + and -."""
+
+    bench: Bench
+    effects: tuple[Effect, ...] = ()
+
+    @classmethod
+    def of(cls, bench: Bench, names: Iterable[str] = ()) -> Model:
+        model = cls(bench)
+        for name in names:
+            model += effect_named(name, bench)
+        return model
+
+    def __add__(self, effect: Effect) -> Model:
+        taken = {c.symbol: each for each in self.effects for c in _states_of(each)}
+        if any(str(each) == str(effect) for each in self.effects):
+            raise InputError(f"{effect} is in the model already: name it once, or take it out first.")
+        for coefficient in _states_of(effect):
+            if coefficient.symbol in taken:
+                raise InputError(
+                    f"{effect} cannot be added: {taken[coefficient.symbol]} in the model already has the coefficient "
+                    f"{coefficient.symbol}; take one of the two out."
+                )
+        return replace(self, effects=(*self.effects, effect))
+
+    def __sub__(self, effect: Effect) -> Model:
+        return replace(self, effects=tuple(each for each in self.effects if str(each) != str(effect)))
+
+    def __str__(self) -> str:
+        """A table: symbols, units, and the size a prior would call large."""
+        return printed(self)
+
+    @property
+    def sum(self) -> str:
+        """The model as a sum of its parts, in a line."""
+        return " + ".join(["twelve parameters", *map(str, self.effects)])
+
+    @cached_property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """Of all effects, in the order of the state after the twelve; an effect's unknown comes after its own."""
+        return tuple(coefficient for effect in self.effects for coefficient in _states_of(effect))
+
+    @cached_property
+    def parts(self) -> dict[str, slice]:
+        """Where in the state each effect stands, by name."""
+        ends = np.cumsum([STATE_COUNT, *(len(_states_of(effect)) for effect in self.effects)]).tolist()
+        return {str(effect): slice(a, b) for effect, (a, b) in zip(self.effects, itertools.pairwise(ends), strict=True)}
+
+    @property
+    def walks(self) -> bool:
+        """Whether an effect lets the biases walk."""
+        return any(effect.walks for effect in self.effects)
+
+    @property
+    def dynamic(self) -> tuple[Effect, ...]:
+        """The effects that show in slews only."""
+        return tuple(effect for effect in self.effects if effect.dynamic)
+
+    @property
+    def oscillates(self) -> bool:
+        """Whether an effect may be faster than a piece of a dwell, so that the dwells are folded on a carrier."""
+        return any(effect.oscillates for effect in self.effects)
+
+    @property
+    def averages(self) -> bool:
+        """Whether an effect needs averaged readings; an oscillation would go with the vibration."""
+        return any(effect.averages for effect in self.effects) and not self.oscillates
+
+    @property
+    def unknowns(self) -> dict[int, Effect]:
+        """The effects with a constant among the states, by the place of its state."""
+        return {self.parts[str(each)].stop - 1: each for each in self.effects if each.unknown and each.smooth}
+
+    @property
+    def stepped(self) -> tuple[Effect, ...]:
+        """The effects with a constant that has no derivative: it is no state."""
+        return tuple(each for each in self.effects if each.unknown and not each.smooth)
+
+    def moved(self, state: Floats) -> Model:
+        """The model with its unknowns where ``state`` (p,) puts them: value times exp(state)."""
+        moved = {str(each): each.at(each.value * math.exp(state[k])) for k, each in self.unknowns.items()}
+        return replace(self, effects=tuple(moved.get(str(each), each) for each in self.effects))
+
+    def with_effect(self, effect: Effect) -> Model:
+        """The model with that effect in the place of the one of the same name."""
+        return replace(self, effects=tuple(effect if str(each) == str(effect) else each for each in self.effects))
+
+    def natural(self, state: Floats) -> tuple[Floats, Floats]:
+        """Values of the effects' coefficients (q,) at ``state`` (p,), and how much of each a unit of its state is."""
+        values, gains = state[STATE_COUNT:].copy(), np.ones(len(state) - STATE_COUNT)
+        for k, effect in self.unknowns.items():
+            values[k - STATE_COUNT] = effect.value * (1.0 + state[k])
+            gains[k - STATE_COUNT] = effect.value
+        return values, gains
+
+    @property
+    def count(self) -> int:
+        return STATE_COUNT + len(self.coefficients)
+
+    def nominal_state(self) -> Floats:
+        """The state (p,) of nominal parameters and no effect."""
+        twelve = paper_parameters.state_of(paper_parameters.nominal(self.bench.nominal))
+        return np.concatenate([twelve, np.zeros(len(self.coefficients))])
+
+    def columns(self, stimulus: Stimulus, state: Floats) -> Floats:
+        """H (m, 3, p): what each accelerometer reads per unit of each state, linearised at ``state`` (p,)."""
+        out = np.zeros((len(stimulus), 3, self.count))
+        for i in range(3) if not stimulus.part else ():
+            out[:, i, 4 * i : 4 * i + 3] = stimulus.force_mps2
+            out[:, i, 4 * i + 3] = 1.0
+        for effect in self.effects:
+            if stimulus.part and not effect.oscillates:
+                continue
+            part = self.parts[str(effect)]
+            own = slice(part.start, part.start + len(effect.coefficients))
+            out[:, :, own] = effect_columns([effect], stimulus)
+            if own.stop < part.stop:
+                out[:, :, own.stop : part.stop] = effect.derivative(stimulus, state[own])
+        return out
+
+
+def effect_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
+    """What each accelerometer reads more per unit of each coefficient of the effects, (m, 3, q)."""
+    own = [
+        np.zeros((len(stimulus), 3, len(each.coefficients)))
+        if stimulus.part and not each.oscillates
+        else each.columns(stimulus)
+        for each in effects
+    ]
+    columns = np.concatenate([np.zeros((len(stimulus), 3, 0)), *own], axis=2)
+    scales = np.array([coefficient.scale for each in effects for coefficient in each.coefficients])
+    # what a large coefficient would not lift above rounding is nothing: a vertical axis cannot tilt gravity
+    columns[np.abs(columns) * scales < _ROUNDING_MPS2] = 0.0
+    return columns
+
+
+def _states_of(effect: Effect) -> tuple[Coefficient, ...]:
+    unknown = effect.unknown
+    if unknown is None or not effect.smooth:
+        return effect.coefficients
+    return *effect.coefficients, Coefficient(unknown.symbol, unknown.unit, 1.0, unknown.shown_unit, unknown.per_si)
+
+
+def dwell_map(state: Floats) -> Floats:
+    """N (3, 4, 6): the nuisance states of a dwell on the regressors, linearised at ``state``.
+
+    Columns 0-2: rotation alpha, whose coefficient in channel i is f x s_i; columns 3-5: offset of sensor i.
+    """
+    out = np.zeros((3, len(REGRESSORS), DWELL_STATES))
+    for i in range(3):
+        sx, sy, sz = state[4 * i : 4 * i + 3]
+        out[i, 1:, :3] = np.array([[0.0, -sz, sy], [sz, 0.0, -sx], [-sy, sx, 0.0]])  # (f x s) = f^T [s]
+        out[i, 0, 3 + i] = 1.0
+    return out

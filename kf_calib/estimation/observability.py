@@ -1,0 +1,141 @@
+"""What a run can say of an effect before anyone fits it: is it visible, how small may it be, what is it confused with.
+
+All from the columns, nothing from the misfit: the effect and the catalogue are projected off the model
+(``score_test``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.effects import Coefficient, Effect, effect_named, names
+from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.measurement_model import STATE_COUNT, Model
+from kf_calib.estimation.score_test import Candidate, Scan, scan
+
+LEVEL, POWER = 0.01, 0.9
+"""Found is what a run in which nothing is missing shows with this chance; smallest sizes are found in this share."""
+
+_CONFUSED, _TWINS, _NAMED = 0.5, 0.99, 3  # overlaps worth naming; that cannot be told apart; how many are named
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """One effect as these orientations show it beside a model.
+
+    share: the largest part of one of its columns that the model leaves (0: invisible); None where it has no column in
+    dwells, and ``why`` says so. unseen: symbols not determined. smallest: (coefficient, SI size) found in 9 of 10 runs,
+    the largest over its coefficients. rivals: (name, overlap), the closest first. degeneracy: exact ones, in words.
+    """
+
+    effect: Effect
+    share: float | None
+    unseen: tuple[str, ...] = ()
+    smallest: tuple[Coefficient, float] | None = None
+    rivals: tuple[tuple[str, float], ...] = ()
+    degeneracy: str = ""
+    why: str = ""
+
+    @property
+    def visible(self) -> bool | None:
+        return None if self.share is None else self.share > 0.0
+
+    def __str__(self) -> str:
+        """The same in a sentence."""
+        if self.share is None:
+            return f"{self.effect}: {self.why}"
+        seen = f"visible, {self.share:.2g} of its column is left beside the rest of the model"
+        parts = [seen if self.visible else "invisible in this run: it adds nothing, or what the rest of the model adds"]
+        if self.unseen and self.visible:
+            parts.append(f"not determined: {' '.join(self.unseen)}")
+        if self.smallest is not None:
+            own, size = self.smallest
+            parts.append(f"smallest size {size * own.per_si:.3g} {own.shown_unit}{self.at}")
+        for words, twins in (("cannot be told from", True), ("overlaps with", False)):
+            named = [f"{name} ({overlap:.2f})" for name, overlap in self.rivals if (overlap > _TWINS) == twins]
+            parts += [f"{words} {', '.join(named)}"] if named else []
+        return "; ".join([f"{self.effect}: {parts[0]}", *parts[1:], *([self.degeneracy] if self.degeneracy else [])])
+
+    @property
+    def at_value(self) -> float | None:
+        """Where the constant inside the columns stands (SI)."""
+        return None if self.effect.unknown is None else self.effect.value
+
+    @property
+    def at(self) -> str:
+        """The same in words, for after a coefficient."""
+        unknown = self.effect.unknown
+        if unknown is None:
+            return ""
+        return f" with {unknown.symbol} at {self.effect.value * unknown.per_si:.3g} {unknown.shown_unit}"
+
+
+def visibility_of(fitted: Fit, effects: Sequence[Effect]) -> list[Visibility]:
+    """Of each effect, beside the model without it; an effect with a constant at that value where it shows best."""
+    with threadpool_limits(1, user_api="blas"):  # small decompositions
+        model = fitted.carried.model
+        inside = [each for each in effects if str(each) in model.parts]
+        seen = {str(each): _beside(fitted, model - each, [each])[0] for each in inside}
+        outside = [each for each in effects if str(each) not in seen]
+        seen |= {str(each.effect): each for each in (_beside(fitted, model, outside) if outside else [])}
+        return [seen[str(each)] for each in effects]
+
+
+def _beside(fitted: Fit, model: Model, effects: Sequence[Effect]) -> list[Visibility]:
+    """Of effects that are not in ``model``, against each other and the catalogue."""
+    bench, named = model.bench, {str(each) for each in effects}
+    others = [effect_named(name, bench) for name in names(bench) if name not in named | set(model.parts)]
+    tried = [at for each in (*effects, *others) if _has_columns(each) for at in _values(each)]
+    state = np.concatenate([fitted.carried.state[:STATE_COUNT], np.zeros(model.count - STATE_COUNT)])
+    carried = Carried(fitted.dwells, model, state)
+    found = scan(carried, fitted.noise.judging, tried)
+    return [replace(_sight(found, each), degeneracy=each.degeneracy(bench)) for each in effects]
+
+
+def _has_columns(effect: Effect) -> bool:
+    return not (effect.dynamic or effect.walks)
+
+
+def _values(effect: Effect) -> list[Effect]:
+    return [effect] if effect.unknown is None else [effect.at(value) for value in effect.unknown.grid(2.0)]
+
+
+def _sight(found: Scan, effect: Effect) -> Visibility:
+    if effect.dynamic:
+        return Visibility(effect, None, why="shows in slews only, which are not looked at here")
+    if effect.walks:
+        return Visibility(effect, None, why="is noise of the biases, not a column: fit it to see it")
+    own = [each for each in found.candidates if str(each.effect) == str(effect)]
+    tests = len({str(each.effect) for each in found.candidates if each.dof})
+    sized = [(smallest_size(each, tests), each) for each in own]
+    size, best = min(sized, key=lambda pair: np.inf if pair[0] is None else pair[0][1])
+    if not best.dof:
+        return Visibility(best.effect, 0.0)
+    overlaps = dict[str, float]()
+    for other in found.candidates:
+        name = str(other.effect)
+        if name != str(effect):
+            overlaps[name] = max(overlaps.get(name, 0.0), best.overlap(other))
+    near = sorted((pair for pair in overlaps.items() if pair[1] > _CONFUSED), key=lambda pair: -pair[1])[:_NAMED]
+    unseen = [c.symbol for c, hidden in zip(best.effect.coefficients, best.hidden, strict=True) if hidden]
+    return Visibility(best.effect, min(best.visibility, 1.0), tuple(unseen), size, tuple(near))
+
+
+def smallest_size(candidate: Candidate, tests: int) -> tuple[Coefficient, float] | None:
+    """The coefficient that must be largest to be found in 9 of 10 runs among ``tests`` effects, and that size (SI)."""
+    from scipy.special import chdtri, chndtrinc
+
+    sizes: Floats = np.linalg.norm(candidate.columns, axis=0)
+    seen = np.flatnonzero(~candidate.hidden & (sizes > 0))
+    if not (candidate.dof and seen.size):
+        return None
+    threshold = float(chdtri(candidate.dof, 0.5 * LEVEL / tests))  # half: the misfit as a whole is tested beside
+    worst = int(seen[np.argmin(sizes[seen])])
+    needed = float(np.sqrt(chndtrinc(threshold, candidate.dof, 1.0 - POWER)))
+    return candidate.effect.coefficients[worst], needed / float(sizes[worst])

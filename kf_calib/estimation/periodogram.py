@@ -1,0 +1,250 @@
+"""Oscillations at many frequencies against a model: by how much each would lower chi-squared.
+
+The whitened columns of an oscillation of frequency f in a dwell about t_d, cosine + i sine of each accelerometer, are
+e^(2 pi i f t_d) times columns Gamma_d(f) that change with f no faster than the dwell is long. They are worked out at a
+few Chebyshev points of the band and interpolated between; sums over the dwells are matrix products with e^(2 pi i f
+t_d). It is the periodogram of Lomb and Scargle beside any linear model, in noise that is neither white nor alike in all
+dwells. What the biases' walk explains is taken out through its banded precision.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.effects import Effect
+from kf_calib.estimation import square_root_information
+from kf_calib.estimation.dwell_columns import Carried, candidate_columns
+from kf_calib.estimation.measurement_model import STATE_COUNT
+from kf_calib.estimation.noise_model import Noise, steps
+
+_SEEN = 1e-6  # of a column beside the model: less is nothing
+_NEW = 1e-9  # of a column beside those before: less is rounding
+_SPARE = 18  # points beyond the phase, rad, that a dwell goes through: 1e-10 of a column
+_AT_ONCE = 64  # frequencies
+_LEAST_PAUSE = 1e-6  # of the largest step of a walk: no pause is taken to be shorter
+
+Waves = NDArray[np.complex128]
+
+
+class Periodogram:
+    """Of the ``effect`` at ``values_hz`` (N,), in the dwells carried and the noise by which they are judged."""
+
+    def __init__(self, carried: Carried, noise: Noise, effect: Effect, values_hz: Floats) -> None:
+        self.values_hz, self.state, self.noise = values_hz, carried.state, noise
+        dwells = carried.dwells
+        self._middles_s = np.array([0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells])
+        points_hz, self._shares = _points(values_hz, max(dwell.end_s - dwell.start_s for dwell in dwells))
+        waves = candidate_columns(dwells, [effect.at(hz) for hz in points_hz], carried.model.bench, carried.state)
+        columns = [
+            np.concatenate([own[..., :STATE_COUNT], more], axis=3)
+            for own, more in zip(carried.columns, waves, strict=True)
+        ]
+        rows, width = square_root_information.misfit_rows(
+            dwells, columns, noise, carried.state, STATE_COUNT, reduced=False
+        )
+        rows = rows[len(rows) - len(dwells) :]
+        self._ends = np.cumsum([0, *map(len, rows)]).tolist()
+        stacked, inside = np.concatenate(rows), 3 if noise.walk_mps2_per_sqrt_s else 0
+        parts = stacked[:, inside + width : -1].reshape(len(stacked), len(points_hz), 3, 2)
+        turned = np.exp(-2j * np.pi * np.repeat(self._middles_s, np.diff(self._ends))[:, None] * points_hz)
+        self._waves: Waves = turned[..., None] * (parts[..., 1] + 1j * parts[..., 0])  # (m, points, 3)
+        self._path = _Path(stacked, self._ends, steps(dwells, noise)) if inside else None
+        self._squares = self._products_of_waves()
+        self._first: _Beside | None = None
+
+    def falls(self, rows: Floats, own: Floats, first: int) -> Floats:
+        """By how much the oscillation at each frequency would lower chi-squared (N,) beside a model.
+
+        rows (r, c): whitened [H | E | z], of which H, ``first`` columns, is the same in all models, so that it is
+        worked out once; own (m, c): the same of the dwells alone, their walk not yet taken out.
+        """
+        if self._first is None:
+            self._first = _Beside.nothing(rows[:, -1], own[:, -1]).with_columns(rows[:, :first], own[:, :first])
+            self._first.known = self._along(np.column_stack([self._first.own, self._first.own_left]))
+        base = self._first
+        whole = base.with_columns(rows[:, first:-1], own[:, first:-1])
+        added = whole.own[:, base.own.shape[1] :]
+        more = self._along(added)
+        left = base.known[:, :, -1] - more @ (whole.rows[:, base.own.shape[1] :].T @ base.left)
+        return self._lowered(np.concatenate([base.known[:, :, :-1], more], axis=2), left)
+
+    def _along(self, columns: Floats) -> Floats:
+        """Products (N, 6, c) of cosines and sines of the three accelerometers, in that order, with columns (m, c) that
+        the rows of the dwells have."""
+        count, points = columns.shape[1], self._shares.shape[1]
+        if not count:
+            return np.zeros((len(self.values_hz), 6, 0))
+        if self._path is not None:
+            columns = self._path.freed(columns)
+        waves = self._waves.reshape(len(columns), -1)
+        sums = np.array([waves[part].T @ columns[part] for part in _parts(self._ends)])  # (D, 3 points, c)
+        out: Waves = np.empty((len(self.values_hz), 3, count), np.complex128)
+        for part, turning in self._turning():
+            found = (turning @ sums.reshape(len(sums), -1)).reshape(len(turning), points, 3, count)
+            out[part] = np.einsum("np,npic->nic", self._shares[part], found)
+        return np.concatenate([out.real, out.imag], axis=1)
+
+    def _lowered(self, along_model: Floats, along_left: Floats) -> Floats:
+        """Chi-squared (N,) lowered, from the products (N, 6, p) with the model's columns, made orthonormal, and (N, 6)
+        with what they leave of the readings."""
+        sizes = np.sqrt(np.maximum(np.einsum("nii->ni", self._squares), 1e-300))
+        gram = self._squares - along_model @ np.swapaxes(along_model, 1, 2)
+        gram, along = gram / (sizes[:, :, None] * sizes[:, None, :]), along_left / sizes
+        inverse = np.linalg.pinv(gram, rcond=_SEEN, hermitian=True)
+        return np.einsum("ni,nij,nj->n", along, inverse, along)
+
+    def _products_of_waves(self) -> Floats:
+        """Products (N, 6, 6) of cosines and sines with each other.
+
+        conj(Gamma_i) Gamma_j has no phase, so its sum over the dwells is smooth in f; Gamma_i Gamma_j has twice that of
+        its dwell.
+        """
+        points, same, twice = self._shares.shape[1], 0.0, list[Waves]()
+        for part in _parts(self._ends):
+            own = np.ascontiguousarray(np.moveaxis(self._waves[part], 0, 2))  # (points, 3, r)
+            same = same + own.conj() @ np.swapaxes(own, 1, 2)
+            twice.append(own @ np.swapaxes(own, 1, 2))
+        sums, out = np.array(twice).reshape(len(twice), -1), np.empty((len(self.values_hz), 6, 6))
+        for part, turning in self._turning():
+            double = np.einsum("np,npij->nij", self._shares[part], (turning**2 @ sums).reshape(-1, points, 3, 3))
+            single = np.einsum("np,pij->nij", self._shares[part], same)
+            plus, minus = 0.5 * (single + double), 0.5 * (single - double)
+            out[part, :3, :3], out[part, 3:, 3:] = plus.real, minus.real
+            out[part, :3, 3:], out[part, 3:, :3] = plus.imag, np.swapaxes(plus.imag, 1, 2)
+            if self._path is not None:
+                out[part] -= self._explained_by_path(self._path, part, turning)
+        return out
+
+    def _explained_by_path(self, path: _Path, part: slice, turning: Waves) -> Floats:
+        """What a walk's path takes of the products (n, 6, 6) of some frequencies."""
+        points, count = self._shares.shape[1], len(self._middles_s)
+        sums = path.products(self._waves.reshape(len(self._waves), -1)).reshape(count, 6, points, 3)
+        found = np.einsum("np,dqpi->dqni", self._shares[part], sums, optimize=True) * turning.T[:, None, :, None]
+        sides = np.concatenate([found.real, found.imag], axis=3)  # (D, 6, n, 6)
+        solved = np.moveaxis(path.whitened(sides.reshape(6 * count, -1)).reshape(6 * count, -1, 6), 1, 0)
+        return np.swapaxes(solved, 1, 2) @ solved
+
+    def _turning(self) -> Iterator[tuple[slice, Waves]]:
+        """Frequencies, some at a time, and e^(2 pi i f t_d) (n, D) of them."""
+        for first in range(0, len(self.values_hz), _AT_ONCE):
+            part = slice(first, first + _AT_ONCE)
+            yield part, np.exp(2j * np.pi * self.values_hz[part, None] * self._middles_s)
+
+
+@dataclass
+class _Beside:
+    """Columns of a model made orthonormal in its noise, as ``rows`` (r, p) and as rows of the dwells, ``own`` (m, p);
+    left, own_left: what they leave of the readings. known: products of the oscillations with own and own_left."""
+
+    rows: Floats
+    own: Floats
+    left: Floats
+    own_left: Floats
+    known: Floats = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def nothing(cls, left: Floats, own_left: Floats) -> _Beside:
+        return cls(np.zeros((len(left), 0)), np.zeros((len(own_left), 0)), left, own_left)
+
+    def with_columns(self, rows: Floats, own: Floats) -> _Beside:
+        """With further columns, as far as they are not in these."""
+        scale = np.linalg.norm(rows, axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
+        rows, own = rows / scale, own / scale
+        for _ in range(2):  # twice, or the rounding of what is large stays in what is left
+            share = self.rows.T @ rows
+            rows, own = rows - self.rows @ share, own - self.own @ share
+        _, singular, right = np.linalg.svd(rows, full_matrices=False)
+        seen = singular > _NEW
+        turned = right[seen].T / singular[seen]
+        rows, own, left, own_left = rows @ turned, own @ turned, self.left, self.own_left
+        for _ in range(2):
+            share = rows.T @ left
+            left, own_left = left - rows @ share, own_left - own @ share
+        return _Beside(np.hstack([self.rows, rows]), np.hstack([self.own, own]), left, own_left)
+
+
+class _Path:
+    """The biases' walk as unknowns that belong to dwells: the way a from the beginning of the run to that of a dwell,
+    and the step s within it, (D, 6), with the precision that the rows and the walk itself give them."""
+
+    def __init__(self, rows: Floats, ends: list[int], steps: Floats) -> None:
+        from scipy.linalg import cholesky_banded
+
+        self._unit, self._ends = float(np.sqrt(steps.max())), ends
+        inside, biases = rows[:, :3], rows[:, 3:][:, [3, 7, 11]]
+        self._columns = self._unit * np.concatenate([biases, inside + biases], axis=1)
+        self._columns[: ends[1], :3] = 0.0  # the first dwell is where the way begins
+        self._root = cholesky_banded(self._bands(steps / self._unit**2), lower=True)
+
+    def products(self, columns: NDArray[Any]) -> NDArray[Any]:
+        """Products (6 D, c) of the path's columns with others (m, c)."""
+        return np.concatenate([self._columns[part].T @ columns[part] for part in _parts(self._ends)])
+
+    def whitened(self, sides: Floats) -> Floats:
+        """The root of the precision divided out of products (6 D, c)."""
+        from scipy.linalg import get_lapack_funcs
+
+        solve: Any = get_lapack_funcs("tbtrs", dtype=np.float64)  # solve_banded does not know that it is triangular
+        return solve(self._root, np.asfortranarray(sides), uplo="L")[0]
+
+    def freed(self, columns: Floats) -> Floats:
+        """Columns (m, c) less what the path explains of them."""
+        from scipy.linalg import cho_solve_banded
+
+        found = np.asarray(cho_solve_banded((self._root, True), self.products(columns)), float).reshape(
+            len(self._ends) - 1, 6, -1
+        )
+        out = columns.copy()
+        for part, way in zip(_parts(self._ends), found, strict=True):
+            out[part] -= self._columns[part] @ way
+        return out
+
+    def _bands(self, steps: Floats) -> Floats:
+        """The precision as bands (7, 6 D): s of variance ``steps`` (D, 2)[1], the next a = a + s + the pause's step."""
+        count = len(steps)
+        bands = np.zeros((7, count, 6))
+        for k, part in enumerate(_parts(self._ends)):
+            own = self._columns[part].T @ self._columns[part]
+            for apart in range(6):
+                bands[apart, k, : 6 - apart] = np.diag(own, -apart)
+        within, pauses = 1.0 / steps[:, 1], 1.0 / np.maximum(steps[1:, 0], _LEAST_PAUSE)
+        bands[0, :, 3:] += within[:, None]
+        bands[0, 0, :3] += 1.0  # the first a is not there
+        bands[0, 1:, :3] += pauses[:, None]
+        bands[0, 1:-1, :3] += pauses[1:, None]
+        bands[0, :-1, 3:] += pauses[:, None]
+        bands[3, 1:-1, :3] += pauses[1:, None]  # a and s of one dwell lead to the next
+        bands[3, :-1, 3:] -= pauses[:, None]  # s, and the next a
+        bands[6, 1:-1, :3] -= pauses[1:, None]  # a, and the next a
+        return bands.reshape(7, -1)
+
+
+def _parts(ends: list[int]) -> list[slice]:
+    """The rows of each dwell."""
+    return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+
+def _points(values_hz: Floats, longest_s: float) -> tuple[Floats, Floats]:
+    """Chebyshev points (k,) of a band, and the shares (N, k) by which what is known there is interpolated; all of the
+    values where these are as few.
+
+    Products of two columns go through twice the phase of a dwell of ``longest_s``.
+    """
+    low, high = float(values_hz.min()), float(values_hz.max())
+    count = int(np.ceil(np.pi * (high - low) * longest_s)) + _SPARE
+    if count >= len(values_hz):
+        return values_hz, np.eye(len(values_hz))
+    angles = (np.arange(count) + 0.5) * np.pi / count
+    at = np.arccos(np.clip((2.0 * values_hz - low - high) / (high - low), -1.0, 1.0))
+    orders = np.arange(count)
+    values, points = np.cos(np.outer(at, orders)), np.cos(np.outer(orders, angles))
+    shares = 2.0 / count * values @ points - 1.0 / count
+    return 0.5 * (low + high) + 0.5 * (high - low) * np.cos(angles), shares

@@ -1,0 +1,117 @@
+"""What a user must know of a calibration, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.dwells import window_average
+from kf_calib.effects import remarks_of
+from kf_calib.estimation import setup_blunders
+from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.noise_model import TOO_SHORT, Noise
+from kf_calib.estimation.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, directions
+from kf_calib.estimation.results import Consistency, Estimate
+
+
+def misfit_remark(judged: Consistency, residuals: Floats, bench: Bench, noise: Noise) -> str:
+    """What may be the matter where the dwells do not fit the model, from residuals (D, 3); '' where they fit."""
+    rms = float(np.sqrt(np.mean(residuals**2)))
+    if rms > 0.03 * bench.gravity_mps2:
+        return (
+            f"the angles do not explain the readings (residual {rms:.2g} m/s^2 rms between dwells): check the order "
+            "and sign of the axes, the unit of the angles, and which channel is which."
+        )
+    if judged.consistent is False:
+        return (
+            "the dwells scatter about the model by more than the noise: an effect is missing in the model, or "
+            f"{_beyond_noise(noise)}."
+        )
+    return ""
+
+
+def unstated(noise: Noise) -> list[str]:
+    """Bench keys of the noise from dwell to dwell that the recording does not state."""
+    known = {"angle_sigma_deg": noise.setting_stated, "scatter_sigma_mps2": noise.scatter_stated}
+    return [key for key, stated in known.items() if not stated]
+
+
+def beyond_stated(noise: Noise, bench: Bench) -> bool:
+    """Whether the setting error holds more than is stated: what the angles' own noise leaves uncertain of a pose."""
+    return bench.angle_sigma_deg is not None and np.degrees(noise.setting_rad) > 1.1 * bench.angle_sigma_deg
+
+
+def _beyond_noise(noise: Noise) -> str:
+    """What dwells may scatter by beside an effect."""
+    keys = " and ".join(unstated(noise))
+    if keys:
+        return f"there is noise from dwell to dwell, which was not stated ({keys})"
+    return "there is more noise from dwell to dwell than is stated (angle_sigma_deg, scatter_sigma_mps2)"
+
+
+def remarks_on(
+    carried: Carried, noise: Noise, estimate: Estimate, judged: Consistency, residuals: Floats
+) -> Iterator[str]:
+    """What a reader of the numbers must know, one sentence each."""
+    model, dwells = carried.model, carried.dwells
+    if model.dynamic and not carried.slews:
+        yield (
+            f"{' and '.join(map(str, model.dynamic))} cannot be seen in this recording: it needs slew samples, "
+            "readings and angles recorded all through the motions, angles at least every half second."
+        )
+    yield from (remark for effect in model.effects for remark in remarks_of(effect))
+    unseen = [symbol for symbol, hidden in zip(paper_parameters.SYMBOLS, estimate.unseen, strict=True) if hidden]
+    unseen += [c.symbol for c, s in zip(model.coefficients, estimate.effect_sigma, strict=True) if np.isnan(s)]
+    if unseen:
+        yield f"these orientations do not determine {', '.join(unseen)}: visit more, spread over the sphere."
+    for effect in model.effects:
+        exact = effect.degeneracy(model.bench)
+        if exact and any(coefficient.symbol in unseen for coefficient in effect.coefficients):
+            yield f"{exact}."
+    if judged.dof == 0:
+        yield (
+            f"{len(dwells)} dwell{'s leave' if len(dwells) > 1 else ' leaves'} nothing over to judge the model by: "
+            "visit at least five spread orientations."
+        )
+    if misfit := misfit_remark(judged, residuals, model.bench, noise):
+        yield misfit
+    scales, expected = estimate.parameters[2::4], paper_parameters.nominal(model.bench.nominal)[2::4]
+    if not estimate.unseen[2::4].any() and (
+        common := setup_blunders.common_scale(scales / expected, estimate.sigma[2::4] / np.abs(expected), model.bench)
+    ):
+        yield common
+    windows = window_average.inflation() if dwells[0].averaged else 1.0
+    if noise.inflation.max() > 1.5 * windows:
+        kappa = ", ".join(f"{value / windows:.3g}" for value in noise.inflation)
+        usual = float(np.median([dwell.count for dwell in dwells]))
+        short = not dwells[0].averaged and usual < TOO_SHORT * noise.inflation.max()
+        slow = "; dwells are too short to tell how slow it is: stay longer in each" if short else ""
+        yield f"the noise within a dwell is correlated: sigmas allow for it by inflating its variance by {kappa}{slow}."
+    if not noise.checked and noise.scatter_mps2.any() and not noise.scatter_stated:
+        known = directions(carried.means.force_mps2)
+        yield (
+            f"these orientations have gravity in {known} different direction{'s' * (known != 1)}, which cannot tell a "
+            "setting error of the angles from scatter of the sensors: dwells are weighted alike and their whole misfit "
+            f"({noise.scatter_mps2[0]:.2g} m/s^2) counts in every sigma; {ENOUGH_DIRECTIONS} directions, spread, would "
+            "tell."
+        )
+    if unstated(noise) and degrees_of_freedom(carried.means) < FEWEST:
+        yield (
+            f"{len(dwells)} dwell{'s are' if len(dwells) > 1 else ' is'} too few to estimate what was not stated "
+            f"({' and '.join(unstated(noise))}): it is taken as zero, and where it is not, sigmas are too small."
+        )
+    stated_deg = model.bench.angle_sigma_deg
+    if stated_deg is not None and beyond_stated(noise, model.bench):
+        yield (
+            f"the angles' own noise leaves {np.degrees(noise.setting_rad):.2g} deg uncertain of a pose, with the "
+            f"{stated_deg:g} deg stated for its setting: that is what dwells are weighted by."
+        )
+    if not noise.setting_stated and noise.setting_rad > 0:
+        yield (
+            f"angle_sigma_deg was not stated; {np.degrees(noise.setting_rad):.2g} deg was estimated from the misfit "
+            "between dwells, which an effect not in the model could also cause."
+        )

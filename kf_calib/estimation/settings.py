@@ -1,0 +1,48 @@
+"""What a calibration is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+from kf_calib.dwells.stationarity import Stillness
+from kf_calib.errors import InputError, check_number
+from kf_calib.estimation.prior import PRIORS, Prior
+
+Engine = Literal["block", "filterpy"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a run is evaluated. Raises InputError where a value cannot be.
+
+    walk_mps2_per_sqrt_s: random walk of the biases (process noise), 0: none. effects: names of those in the model, or
+    the name of one.
+    window_s: readings are averaged over windows of that length first; 0: only for effects that go with vibration, then
+    over windows of a second, or as long as the vibration needs that is seen. left_out: numbers of dwells (from 1) that
+    are not used.
+    """
+
+    engine: Engine = "block"
+    prior: Prior = PRIORS["diffuse"]
+    stillness: Stillness = field(default_factory=Stillness)
+    gate_sigma: float | None = 6.0
+    walk_mps2_per_sqrt_s: float = 0.0
+    effects: Sequence[str] = ()
+    window_s: float = 0.0
+    left_out: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "effects", (self.effects,) if isinstance(self.effects, str) else tuple(self.effects))
+        if self.engine not in get_args(Engine):
+            raise InputError(f"engine {self.engine!r} is not known: use {' or '.join(get_args(Engine))}.")
+        if not isinstance(self.prior, Prior):
+            known = 'kf_calib.estimation.prior.PRIORS["navigation"]'
+            raise InputError(f"prior is {self.prior!r}: give a Prior, for example {known}.")
+        if not isinstance(self.stillness, Stillness):
+            raise InputError(f"stillness is {self.stillness!r}: give a kf_calib.dwells.stationarity.Stillness.")
+        if self.gate_sigma is not None:
+            check_number("gate_sigma (--gate-sigma)", self.gate_sigma, 3.0)
+        check_number("walk_mps2_per_sqrt_s (--bias-walk)", self.walk_mps2_per_sqrt_s)
+        check_number("window_s", self.window_s)

@@ -1,0 +1,358 @@
+"""Blunders of a set-up: what is wrong with a run before any estimate of it means anything.
+
+The model is linear in s_i = K_i E_i, so a reversed channel, exchanged channels or a reversed gimbal fit it exactly: no
+p-value notices. What notices is the estimate itself: an accelerometer whose axis lies more than 45 deg from nominal.
+
+    mean reading of dwell d, channel i:  z_di = s_i . f_d + b_i        (D dwells; f_d from the angles)
+
+``refuse`` fits this to the means of the dwells, in a millisecond, and raises ``BlunderError`` where the result cannot
+be a calibration. The message says what is wrong and, where the reason is known, which options mend it: orders and signs
+of the channels (48), senses and order of the gimbals, the unit of the angles and the axis that is up are tried, the
+fewest changes first. Nothing is applied unasked. Changes that give the same readings are all named.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.bench import CHANNELS, Bench
+from kf_calib.bench.mountings import Mounting, mountings
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.effects.effect import G
+from kf_calib.errors import BlunderError
+
+_FARTHEST = math.cos(math.radians(45.0))  # of an axis from nominal
+_GAIN = (0.5, 2.0)  # of a scale factor over nominal: beyond it is another unit or no accelerometer
+_DEAD = 0.05  # g: means of a channel that stay within it feel nothing
+_TURNED = 1.0  # g: where gravity along the channel should have changed by more
+_CHANGED = 0.1  # g: where gravity should have changed by more, a reading that stays the same to its last digit is stuck
+_UNEXPLAINED = 0.05  # rms of what is left of the mean readings, g: beyond it the angles do not explain them
+_BETTER = 0.2  # of what is left: a change that mends leaves less than this share
+_SPREAD = 0.2  # least singular value of the directions over sqrt(D); 0.577 where they are spread evenly
+_BIAS = 0.3  # 1 sigma of a bias, g: what decides where the orientations do not determine it
+_NOMINAL = 0.15  # rms from nominal, g, of readings that have no blunder: biases, scale factors and mounting together
+_MOST_DWELLS = 96  # that are looked at: of more, some all along the run
+_MOST_CHANGES = 4  # of gimbals and channels together
+_MOST_NAMED = 3  # changes that would do equally well
+_ALIKE = 0.05  # of what three scale factors have in common: they differ by less
+_LITTLE = 20e-6  # of a scale factor: not worth a word
+_STUCK = 1e-9  # relative: readings that differ by less are one value
+
+Channels = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Means:
+    """Of D dwells: recorded poses (D, k), mean readings (D, 3), when their middle was, s (D,), and their numbers."""
+
+    poses: Floats
+    readings: Floats
+    middle_s: Floats
+    numbers: tuple[int, ...]
+
+    @classmethod
+    def of(cls, dwells: Sequence[DwellFactor]) -> Means:
+        return cls(
+            np.array([dwell.recorded_pose for dwell in dwells]),
+            np.array([dwell.means[4:] for dwell in dwells]),
+            np.array([0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells]),
+            tuple(dwell.number for dwell in dwells),
+        )
+
+    def __getitem__(self, part: Mask) -> Means:
+        numbers = tuple(itertools.compress(self.numbers, part))
+        return Means(self.poses[part], self.readings[part], self.middle_s[part], numbers)
+
+    def force(self, mounting: Mounting) -> Floats:
+        """Specific force (D, 3) in the platform, in units of gravity."""
+        bench = mounting.bench
+        return bench.specific_force(self.middle_s, mounting.poses(self.poses)) / bench.gravity_mps2
+
+
+@dataclass(frozen=True)
+class Affine:
+    """Mean readings by the specific force, least squares: sensitivity (3, 3), rows s_i; left: what remains, g rms."""
+
+    sensitivity: Floats
+    left: float
+    nominal: Floats
+
+    @cached_property
+    def scales(self) -> Floats:
+        """|s_i| over nominal, (3,)."""
+        return np.linalg.norm(self.sensitivity, axis=1) / np.linalg.norm(self.nominal, axis=1)
+
+    @cached_property
+    def cosines(self) -> Floats:
+        """Of the angles between axis i and the nominal axis of accelerometer j, (3, 3)."""
+        own, nominal = (rows / np.linalg.norm(rows, axis=1)[:, None] for rows in (self.sensitivity, self.nominal))
+        return own @ nominal.T
+
+    def is_near(self, channels: Channels = CHANNELS) -> bool:
+        """Whether every axis is near nominal, and every scale factor, with the channels in this order and of these
+        signs."""
+        own = np.abs(channels) - 1
+        cosines = np.sign(channels) * self.cosines[own, [0, 1, 2]]
+        scales = np.linalg.norm(self.sensitivity, axis=1)[own] / np.linalg.norm(self.nominal, axis=1)
+        return bool((cosines > _FARTHEST).all() and (scales > _GAIN[0]).all() and (scales < _GAIN[1]).all())
+
+
+def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
+    """Raise BlunderError, a sentence on what it looks like, where these cannot be dwells of the bench as it is stated.
+
+    Says nothing while the orientations are too few to tell.
+    """
+    step = -(-len(dwells) // _MOST_DWELLS)
+    means, stated = Means.of(dwells[::step]), Mounting.stated(bench)
+    _refuse_silent(means, stated)
+    found = _affine(means, stated)
+    if found is None and not _shows_all(means.readings / bench.gravity_mps2):
+        return
+    if found is not None and found.left < _UNEXPLAINED:
+        if found.is_near():
+            return
+        _refuse_wrong_gain(found, bench)
+    wrong = _what_is_wrong(found, bench)
+    _refuse_exchange(means, stated)
+    mending = _mendings(means, stated, found)
+    if mending:
+        raise BlunderError(f"{wrong}: {_question(bench, mending)}")
+    if (found is None or not found.is_near()) and not _one_dwell(means, stated):
+        raise BlunderError(
+            f"{wrong}, and no order or sign of channels, gimbals or angles brings all axes near nominal: check what "
+            "the channels and the angles are, and state --nominal where the block is mounted so."
+        )
+
+
+def _affine(means: Means, mounting: Mounting) -> Affine | None:
+    """The fit, None where the orientations do not show all three axes."""
+    force = means.force(mounting)
+    if not _shows_all(force):
+        return None
+    readings = means.readings / mounting.bench.gravity_mps2
+    columns = np.column_stack([force, np.ones(len(force))])
+    held = np.vstack([columns, [0.0, 0.0, 0.0, 0.05 / _BIAS]])  # readings of gravity are good to 0.05 g, say
+    solution = np.linalg.lstsq(held, np.vstack([readings, np.zeros((1, 3))]), rcond=None)[0]
+    freedom = max(len(force) - 4, 1) / len(force)
+    left = math.sqrt(np.mean((readings - columns @ solution) ** 2) / freedom)
+    return Affine(np.asarray(solution[:3].T, float), left, _nominal(mounting.bench))
+
+
+def _shows_all(force: Floats) -> bool:
+    """Whether directions (D, 3) determine three axes."""
+    return len(force) >= 3 and np.linalg.svd(force, compute_uv=False)[-1] > _SPREAD * math.sqrt(len(force))
+
+
+def _nominal(bench: Bench) -> Floats:
+    """Nominal sensitivities (3, 3)."""
+    return paper_parameters.state_of(paper_parameters.nominal(bench.nominal)).reshape(3, 4)[:, :3]
+
+
+def _refuse_silent(means: Means, stated: Mounting) -> None:
+    """Refuse where a channel keeps one value, or hardly changes, although gravity along it should change by far."""
+    readings, count = means.readings, len(means.readings)
+    expected = means.force(stated) @ _nominal(stated.bench).T
+    same = np.abs(readings - readings[-1]) <= _STUCK * np.abs(readings[-1])
+    for i, channel in enumerate(map(abs, stated.bench.channels)):
+        first = count - int(np.argmin(np.append(same[::-1, i], False)))
+        if count - first >= 3 and np.ptp(expected[first:, i]) > _CHANGED:
+            since = f"from dwell {means.numbers[first]} on (at {means.middle_s[first]:.0f} s)" if first else "all along"
+            raise BlunderError(
+                f"channel {channel} is stuck: {since} it reads {readings[-1, i]:.6g} m/s^2 in every orientation; check "
+                "its cable and converter, and evaluate what was recorded before."
+            )
+        spread_mps2 = float(np.ptp(readings[:, i]))
+        if spread_mps2 < _DEAD * stated.bench.gravity_mps2 and np.ptp(expected[:, i]) > _TURNED:
+            raise BlunderError(
+                f"channel {channel} is dead: its mean stays within {spread_mps2:.2g} m/s^2 in {count} dwells in which "
+                "gravity along it should change by more than g; check that it is connected and on."
+            )
+
+
+def _refuse_wrong_gain(found: Affine, bench: Bench) -> None:
+    """Refuse where one channel feels gravity by another factor than the others, as in another unit."""
+    for i, scale in enumerate(found.scales.tolist()):
+        if not _GAIN[0] < scale < _GAIN[1]:
+            others = " and ".join(f"{other:.3g}" for other in np.delete(found.scales, i))
+            raise BlunderError(
+                f"channel {abs(bench.channels[i])} feels {scale:.3g} times gravity, the others {others}: check its "
+                "unit and its range; all channels must be in one unit."
+            )
+
+
+@dataclass(frozen=True)
+class Mending:
+    """A mounting and an order and signs of channels with which all axes are near nominal."""
+
+    mounting: Mounting
+    channels: Channels
+
+    @property
+    def changes(self) -> int:
+        return self.mounting.changes + _changes_of(self.channels)
+
+
+def _changes_of(channels: Channels) -> int:
+    """How many things are wrong where the channels are in this order: an exchange or a cycle, and each sign; all signs
+    are one thing, the sense of the readings."""
+    reversed_ = sum(channel < 0 for channel in channels)
+    order = tuple(map(abs, channels)) != CHANNELS
+    return order + (1 if reversed_ == 3 else reversed_)
+
+
+_WIRINGS: tuple[Channels, ...] = tuple(
+    (i * a, j * b, k * c)
+    for a, b, c in itertools.permutations(CHANNELS)
+    for i, j, k in itertools.product((1, -1), repeat=3)
+)
+"""Which channel each accelerometer may be, and of which sign: 48."""
+
+
+def _mendings(means: Means, stated: Mounting, found: Affine | None) -> list[Mending]:
+    """The mountings with the fewest changes that explain the readings with all axes near nominal."""
+    left = _UNEXPLAINED if found is None or found.left < _UNEXPLAINED else max(_BETTER * found.left, 0.01)
+    out, fewest = list[Mending](), _MOST_CHANGES
+    for mounting in mountings(stated):
+        if mounting.changes > fewest:
+            break
+        fitted = found if not mounting.changes else _affine(means, mounting)
+        if fitted is None or fitted.left > left:
+            continue
+        for channels in _WIRINGS:
+            mending = Mending(mounting, channels)
+            if mending.changes and mending.changes <= fewest and fitted.is_near(channels):
+                fewest = mending.changes
+                out.append(mending)
+    equal = [each for each in out if each.changes == fewest]
+    return sorted(equal, key=lambda each: each.mounting.changes > 0 and each.channels != CHANNELS)  # mixtures last
+
+
+def _what_is_wrong(found: Affine | None, bench: Bench) -> str:
+    """The channels whose axes are far from nominal; else, that the angles do not explain the readings."""
+    if found is None:
+        return "the readings show the platform in many orientations, the angles in few"
+    cosines, numbers = np.diag(found.cosines), [abs(channel) for channel in bench.channels]
+    opposite = [channel for channel, cosine in zip(numbers, cosines, strict=True) if cosine < -_FARTHEST]
+    out = list[str]()
+    if opposite:
+        out.append(f"{_channels(opposite)} -g where +g is expected")
+    for channel, cosine in zip(numbers, cosines.tolist(), strict=True):
+        if abs(cosine) < _FARTHEST:
+            out.append(f"the axis of channel {channel} lies {math.degrees(math.acos(cosine)):.0f} deg from nominal")
+    return ", ".join(out) or f"the angles do not explain the readings ({found.left:.2g} g rms are left)"
+
+
+def _channels(numbers: Sequence[int]) -> str:
+    """``channel 2 reads``, ``channels 1, 3 read``."""
+    return f"channel {numbers[0]} reads" if len(numbers) == 1 else f"channels {', '.join(map(str, numbers))} read"
+
+
+def _question(stated: Bench, mendings: Sequence[Mending]) -> str:
+    """What each of equal mendings means, and the options that state it."""
+    said = list(dict.fromkeys((" and ".join(_reasons(stated, each)), _advice(stated, each)) for each in mendings))
+    if len(said) == 1:
+        reason, advice = said[0]
+        return f"{reason}? Try {advice}."
+    more = f" (or one of {len(said) - _MOST_NAMED} more)" if len(said) > _MOST_NAMED else ""
+    named = ", or ".join(f"{reason} ({advice})" for reason, advice in said[:_MOST_NAMED])
+    return f"{named}{more}? Each would give these readings: look at the bench to tell."
+
+
+def _reasons(stated: Bench, mending: Mending) -> list[str]:
+    out, channels = list(mending.mounting.words), mending.channels
+    moved = [k for k, channel in enumerate(channels, 1) if abs(channel) != k]
+    negative = sorted(-channel for channel in channels if channel < 0)
+    if stated.channels != CHANNELS and (moved or negative):
+        return [*out, f"accelerometers 1, 2, 3 are channels {_wired(stated, channels)}"]
+    if len(moved) == 2:
+        out.append(f"channels {moved[0]} and {moved[1]} are exchanged")
+    elif moved:
+        out.append(f"accelerometers 1, 2, 3 are channels {', '.join(str(abs(channel)) for channel in channels)}")
+    if len(negative) == 3:
+        out.append("all readings have the opposite sign (acceleration in place of specific force)")
+    elif negative:
+        out.append(f"channel {' and '.join(map(str, negative))} reversed")
+    return out
+
+
+def _wired(stated: Bench, channels: Channels) -> str:
+    """The channels of the recording, where those that are stated are in the order and of the signs ``channels``."""
+    return ",".join(str(int(math.copysign(1, channel)) * stated.channels[abs(channel) - 1]) for channel in channels)
+
+
+def _advice(stated: Bench, mending: Mending) -> str:
+    """The options that state a mounting, and what there is no option for in words."""
+    mounting, options, words = mending.mounting, list[str](), list[str]()
+    if mounting.bench.axes != stated.axes:
+        options.append(f'--axes "{mounting.bench.to_metadata()["axes"]}"')
+    if mounting.bench.up != stated.up:
+        options.append(f"--up {mounting.bench.up}")
+    if mounting.angle_unit < 1.0:
+        options.append("--angle-unit deg")
+    if mending.channels != CHANNELS:
+        options.append(f"--channels {_wired(stated, mending.channels)}")
+    if stated.axes and mounting.order != tuple(range(len(stated.axes))):
+        words.append("--joints with the names of the angles, outer to inner")
+    if mounting.angle_unit > 1.0:
+        words.append("angles that are converted once")
+    if mounting.conjugate or mounting.real_first:
+        words.append("quaternions of the platform in the bench, x y z w")
+    return " and ".join([*([" ".join(options)] if options else []), *words])
+
+
+def _refuse_exchange(means: Means, stated: Mounting) -> None:
+    """Refuse where channels change their order or signs in the course of the run: nominal on both sides of a dwell."""
+    if len(means.numbers) < 6:
+        return
+    bench = stated.bench
+    expected, readings = means.force(stated) @ _nominal(bench).T, means.readings / bench.gravity_mps2
+    wired = np.stack([readings[:, np.abs(own) - 1] * np.sign(own) for own in _WIRINGS])  # (48, D, 3)
+    squares = ((wired - expected) ** 2).sum(axis=2)
+    before = np.cumsum(squares, axis=1)[:, :-1]  # of dwells up to k, as each wiring would have them
+    after = squares.sum(axis=1, keepdims=True) - before
+    k = int(np.argmin(before.min(axis=0) + after.min(axis=0)))
+    first, then = int(before[:, k].argmin()), int(after[:, k].argmin())
+    left = math.sqrt((before[first, k] + after[then, k]) / expected.size)
+    if first == then or left > _NOMINAL or not 2 <= k + 1 <= len(readings) - 2:
+        return
+    wirings = (Mending(stated, _WIRINGS[own]) for own in (first, then))
+    told = [" and ".join(_reasons(bench, each)) or "channels are as stated" for each in wirings]
+    raise BlunderError(
+        f"the channels change in the course of the run: up to dwell {means.numbers[k]} {told[0]}, from dwell "
+        f"{means.numbers[k + 1]} on (at {means.middle_s[k + 1]:.0f} s) {told[1]}; evaluate the two parts apart."
+    )
+
+
+def _one_dwell(means: Means, stated: Mounting) -> bool:
+    """Whether without a single dwell all axes are near nominal, and the angles explain the readings."""
+    for k in range(len(means.numbers)):
+        found = _affine(means[np.arange(len(means.numbers)) != k], stated)
+        if found is not None and found.is_near() and found.left < _UNEXPLAINED:
+            return True
+    return False
+
+
+def common_scale(scales: Floats, sigmas: Floats, bench: Bench) -> str:
+    """A sentence on scale factors (3,), over nominal and with sigma, that are all off by the same; '' where not."""
+    off = scales - 1.0
+    level = float(off.mean())
+    same = np.abs(off - level).max() < max(3.0 * float(sigmas.max()), _ALIKE * abs(level))
+    if not (same and abs(level) > max(5.0 * float(sigmas.max()), _LITTLE)):
+        return ""
+    said = f"the three scale factors are off by the same {1e6 * level:+.0f} ppm, as they are where"
+    factor = bench.gravity_mps2 / G
+    if abs(level - (1.0 / factor - 1.0)) < max(5.0 * float(sigmas.max()), _ALIKE * abs(level)):
+        return (
+            f"{said} readings in units of local gravity ({bench.gravity_mps2:.6g} m/s^2) are taken for such of "
+            f"standard gravity ({G}): if they are, state --accel-scale {factor:.7f}."
+        )
+    seen_mps2 = bench.gravity_mps2 * (1.0 + level)
+    return f"{said} gravity is not {bench.gravity_mps2:.6g} m/s^2 as stated, but {seen_mps2:.6g}."

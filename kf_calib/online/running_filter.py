@@ -1,0 +1,178 @@
+"""A filter in the course of a run that takes effects in and out without a restart.
+
+Its factor [R | z] carries the columns of more effects than its model has. The estimate of any choice of them is one
+small QR (``square_root_information.restrict``), and equals that of a filter that had run with this choice from the
+start. A dwell that closes is one update of the factor; effects whose columns were not carried are folded in from the
+dwell factors.
+
+    running = Running.over(dwells, model, noise, state, candidates)
+    running = running.after(dwell)               # as each dwell closes
+    running = running.with_effect("mine = a*T")  # in or out, at any time
+    state, covariance, undetermined = running.solved()
+
+Noise and linearisation are those given; a constant inside an effect's columns stays at its value, and what shows in
+slews only is not here. ``calibrate`` iterates all of these.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.qr import triangle
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.effects import Effect, effect_named
+from kf_calib.errors import InputError
+from kf_calib.estimation import square_root_information
+from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.measurement_model import STATE_COUNT, Model
+from kf_calib.estimation.noise_model import Noise, steps
+from kf_calib.estimation.prior import Prior
+from kf_calib.estimation.score_test import Scan, project
+
+
+@dataclass(frozen=True)
+class Running:
+    """carried: the dwells so far, with the columns of the model and of all candidates; inside: names of those effects
+    that are in the model; factor (P, P + 1): of all columns, its states counted from ``about``. left, rows: the sum of
+    squares that all columns together leave of so many whitened rows.
+    """
+
+    carried: Carried
+    inside: tuple[str, ...]
+    noise: Noise
+    prior: Prior
+    factor: Floats
+    left: float = 0.0
+    rows: int = 0
+
+    @classmethod
+    def over(
+        cls,
+        dwells: Sequence[DwellFactor],
+        model: Model,
+        noise: Noise,
+        state: Floats,
+        candidates: Iterable[Effect] = (),
+        prior: Prior | None = None,
+    ) -> Running:
+        """The filter after ``dwells`` (one or more), linearised at the affine ``state`` (12,)."""
+        every = model
+        for effect in candidates:
+            every += effect
+        at = np.concatenate([state[:STATE_COUNT], np.zeros(every.count - STATE_COUNT)])
+        inside = tuple(str(effect) for effect in model.effects)
+        empty = np.zeros((every.count, every.count + 1))
+        return cls(Carried(dwells, every, at), inside, noise, prior or Prior(), empty)._folded()
+
+    @property
+    def dwells(self) -> list[DwellFactor]:
+        return self.carried.dwells
+
+    @property
+    def about(self) -> Floats:
+        """The state (P,) that the factor's states are counted from."""
+        return self.carried.state
+
+    @cached_property
+    def model(self) -> Model:
+        """The model as it stands: the twelve parameters and the effects inside, in the order they came."""
+        known = {str(effect): effect for effect in self.carried.model.effects}
+        return Model(self.carried.model.bench, tuple(known[name] for name in self.inside))
+
+    def after(self, dwell: DwellFactor, exact: bool = True) -> Running:
+        """The filter after one more dwell: one update, unless it changes what earlier dwells are known to have felt.
+
+        Not ``exact``: earlier dwells stay as they were known when they closed.
+        """
+        if exact:
+            carried = Carried([*self.dwells, dwell], self.carried.model, self.about)
+            if not all(map(np.array_equal, self.carried.columns, carried.columns[:-1])):
+                return replace(self, carried=carried)._folded()
+        else:
+            carried = self.carried.followed_by(dwell)
+        more = replace(self, carried=carried)
+        return more._updated(more._rows([-1])[0], steps(carried.dwells[-2:], self.noise)[-1])
+
+    def with_effect(self, text: str) -> Running:
+        """With that effect (a name or a formula) in the model; raises InputError where it cannot be added."""
+        effect = effect_named(text, self.carried.model.bench)
+        _ = self.model + effect  # refuses what the model has
+        inside = (*self.inside, str(effect))
+        if str(effect) in self.carried.model.parts:
+            return replace(self, inside=inside)
+        every = self.carried.model + effect
+        at = np.concatenate([self.about, np.zeros(every.count - len(self.about))])
+        return replace(self, inside=inside, carried=Carried(self.dwells, every, at))._folded()
+
+    def without(self, name: str) -> Running:
+        """With that effect out of the model; its columns are still carried."""
+        if name not in self.inside:
+            raise InputError(f"{name} is not in the model: it has {', '.join(self.inside) or 'no effects'}.")
+        return replace(self, inside=tuple(each for each in self.inside if each != name))
+
+    def solved(self) -> tuple[Floats, Floats, Floats]:
+        """State (p,) of the model, covariance (p, p), and a basis (p, q) of the combinations not determined."""
+        kept = self._kept
+        around = self.model.nominal_state() - self.about[kept]
+        moved, covariance, undetermined = square_root_information.solve(
+            square_root_information.restrict(self.factor, kept), around
+        )
+        return self.about[kept] + moved, covariance, undetermined
+
+    @property
+    def state(self) -> Floats:
+        """The state (P,) of all columns: the estimate of the model, zero for what is only carried."""
+        out = np.zeros(len(self.about))
+        out[self._kept] = self.solved()[0]
+        return out
+
+    @cached_property
+    def scan(self) -> Scan:
+        """What each effect that is carried and not in the model would explain."""
+        kept, parts = self._kept, self.carried.model.parts
+        outside = [effect for effect in self.carried.model.effects if str(effect) not in self.inside]
+        theirs = [range(*parts[str(effect)].indices(len(self.about))) for effect in outside]
+        order = [*kept, *itertools.chain(*theirs), len(self.about)]
+        upper = np.vstack([triangle(self.factor[:, order]), np.zeros((1, len(order)))])
+        return project(upper, len(kept), outside, [len(own) for own in theirs])
+
+    @property
+    def misfit(self) -> tuple[float, int]:
+        """What the model as it stands leaves: sum of squares, chi-squared of so many degrees of freedom."""
+        restricted = square_root_information.restrict(self.factor, self._kept)
+        squares = self.left + float(np.sum(self.factor[:, -1] ** 2) - np.sum(restricted[:, -1] ** 2))
+        return squares, self.rows - square_root_information.rank(restricted)
+
+    @cached_property
+    def _kept(self) -> list[int]:
+        """Places of the model's columns among all."""
+        parts, count = self.carried.model.parts, len(self.about)
+        return [*range(STATE_COUNT), *(k for name in self.inside for k in range(*parts[name].indices(count)))]
+
+    def _updated(self, rows: Floats, walked: Floats) -> Running:
+        factor, left = square_root_information.update(self.factor, rows, walked)
+        return replace(self, factor=factor, left=self.left + left, rows=self.rows + len(rows))
+
+    def _folded(self) -> Running:
+        """The same with its factor made anew from the dwells."""
+        factor = square_root_information.start(self.prior, self.carried.model)
+        factor[:, -1] -= factor[:, :-1] @ self.about
+        variances = steps(self.dwells, self.noise)
+        out = replace(self, factor=factor, left=0.0, rows=0)
+        if not variances.any():
+            return out._updated(np.concatenate(self._rows()), variances[0])
+        for own, variance in zip(self._rows(), variances, strict=True):
+            out = out._updated(own, variance)
+        return out
+
+    def _rows(self, chosen: Sequence[int] | None = None) -> list[Floats]:
+        """Whitened rows of all dwells, or of those chosen."""
+        chosen = range(len(self.dwells)) if chosen is None else chosen
+        dwells, columns = [self.dwells[k] for k in chosen], [self.carried.columns[k] for k in chosen]
+        return square_root_information.whiten(dwells, columns, self.noise.weights, self.about, self.about)

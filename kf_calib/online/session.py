@@ -1,0 +1,255 @@
+"""A run evaluated while it goes on: batches in, a ``Standing`` out at every batch, a ``Judgement`` at every dwell.
+
+The thread that calls ``run`` folds the samples as they come, and looks into the open dwell after 1, 2, 4 ... s; a
+second one judges the dwells that have closed. Neither waits for the other, nor for whoever looks on. What is folded is
+what a replay of the recording folds: the result is the same to the last bit.
+
+    session = Session(source, settings)
+    session.listeners.append(print)     # each judgement, from the judging thread: must not block
+    final = session.run()
+    session.accept("second-order")      # from any thread, while it runs: the effect is in all that follows
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+from threadpoolctl import threadpool_limits
+
+from kf_calib.bench.streams import Batch, Source
+from kf_calib.dwells.blocks import Tally
+from kf_calib.dwells.sufficient_statistics import Folder
+from kf_calib.effects import effect_named
+from kf_calib.errors import InputError, KfCalibError
+from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.settings import Settings
+from kf_calib.online.status import Judgement, Standing, current, judge_whole_run, judged, targets
+
+_FIRST_LOOK_S = 1.0
+
+
+@dataclass(frozen=True)
+class _Closed:
+    """What is judged: the pass as it was when a dwell closed, and when that was in bench time."""
+
+    passed: Pass
+    elapsed_s: float
+
+
+class Session:
+    """A source evaluated as it comes.
+
+    wanted: targets of sigmas by symbol, SI. every: judge after each dwell even where dwells close faster than that;
+    else the newest only. auto: accept what is missing and can be told from all else. again: what gives the samples once
+    more when the source has ended (its recording); None: they are gone then.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        settings: Settings | None = None,
+        wanted: Mapping[str, float] | None = None,
+        *,
+        every: bool = True,
+        auto: bool = False,
+        again: Callable[[], Source | None] | None = None,
+    ) -> None:
+        self.source, self.settings, self.wanted = source, settings or Settings(), targets(wanted or {})
+        self.every, self.auto, self.again = every, auto, again
+        self.listeners = list[Callable[[Judgement], None]]()
+        self.standing = Standing(model=self.settings.effects)
+        self._refuse(Model.of(source.bench, self.settings.effects))
+        self._passed = Pass(source, self.settings)
+        self._segmenter = self._passed.segmenter()
+        self._closed, self._looked_s = 0, 0.0
+        self._lock = threading.Condition()
+        self._waiting, self._ended, self._hurried = deque[_Closed](), False, False
+        self._last: _Closed | None = None
+
+    def run(self) -> Judgement:
+        """Evaluate the source to its end; the final judgement. Raises KfCalibError where nothing can be said."""
+        failure: Exception | None = None
+        with threadpool_limits(1, user_api="blas"):  # for both threads: setting it in one would change the other's
+            judge = threading.Thread(target=self._judge, name="judge", daemon=True)
+            judge.start()
+            try:
+                for batch in self.source:  # to its end whatever happens: the source may be recording
+                    try:
+                        if failure is None:
+                            self._take(batch)
+                    except Exception as error:
+                        failure = error
+                        self.say(f"the evaluation stopped: {error}")
+                if failure is None:
+                    self._finish()
+            finally:
+                with self._lock:
+                    self._ended = True
+                    self._lock.notify_all()
+                judge.join()
+            if failure is not None:
+                raise failure
+            return self._conclude()
+
+    def accept(self, *names: str) -> None:
+        """Put effects (names or formulas) into the model from now on. Raises InputError where one cannot be added."""
+        with self._lock:
+            model = Model.of(self.source.bench, self.settings.effects)
+            for name in names:
+                model += effect_named(name, self.source.bench)
+            self._refuse(model, begun=True)
+            self.settings = replace(self.settings, effects=(*self.settings.effects, *names))
+            self._publish(notice=f"{' and '.join(names)} accepted", model=self.settings.effects)
+            if self._last is not None and not self._waiting:
+                self._waiting.append(self._last)
+            self._lock.notify_all()
+
+    def hurry(self) -> None:
+        """Judge nothing more but the end: the run is to be over."""
+        with self._lock:
+            self._hurried = True
+            self._waiting.clear()
+            self._lock.notify_all()
+
+    def _refuse(self, model: Model, begun: bool = False) -> None:
+        """Raise InputError where the model needs what a source that comes only once does not give."""
+        if self.settings.engine != "block":
+            raise InputError(
+                "a live run is evaluated from folded dwells, as the block engine does: leave out --engine, and check "
+                "the recording with replay --engine filterpy."
+            )
+        swinging = [str(effect) for effect in model.effects if effect.oscillates]
+        if swinging:
+            raise InputError(
+                f"{swinging[0]} needs a second pass over the readings: record the run, then "
+                f"replay the recording --with {swinging[0]}."
+            )
+        moving = [str(effect) for effect in model.dynamic]
+        if begun and moving and not self._segmenter.slews:
+            raise InputError(
+                f"{moving[0]} shows in slews, which have not been kept from the start: begin with --with {moving[0]}, "
+                "or replay the recording with it."
+            )
+
+    def _take(self, batch: Batch) -> None:
+        passed, segmenter = self._passed, self._segmenter
+        for rows in passed.rows_of(segmenter.push(batch)):
+            passed.add(rows)
+        elapsed_s = self.standing.elapsed_s
+        if len(batch.accel) and segmenter.first_ns is not None:
+            elapsed_s = max(elapsed_s, float(batch.accel.time_ns[-1] - segmenter.first_ns) / 1e9)
+        standing, folded = segmenter.standing, passed.folder.dwells
+        closed = sum(1 for dwell in folded[self._closed :] if standing is None or dwell.number < standing)
+        with self._lock:
+            self._publish(samples=passed.tally.read, elapsed_s=elapsed_s)
+        self._close_next(closed, elapsed_s)
+        self._look(standing, elapsed_s)
+
+    def _finish(self) -> None:
+        passed = self._passed
+        for rows in passed.rows_of(self._segmenter.finish()):
+            passed.add(rows)
+        self._close_next(len(passed.folder.dwells) - self._closed, self.standing.elapsed_s)
+        with self._lock:
+            self._publish(samples=passed.tally.read, current=None)
+
+    def _close_next(self, count: int, elapsed_s: float) -> None:
+        for _ in range(count):
+            self._closed += 1
+            self._close(elapsed_s)
+
+    def _close(self, elapsed_s: float) -> None:
+        """Hand the dwells that have closed to be judged; nothing in them changes any more."""
+        passed, folder = self._passed, Folder()
+        folder.dwells, folder.slews = passed.folder.dwells[: self._closed], list(passed.folder.slews)
+        closed = _Closed(replace(passed, tally=replace(passed.tally), folder=folder), elapsed_s)
+        with self._lock:
+            self._last = closed
+            if not self.every:
+                self._waiting.clear()
+            if not self._hurried:
+                self._waiting.append(closed)
+            self._looked_s = 0.0
+            self._publish(dwells=self._closed, current=None)
+            self._lock.notify_all()
+
+    def _look(self, standing: int | None, elapsed_s: float) -> None:
+        """Look into the open dwell when it has lasted 1, 2, 4 ... s; what is looked at stays where it is."""
+        if standing is None:
+            return
+        folder, open_dwells = Folder(), self._passed.folder.dwells[self._closed :]
+        folder.dwells = list(open_dwells[-1:])
+        arrival_s = self._segmenter.arrival_s
+        if elapsed_s - arrival_s < max(2.0 * self._looked_s, _FIRST_LOOK_S):
+            return
+        aside = replace(self._passed, tally=Tally(), folder=folder)
+        for rows in aside.rows_of(self._segmenter.waiting()):
+            folder.add(rows)
+        if not folder.dwells or folder.dwells[-1].count < 8:
+            return
+        self._looked_s = elapsed_s - arrival_s
+        here = current(folder.dwells[-1], self.standing.judgement)
+        with self._lock:
+            self._publish(current=here)
+
+    def _judge(self) -> None:
+        """The judging thread: dwells as they close, in order."""
+        before = None
+        while (closed := self._next()) is not None:
+            with self._lock:
+                settings = self.settings
+            try:
+                judgement = judged(replace(closed.passed, settings=settings), self.wanted, before)
+            except KfCalibError as error:
+                with self._lock:
+                    self._publish(problem=str(error))
+                continue
+            except Exception as error:  # the run goes on, and its end is judged anew
+                self.say(f"a dwell could not be judged: {error!r}")
+                continue
+            before = judgement
+            self._told(judgement, closed.elapsed_s)
+            self._automatic(judgement)
+
+    def _next(self) -> _Closed | None:
+        with self._lock:
+            self._lock.wait_for(lambda: self._waiting or self._ended)
+            return self._waiting.popleft() if self._waiting else None
+
+    def _told(self, judgement: Judgement, elapsed_s: float) -> None:
+        with self._lock:
+            self._publish(judgement=judgement, judged_s=elapsed_s, problem="")
+        for listener in list(self.listeners):
+            listener(judgement)
+
+    def _automatic(self, judgement: Judgement) -> None:
+        """With ``auto``: accept what is missing, once looks in a row have told it from all else."""
+        if not (self.auto and judgement.alarm and judgement.look.settled):
+            return
+        found = judgement.found
+        if found.after is None or len(found.ambiguity) != len(found.missing):
+            return
+        try:
+            self.accept(*found.missing)
+        except InputError as error:
+            self.say(str(error))
+
+    def _conclude(self) -> Judgement:
+        before = self.standing.judgement
+        passed = replace(self._passed, settings=self.settings)
+        again = None if self.again is None else self.again()
+        final = judge_whole_run(passed, self.wanted, None if before is None else before.watch, again)
+        self._told(final, self.standing.elapsed_s)
+        return final
+
+    def say(self, notice: str) -> None:
+        """Have a sentence on the screen."""
+        with self._lock:
+            self._publish(notice=notice)
+
+    def _publish(self, **changed: object) -> None:
+        self.standing = replace(self.standing, **changed)

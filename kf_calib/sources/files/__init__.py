@@ -1,0 +1,1 @@
+"""Recordings: MCAP, CSV and JSON lines, read and written."""

@@ -1,0 +1,173 @@
+"""What is in the files of a recording besides samples: topics, found by their schema, and the bench's description."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mcap.opcode import Opcode
+from mcap.records import Channel, Metadata, Schema
+
+from kf_calib.errors import InputError
+from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, MessageType
+from kf_calib.sources.files.mcap_file import DamagedError, McapFile, Warn, parse
+
+BENCH_RECORD = "kf_calib.bench"
+CHECKSUM_KEY = "crc32"
+"""Key of the bench record with the checksum of the others: gravity and axes lie outside every chunk's CRC."""
+
+ACCEL_TOPIC = "/accelerometer"
+ANGLES_TOPIC = "/platform/angles"
+ATTITUDE_TOPIC = "/platform/attitude"
+TEMPERATURE_TOPIC = "/temperature"
+
+
+def bench_checksum(metadata: Mapping[str, str]) -> str:
+    """CRC-32 in hexadecimal of keys and values, sorted, each ended by NUL; the checksum's own key is left out."""
+    text = "".join(f"{key}\0{value}\0" for key, value in sorted(metadata.items()) if key != CHECKSUM_KEY)
+    return f"{zlib.crc32(text.encode()):08x}"
+
+
+@dataclass(frozen=True)
+class Role:
+    """What a topic is wanted for. ``preferred`` topics win, in this order, where several have a fitting schema."""
+
+    quantity: str
+    option: str
+    kinds: tuple[MessageType, ...]
+    preferred: tuple[str, ...]
+
+    def kind(self, schema: str) -> MessageType | None:
+        """The message type of that schema name, if this role can use it; older names lack the ``msg/``."""
+        return next((kind for kind in self.kinds if schema in (kind.name, kind.name.replace("/msg/", "/"))), None)
+
+    @property
+    def schemas(self) -> str:
+        return " or ".join(kind.name for kind in self.kinds)
+
+
+READINGS = Role("accelerometer", "--accel-topic", (IMU,), (ACCEL_TOPIC,))
+POSES = Role("angle or attitude", "--pose-topic", (JOINT_STATE, QUATERNION), (ANGLES_TOPIC, ATTITUDE_TOPIC))
+TEMPERATURES = Role("temperature", "--temperature-topic", (TEMPERATURE,), (TEMPERATURE_TOPIC,))
+
+
+@dataclass
+class Contents:
+    """Topics of a file and its bench's description, as far as they have been met."""
+
+    path: Path
+    schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
+    channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
+    bench: dict[str, str] | None = None
+    bench_damaged: bool = False
+
+    def add(self, opcode: int, content: bytes, warn: Warn) -> None:
+        """Takes note of a record that is not a message."""
+        try:
+            match opcode:
+                case Opcode.SCHEMA:
+                    schema = parse(Schema.read, content)
+                    self.schemas.setdefault(schema.id, schema)
+                case Opcode.CHANNEL:
+                    channel = parse(Channel.read, content)
+                    self.channels.setdefault(channel.id, channel)
+                case Opcode.METADATA:
+                    self._add_metadata(content)
+                case _:
+                    pass
+        except DamagedError:
+            warn(f"{self.path}: a record that describes a topic or the bench is damaged and not used.")
+
+    def _add_metadata(self, content: bytes) -> None:
+        try:
+            record = parse(Metadata.read, content)
+        except DamagedError:
+            self.bench_damaged |= self.bench is None
+            raise
+        if record.name != BENCH_RECORD:
+            return
+        stated = record.metadata.pop(CHECKSUM_KEY, None)
+        if stated is not None and stated != bench_checksum(record.metadata):
+            self.bench_damaged |= self.bench is None
+            raise DamagedError("the bench's description does not fit its checksum")
+        if self.bench is None:  # the first whole one; recorders repeat it
+            self.bench, self.bench_damaged = record.metadata, False
+
+    def topics(self, role: Role) -> list[str]:
+        """Topics with a schema that ``role`` can use, in the order of the file."""
+        fitting = [channel.topic for channel in self.channels.values() if role.kind(self._schema(channel))]
+        return list(dict.fromkeys(fitting))
+
+    def ids(self, topic: str) -> list[int]:
+        return [channel.id for channel in self.channels.values() if channel.topic == topic]
+
+    def kind(self, role: Role, topic: str) -> MessageType:
+        """What the messages of a chosen topic are. Raises InputError where they are not encoded as in ROS 2."""
+        channel = self.channels[self.ids(topic)[0]]
+        schema = self.schemas[channel.schema_id]
+        kind = role.kind(schema.name)
+        if kind is None or channel.message_encoding != "cdr" or schema.encoding not in ("ros2msg", "ros2idl"):
+            raise InputError(
+                f"{self.path}: topic {topic} has {channel.message_encoding!r} messages with a schema {schema.name} in "
+                f"{schema.encoding!r}, only 'cdr' with 'ros2msg' can be read: convert the file to ROS 2 first."
+            )
+        return kind
+
+    @property
+    def schemas_of_topics(self) -> dict[str, str]:
+        return {channel.topic: self._schema(channel) for channel in self.channels.values()}
+
+    def _schema(self, channel: Channel) -> str:
+        schema = self.schemas.get(channel.schema_id)
+        return schema.name if schema else "no schema"
+
+
+@dataclass
+class Parts:
+    """The files of a recording, which follow each other."""
+
+    path: Path
+    files: list[McapFile]
+    contents: list[Contents] = field(default_factory=list[Contents])
+
+    @property
+    def size(self) -> int:
+        return sum(file.size for file in self.files)
+
+    @property
+    def bench(self) -> tuple[Mapping[str, str], bool]:
+        """Keys of the first description of the bench, and whether it is damaged."""
+        described = (own for own in self.contents if own.bench is not None or own.bench_damaged)
+        first = next(described, Contents(self.path))
+        return first.bench or {}, first.bench_damaged
+
+    def topics(self, role: Role) -> list[str]:
+        """Topics with a schema that ``role`` can use, in the order of the files."""
+        return list(dict.fromkeys(topic for own in self.contents for topic in own.topics(role)))
+
+    def choose(self, role: Role, wanted: str | None) -> str | None:
+        """The topic to use for ``role``, None where there is none. Raises InputError where the choice is not clear."""
+        candidates = self.topics(role)
+        for topic in role.preferred if wanted is None else (wanted,):
+            if topic in candidates:
+                return topic
+        if wanted is not None:
+            raise InputError(
+                f"{self.path} has no {role.quantity} topic {wanted!r}, it has {self}: give one of schema "
+                f"{role.schemas} by {role.option}."
+            )
+        if len(candidates) > 1:
+            raise InputError(
+                f"{self.path} has several {role.quantity} topics, {', '.join(candidates)}: choose one by {role.option}."
+            )
+        return candidates[0] if candidates else None
+
+    def kind(self, role: Role, topic: str) -> MessageType:
+        """What the messages of a chosen topic are. Raises InputError where they are not encoded as in ROS 2."""
+        return next(own for own in self.contents if own.ids(topic)).kind(role, topic)
+
+    def __str__(self) -> str:
+        topics = {topic: schema for own in self.contents for topic, schema in own.schemas_of_topics.items()}
+        return ", ".join(f"{topic} ({schema})" for topic, schema in topics.items()) or "no topics"

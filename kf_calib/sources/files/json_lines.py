@@ -1,0 +1,146 @@
+"""Batches from JSON lines (docs/format.md): one object a line, readings and poses together or on lines of their own."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from decimal import Decimal
+from typing import Any
+
+from kf_calib.bench.bench import metadata_of
+from kf_calib.sources.files.line_parts import (
+    ACCEL_UNITS,
+    TIME_DECIMALS,
+    Account,
+    LineError,
+    LineReader,
+    LineRows,
+    number_of,
+    stamp_ns,
+)
+
+_ACCEL = {f"accel_{unit}": factor for unit, factor in ACCEL_UNITS.items()}
+_ANGLES = {"angles_rad": 1.0, "angles_deg": math.pi / 180.0}
+_ATTITUDE = "attitude_xyzw"
+_TEMPERATURE = "temperature_c"
+_KNOWN = frozenset([*TIME_DECIMALS, *_ACCEL, *_ANGLES, _ATTITUDE, _TEMPERATURE])
+
+
+_decode_exactly = json.JSONDecoder(parse_float=Decimal).decode
+_decode_with_care = json.JSONDecoder(parse_float=number_of).decode
+_find_tiny = re.compile(r"[0-9][eE]-[0-9]{3}").search  # a number as small as this is rare, and may be two
+
+
+class JsonLines(LineReader):
+    """Reads JSON lines block by block.
+
+    ``columns`` renames foreign keys. ``metadata`` is the first line's ``{"bench": ...}`` as strings. The first pose
+    settles whether poses are angles (``has_angles``) and how many (``pose_width``, 0 until then).
+    """
+
+    _faults = (
+        (ValueError, "it is not JSON"),
+        (RecursionError, "it is nested too deeply"),
+        (ArithmeticError, "a number is out of range"),
+    )
+
+    def __init__(self, columns: Mapping[str, str], account: Account) -> None:
+        super().__init__(account)
+        self._columns = columns
+        self._is_first = True
+
+    @property
+    def advice(self) -> str:
+        """How readings and poses have to be named."""
+        return "name the readings accel_mps2 or accel_g, and the poses angles_rad, angles_deg or attitude_xyzw"
+
+    def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
+        if not line.lstrip().startswith("{"):  # found out at a tenth of the cost, where a link brings much of it
+            raise LineError("it is not a JSON object")
+        is_tiny = ("e-" in line or "E-" in line) and _find_tiny(line)
+        entry = _decode_with_care(line) if is_tiny else json.loads(line)
+        if self._columns:
+            entry = {self._columns.get(key, key): value for key, value in entry.items()}
+        if self._takes_bench(entry):
+            return
+        time_ns = self._time_ns(entry, line)
+        # everything on the line is understood before any of it is used
+        readings = self._readings(entry)
+        attitude, has_angles = self._pose(entry)
+        degrees = _numbers([entry[_TEMPERATURE]], _TEMPERATURE) if entry.get(_TEMPERATURE) is not None else None
+        if attitude and not self.pose_width:
+            self.pose_width, self.has_angles = len(attitude), has_angles
+        accel.add(time_ns, readings)
+        pose.add(time_ns, attitude)
+        temperature.add(time_ns, degrees)
+        if not entry.keys() <= _KNOWN:
+            self._account.leave_out(key for key in entry if key not in _KNOWN)
+
+    def _takes_bench(self, entry: dict[str, Any]) -> bool:
+        """Whether this is the first line and describes the bench, which is then kept."""
+        is_first, self._is_first = self._is_first, False
+        if not is_first or "bench" not in entry:
+            return False
+        bench = entry["bench"]
+        if not isinstance(bench, dict):
+            raise LineError("bench is not a JSON object")
+        self.metadata = metadata_of({key: value for key, value in bench.items() if value is not None})
+        return True
+
+    def _time_ns(self, entry: dict[str, Any], line: str) -> int:
+        name = next((name for name in TIME_DECIMALS if name in entry), None)
+        if name is None:
+            raise LineError("it has no time stamp (time_ns or time_s)")
+        number = entry[name]
+        if type(number) is float:  # has lost digits: read the line again with all of them
+            exact = _decode_exactly(line)
+            number = next(value for key, value in exact.items() if self._columns.get(key, key) == name)
+        if type(number) not in (int, Decimal):
+            raise LineError(f"{name} is not a number")
+        return stamp_ns(number, TIME_DECIMALS[name])
+
+    def _readings(self, entry: dict[str, Any]) -> list[float] | None:
+        for name, factor in _ACCEL.items():
+            if entry.get(name) is not None:
+                values = _numbers(entry[name], name)
+                if len(values) != 3:
+                    raise LineError(f"{name} has {len(values)} numbers, not 3")
+                return values if factor == 1.0 else [factor * value for value in values]
+        return None
+
+    def _pose(self, entry: dict[str, Any]) -> tuple[list[float] | None, bool]:
+        """The pose, if any, and whether it is made of angles."""
+        for name, factor in _ANGLES.items():
+            if entry.get(name) is not None:
+                return self._fitting([factor * value for value in _numbers(entry[name], name)], name, True), True
+        if entry.get(_ATTITUDE) is None:
+            return None, True
+        values = _numbers(entry[_ATTITUDE], _ATTITUDE)
+        if len(values) != 4 or not any(values):
+            raise LineError(f"{_ATTITUDE} is not a quaternion")
+        return self._fitting(values, _ATTITUDE, False), False
+
+    def _fitting(self, values: list[float], name: str, has_angles: bool) -> list[float]:
+        if not values:
+            raise LineError(f"{name} is empty")
+        if self.pose_width and (len(values), has_angles) != (self.pose_width, self.has_angles):
+            raise LineError(f"{name} is not like the poses before it")
+        return values
+
+
+def _numbers(values: Any, name: str) -> list[float]:
+    """Finite numbers; true, "1", NaN and 1e999 are none."""
+    if type(values) is not list:
+        raise LineError(f"{name} is not a list of numbers")
+    for value in values:
+        if type(value) is not float and type(value) is not int:
+            raise LineError(f"{name} holds what is not a number")
+    try:
+        out = [float(value) for value in values]
+    except OverflowError:
+        raise LineError(f"{name} is out of range") from None
+    if not all(map(math.isfinite, out)):
+        raise LineError(f"{name} is out of range")
+    return out

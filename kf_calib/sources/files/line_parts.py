@@ -1,0 +1,143 @@
+"""What the readers of JSON and CSV lines share: units, exact stamps, rows, and an account of what was not used."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from decimal import Decimal
+from typing import ClassVar
+
+import numpy as np
+
+from kf_calib.bench.streams import Batch, Stream
+
+STANDARD_GRAVITY_MPS2 = 9.80665
+ACCEL_UNITS = {"mps2": 1.0, "g": STANDARD_GRAVITY_MPS2, "mg": STANDARD_GRAVITY_MPS2 / 1e3}
+TIME_DECIMALS = {"time_ns": 0, "time_us": 3, "time_ms": 6, "time_s": 9}
+"""Names of the stamp, and how many decimals its unit has in nanoseconds."""
+
+_NAMED = 8
+_NAME_LENGTH = 40
+
+
+class LineError(ValueError):
+    """A line cannot be used; the message is the reason in a few words."""
+
+
+@dataclass
+class Account:
+    """Lines read, lines that could not be used (with the first of them), and names that mean nothing to us."""
+
+    lines: int = 0
+    malformed: int = 0
+    first_malformed: tuple[int, str] | None = None
+    unknown: Counter[str] = field(default_factory=Counter[str])
+    what: str = "lines"
+
+    def refuse(self, line: int, reason: str) -> None:
+        self.malformed += 1
+        if self.first_malformed is None or line < self.first_malformed[0]:
+            self.first_malformed = (line, reason)
+
+    def leave_out(self, names: Iterable[str]) -> None:
+        """Counts values under unknown names; of the names, the first few are kept."""
+        for name in names:
+            short = name[:_NAME_LENGTH]
+            self.unknown[short if short in self.unknown or len(self.unknown) < _NAMED else "others"] += 1
+
+    def sentences(self) -> list[str]:
+        out = list[str]()
+        if self.first_malformed:
+            line, reason = self.first_malformed
+            out.append(
+                f"{self.malformed} of {self.lines} {self.what} were malformed and skipped "
+                f"(first {self.what.removesuffix('s')} {line}: {reason})."
+            )
+        if self.unknown:
+            named = ", ".join(f"{name!r} ({count})" for name, count in dict(self.unknown).items())
+            out.append(f"names that are not known were left out, with the values under them: {named}.")
+        return out
+
+
+class LineRows:
+    """Stamped rows on their way to a stream."""
+
+    def __init__(self) -> None:
+        self._stamps = list[int]()
+        self._values = list[list[float]]()
+
+    def add(self, time_ns: int, values: list[float] | None) -> None:
+        """Adds a row, unless there is nothing to add."""
+        if values:
+            self._stamps.append(time_ns)
+            self._values.append(values)
+
+    def stream(self, width: int) -> Stream:
+        if not self._stamps:
+            return Stream.empty(width)
+        return Stream(np.array(self._stamps, np.int64), np.array(self._values, float))
+
+
+class LineReader(ABC):
+    """Reads lines block by block; those that cannot be used are put down in the account.
+
+    ``metadata``: of the bench, as strings. ``has_angles``: poses are angles; ``pose_width``: numbers of one.
+    """
+
+    _faults: ClassVar[tuple[tuple[type[Exception], str], ...]]
+    """What reading a line may raise beside LineError, and the reason to give."""
+
+    def __init__(self, account: Account) -> None:
+        self.metadata: dict[str, str] = {}
+        self.has_angles = True
+        self.pose_width = 0
+        self._account = account
+
+    @property
+    @abstractmethod
+    def advice(self) -> str:
+        """How quantities have to be named."""
+
+    def read(self, lines: Sequence[str], first_line: int) -> Batch:
+        """The batch of consecutive lines, the first of them of that number."""
+        accel, pose, temperature = LineRows(), LineRows(), LineRows()
+        faults = tuple(kind for kind, _ in self._faults)
+        for number, line in enumerate(lines, start=first_line):
+            if not line or line.isspace():
+                continue
+            try:
+                self._read_line(line, accel, pose, temperature)
+            except LineError as error:
+                self._account.refuse(number, str(error))
+            except faults as error:
+                reason = next(reason for kind, reason in self._faults if isinstance(error, kind))
+                self._account.refuse(number, reason)
+        return Batch(accel.stream(3), pose.stream(self.pose_width), temperature.stream(1))
+
+    @abstractmethod
+    def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
+        """Adds what one line holds, all of it or nothing; raises LineError or one of ``_faults``."""
+
+
+def number_of(text: str) -> float:
+    """The number that a text says. Raises LineError where it is too small for one, as when two have run together:
+    1.234e-01700001234567 is no zero."""
+    value = float(text)
+    if value == 0.0 and float(text.lower().partition("e")[0]):
+        raise LineError("a number is out of range")
+    return value
+
+
+def stamp_ns(number: int | Decimal, decimals: int) -> int:
+    """A stamp in whole nanoseconds from one in a unit of 10^decimals ns, exactly; halves go to the even one."""
+    if isinstance(number, Decimal):
+        if not number.is_finite() or abs(number.adjusted()) > 20:  # before an exponent is written out in full
+            raise LineError("the time stamp is out of range")
+        nanoseconds = round(number.scaleb(decimals))
+    else:
+        nanoseconds = number * 10**decimals
+    if not -(2**63) <= nanoseconds < 2**63:
+        raise LineError("the time stamp is out of range")
+    return nanoseconds

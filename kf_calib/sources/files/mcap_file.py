@@ -1,0 +1,505 @@
+"""An MCAP file read in bulk: whole chunks of records, whatever state the file is in.
+
+A file is a sequence of records (opcode u8, length u64, content), most of them packed into chunks with a checksum.
+A recorder that was killed leaves no footer; a failing disk flips bits. Everything whole is read, everything lost is
+told in one sentence through ``warn``. Where the summary at the file's end is whole (it has a checksum of its own), its
+list of chunks leads past damage; without it the next chunk is known by its head. Memory is that of a few blocks, or of
+one chunk where that is larger: what claims to unpack to more than is allowed is passed over.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import IO, TypeVar
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Header, Metadata, MetadataIndex, Schema, Statistics
+
+from kf_calib.errors import InputError
+from kf_calib.sources.files.foreign import HEAD_BYTES, advice
+from kf_calib.sources.files.mcap_messages import HEAD, MESSAGE_FIELDS, RecordBlock
+
+MAGIC = b"\x89MCAP0\r\n"
+MAX_CHUNK_MB = 256.0
+"""A chunk that unpacks to more is passed over: recorders write some MB, and a few kB of zeros claim a GB."""
+
+Warn = Callable[[str], None]
+
+_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of its offsets, CRC
+_CHUNK = struct.Struct("<QQQII")  # first and last time, size and CRC uncompressed, length of the compression's name
+_SUMMARY_LIMIT = 1 << 28
+_BLOCK = 1 << 22  # smaller chunks are joined: every block costs some hundred microseconds besides its messages
+_PIECE = 1 << 20
+_AHEAD = 2 * _BLOCK  # bytes unpacked and not yet asked for
+_LONGEST_SPAN_S = 1e7  # a longer one is damage itself
+_PACKED_HEADS = tuple(struct.pack("<I", len(name)) + name for name in (b"zstd", b"lz4"))
+
+# What may stand in the data section, with the least length of its content
+_LEAST: dict[int, int] = {
+    Opcode.HEADER: 8, Opcode.SCHEMA: 14, Opcode.CHANNEL: 16, Opcode.MESSAGE: MESSAGE_FIELDS, Opcode.CHUNK: 40,
+    Opcode.MESSAGE_INDEX: 6, Opcode.ATTACHMENT: 36, Opcode.METADATA: 8, Opcode.DATA_END: 4,
+}  # fmt: skip
+_PARSED: dict[int, Callable[[ReadDataStream], object]] = {
+    Opcode.HEADER: Header.read, Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read,
+    Opcode.METADATA: Metadata.read,
+}  # fmt: skip
+_FIRST_PRIVATE_OPCODE = 0x80
+_NOTHING_YET = -1  # in place of an opcode: the next record of a growing file is not whole
+_Record = TypeVar("_Record")
+
+
+class DamagedError(Exception):
+    """A stretch of the file is not what MCAP says it must be; the text says how."""
+
+
+class _ExactStream(ReadDataStream):
+    def read(self, length: int) -> bytes:
+        data = super().read(length)
+        if len(data) != length:
+            raise EndOfFile
+        return data
+
+
+def parse(read: Callable[[ReadDataStream], _Record], content: bytes) -> _Record:
+    """The record in ``content``; ``read`` is its class's reader. Raises DamagedError unless it fits exactly."""
+    stream = _ExactStream(BytesIO(content))
+    try:
+        record = read(stream)
+    except (McapError, struct.error, ValueError) as error:
+        raise DamagedError("a record does not parse") from error
+    if stream.count != len(content):
+        raise DamagedError("a record is longer than what it holds")
+    return record
+
+
+def unpack_chunk(content: bytes, max_chunk: int) -> bytes:
+    """The records in the content of a chunk record. Raises DamagedError where size or checksum do not fit."""
+    _, _, size, crc, _ = _CHUNK.unpack_from(content)
+    start = _packed_start(content)
+    if not start:
+        raise DamagedError("its lengths contradict each other")
+    if size > max_chunk:
+        raise DamagedError(f"it claims to hold {_mb(size)} MB, {_allowed(max_chunk)}")
+    data = _decompress(content[_CHUNK.size : start - 8], content[start:], size)
+    if len(data) != size:
+        raise DamagedError(f"it holds {len(data)} bytes in place of {size}")
+    if crc and zlib.crc32(data) != crc:
+        raise DamagedError("its checksum does not fit")
+    return data
+
+
+def _packed_start(content: bytes) -> int:
+    """Where the packed records begin in the content of a chunk record; 0 where its lengths contradict each other."""
+    start = _CHUNK.size + _CHUNK.unpack_from(content)[-1] + 8
+    fits = start <= len(content) and int.from_bytes(content[start - 8 : start], "little") == len(content) - start
+    return start if fits else 0
+
+
+def _mb(size: int) -> str:
+    return f"{size / (1 << 20):.0f}"
+
+
+def _allowed(max_chunk: int) -> str:
+    return f"more than the {_mb(max_chunk)} MB that --max-chunk-mb allows"
+
+
+def _decompress(compression: bytes, data: bytes, size: int) -> bytes:
+    try:
+        match compression:
+            case b"":
+                return data
+            case b"zstd":
+                if zstandard.frame_content_size(data) not in (-1, size):  # the frame's claim is what gets allocated
+                    raise DamagedError("its sizes contradict each other")
+                return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+            case b"lz4":
+                return lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+            case _:
+                raise DamagedError(f"its compression {compression.decode(errors='replace')!r} is not known")
+    except (zstandard.ZstdError, RuntimeError, MemoryError) as error:
+        raise DamagedError("it does not decompress") from error
+
+
+@dataclass
+class Summary:
+    """What the end of a finished file tells of the whole; ``start`` is the byte where that end begins."""
+
+    start: int
+    schemas: list[Schema] = field(default_factory=list[Schema])
+    channels: list[Channel] = field(default_factory=list[Channel])
+    chunks: list[ChunkIndex] = field(default_factory=list[ChunkIndex])
+    metadata: list[MetadataIndex] = field(default_factory=list[MetadataIndex])
+    message_counts: dict[int, int] = field(default_factory=dict[int, int])
+
+    @classmethod
+    def read(cls, file: IO[bytes], size: int) -> Summary:
+        """The summary of a file of ``size`` bytes. Raises DamagedError where there is none or it is not whole."""
+        footer_start = size - _FOOTER.size - len(MAGIC)
+        if footer_start < len(MAGIC):
+            raise DamagedError("it has no footer")
+        file.seek(footer_start)
+        footer, magic = file.read(_FOOTER.size), file.read(len(MAGIC))
+        opcode, length, start, _, crc = _FOOTER.unpack(footer)
+        if magic != MAGIC or (opcode, length) != (Opcode.FOOTER, _FOOTER.size - HEAD.size):
+            raise DamagedError("it has no footer")
+        start = start or footer_start
+        if not footer_start - _SUMMARY_LIMIT <= start <= footer_start or start < len(MAGIC):
+            raise DamagedError("its footer is damaged")
+        file.seek(start)
+        content = file.read(footer_start - start)
+        if crc and zlib.crc32(footer[:-4], zlib.crc32(content)) != crc:
+            raise DamagedError("the checksum of its summary does not fit")
+        summary = cls(start)
+        summary._fill(content)
+        return summary
+
+    def _fill(self, content: bytes) -> None:
+        position = 0
+        while position < len(content):
+            opcode, record, position = _record_at(content, position)
+            match opcode:
+                case Opcode.SCHEMA:
+                    self.schemas.append(parse(Schema.read, record))
+                case Opcode.CHANNEL:
+                    self.channels.append(parse(Channel.read, record))
+                case Opcode.CHUNK_INDEX:
+                    self.chunks.append(parse(ChunkIndex.read, record))
+                case Opcode.METADATA_INDEX:
+                    self.metadata.append(parse(MetadataIndex.read, record))
+                case Opcode.STATISTICS:
+                    self.message_counts = parse(Statistics.read, record).channel_message_counts
+                case _:
+                    pass
+        self.chunks.sort(key=lambda index: index.chunk_start_offset)
+
+
+def _record_at(data: bytes, position: int) -> tuple[int, bytes, int]:
+    if position + HEAD.size > len(data):
+        raise DamagedError("a record has no room for its head")
+    opcode, length = HEAD.unpack_from(data, position)
+    start = position + HEAD.size
+    if start + length > len(data):
+        raise DamagedError("a record ends outside its section")
+    return opcode, data[start : start + length], start + length
+
+
+class McapFile:
+    """An MCAP file on disk. ``summary`` is None where the file's end is missing or damaged: ``trouble`` says so.
+
+    max_chunk: bytes that a chunk may take, packed or unpacked.
+    """
+
+    def __init__(self, path: Path, max_chunk: int = int(MAX_CHUNK_MB * (1 << 20))) -> None:
+        self.path = path
+        self.max_chunk = max_chunk
+        self.summary: Summary | None = None
+        self.trouble = ""
+        with self.open() as file:
+            self.size = file.seek(0, 2)
+            file.seek(0)
+            if not self.size:
+                raise InputError(f"{path} is empty: nothing was recorded in it.")
+            head = file.read(HEAD_BYTES)
+            if not head.startswith(MAGIC):
+                raise InputError(advice(path, head))
+            try:
+                self.summary = Summary.read(file, self.size)
+            except DamagedError as damage:
+                self.trouble = f"{path} was not finished or has lost its end ({damage}): what is whole in it is used."
+
+    def open(self) -> IO[bytes]:
+        try:
+            return self.path.open("rb")
+        except FileNotFoundError:
+            raise InputError(f"{self.path} does not exist: check the path.") from None
+        except IsADirectoryError:
+            raise InputError(f"{self.path} is a directory: give a .mcap file in it.") from None
+        except OSError as error:
+            raise InputError(f"{self.path} cannot be read ({error.strerror}): check its permissions.") from error
+
+    def record_at(self, position: int, opcode: int) -> bytes:
+        """The content of the record at byte ``position``. Raises DamagedError where there is none of that opcode."""
+        with self.open() as file:
+            file.seek(min(position, self.size))
+            head = file.read(HEAD.size).ljust(HEAD.size, b"\x00")
+            found, length = HEAD.unpack(head)
+            if found != opcode or length > self.size - position - HEAD.size:
+                raise DamagedError("a record is not where it should be")
+            return file.read(length)
+
+    def blocks(
+        self, warn: Warn, start: int = 0, end: int | None = None, growing: bool = False
+    ) -> Iterator[RecordBlock]:
+        """Every whole stretch of records, from the start; ``warn`` is told what is lost. Raises InputError.
+
+        start, end: bytes between which whole records lie, where not all are wanted. growing: the file is being written;
+        an empty block means that no further record is whole yet.
+        """
+        with self.open() as file:
+            walk = _Walk(self, file, warn, start, end, growing)
+            try:
+                yield from map(walk.unpack, walk.parcels()) if growing else _ahead(walk.unpack, walk.parcels())
+            except OSError as error:
+                raise InputError(f"{self.path} cannot be read ({error.strerror}): check its medium.") from error
+            walk.compare_checksum()
+
+
+@dataclass
+class _Parcel:
+    """Records (start, opcode, content) taken from the file to become one block of ``size`` bytes."""
+
+    records: list[tuple[int, int, bytes]] = field(default_factory=list[tuple[int, int, bytes]])
+    size: int = 0
+    end: int = 0
+
+
+def _ahead(unpack: Callable[[_Parcel], RecordBlock], parcels: Iterable[_Parcel]) -> Iterator[RecordBlock]:
+    """``map(unpack, parcels)``, some MB ahead in a thread: unpacking and checksums leave the interpreter free."""
+    with ThreadPoolExecutor(max_workers=1) as worker:
+        coming: deque[tuple[int, Future[RecordBlock]]] = deque()
+        for parcel in parcels:
+            coming.append((parcel.size, worker.submit(unpack, parcel)))
+            while sum(size for size, _ in coming) > _AHEAD:
+                yield coming.popleft()[1].result()
+        while coming:
+            yield coming.popleft()[1].result()
+
+
+class _Walk:
+    """One passage through the data section, keeping the checksum of all that it passed."""
+
+    def __init__(
+        self, mcap: McapFile, file: IO[bytes], warn: Warn, start: int = 0, end: int | None = None, growing: bool = False
+    ) -> None:
+        self.path = mcap.path
+        self.max_chunk = mcap.max_chunk
+        self.growing = growing
+        self.file = file
+        self.warn = warn
+        self.end = end or (mcap.summary.start if mcap.summary else file.seek(0, 2))
+        self.chunks = {index.chunk_start_offset: index for index in mcap.summary.chunks} if mcap.summary else {}
+        self.chunk_starts = sorted(start for start in self.chunks if start < self.end)
+        self.indexed = mcap.summary is not None
+        self.position = file.seek(start)
+        self.crc = self.crc_before_end = self.stated_crc = 0
+        self.whole = not start  # nothing lost so far
+        self.unchecked = False  # readings were passed that no chunk's checksum covers
+        self.next_chunk = 0  # found by its head; nothing before it is one
+        if not start:
+            self._take(len(MAGIC))
+
+    def parcels(self) -> Iterator[_Parcel]:
+        parcel = _Parcel()
+        for start, opcode, content in self._records():
+            size = self._unpacked_size(opcode, content)
+            is_full = bool(parcel.records) and parcel.size + size > _BLOCK and opcode != Opcode.MESSAGE_INDEX
+            if opcode == _NOTHING_YET or is_full:
+                yield parcel
+                parcel = _Parcel()
+            if opcode not in (Opcode.HEADER, _NOTHING_YET):
+                parcel.records.append((start, opcode, content))
+                parcel.size += size
+                parcel.end = self.position
+        if parcel.records:
+            yield parcel
+
+    def _unpacked_size(self, opcode: int, content: bytes) -> int:
+        stated = _CHUNK.unpack_from(content)[2] if opcode == Opcode.CHUNK else len(content)
+        return stated if stated <= self.max_chunk else 0  # a chunk of more is passed over
+
+    def unpack(self, parcel: _Parcel) -> RecordBlock:
+        parts: list[bytes] = []
+        borders = [0]
+        index = [np.empty(0, np.int64)]
+        for start, opcode, content in parcel.records:
+            if opcode == Opcode.MESSAGE_INDEX:  # it follows its chunk, and counts from the chunk's start
+                index.append(np.frombuffer(content[6:], "<i8")[1::2] + borders[max(len(parts) - 1, 0)])
+                continue
+            part = self._unpack_chunk(start, content) if opcode == Opcode.CHUNK else self._loose(opcode, content)
+            parts.append(part)
+            borders.append(borders[-1] + len(part))
+        data = parts[0] if len(parts) == 1 else b"".join(parts)
+        return RecordBlock(data, tuple(borders[1:]), np.sort(np.concatenate(index), kind="stable"), parcel.end)
+
+    def compare_checksum(self) -> None:
+        """Checks what lies outside chunks, once all has been read and unpacked."""
+        if self.stated_crc and self.whole and self.crc_before_end != self.stated_crc:
+            self.warn(
+                f"{self.path}: data section CRC mismatch although all chunks are whole, so something between "
+                "them is damaged: check the bench's description."
+            )
+        if self.unchecked and not self.stated_crc:
+            self.warn(f"{self.path} carries no checksums of its readings: damage in it would pass unnoticed.")
+
+    def _records(self) -> Iterator[tuple[int, int, bytes]]:
+        """Start, opcode and content of record after record; attachments and kinds not known are passed over."""
+        while self.growing or self.position < self.end:
+            if self.growing and not self._has_come():
+                yield self.position, _NOTHING_YET, b""
+                continue
+            start, limit, crc = self.position, self._limit(), self.crc
+            head = self._take(min(HEAD.size, limit - start))
+            opcode, length = HEAD.unpack(head.ljust(HEAD.size, b"\x00"))
+            if not self._plausible(start, opcode, length, limit):
+                self._lose(start, opcode, limit)
+                continue
+            if opcode == Opcode.ATTACHMENT or opcode >= _FIRST_PRIVATE_OPCODE or length > self.max_chunk + _PIECE:
+                self._pass_over(opcode, length)
+                continue
+            content = self._take(length)
+            if opcode == Opcode.DATA_END:
+                self.crc_before_end, self.stated_crc = crc, int.from_bytes(content[:4], "little")
+                return
+            if not _consistent(opcode, content):
+                self.whole = False
+                if opcode in (Opcode.HEADER, Opcode.MESSAGE_INDEX):
+                    what = f"the record at byte {start} is damaged"
+                    self.warn(f"{self.path}: {what}: its {length} bytes are passed over.")
+                else:
+                    yield start, opcode, content  # whoever wants it tells what is lost
+                if not self.indexed:  # its length may be what is damaged
+                    self._go_to(min(self._chunk_after(start), self.position))
+                continue
+            yield start, opcode, content
+
+    def _has_come(self) -> bool:
+        """Whether the record at the present position is whole, or will never be."""
+        self.end = self.file.seek(0, 2)
+        self.file.seek(self.position)
+        head = self.file.read(HEAD.size)
+        self.file.seek(self.position)
+        if len(head) < HEAD.size:
+            return False
+        opcode, length = HEAD.unpack(head)
+        return length > self.max_chunk + _PIECE or not opcode or self.position + HEAD.size + length <= self.end
+
+    def _take(self, length: int) -> bytes:
+        data = self.file.read(length)
+        if len(data) != length:
+            raise InputError(f"{self.path} became shorter while it was read: read it again when it is at rest.")
+        self.crc = zlib.crc32(data, self.crc)
+        self.position += length
+        return data
+
+    def _limit(self) -> int:
+        """Where the record at the present position must have ended: at the next chunk known of, or the end."""
+        later = bisect_right(self.chunk_starts, self.position)
+        return self.chunk_starts[later] if later < len(self.chunk_starts) else self.end
+
+    def _plausible(self, start: int, opcode: int, length: int, limit: int) -> bool:
+        if start in self.chunks and (opcode, length + HEAD.size) != (Opcode.CHUNK, self.chunks[start].chunk_length):
+            return False
+        known = opcode >= _FIRST_PRIVATE_OPCODE or length >= _LEAST.get(opcode, length + 1)
+        return known and start + HEAD.size + length <= limit
+
+    def _pass_over(self, opcode: int, length: int) -> None:
+        start = self.position - HEAD.size
+        if opcode == Opcode.CHUNK:
+            what = f"the chunk at byte {start} takes {_mb(length)} MB, {_allowed(self.max_chunk)}"
+            self.warn(f"{self.path}: {what}: it is passed over.")
+        elif opcode != Opcode.ATTACHMENT:
+            self.warn(f"{self.path}: the record of kind {opcode} at byte {start} ({length} bytes) is passed over.")
+        for taken in range(0, length, _PIECE):
+            self._take(min(_PIECE, length - taken))
+
+    def _lose(self, start: int, opcode: int, limit: int) -> None:
+        """Goes on at ``limit``, or the next chunk: nothing tells where the record at ``start`` ends."""
+        self.whole = False
+        index, times = self.chunks.get(start), self.file.read(16) if opcode == Opcode.CHUNK else b""
+        span = _span(index.message_start_time, index.message_end_time) if index else _span(*_times(times))
+        resumed = limit if self.indexed else self._chunk_after(start)
+        count = resumed - start
+        if self.indexed or resumed < limit:
+            self.warn(f"{self.path} is damaged at byte {start}: {count} bytes{span} are lost.")
+        elif opcode in _LEAST or count < HEAD.size:
+            self.warn(f"{self.path} breaks off in a record: the {count} bytes{span} from byte {start} on are lost.")
+        else:
+            self.warn(f"{self.path} is damaged at byte {start}: the {count} bytes from there to its end are lost.")
+        self._go_to(resumed)
+
+    def _go_to(self, position: int) -> None:
+        self.position = self.file.seek(position)
+
+    def _chunk_after(self, start: int) -> int:
+        """Where the first packed chunk behind ``start`` begins, by all of its head; the end where there is none."""
+        if self.next_chunk > start:
+            return self.next_chunk
+        overlap = HEAD.size + _CHUNK.size + 4 + 8  # the longest head
+        place, self.next_chunk = start + 1, self.end
+        while place < self.end and self.next_chunk == self.end:
+            self.file.seek(place)
+            piece = self.file.read(min(_PIECE + overlap, self.end - place))
+            found = (place + at for at in _chunk_heads(piece) if place + at + self._chunk_length(piece, at) <= self.end)
+            self.next_chunk = next(found, self.end)
+            place += _PIECE
+        return self.next_chunk
+
+    @staticmethod
+    def _chunk_length(piece: bytes, at: int) -> int:
+        return HEAD.size + HEAD.unpack_from(piece, at)[1]
+
+    def _loose(self, opcode: int, content: bytes) -> bytes:
+        self.unchecked |= opcode == Opcode.MESSAGE
+        return HEAD.pack(opcode, len(content)) + content
+
+    def _unpack_chunk(self, start: int, content: bytes) -> bytes:
+        first_ns, last_ns, _, crc, _ = _CHUNK.unpack_from(content)
+        self.unchecked |= crc == 0
+        try:
+            return unpack_chunk(content, self.max_chunk)
+        except DamagedError as damage:
+            self.whole = False
+            lost = f"its {len(content)} bytes{_span(first_ns, last_ns)} are lost"
+            self.warn(f"{self.path}: the chunk at byte {start} is damaged ({damage}): {lost}.")
+            return b""
+
+
+def _consistent(opcode: int, content: bytes) -> bool:
+    """Whether a record is as long as what it holds; of loose messages, nothing in them tells."""
+    if opcode == Opcode.MESSAGE_INDEX:
+        size = len(content) - 6
+        return int.from_bytes(content[2:6], "little") == size and size % 16 == 0
+    if opcode == Opcode.CHUNK:
+        return bool(_packed_start(content))
+    try:
+        return opcode not in _PARSED or bool(parse(_PARSED[opcode], content))
+    except DamagedError:
+        return False
+
+
+def _chunk_heads(piece: bytes) -> Iterator[int]:
+    """Where heads of packed chunks begin in ``piece``, ascending: opcode, name and both lengths agree."""
+    before = HEAD.size + _CHUNK.size - 4
+    places = sorted(hit.start() - before for head in _PACKED_HEADS for hit in re.finditer(re.escape(head), piece))
+    for at in places:
+        if at < 0 or piece[at] != Opcode.CHUNK:
+            continue
+        name = piece[at + before]  # the length of the name, one byte of it
+        rest = at + HEAD.size + _CHUNK.size + name + 8
+        length = HEAD.unpack_from(piece, at)[1]
+        if int.from_bytes(piece[rest - 8 : rest], "little") == length - (rest - at - HEAD.size):
+            yield at
+
+
+def _times(content: bytes) -> tuple[int, int]:
+    """First and last time in the first bytes of a chunk's content; no times at all where they are not there."""
+    return struct.unpack("<QQ", content) if len(content) == 16 else (1, 0)
+
+
+def _span(first_ns: int, last_ns: int) -> str:
+    seconds = (last_ns - first_ns) / 1e9
+    return f", about {seconds:.3g} s of readings," if 0 <= seconds < _LONGEST_SPAN_S else ""

@@ -1,0 +1,305 @@
+"""A recording (MCAP files, docs/format.md) as a source of batches, one a chunk.
+
+Topics are found by their schema. What is whole in a damaged or unfinished file is used, what is lost is told in
+``warnings``. Sample time is ``header.stamp``. Memory is that of a few chunks, however long the recording.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Metadata
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Batch, Source, Stream
+from kf_calib.errors import BenchError, InputError
+from kf_calib.sources.files.bags import files_of
+from kf_calib.sources.files.cdr import JOINT_STATE, CdrError, Decoder
+from kf_calib.sources.files.contents import BENCH_RECORD, POSES, READINGS, TEMPERATURES, Contents, Parts, Role
+from kf_calib.sources.files.joints import Joints
+from kf_calib.sources.files.mcap_file import MAX_CHUNK_MB, DamagedError, McapFile, Warn, parse
+from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, RecordBlock
+
+_MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
+GAP_RECORD = "kf_calib.gap"
+"""Metadata record at a place where the link to the bench was down: after_ns, seconds, reason."""
+CLOCK_RECORD = "kf_calib.clock"
+"""Where the bench's clock was set: after_ns, begin_ns (the first new stamp), shift_ns (from there on), reason."""
+_MARKS = {GAP_RECORD: "the link to the bench was lost", CLOCK_RECORD: "the bench's clock was set during the run"}
+
+
+class Recording:
+    """A recording as a ``Source``: iterating reads it from its start.
+
+    path: a file, or the folder of a ROS 2 bag, whose files follow each other. overrides: bench metadata keys
+    (docs/format.md) that win over those in the file.
+    accel_scale: factor on the readings, one for all or one a sensor (9.80665 for a file in g). angle_scale: factor on
+    the gimbal angles (0.017453 for a file in degrees).
+    accel_topic, pose_topic, temperature_topic: which to use where the file has several of the kind.
+    max_chunk_mb: chunks that unpack to more are passed over, and told.
+    Raises InputError where the file, or what it holds, cannot be used.
+    """
+
+    def __init__(
+        self,
+        path: str | PathLike[str],
+        overrides: Mapping[str, str] = MappingProxyType({}),
+        accel_scale: float | tuple[float, float, float] = 1.0,
+        *,
+        angle_scale: float = 1.0,
+        accel_topic: str | None = None,
+        pose_topic: str | None = None,
+        temperature_topic: str | None = None,
+        max_chunk_mb: float = MAX_CHUNK_MB,
+    ) -> None:
+        self.path = Path(path)
+        self.fraction = 0.0
+        self._accel_scale, self._angle_scale = np.asarray(accel_scale, float), angle_scale
+        self._wanted = {READINGS: accel_topic, POSES: pose_topic, TEMPERATURES: temperature_topic}
+        self._parts = Parts(self.path, [McapFile(file, int(max_chunk_mb * (1 << 20))) for file in files_of(self.path)])
+        self.warnings = [file.trouble for file in self._parts.files if file.trouble]
+        self._parts.contents = [self._survey(file) for file in self._parts.files]
+        self._accel = self._require(READINGS, "convert the readings to sensor_msgs/msg/Imu")
+        self._pose = self._require(POSES, "record the angles too, as sensor_msgs/msg/JointState by the same clock")
+        self._parts.choose(TEMPERATURES, temperature_topic)  # optional, but not to be guessed
+        self.bench = self._describe_bench(overrides)
+        self._opening_warnings = len(self.warnings)
+
+    def __iter__(self) -> Iterator[Batch]:
+        return self._batches(growing=False)
+
+    def following(self) -> Iterator[Batch]:
+        """The batches of a file that is being written, from its start; an empty one: nothing more has come yet."""
+        return self._batches(growing=True)
+
+    @property
+    def warnings_while_read(self) -> list[str]:
+        """Those that are not of the file's end, which one that is still being written has not."""
+        return self.warnings[self._opening_warnings :]
+
+    def _batches(self, growing: bool) -> Iterator[Batch]:
+        del self.warnings[self._opening_warnings :]
+        self.fraction, begun, parts = 0.0, 0, self._parts
+        joints = Joints(len(self.bench.axes), self.bench.joints, self.bench.axis_letters, self._warn_of_joints)
+        decoders = _Decoders(parts, self.bench.pose_width, joints)
+        for file, contents in zip(parts.files, parts.contents, strict=True):
+            passage = _Passage(contents, self._warn_of_damage)
+            for end, batch in self._part(file, passage, decoders, growing and file is parts.files[-1]):
+                self.fraction = math.nan if growing else min((begun + end) / parts.size, 1.0)
+                if growing or len(batch.accel) or len(batch.pose) or len(batch.temperature):
+                    yield batch
+            passage.account(file.summary.message_counts if file.summary else {}, self.warnings.append)
+            begun += file.size
+        if joints.others and not joints.found:
+            raise InputError(
+                f"{self.path}: no message of topic {self._pose} names the joints {' '.join(self.bench.joints)}, it "
+                f"names {' '.join(joints.others)}: name the gimbals, outer to inner, by --joints."
+            )
+        self.fraction = 1.0
+
+    def _part(
+        self, file: McapFile, passage: _Passage, decoders: _Decoders, growing: bool
+    ) -> Iterator[tuple[int, Batch]]:
+        """The batches of one file, and up to which byte it has been read then."""
+        accel, pose = (passage.track(topic, decoders.of(role, topic)) for role, topic in
+                       ((READINGS, self._accel), (POSES, self._pose)))  # fmt: skip
+        temperature = None
+        for block in file.blocks(self._warn_of_damage, growing=growing):
+            messages = passage.find(block)
+            if not temperature and (topic := self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])):
+                temperature = passage.track(topic, decoders.of(TEMPERATURES, topic))
+            readings, angles = accel.read(block, messages), pose.read(block, messages)
+            batch = Batch(
+                _scaled(readings, self._accel_scale),
+                _scaled(angles, self._angle_scale),
+                temperature.read(block, messages) if temperature else Stream.empty(1),
+            )
+            yield block.end, batch
+
+    def _warn_of_damage(self, said: str) -> None:
+        if len(self.warnings) < _MOST_DAMAGES:
+            self.warnings.append(said)
+        elif len(self.warnings) == _MOST_DAMAGES:
+            self.warnings.append(f"{self.path} is damaged in more places than can be told.")
+
+    def _warn_of_joints(self, said: str) -> None:
+        self.warnings.append(f"{self.path}: topic {self._pose}: {said}.")
+
+    def _survey(self, file: McapFile) -> Contents:
+        """Topics and bench: from the summary, else by reading on until no better choice of topics can come, and where
+        something is damaged the bench."""
+        contents, summary = Contents(file.path), file.summary
+        if summary:
+            contents.schemas = {schema.id: schema for schema in summary.schemas}
+            contents.channels = {channel.id: channel for channel in summary.channels}
+            for index in summary.metadata:
+                if index.name == BENCH_RECORD and contents.bench is None:
+                    _look_up_bench(file, contents, index.offset)
+        lists_topics = bool(contents.channels and contents.schemas)
+        if lists_topics and (contents.bench is not None or contents.bench_damaged):
+            return contents
+        find, damage = MessageFinder(), list[str]()
+        for block in file.blocks(warn=damage.append):
+            for opcode, content in find(block).others:
+                contents.add(opcode, content, warn=_ignore)
+            may_come_again = contents.bench is None and bool(contents.bench_damaged or damage)
+            if lists_topics or (self._is_settled(contents) and not may_come_again):
+                break
+        return contents
+
+    def _is_settled(self, contents: Contents) -> bool:
+        for role, wanted in self._wanted.items():
+            sought = role.preferred if wanted is None else (wanted,)
+            is_optional = role is TEMPERATURES and wanted is None
+            if not is_optional and not set(sought) & set(contents.topics(role)):
+                return False
+        return True
+
+    def _require(self, role: Role, advice: str) -> str:
+        topic = self._parts.choose(role, self._wanted[role])
+        if topic is None:
+            state = " and is not whole" if any(file.trouble for file in self._parts.files) else ""
+            raise InputError(
+                f"{self.path} has no {role.quantity} topic ({role.schemas}), it has {self._parts}{state}: {advice}."
+            )
+        return topic
+
+    def _describe_bench(self, overrides: Mapping[str, str]) -> Bench:
+        recorded, is_damaged = self._parts.bench
+        damage = f"{self.path}: the description of the bench in it is damaged"
+        if is_damaged:
+            self.warnings.append(f"{damage}: only what options give is used.")
+        has_angles = self._parts.kind(POSES, self._pose) is JOINT_STATE
+        if not has_angles and self._angle_scale != 1.0:
+            raise InputError(
+                f"{self.path}: topic {self._pose} has attitudes, which have no unit: leave out --angle-unit."
+            )
+        try:
+            return Bench.from_metadata({**recorded, **overrides}, has_angles)
+        except BenchError as error:
+            where = f"{damage}, so give it by options" if is_damaged else str(self.path)
+            raise BenchError(f"{where}: {error}") from error
+
+
+def _look_up_bench(file: McapFile, contents: Contents, position: int) -> None:
+    try:
+        contents.add(Opcode.METADATA, file.record_at(position, Opcode.METADATA), warn=_ignore)
+    except DamagedError:
+        contents.bench_damaged = True
+
+
+@dataclass
+class _Decoders:
+    """What reads the messages of a recording's topics, in all of its files."""
+
+    parts: Parts
+    pose_width: int
+    joints: Joints
+    known: dict[Role, Decoder] = field(default_factory=dict[Role, Decoder])
+
+    def of(self, role: Role, topic: str) -> Decoder:
+        if role not in self.known:
+            width = {READINGS: 3, POSES: self.pose_width, TEMPERATURES: 1}[role]
+            self.known[role] = Decoder(self.parts.kind(role, topic), width, self.joints if role is POSES else None)
+        return self.known[role]
+
+
+def opened(source: Source | str | PathLike[str]) -> Source:
+    """The source itself, or the recording at a path."""
+    return Recording(source) if isinstance(source, str | PathLike) else source
+
+
+class _Passage:
+    """One reading of a file from its start, with the account of the messages met."""
+
+    def __init__(self, contents: Contents, warn: Warn) -> None:
+        self.contents = contents
+        self.warn = warn
+        self._find = MessageFinder()
+        self._tracks: list[_Track] = []
+        self._met = Counter[int]()
+        self._marks = list[Metadata]()
+
+    def track(self, topic: str, decode: Decoder) -> _Track:
+        track = _Track(self.contents, topic, decode)
+        self._tracks.append(track)
+        return track
+
+    def find(self, block: RecordBlock) -> Messages:
+        messages = self._find(block)
+        for opcode, content in messages.others:
+            self.contents.add(opcode, content, self.warn)
+            self._marks += _mark(opcode, content)
+        if messages.lost:
+            self.warn(f"{self.contents.path}: {messages.lost} bytes of records before byte {block.end} make no sense.")
+        for group in messages.groups:
+            self._met[group.channel] += len(group.at)
+        return messages
+
+    def account(self, stated: Mapping[int, int], warn: Warn) -> None:
+        """Warns of messages that the file should have (``stated``, by channel) but that were not met, and of gaps."""
+        for name, what in _MARKS.items():
+            if marks := [mark for mark in self._marks if mark.name == name]:
+                reason = marks[0].metadata.get("reason", "unknown")
+                warn(f"{self.contents.path}: {what} {len(marks)} times (first: {reason}).")
+        for track in self._tracks:
+            ids = self.contents.ids(track.topic)
+            total = sum(stated.get(channel, 0) for channel in ids)
+            lost = total - sum(self._met[channel] for channel in ids)
+            if lost > 0:
+                warn(f"{self.contents.path}: {lost} of {total} messages of {track.topic} are lost.")
+        stray = sum(count for channel, count in self._met.items() if channel not in self.contents.channels)
+        if stray:
+            warn(f"{self.contents.path}: {stray} messages belong to no topic the file defines and are left out.")
+
+
+@dataclass(frozen=True)
+class _Track:
+    """One topic on its way from blocks to a stream."""
+
+    contents: Contents
+    topic: str
+    decode: Decoder
+
+    def read(self, block: RecordBlock, messages: Messages) -> Stream:
+        """The topic's samples in ``block``. Raises InputError where a message is not what its schema says."""
+        ids = self.contents.ids(self.topic)
+        groups = [group for group in messages.groups if group.channel in ids]
+        try:
+            parts = [self.decode.located(block.data, group.at, group.size) for group in groups]
+        except CdrError as error:
+            raise InputError(f"{self.contents.path}: topic {self.topic} cannot be used: {error}.") from error
+        if len(parts) == 1:
+            return parts[0][1]
+        joined = sum((stream for _, stream in parts), Stream.empty(self.decode.width))
+        order = np.argsort(np.concatenate([np.empty(0, np.int64), *(at for at, _ in parts)]))
+        return Stream(joined.time_ns[order], joined.values[order])
+
+
+def _scaled(stream: Stream, scale: Floats | float) -> Stream:
+    with np.errstate(over="ignore"):  # what damage has made too large becomes infinite, and is counted as such
+        return Stream(stream.time_ns, stream.values * scale)
+
+
+def _mark(opcode: int, content: bytes) -> list[Metadata]:
+    """A record that says what happened to the link or the clock; none of any other."""
+    if opcode != Opcode.METADATA:
+        return []
+    try:
+        record = parse(Metadata.read, content)
+    except DamagedError:  # told already
+        return []
+    return [record] if record.name in _MARKS else []
+
+
+def _ignore(_: str) -> None:
+    """While surveying: the warnings come again when the file is read."""

@@ -1,0 +1,1 @@
+"""A simulated bench: the nonlinear truth, with effects injected into it."""

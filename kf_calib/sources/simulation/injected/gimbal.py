@@ -1,0 +1,174 @@
+"""Errors of the positioner: encoders, axes, base, platform. All are solved as rotations.
+
+Encoders: recorded is the reading q, true is q + error(q). Turns of a rotation vector follow the right-hand rule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Vector
+from kf_calib.sources.simulation.gimbal_motion import attitude
+from kf_calib.sources.simulation.injected.kinds import Rig, made
+from kf_calib.sources.simulation.injected.terms import column
+from kf_calib.sources.simulation.physics import State, Step, to_bench, turned
+
+_ROUNDS = 6  # of the flexure's fixed point; each gains the digits of its angle
+_PROBE_S = 2e-4  # of the second difference that makes an acceleration
+
+
+def encoder_error(axis: int, error: Callable[[Floats], Floats]) -> Step:
+    """The step that makes the true angle of one gimbal differ from its reading."""
+
+    def step(state: State) -> None:
+        angles_rad = state.angles_rad.copy()
+        angles_rad[:, axis] += error(angles_rad[:, axis])
+        state.angles_rad = angles_rad
+
+    return step
+
+
+@made(
+    "encoder-offset", "rad", ("1arcsec", "20arcsec"), ("0.02deg", "0.5deg"),
+    stage="angles", coefficients=("epsilon",), per_axis=True,
+)  # fmt: skip
+def encoder_offset(epsilon: Floats, rig: Rig, axis: int) -> Step:
+    """Zero of an encoder: the true angle is q + epsilon."""
+    return encoder_error(axis, lambda q: np.full_like(q, epsilon[0]))
+
+
+@made(
+    "encoder-scale", "1", ("1ppm", "20ppm"), ("0.1permille", "2permille"),
+    stage="angles", coefficients=("epsilon",), per_axis=True,
+)  # fmt: skip
+def encoder_scale(epsilon: Floats, rig: Rig, axis: int) -> Step:
+    """Scale of an encoder: the true angle is q (1 + epsilon), q as it was commanded, whole turns included."""
+    return encoder_error(axis, lambda q: epsilon[0] * q)
+
+
+def harmonic(order: int) -> Callable[..., Step]:
+    def make(size: Floats, rig: Rig, axis: int) -> Step:
+        return encoder_error(axis, lambda q: size[0] * np.sin(order * q) + size[1] * np.cos(order * q))
+
+    multiple = "q" if order == 1 else f"{order}q"
+    make.__doc__ = (
+        f"Encoder error of order {order}: the true angle is q + s sin {multiple} + c cos {multiple}, "
+        "from a graduated circle off its centre or out of round."
+    )
+    return make
+
+
+for _order in (1, 2):
+    made(
+        f"encoder-harmonic-{_order}", "rad", ("1urad", "100urad"), ("0.1mrad", "5mrad"),
+        stage="angles", coefficients=("s", "c"), per_axis=True,
+    )(harmonic(_order))  # fmt: skip
+
+
+@made(
+    "axis-nonorthogonality", "rad", ("5urad", "50urad"), ("0.1mrad", "5mrad"),
+    stage="angles", coefficients=("u", "v"), per_axis=True,
+)  # fmt: skip
+def axis_nonorthogonality(tilt: Floats, rig: Rig, axis: int) -> Step:
+    """Nonorthogonality of a gimbal axis: it is tilted in its parent by u and v about the two axes that follow it in
+    cyclic order, for y about z and x; at zero angles the frames coincide."""
+    nominal = rig.axes[axis]
+    true = tuple(Rotation.from_rotvec(tilt @ across(nominal)).apply(nominal).tolist())
+
+    def step(state: State) -> None:
+        state.axes = [true if number == axis else other for number, other in enumerate(state.axes)]
+
+    return step
+
+
+def across(axis: Vector) -> Floats:
+    """Two unit vectors (2, 3) across an axis: the next two in cyclic order where it is x, y or z."""
+    letter = int(np.argmax(np.abs(axis)))
+    following = np.eye(3)[(letter + 1) % 3]
+    first = following - np.dot(following, axis) * np.array(axis)
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(axis, first)])
+
+
+@made("base-tilt", "rad", ("5urad", "500urad"), ("0.1mrad", "10mrad"), stage="attitude", coefficients=("N", "E"))
+def base_tilt(delta: Floats, rig: Rig) -> Step:
+    """Tilt of the base: it is turned by the rotation vector (delta N about North, delta E about East)."""
+    return base_turning(delta, rig, lambda state: np.ones(1))
+
+
+@made(
+    "base-tilt-drift", "rad/s", ("1urad/day", "50urad/day"), ("1urad/h", "100urad/h"),
+    stage="attitude", coefficients=("N", "E"),
+)  # fmt: skip
+def base_tilt_drift(rate: Floats, rig: Rig) -> Step:
+    """Drift of the base's tilt: turned by t (rate N about North, rate E about East)."""
+    return base_turning(rate, rig, lambda state: state.time_s)
+
+
+def base_turning(delta: Floats, rig: Rig, multiple: Callable[[State], Floats]) -> Step:
+    """The step that turns the base about horizontal axes by (delta N, delta E) times something (n,)."""
+    vector = to_bench([delta[0], 0.0, delta[1]], rig.bench.azimuth_deg)
+
+    def step(state: State) -> None:
+        state.attitude = Rotation.from_rotvec(column(multiple(state)) * vector) * state.attitude
+
+    return step
+
+
+@made(
+    "platform-drift", "rad/s", ("0.01deg/h", "1deg/h"), ("1deg/h", "30deg/h"),
+    stage="attitude", coefficients=("x", "y", "z"),
+)  # fmt: skip
+def platform_drift(rate: Floats, rig: Rig) -> Step:
+    """Drift of the platform: turned in its own axes by the rotation vector omega_d t, from its gyros (IEEE Std 813)."""
+
+    def step(state: State) -> None:
+        state.attitude = state.attitude * Rotation.from_rotvec(column(state.time_s) * rate)
+
+    return step
+
+
+@made(
+    "flexure", "rad/(m/s^2)", ("5urad/g", "100urad/g"), ("0.1mrad/g", "3mrad/g"),
+    stage="force", coefficients=("x", "y", "z"),
+)  # fmt: skip
+def flexure(offset: Floats, rig: Rig) -> Step:
+    """Flexure: the platform gives way by the rotation vector f x d, the torque of gravity on a mass off the centre
+    times compliance; d is compliance x mass x offset, and f is felt by the bent platform (Hooke's law)."""
+
+    def step(state: State) -> None:
+        bent = Rotation.identity()
+        for _ in range(_ROUNDS):
+            bent = Rotation.from_rotvec(np.cross(turned(bent.inv(), state.force_mps2), offset))
+        state.force_mps2, state.attitude = turned(bent.inv(), state.force_mps2), state.attitude * bent
+
+    return step
+
+
+@made(
+    "lever-arm", "m", ("5mm", "3cm"),
+    stage="input", coefficients=tuple(number + axis for number in "123" for axis in "xyz"),
+)  # fmt: skip
+def lever_arm(arm: Floats, rig: Rig) -> Step:
+    """Lever arm: accelerometer i sits at r_i in the platform, whose origin does not move, and feels in slews the
+    acceleration of its place along its input axis, R E_i . d2(R r_i)/dt2 (kinematics)."""
+    arms, shifts_s = arm.reshape(3, 3), (-_PROBE_S, 0.0, _PROBE_S)
+
+    def step(state: State) -> None:
+        if state.moving:
+            before, now, after = (_carried(rig, state.time_s + shift_s) for shift_s in shifts_s)
+            felt = (after(arms) - 2.0 * now(arms) + before(arms)) / _PROBE_S**2
+            state.input_mps2 = state.input_mps2 + np.sum(now(rig.sensors.input_axes) * felt, axis=2)
+
+    return step
+
+
+def _carried(rig: Rig, time_s: Floats) -> Callable[[Floats], Floats]:
+    """What takes three vectors of the platform, rows (3, 3), into the bench at n instants: (n, 3, 3)."""
+    time_ns = np.rint(np.maximum(time_s, 0.0) * 1e9).astype(np.int64)
+    carried = attitude(rig.axes, rig.motion.angles_at(time_ns))
+    return lambda rows: np.stack([turned(carried, row[None]) for row in rows], axis=1)

@@ -1,0 +1,93 @@
+"""A simulated run from options: those of ``kf-calib simulate``, or of a URL ``sim://?sample_hz=1000&seed=3``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+from urllib.parse import parse_qsl
+
+from kf_calib.bench.bench import Bench, Vector, parse_axes
+from kf_calib.errors import InputError
+from kf_calib.sources.simulation.detectability import sized
+from kf_calib.sources.simulation.injected import parse
+from kf_calib.sources.simulation.physics import Ambient
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
+from kf_calib.sources.simulation.visit_plans import Visit, angles_from_csv, explicit_plan, six_faces, spread_plan
+
+DEFAULTS: Mapping[str, Any] = MappingProxyType(
+    {
+        "grade": "navigation", "plan": "spread", "count": 24, "dwell_s": 30.0, "sample_hz": 100.0, "angle_hz": 10.0,
+        "slew_degps": 20.0, "hidden": (), "unstated": False, "seed": 0,
+    }
+)  # fmt: skip
+_NUMBERS = {"count": int, "seed": int}  # all others that are no words are float
+_WORDS = frozenset(("grade", "plan"))
+_SHORT = {"orientations": "count", "hide": "hidden"}
+
+
+def options_from_query(query: str) -> dict[str, Any]:
+    """Options from ``dwell_s=5&hide=second-order=10sigma``; ``hide`` may be repeated. Raises InputError."""
+    known = {*DEFAULTS, *(each.name for kind in (*GRADES.values(),) for each in fields(kind.noise))}
+    known |= {each.name for each in fields(Ambient)}
+    options: dict[str, Any] = {}
+    for key, text in parse_qsl(query, keep_blank_values=True):
+        name = _SHORT.get(key, key).replace("-", "_")
+        if name not in known:
+            raise InputError(f"sim:// has no setting {key!r}: use speed, hide or one of {', '.join(sorted(known))}.")
+        try:
+            if name == "hidden":
+                options[name] = (*options.get(name, ()), text)
+            elif name == "unstated":
+                options[name] = text not in ("0", "no", "false")
+            else:
+                options[name] = text if name in _WORDS else _NUMBERS.get(name, float)(text)
+        except ValueError:
+            raise InputError(f"sim://: {key}={text} is not a number.") from None
+    return options
+
+
+def simulation(
+    options: Mapping[str, Any],
+    bench_keys: Mapping[str, str],
+    batch_samples: int = 65536,
+    begin: Callable[[Simulation], None] = lambda run: None,
+) -> Simulation:
+    """The run that these options describe (those of ``simulate``; None: as the grade has it). Raises InputError.
+
+    begin: is given the run before anything is hidden in it, which takes as long as the run is large.
+    """
+    options = {**DEFAULTS} | {key: value for key, value in options.items() if value is not None}
+    keys = {"axes": "y z x", **bench_keys}
+    if "latitude_deg" not in keys:
+        keys.setdefault("gravity_mps2", "9.81")
+    grade = GRADES[options["grade"]]
+    names = {field.name for field in fields(grade.noise)}
+    noise = replace(grade.noise, **{key: options[key] for key in names if key in options})
+    axes = parse_axes(keys["axes"])
+    visits = _visits(options, axes, keys.get("up", "y"))
+    if not options["unstated"]:
+        keys.setdefault("angle_sigma_deg", repr(noise.setting_sigma_deg))
+        keys.setdefault("scatter_sigma_mps2", repr(noise.dwell_sigma_mps2(len(visits))))
+    ambient = Ambient(**{field.name: options[field.name] for field in fields(Ambient) if field.name in options})
+    run = Simulation(
+        Bench.from_metadata(keys), grade.sensors(options["seed"]), noise, visits,
+        sample_hz=options["sample_hz"], angle_hz=options["angle_hz"], slew_rate_degps=options["slew_degps"],
+        ambient=ambient, seed=options["seed"], grade=options["grade"], batch_samples=batch_samples,
+    )  # fmt: skip
+    begin(run)
+    return run.hiding(
+        parse(options["hidden"], axes, seed=options["seed"], grade=options["grade"], sized=partial(sized, run))
+    )
+
+
+def _visits(options: Mapping[str, Any], axes: tuple[Vector, ...], up: str) -> list[Visit]:
+    if options["plan"] == "spread":
+        return spread_plan(options["count"], axes, options["dwell_s"], options["seed"], up)
+    if options["plan"] == "faces":
+        return six_faces(axes, options["dwell_s"], up)
+    return explicit_plan(angles_from_csv(Path(options["plan"]), len(axes)), options["dwell_s"])

@@ -1,0 +1,209 @@
+"""What is true of the simulated bench, and the steps that make it so.
+
+A ``State`` goes through steps in three groups: the platform (angles -> attitude -> specific force), the response of the
+accelerometers (specific force -> input acceleration -> readings), and the recording (noise). They share no formula with
+the estimator. Hidden effects (``injected``) are further steps between these.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench, Vector
+from kf_calib.errors import InputError
+from kf_calib.sources.simulation.gimbal_motion import attitude, between
+from kf_calib.sources.simulation.noise_processes import Process
+from kf_calib.sources.simulation.sensors import Sensors
+
+SIDEREAL_DAY_S = 86164.0905
+"""One turn of the Earth in inertial space."""
+
+
+@dataclass(frozen=True)
+class Ambient:
+    """Temperature over time: constant + swing sin(2 pi t / period) - warm_up exp(-t / warm_up_s), degC."""
+
+    constant_c: float = 25.0
+    swing_c: float = 0.0
+    period_s: float = 14400.0
+    warm_up_c: float = 0.0
+    warm_up_s: float = 1800.0
+    sigma_c: float = 0.01  # of the recorded values
+
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, astuple(self))):
+            raise InputError("a figure of the temperature is not a finite number: give one.")
+        for words, value_s in (("period of the temperature", self.period_s), ("warm-up time", self.warm_up_s)):
+            if not value_s > 0.0:
+                raise InputError(f"the {words} is {value_s:g} s: give a positive time.")
+        if self.sigma_c < 0.0:
+            raise InputError(f"the noise of the thermometer is {self.sigma_c:g} K: give zero or a positive number.")
+        coldest_c = self.constant_c - abs(self.swing_c) - max(self.warm_up_c, 0.0)
+        if coldest_c < -273.15:
+            raise InputError(f"the temperature falls to {coldest_c:g} degC, below absolute zero: give a warmer one.")
+
+    def __call__(self, time_s: Floats) -> Floats:
+        swing = self.swing_c * np.sin(2.0 * np.pi * time_s / self.period_s)
+        return self.constant_c + swing - self.warm_up_c * np.exp(-time_s / self.warm_up_s)
+
+    def rate(self, time_s: Floats) -> Floats:
+        """Its rate of change, K/s."""
+        swing = 2.0 * np.pi * self.swing_c / self.period_s * np.cos(2.0 * np.pi * time_s / self.period_s)
+        return swing + self.warm_up_c / self.warm_up_s * np.exp(-time_s / self.warm_up_s)
+
+
+@dataclass
+class State:
+    """What is true of n consecutive samples that lie within one dwell, or within one slew.
+
+    Arrays have n rows, or one where a quantity is constant over the stretch: they broadcast. ``dwell`` is the one the
+    platform is in, or was last in; ``share`` of the way to the next one it has gone.
+    """
+
+    time_s: Floats  # (n,) since the first sample
+    ambient: Ambient
+    dwell: int
+    moving: bool
+    arrival_s: float
+    share: Floats  # (n,) or (1,)
+    axes: Sequence[Vector]  # of the gimbals, outer first
+    angles_rad: Floats  # (n, k) or (1, k); the encoders see them without the hidden effects, and with their noise
+    attitude: Rotation = field(default_factory=Rotation.identity)  # platform -> bench
+    force_mps2: Floats = field(default_factory=lambda: np.zeros((1, 3)))  # specific force, in the platform
+    input_mps2: Floats = field(default_factory=lambda: np.zeros((1, 3)))  # along each accelerometer's input axis
+    reading_mps2: Floats = field(default_factory=lambda: np.zeros((1, 3)))
+
+    @property
+    def temperature_c(self) -> Floats:
+        return self.ambient(self.time_s)
+
+    @property
+    def since_arrival_s(self) -> Floats:
+        return self.time_s - self.arrival_s
+
+    def of_dwells(self, values: Floats) -> Floats:
+        """What has ``values`` (m, k) in the dwells and passes smoothly from one to the next: (n, k) or (1, k)."""
+        return between(values, np.full(len(self.share), self.dwell), self.share)
+
+
+Step = Callable[[State], None]
+"""One part of the bench: changes what is true in a ``State``. It may remember what went before."""
+
+
+@dataclass(frozen=True)
+class Gimbals:
+    """The chain of gimbals, on a base whose axis ``up`` points up: angles -> attitude in the bench frame."""
+
+    up: str
+
+    def __call__(self, state: State) -> None:
+        state.attitude = attitude(state.axes, state.angles_rad, self.up)
+
+
+@dataclass(frozen=True)
+class SettingError:
+    """The platform turned in itself by a small rotation vector in each dwell, ``rotation_rad`` (m, 3)."""
+
+    rotation_rad: Floats
+
+    def __call__(self, state: State) -> None:
+        state.attitude = state.attitude * Rotation.from_rotvec(state.of_dwells(self.rotation_rad))
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """Specific force seen by the platform: f_p = C_bp^T f_b, f_b = (0, g, 0), which turns with the Earth where the
+    platform is held in inertial space."""
+
+    bench: Bench
+
+    def __call__(self, state: State) -> None:
+        up = carried_by_earth(self.bench, np.array([[0.0, self.bench.gravity_mps2, 0.0]]), state.time_s)
+        state.force_mps2 = turned(state.attitude.inv(), up)
+
+
+def carried_by_earth(bench: Bench, vector: Floats, time_s: Floats) -> Floats:
+    """A vector (1, 3) fixed to the Earth, in the frame that attitudes refer to: it turns where that one is inertial."""
+    if bench.reference == "base":
+        return vector
+    # a bench that says inertial states its latitude
+    rate_radps = earth_rate_radps(bench.latitude_deg or 0.0, bench.azimuth_deg)
+    return turned(Rotation.from_rotvec(time_s[:, None] * rate_radps), vector)
+
+
+def earth_rate_radps(latitude_deg: float, azimuth_deg: float) -> Floats:
+    """Turning rate of the Earth (3,) in the bench frame."""
+    pole = Rotation.from_rotvec([0.0, 0.0, np.radians(latitude_deg)]).apply([1.0, 0.0, 0.0])  # raised from North
+    return 2.0 * np.pi / SIDEREAL_DAY_S * to_bench(pole, azimuth_deg)
+
+
+def to_bench(north_up_east: ArrayLike, azimuth_deg: float) -> Floats:
+    """A vector (3,) given by its parts toward North, Up and East, in the bench frame, whose x has the azimuth."""
+    from_north = Rotation.from_rotvec([0.0, -np.radians(azimuth_deg), 0.0])  # East is z: toward it is a turn about Down
+    return from_north.inv().apply(north_up_east)
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Accelerations along the input axes of the three accelerometers: a_i = E_i . f."""
+
+    sensors: Sensors
+
+    def __call__(self, state: State) -> None:
+        state.input_mps2 = along(state.force_mps2, self.sensors.input_axes)
+
+
+def turned(rotation: Rotation, vector: Floats) -> Floats:
+    """A vector (n, 3) turned by rotations, n or 1 of them."""
+    return along(vector, rotation.as_matrix().reshape(-1, 3, 3))
+
+
+def along(vector: Floats, axes: Floats) -> Floats:
+    """Parts (n, 3) of a vector (n, 3) along three axes, the rows (3, 3) or (n, 3, 3).
+
+    Written out, because products of matrices round differently with the number of samples.
+    """
+    return vector[:, 0:1] * axes[..., 0] + vector[:, 1:2] * axes[..., 1] + vector[:, 2:3] * axes[..., 2]
+
+
+@dataclass(frozen=True)
+class Response:
+    """Readings of the three accelerometers: K_i a_i + b_i."""
+
+    sensors: Sensors
+
+    def __call__(self, state: State) -> None:
+        state.reading_mps2 = self.sensors.scales * state.input_mps2 + self.sensors.biases_mps2
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """An offset of each accelerometer in each dwell, ``offset_mps2`` (m, 3)."""
+
+    offset_mps2: Floats
+
+    def __call__(self, state: State) -> None:
+        state.reading_mps2 = state.reading_mps2 + state.of_dwells(self.offset_mps2)
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """Noise added to the readings; ``when_moving``: only in slews."""
+
+    process: Process
+    when_moving: bool = False
+
+    def __call__(self, state: State) -> None:
+        if state.moving or not self.when_moving:
+            state.reading_mps2 = state.reading_mps2 + self.process(len(state.time_s))
+
+
+class BiasWalk(Disturbance):
+    """One that moves the biases: where it ends, they are then."""

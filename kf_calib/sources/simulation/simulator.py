@@ -1,0 +1,263 @@
+"""A simulated bench: the truth, apart from what any estimator believes.
+
+Nonlinear, by scipy's rotations; of the package it knows the description of the bench and the streams, and no formula.
+Each stretch of samples goes through a chain of steps (``physics``): the platform, the response of the accelerometers,
+the recording. A further physical effect is one more step in the chain. Samples are made as they are asked for; memory
+does not grow with the run.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain, pairwise
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats, Times
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Batch, Stream
+from kf_calib.errors import InputError
+from kf_calib.sources.simulation.gimbal_motion import Motion, attitude
+from kf_calib.sources.simulation.injected import Hidden, Rig, Stage, steps_of
+from kf_calib.sources.simulation.noise_processes import TrueNoise, generator
+from kf_calib.sources.simulation.physics import (
+    Ambient,
+    BiasWalk,
+    Disturbance,
+    Gimbals,
+    Gravity,
+    Inputs,
+    Response,
+    Scatter,
+    SettingError,
+    State,
+    Step,
+)
+from kf_calib.sources.simulation.sensors import Sensors
+from kf_calib.sources.simulation.visit_plans import YZX, Visit, stays
+
+START_NS = 1_750_000_000_000_000_000
+"""Stamp of the first sample: 15 June 2025, 15:06:40 UTC."""
+
+_TEMPERATURE_HZ = 1.0
+_READING_BYTES, _POSE_BYTES, _TEMPERATURE_BYTES = 50, 30, 35  # in a recording, compressed
+_LONGEST_S = 7e9  # the stamps of a recording end in 2262
+
+
+class Simulation:
+    """A simulated run as a ``Source``: iterating it again gives the same samples.
+
+    bench: what the recording says of the bench; where it has no axes, the gimbals are y z x and the attitude quaternion
+    is recorded in place of angles. sample_hz, angle_hz: rates of readings and of poses; temperature comes at 1 Hz.
+    slew_rate_degps: greatest speed of the fastest axis (infinity: the platform jumps). batch_samples: readings a batch.
+    grade: name of the grade the sensors were drawn from, for the record. hidden: further physical effects, which only
+    the truth tells.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        sensors: Sensors,
+        noise: TrueNoise,
+        plan: Sequence[Visit],
+        *,
+        sample_hz: float = 100.0,
+        angle_hz: float = 10.0,
+        ambient: Ambient | None = None,
+        slew_rate_degps: float = 20.0,
+        seed: int = 0,
+        batch_samples: int = 65536,
+        grade: str = "",
+        hidden: Sequence[Hidden] = (),
+    ) -> None:
+        self.bench, self.sensors, self.noise, self.plan = bench, sensors, noise, stays(plan)
+        self.ambient, self.seed, self.grade = ambient or Ambient(), seed, grade
+        self.hidden = tuple(hidden)
+        self.warnings = list[str]()
+        self.fraction = 0.0
+        self._axes = bench.axes or YZX
+        _refuse_impossible(self.plan, len(self._axes), sample_hz, angle_hz, slew_rate_degps, batch_samples)
+        angles_rad = np.radians([visit.gimbal_deg for visit in self.plan])
+        self.motion = Motion.through(angles_rad, np.array([visit.dwell_s for visit in self.plan]), slew_rate_degps)
+        self._accel, self._pose, self._temperature = map(_Clock.of, (sample_hz, angle_hz, _TEMPERATURE_HZ))
+        self._batch_samples = batch_samples
+
+    def __len__(self) -> int:
+        """Number of readings."""
+        return self._accel.first_at(self.motion.end_ns)
+
+    @property
+    def duration_s(self) -> float:
+        return self.motion.end_ns * 1e-9
+
+    @property
+    def file_bytes(self) -> int:
+        """About as large its recording becomes."""
+        poses, temperatures = (clock.first_at(self.motion.end_ns) for clock in (self._pose, self._temperature))
+        return _READING_BYTES * len(self) + _POSE_BYTES * poses + _TEMPERATURE_BYTES * temperatures
+
+    def __iter__(self) -> Iterator[Batch]:
+        steps = self._steps()
+        encoder_rng, thermometer_rng = generator(self.seed, "encoders"), generator(self.seed, "thermometer")
+        for first in range(0, len(self), self._batch_samples):
+            last = min(first + self._batch_samples, len(self))
+            start_ns = first * self._accel.period_ns
+            end_ns = last * self._accel.period_ns if last < len(self) else self.motion.end_ns
+            yield Batch(
+                self._readings(first, last, steps),
+                self._poses(self._pose.between(start_ns, end_ns), encoder_rng),
+                self._temperatures(self._temperature.between(start_ns, end_ns), thermometer_rng),
+            )
+            self.fraction = last / len(self)
+
+    def hiding(self, hidden: Sequence[Hidden], noise: TrueNoise | None = None) -> Simulation:
+        """The same run with these hidden effects in place of its own, and with other noise where some is given."""
+        other = copy.copy(self)
+        other.hidden, other.noise, other.fraction = tuple(hidden), noise or self.noise, 0.0
+        other.warnings = list[str]()
+        return other
+
+    def parameters_at_end(self) -> dict[str, float] | None:
+        """The parameters at the last reading, where the biases have walked there; None where they have not."""
+        rig, noise = self._rig, TrueNoise(walk_mps2_per_sqrt_s=self.noise.walk_mps2_per_sqrt_s)
+        processes = noise.processes(self.seed, rig.period_s, rig.duration_s)
+        hidden = chain.from_iterable(self._hidden_steps().values())
+        processes += [step.process for step in hidden if isinstance(step, BiasWalk)]
+        if not processes:
+            return None
+        counts = [min(self._batch_samples, len(self) - first) for first in range(0, len(self), self._batch_samples)]
+        ends = [[process(count)[-1] for count in counts][-1] for process in processes]
+        there = dict(self.sensors.parameters)
+        for k, walked in enumerate(np.sum(ends, axis=0).tolist(), start=1):
+            there[f"b{k}"] += walked
+        return there
+
+    def _steps(self) -> list[Step]:
+        """The chain, fresh from its start."""
+        hidden = self._hidden_steps()
+        platform: list[Step] = [*hidden["angles"], Gimbals(self.bench.up), *hidden["attitude"], *self._setting_steps()]
+        response: list[Step] = [Inputs(self.sensors), *hidden["input"], Response(self.sensors), *hidden["reading"]]
+        force: list[Step] = [Gravity(self.bench), *hidden["force"]]
+        return [*platform, *force, *response, *self._noise_steps(), *hidden["record"]]
+
+    def _hidden_steps(self) -> dict[Stage, list[Step]]:
+        return steps_of(self.hidden, self._rig)
+
+    @property
+    def _rig(self) -> Rig:
+        period_s = self._accel.period_ns * 1e-9
+        return Rig(self.bench, self._axes, self.sensors, self.motion, period_s, len(self) * period_s, self.seed)
+
+    def _setting_steps(self) -> list[Step]:
+        if not self.noise.setting_sigma_deg:
+            return []
+        return [SettingError(self._drawn_per_dwell("setting", math.radians(self.noise.setting_sigma_deg)))]
+
+    def _noise_steps(self) -> list[Step]:
+        noise, period_s = self.noise, self._accel.period_ns * 1e-9
+        processes = noise.processes(self.seed, period_s, len(self) * period_s)
+        steps: list[Step] = [Disturbance(process) for process in processes]
+        if noise.scatter_mps2:
+            steps.append(Scatter(self._drawn_per_dwell("scatter", noise.scatter_mps2)))
+        if noise.vibration_mps2:
+            rng = generator(self.seed, "vibration")
+            steps.append(Disturbance(lambda n: noise.vibration_mps2 * rng.standard_normal((n, 3)), when_moving=True))
+        return steps
+
+    def _drawn_per_dwell(self, quantity: str, sigma: float) -> Floats:
+        return sigma * generator(self.seed, quantity).standard_normal((len(self.plan), 3))
+
+    def _readings(self, first: int, last: int, steps: Sequence[Step]) -> Stream:
+        time_ns = np.arange(first, last) * self._accel.period_ns
+        values = np.empty((last - first, 3))
+        turning_points = np.searchsorted(time_ns, np.concatenate([self.motion.arrive_ns, self.motion.leave_ns]))
+        cuts = np.unique([0, last - first, *turning_points])
+        for start, end in pairwise(cuts.tolist()):
+            state = self._state(time_ns[start:end])
+            for step in steps:
+                step(state)
+            values[start:end] = state.reading_mps2
+        return Stream(START_NS + time_ns, _channels(values, self.bench.channels))
+
+    def _state(self, time_ns: Times) -> State:
+        dwell = int(self.motion.locate(time_ns[:1])[0][0])
+        moving = bool(time_ns[0] >= self.motion.leave_ns[dwell])
+        posed_ns = time_ns if moving else time_ns[:1]
+        return State(
+            time_s=np.multiply(time_ns, 1e-9),
+            ambient=self.ambient,
+            dwell=dwell,
+            moving=moving,
+            arrival_s=float(self.motion.arrive_ns[dwell]) * 1e-9,
+            share=self.motion.locate(posed_ns)[1],
+            axes=self._axes,
+            angles_rad=self.motion.angles_at(posed_ns),
+        )
+
+    def _poses(self, time_ns: Times, rng: np.random.Generator) -> Stream:
+        """Encoder readings, or the attitude they make where the bench has no axes."""
+        angles_deg = np.degrees(self.motion.angles_at(time_ns))
+        if self.noise.encoder_sigma_deg:
+            angles_deg += self.noise.encoder_sigma_deg * rng.standard_normal(angles_deg.shape)
+        if self.noise.encoder_step_deg:
+            angles_deg = self.noise.encoder_step_deg * np.rint(angles_deg / self.noise.encoder_step_deg)
+        angles_rad = np.radians(angles_deg)
+        values = angles_rad if self.bench.axes else attitude(self._axes, angles_rad).as_quat()
+        return Stream(START_NS + time_ns, values)
+
+    def _temperatures(self, time_ns: Times, rng: np.random.Generator) -> Stream:
+        values = self.ambient(np.multiply(time_ns, 1e-9)) + self.ambient.sigma_c * rng.standard_normal(len(time_ns))
+        return Stream(START_NS + time_ns, values[:, None])
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """Stamps at whole multiples of a period."""
+
+    period_ns: int
+
+    @classmethod
+    def of(cls, rate_hz: float) -> _Clock:
+        return cls(round(1e9 / rate_hz))
+
+    def first_at(self, time_ns: int) -> int:
+        """Number of the first stamp at or after that time."""
+        return -(-time_ns // self.period_ns)
+
+    def between(self, start_ns: int, end_ns: int) -> Times:
+        """The stamps from ``start_ns`` on that lie before ``end_ns``."""
+        return np.arange(self.first_at(start_ns), self.first_at(end_ns)) * self.period_ns
+
+
+def _channels(readings: Floats, wired: tuple[int, int, int]) -> Floats:
+    """What comes out of the three channels (n, 3) where accelerometer i is wired to channel |wired[i]|, by its sign."""
+    out = np.empty_like(readings)
+    for accelerometer, channel in enumerate(wired):
+        out[:, abs(channel) - 1] = readings[:, accelerometer] if channel > 0 else -readings[:, accelerometer]
+    return out
+
+
+def _refuse_impossible(
+    plan: Sequence[Visit], axes: int, sample_hz: float, angle_hz: float, slew_rate_degps: float, batch_samples: int
+) -> None:
+    if not plan:
+        raise InputError("the plan visits no orientation: give one or more.")
+    for number, visit in enumerate(plan, start=1):
+        if len(visit.gimbal_deg) != axes or not all(map(math.isfinite, visit.gimbal_deg)):
+            raise InputError(f"visit {number} has angles {visit.gimbal_deg}: give one number for each of {axes} axes.")
+        if not 0.0 < visit.dwell_s < math.inf:
+            raise InputError(f"visit {number} lasts {visit.dwell_s:g} s: give a positive time.")
+    total_s = sum(visit.dwell_s for visit in plan)
+    if total_s > _LONGEST_S:
+        raise InputError(
+            f"the visits last {total_s:.3g} s in all, {total_s / 31557600:.3g} years: the stamps of a recording hold "
+            "220; dwell shorter."
+        )
+    for name, rate_hz in (("sample_hz", sample_hz), ("angle_hz", angle_hz)):
+        if not 0.0 < rate_hz <= 1e6:
+            raise InputError(f"{name} is {rate_hz:g}: give a rate above 0 and up to 1e6 Hz.")
+    if not slew_rate_degps > 0.0 or batch_samples < 1:
+        raise InputError("slew_rate_degps and batch_samples must be positive: give them so.")

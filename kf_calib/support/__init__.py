@@ -1,0 +1,1 @@
+"""Files, locks, text and progress, whatever they are of."""

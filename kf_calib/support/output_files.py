@@ -1,0 +1,222 @@
+"""Files that are written: one rule for every output of every command, so that nothing of the user's is harmed.
+
+- Never the input: no output is a file that the command reads, under whatever name (links too), nor another output.
+- Nothing is replaced without ``--overwrite``, nor a folder, a device or a file protected from writing with it. A link
+  stays, and the file it points to is written.
+- All this, and whether the folder can be written in, is seen before the work begins.
+- A file is written beside its place and takes its name when it is whole (``whole``): who looks sees the old or the new.
+- What grows for as long as a run lasts must be found if the run is killed (``Growing``). It is written under its own
+  name from the start; where it replaces an earlier file, it takes that one's name as soon as its first readings are on
+  the disk, and till then the earlier one stays. Where nothing came, nothing is left. Till it ends, no other run can
+  write it: both files are locked.
+
+Commands print their result first, and then write what else was asked for. A file that cannot be written is one sentence
+and exit 2; a picture that the viewer cannot draw, for want of a graphics driver for example, is a warning and exit 0.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from itertools import combinations
+from pathlib import Path
+from typing import IO
+
+from kf_calib.errors import InputError
+from kf_calib.support.file_lock import lock, writer
+
+_STREAMS = {0: "standard input", 1: "standard output"}
+
+
+class Outputs:
+    """The files that one run of a command writes, each with the option or argument that asks for it (None: left out).
+
+    inputs: what the run reads; of a folder, all that is in it. Raises InputError, before anything is written, where
+    the rule forbids one of them.
+    """
+
+    def __init__(
+        self, files: Mapping[str, Path | None], inputs: Iterable[Path | None] = (), overwrite: bool = False
+    ) -> None:
+        self._files = {name: path for name, path in files.items() if path is not None}
+        self._overwrite = overwrite
+        self._own = set[Path]()
+        self.spare(inputs)
+        for (name, path), (other, its) in combinations(self._files.items(), 2):
+            if _same(path, its):
+                raise InputError(f"{name} and {other} name the same file, {path}: give each a name of its own.")
+        for name, path in self._files.items():
+            refuse(path, overwrite, name)
+
+    def spare(self, inputs: Iterable[Path | None]) -> None:
+        """Raise InputError where an output is one of these files, which the run reads."""
+        read = [each for path in inputs if path is not None for each in _in(path)]
+        for name, path in self._files.items():
+            for each in read:
+                if _same(path, each):
+                    alias = "" if path == each else f", the same file as {each},"
+                    raise InputError(f"{path}{alias} is read by this very command: give another {name}.")
+            for descriptor, stream in _STREAMS.items():
+                if _is_open(path, descriptor):
+                    raise InputError(f"{path} is the {stream} of this very command: give another {name}.")
+
+    def write(self, path: Path, save: Callable[[Path], object]) -> None:
+        """Have ``save`` write the file; raises InputError where another one has come to be there in the meantime."""
+        if path not in self._own and not self._overwrite and path.exists():
+            raise InputError(f"{path} came to be during the run and was left as it is: run again with another name.")
+        save(path)
+        self._own.add(path)
+
+    def own(self, path: Path) -> None:
+        """This run has begun the file by itself, and may write it again."""
+        self._own.add(path)
+
+
+def refuse(path: Path, overwrite: bool = False, name: str = "name") -> None:
+    """Raise InputError, which asks for another ``name``, where no file can be written at ``path``."""
+    target = target_of(path)
+    try:
+        if not target.parent.is_dir():
+            raise InputError(f"{path} cannot be created, there is no folder {target.parent}: give another {name}.")
+        with suppress(FileNotFoundError):
+            _refuse_found(path, target.lstat(), overwrite, name)
+        trial = beside(target)
+        trial.open("xb").close()
+        trial.unlink()
+    except OSError as error:
+        raise InputError(f"{path} cannot be created ({error.strerror}): give another {name}.") from None
+
+
+def _refuse_found(path: Path, found: os.stat_result, overwrite: bool, name: str) -> None:
+    if stat.S_ISDIR(found.st_mode):
+        raise InputError(f"{path} is a folder: give {name} a file's name in it.")
+    _refuse_device(path, found, name)
+    if who := writer(path):
+        raise InputError(f"{path} is being written by {who}: end that one first, or give another {name}.")
+    if not overwrite:
+        raise InputError(f"{path} exists already: give another name, or --overwrite to replace it.")
+    if not (found.st_mode & 0o222 and os.access(path, os.W_OK)):
+        raise InputError(f"{path} is protected from writing: give another {name}.")
+
+
+def _refuse_device(path: Path, found: os.stat_result, name: str = "name") -> None:
+    if not stat.S_ISREG(found.st_mode):
+        raise InputError(f"{path} is not a plain file but a device, a pipe or the like: give another {name}.")
+
+
+def target_of(path: Path) -> Path:
+    """Where writing to ``path`` ends up: the file a link points to."""
+    return Path(os.path.realpath(path))
+
+
+def beside(target: Path) -> Path:
+    """A new name in the same folder, for what is not whole yet."""
+    return target.with_name(f".kf-calib-{os.urandom(4).hex()}.part")
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A name to write under; ``path`` is the file when the block ends, and stays as it was where the block fails.
+
+    Raises InputError where it cannot be written.
+    """
+    target = target_of(path)
+    part = beside(target)
+    if not target.parent.is_dir():
+        raise InputError(f"{path} cannot be written: there is no folder {target.parent}.")
+    with suppress(FileNotFoundError):
+        _refuse_device(path, target.lstat())
+    try:
+        yield part
+        _rename(part, target)
+    except OSError as error:
+        raise InputError(
+            f"{path} cannot be written ({error.strerror or error}): make room, or give another place."
+        ) from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file at once, or not at all. Raises InputError where it cannot be written."""
+    with whole(path) as part:
+        part.write_bytes(content)
+
+
+class Growing:
+    """Where a file is written that grows: ``at``, which is the place it was asked for from ``settle`` on."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._target = path, target_of(path)
+        self.at = beside(self._target) if self._target.exists() else self._target
+        self._earlier: IO[bytes] | None = None
+
+    @property
+    def settled(self) -> bool:
+        return self.at == self._target
+
+    def open(self) -> IO[bytes]:
+        """Create the file, which nobody else can write or replace while it is open. Raises InputError where another
+        run has it."""
+        if not self.settled:
+            self._earlier = self._target.open("r+b")
+            if not (lock(self._earlier) and os.path.samestat(os.fstat(self._earlier.fileno()), self._target.stat())):
+                self._let_go()
+                self._refuse()
+        file = self.at.open("xb")
+        if not lock(file):
+            file.close()
+            self._refuse()
+        return file
+
+    def settle(self) -> None:
+        """What is there is worth having: it takes the place of the earlier file, if there is one."""
+        if not self.settled:
+            _rename(self.at, self._target)
+            self.at = self._target
+            self._let_go()
+
+    def discard(self) -> None:
+        """Nothing came: no file is left, and the earlier one stays."""
+        self.at.unlink(missing_ok=True)
+        self._let_go()
+
+    def _let_go(self) -> None:
+        if self._earlier is not None:
+            self._earlier.close()
+            self._earlier = None
+
+    def _refuse(self) -> None:
+        who = writer(self._target) or "another run"
+        raise InputError(f"{self._path} is being written by {who}: end that one first, or give another name.")
+
+
+def _rename(part: Path, target: Path) -> None:
+    """Give a file its name; who may read and write an earlier one may this one."""
+    if target.exists():
+        shutil.copymode(target, part)
+    part.replace(target)
+
+
+def _in(path: Path) -> list[Path]:
+    return [path, *path.iterdir()] if path.is_dir() else [path]
+
+
+def _same(one: Path, other: Path) -> bool:
+    """Whether two names lead to one file, or would."""
+    try:
+        return one.samefile(other)
+    except OSError:
+        return os.path.realpath(one) == os.path.realpath(other)
+
+
+def _is_open(path: Path, descriptor: int) -> bool:
+    """Whether a file is what a standard stream reads or writes; nothing is lost at a device or a pipe."""
+    try:
+        found, stream = path.stat(), os.fstat(descriptor)
+    except OSError:
+        return False
+    return stat.S_ISREG(found.st_mode) and os.path.samestat(found, stream)

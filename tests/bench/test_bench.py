@@ -1,0 +1,190 @@
+"""The gimbal chain, the Earth and gravity against scipy's rotations and closed forms."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
+
+from kf_calib.bench.bench import (
+    EARTH_RATE_RADPS,
+    Bench,
+    axes_of,
+    interpolate_pose,
+    metadata_of,
+    normal_gravity,
+    parse_axes,
+    pose_distance,
+    slerp,
+    unwrap_pose,
+)
+from kf_calib.bench.keys import KEYS
+from kf_calib.errors import BenchError
+
+G = 9.81
+UNITS = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}
+
+
+def chain(axes: list[list[float]], angles: np.ndarray) -> Rotation:
+    turned = Rotation.identity()
+    for axis, angle in zip(axes, angles, strict=True):
+        turned = turned * Rotation.from_rotvec(np.array(axis) / np.linalg.norm(axis) * angle)
+    return turned
+
+
+@pytest.mark.parametrize("letters", ["yzx", "xyz", "z", "zyxz", "yx"])
+def test_attitude_is_the_product_of_rotations(letters: str) -> None:
+    angles = np.random.default_rng(1).uniform(-4, 4, (20, len(letters)))
+    expected = [chain([UNITS[c] for c in letters], row).as_matrix() for row in angles]
+    np.testing.assert_allclose(Bench(axes_of(letters), G).attitude(angles), expected, atol=1e-14)
+
+
+def test_axes_of_any_direction_and_sign() -> None:
+    bench = Bench(parse_axes("-y 1,1,0 0,-0.6,0.8"), G)
+    angles = np.array([[0.3, -1.1, 2.0]])
+    expected = chain([[0, -1, 0], [1, 1, 0], [0, -0.6, 0.8]], angles[0]).as_matrix()
+    np.testing.assert_allclose(bench.attitude(angles)[0], expected, atol=1e-14)
+    assert Bench.from_metadata(bench.to_metadata()) == bench
+
+
+def test_quaternion_gives_the_attitude_of_its_rotation() -> None:
+    turns = Rotation.random(10, random_state=2)
+    np.testing.assert_allclose(Bench((), G).attitude(2.5 * turns.as_quat()), turns.as_matrix(), atol=1e-14)
+
+
+def test_six_faces() -> None:
+    poses = np.radians([[0, 0, 0], [0, 90, 0], [0, -90, 0], [0, 0, 90], [0, 0, -90], [77, 180, 0]])
+    force = Bench(axes_of("yzx"), G).specific_force(np.zeros(6), poses)
+    faces = [[0, G, 0], [G, 0, 0], [-G, 0, 0], [0, 0, -G], [0, 0, G], [0, -G, 0]]
+    np.testing.assert_allclose(force, faces, atol=1e-14)
+
+
+def test_gravity_stands_still_on_a_base() -> None:
+    force = Bench(axes_of("y"), G, latitude_deg=50.0).specific_force(np.array([0.0, 1e5]), np.zeros((1, 1)))
+    np.testing.assert_allclose(force, [[0, G, 0]] * 2)
+
+
+@pytest.mark.parametrize("latitude, azimuth", [(0.0, 0.0), (90.0, 10.0), (-35.0, 120.0), (55.75, -60.0)])
+def test_gravity_turns_with_the_earth_in_an_inertial_platform(latitude: float, azimuth: float) -> None:
+    bench = Bench(axes_of("y"), G, reference="inertial", latitude_deg=latitude, azimuth_deg=azimuth)
+    hours = np.array([0.0, 1.0, 6.0])
+    # Earth-centred: the bench's up at time t, seen in the axes (x, up, z) it had at t = 0
+    lat, az = np.radians([latitude, azimuth])
+    up = np.array([np.cos(lat), 0, np.sin(lat)])
+    north, east = np.array([-np.sin(lat), 0, np.cos(lat)]), np.array([0, 1, 0])
+    x = np.cos(az) * north + np.sin(az) * east
+    basis = np.array([x, up, np.cross(x, up)])
+    turns = Rotation.from_rotvec(np.outer(hours * 3600 * EARTH_RATE_RADPS, [0, 0, 1]))
+    expected = G * turns.apply(up) @ basis.T
+    np.testing.assert_allclose(bench.specific_force(hours * 3600, np.zeros((1, 1))), expected, atol=1e-12)
+
+
+def test_earth_rate_is_fifteen_degrees_an_hour() -> None:
+    assert np.degrees(EARTH_RATE_RADPS) * 3600 == pytest.approx(15.041, abs=1e-3)
+
+
+@pytest.mark.parametrize("latitude, gravity", [(0.0, 9.7803253359), (45.0, 9.806197769), (90.0, 9.8321849379)])
+def test_normal_gravity_of_the_standard(latitude: float, gravity: float) -> None:
+    assert normal_gravity(latitude) == pytest.approx(gravity, abs=1e-9)
+
+
+def test_normal_gravity_falls_with_height() -> None:
+    assert normal_gravity(45.0, 1000.0) - normal_gravity(45.0) == pytest.approx(-3.086e-3, abs=2e-6)
+
+
+def test_slerp_agrees_with_scipy_even_for_tiny_arcs() -> None:
+    for step in (1e-9, 1e-3, 2.0):
+        ends = Rotation.from_rotvec([[0.1, 0.2, 0.3], [0.1 + step, 0.2, 0.3]])
+        weights = np.linspace(0, 1, 7)
+        expected = Slerp([0, 1], ends)(weights)
+        quaternions = ends.as_quat()
+        got = slerp(np.repeat(quaternions[:1], 7, 0), np.repeat(-quaternions[1:], 7, 0), weights[:, None])
+        assert (Rotation.from_quat(got).inv() * expected).magnitude().max() < 1e-14
+        assert pose_distance(quaternions[0], quaternions[1], True) == pytest.approx(
+            (ends[0].inv() * ends[1]).magnitude(), rel=1e-6
+        )
+
+
+def test_angles_are_interpolated_the_short_way_round() -> None:
+    times = np.array([0, 1_000_000_000])
+    poses, _ = unwrap_pose(np.radians([[359.0], [1.0]]), False)
+    middle = interpolate_pose(np.array([500_000_000]), times, poses, False)
+    assert np.cos(middle[0, 0]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    "metadata, says",
+    [
+        ({"gravity_mps2": "9.81"}, "axes"),
+        ({"axes": "y q", "gravity_mps2": "9.81"}, "'q'"),
+        ({"axes": "y"}, "gravity"),
+        ({"axes": "y", "gravity_mps2": "981"}, "m/s^2"),
+        ({"axes": "y", "gravity_mps2": "nine"}, "nine"),
+        ({"axes": "y", "gravity_mps2": "9.81", "reference": "inertial"}, "latitude"),
+        ({"axes": "y", "gravity_mps2": "9.81", "reference": "moon"}, "moon"),
+        ({"axes": "y", "latitude_deg": "123"}, "latitude"),
+        ({"axes": "y", "gravity_mps2": "9.81", "format_version": "7"}, "7"),
+        ({"axes": "y", "gravity_mps2": "9.81", "angle_sigma_deg": "-1"}, "angle_sigma_deg"),
+        ({"axes": "y", "gravity_mps2": "9.81", "nominal": "[1]"}, "nominal"),
+        ({"axes": "y", "gravity_mps2": "9.81", "axis": "x"}, "axis"),
+        ({"axes": "y", "gravity_mps2": "9.81", "nominal": '{"theta1": NaN}'}, "theta1: it must be a finite number"),
+        ({"axes": "y", "gravity_mps2": "9.81", "nominal": '{"theta9": 0}'}, "theta9: it is unknown"),
+        ({"axes": "y", "gravity_mps2": "9.81", "nominal": '{"nu1": 1}'}, "nu1: it must be less than or equal to 0.78"),
+        ({"axes": "y", "gravity_mps2": "9.81", "nominal": "[" * 100_000}, "nominal"),
+        ({"axes": "y", "gravity_mps2": "9" * 400}, "gravity_mps2"),
+        ({"axes": "y", "gravity_mps2": "9.81\0"}, "gravity_mps2"),
+        ({"axes": "y", "gravity_mps2": "9.81", "azimuth_deg": "1e300"}, "azimuth_deg"),
+        ({"axes": "y", "gravity_mps2": "9.81", "note": "\ud800"}, "note"),
+        ({"axes": "y", "gravity_mps2": "9.81", "bench": "\x1b[2J"}, "without control characters"),
+        ({"axes": "y", "gravity_mps2": "9.81", "operator": "x" * 1_000_000}, "at most 1000 characters"),
+        ({"axes": "y", "gravity_mps2": "9.81", "x" * 1_000_000: "1"}, "is not known"),
+        ({"axes": 5, "gravity_mps2": "9.81"}, "axes"),
+        ({"axes": "y", "gravity_mps2": True}, "gravity_mps2"),
+        ({"axes": "y", "gravity_mps2": None}, "gravity_mps2"),
+    ],
+    ids=lambda value: value[:20] if isinstance(value, str) else "",
+)
+def test_an_impossible_bench_is_one_sentence(metadata: dict[str, str], says: str) -> None:
+    with pytest.raises(BenchError, match=re.escape(says)) as caught:
+        Bench.from_metadata(metadata)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize(
+    "values, key",
+    [({"nominal": {"theta1": math.nan}}, "nominal"), ({"nominal": {"K1": math.inf}}, "nominal"),
+     ({"azimuth_deg": math.nan}, "azimuth_deg"), ({"height_m": math.inf}, "height_m"),
+     ({"gravity_mps2": math.nan}, "gravity_mps2"), ({"gravity_mps2": None}, "gravity_mps2"),
+     ({"notes": {"note": "\x9b2J"}}, "note"), ({"angle_sigma_deg": "x"}, "angle_sigma_deg")],
+)  # fmt: skip
+def test_a_bench_made_in_python_is_held_to_the_same(values: dict[str, object], key: str) -> None:
+    with pytest.raises(BenchError, match=f"bench key {key} is "):
+        Bench(**{"axes": axes_of("y"), "gravity_mps2": G, **values})
+
+
+JSON_VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers(-(10**500), 10**500) | st.floats() | st.text()
+    | st.characters(categories=["Cs"]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=9), inner, max_size=3),
+    max_leaves=6,
+)  # fmt: skip
+
+
+@settings(max_examples=1500, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+@given(st.dictionaries(st.sampled_from(sorted(KEYS)), JSON_VALUES | st.sampled_from(["y z x", "9.81", "1,2,3", "z"])))
+def test_whatever_values_say_is_a_bench_or_a_sentence(values: dict[str, object]) -> None:
+    """As they come in a recording (text), in JSON or TOML (made text), and from Python."""
+    for metadata in ({**values}, metadata_of({"axes": "y z x", "gravity_mps2": 9.81} | values)):
+        try:
+            bench = Bench.from_metadata(metadata)
+        except BenchError as error:
+            assert "\n" not in str(error) and len(str(error)) < 1000
+        else:
+            assert np.isfinite([*bench.nominal.values(), bench.gravity_mps2, bench.azimuth_deg]).all()
+            assert Bench.from_metadata(bench.to_metadata()) == bench
+            "".join(bench.to_metadata().values()).encode()

@@ -1,0 +1,63 @@
+"""The paper's parameters in closed form against finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.synthetic import NOMINAL, sensitivities
+
+from kf_calib.bench import paper_parameters
+from kf_calib.errors import BenchError
+
+RNG = np.random.default_rng(3)
+
+
+def test_nominal_is_the_papers_and_can_be_overridden() -> None:
+    np.testing.assert_array_equal(paper_parameters.nominal(), NOMINAL)
+    assert paper_parameters.nominal({"theta1": 0.0})[0] == 0.0
+    with pytest.raises(BenchError, match="theta2"):
+        paper_parameters.nominal({"theta2": 0.0})
+
+
+@pytest.mark.parametrize("size", [1e-4, 0.05, 0.3])
+def test_state_is_the_turned_axes(size: float) -> None:
+    truth = NOMINAL + RNG.normal(size=12) * size
+    rows, biases = sensitivities(truth)
+    np.testing.assert_allclose(
+        paper_parameters.state_of(truth).reshape(3, 4), np.column_stack([rows, biases]), atol=1e-14
+    )
+    np.testing.assert_allclose(paper_parameters.parameters_of(paper_parameters.state_of(truth)), truth, atol=1e-13)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.05, 0.3])
+def test_both_jacobians_by_finite_differences(size: float) -> None:
+    truth = NOMINAL + RNG.normal(size=12) * size
+    state, h = paper_parameters.state_of(truth), 1e-6
+    forward = np.array(
+        [
+            (paper_parameters.state_of(truth + h * e) - paper_parameters.state_of(truth - h * e)) / (2 * h)
+            for e in np.eye(12)
+        ]
+    ).T
+    back = np.array(
+        [
+            (paper_parameters.parameters_of(state + h * e) - paper_parameters.parameters_of(state - h * e)) / (2 * h)
+            for e in np.eye(12)
+        ]
+    )
+    np.testing.assert_allclose(paper_parameters.sensitivity_jacobian(truth), forward, atol=1e-9)
+    np.testing.assert_allclose(paper_parameters.jacobian(state), back.T, atol=1e-9)
+
+
+def test_parameters_and_state_are_one_to_one_whatever_way_the_axes_point() -> None:
+    """An accelerometer 2 that points down has a negative K2; no sign is lost, and the Jacobian is the derivative."""
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        state = rng.standard_normal(12)
+        np.testing.assert_allclose(paper_parameters.state_of(paper_parameters.parameters_of(state)), state, atol=1e-12)
+        assert (paper_parameters.parameters_of(state)[6] < 0) == (state[5] < 0)
+        steps = 1e-6 * np.eye(12)
+        differences = (
+            paper_parameters.parameters_of(state + steps) - paper_parameters.parameters_of(state - steps)
+        ).T / 2e-6
+        np.testing.assert_allclose(paper_parameters.jacobian(state), differences, rtol=1e-4, atol=1e-4)

@@ -1,0 +1,283 @@
+"""The command line as a user meets it: keys, exit codes, one sentence on stderr."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kf_calib.bench.streams import Batch, Stream
+from kf_calib.cli import main
+from kf_calib.sources.files.recorder import Recorder
+from kf_calib.sources.files.recording import Recording
+
+PARAMETERS = ["theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3"]
+QUICK = ["--orientations", "12", "--dwell-s", "6", "--slew-degps", "360", "--sample-hz", "50"]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("cli") / "run.mcap"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["kf-calib", "simulate", str(path), *QUICK, "--seed", "3"])
+        with pytest.raises(SystemExit):
+            main()
+    return path
+
+
+def changed(recording: Path, path: Path, accel=lambda stream: stream, pose=lambda stream: stream) -> Path:
+    source = Recording(recording)
+    with Recorder(path, source.bench) as recorder:
+        for batch in source:
+            recorder.write(Batch(accel(batch.accel), pose(batch.pose), batch.temperature))
+    return path
+
+
+def test_replay_prints_the_agreed_keys(run, recording: Path) -> None:
+    code, out, err = run("replay", recording, "--json")
+    result = json.loads(out)
+    assert code == 0 and err == "" and out.count("\n") == 1
+    assert [p["symbol"] for p in result["parameters"]] == PARAMETERS
+    assert [p["unit"] for p in result["parameters"]] == ["rad", "rad", "1", "m/s^2"] * 3
+    assert result["dwells"] == 12 and result["model"] == []
+    assert len(result["noise"]["sigma_mps2"]) == len(result["noise"]["dwell_sigma_mps2"]) == 3
+    assert result["consistency"]["consistent"] is True and 0 < result["consistency"]["p_value"] <= 1
+    for key in ("samples", "residual_rms_mps2", "held_out_rms_mps2", "held_out_floor_mps2", "warnings"):
+        assert key in result
+    truth = json.loads(recording.with_suffix(".truth.json").read_text())["parameters"]
+    ratios = [(p["value"] - truth[p["symbol"]]) / p["sigma"] for p in result["parameters"]]
+    assert np.abs(ratios).max() < 4.5
+
+
+def test_truth_is_not_in_the_recording(recording: Path) -> None:
+    content = recording.read_bytes()
+    assert b"truth" not in content and b"grade" not in content and b"seed" not in content
+
+
+def test_a_folder_and_angles_in_degrees_give_the_same(run, recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    changed(recording, tmp_path / "bag" / "bag_0.mcap")
+    degrees = changed(recording, tmp_path / "deg.mcap", pose=lambda s: Stream(s.time_ns, np.degrees(s.values)))
+    results = [json.loads(run("replay", *words, "--json")[1]) for words in
+               ([recording], [tmp_path / "bag"], [degrees, "--angle-unit", "deg"])]  # fmt: skip
+    assert results[0] == results[1]
+    for one, other in zip(results[0]["parameters"], results[2]["parameters"], strict=True):
+        assert abs(one["value"] - other["value"]) < 1e-6 * one["sigma"]
+
+
+def test_a_mistyped_command_is_told_what_was_meant(run) -> None:
+    code, out, err = run("diagnos", "run.mcap")
+    assert code == 2 and not out and "'diagnose'" in err
+
+
+def test_replay_in_words(run, recording: Path) -> None:
+    code, out, _ = run("replay", recording)
+    assert code == 0 and "θ1" in out and "Model and measurements agree" in out and "\x1b" not in out
+
+
+def test_engines_give_one_answer(run, recording: Path) -> None:
+    _, block, _ = run("replay", recording, "--json")
+    _, reference, _ = run("replay", recording, "--json", "--engine", "filterpy")
+    for one, other in zip(json.loads(block)["parameters"], json.loads(reference)["parameters"], strict=True):
+        assert abs(one["value"] - other["value"]) < 1e-6 * one["sigma"]
+        assert one["sigma"] == pytest.approx(other["sigma"], rel=1e-8)
+
+
+def test_compare_prints_the_agreed_keys(run, recording: Path) -> None:
+    code, out, _ = run("compare", recording, "--json")
+    result = json.loads(out)
+    assert code == 0 and result["max_difference_sigma"] <= 1e-6
+    assert set(result["engines"]) == {"block", "filterpy", "batch"}
+    assert all(way["wall_s"] > 0 and way["peak_mb"] > 0 for way in result["engines"].values())
+
+
+def test_strict_exits_with_one_on_a_misfit(run, recording: Path, tmp_path: Path) -> None:
+    bent = changed(recording, tmp_path / "bent.mcap", lambda s: Stream(s.time_ns, s.values + 1e-5 * s.values**2))
+    assert run("replay", bent)[0] == 0
+    code, out, _ = run("replay", bent, "--strict", "--json")
+    assert code == 1 and json.loads(out)["consistency"]["consistent"] is False
+
+
+def test_lines_round_trip(run, recording: Path, tmp_path: Path) -> None:
+    """A bench's logger writes CSV; recording it gives the same calibration."""
+    table = tmp_path / "lines.csv"
+    source = Recording(recording)
+    with table.open("w") as file:
+        file.write("time_ns,acc x [mg],acc y [mg],acc z [mg],outer_deg,middle_deg,inner_deg\n")
+        for batch in source:
+            rows: dict[int, list[str]] = {}
+            for stamp, values in zip(batch.accel.time_ns.tolist(), batch.accel.values / 9.80665e-3, strict=True):
+                rows.setdefault(stamp, [""] * 6)[:3] = [repr(float(value)) for value in values]
+            for stamp, values in zip(batch.pose.time_ns.tolist(), np.degrees(batch.pose.values), strict=True):
+                rows.setdefault(stamp, [""] * 6)[3:] = [repr(float(value)) for value in values]
+            file.writelines(f"{stamp},{','.join(cells)}\n" for stamp, cells in sorted(rows.items()))
+    columns = [word for axis in "xyz" for word in ("--column", f"acc {axis} [mg]=a{axis}_mg")]
+    out = tmp_path / "again.mcap"
+    code, _, err = run("record", out, table, *columns, "--axes", "y z x", "--gravity", "9.81", "--angle-sigma", 0)
+    assert code == 0, err
+    first, again = (json.loads(run("replay", path, "--json")[1]) for path in (recording, out))
+    for one, other in zip(first["parameters"], again["parameters"], strict=True):
+        assert one["value"] == pytest.approx(other["value"], abs=1e-3 * one["sigma"])
+
+
+def test_recording_says_how_long_it_is_and_what_will_not_be_used(run, tmp_path: Path) -> None:
+    """Stamps begin at zero, and one jumps back."""
+    table, out = tmp_path / "lines.csv", tmp_path / "lines.mcap"
+    stamps = [0.1 * k if k != 150 else 2.0 for k in range(300)]
+    rows = [f"{stamp:.2f},0,0,1,0,0,0" for stamp in stamps]
+    table.write_text("\n".join(["time_s,ax_g,ay_g,az_g,outer_deg,middle_deg,inner_deg", *rows]) + "\n")
+    words = "record", out, table, "--axes", "y z x", "--gravity", "9.81"
+    code, said, err = run(*words)
+    assert code == 0, err
+    assert "300 readings, 1 dwell, 30 s" in said and "stamps jumped back (first at 14.900 s), dropped: 1" in said
+    told = json.loads(run(*words, "--overwrite", "--json")[1])
+    assert told["duration_s"] == pytest.approx(29.9) and len(told["warnings"]) == 2
+
+
+def test_the_bench_from_a_toml_file(run, recording: Path, tmp_path: Path) -> None:
+    toml = tmp_path / "bench.toml"
+    toml.write_text("gravity_mps2 = 9.9\nangle_sigma_deg = 0.5\n[nominal]\ntheta1 = 0.25\n")
+    code, out, _ = run("replay", recording, "--bench", toml, "--json")
+    result = json.loads(out)
+    assert code == 0 and result["noise"]["angle_sigma_deg"] == pytest.approx(0.5)
+    assert result["parameters"][0]["nominal"] == 0.25
+    assert result["parameters"][2]["value"] == pytest.approx(9.81 / 9.9, abs=2e-3)
+
+
+BAD = {
+    "readings in g": (dict(accel=lambda s: Stream(s.time_ns, s.values / 9.80665)), "--accel-unit g"),
+    "counts": (dict(accel=lambda s: Stream(s.time_ns, np.round(s.values * 1e4))), "counts"),
+    "no angles": (dict(pose=lambda s: Stream.empty(3)), "angles"),
+    "no readings": (dict(accel=lambda s: Stream.empty(3)), "no accelerometer readings"),
+    "one orientation": (dict(accel=lambda s: s[s.time_ns < s.time_ns[0] + 5 * 10**9]), "can be seen"),
+    "all too large": (dict(accel=lambda s: Stream(s.time_ns, 1e200 * s.values)), "too large"),
+    "all NaN": (dict(accel=lambda s: Stream(s.time_ns, np.nan * s.values)), "not finite"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_recordings_are_one_sentence(run, recording: Path, tmp_path: Path, name: str) -> None:
+    how, says = BAD[name]
+    code, out, err = run("replay", changed(recording, tmp_path / "bad.mcap", **how), "--json")
+    assert (code, out) == (2, "")
+    assert says in err and err.count("\n") == 1 and "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    "words, says",
+    [
+        (["replay", "{tmp}/absent.mcap"], "absent.mcap"),
+        (["replay", "{tmp}"], "holds several recordings (empty.mcap, text.mcap)"),
+        (["replay", "{tmp}/empty.mcap"], "empty"),
+        (["replay", "{tmp}/text.mcap"], "not an MCAP"),
+        (["replay", "{run}", "--axes", "y q x"], "'q'"),
+        (["replay", "{run}", "--axes", "y z"], "2 gimbal axes"),
+        (["replay", "{run}", "--gravity", "981"], "m/s^2"),
+        (["replay", "{run}", "--reference", "inertial"], "latitude"),
+        (["replay", "{run}", "--engine", "unscented"], "unscented"),
+        (["replay", "{run}", "--bench", "{tmp}/text.mcap"], "TOML"),
+        (["replay"], "RECORDING"),
+        (["repeat", "{run}"], "repeat"),
+        (["record", "{run}", "{tmp}/text.mcap", "--axes", "y z x", "--gravity", "9.8"], "."),
+        (["simulate", "{run}"], "exists"),
+        (["replay", "{run}", "--gravity", "9,81"], "write 9.81 with a point"),
+        (["replay", "{run}", "--gravity", "nan"], "not a finite number"),
+        (["replay", "{run}", "--angle-sigma", "-1"], "x>=0"),
+        (["replay", "{run}", "--bench", "{tmp}/comma.toml"], "comma.toml: bench key gravity_mps2 is '9,81'"),
+        (["replay", "{run}", "--bench", "{tmp}/nan.toml"], "(theta1: it must be a finite number)"),
+        (["replay", "{run}", "--still-deg", "1000"], "above 0 and up to 5"),
+        (["plan", "--target", "K=2,5ppm"], "write 2.5 with a point"),
+        (["simulate", "{tmp}/new.mcap", "--hide", "base-tilt=4,1arcsec"], "write 4.1 with a point"),
+        (["simulate", "{tmp}/new.mcap", "--dwell-s", "1e8"], "or begin nevertheless with --large"),
+        (["simulate", "{tmp}/new.mcap", "--dwell-s", "1e9", "--large"], "years"),
+        (["simulate", "{tmp}/new.mcap", "--plan", "{tmp}/text.mcap"], "no orientation"),
+    ],
+)
+def test_bad_usage_is_one_sentence(run, recording: Path, tmp_path: Path, words: list[str], says: str) -> None:
+    (tmp_path / "empty.mcap").touch()
+    (tmp_path / "text.mcap").write_text("1, 2, three\n")
+    (tmp_path / "comma.toml").write_text('gravity_mps2 = "9,81"\n')
+    (tmp_path / "nan.toml").write_text("[nominal]\ntheta1 = nan\n")
+    before = recording.read_bytes()
+    code, out, err = run(*(word.format(tmp=tmp_path, run=recording) for word in words))
+    assert (code, out) == (2, "") and err.startswith("kf-calib: ") and err.count("\n") == 1
+    assert says in err and recording.read_bytes() == before
+
+
+def test_a_setting_that_cannot_be_kept_to_is_said(run, recording: Path) -> None:
+    _, out, _ = run("replay", recording, "--settle-s", 1000, "--json")
+    (said,) = json.loads(out)["warnings"]
+    assert said.startswith("10 dwells are too short to leave out 1000 s") and "of the shortest" in said
+    assert json.loads(run("replay", recording, "--json")[1])["warnings"] == []
+
+
+def test_noise_is_stated_estimated_or_neither(run, tmp_path: Path) -> None:
+    """The table beside the notes, with dwells that are too few, cannot tell, and can tell what was not stated."""
+    for count, rows in (5, "neither"), (7, "scatter"), (14, "both"):
+        path = tmp_path / f"{count}.mcap"
+        words = ["--orientations", count, "--unstated", "--setting", "0.005", "--seed", 3]
+        assert run("simulate", path, *QUICK, *words)[0] == 0
+        _, out, _ = run("replay", path)
+        assert ("dwell to dwell, estimated" in out) == (rows != "neither")
+        assert ("setting of angles, estimated" in out) == (rows == "both")
+        assert ("too few to estimate what was not stated" in out) == (rows == "neither")
+        assert ("gravity in 7 different directions" in out) == (rows == "scatter")
+        assert ", stated" not in out
+
+
+@pytest.mark.parametrize("command", ["replay", "diagnose", "improve", "live", "plan", "simulate", "record", "effects"])
+def test_help_groups_options_with_what_is_usual_first(run, command: str) -> None:
+    code, out, _ = run(command, "--help")
+    assert code == 0 and "…" not in out
+    groups = [line.rstrip(": ") for line in out.splitlines() if line[:1].isupper() and line.rstrip().endswith(":")]
+    assert {"Input and bench", "Output", "Examples"} <= set(groups)
+    left = out[out.index("Options:") : out.index("Examples:")]
+    assert left.count("--") == 1, "an option without a group: give it panel="
+
+
+def test_a_plan_from_a_file_is_visited(run, tmp_path: Path) -> None:
+    plan = tmp_path / "plan.csv"
+    plan.write_text("outer,middle,inner\n0,0,0\n0, 90, 0  # x up\n45,-90,0\n")
+    code, out, _ = run("simulate", tmp_path / "a.mcap", "--plan", plan, "--dwell-s", 5, "--json")
+    assert code == 0 and json.loads(out)["dwells"] == 3
+
+
+def test_views_are_saved(run, recording: Path, tmp_path: Path) -> None:
+    code, out, _ = run("replay", recording, "--rrd", tmp_path / "view.rrd")
+    assert code == 0 and "saved" in out and (tmp_path / "view.rrd").stat().st_size > 10_000
+
+
+def test_a_hidden_effect_fails_and_the_right_one_mends_it(run, tmp_path: Path) -> None:
+    """Compare the model with the measurements, see it fail, add the effect, watch the error fall; also in Rerun."""
+    path = tmp_path / "hidden.mcap"
+    assert run("simulate", path, *QUICK, "--hide", "second-order=40ug/g^2", "--seed", 8)[0] == 0
+    plain = json.loads(run("replay", path, "--json")[1])
+    mended = json.loads(run("replay", path, "--json", "--with", "second-order", "--rrd", tmp_path / "view.rrd")[1])
+    assert plain["consistency"]["consistent"] is False and mended["consistency"]["consistent"] is True
+    assert mended["model"] == ["second-order"]
+    assert mended["held_out_rms_mps2"] < 0.1 * plain["held_out_rms_mps2"]
+    truth = json.loads(path.with_suffix(".truth.json").read_text())["effects"][0]["sizes"]
+    found = {p["symbol"]: p for p in mended["parameters"]}
+    for i in "123":
+        coefficient = found[f"K2_{i}"]
+        assert abs(coefficient["value"] - truth[i]) < 4 * coefficient["sigma"]
+        assert coefficient["unit"] == "s^2/m"
+    assert b"second-order" not in path.read_bytes()
+    code, out, err = run("replay", path, "--with", "second-ordr")
+    assert (code, out) == (2, "") and "did you mean second-order" in err
+
+
+@pytest.mark.slow  # tests/test_readme.py runs it with tables
+def test_demo_does_the_main_job(tmp_path: Path) -> None:
+    """In a process of its own, as the README has it."""
+    words = [sys.executable, "-m", "kf_calib.cli", "demo", str(tmp_path / "out"), "--json"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["compare"]["max_difference_sigma"] <= 1e-6
+    assert result["replay"]["consistency"]["consistent"] is True
+    assert all(Path(result[key]).exists() for key in ("recording", "truth", "view"))

@@ -1,0 +1,80 @@
+"""Where to go next: what is predicted of it, against a run that went there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.hidden_effects import noisy_run as run
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.design.next_orientation import Advice, to_tell_apart
+from kf_calib.effects import Effect, effect_named
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.score_test import scan
+from kf_calib.sources.simulation.visit_plans import Visit, spread_plan
+
+PLAN = spread_plan(12, dwell_s=8.0, seed=5)
+
+
+def separation(result: Calibration, one: Effect, size: Floats, other: Effect) -> float:
+    """What of ``one`` of this size neither the model nor ``other`` explains, in sigma."""
+    rival, own = scan(result.carried, result.noise.judging, [other, one]).candidates
+    signal = own.columns @ size
+    return float(np.linalg.norm(signal - rival.basis @ (rival.basis.T @ signal)))
+
+
+def advised(one: Effect, other: Effect) -> tuple[Calibration, Floats, Advice]:
+    """A run, coefficients of 8 sigma in it, and where to go next."""
+    result = run(plan=PLAN)
+    (alone,) = scan(result.carried, result.noise.judging, [one]).candidates
+    even = np.ones(len(one.coefficients))
+    size = 8.0 * even / np.linalg.norm(alone.columns @ even)
+    found = to_tell_apart(result.fit, one, size, [other])
+    assert found is not None
+    return result, size, found
+
+
+@pytest.mark.parametrize(
+    "names, values, stays",
+    [
+        (("second-order", "scale-asymmetry"), (None, None), False),
+        (("odd-quadratic", "third-order"), (None, None), False),
+        (("warm-up", "bias-drift"), (100.0, None), True),
+        (("bias-drift", "warm-up"), (None, 150.0), True),
+    ],
+)
+def test_the_separation_predicted_is_that_of_the_run_that_goes_there(
+    names: tuple[str, str], values: tuple[float | None, float | None], stays: bool
+) -> None:
+    """A longer stay is advised for what only time tells apart; of it the last part alone is counted on."""
+    bench = run(plan=PLAN).bench
+    one, other = (
+        effect_named(name, bench) if value is None else effect_named(name, bench).at(value)
+        for name, value in zip(names, values, strict=True)
+    )
+    result, size, found = advised(one, other)
+    after = run(plan=[*PLAN, Visit(found.gimbal_deg, found.stay_s or 8.0)])
+    assert found.before == pytest.approx(separation(result, one, size, other), rel=0.02)
+    reached = separation(after, one, size, other)
+    assert (found.stay_s is not None) == stays
+    if stays:
+        assert 0.9 * found.after < reached
+    else:
+        assert found.after == pytest.approx(reached, rel=0.05)
+    elsewhere = run(plan=[*PLAN, Visit((0.0, 0.0, 0.0), 8.0)])
+    assert reached >= separation(elsewhere, one, size, other)
+
+
+@pytest.mark.parametrize("names", [("cross-coupling-ip", "settling"), ("settling", "bias-drift")])
+def test_where_the_platform_is_already_is_no_next_orientation(names: tuple[str, str]) -> None:
+    """It is not set anew by staying: another dwell there would tell less than is predicted of it."""
+    bench = run(plan=PLAN).bench
+    one, other = (effect_named(name, bench) for name in names)
+    size = np.full(len(one.coefficients), 1e-4)
+    first = to_tell_apart(run(plan=PLAN, setting_sigma_deg=1e-3).fit, one, size, [other])
+    assert first is not None
+    going_on = run(plan=[*PLAN, Visit(first.gimbal_deg, 8.0)], setting_sigma_deg=1e-3)
+    then = to_tell_apart(going_on.fit, one, size, [other])
+    assert then is not None
+    turn = np.subtract(then.gimbal_deg, first.gimbal_deg)
+    assert np.abs((turn + 180.0) % 360.0 - 180.0).max() > 1.0

@@ -1,0 +1,297 @@
+"""Dwells from the angles' own stillness, and from the readings where angles are absent during a motion."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from helpers.synthetic import G, Run
+
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.bench.streams import Batch, Stream
+from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
+from kf_calib.dwells.stationarity import Stillness
+from kf_calib.errors import InputError
+from kf_calib.estimation.calibration import calibrate
+
+S = 1_000_000_000
+BENCH = Bench(axes_of("zx"), 9.81)
+
+
+class Given:
+    warnings: tuple[str, ...] = ()
+    fraction = 1.0
+
+    def __init__(self, *batches: Batch, bench: Bench = BENCH) -> None:
+        self.batches, self.bench = batches, bench
+
+    def __iter__(self):
+        return iter(self.batches)
+
+
+def path(*points: tuple[float, float], rate_hz: float, noise_deg: float = 0.0) -> Stream:
+    """Angle messages on a broken line of (seconds, degrees) of the first axis."""
+    seconds, degrees = np.array(points).T
+    at = np.arange(seconds[0], seconds[-1], 1 / rate_hz)
+    angles = np.interp(at, seconds, degrees) + np.random.default_rng(0).normal(size=len(at)) * noise_deg
+    return Stream(np.round(at * S).astype(np.int64), np.column_stack([np.radians(angles), 0 * at]))
+
+
+def readings(pose: Stream, until_s: float, rate_hz: float = 100.0) -> Stream:
+    at = np.arange(0, until_s, 1 / rate_hz)
+    angle = np.interp(at * S, pose.time_ns, pose.values[:, 0])
+    values = 9.81 * np.column_stack([np.sin(angle), np.cos(angle), 0 * at])
+    values += np.random.default_rng(1).normal(size=values.shape) * 1e-3
+    return Stream(np.round(at * S).astype(np.int64), values)
+
+
+def spans(source: Given, **how) -> list[tuple[float, float]]:
+    segmenter = Segmenter(source.bench, Stillness(**how))
+    found: dict[int, list[float]] = {}
+    for block in dwell_blocks(source, segmenter):
+        found.setdefault(block.dwell, []).extend([block.elapsed_s[0], block.elapsed_s[-1]])
+    spans.tally = segmenter.tally
+    return [(min(times), max(times)) for times in found.values()]
+
+
+SLEWS = [(0, 0), (10, 0), (14, 40), (24, 40), (25, 80), (35, 80)]
+
+
+@pytest.mark.parametrize("rate_hz, noise_deg", [(10, 0), (100, 0), (100, 0.005), (2, 0)])
+def test_dwells_between_slews(rate_hz: float, noise_deg: float) -> None:
+    pose = path(*SLEWS, rate_hz=rate_hz, noise_deg=noise_deg)
+    got = spans(Given(Batch(readings(pose, 35), pose)))
+    assert len(got) == 3
+    for (start, end), (low, high) in zip(got, [(0, 10), (15, 24), (26, 35)], strict=True):
+        assert low - 0.01 <= start <= low + 0.6 + 1 / rate_hz
+        assert high - 0.6 - 1 / rate_hz <= end <= high
+    tally = spans.tally
+    assert tally.used + tally.moving + tally.settling + tally.without_pose == tally.read
+
+
+def test_a_slow_slew_is_no_dwell() -> None:
+    pose = path((0, 0), (10, 0), (110, 20), (120, 20), rate_hz=50)  # 0.2 deg/s
+    assert len(spans(Given(Batch(readings(pose, 120), pose)))) == 2
+
+
+def gentle(rate_hz: float, slew_s: float = 60.0, noise_deg: float = 0.0) -> tuple[Stream, Stream]:
+    """Three dwells of 30 s and slews of 90 deg that begin and end gently; angles, and readings of the true motion."""
+    share = np.linspace(0, 1, 601)
+    rise = share**3 * (10 - 15 * share + 6 * share**2)
+    knots = [(0.0, 0.0)]
+    for k in range(3):
+        start = knots[-1][0] + 30.0
+        knots += [(start, 90.0 * k)]
+        knots += [(start + slew_s * x, 90.0 * (k + y)) for x, y in zip(share, rise, strict=True)] if k < 2 else []
+    points = sorted(set(knots))
+    return path(*points, rate_hz=rate_hz, noise_deg=noise_deg), readings(path(*points, rate_hz=200), points[-1][0])
+
+
+@pytest.mark.parametrize("rate_hz", [0.5, 1, 1.7, 4, 20])
+@pytest.mark.parametrize("slew_s", [20.0, 60.0, 200.0])
+def test_a_gentle_slew_spoils_no_dwell_however_seldom_angles_come(rate_hz: float, slew_s: float) -> None:
+    """Three dwells, and in each block the platform is where the block says: to a few thousandths of a degree."""
+    pose, accel = gentle(rate_hz, slew_s)
+    truth, _ = gentle(200.0, slew_s)
+    blocks = list(dwell_blocks(Given(Batch(accel, pose)), Segmenter(BENCH)))
+    assert {block.dwell for block in blocks} == {1, 2, 3}
+    assert sum(len(block.elapsed_s) for block in blocks) > 0.8 * 90 * 100
+    for block in blocks:
+        was = np.degrees(np.interp(block.elapsed_s * S, truth.time_ns, truth.values[:, 0]))
+        assert np.abs(was - np.degrees(block.pose[:, 0])).max() < 0.012
+        assert abs(was.mean() - np.degrees(block.pose[:, 0]).mean()) < 0.001
+
+
+def test_a_creeping_platform_is_used_though_it_never_rests() -> None:
+    pose = path((0, 0), (60, 0.24), (64, 40), (124, 40.24), rate_hz=10)
+    got = spans(Given(Batch(readings(pose, 124), pose)))
+    assert [round(end - start) for start, end in got] == [60, 59]
+
+
+def test_settling_is_left_out() -> None:
+    pose = path(*SLEWS, rate_hz=10)
+    assert spans(Given(Batch(readings(pose, 35), pose)), settle_s=3.0)[1][0] == pytest.approx(17.0, abs=0.2)
+
+
+def test_angles_absent_during_motion_readings_decide() -> None:
+    """One angle message a dwell, at its middle: the dwells reach to where the readings move."""
+    truth = path(*SLEWS, rate_hz=100)
+    sparse = Stream(np.array([5, 19, 30]) * S, np.column_stack([np.radians([0, 40, 80]), np.zeros(3)]))
+    got = spans(Given(Batch(readings(truth, 35), sparse)))
+    assert len(got) == 3
+    for (start, end), (low, high) in zip(got, [(4, 10), (14, 24), (25, 31)], strict=True):
+        assert low - 0.01 <= start <= low + 2.0 and high - 1.0 <= end <= high + 0.01
+
+
+@pytest.mark.parametrize("angle_hz", [0.9, 10.0])
+@pytest.mark.parametrize("slew_s", [0.0, 8.0, 40.0])
+def test_what_comes_out_does_not_depend_on_batches(angle_hz: float, slew_s: float) -> None:
+    pose = path(*SLEWS, rate_hz=angle_hz, noise_deg=0.003)
+    accel = readings(pose, 35)
+    if slew_s:
+        pose, accel = gentle(angle_hz, slew_s, noise_deg=0.003)
+    whole = list(dwell_blocks(Given(Batch(accel, pose)), Segmenter(BENCH)))
+    edges = np.arange(0, 180, 0.37)
+    pieces = [
+        Batch(
+            accel[(accel.time_ns >= a * S) & (accel.time_ns < b * S)],
+            pose[(pose.time_ns >= a * S) & (pose.time_ns < b * S)],
+        )
+        for a, b in itertools.pairwise(edges)
+    ]
+    again = list(dwell_blocks(Given(*pieces), Segmenter(BENCH)))
+    assert len(whole) == len(again)
+    for one, other in zip(whole, again, strict=True):
+        np.testing.assert_array_equal(one.accel_mps2, other.accel_mps2)
+        np.testing.assert_array_equal(one.pose, other.pose)
+        assert one.felt_s == other.felt_s
+
+
+@pytest.mark.parametrize("angle_hz", [2.0, 10.0, 100.0])
+def test_an_arrival_is_known_to_a_reading_whatever_the_angles_say(angle_hz: float) -> None:
+    """Slews end at 14 and 25 s; angles tell it to half a second."""
+    pose, accel = path(*SLEWS, rate_hz=angle_hz), readings(path(*SLEWS, rate_hz=1000), 35)
+    blocks = list(dwell_blocks(Given(Batch(accel, pose)), Segmenter(BENCH)))
+    arrivals = {block.dwell: block.felt_s for block in blocks}
+    assert [arrivals[2], arrivals[3]] == pytest.approx([14.0, 25.0], abs=0.02)
+
+
+def test_an_attitude_in_place_of_angles() -> None:
+    from scipy.spatial.transform import Rotation
+
+    pose = path(*SLEWS, rate_hz=20)
+    turns = (
+        Rotation.from_rotvec(np.outer(pose.values[:, 0], [0, 0, 1])).as_quat()
+        * np.where(np.sin(7 * np.arange(700)) < 0, -1, 1)[:, None]
+    )
+    bench = Bench((), 9.81)
+    source = Given(Batch(readings(pose, 35), Stream(pose.time_ns, turns)), bench=bench)
+    assert len(spans(source)) == 3
+
+
+def test_bad_samples_are_dropped_and_counted() -> None:
+    pose = path((0, 0), (20, 0), rate_hz=10)
+    accel = readings(pose, 20)
+    accel.values[5, 1] = np.nan
+    accel.values[6, 2] = np.inf
+    times = accel.time_ns.copy()
+    times[10] = times[9]  # repeated
+    times[20] = times[15]  # back
+    times[30] += 3600 * S  # a damaged stamp far ahead
+    got = spans(Given(Batch(Stream(times, accel.values), pose)))
+    tally = spans.tally
+    assert (tally.not_finite, tally.repeated, tally.backward, tally.leaping) == (2, 1, 1, 1)
+    assert tally.used == 2000 - 5 and len(got) == 1
+    said = " ".join(tally.sentences())
+    assert "NaN" in said and "jumped back" in said and "repeated the stamp" in said and "far ahead" in said
+
+
+@pytest.mark.parametrize("size", [2e12, 1e155, 1.7e308, -1e200])
+def test_what_nothing_can_read_is_dropped_and_told(size: float) -> None:
+    """One reading of 1e155, squared, made a run that could not be evaluated."""
+    run, altered = Run(seed=1, dwells=14, count=100), Run(seed=1, dwells=14, count=100)
+    altered.accel.values[1234, 1] = altered.pose.values[55, 2] = size
+    heat = Stream(run.accel.time_ns[[0, 500, 900]], np.array([[20.0], [size], [21.0]]))
+    batch = Batch(altered.accel, altered.pose, heat)
+    result = calibrate(Given(batch, bench=run.bench))
+    tally = result.tally
+    assert (tally.too_large, tally.poses_dropped, tally.temperatures_dropped, tally.not_finite) == (1, 1, 1, 0)
+    said = " ".join(result.warnings)
+    assert "readings beyond 1e+12 m/s^2, which nothing can read, dropped: 1" in said
+    assert "beyond 1e+06 rad" in said and "temperatures not finite or beyond 1e+06 degC, dropped: 1" in said
+    expected = calibrate(run).estimate
+    assert np.abs((result.estimate.parameters - expected.parameters) / expected.sigma).max() < 0.5
+
+
+def test_counts_of_a_converter_are_left_to_the_check_of_the_unit() -> None:
+    run = Run(seed=1, dwells=14, count=100)
+    counts = Stream(run.accel.time_ns, np.round(run.accel.values / G * 2**31))
+    with pytest.raises(InputError, match="they look like counts; give the size of one count"):
+        calibrate(Given(Batch(counts, run.pose), bench=run.bench))
+
+
+def test_counts_in_place_of_angles_are_told() -> None:
+    run = Run(seed=1, dwells=14, count=100)
+    counts = Stream(run.pose.time_ns, 1e9 + run.pose.values)
+    with pytest.raises(InputError, match=r"none of the 140 angle messages can be used: .* beyond 1e.06 rad"):
+        calibrate(Given(Batch(run.accel, counts), bench=run.bench))
+
+
+def test_readings_outside_the_angles_are_counted() -> None:
+    pose = path((5, 0), (10, 0), rate_hz=10)
+    spans(Given(Batch(readings(path((0, 0), (20, 0), rate_hz=10), 20), pose)))
+    assert spans.tally.without_pose == pytest.approx(400 + 900, abs=20)
+
+
+def test_temperature_goes_on_as_it_went_last() -> None:
+    """Before the first: none; after one: that; then the line through the last two, for as long as they lie apart."""
+    pose = path((0, 0), (20, 0), rate_hz=10)
+    warm = Stream(np.array([4, 6, 8]) * S, np.array([[20.0], [30.0], [32.0]]))
+    blocks = list(dwell_blocks(Given(Batch(readings(pose, 20), pose, warm)), Segmenter(BENCH)))
+    times, values = (np.concatenate([getattr(b, key) for b in blocks]) for key in ("elapsed_s", "temperature_c"))
+    assert np.isnan(values[times < 4]).all() and (values[(times >= 4) & (times < 6)] == 20).all()
+    rising = (times >= 6) & (times < 8)
+    np.testing.assert_allclose(values[rising], 30 + 5 * (times[rising] - 6))
+    np.testing.assert_allclose(values[times >= 8], 32 + np.minimum(times[times >= 8] - 8, 2.0))
+
+
+def test_a_gentle_start_of_a_slew_is_not_in_the_dwell() -> None:
+    """A minimum-jerk slew stays within the tolerance for tenths of a second: none of it may reach the fit."""
+    from kf_calib.estimation.calibration import calibrate
+    from kf_calib.sources.simulation.sensors import GRADES
+    from kf_calib.sources.simulation.simulator import Simulation
+    from kf_calib.sources.simulation.visit_plans import spread_plan
+
+    grade, bench = GRADES["navigation"], Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+    p_values = []
+    for seed in range(3):
+        run = Simulation(
+            bench, grade.sensors(seed), grade.noise, spread_plan(12, dwell_s=8.0), slew_rate_degps=20.0, seed=seed
+        )
+        result = calibrate(run)
+        assert result.tally.gated <= 2
+        p_values.append(result.consistency.p_value)
+    assert np.mean(p_values) > 0.1
+
+
+def stretch(whole: Batch, since_ns: tuple[int, int], until_ns: tuple[int, int]) -> Batch:
+    """Readings and angles of a run between two stamps, of each its own."""
+    cuts = zip((whole.accel, whole.pose), since_ns, until_ns, strict=True)
+    return Batch(*(part[slice(*np.searchsorted(part.time_ns, (a, b)))] for part, a, b in cuts))
+
+
+def in_parts(whole: Batch, seed: int, ahead_s: float) -> list[Batch]:
+    """As a link delivers it: now more, now less, the angles behind the readings or ahead of them."""
+    rng, end = np.random.default_rng(seed), int(whole.accel.time_ns[-1])
+    parts, since = list[Batch](), (0, 0)
+    while since[0] <= end:
+        readings_ns = since[0] + round(rng.choice([0.02, 0.1, 0.5, 3.0]) * S)
+        until = readings_ns, max(since[1], readings_ns + round(rng.uniform(-1.0, ahead_s) * S))
+        parts.append(stretch(whole, since, until))
+        since = until
+    return [*parts, stretch(whole, since, (1 << 62, 1 << 62))]
+
+
+def blocks_of(batches: list[Batch], slews: bool) -> list:
+    segmenter = Segmenter(BENCH, slews=slews)
+    found = list(dwell_blocks(Given(*batches), segmenter))
+    return [vars(segmenter.tally)] + [
+        (each.dwell, each.arrival_s, each.felt_s, each.turns, each.pose_sigma_rad, each.elapsed_s.tobytes(),
+         each.accel_mps2.tobytes(), each.pose.tobytes()) for each in found
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("slews", [False, True])
+@pytest.mark.parametrize("rate_hz", [0.2, 0.5, 2.0, 20.0])
+@pytest.mark.parametrize("ahead_s", [0.0, 0.3, 8.0])
+def test_how_the_streams_come_in_parts_changes_no_bit(rate_hz: float, ahead_s: float, slews: bool) -> None:
+    """Angles that were ahead made readings of a slew those of a dwell; whole turns came with other roundings."""
+    points = [(0, 10.0), (20, 10.0), (24, 250.0), (45, 250.0), (47, 10.0), (70, 10.0), (71, 350.0), (90.0, 350.0)]
+    pose = path(*points, rate_hz=rate_hz, noise_deg=1e-4)
+    wrapped = (pose.values + np.pi) % (2.0 * np.pi) - np.pi
+    whole = Batch(readings(pose, 90.0), Stream(pose.time_ns, wrapped))
+    expected = blocks_of([whole], slews)
+    assert len(expected) > 3
+    for seed in range(6):
+        assert blocks_of(in_parts(whole, seed, ahead_s), slews) == expected

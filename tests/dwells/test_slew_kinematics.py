@@ -1,0 +1,129 @@
+"""Effects that show in slews only: latency and lever arm, against a truth made without their columns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.long_runs import slow
+from helpers.synthetic import plan_of
+
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.dwells.slew_kinematics import Curve
+from kf_calib.errors import InputError
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.engine_comparison import compare
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.settings import Settings
+from kf_calib.sources.simulation.injected import parse
+from kf_calib.sources.simulation.noise_processes import TrueNoise
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
+
+BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+ARMS_M = [0.01, -0.02, 0.03, 0.015, 0.012, -0.011, 0.02, -0.01, 0.03]
+ARMS = "lever-arm=" + ",".join(map(str, ARMS_M))
+
+
+def run(
+    hidden: list[str], seed: int = 5, dwells: int = 10, sample_hz: float = 100.0, bench: Bench = BENCH,
+    rate: float = 20.0, angle_hz: float = 10.0, batch: int = 65536, **noise: float,
+) -> Simulation:  # fmt: skip
+    return Simulation(
+        bench, GRADES["navigation"].sensors(seed), TrueNoise(white_mps2=5e-5, **noise),
+        plan_of(dwells, dwell_s=6.0, seed=4),
+        sample_hz=sample_hz, angle_hz=angle_hz, slew_rate_degps=rate, seed=seed, batch_samples=batch,
+        hidden=parse(hidden, BENCH.axes, seed=seed),
+    )  # fmt: skip
+
+
+def values(result: Calibration) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients of the effects and their sigmas."""
+    found = list(result.parameters.values())[12:]
+    return np.array([p.value for p in found], float), np.array([p.sigma for p in found], float)
+
+
+@pytest.mark.parametrize("angle_hz", [10.0, 50.0])
+def test_latency_is_found(angle_hz: float) -> None:
+    value, sigma = values(calibrate(run(["latency=5ms"], angle_hz=angle_hz), Settings(effects=("latency",))))
+    assert abs(value[0] - 5e-3) < 2.0 * sigma[0] and sigma[0] < 1e-5
+
+
+def test_lever_arms_are_found() -> None:
+    value, sigma = values(calibrate(run([ARMS]), Settings(effects=("lever-arm",))))
+    assert np.abs(value - ARMS_M).max() < 1e-4 and (np.abs(value - ARMS_M) < 4.0 * sigma).all()
+
+
+def test_both_at_once_and_with_other_effects() -> None:
+    source = run(["latency=2ms", ARMS, "second-order=1e-5,-1e-5,2e-5"], dwells=16)
+    value, sigma = values(calibrate(source, Settings(effects=("latency", "lever-arm", "second-order", "bias-drift"))))
+    truth = [2e-3, *ARMS_M, 1e-5, -1e-5, 2e-5, 0.0, 0.0, 0.0]
+    assert (np.abs(value - truth) < 4.0 * sigma).all()
+
+
+@pytest.mark.parametrize("runs, low, high", [(2, 0.75, 1.0), *slow((300, 0.92, 0.98))])
+@pytest.mark.parametrize("text, truth", [("latency=1ms", [1e-3]), (ARMS, ARMS_M)])
+def test_intervals_cover(text: str, truth: list[float], runs: int, low: float, high: float) -> None:
+    """Coefficients over their sigmas, half the runs with noise of the encoders (which correlates a slew's readings)."""
+    ratios = list[float]()
+    for seed in range(100, 100 + runs):
+        source = run([text], seed, sample_hz=50.0, encoder_sigma_deg=2e-4 * (seed % 2))
+        value, sigma = values(calibrate(source, Settings(effects=(text.partition("=")[0],))))
+        ratios += ((value - truth) / sigma).tolist()
+    share = float(np.mean(np.abs(ratios) < 1.96))
+    print(f"\n{text}: {share:.3f}, mean {np.mean(ratios):+.2f}, std {np.std(ratios):.2f}", end="")
+    assert low <= share <= high
+
+
+def test_engines_and_batch_agree() -> None:
+    compared = compare(run(["latency=1ms"], dwells=5, sample_hz=10.0), Settings(effects=("latency",)))
+    assert compared.result.carried.slews
+    assert compared.max_difference_sigma <= 1e-6
+    assert all(way.max_relative_variance <= 1e-8 for way in compared.ways.values())
+
+
+def test_slews_do_not_depend_on_batches() -> None:
+    settings = Settings(effects=("latency",))
+    whole, chopped = (Pass(run([], dwells=5, batch=batch), settings) for batch in (1 << 30, 37))
+    for one, other in zip((whole.fold(), whole.folder.slews), (chopped.fold(), chopped.folder.slews), strict=True):
+        assert [each.number for each in one] == [each.number for each in other]
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_array_equal(a.factor, b.factor)
+
+
+def test_without_such_an_effect_slews_change_nothing() -> None:
+    """Dwells are the same to the last bit, whether slews are folded beside them or not."""
+    source = run([], dwells=6)
+    without, beside = Pass(source, Settings()), Pass(source, Settings(effects=("latency",)))
+    for a, b in zip(without.fold(), beside.fold(), strict=True):
+        np.testing.assert_array_equal(a.factor, b.factor)
+    assert not without.folder.slews and len(beside.folder.slews) == 5
+    assert without.tally.moving == beside.tally.slewing and not beside.tally.moving
+
+
+@pytest.mark.parametrize("name", ["latency", "lever-arm"])
+def test_without_slews_a_sentence_says_so(name: str) -> None:
+    result = calibrate(run([], rate=np.inf), Settings(effects=(name,)))
+    assert any(name in said and "needs slew samples" in said for said in result.warnings)
+    assert result.parameters["K1"].value is not None
+    assert all(result.parameters[c.symbol].value is None for c in Model.of(BENCH, [name]).coefficients)
+
+
+def test_quaternions_are_refused_in_a_sentence() -> None:
+    with pytest.raises(InputError, match="gimbal angles"):
+        calibrate(run([], dwells=4, bench=replace(BENCH, axes=())), Settings(effects=("latency",)))
+
+
+def test_rates_of_a_curve_are_those_of_the_attitude() -> None:
+    """omega x v = -dv/dt of a bench vector seen in the platform, and domega/dt by differences."""
+    time_s = np.linspace(0.0, 4.0, 41)
+    curve = Curve.through(BENCH, time_s, np.column_stack([np.sin(time_s), 0.3 * time_s**2, np.cos(0.7 * time_s)]))
+    at, step, vector = np.linspace(0.5, 3.5, 7), 1e-4, np.array([0.3, -0.8, 0.5])
+    seen = [BENCH.to_platform(vector, curve.angles(at + k * step)) for k in (-1, 0, 1)]
+    np.testing.assert_allclose(np.cross(seen[1], curve.rate(at)), (seen[2] - seen[0]) / (2 * step), atol=1e-6)
+    np.testing.assert_allclose(
+        curve.rate_change(at), (curve.rate(at + step) - curve.rate(at - step)) / (2 * step), atol=1e-2
+    )

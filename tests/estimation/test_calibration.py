@@ -1,0 +1,216 @@
+"""The main job: real data by others, misfit, held-out error, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.synthetic import G, Run, sensitivities
+from scipy.spatial.transform import Rotation
+
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.bench.streams import Batch, Stream
+from kf_calib.errors import BlunderError, InputError, UnobservableError
+from kf_calib.estimation import square_root_information
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.cross_validation import orientations
+from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.fit import fit
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.settings import Settings
+from kf_calib.sources.files.recording import Recording
+
+
+def test_a_real_imu_placed_by_hand(ferraris: Path) -> None:
+    """imucal's published scale factors; plain least squares' biases; the hand's angle errors in the sigmas."""
+    result = calibrate(Recording(ferraris))
+    values = {symbol: p.value for symbol, p in result.parameters.items()}
+    np.testing.assert_allclose([values["K1"], values["K2"], values["K3"]], [0.99675, 1.00244, 1.02340], atol=2e-4)
+    np.testing.assert_allclose([values["b1"], values["b2"], values["b3"]], [0.551, -0.620, 0.386], atol=5e-3)
+    assert result.residual_rms_mps2 == pytest.approx(0.0131, abs=3e-4)
+    assert len(result.visits) == 6
+    sigmas = {symbol: p.sigma for symbol, p in result.parameters.items()}
+    assert all(1e-3 < sigmas[f"K{i}"] < 5e-3 and 5e-3 < sigmas[f"b{i}"] < 0.05 for i in (1, 2, 3))
+    assert sigmas["theta1"] > np.radians(0.3) / 2
+    assert result.noise.setting_stated and result.consistency.consistent
+    assert result.parameters["theta1"].nominal == 0.0
+    assert any("cannot tell a setting error" in warning for warning in result.warnings)
+
+
+def test_an_effect_that_is_missing_shows_as_misfit() -> None:
+    run = Run(seed=1)
+    assert calibrate(run).consistency.consistent
+    run.accel.values[:, 0] += 3e-6 * run.accel.values[:, 0] ** 2
+    result = calibrate(run)
+    assert result.consistency.consistent is False
+    assert result.held_out_rms_mps2 > 3 * result.held_out_floor_mps2
+    assert any("an effect is missing" in warning for warning in result.warnings)
+
+
+def test_held_out_equals_refits_without_the_orientation() -> None:
+    run = Run(seed=2, dwells=8)
+    run.accel = Stream(run.accel.time_ns, run.accel.values)
+    result = calibrate(run)
+    errors = []
+    for left_out in range(8):
+        from kf_calib.estimation.calibration import evaluate
+
+        kept = [visit.dwell for k, visit in enumerate(result.visits) if k != left_out]
+        rest = evaluate(kept, replace(run.bench, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0), Settings())
+        means = result.visits[left_out].dwell.means
+        state = rest.estimate.state.reshape(3, 4)
+        errors.append(means[4:] - state[:, :3] @ means[1:4] - state[:, 3])
+    assert result.held_out_rms_mps2 == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=0.01)
+
+
+def test_repeated_poses_are_one_orientation() -> None:
+    poses = np.random.default_rng(0).uniform(-3, 3, (5, 3))
+    result = calibrate(Run(seed=3, poses=np.vstack([poses, poses])))
+    groups = orientations([visit.dwell for visit in result.visits])
+    assert groups == [[k, k + 5] for k in range(5)]
+
+
+def test_one_orientation_names_what_cannot_be_seen() -> None:
+    with pytest.raises(UnobservableError, match=r"theta1.*phi1.*K1.*b1.*nu1.*K3.*b3"):
+        calibrate(Run(seed=4, poses=np.zeros((1, 3))))
+
+
+def test_two_faces_name_the_unseen_and_give_the_rest() -> None:
+    result = calibrate(Run(seed=5, poses=np.array([[0.0, 0, 0], [0, np.pi, 0]]), count=600))
+    unseen = {symbol for symbol, p in result.parameters.items() if p.value is None}
+    assert unseen == {"theta1", "phi1", "K1", "nu1", "nu2", "theta3", "phi3", "K3"}  # K sin(theta) is seen, not theta
+    assert any(
+        "do not determine theta1, phi1, K1, nu1, nu2, theta3, phi3, K3" in warning for warning in result.warnings
+    )
+    error = result.estimate.parameters - Run(seed=5, poses=np.zeros((1, 3))).truth
+    assert result.consistency.consistent is None and abs(error[6]) < 5 * result.parameters["K2"].sigma
+
+
+def test_four_orientations_leave_nothing_to_judge_by() -> None:
+    result = calibrate(Run(seed=6, dwells=4))
+    assert result.consistency.consistent is None
+    assert any("nothing over to judge" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize("unit, factor", [("g", 1 / 9.80665), ("mg", 1e3 / 9.80665)])
+def test_readings_in_g_are_noticed(unit: str, factor: float) -> None:
+    run = Run(seed=7, dwells=6)
+    run.accel = replace(run.accel, values=run.accel.values * factor)
+    with pytest.raises(InputError, match=f"gravity in {unit}, .*--accel-unit {unit}"):
+        calibrate(run)
+
+
+def test_counts_are_noticed() -> None:
+    run = Run(seed=7, dwells=6)
+    run.accel = replace(run.accel, values=np.round(run.accel.values * 1671.0))
+    with pytest.raises(InputError, match="look like counts"):
+        calibrate(run)
+
+
+def test_wrong_axes_are_noticed() -> None:
+    run = Run(seed=8)
+    run.bench = replace(run.bench, axes=axes_of("xzy"))
+    with pytest.raises(BlunderError, match="gimbal axes are, outer to inner, y z x"):
+        calibrate(run)
+
+
+def test_degrees_taken_for_radians_are_noticed() -> None:
+    run = Run(seed=8)
+    run.pose = replace(run.pose, values=np.degrees(run.pose.values))
+    with pytest.raises(BlunderError, match="--angle-unit deg"):
+        calibrate(run)
+
+
+def test_noise_free_readings_do_no_harm() -> None:
+    run = Run(seed=9, white_mps2=0.0)
+    result = calibrate(run)
+    np.testing.assert_allclose(result.estimate.parameters, run.truth, atol=1e-12)
+    assert result.consistency.consistent
+
+
+def test_platform_that_never_rests_is_refused() -> None:
+    time_ns = np.arange(0, 60_000_000_000, 50_000_000)
+    angles = np.column_stack([time_ns * 1e-9] * 3)
+    run = Run(seed=10, dwells=1)
+    run.accel, run.pose = Stream(time_ns, np.full((len(time_ns), 3), G / 2)), Stream(time_ns, angles)
+    with pytest.raises(InputError, match="no dwell was found"):
+        calibrate(run)
+
+
+def test_nothing_at_all_is_refused() -> None:
+    class Empty:
+        bench = Bench(axes_of("y"), G)
+        warnings: tuple[str, ...] = ()
+        fraction = 1.0
+
+        def __iter__(self):
+            return iter([Batch(Stream.empty(3), Stream.empty(1))])
+
+    with pytest.raises(InputError, match="no accelerometer readings"):
+        calibrate(Empty())
+
+
+def test_the_result_prints_itself() -> None:
+    text = str(calibrate(Run(seed=11)))
+    assert "θ1" in text and "ppm" in text and "Model and measurements agree" in text and "\x1b" not in text
+
+
+@pytest.mark.parametrize("reference", ["base", "inertial"])
+def test_an_attitude_in_place_of_angles(reference: str) -> None:
+    """A quaternion stream, base-fixed and inertially held."""
+    run = Run(seed=12, dwells=12)
+    run.bench = Bench((), G, reference=reference, latitude_deg=50.0)  # type: ignore[arg-type]
+    elapsed_s = (run.accel.time_ns - run.accel.time_ns[0]) / 1e9
+    dwell = np.arange(len(elapsed_s)) // run.count
+    attitudes = Rotation.random(12, random_state=3).as_quat()[dwell]
+    rows, biases = sensitivities(run.truth)
+    noise = np.random.default_rng(1).normal(size=(len(elapsed_s), 3)) * 1e-4
+    force = run.bench.specific_force(elapsed_s, attitudes)
+    run.accel = replace(run.accel, values=force @ rows.T + biases + noise)
+    run.pose = Stream(run.accel.time_ns, attitudes)
+    result = calibrate(run)
+    assert len(result.visits) == 12 and result.consistency.consistent
+    assert np.abs((result.estimate.parameters - run.truth) / result.estimate.sigma).max() < 4
+
+
+@pytest.mark.parametrize("seed", [20090, 20216, 20372])
+def test_a_dwell_on_one_or_two_messages_of_a_noisy_encoder_is_left_out(seed: int) -> None:
+    """Where noise breaks a dwell in two, the shorter part may have too few angles to know where it stands."""
+    run = Run(seed=seed, dwells=24, count=200, encoder_deg=0.01)
+    result = calibrate(run)
+    assert all(visit.dwell.pose_sigma_rad > 0.0 for visit in result.visits)
+    assert result.consistency.p_value is not None and result.consistency.p_value > 0.01
+    exact = calibrate(Run(seed=seed, dwells=24, count=50))  # every dwell of an encoder without noise is used
+    assert len(exact.visits) == 24
+
+
+def test_dwells_whitened_together_are_those_whitened_alone() -> None:
+    """Of any shape, beside each other in any order; a factor is solved alike in company, undetermined or not."""
+    dwells = Pass(Run(dwells=14, count=200, setting_deg=0.01), Settings()).fold()
+    dwells = [next(iter(dwell.prefixes())) if k % 3 else dwell for k, dwell in enumerate(dwells)]
+    assert len({len(dwell.pieces) for dwell in dwells}) > 1
+    fitted = fit(dwells, Model.of(Run(dwells=1).bench, ("bias-drift",)))
+    columns, state = fitted.carried.columns, fitted.carried.state
+    for noise in (fitted.noise, replace(fitted.noise, scatter_mps2=np.full(3, 1e-5), walk_mps2_per_sqrt_s=1e-5)):
+        together = square_root_information.whiten(dwells, columns, noise, state, reduced=False)
+        for dwell, own, rows in zip(dwells, columns, together, strict=True):
+            (alone,) = square_root_information.whiten([dwell], [own], noise, state, reduced=False)
+            np.testing.assert_array_equal(rows, alone)
+        few = square_root_information.whiten(dwells, columns, noise, state)
+        for whole, rows in zip(together, few, strict=True):
+            assert len(rows) < len(whole)
+            left, right = rows[:, :-1].T @ rows, whole[:, :-1].T @ whole
+            np.testing.assert_allclose(left, right, rtol=0, atol=1e-9 * np.abs(right).max())
+    factors = [square_root_information.accumulate(fitted.rows()[:count])[:-1] for count in (1, 3, 14)]
+    around = fitted.carried.model.nominal_state()
+    for factor, (state, covariance, lost) in zip(
+        factors, square_root_information.solve_all(np.array(factors), around), strict=True
+    ):
+        assert lost.shape[1] == len(factor) - square_root_information.rank(factor)
+        np.testing.assert_allclose(factor[:, :-1] @ lost, 0.0, atol=1e-6 * np.abs(factor).max())
+        if not lost.size:
+            np.testing.assert_allclose(factor[:, :-1] @ state, factor[:, -1], atol=1e-6 * np.abs(factor[:, -1]).max())
+            sigma = np.sqrt(np.diag(covariance))
+            np.testing.assert_allclose(factor[:, :-1].T @ factor[:, :-1] @ covariance, np.eye(len(sigma)), atol=1e-4)

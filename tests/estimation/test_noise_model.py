@@ -1,0 +1,105 @@
+"""The noise model against noise of known kind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.long_runs import slow
+from helpers.synthetic import Run, plan_of
+from scipy.signal import lfilter
+
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.dwells.sufficient_statistics import Autocovariance, less_curve
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.reml import restricted_log_likelihood
+from kf_calib.sources.simulation.noise_processes import TrueNoise as SimulatedNoise
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
+
+
+def test_autocovariance_is_the_sum_of_lagged_products() -> None:
+    """Of what a parabola leaves: a drift within the block is no noise."""
+    noise, time = np.random.default_rng(0).normal(size=(3, 500)), np.arange(500.0)
+    got = Autocovariance.of(less_curve(noise + 3.0 * time - 0.01 * time**2))
+    values = np.array([row - np.polyval(np.polyfit(time, row, 2), time) for row in noise])
+    for lag in (0, 1, 7, 64):
+        np.testing.assert_allclose(got.products[lag], np.sum(values[:, : 500 - lag] * values[:, lag:], axis=1))
+    assert got.pairs[64] == 436
+
+
+def test_white_noise_is_not_inflated() -> None:
+    inflations = [calibrate(Run(seed=seed, dwells=6)).noise.inflation for seed in range(10)]
+    assert np.mean(np.array(inflations) == 1.0) > 0.9
+
+
+@pytest.mark.parametrize("phi", [0.5, 0.9, 0.97])
+def test_ar1_inflation_is_that_of_the_mean(phi: float) -> None:
+    """kappa = (1 + phi) / (1 - phi)."""
+    result = calibrate(Run(seed=1, dwells=24, count=2000, rate_hz=100.0, phi=phi))
+    np.testing.assert_allclose(result.noise.inflation, (1 + phi) / (1 - phi), rtol=0.25)
+    np.testing.assert_allclose(result.noise.sigma_mps2, 1e-4, rtol=0.1)
+
+
+def test_ar2_resonance_is_followed_too() -> None:
+    """A noise with a spectral line averages faster near zero frequency than its variance says: never below white."""
+    run = Run(seed=2, dwells=12, count=2000, rate_hz=100.0, white_mps2=0.0)
+    a = [1.0, -2 * 0.95 * np.cos(1.0), 0.95**2]
+    run.accel.values[:] += 1e-4 * lfilter(
+        [1.0], a, np.random.default_rng(0).normal(size=run.accel.values.shape), axis=0
+    )
+    np.testing.assert_allclose(calibrate(run).noise.inflation, 1.0)
+
+
+@pytest.mark.parametrize("runs, off", [(5, 0.15), *slow((12, 0.1))])
+def test_setting_error_and_scatter_are_told_apart_and_sized(runs: int, off: float) -> None:
+    settings, scatters, mistaken = [], [], 0
+    for seed in range(runs):
+        setting = calibrate(Run(seed=seed, dwells=30, setting_deg=0.01, stated=False)).noise
+        mistaken += bool(setting.scatter_mps2.any())
+        settings.append(np.degrees(setting.setting_rad))
+        scatter = calibrate(Run(seed=seed, dwells=30, scatter_mps2=5e-4)).noise
+        mistaken += scatter.setting_rad > 0 and not scatter.setting_stated
+        scatters.append(scatter.scatter_mps2)
+    assert mistaken <= runs // 5  # of twice as many, at the 1 % point each
+    assert np.sqrt(np.mean(np.square(settings))) == pytest.approx(0.01, rel=off)
+    assert np.sqrt(np.mean(np.square(scatters))) == pytest.approx(5e-4, rel=1.2 * off)
+
+
+def test_what_is_stated_is_not_estimated() -> None:
+    noise = calibrate(Run(seed=3, setting_deg=0.01)).noise
+    assert noise.setting_stated and noise.setting_rad == pytest.approx(np.radians(0.01))
+
+
+@pytest.mark.parametrize("kind", [{"setting_deg": 0.01}, {"scatter_mps2": 5e-4}])
+@pytest.mark.parametrize("seed", range(4))
+def test_no_other_size_of_the_dwell_parts_is_likelier(seed: int, kind: dict[str, float]) -> None:
+    """By the likelihood alone, without the derivative that the search goes by."""
+    result = calibrate(Run(seed=seed, dwells=30, stated=False, **kind))
+    noise, means, state = result.noise, result.carried.means, result.carried.state
+
+    def likelihood(setting: float, scatter: float) -> float:
+        other = replace(noise, setting_rad=noise.setting_rad * setting, scatter_mps2=noise.scatter_mps2 * scatter)
+        return restricted_log_likelihood(other.weights, means, state)
+
+    others = [likelihood(*pair) for x in (0.5, 0.9, 0.98, 1.02, 1.1, 2.0) for pair in ((x, 1.0), (1.0, x))]
+    assert noise.setting_rad + noise.scatter_mps2.max() > 0
+    assert max(others) <= likelihood(1.0, 1.0) + 1e-6
+
+
+@pytest.mark.parametrize("runs", [10, *slow(40)])
+def test_dwells_too_short_for_their_noise_raise_no_alarm_and_are_told(runs: int) -> None:
+    """Forty readings, correlated over ten: their parabola takes all that would tell how slow they are."""
+    low = 0
+    for seed in range(runs):
+        bench = Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+        source = Simulation(
+            bench, GRADES["mems"].sensors(seed), SimulatedNoise(white_mps2=0.02, ar1_phi=0.9),
+            plan_of(16, dwell_s=10.0, seed=seed), sample_hz=4.0, angle_hz=4.0, slew_rate_degps=90.0, seed=seed,
+        )  # fmt: skip
+        result = calibrate(source)
+        assert result.consistency.p_value is not None
+        low += result.consistency.p_value < 0.05
+        assert "too short to tell" in " ".join(result.warnings)
+    assert low <= runs / 20  # one in five would be were each channel's correlation taken as it is found

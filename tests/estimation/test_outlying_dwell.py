@@ -1,0 +1,77 @@
+"""A dwell that alone is wrong is named, with the turn that mends it; effects and noise are no such dwell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.altered import Altered, mistyped, short_run
+
+from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.errors import InputError
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.settings import Settings
+
+
+@pytest.mark.parametrize("options", [{}, {"unstated": True}, {"setting_sigma_deg": 0.01}, {"grade": "mems"}], ids=str)
+@pytest.mark.parametrize(("number", "gimbal", "error_deg"), [(7, 1, 10.0), (1, 2, -90.0), (4, 2, 1.0), (24, 1, 0.5)])
+def test_a_mistyped_pose_is_named_and_mended(options, number: int, gimbal: int, error_deg: float) -> None:
+    run = short_run(**options)
+    typed = np.array(run.plan[number - 1].gimbal_deg)
+    source = Altered(run, poses=mistyped(run, number, gimbal, error_deg))
+    result = calibrate(source)
+    (found,) = result.outlying
+    assert found.number == number
+    (turn,) = [turn for turn in found.turns if turn.gimbal == gimbal]
+    assert abs(turn.recorded_deg - typed[gimbal] - error_deg) < 1e-3
+    assert abs(turn.mended_deg - typed[gimbal]) < 5.0 * turn.sigma_deg
+    assert f"dwell {number} " in str(found) and f"--leave-out {number}" in str(found)
+    told = diagnose(result)
+    assert told.unknown and not told.missing and f"dwell {number} " in told.verdict
+
+    alone = calibrate(source, Settings(left_out=(number,)))
+    assert alone.consistency.consistent and len(alone.visits) == 23
+    for symbol, parameter in found.without.parameters.items():
+        assert parameter.value == alone.parameters[symbol].value
+        assert parameter.value == pytest.approx(run.sensors.parameters[symbol], abs=5 * parameter.sigma)
+
+
+def test_where_two_dwells_could_be_it_both_are_named() -> None:
+    """Of six faces, opposite ones only are told by each other."""
+    run = short_run(plan="faces")
+    found = calibrate(Altered(run, poses=mistyped(run, 4, 2, 1.0))).outlying
+    assert [each.number for each in found] == [3, 4]
+
+
+def test_a_knock_that_no_turn_explains() -> None:
+    run = short_run()
+    begin, end = run.motion.arrive_ns[10] * 1e-9 - 0.1, run.motion.leave_ns[10] * 1e-9 + 0.1
+    source = Altered(run, lambda t, a: a + np.where(((t > begin) & (t < end))[:, None], [0.5, 0.6, -0.4], 0.0))
+    (found,) = calibrate(source).outlying
+    assert found.number == 11 and not found.turns
+    assert "no turn of one gimbal explains" in str(found)
+
+
+@pytest.mark.parametrize(
+    "hidden", ["second-order=40sigma", "warm-up=40sigma;tau=20", "hysteresis=30sigma", "base-tilt=100sigma"]
+)
+def test_an_effect_is_no_outlying_dwell(hidden: str) -> None:
+    for seed in range(3):
+        assert not calibrate(short_run(hidden=(hidden,), seed=seed)).outlying
+
+
+def test_noise_is_no_outlying_dwell() -> None:
+    for seed in range(20):
+        run = short_run(count=10, dwell_s=1.5, seed=seed, setting_sigma_deg=0.02, unstated=seed % 2)
+        assert not calibrate(run).outlying
+
+
+def test_poses_are_those_that_were_recorded() -> None:
+    """Angles that go on beyond a turn are shown as they were typed."""
+    run = short_run(count=8)
+    typed = np.degrees(np.array([visit.dwell.recorded_pose for visit in calibrate(run).visits]))
+    np.testing.assert_allclose(typed, [visit.gimbal_deg for visit in run.plan], atol=1e-9)
+
+
+def test_a_dwell_to_leave_out_must_be_there() -> None:
+    with pytest.raises(InputError, match=r"no dwell 9 to leave out \(--leave-out\): the run has dwells 1 to 8"):
+        calibrate(short_run(count=8), Settings(left_out=(2, 9)))

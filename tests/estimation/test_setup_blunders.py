@@ -1,0 +1,165 @@
+"""A set-up that is wrong is refused with what mends it; what mends it, mends it; and a sound one is left alone."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import replace
+from itertools import permutations, product
+
+import numpy as np
+import pytest
+from helpers.altered import Altered, short_run
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench, parse_axes, parse_channels
+from kf_calib.bench.keys import UP
+from kf_calib.errors import BlunderError, InputError
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.setup_blunders import common_scale
+
+
+def reordered(*channels: int):
+    """Readings as they come where accelerometer i is wired to channel |channels[i]|."""
+
+    def change(_: Floats, readings: Floats) -> Floats:
+        out = np.empty_like(readings)
+        for i, channel in enumerate(channels):
+            out[:, abs(channel) - 1] = np.sign(channel) * readings[:, i]
+        return out
+
+    return change
+
+
+def mended(bench: Bench, message: str) -> list[Bench]:
+    """The benches that a message's options would state."""
+    out = []
+    for options in re.findall(r"--(?:up|axes|channels)[^)?]*?(?=[),]? (?:or|and)|\)|\.$)", message):
+        words = shlex.split(options.rstrip("."))
+        keys = dict(zip(words[::2], words[1::2], strict=True))
+        axes = parse_axes(keys["--axes"]) if "--axes" in keys else bench.axes
+        channels = parse_channels(keys["--channels"]) if "--channels" in keys else bench.channels
+        out.append(replace(bench, axes=axes, channels=channels, up=keys.get("--up", bench.up)))
+    return out
+
+
+def refused(source: Altered) -> str:
+    with pytest.raises(BlunderError) as told:
+        calibrate(source)
+    return str(told.value)
+
+
+WIRINGS = [
+    tuple(sign * place for sign, place in zip(signs, places, strict=True))
+    for places in permutations((1, 2, 3))
+    for signs in product((1, -1), repeat=3)
+]
+
+
+@pytest.mark.parametrize("channels", [w for w in WIRINGS if w != (1, 2, 3)], ids=str)
+def test_each_of_47_wrong_wirings_is_refused_and_its_mending_mends(channels: tuple[int, int, int]) -> None:
+    run = short_run(count=8, dwell_s=1.5)
+    source = Altered(run, reordered(*channels))
+    options = mended(run.bench, refused(source))
+    assert options
+    for bench in options:
+        source.bench = bench
+        result = calibrate(source)
+        assert result.consistency.consistent
+    source.bench = replace(run.bench, channels=channels)
+    for symbol, expected in run.sensors.parameters.items():
+        found = calibrate(source).parameters[symbol]
+        assert found.value == pytest.approx(expected, abs=6 * found.sigma)
+
+
+@pytest.mark.parametrize(
+    ("readings", "poses", "words"),
+    [
+        (reordered(1, -2, 3), None, "channel 2 reads -g where +g is expected: channel 2 reversed? Try --channels 1,-2"),
+        (reordered(2, 1, 3), None, "channels 1 and 2 are exchanged? Try --channels 2,1,3."),
+        (reordered(2, 3, 1), None, "Try --channels 2,3,1."),
+        (reordered(-1, -2, -3), None, "acceleration in place of specific force"),
+        (None, lambda _, q: q * [1, -1, 1], 'gimbal z turns the other way (--axes "y -z x")'),
+        (None, lambda _, q: q * [1, 1, -1], 'gimbal x turns the other way (--axes "y z -x")'),
+        (None, lambda _, q: np.degrees(q), "the angles are in degrees? Try --angle-unit deg."),
+        (None, lambda _, q: np.radians(q), "turned from degrees into radians twice"),
+        (None, lambda _, q: q[:, ::-1], "--joints"),
+        (lambda _, a: a * [1, 1, 1e-6], None, "channel 3 is dead"),
+        (lambda _, a: np.where([True, True, False], a, 0.3), None, "channel 3 is stuck: all along it reads 0.3"),
+        (lambda _, a: a * [1, 1 / 9.80665, 1], None, "channel 2 feels 0."),
+        (
+            lambda t, a: np.where((t > 60)[:, None], a[:, [1, 0, 2]], a), None,
+            "up to dwell 8 channels are as stated, from dwell 9 on (at 67 s) channels 1 and 2 are exchanged",
+        ),
+        (lambda t, a: np.where((t > 60)[:, None] & [False, False, True], 1.5, a), None, "stuck: from dwell 9 on"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("grade", ["navigation", "mems"])
+def test_blunders_are_named(grade: str, readings, poses, words: str) -> None:
+    assert words in refused(Altered(short_run(grade=grade), readings, poses))
+
+
+def test_a_bench_with_z_up_that_is_said_to_be_the_usual_one() -> None:
+    run = short_run({"axes": "z y x", "up": "z"})
+    source = Altered(run, bench=replace(run.bench, axes=parse_axes("y z x"), up="y"))
+    message = refused(source)
+    assert message.index("z is up when all angles are zero") < message.index('(--axes "z y x" --up z)')
+    for bench in mended(source.bench, message):
+        source.bench = bench
+        assert calibrate(source).consistency.consistent
+
+
+@pytest.mark.parametrize("up", UP)
+def test_any_axis_may_be_up(up: str) -> None:
+    run = short_run({"axes": "z y x", "up": up, "channels": "-3,1,2"}, count=12)
+    result = calibrate(run)
+    assert result.consistency.consistent
+    errors = [(p.value - run.sensors.parameters[s]) / p.sigma for s, p in result.parameters.items()]
+    assert np.abs(errors).max() < 4.0
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"plan": "faces"}, {"count": 4}, {"count": 3}, {"grade": "mems"}, {"grade": "paper"}], ids=str
+)
+def test_sound_runs_are_left_alone(options) -> None:
+    for seed in range(5):
+        calibrate(short_run(seed=seed, **options))
+
+
+def test_a_block_that_is_mounted_so_is_stated() -> None:
+    """An accelerometer that does point the other way: K2 is negative, and parameters and state are one to one."""
+    run = short_run()
+    bench = replace(run.bench, nominal={"K2": -1.0})
+    k2 = calibrate(Altered(run, reordered(1, -2, 3), bench=bench)).parameters["K2"]
+    assert k2.value == pytest.approx(-run.sensors.parameters["K2"], abs=6 * k2.sigma)
+
+
+def test_attitudes_of_the_inverse_rotation_are_told() -> None:
+    run = short_run()
+    source = Altered(
+        run, poses=lambda _, q: np.column_stack([-q[:, :3], q[:, 3]]), bench=replace(run.bench, axes=())
+    )  # fmt: skip
+    run.bench = source.bench
+    assert "the attitude is that of the bench in the platform" in refused(source)
+
+
+def test_scale_factors_that_are_all_off_by_the_same() -> None:
+    bench = Bench(parse_axes("y z x"), 9.8123)
+    local = np.full(3, 9.80665 / 9.8123)
+    differing, sigmas = np.array([1e-6, 0.0, -1e-6]), np.full(3, 1e-6)
+    assert "--accel-scale 1.0005761" in common_scale(local + differing, sigmas, bench)
+    assert "not 9.8123 m/s^2 as stated, but 9.82211" in common_scale(np.full(3, 1.001), sigmas, bench)
+    assert not common_scale(1.0 + np.array([3e-4, 2e-4, 3e-4]), sigmas, bench)
+    assert not common_scale(np.full(3, 1.0 + 3e-6), sigmas, bench)
+
+    run = short_run({"gravity_mps2": "9.8123"})
+    scales = np.array([run.sensors.parameters[f"K{i}"] for i in (1, 2, 3)])
+    notes = calibrate(Altered(run, lambda _, a: a * local / scales)).warnings
+    assert "off by the same -576 ppm" in " ".join(notes)
+    assert "off by the same" not in " ".join(calibrate(run).warnings)
+
+
+def test_degrees_of_a_noisy_encoder_in_which_nothing_stands_still() -> None:
+    run = short_run(encoder_sigma_deg=0.02, angle_hz=50.0)
+    with pytest.raises(InputError, match=r"look like degrees \(--angle-unit deg\)"):
+        calibrate(Altered(run, poses=lambda _, q: np.degrees(q)))

@@ -1,0 +1,227 @@
+"""Steps, flat tops and crowded outliers are found in the readings, at their true size, and not where there are none."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.long_runs import slow
+from helpers.synthetic import Run
+
+from kf_calib.bench.streams import Stream
+from kf_calib.estimation.calibration import calibrate, refitted
+from kf_calib.estimation.signal_quality import Readings, clustering, common_step, missing_above
+from kf_calib.sources.files.recording import Recording
+
+QUICK = ["--orientations", "24", "--dwell-s", "8", "--slew-degps", "360", "--sample-hz", "100", "--seed", "3"]
+FACES = np.array([(0, b, c) for b, c in itertools.product(np.radians([0.0, 90, 180, 270]), np.radians([0.0, 45, 90]))])
+
+
+def readings(run: Run, change=lambda values: values) -> Readings:
+    run.accel = Stream(run.accel.time_ns, change(run.accel.values))
+    return calibrate(run).readings
+
+
+def stepped(step: float):
+    return lambda values: step * np.rint(values / step)
+
+
+def stored(values: np.ndarray) -> np.ndarray:
+    return values.astype(np.float32).astype(float)
+
+
+@pytest.mark.parametrize("sigmas", [0.1, 0.5, 1.0, 2.0, 4.0, 20.0, 300.0])
+@pytest.mark.parametrize("store", [lambda values: values, stored, lambda values: 9.80665 * stored(values / 9.80665)])
+def test_the_step_is_found_and_matters_where_averaging_cannot_help(sigmas: float, store) -> None:
+    step = sigmas * 1e-4
+    if sigmas == 0.1 and store(np.full(1, np.pi))[0] != np.pi:
+        return  # a hundredth of a microradian of g: no more than ten steps of float32
+    found = readings(Run(seed=1), lambda values: store(stepped(step)(values)))
+    assert [each.channel for each in found.quantisation] == [1, 2, 3]
+    for each in found.quantisation:
+        assert each.step_mps2 == pytest.approx(step, rel=1e-3)
+        assert each.matters == (sigmas > 2.0)
+        assert each.mean_error_mps2 <= each.step_mps2 / 2
+    assert not found.saturation and found.outliers.clustered_p is None
+
+
+@pytest.mark.parametrize("sigmas", [1.0, 2.0, 3.0, 4.0, 8.0])
+def test_means_are_off_by_no_more_than_is_said(sigmas: float) -> None:
+    """Readings of a hundred levels, many enough that noise averages out."""
+    found = readings(Run(seed=5), stepped(sigmas * 1e-4)).quantisation[0]
+    rng = np.random.default_rng(0)
+    levels = np.linspace(0.0, 1.0, 101)[:, None]
+    means = np.rint(levels + rng.normal(size=(101, 20_000)) / sigmas).mean(axis=1)
+    largest = found.step_mps2 * np.abs(means - levels[:, 0]).max()
+    assert largest < 1.25 * found.mean_error_mps2 + 4.0 * 1.1e-4 / np.sqrt(20_000)
+    assert largest > 0.4 * found.mean_error_mps2
+
+
+@pytest.mark.parametrize("seeds", [range(4), *slow(range(100))], ids=len)
+@pytest.mark.parametrize("kind", ["white", "ar1", "float32", "counts", "correlated counts"])
+def test_no_false_alarm(kind: str, seeds: range) -> None:
+    for seed in seeds:
+        mems, phi = "counts" in kind, 0.9 if kind in ("ar1", "correlated counts") else 0.0
+        run = Run(seed=seed, dwells=12, count=200, phi=phi, white_mps2=0.02 if mems else 1e-4)
+        change = stepped(9.81 / 16384 * (1, 4, 16, 32)[seed % 4]) if mems else stored if kind == "float32" else np.copy
+        found = readings(run, change)
+        assert not found.warnings and not found.saturation, (seed, found)
+        assert not found.quantisation or mems, (seed, found)
+
+
+def test_a_real_imu_counts_in_2048ths_of_g(ferraris: Path) -> None:
+    found = calibrate(Recording(ferraris)).readings
+    assert [each.step_mps2 for each in found.quantisation] == pytest.approx([9.81 / 2048] * 3, rel=1e-9)
+    assert not found.warnings
+
+
+@pytest.mark.parametrize("limit", [7.0, 9.0, 9.7])
+@pytest.mark.parametrize("change", [np.copy, stored, stepped(5e-5), stepped(2e-4)])
+def test_flat_tops_are_found_where_they_are(limit: float, change) -> None:
+    clean = calibrate(Run(seed=1, poses=FACES, dwells=12))
+    beyond = {
+        (i + 1, sign): tuple(k + 1 for k, visit in enumerate(clean.visits) if sign * visit.dwell.means[4 + i] > limit)
+        for i in range(3)
+        for sign in (1, -1)
+    }
+    found = readings(Run(seed=1, poses=FACES, dwells=12), lambda v: change(np.clip(v, -limit, limit)))
+    got = {(each.channel, int(np.sign(each.level_mps2))): each for each in found.saturation}
+    assert {key: each.dwells for key, each in got.items()} == {key: at for key, at in beyond.items() if at}
+    for each in found.saturation:
+        assert abs(each.level_mps2) == pytest.approx(limit, abs=1e-4)
+        assert each.share == pytest.approx(len(each.dwells) / 12, abs=0.02)
+
+
+@pytest.mark.parametrize("below_sigmas", [-4.0, -2.0, 0.0, 2.0])
+def test_a_top_cut_within_the_noise_is_found_by_what_is_missing_above(below_sigmas: float) -> None:
+    run = Run(seed=2, poses=FACES, dwells=12, count=2000)
+    level = max(visit.dwell.means[4] for visit in calibrate(Run(seed=2, poses=FACES, dwells=12)).visits)
+    found = readings(run, lambda v: np.minimum(v, [level - below_sigmas * 1e-4, 99.0, 99.0])).saturation
+    assert [each.channel for each in found] == ([] if below_sigmas == -4.0 else [1])
+
+
+def test_what_noise_puts_above_a_step() -> None:
+    rng = np.random.default_rng(3)
+    values = np.rint(rng.normal(size=1_000_000) / 0.7)
+    for top in (1.0, 2.0, 3.0):  # cut there, as many are missing as lay above
+        stuck = (values == top).sum() / (values <= top).sum()
+        count = float((values <= top).sum())
+        share_at_or_above = (values >= top).mean()
+        expected = (values > top).mean() * 1e6
+        got = missing_above(np.array([share_at_or_above * 1e6]), np.array([1e6]), 0.7)[0]
+        assert got == pytest.approx(expected, rel=0.05)
+        assert 0 < stuck < 1 and count > 0
+
+
+def test_outliers_crowd_or_do_not() -> None:
+    rng = np.random.default_rng(4)
+    spread, crowded = Run(seed=4), Run(seed=4)
+    hit = rng.random(len(spread.accel)) < 0.01
+    spread.accel.values[hit, 1] += 0.1
+    place = 7 * 300 + 30 + 3 * np.arange(30)
+    crowded.accel.values[place, 2] -= 0.1
+    one, other = calibrate(spread), calibrate(crowded)
+    assert one.readings.outliers.count == one.tally.gated > 30
+    assert one.readings.outliers.by_channel == (0, one.tally.gated, 0)
+    assert one.readings.outliers.share == pytest.approx(0.01, rel=0.3)
+    assert one.readings.outliers.clustered_p is not None and one.readings.outliers.clustered_p > 0.01
+    found = other.readings.outliers
+    assert (found.count, found.by_channel, found.dwells) == (30, (0, 0, 30), (8,))
+    assert found.clustered_p is not None and found.clustered_p < 1e-9
+    assert any("crowded in dwell 8" in warning for warning in other.warnings)
+    assert not any("crowded" in warning for warning in one.warnings)
+
+
+def test_the_p_of_crowding_is_no_smaller_than_chance() -> None:
+    rng, counts = np.random.default_rng(6), np.array([100.0] * 12 + [900.0] * 12)
+    for total in (2, 20, 200):
+        p = [clustering(rng.multinomial(total, counts / counts.sum()).astype(float), counts)[0] for _ in range(1000)]
+        assert np.mean(np.array(p, float) < 0.05) < 0.07
+    assert clustering(np.ones(1), np.array([10.0])) == (None, slice(0, 0))
+    hits, many = np.zeros(5000), np.full(5000, 100.0)
+    hits[4000:4100] = 1.0
+    p_value, dwells = clustering(hits, many)
+    assert p_value is not None and p_value < 1e-50 and 4000 < (dwells.start + dwells.stop) / 2 < 4101
+
+
+def test_common_step() -> None:
+    rng = np.random.default_rng(7)
+    for step in (1e-5, 0.03, 2.0):
+        values = step * rng.integers(-300, 300, 40) + 0.123
+        assert common_step(values, 1e-12) == pytest.approx(step, rel=1e-9)
+    coarse = 0.05 * np.array([0.0, 6, 16, 31])  # differences of 6, 10 and 15: no two share the step alone
+    assert common_step(coarse + rng.uniform(-1e-6, 1e-6, 4), 2e-6) == pytest.approx(0.05, rel=1e-3)
+    assert common_step(rng.normal(size=40), 1e-6) is None
+    assert common_step(np.array([1.0, 2.0, 3.0]), 1e-6) is None
+
+
+def test_degenerate_readings_say_nothing_wrong() -> None:
+    short, holed, one = Run(seed=8, count=40, dwells=6), Run(seed=8), Run(seed=8, dwells=5)
+    holed.accel.values[::7] = np.nan
+    assert readings(short) == readings(holed) == Readings()
+    one.accel.values[:300, 0] = 3.0  # stuck within the range is no end of it
+    assert not readings(one).saturation
+    crowd = Run(seed=8)
+    crowd.accel.values[330, 0] = 50.0  # one outlier is neither a flat top nor a crowd
+    assert not readings(crowd).warnings
+
+
+def test_a_refit_keeps_what_was_seen() -> None:
+    run = Run(seed=1)
+    run.accel = Stream(run.accel.time_ns, np.clip(run.accel.values, -9.0, 9.0))
+    before = calibrate(run)
+    assert before.readings.saturation and refitted(before, ["second-order"]).readings == before.readings
+
+
+@pytest.fixture
+def printed(run):
+    """What a command prints that must end well, without a word of warning."""
+
+    def call(*words: object) -> str:
+        code, out, err = run(*words)
+        assert not code and not err
+        return out
+
+    return call
+
+
+def simulated(printed, path: Path, *hide: str) -> Path:
+    printed("simulate", path, *QUICK, *(word for text in hide for word in ("--hide", text)))
+    return path
+
+
+def test_hidden_flat_tops_are_said_before_an_effect_is_named(printed, tmp_path: Path) -> None:
+    path = tmp_path / "flat.mcap"
+    printed("simulate", path, *QUICK, "--plan", "faces", "--hide", "saturation=0,9.5,0")
+    found = json.loads(printed("diagnose", path, "--json"))
+    assert {each["channel"] for each in found["readings"]["saturation"]} == {2}
+    assert {abs(each["level_mps2"]) for each in found["readings"]["saturation"]} == {9.5}
+    assert found["verdict"].startswith("Readings of accelerometer 2 are cut off at ")
+    words = printed("diagnose", path)
+    assert "saturation of accelerometer 2" in words and words.count("widen its range") == len(
+        found["readings"]["saturation"]
+    )
+    replayed = json.loads(printed("replay", path, "--json"))
+    assert replayed["readings"] == found["readings"]
+    assert any("cut off" in warning for warning in replayed["warnings"])
+
+
+@pytest.mark.parametrize("step, matters", [(2e-5, False), (1e-3, True)])
+def test_a_hidden_step(printed, tmp_path: Path, step: float, matters: bool) -> None:
+    path = simulated(printed, tmp_path / "steps.mcap", f"quantisation={step}")
+    found = json.loads(printed("replay", path, "--json"))
+    assert [each["step_mps2"] for each in found["readings"]["quantisation"]] == pytest.approx([step] * 3, rel=1e-6)
+    assert [each["matters"] for each in found["readings"]["quantisation"]] == [matters] * 3
+    assert any("averaging does not help" in warning for warning in found["warnings"]) == matters
+    assert found["readings"]["saturation"] == []
+
+
+def test_hidden_outliers_and_none(printed, tmp_path: Path) -> None:
+    found = json.loads(printed("replay", simulated(printed, tmp_path / "a.mcap", "outliers=10mg;rate=2e-3"), "--json"))
+    assert found["readings"]["outliers"]["count"] == found["counts"]["gated"] > 20
+    assert found["readings"]["outliers"]["clustered_p"] > 1e-3
+    clean = json.loads(printed("diagnose", simulated(printed, tmp_path / "b.mcap"), "--json"))["readings"]
+    assert clean["quantisation"] == clean["saturation"] == [] and clean["outliers"]["count"] == 0

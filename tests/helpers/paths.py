@@ -1,0 +1,10 @@
+"""Where things are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+RECORDINGS = ROOT / "recordings"
+SHARED = ROOT.parent / "shared" / "recordings"
+"""Recordings of others, beside the checkout; tests that need them skip where they are absent."""

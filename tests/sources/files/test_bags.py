@@ -1,0 +1,120 @@
+"""A folder is a recording as a file is; what is none says what to do with it."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import pytest
+from helpers.recordings import ACCEL, ANGLES, BATCH, HEAT, Topic, assert_equal, read, write_officially
+
+from kf_calib.bench.streams import Stream
+from kf_calib.diagnosis.selection_journal import Origin
+from kf_calib.errors import InputError
+from kf_calib.sources.files.recording import Recording
+
+METADATA = """rosbag2_bagfile_information:
+  version: 5
+  storage_identifier: mcap
+  relative_file_paths:
+{}
+  duration:
+    nanoseconds: 10
+  files:
+    - path: not_this.mcap
+"""
+
+
+def cut(topic: Topic, part: slice) -> Topic:
+    name, kind, template, stream = topic
+    return name, kind, template, Stream(stream.time_ns[part], stream.values[part])
+
+
+def split(folder: Path, names: list[str], **options: object) -> Path:
+    """Our batch in several files, whose topics come in another order each; the temperature from the second on."""
+    folder.mkdir()
+    for k, name in enumerate(names):
+        share = len(names)
+        own = [cut(topic, slice(len(topic[3]) * k // share, len(topic[3]) * (k + 1) // share)) for topic in
+               (ACCEL, ANGLES, HEAT)]  # fmt: skip
+        own = own[:2] if k == 0 else own[::-1]
+        write_officially(folder / name, tuple(own), **({} if k == 0 else {"metadata": {}}), **options)
+    return folder
+
+
+NAMES = ["bag_0.mcap", "bag_2.mcap", "bag_10.mcap"]
+
+
+def test_one_file_in_a_folder_is_the_recording(tmp_path: Path) -> None:
+    write_officially(tmp_path / "any.mcap")
+    assert_equal(read(Recording(tmp_path)), BATCH)
+
+
+@pytest.mark.parametrize("finish", [True, False])
+def test_the_files_of_a_split_bag_follow_each_other(tmp_path: Path, finish: bool) -> None:
+    recording = Recording(split(tmp_path / "bag", NAMES, finish=finish))
+    first_heat = len(HEAT[3]) // 3
+    for _ in range(2):
+        found = read(recording)
+        assert recording.fraction == 1.0
+        for one, other in ((found.accel, BATCH.accel), (found.pose, BATCH.pose)):
+            assert one.time_ns.tolist() == other.time_ns.tolist() and one.values.tobytes() == other.values.tobytes()
+        assert found.temperature.time_ns.tolist() == BATCH.temperature.time_ns[first_heat:].tolist()
+    assert len(recording.warnings) == (0 if finish else 3)
+
+
+def test_metadata_says_which_files_and_in_which_order(tmp_path: Path) -> None:
+    names = ["z.mcap", "a.mcap", "m.mcap"]
+    folder = split(tmp_path / "bag", names)
+    (folder / "metadata.yaml").write_text(METADATA.format("\n".join(f"    - {name}" for name in names)))
+    assert read(Recording(folder)).accel.time_ns.tolist() == BATCH.accel.time_ns.tolist()
+    one, other = Origin.of(folder), Origin.of(folder / "z.mcap")
+    assert one.name == "bag" and one.sha256 != other.sha256
+    (folder / "a.mcap").unlink()
+    with pytest.raises(InputError, match=r"lacks a\.mcap, which its metadata.yaml names"):
+        Recording(folder)
+
+
+def test_recordings_that_only_lie_in_one_folder_are_not_joined(tmp_path: Path) -> None:
+    folder = split(tmp_path / "bag", ["monday.mcap", "tuesday.mcap"])
+    with pytest.raises(InputError, match=r"several recordings \(monday.mcap, tuesday.mcap\).*give one of them"):
+        Recording(folder)
+
+
+def test_a_bag_in_sqlite_says_how_it_is_converted(tmp_path: Path) -> None:
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    with sqlite3.connect(folder / "bag_0.db3") as base:
+        base.execute("create table messages (id integer)")
+    (folder / "metadata.yaml").write_text(METADATA.replace("mcap", "sqlite3").format("    - bag_0.db3"))
+    for path in (folder, folder / "bag_0.db3"):
+        with pytest.raises(InputError, match="in SQLite") as refused:
+            Recording(path)
+        for part in (
+            f"`ros2 bag convert -i {folder} -o convert.yaml`",
+            "`output_bags: [{uri: OUT, storage_id: mcap, all: true}]`",
+            f"`rosbags-convert --src {folder} --dst OUT --dst-storage mcap`",
+        ):
+            assert part in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("old.bag", b"#ROSBAG V2.0\n....", "is a bag of ROS 1: convert it by `rosbags-convert --src .*old.bag --dst"),
+        ("a.csv", b"time_s,ax_mps2\n1,2\n", r"holds lines of text: .*`kf-calib record \S*a.mcap \S*a.csv`"),
+        ("a.jsonl", b'{"time_s": 1}\n', r"`kf-calib record \S*a.mcap \S*a.jsonl`, and give \S*a.mcap"),
+        ("named.mcap", b"\xef\xbb\xbfa;b\n", r"`kf-calib record \S*named_recorded.mcap \S*named.mcap`"),
+        ("x.mcap.zstd", b"\x28\xb5\x2f\xfd....", r"`zstd -d \S*x.mcap.zstd -o OUT.mcap`"),
+        ("other", b"\0\1\2" * 9, "its first bytes differ"),
+    ],
+)
+def test_other_files_say_what_to_do(tmp_path: Path, name: str, content: bytes, says: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=says):
+        Recording(tmp_path / name)
+
+
+def test_an_empty_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"holds no \.mcap file"):
+        Recording(tmp_path)
