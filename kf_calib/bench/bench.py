@@ -158,7 +158,7 @@ class Bench:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str], has_angles: bool = True) -> Bench:
-        """The bench from the strings of a metadata record (FORMAT.md), or from options of the same names."""
+        """The bench from the strings of a metadata record (docs/format.md), or from options of the same names."""
         from kf_calib.bench.keys import FREE_TEXT, NUMBERS, known
 
         given = known(metadata)

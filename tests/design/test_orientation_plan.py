@@ -5,13 +5,11 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import re
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.paths import ROOT
 from helpers.synthetic import Run
 
 from kf_calib.bench import paper_parameters
@@ -363,19 +361,3 @@ def test_a_plan_says_where_it_leaves_little_to_go_by(run) -> None:
     assert any("times worse than by as many dwells in directions that are spread" in said for said in narrow)
     plenty = json.loads(run("plan", "--count", 12, "--json")[1])["remarks"]
     assert not any("left over" in said or "times worse" in said for said in plenty)
-
-
-def test_the_readme_shows_what_the_command_prints(run) -> None:
-    text = (ROOT / "README.md").read_text()
-    shown = text[text.index("$ kf-calib plan --count 4") :].split("```")[0]
-    line, _, body = shown.partition("\n")
-    code, out, _ = run(*line.split()[2:])
-    printed = " ".join(out.split())
-    assert code == 0
-    for part in body.split("\n...\n"):
-        assert " ".join(_without_angles(part)) in " ".join(_without_angles(printed))
-
-
-def _without_angles(text: str) -> list[str]:
-    """Of a plan that is one of many as good: without its angles, times and directions."""
-    return re.sub(r"\[?[+-]?\d+\.\d+\]? ?|\d+ s\b|│ +\d+ │ +\d+ │", "#", " ".join(text.split())).split()

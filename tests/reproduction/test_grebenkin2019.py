@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.paths import ROOT
 from helpers.synthetic import NOMINAL, sensitivities
 from scipy.spatial.transform import Rotation
 
@@ -20,7 +19,6 @@ from kf_calib.estimation.prior import PRIORS
 from kf_calib.reproduction import grebenkin2019, grebenkin2019_conditions
 from kf_calib.reproduction.grebenkin2019 import NONOPTIMAL_PRINTED, OPTIMAL_PRINTED, Conditions
 from kf_calib.views import paper as views
-from kf_calib.views.console import plain
 
 ANGLES = np.array([0.01, 0.3, 1.1, 0.0, 0.2, 0.3, 0.9, 0.0, 0.02, -1.4, 1.05, 0.0])
 """Away from the nominal, where several misprints happen to vanish."""
@@ -292,13 +290,3 @@ def test_bad_usage_is_one_sentence(words: list[object], says: str) -> None:
     done = command(*words)
     assert (done.returncode, done.stdout) == (2, "")
     assert says in done.stderr and done.stderr.count("\n") == 1
-
-
-def test_readme_shows_what_the_command_prints(
-    found: grebenkin2019.Experiment, searched: grebenkin2019_conditions.ConditionSearch
-) -> None:
-    """Pages break long lines where they like."""
-    readme = (ROOT / "README.md").read_text()
-    shown = readme.split("$ kf-calib paper\n")[1].split("\n```")[0]
-    printed = plain(views.paper_report(found, searched))
-    assert shown.split() == printed.split()

@@ -1,4 +1,4 @@
-"""Batches from CSV lines (FORMAT.md): a header that names quantity and unit, then rows; an empty cell: not measured."""
+"""Batches from CSV lines (docs/format.md): a header that names quantity and unit, then rows; empty: not measured."""
 
 from __future__ import annotations
 

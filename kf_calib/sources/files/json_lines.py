@@ -1,4 +1,4 @@
-"""Batches from JSON lines (FORMAT.md): one object a line, readings and poses together or on lines of their own."""
+"""Batches from JSON lines (docs/format.md): one object a line, readings and poses together or on lines of their own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lines of JSON or CSV, from a file or live from a stream, as a source of batches (FORMAT.md, "Lines").
+"""Lines of JSON or CSV, from a file or live from a stream, as a source of batches (docs/format.md, "Lines").
 
 The first line that is not empty decides: ``{`` or ``[`` begins JSON lines, anything else is the header of a CSV table.
 Bytes are taken as they arrive and cut into lines here; memory is that of one block and one line, whatever comes.

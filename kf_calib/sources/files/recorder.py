@@ -1,4 +1,4 @@
-"""Writes batches to an MCAP recording (FORMAT.md) that survives its writer being killed at any moment."""
+"""Writes batches to an MCAP recording (docs/format.md) that survives its writer being killed at any moment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recording (MCAP files, FORMAT.md) as a source of batches, one a chunk.
+"""A recording (MCAP files, docs/format.md) as a source of batches, one a chunk.
 
 Topics are found by their schema. What is whole in a damaged or unfinished file is used, what is lost is told in
 ``warnings``. Sample time is ``header.stamp``. Memory is that of a few chunks, however long the recording.
@@ -42,7 +42,7 @@ class Recording:
     """A recording as a ``Source``: iterating reads it from its start.
 
     path: a file, or the folder of a ROS 2 bag, whose files follow each other. overrides: bench metadata keys
-    (FORMAT.md) that win over those in the file.
+    (docs/format.md) that win over those in the file.
     accel_scale: factor on the readings, one for all or one a sensor (9.80665 for a file in g). angle_scale: factor on
     the gimbal angles (0.017453 for a file in degrees).
     accel_topic, pose_topic, temperature_topic: which to use where the file has several of the kind.
