@@ -44,6 +44,7 @@ LEVELS = [
     ["live"],
     ["views"],
     ["cli"],
+    ["__main__"],
 ]
 LEVEL = {name: k for k, names in enumerate(LEVELS) for name in names}
 
