@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import rich_click as click
+from click import get_current_context  # rich_click declares that there may be none
 
 from kf_calib.cli.echo import complain, echo
 from kf_calib.cli.files import OutputFile, claimed, delivery
@@ -30,7 +31,7 @@ from kf_calib.cli.options import (
 )
 from kf_calib.cli.signals import answered, interrupt
 from kf_calib.errors import InputError
-from kf_calib.support.output_files import Outputs
+from kf_calib.support.output_files import Outputs, write_whole
 from kf_calib.support.plain_text import sentence
 
 if TYPE_CHECKING:
@@ -256,14 +257,52 @@ def pair(text: str) -> tuple[str, str]:
     return theirs, ours
 
 
-@click.command(epilog=examples("demo", "demo somewhere"))
-@click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default="out")
+def _folder() -> str:
+    return "recordings" if get_current_context().params["tutorial"] else "out"
+
+
+@click.command(epilog=examples("demo", "demo somewhere", "demo --tutorial"))
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default=_folder)
+@click.option(
+    "--tutorial", is_flag=True, is_eager=True, help="Instead, copy the recordings of the tutorial to FOLDER."
+)
 @json_option
-def demo(folder: Path, as_json: bool) -> None:
+def demo(folder: Path, tutorial: bool, as_json: bool) -> None:
     """The main job on a simulated run: record, replay, compare with least squares, save the view; files in FOLDER.
 
-    Files of an earlier demo there are replaced.
+    FOLDER is "out" where you name none, with --tutorial "recordings". Files of an earlier demo there are replaced.
     """
+    if tutorial:
+        _copy_recordings(folder, as_json)
+    else:
+        _do_main_job(folder, as_json)
+
+
+def _copy_recordings(folder: Path, as_json: bool) -> None:
+    """The recordings that come with the package, and their truths; those that are in the folder already stay."""
+    from importlib.resources import files
+
+    own = {
+        folder / file.name: file.read_bytes()
+        for file in sorted(files("kf_calib").joinpath("recordings").iterdir(), key=lambda file: file.name)
+        if file.name.endswith((".mcap", ".json"))
+    }
+    for path, content in own.items():
+        if path.exists() and path.read_bytes() != content:
+            raise InputError(f"{path} is there, and is not the tutorial's: move it away, or name another FOLDER.")
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, content in own.items():
+        if not path.exists():
+            write_whole(path, content)
+    recordings = [str(path) for path in own if path.suffix == ".mcap"]
+    if as_json:
+        print_json({"recordings": recordings})
+    else:
+        echo(f"{', '.join(recordings)}: there, each with its truth beside it.")
+        echo(f"Begin with: kf-calib replay {folder / 'hidden.mcap'}")
+
+
+def _do_main_job(folder: Path, as_json: bool) -> None:
     from rich.console import Group
 
     from kf_calib.estimation.calibration import calibrate
@@ -300,4 +339,15 @@ def demo(folder: Path, as_json: bool) -> None:
     with delivery(outputs, as_json) as deliver, progress("saving the view", as_json):
         kept = deliver.keep(rrd, lambda path: save_view(result, path))
     if kept:
-        say(f"View: {rrd} (open it with .venv/bin/rerun {rrd}).")
+        say(f"View: {rrd} (open it with {_viewer()} {rrd}).")
+
+
+def _viewer() -> str:
+    """The Rerun viewer that came with this program, as one types it in this folder."""
+    place, folder = Path(sys.executable).parent, Path.cwd()
+    if found := shutil.which("rerun", path=str(place)):
+        if place.is_relative_to(folder):
+            return str(Path(found).relative_to(folder))
+        if shutil.which("rerun") != found:
+            return found
+    return "rerun"
