@@ -21,6 +21,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+_ENVIRONMENT = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
 RUN = ("--dwell-s", "5", "--sample-hz", "20", "--angle-hz", "5")
 
 
@@ -44,7 +45,7 @@ def cost(command: list[str], runs: int) -> Cost:
     found = list[Cost]()
     for _ in range(runs):
         begin = time.perf_counter()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=_ENVIRONMENT)
         _, status, used = os.wait4(process.pid, 0)
         if status:
             raise SystemExit(f"{' '.join(command)} ended with {status}")
