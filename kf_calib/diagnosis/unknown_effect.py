@@ -19,13 +19,12 @@ from kf_calib.effects.formula import formula
 from kf_calib.errors import InputError
 from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.results import consistency
-from kf_calib.estimation.score_test import Frame, batches
+from kf_calib.estimation.score_test import Frame, batches, columns_at_once
 from kf_calib.support import stage
 
 _CHANCE = 1e-4  # of a family to fall as much where nothing is missing: there are about a hundred
 _WITHIN = 0.01  # of trends within dwells
 _SAME = 0.99  # cosine above which a formula is a known effect
-_TOGETHER = 24  # columns of families that are tried at a time
 _DECAYS_S = (10, 30, 100, 300)
 _JUMPS = 100  # at most
 
@@ -168,7 +167,9 @@ def _tried(fitted: Fit, frame: Frame, others: Sequence[Effect]) -> list[Family]:
             tried.append((driver, texts, [*own]))
     stage.say(f"trying {sum(len(texts) for _, texts, _ in tried)} formulas")
     out, known = list[Family](), len(frame.effects) + len(others)
-    for part in batches([sum(len(each.coefficients) for each in effects) for _, _, effects in tried], _TOGETHER):
+    for part in batches(
+        [sum(len(each.coefficients) for each in effects) for _, _, effects in tried], columns_at_once(fitted.carried)
+    ):
         some = [tried[k] for k in part]
         scanned = frame.scan(fitted.carried, [*others, *(effect for _, _, effects in some for effect in effects)])
         beside, left = scanned.candidates[:known], iter(scanned.candidates[known:])

@@ -34,7 +34,8 @@ _SEEN = 1e-6
 _SAME = 1.0 - 1e-6
 """Cosine above which two directions are one."""
 
-_TOGETHER = 24  # columns that are whitened at a time: memory stays that of the result
+_TOGETHER = 24  # columns, at least, that are whitened at a time: memory stays that of the result
+_CELLS = 10_000  # columns times dwells that are whitened at a time, where that is more
 _OF_ONE_KIND = 400  # the same of many effects of one kind
 _MANY = 100  # oscillations, of which a periodogram is quicker
 
@@ -273,12 +274,17 @@ def whiten_model(
 def whitened_columns(carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats | None = None) -> Floats:
     """G (m, q) of ``whiten``, some effects at a time: it takes no more memory than the result."""
     sizes, out, first = [len(effect.coefficients) for effect in effects], np.zeros((0, 0)), 0
-    for part in batches(sizes, _TOGETHER) or [[]]:
+    for part in batches(sizes, columns_at_once(carried)) or [[]]:
         rows, width = whiten_model(carried, noise, [effects[k] for k in part], state)
         out = out if len(out) else np.empty((len(rows), sum(sizes)))
         count = rows.shape[1] - width - 1
         out[:, first : first + count], first = rows[:, width:-1], first + count
     return out
+
+
+def columns_at_once(carried: Carried) -> int:
+    """How many columns are whitened at a time: more of few dwells, for which calls cost more than what they do."""
+    return max(_TOGETHER, _CELLS // len(carried.dwells))
 
 
 def batches(sizes: Sequence[int], columns: int) -> list[list[int]]:
