@@ -78,10 +78,15 @@ def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> li
 
 
 def candidate_columns(
-    dwells: Sequence[DwellFactor], effects: Sequence[Effect], bench: Bench, state: Floats
+    dwells: Sequence[DwellFactor],
+    effects: Sequence[Effect],
+    bench: Bench,
+    state: Floats,
+    stimulus: Stimulus | None = None,
 ) -> list[Floats]:
-    """Columns of effects that are in no model yet, like ``columns_of``."""
-    return _by_dwell(dwells, lambda s: effect_columns(effects, s), stimulus_of(dwells, bench, state))
+    """Columns of effects that are in no model yet, like ``columns_of``; stimulus: of these dwells, if known."""
+    stimulus = stimulus or stimulus_of(dwells, bench, state)
+    return _by_dwell(dwells, lambda s: effect_columns(effects, s), stimulus)
 
 
 def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> list[Floats]:

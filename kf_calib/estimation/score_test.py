@@ -21,9 +21,9 @@ from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.dwells.line_spectrum import Line
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
-from kf_calib.effects import Effect
+from kf_calib.effects import Effect, Stimulus
 from kf_calib.estimation import random_walk, square_root_information
-from kf_calib.estimation.dwell_columns import Carried, candidate_columns
+from kf_calib.estimation.dwell_columns import Carried, candidate_columns, stimulus_of
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise, steps
 from kf_calib.estimation.periodogram import Periodogram
@@ -116,7 +116,10 @@ class Frame:
     def __init__(self, carried: Carried, noise: Noise, effects: Sequence[Effect]) -> None:
         self.dwells, self.noise, self.state, self.effects = carried.dwells, noise, carried.state, list(effects)
         self.parts = _parts(effects)
-        self.basis, self.coordinates = orthonormal(whitened_columns(carried, noise, effects))
+        self._stimulus = stimulus_of(carried.dwells, carried.model.bench, carried.state)
+        self.basis, self.coordinates = orthonormal(
+            whitened_columns(carried, noise, effects, carried.state, self._stimulus)
+        )
         self._periodogram: Periodogram | None = None
         self._lines: dict[float, tuple[Line, ...]] = {}
         self._last: tuple[Carried, Floats, Floats, int] | None = None
@@ -151,7 +154,7 @@ class Frame:
         """Those of the effects that the model carried does not have, and ``more`` behind them, beside that model."""
         kept = [k for k, effect in enumerate(self.effects) if str(effect) not in carried.model.parts]
         inside, outside, width = self._model(carried)
-        more_inside, more_outside = self._split(whitened_columns(carried, self.noise, more, self.state))
+        more_inside, more_outside = self._split(whitened_columns(carried, self.noise, more, self.state, self._stimulus))
         beside = square_root_information.accumulate([np.hstack([outside[:, :-1], more_outside, outside[:, -1:]])])
         own = [self.coordinates[:, self.parts[k]] for k in kept]
         count = sum(each.shape[1] for each in own)
@@ -171,7 +174,7 @@ class Frame:
         """[H | W | z] of a model in the frame and beside it, and how many columns come before z; kept for the next
         scan beside the same."""
         if self._last is None or self._last[0] is not carried:
-            rows, width = whiten_model(carried, self.noise, [], self.state)
+            rows, width = whiten_model(carried, self.noise, [], self.state, self._stimulus)
             self._last = carried, *self._split(rows), width
         return self._last[1:]
 
@@ -260,22 +263,29 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
 
 
 def whiten_model(
-    carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats | None = None
+    carried: Carried,
+    noise: Noise,
+    effects: Sequence[Effect],
+    state: Floats | None = None,
+    stimulus: Stimulus | None = None,
 ) -> tuple[Floats, int]:
     """Rows [H | W | G | z] (m, c) of unit noise of the model carried and of ``effects``, and how many columns come
-    before G. state: where rotations and input axes are linearised, other than where the model is."""
+    before G. state: where rotations and input axes are linearised, other than where the model is; stimulus: of the
+    dwells there, where it is known."""
     at, dwells = carried.state if state is None else state, carried.dwells
-    added = candidate_columns(dwells, effects, carried.model.bench, at)
+    added = candidate_columns(dwells, effects, carried.model.bench, at, stimulus)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
     rows, width = _judged(dwells, columns, noise, at, carried.model.count)
     return _stacked(rows, dwells, noise), width
 
 
-def whitened_columns(carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats | None = None) -> Floats:
-    """G (m, q) of ``whiten``, some effects at a time: it takes no more memory than the result."""
+def whitened_columns(
+    carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats, stimulus: Stimulus
+) -> Floats:
+    """G (m, q) of ``whiten_model``, some effects at a time: it takes no more memory than the result."""
     sizes, out, first = [len(effect.coefficients) for effect in effects], np.zeros((0, 0)), 0
     for part in batches(sizes, columns_at_once(carried)) or [[]]:
-        rows, width = whiten_model(carried, noise, [effects[k] for k in part], state)
+        rows, width = whiten_model(carried, noise, [effects[k] for k in part], state, stimulus)
         out = out if len(out) else np.empty((len(rows), sum(sizes)))
         count = rows.shape[1] - width - 1
         out[:, first : first + count], first = rows[:, width:-1], first + count
