@@ -245,7 +245,7 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
 
     Nothing else is asked of them, so the rows are not folded: of n columns in d rows that takes d n, not d n^2.
     """
-    if effects[0].oscillates and len(effects) > _MANY and not carried.carrier_hz:
+    if effects[0].oscillates and len(effects) > _MANY:
         rows, width = _judged(carried.dwells, carried.columns, noise, carried.state, carried.model.count)
         own = np.concatenate(rows[len(rows) - len(carried.dwells) :])[:, _inside(noise) :]
         many = Periodogram(carried, noise, effects[0], np.array([effect.value for effect in effects]))
