@@ -285,11 +285,25 @@ def whitened_columns(
     """G (m, q) of ``whiten_model``, some effects at a time: it takes no more memory than the result."""
     sizes, out, first = [len(effect.coefficients) for effect in effects], np.zeros((0, 0)), 0
     for part in batches(sizes, columns_at_once(carried)) or [[]]:
-        rows, width = whiten_model(carried, noise, [effects[k] for k in part], state, stimulus)
-        out = out if len(out) else np.empty((len(rows), sum(sizes)))
-        count = rows.shape[1] - width - 1
-        out[:, first : first + count], first = rows[:, width:-1], first + count
+        own = _columns_of_some(carried, noise, [effects[k] for k in part], state, stimulus)
+        out = out if len(out) else np.empty((len(own), sum(sizes)))
+        out[:, first : first + own.shape[1]], first = own, first + own.shape[1]
     return out
+
+
+def _columns_of_some(
+    carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats, stimulus: Stimulus
+) -> Floats:
+    dwells, bench = carried.dwells, carried.model.bench
+    added = candidate_columns(dwells, effects, bench, state, stimulus)
+    if not _inside(noise):
+        return square_root_information.misfit_columns(dwells, added, noise, state)
+    # a walk is whitened by the columns of the biases, which are among the twelve
+    both = [
+        np.concatenate([own[..., :STATE_COUNT], more], axis=3) for own, more in zip(carried.columns, added, strict=True)
+    ]
+    rows, width = _judged(dwells, both, noise, state, STATE_COUNT)
+    return _stacked(rows, dwells, noise)[:, width:-1]
 
 
 def columns_at_once(carried: Carried) -> int:

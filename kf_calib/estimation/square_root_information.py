@@ -151,6 +151,14 @@ def misfit_rows(
     return [prior, *whiten(dwells, both, noise, state, flicker_mps2=flicker, reduced=reduced)], width + len(sigma)
 
 
+def misfit_columns(dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats) -> Floats:
+    """G (m, q) alone of ``misfit_rows``, all its rows, for a noise in which the biases do not walk."""
+    count = len(slow_scatter(dwells, noise)[1])
+    flicker = flicker_sigma(noise, len(dwells)) if count else None
+    rows = whiten(dwells, columns, noise, state, flicker_mps2=flicker, reduced=False)
+    return np.concatenate([np.zeros((count, columns[0].shape[3])), *(own[:, :-1] for own in rows)])
+
+
 def _waves(dwell: DwellFactor) -> Floats:
     """sqrt(2) cos(pi k t / T) over a dwell of length T, (pieces, nodes, k)."""
     at = np.array([piece.nodes.elapsed_s for piece in dwell.pieces]) - dwell.start_s
