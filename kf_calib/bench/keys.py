@@ -59,7 +59,7 @@ def _nominal(value: Any) -> dict[str, float]:
         raise ValueError("it must be a valid dictionary")
     out = dict[str, float]()
     for symbol, size in value.items():
-        place = cut(str(symbol), 100)
+        place = cut(repr(symbol)[1:-1] if isinstance(symbol, str) else str(symbol), 100)  # no line ends in it
         if symbol not in paper_parameters.SYMBOLS:
             raise ValueError(f"{place}: it is unknown")
         try:

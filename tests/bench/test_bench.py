@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -176,6 +176,7 @@ JSON_VALUES = st.recursive(
 
 
 @settings(max_examples=1500, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+@example({"nominal": {"\n": None}})
 @given(st.dictionaries(st.sampled_from(sorted(KEYS)), JSON_VALUES | st.sampled_from(["y z x", "9.81", "1,2,3", "z"])))
 def test_whatever_values_say_is_a_bench_or_a_sentence(values: dict[str, object]) -> None:
     """As they come in a recording (text), in JSON or TOML (made text), and from Python."""
