@@ -54,9 +54,10 @@ def rival_margin(dof: int, tried: int = 1) -> float:
 
 
 def margin_of(candidate: Candidate | None) -> float:
-    """The margin of ``rival_margin`` for a candidate, with one more degree of freedom for a constant that was searched.
+    """The margin of ``rival_margin`` for a candidate.
 
-    None stands for a random walk or a spectral line, which has one number.
+    A constant that was searched counts as one more degree of freedom. None stands for a random walk or a spectral line,
+    which has one degree of freedom.
     """
     if candidate is None:
         return rival_margin(1)
@@ -104,10 +105,7 @@ class CandidateTests:
 
     @property
     def p_value(self) -> float | None:
-        """The p-value of the run: the smallest of those of the misfit, effects, lines and trends, each at its share.
-
-        None where nothing could be tested.
-        """
+        """The p-value of the run: the smallest of all tests, each at its share; None where nothing could be tested."""
         found = [*self.p_values.values(), *([self.misfit_p] if self.misfit_p is not None else [])]
         found += [self.trend.p_value * SHARE / REST] if self.trend else []
         return min(1.0, min(found) / SHARE) if found else None
@@ -140,8 +138,8 @@ class CandidateTests:
     def nearness(self, name: str) -> float:
         """The score of an effect for comparison with its rivals.
 
-        A search over many values of a constant raises the threshold against chance. That part of the threshold is not
-        charged here, since it says nothing against the effect beside another.
+        It leaves out what a search over many values of a constant adds to the threshold: that part guards against
+        chance, and says nothing against the effect in comparison with another.
         """
         if name not in self.best:
             return self.scores[name]
@@ -153,7 +151,7 @@ class CandidateTests:
         ahead, out = margin_of(self.candidate(first) if first in self.best else None), list[str]()
         for name in self.ranked:
             behind = self.scores[first] - self.nearness(name)
-            # fewer coefficients, and so a lower threshold, make no rival: chi-squared itself has to come near
+            # an effect is no rival just because it has fewer coefficients: chi-squared itself has to come near
             if first in self.best and name in self.best:
                 falls = (float(self.scan.statistics[self.best[each]]) for each in (first, name))
                 behind = max(behind, next(falls) - next(falls))
@@ -176,10 +174,7 @@ class CandidateTests:
 
 
 def candidates(model: Model) -> list[Effect]:
-    """The effects of the catalogue that are not in the model; those with a constant once for each value of a grid.
-
-    Effects that show only in slews, random walks and oscillations are left out: they are tested by other means.
-    """
+    """Effects of the catalogue that are not in the model and can be scanned, at each value of a grid of a constant."""
     inside, out = {str(effect) for effect in model.effects}, list[Effect]()
     for name in names(model.bench):
         effect = effect_named(name, model.bench)
@@ -231,10 +226,7 @@ def assess_candidates(
 
 
 def candidate_frame(fitted: Fit, frames: list[Frame]) -> Frame:
-    """The frame of the columns of all candidates, in the noise of a fit; taken from ``frames`` if one there serves.
-
-    A frame that has to be made replaces those in ``frames``.
-    """
+    """The frame of the columns of all candidates in the noise of a fit: one of ``frames``, or a new one put there."""
     carried, noise = fitted.carried, fitted.noise.judging
     for known in frames:
         if known.serves(carried, noise):
@@ -265,11 +257,7 @@ def _oscillation(model: Model) -> Effect | None:
 
 
 def slow_hz(fitted: Fit, effect: Effect) -> Floats:
-    """Frequencies of oscillations that are too slow to show within dwells, Hz.
-
-    They begin at one cycle per run, go up in steps of half a cycle per run, and end below the frequencies at which
-    oscillations within dwells are searched.
-    """
+    """Frequencies (Hz) of oscillations too slow to show within dwells: from one cycle per run in half-cycle steps."""
     stimulus = stimulus_of(fitted.dwells, fitted.carried.model.bench, fitted.carried.state)
     values = effect.grid(stimulus)[2::2]
     return values[values < min(_searched_hz(fitted.dwells))]
@@ -409,7 +397,7 @@ def evidence_as_fall(found: Scan, own: Sequence[int], falls: Floats) -> float:
 
 
 def joint_evidence_as_fall(found: Scan, own: Sequence[int]) -> float:
-    """The same for several effects together, each at the one best value of its constant."""
+    """The Bayes factor of several effects together, as a fall of chi-squared, each at one value of its constant."""
     each = [found.candidates[k] for k in own]
     fall, dof = found.explained(np.concatenate([one.basis for one in each], axis=1))
     tried = int(np.prod([max(_values(found, one), one.tried) for one in each]))

@@ -181,9 +181,9 @@ def _or_walk(found: Diagnosis) -> Diagnosis:
 
 
 def _beside_lines(found: Diagnosis) -> Diagnosis | None:
-    """Return the diagnosis beside the oscillation that makes the lines, or None where it explains the misfit alone.
+    """Return a diagnosis of what is left beside the oscillation that makes the lines, or None where nothing is named.
 
-    An oscillation of lines has no column in the scan, so that ``candidate_pairs`` cannot find such pairs.
+    That oscillation has no columns in the scan, so that ``candidate_pairs`` cannot find it in a pair.
     """
     test = found.test
     if not test.oscillating:
@@ -222,11 +222,7 @@ def _is_outdone(found: Diagnosis, suspect: Suspect) -> bool:
 
 
 def _one(found: Diagnosis, first: Suspect | None, pairs: Pairs) -> Diagnosis:
-    """Return the diagnosis with one effect, and with all look-alikes and pairs that explain as much.
-
-    first: the suspect that explains the misfit. None: a formula that is not a known effect explains it better than
-    every suspect, so that the effect is unknown.
-    """
+    """Return the diagnosis with one effect, its look-alikes and pairs that explain as much; None stands for unknown."""
     test = found.test
     if first is None:
         return replace(found, unknown=True)
@@ -255,10 +251,7 @@ def _beside(found: Diagnosis, together: Sequence[tuple[str, str]]) -> Diagnosis:
 
 
 def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool:
-    """Tell whether a formula explains the misfit clearly better than these effects at the constants found for them.
-
-    Formulas that equal known effects do not count, since they would not make the effect unknown.
-    """
+    """Tell whether a formula, other than a known effect, explains the misfit clearly better than these effects do."""
     fitted, tests = found.before.fit, found.test.effective_tests
     effects = [effect for effect in refit.model.effects if str(effect) in names and not effect.walks]
     scanned = scan(fitted.carried, fitted.noise.judging, effects)
@@ -274,10 +267,9 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
 
 
 def _refits_compare(found: Diagnosis, names: Sequence[str]) -> bool:
-    """Tell whether the chi-squared of refits may be compared, because all of them are judged by the same noise.
+    """Tell whether all refits are judged by the same noise, so that their chi-squared may be compared.
 
-    The comparison is needed for large effects: the scan is linear, and its prediction of the fall of chi-squared may be
-    wrong by much more than the noise.
+    For large effects this is better than the scan, which is linear and may be wrong by much more than the noise.
     """
     return dwell_noise_is_stated(found.before) and all(name in found.test.best for name in names)
 

@@ -12,8 +12,8 @@
     [options]                               # those given on the command line; a replay uses them again
     angle_sigma_deg = "0.002"
 
-    [sha256]                                # fingerprints of the Python files under effects_from; a replay asks before
-it runs them     "/home/me/my_effects.py" = "9c1a..."
+    [sha256]                                # of the Python files under effects_from; a replay asks before it runs them
+    "/home/me/my_effects.py" = "9c1a..."
 
     [start]                                 # figures of the first model in SI, with all digits
     held_out_rms_mps2 = 1.4e-5

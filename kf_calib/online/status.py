@@ -80,7 +80,7 @@ class Look:
         return _look(result, watch, self) if self._is_due(result, watch) else self
 
     def _is_due(self, result: Calibration, watch: Watch | None) -> bool:
-        """Tell whether a new look may differ: the run has grown, or the model, the alarm or the advice has changed."""
+        """Tell whether a new look is due: run, model or alarm has changed, or a diagnosis needs to be confirmed."""
         before = self.result
         if len(result.visits) >= _GROWN * len(before.visits) or result.settings.effects != before.settings.effects:
             return True

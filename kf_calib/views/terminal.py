@@ -1,4 +1,4 @@
-"""The Rich console that results are drawn on: what it draws is text, and nothing in it reaches the terminal as more."""
+"""The Rich console on which results are drawn: control characters in a text never reach the terminal as commands."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kf_calib.support.plain_text import printable, sentence
 
 
 class PlainConsole(Console):
-    """Reads no markup in what it is given, and draws characters that command a terminal as their codes."""
+    """A console that reads no markup in its text, and shows control characters as their codes."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, **settings)
@@ -24,5 +24,5 @@ class PlainConsole(Console):
 
 
 def note(said: str) -> Text:
-    """What is worth knowing beside a result, in a line of its own."""
+    """A remark beside a result, on a line of its own."""
     return Text(f"Note: {sentence(said)}", style="yellow")
