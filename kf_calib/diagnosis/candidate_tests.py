@@ -127,12 +127,12 @@ class CandidateTests:
 
     @cached_property
     def invisible(self) -> list[str]:
-        """Effects that these orientations cannot show, those that only slews could show, and unsearched frequencies."""
+        """Effects invisible in these orientations, effects of slews only, and oscillations at untested frequencies."""
         return [*self.unseen, *([self.between] if self.between else [])]
 
     @cached_property
     def unseen(self) -> list[str]:
-        """Effects that this run cannot show at all: those invisible in these orientations, and those of slews only."""
+        """Effects of which the run shows nothing: those invisible in these orientations, and those of slews only."""
         return [*(name for name, k in self.best.items() if not self.scan.candidates[k].dof), *self.in_slews_only]
 
     def nearness(self, name: str) -> float:
@@ -252,6 +252,7 @@ def _scanned(fitted: Fit, frame: Frame) -> Scan:
 
 
 def _oscillation(model: Model) -> Effect | None:
+    """Return the effect of the catalogue that oscillates, or None."""
     every = (effect_named(name, model.bench) for name in names(model.bench))
     return next((effect for effect in every if effect.oscillates), None)
 
@@ -320,8 +321,7 @@ def threshold(dof: int, tests: float) -> float:
 def independent_tests(found: Scan, seed: int = 0) -> float:
     """The effective number of independent tests that the correlated tests of all candidates amount to.
 
-    It is n for which n independent tests have the 1 % quantile of the smallest p-value that these tests have in runs
-    with noise alone.
+    It is n = 0.01 / q, where q is the 1 % quantile of the smallest p-value of these tests in runs with noise alone.
     """
     seen = np.flatnonzero([each.dof for each in found.candidates])
     if not len(seen):
@@ -330,7 +330,7 @@ def independent_tests(found: Scan, seed: int = 0) -> float:
 
 
 def run_level(p_value: float, tests: float) -> float:
-    """The family-wise p-value of a test: the chance 1 - (1 - p)^n that any of n independent tests shows p (Šidák)."""
+    """The family-wise p-value 1 - (1 - p)^n: the chance that any of n independent tests gives p or less (Šidák)."""
     return float(-np.expm1(tests * np.log1p(-min(p_value, 1.0 - 1e-16))))
 
 
@@ -373,10 +373,11 @@ def _beside_best(found: Scan, scores: Mapping[str, float], tests: float) -> floa
 
 
 def walk_path_margin(found: Scan, own: Sequence[int], falls: Floats, score: float, tests: float) -> float:
-    """The addition to the score of a random walk with which it is compared fairly with another effect (``paths``).
+    """What is added to the score of a random walk so that it compares fairly with another effect.
 
     own: numbers of the candidates of the other effect. falls: fall of chi-squared of each of them. score: the score of
-    the best of them. Both are counted beside a further effect where the walk is. tests: effective number of tests.
+    the best of them. Where the walk is tested beside a further effect, falls and score are counted beside it, too.
+    tests: effective number of independent tests.
     """
     return score + threshold(1, tests) - evidence_as_fall(found, own, falls)
 
@@ -405,4 +406,5 @@ def joint_evidence_as_fall(found: Scan, own: Sequence[int]) -> float:
 
 
 def _values(found: Scan, candidate: Candidate) -> int:
+    """Return the number of values of its constant at which the effect of a candidate was scanned."""
     return sum(str(other.effect) == str(candidate.effect) for other in found.candidates)

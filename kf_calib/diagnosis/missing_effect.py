@@ -96,7 +96,7 @@ def _diagnosed(before: Calibration) -> Diagnosis:
 
 
 def _explained(before: Calibration, test: CandidateTests) -> Diagnosis:
-    """Return the diagnosis by the tests: one effect or two with their look-alikes, or none."""
+    """Return the diagnosis by these tests: one effect or two with their look-alikes, unknown, or nothing missing."""
     found = _or_walk(_likeliest(before, test))
     if test.consistent is not False or dwell_noise_is_stated(before):
         return found
@@ -169,7 +169,7 @@ def _clearly_better(found: Diagnosis, pairs: Pairs, first: str) -> Pairs:
 
 
 def _or_walk(found: Diagnosis) -> Diagnosis:
-    """Return the diagnosis with a random walk in the ambiguity set where the dwells are too few for the F-test."""
+    """Return the diagnosis with a random walk as a look-alike where the named effects fail the F-test."""
     model = found.before.fit.carried.model
     walk = walk_named(model.bench)
     if not walk or not found.missing or model.walks or walk in found.ambiguity:
@@ -222,7 +222,7 @@ def _is_outdone(found: Diagnosis, suspect: Suspect) -> bool:
 
 
 def _one(found: Diagnosis, first: Suspect | None, pairs: Pairs) -> Diagnosis:
-    """Return the diagnosis with one effect, its look-alikes and pairs that explain as much; None stands for unknown."""
+    """Return the diagnosis with the effect ``first``, its look-alikes and equally good pairs; unknown if it is None."""
     test = found.test
     if first is None:
         return replace(found, unknown=True)
@@ -289,7 +289,7 @@ def _left(found: Diagnosis, refit: Calibration, names: Sequence[str], dof: int =
 
 
 def _formulas(found: Diagnosis) -> list[tuple[float, Family]]:
-    """Return the formulas that are no known effects, each with its fall of chi-squared less its threshold."""
+    """Return the formulas that are no known effects, each with its fall of chi-squared less its threshold, in order."""
     test = found.test
     known = [test.candidate(name).effect for name in test.best]
     fitted = found.before.fit
@@ -319,10 +319,11 @@ def _walks_not(found: Diagnosis, first: Suspect) -> bool:
 
 
 def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:
-    """Return the diagnosis with the likeliest pair of effects that fits the run, or None if there is none.
+    """Return the diagnosis with the likeliest pair of effects that fits the run, or None.
 
-    alone: a single effect that also explains the misfit, if clearly less well. If it is a random walk, which can take
-    any path, it stays in the ambiguity set.
+    It is None where no pair fits, or where a formula explains clearly more than the pair. alone: a single effect that
+    also explains the misfit, if clearly less well. If it is a random walk, which can take any path, it stays in the
+    ambiguity set.
     """
     test = found.test
     for pair in likeliest_pairs(test, pairs):

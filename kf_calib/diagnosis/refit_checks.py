@@ -68,7 +68,7 @@ def _no_walk(refit: Calibration) -> bool:
 def restoring_time_s(found: Diagnosis) -> float | None:
     """The time constant of a drift that returns, in s, where that explains the run better than the random walk named.
 
-    None where no walk was named, or where the gain is smaller than 1 of 20 true random walks shows (5 %).
+    None where no walk was named, or where the gain in likelihood is below what 1 of 20 true random walks exceeds.
     """
     if found.after is None or not found.after.noise.walk_mps2_per_sqrt_s or found.test.walking not in found.missing:
         return None

@@ -103,7 +103,7 @@ def _beyond_linear(before: Calibration, test: CandidateTests, columns: Sequence[
 
 
 def passes_f_test(before: Calibration, test: CandidateTests, names: Sequence[str]) -> bool:
-    """Whether effects explain significantly more than they would of irregular changes from dwell to dwell, of any size.
+    """Whether effects explain significantly more than they would of irregular changes from dwell to dwell of any size.
 
     F = (fall / q) / (rest / (dof - q)) with q coefficients. A common factor in the variance from dwell to dwell enters
     the fall and the rest of chi-squared alike and cancels. With few dwells the test has little power. Effects that show
@@ -148,6 +148,7 @@ def least_noisy(refits: Iterable[Calibration]) -> Calibration | None:
     """The fit with the least noise, by the determinants of the covariances of its dwell means, or None."""
 
     def size(refit: Calibration) -> float:
+        """Return the log determinant of the covariances of all dwell means."""
         covariances = mean_covariances(refit.noise, refit.carried.means, refit.carried.state)
         return float(np.linalg.slogdet(covariances)[1].sum())
 

@@ -199,6 +199,7 @@ def read(path: Path) -> Journal:
 
 
 def _choice(step: _Step) -> Choice:
+    """Return the choice that an entry of a journal records."""
     return Choice(step.get("added"), tuple(each["name"] for each in step["dropped"]), step["by"], step["figures"])
 
 
@@ -227,6 +228,7 @@ def _difference(one: Mapping[str, float], other: Mapping[str, float]) -> float:
 
 
 def _version() -> str:
+    """Return the version of this program."""
     from importlib.metadata import version
 
     return version("kf_calib")
