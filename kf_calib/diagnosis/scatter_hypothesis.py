@@ -103,7 +103,7 @@ def _beyond_linear(before: Calibration, test: CandidateTests, columns: Sequence[
 
 
 def passes_f_test(before: Calibration, test: CandidateTests, names: Sequence[str]) -> bool:
-    """Whether effects explain significantly more than they would of irregular changes from dwell to dwell of any size.
+    """Whether effects are significant in an F-test against irregular changes from dwell to dwell of unknown size.
 
     F = (fall / q) / (rest / (dof - q)) with q coefficients. A common factor in the variance from dwell to dwell enters
     the fall and the rest of chi-squared alike and cancels. With few dwells the test has little power. Effects that show
