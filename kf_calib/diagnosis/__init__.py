@@ -1,1 +1,1 @@
-"""Which effect is missing: hypotheses, evidence, verdict, stepwise selection."""
+"""Diagnosis of a misfit: tests of candidate effects, their evidence, the verdict, and stepwise selection."""

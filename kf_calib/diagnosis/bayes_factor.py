@@ -1,7 +1,8 @@
-"""Odds of an effect against none where its coefficients may point any way.
+"""Bayes factor of an effect whose coefficients may point in any direction.
 
-A fall of chi-squared is that of the best direction and the best value of a constant; a likelihood in which these are
-integrated out, as that of a random walk is over all its paths, is compared with their mean.
+The fall of chi-squared of an effect belongs to the best direction of its coefficients and to the best value of its
+constant. The likelihood of a random walk, in contrast, is averaged over all paths. To compare the two fairly, the
+likelihood of the effect is averaged over its directions and values, too.
 """
 
 from __future__ import annotations
@@ -10,15 +11,19 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 
-_LEAST = 1e-12  # of a fall: the odds of none are their limit
-_LARGE = 1e8  # where the Bessel function is its limit, and from 1e9 on unknown to the library
+_LEAST = 1e-12  # the smallest fall put into the formula, which would divide by zero at a fall of none
+_LARGE = 1e8  # above this the asymptotic form of the Bessel function is exact; the library fails from 1e9 on
 
 
 def log_odds(dof: int, falls: Floats | float, sigmas: float) -> Floats:
-    """log of the likelihood ratio of an effect of ``sigmas`` against none, averaged over its directions.
+    """Log of the likelihood ratio of an effect of a given size against no effect, averaged over its directions.
 
-    falls: of chi-squared in its space of ``dof`` dimensions. The mean of exp(n u w - n^2 / 2) over the unit sphere,
-    |w|^2 the fall, is Gamma(k/2) (2 / x)^v I_v(x) exp(-n^2 / 2), v = k/2 - 1, x = n |w| (von Mises, Fisher).
+    With w the whitened residual in the space of the effect, u a unit vector in it, n = ``sigmas`` and k = ``dof``, the
+    mean of exp(n u'w - n^2 / 2) over all u is Gamma(k/2) (2 / x)^v I_v(x) exp(-n^2 / 2), where v = k/2 - 1 and x = n
+    |w| (the normalisation of the von Mises-Fisher distribution).
+
+    dof: dimension of the space of the effect. falls: chi-squared that it explains there, |w|^2; a number or an array.
+    sigmas: size of the effect in sigma. Returns the natural logarithm, of the shape of ``falls``.
     """
     from scipy.special import gammaln, ive
 
@@ -28,10 +33,13 @@ def log_odds(dof: int, falls: Floats | float, sigmas: float) -> Floats:
 
 
 def as_fall(dofs: Floats, falls: Floats, tried: int = 1) -> float:
-    """Twice the log of the same of an effect at its likeliest size, averaged over the values of its constant: what a
-    fall of chi-squared is worth beside a likelihood in which nothing is left to choose.
+    """Twice the log of the Bayes factor of an effect at its likeliest size, averaged over the values of its constant.
 
-    dofs, falls (values,): at each value; tried: these are the best of so many.
+    This is the fall of chi-squared by which the effect may be compared with a likelihood that has nothing left to
+    choose, such as that of a random walk.
+
+    dofs, falls (values,): degrees of freedom and fall of chi-squared at each value of the constant. tried: number of
+    values of which these are the best, where more were tried than are given.
     """
     sigmas = float(np.sqrt(max((falls - dofs).max(), 1.0)))
     parts = [log_odds(int(dof), fall, sigmas) for dof, fall in zip(dofs, falls, strict=True)]

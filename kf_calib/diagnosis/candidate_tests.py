@@ -1,4 +1,4 @@
-"""All candidates against one fit: which explain more than chance would, and how small an effect would be found."""
+"""Score tests of all candidate effects against one fit, with a false-alarm rate that holds for the whole run."""
 
 from __future__ import annotations
 
@@ -25,26 +25,28 @@ from kf_calib.estimation.score_test import Candidate, Frame, Scan
 from kf_calib.support import stage
 
 LEVEL = 0.01
-"""Chance of a false alarm a run."""
+"""Probability of a false alarm in one run."""
 
 SHARE = 0.4
-"""Of the chance of a false alarm: the misfit's, and the scan's."""
+"""Share of the false-alarm probability that is given to the test of the misfit, and as much to the scan."""
 
 REST = 0.5 * (1.0 - 2.0 * SHARE)
-"""The lines', and the trends'."""
+"""Share that is given to the test of spectral lines, and as much to that of trends within dwells."""
 
 EQUAL = 6.63
-"""Suspects whose chi-squared is this close to the best cannot be told from it (1 %, 1 dof)."""
+"""Two suspects whose chi-squared differs by less than this cannot be told apart (1 %, 1 degree of freedom)."""
 
 
 @functools.cache
 def rival_margin(dof: int, tried: int = 1) -> float:
-    """By so much noise lets an effect explain more than the one that is really missing, in 1 of 100 runs at most.
+    """By how much noise may let a wrong effect lower chi-squared more than the missing one, in at most 1 of 100 runs.
 
-    tried: it is the best of so many values of its constant.
+    Take one pair of principal directions of the two effects, at an angle a. Let x be the residual along the missing
+    effect and n the noise perpendicular to it in their plane. The wrong effect then lowers chi-squared by
+    (x cos a + n sin a)^2 and the missing one by x^2. The difference is largest at x = n / tan a, where it is n^2.
+    Summed over all pairs, the margin is a quantile of chi-squared with the degrees of freedom of the wrong effect.
 
-    Where the missing effect's space and the other's make angles a, the other's fall less its own is the sum over them
-    of (x cos a + n sin a)^2 - x^2, which is largest at x = n / tan a, and n^2 there: chi-squared of the other's dof.
+    dof: degrees of freedom of the wrong effect. tried: number of values of its constant of which it is the best.
     """
     from scipy.special import chdtri
 
@@ -52,28 +54,37 @@ def rival_margin(dof: int, tried: int = 1) -> float:
 
 
 def margin_of(candidate: Candidate | None) -> float:
-    """The lead of a candidate, its constant being looked for, too; None: a walk, a line, of one number."""
+    """The margin of ``rival_margin`` for a candidate.
+
+    A constant that was searched counts as one more degree of freedom. None stands for a random walk or a spectral line,
+    which has one degree of freedom.
+    """
     if candidate is None:
         return rival_margin(1)
     return rival_margin(candidate.dof + (candidate.effect.unknown is not None), candidate.tried)
 
 
 _DRAWS = 4000
-_FEWEST_WALKED = 8  # dwells: a walk of the biases is looked for in that many
+_FEWEST_WALKED = 8  # dwells that are needed before a random walk of the biases is tested
 
 
 @dataclass(frozen=True)
 class CandidateTests:
-    """All candidates against one fit: a candidate an effect, the best of the values where it has an unknown.
+    """Results of the tests of all candidates against one fit.
 
-    scores: chi-squared falls less the threshold of their degrees of freedom: above zero is beyond chance.
-    p_values: of the run. misfit_p: of the sum of squares as a whole (None: nothing left over to judge by).
-    trend: what goes on within dwells beside the model and the noise (None: not to be judged, as where there are lines).
-    lines: in the spectrum of the readings within dwells, and the name of the effect they speak for. vibration: those
-    that are no oscillation of one amplitude, and count as noise. without_lines: the test with its lines as vibration.
-    between: in words, of an oscillation what is too fast for the scan and too slow for a line. paths: what a walk's
-    score gains on that of columns, whose falls are those of their best directions, as its likelihood is not of its best
-    path.
+    A candidate is one effect; where an effect has an unknown constant, it is the value that explains most.
+
+    scan: candidates and residual in their common frame. best: number in the scan of the best candidate of each effect.
+    scores: fall of chi-squared of each effect less the threshold for its degrees of freedom; positive is significant.
+    p_values: family-wise p-value of each effect. misfit_p: p-value of the sum of squares as a whole (None: no degrees
+    of freedom are left). walking: name of the random walk of the biases ("": it was not tested). effective_tests:
+    number of independent tests that the scan amounts to. in_slews_only: effects that only slews could show. lines:
+    significant lines in the spectrum of the readings within dwells. oscillating: name of the effect that would explain
+    them. vibration: lines that are not an oscillation of constant amplitude, and so count as noise. without_lines: the
+    same tests with the lines treated as vibration. between: in words, the frequencies of an oscillation that are too
+    fast for the scan and too slow for a line. paths: what is added to the score of the random walk so that it ranks
+    ahead of the best other effect exactly where its likelihood is higher. trend: the test of trends within dwells
+    (None: it cannot be made, or there are lines).
     """
 
     scan: Scan
@@ -94,49 +105,54 @@ class CandidateTests:
 
     @property
     def p_value(self) -> float | None:
-        """Of the run: the smallest of the misfit's, the best suspect's, the best line's and the trends', each at its
-        share."""
+        """The p-value of the run: the smallest of all tests, each at its share; None where nothing could be tested."""
         found = [*self.p_values.values(), *([self.misfit_p] if self.misfit_p is not None else [])]
         found += [self.trend.p_value * SHARE / REST] if self.trend else []
         return min(1.0, min(found) / SHARE) if found else None
 
     @property
     def consistent(self) -> bool | None:
+        """Whether the model agrees with the run at ``LEVEL``; None where nothing could be tested."""
         return None if self.p_value is None else self.p_value >= LEVEL
 
     @property
     def count(self) -> int:
-        """How many effects were looked for or could not be."""
+        """Number of effects that were tested or that this run cannot show."""
         return len(self.best) + len(self.in_slews_only) + bool(self.walking)
 
     @property
     def ranked(self) -> list[str]:
-        """Names, the likeliest first."""
+        """Names of the effects, the one with the highest score first."""
         return sorted(self.scores, key=lambda name: -self.scores[name])
 
     @cached_property
     def invisible(self) -> list[str]:
-        """Effects of which these orientations show nothing, and those that only slews could show."""
+        """Effects invisible in these orientations, effects of slews only, and oscillations at untested frequencies."""
         return [*self.unseen, *([self.between] if self.between else [])]
 
     @cached_property
     def unseen(self) -> list[str]:
-        """The effects among them of which nothing at all shows."""
+        """Effects of which the run shows nothing: those invisible in these orientations, and those of slews only."""
         return [*(name for name, k in self.best.items() if not self.scan.candidates[k].dof), *self.in_slews_only]
 
     def nearness(self, name: str) -> float:
-        """The score without what many values of a constant cost: that speaks against chance, not for a rival."""
+        """The score of an effect for comparison with its rivals.
+
+        It leaves out what a search over many values of a constant adds to the threshold: that part guards against
+        chance, and says nothing against the effect in comparison with another.
+        """
         if name not in self.best:
             return self.scores[name]
         own, tests = self.candidate(name), self.effective_tests
         return self.scores[name] + chance_fall(own, tests) - chance_fall(replace(own, tried=1), tests)
 
     def rivals(self, first: str) -> list[str]:
-        """Effects that noise could have let the first get ahead of, the likeliest first."""
+        """Effects that the first one may lead by noise alone, the likeliest of them first."""
         ahead, out = margin_of(self.candidate(first) if first in self.best else None), list[str]()
         for name in self.ranked:
             behind = self.scores[first] - self.nearness(name)
-            if first in self.best and name in self.best:  # more coefficients cost what chance gives them, at most
+            # an effect is no rival just because it has fewer coefficients: chi-squared itself has to come near
+            if first in self.best and name in self.best:
                 falls = (float(self.scan.statistics[self.best[each]]) for each in (first, name))
                 behind = max(behind, next(falls) - next(falls))
             if behind < ahead and name != first:
@@ -144,7 +160,7 @@ class CandidateTests:
         return out
 
     def holding(self, name: str) -> list[str]:
-        """Effects that can do all that this one can in this run, and more: no reading speaks against them."""
+        """Effects whose columns span those of this one: no reading can speak for it and against any of them."""
         if name not in self.best:
             return []
         own = self.candidate(name)
@@ -153,11 +169,12 @@ class CandidateTests:
         ]
 
     def candidate(self, name: str) -> Candidate:
+        """The best candidate of an effect."""
         return self.scan.candidates[self.best[name]]
 
 
 def candidates(model: Model) -> list[Effect]:
-    """The effects of the catalogue that are not in the model; one with an unknown at every value of a coarse grid."""
+    """Effects of the catalogue that are not in the model and can be scanned, at each value of a grid of a constant."""
     inside, out = {str(effect) for effect in model.effects}, list[Effect]()
     for name in names(model.bench):
         effect = effect_named(name, model.bench)
@@ -170,10 +187,13 @@ def candidates(model: Model) -> list[Effect]:
 def assess_candidates(
     fitted: Fit, tests: float | None = None, seed: int = 0, frames: list[Frame] | None = None
 ) -> CandidateTests:
-    """Score tests of all candidates, calibrated on their own columns by drawing residuals as noise alone makes them.
+    """Score tests of all candidates of the catalogue against a fit.
 
-    tests: as how many independent ones they count, where that is known from nearly the same columns. frames: where a
-    frame of columns is kept for all fits of a run that are judged by the same noise.
+    The false-alarm rate is calibrated for the columns of this run, by drawing residuals that contain only noise.
+
+    fitted: the fit to be tested. tests: effective number of independent tests, where it is known from nearly the same
+    columns (None: it is found by the draws). seed: of the draws. frames: list that keeps the frame of candidate columns
+    for further fits of the run that are judged by the same noise.
     """
     from scipy.special import chdtrc
 
@@ -193,7 +213,8 @@ def assess_candidates(
                 scores[name], p_values[name] = score, run_level(own, tests)
     name, paths = _walking(fitted), 0.0
     if name:
-        # of a million, chi-squared of the dwells' means is not that of the scan to a part in a hundred
+        # The likelihood uses the chi-squared of the dwells' means. Where the misfit is huge, that exceeds the
+        # chi-squared of the scan by up to one per cent, which must not count for the walk.
         fall = max(2.0 * fitted.walk_gain - max(fitted.misfit - agreed.statistic, 0.0), 0.0)
         p_values[name] = run_level(0.5 * float(chdtrc(1, fall)), tests)
         beyond = fall - threshold(1, tests)
@@ -205,19 +226,19 @@ def assess_candidates(
 
 
 def candidate_frame(fitted: Fit, frames: list[Frame]) -> Frame:
-    """The columns of all candidates of the catalogue in the noise of a fit: those in ``frames``, where they serve."""
+    """The frame of the columns of all candidates in the noise of a fit: one of ``frames``, or a new one put there."""
     carried, noise = fitted.carried, fitted.noise.judging
     for known in frames:
         if known.serves(carried, noise):
             return known
     tried = candidates(Model(carried.model.bench))
     stage.say(f"scanning {len({str(each) for each in tried})} effects")
-    frames[:] = [Frame(carried, noise, tried)]  # one is all that memory should hold
+    frames[:] = [Frame(carried, noise, tried)]  # only one frame is kept, to save memory
     return frames[0]
 
 
 def _scanned(fitted: Fit, frame: Frame) -> Scan:
-    """The scan of all candidates, and of an oscillation at the frequency, below those of lines, that explains most."""
+    """Return the scan of all candidates and of slow oscillations, of which the best frequency is kept."""
     carried, effect = fitted.carried, _oscillation(fitted.carried.model)
     values = np.zeros(0) if effect is None or carried.model.oscillates else slow_hz(fitted, effect)
     if effect is None or not len(values):
@@ -231,25 +252,26 @@ def _scanned(fitted: Fit, frame: Frame) -> Scan:
 
 
 def _oscillation(model: Model) -> Effect | None:
+    """Return the effect of the catalogue that oscillates, or None."""
     every = (effect_named(name, model.bench) for name in names(model.bench))
     return next((effect for effect in every if effect.oscillates), None)
 
 
 def slow_hz(fitted: Fit, effect: Effect) -> Floats:
-    """Frequencies of oscillations too slow to show within dwells, in halves of 1/run: from a cycle a run up."""
+    """Frequencies (Hz) of oscillations too slow to show within dwells: from one cycle per run in half-cycle steps."""
     stimulus = stimulus_of(fitted.dwells, fitted.carried.model.bench, fitted.carried.state)
     values = effect.grid(stimulus)[2::2]
     return values[values < min(_searched_hz(fitted.dwells))]
 
 
 def _searched_hz(dwells: Sequence[DwellFactor]) -> tuple[float, float, float]:
-    """From which frequency to which a steady oscillation is looked for, and from which on lines; infinite: not."""
+    """Return the band in which a steady oscillation is searched and the lowest frequency of lines; infinite: none."""
     steady, first = band_hz([dwell.trace for dwell in dwells]), lowest_hz(dwell.spectrum for dwell in dwells)
     return *steady, first
 
 
 def _with_lines(test: CandidateTests, fitted: Fit, frame: Frame) -> CandidateTests:
-    """The test with the lines of the spectrum: they speak for an oscillation, whatever of it is slow."""
+    """Return the tests with the lines of the spectrum, which count for an oscillation in place of slow frequencies."""
     from scipy.special import chdtri
 
     effect = _oscillation(fitted.carried.model)
@@ -277,9 +299,12 @@ def _with_lines(test: CandidateTests, fitted: Fit, frame: Frame) -> CandidateTes
 
 
 def chance_fall(candidate: Candidate, tests: float) -> float:
-    """The fall of chi-squared that chance gives one of so many candidates.
+    """The fall of chi-squared that a candidate has to exceed to be significant in the whole run.
 
-    A constant looked for counts as one degree of freedom more, or, where it takes many tests, as these.
+    An unknown constant counts as one more degree of freedom. Where many of its values were tried as separate tests, it
+    counts as that many tests instead.
+
+    tests: effective number of independent tests in the run.
     """
     looked_for = candidate.effect.unknown is not None and candidate.tried == 1
     return threshold(candidate.dof + looked_for, tests * candidate.tried)
@@ -287,13 +312,17 @@ def chance_fall(candidate: Candidate, tests: float) -> float:
 
 @functools.cache
 def threshold(dof: int, tests: float) -> float:
+    """The fall of chi-squared that noise exceeds in any of n independent tests with a probability of ``LEVEL``."""
     from scipy.special import chdtri
 
     return float(chdtri(dof, LEVEL / tests))
 
 
 def independent_tests(found: Scan, seed: int = 0) -> float:
-    """As many independent tests would reach the smallest p-value that one run in 100 reaches."""
+    """The effective number of independent tests that the correlated tests of all candidates amount to.
+
+    It is n = 0.01 / q, where q is the 1 % quantile of the smallest p-value of these tests in runs with noise alone.
+    """
     seen = np.flatnonzero([each.dof for each in found.candidates])
     if not len(seen):
         return 1.0
@@ -301,15 +330,15 @@ def independent_tests(found: Scan, seed: int = 0) -> float:
 
 
 def run_level(p_value: float, tests: float) -> float:
-    """The chance that any of ``tests`` independent tests shows a p-value as small: 1 - (1 - p)^n."""
+    """The family-wise p-value 1 - (1 - p)^n: the chance that any of n independent tests gives p or less (Šidák)."""
     return float(-np.expm1(tests * np.log1p(-min(p_value, 1.0 - 1e-16))))
 
 
 def _smallest_p(found: Scan, seen: NDArray[np.intp], seed: int) -> Floats:
-    """The smallest p-value among all candidates in each of many runs in which nothing is missing.
+    """Draw the smallest p-value among all candidates in many runs in which no effect is missing.
 
-    Drawn by the symmetric root of the covariance of all scores: which way the frame and the bases in it are turned is
-    up to rounding, and the draws would be those of the machine.
+    The draws use the symmetric root of the covariance of all scores. The bases of the candidates are defined up to a
+    rotation that depends on rounding, and with another root the draws would differ from machine to machine.
     """
     from scipy.special import chdtrc
 
@@ -323,7 +352,7 @@ def _smallest_p(found: Scan, seen: NDArray[np.intp], seed: int) -> Floats:
 
 
 def _walking(fitted: Fit) -> str:
-    """The name of the effect that lets the biases walk; empty where it is in the model, or cannot be looked for."""
+    """Return the name of the random walk of the biases, or "" where it is in the model or cannot be tested."""
     model = fitted.carried.model
     if model.walks or len(fitted.dwells) < _FEWEST_WALKED or fitted.noise.walk_mps2_per_sqrt_s:
         return ""
@@ -331,10 +360,10 @@ def _walking(fitted: Fit) -> str:
 
 
 def _beside_best(found: Scan, scores: Mapping[str, float], tests: float) -> float:
-    """So much more than its fall less its threshold is the score of a walk, to be ahead of the best column where its
-    likelihood is.
+    """Return what to add to the score of a random walk before it is compared with the best other effect.
 
-    That is over all paths; the likelihood of a column is its mean over all directions and values of its constant.
+    With it, the walk ranks ahead exactly where its likelihood, which is averaged over all paths, is higher than that of
+    the other effect, averaged over its directions and the values of its constant.
     """
     best = max(scores, key=lambda name: scores[name], default="")
     if not best or scores[best] <= 0.0:
@@ -344,26 +373,32 @@ def _beside_best(found: Scan, scores: Mapping[str, float], tests: float) -> floa
 
 
 def walk_path_margin(found: Scan, own: Sequence[int], falls: Floats, score: float, tests: float) -> float:
-    """The same against the candidates ``own`` of one effect, by what each lowers chi-squared and the best one's score,
-    alone or beside another effect."""
+    """What is added to the score of a random walk so that it compares fairly with another effect.
+
+    own: numbers of the candidates of the other effect. falls: fall of chi-squared of each of them. score: the score of
+    the best of them. Where the walk is tested beside a further effect, falls and score are counted beside it, too.
+    tests: effective number of independent tests.
+    """
     return score + threshold(1, tests) - evidence_as_fall(found, own, falls)
 
 
 def values_of(found: Scan, name: str) -> list[int]:
-    """Candidates of one effect, one for each value of its constant at which anything shows."""
+    """Numbers of the candidates of one effect: one for each value of its constant at which it is visible."""
     return [k for k, each in enumerate(found.candidates) if str(each.effect) == name and each.dof]
 
 
 def evidence_as_fall(found: Scan, own: Sequence[int], falls: Floats) -> float:
-    """What it is worth beside a likelihood (``as_fall``) that the candidates ``own`` of one effect, at values of its
-    constant, lower chi-squared by ``falls``."""
+    """The Bayes factor of one effect, as a fall of chi-squared (``as_fall``) that can be compared with a likelihood.
+
+    own: numbers of its candidates, one for each value of its constant. falls: fall of chi-squared of each of them.
+    """
     each = [found.candidates[k] for k in own]
     tried = max(_values(found, each[0]), *(one.tried for one in each))
     return as_fall(np.array([one.dof for one in each]), falls, tried)
 
 
 def joint_evidence_as_fall(found: Scan, own: Sequence[int]) -> float:
-    """The same of effects together, each at one value of its constant, the best of all of them."""
+    """The Bayes factor of several effects together, as a fall of chi-squared, each at one value of its constant."""
     each = [found.candidates[k] for k in own]
     fall, dof = found.explained(np.concatenate([one.basis for one in each], axis=1))
     tried = int(np.prod([max(_values(found, one), one.tried) for one in each]))
@@ -371,4 +406,5 @@ def joint_evidence_as_fall(found: Scan, own: Sequence[int]) -> float:
 
 
 def _values(found: Scan, candidate: Candidate) -> int:
+    """Return the number of values of its constant at which the effect of a candidate was scanned."""
     return sum(str(other.effect) == str(candidate.effect) for other in found.candidates)

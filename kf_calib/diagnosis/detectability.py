@@ -1,4 +1,4 @@
-"""How small an effect would be found, from the columns alone."""
+"""The smallest size at which each effect would be found, computed from the columns alone."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ _POWER = 0.9
 
 @dataclass(frozen=True)
 class Detectable:
-    """The size of one coefficient at which an effect is found in 90 of 100 runs, the largest over its coefficients."""
+    """The size of a coefficient at which an effect is found in 90 of 100 runs; of several, that of the least visible.
+
+    name: of the effect. minimum, unit: the size in SI. shown_minimum, shown_unit: the same in the unit of the field.
+    """
 
     name: str
     minimum: float
@@ -23,7 +26,10 @@ class Detectable:
 
 
 def detectable(test: CandidateTests) -> list[Detectable]:
-    """Of every visible effect, from the columns alone."""
+    """The smallest detectable size of every visible effect, from its columns and not from the readings.
+
+    The size is that at which a noncentral chi-squared exceeds the threshold of the scan with a probability of 0.9.
+    """
     from scipy.special import chdtri, chndtrinc
 
     out = list[Detectable]()

@@ -1,6 +1,7 @@
-"""Two effects at once: they may mask each other, or explain together what neither does alone.
+"""Pairs of effects, which may mask each other, or explain together what neither of them explains alone.
 
-A pair is two numbers of candidates of a test, or one and WALKS: a walk of the biases has no columns.
+A pair holds the numbers of two candidates of a test. A random walk of the biases has no columns and therefore no
+number; ``WALKS`` stands for it.
 """
 
 from __future__ import annotations
@@ -13,20 +14,20 @@ import numpy as np
 from kf_calib.diagnosis.candidate_tests import EQUAL, CandidateTests, chance_fall, margin_of, walk_path_margin
 
 WALKS = -1
-"""In a pair, in the place of a candidate's number."""
+"""Stands for the random walk of the biases where a pair holds the number of a candidate."""
 
-_EQUAL_PAIR = 9.21  # as EQUAL, of pairs with neither effect in common: 1 %, 2 dof
+_EQUAL_PAIR = 9.21  # as EQUAL, for two pairs that have no effect in common: 1 %, 2 degrees of freedom
 
 MOST = 3
-"""Pairs that are refitted, and that are said."""
+"""Number of pairs that are refitted, and that are named in a verdict."""
 
 Pair = tuple[int, int]
 Pairs = Mapping[Pair, float]
-"""The scores of pairs: by how much they lower chi-squared, less the prices of both."""
+"""The score of each pair: the fall of chi-squared less the thresholds (``chance_fall``) of both effects."""
 
 
 def candidate_pairs(test: CandidateTests) -> dict[Pair, float]:
-    """Pairs of candidates of which each is beyond chance beside the other."""
+    """Pairs of candidates of which each is significant beside the other, with their scores."""
     candidates, falls = test.scan.candidates, test.scan.statistics
     prices = [chance_fall(each, test.effective_tests) if each.dof else 0.0 for each in candidates]
     out = dict[Pair, float]()
@@ -41,8 +42,10 @@ def candidate_pairs(test: CandidateTests) -> dict[Pair, float]:
 
 
 def walk_path_margin_beside(test: CandidateTests, pairs: Pairs, k: int) -> float:
-    """So much more than its fall less its threshold is the score of a walk beside a candidate, to be ahead of the best
-    column beside it where its likelihood is."""
+    """What is added to the score of a random walk beside candidate ``k``, for comparison with other effects beside it.
+
+    With it, the walk ranks ahead of the best other effect beside ``k`` exactly where its likelihood is higher.
+    """
     candidates, tests = test.scan.candidates, test.effective_tests
     scores = {j if i == k else i: score for (i, j), score in pairs.items() if k in (i, j)}
     if not scores:
@@ -55,7 +58,7 @@ def walk_path_margin_beside(test: CandidateTests, pairs: Pairs, k: int) -> float
 
 
 def likeliest_pairs(test: CandidateTests, pairs: Pairs) -> list[Pair]:
-    """The best few pairs, of those of the same two effects the one of the best constants."""
+    """The pairs with the highest scores, each pair of effects once, at the best values of their constants."""
     named = dict[tuple[str, str], Pair]()
     for pair in sorted(pairs, key=lambda pair: -pairs[pair]):
         named.setdefault(names_of(test, pair), pair)
@@ -63,7 +66,10 @@ def likeliest_pairs(test: CandidateTests, pairs: Pairs) -> list[Pair]:
 
 
 def equal_pairs(test: CandidateTests, pairs: Pairs, score: float, but: Collection[str]) -> list[tuple[str, str]]:
-    """Names of the best few pairs that explain as much as what scores so much, none of them in ``but``: one or two."""
+    """Names of the best pairs that explain as much as an explanation with the given score does.
+
+    score: of that explanation. but: the one or two effects of which it consists; pairs with any of them are left out.
+    """
     equal = EQUAL if len(but) == 1 else _EQUAL_PAIR
     near = sorted((pair for pair in pairs if pairs[pair] > score - equal), key=lambda pair: -pairs[pair])
     named = dict.fromkeys(names_of(test, pair) for pair in near)
@@ -71,7 +77,10 @@ def equal_pairs(test: CandidateTests, pairs: Pairs, score: float, but: Collectio
 
 
 def exchangeable_effects(test: CandidateTests, pairs: Pairs, pair: Pair, least: float) -> dict[str, float]:
-    """Effects that do as well in the place of one of a pair, and the overlap with it, where that is above ``least``."""
+    """Effects that could take the place of one effect of a pair, with the overlap of each with the one it replaces.
+
+    pairs: scores of all pairs. least: overlap that an effect has to exceed to count.
+    """
     both, out = names_of(test, pair), dict[str, float]()
     for other in pairs:
         shared = set(pair) & set(other)
@@ -86,15 +95,17 @@ def exchangeable_effects(test: CandidateTests, pairs: Pairs, pair: Pair, least: 
 
 
 def names_of(test: CandidateTests, pair: Pair) -> tuple[str, str]:
+    """Names of the two effects of a pair."""
     one, two = (name_of(test, k) for k in pair)
     return one, two
 
 
 def name_of(test: CandidateTests, k: int) -> str:
+    """Name of the effect of candidate number ``k``, or of the random walk."""
     return test.walking if k == WALKS else str(test.scan.candidates[k].effect)
 
 
 def candidate_overlap(test: CandidateTests, one: int, other: int) -> float:
-    """The overlap of two candidates; 1 with a walk, which can take any path."""
+    """The overlap of two candidates; it is 1 with a random walk, which can take any path."""
     candidates = test.scan.candidates
     return 1.0 if WALKS in (one, other) else candidates[one].overlap(candidates[other])

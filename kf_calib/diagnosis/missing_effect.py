@@ -1,9 +1,9 @@
-"""Which physical effect is missing: what the misfit says, and what it cannot say.
+"""Diagnosis of a calibration: which physical effect is missing in its model, and which others would explain as much.
 
-The candidates of the catalogue are projected off the model (``score_test``) and tested together: the p-value of a
-suspect is that of the run, the chance that any of them would look as good with nothing missing. A suspect is named only
-where the model with it fits; where several fit equally well they are all named; where none does the answer is
-*unknown*.
+The candidates of the catalogue are projected off the model (``score_test``) and tested together. The p-value of a
+suspect is family-wise: the chance that any candidate would look as significant with nothing missing. A suspect is
+named only if the model with it fits the run. All suspects that fit equally well are named as the ambiguity set; where
+none fits, the effect is reported as *unknown*.
 """
 
 from __future__ import annotations
@@ -60,39 +60,43 @@ from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.estimation.score_test import scan
 from kf_calib.support.threads import one_blas_thread
 
-_ALIKE = 0.5  # overlap above which two suspects may be taken for each other
-_SHOWN = 6  # suspects that are refitted and shown
+_ALIKE = 0.5  # overlap above which two suspects are look-alikes
+_SHOWN = 6  # number of suspects that are refitted and shown
 
 
 def diagnose(run: Calibration | Source | str | PathLike[str]) -> Diagnosis:
-    """What is missing in the model of a calibration, from its dwell factors alone; a recording is calibrated first."""
+    """Diagnosis of a calibration, or of a recording or source, which is calibrated first.
+
+    It works on the dwell factors; the readings are read again only where an oscillation or vibration requires it.
+    """
     before = run if isinstance(run, Calibration) else calibrate(run)
     with one_blas_thread():
         return _diagnosed(before)
 
 
 def _diagnosed(before: Calibration) -> Diagnosis:
-    if before.outlying:  # a dwell that is wrong is no effect, and looks like many
+    """Diagnose a calibration: look for an outlying dwell first, then for effects, with vibration averaged out."""
+    if before.outlying:  # one wrong dwell is not an effect, but would make many effects significant
         test = assess_candidates(before.fit, frames=before.frames)
         verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {outlying_in_words(before.outlying)}"
         return Diagnosis(before, test, (), (), test.consistent is False, (), {}, None, verdict)
     test = _without_vibration(before, assess_candidates(before.fit, frames=before.frames))
     found = _explained(before, test)
-    if found.unknown and test.without_lines:  # of one phase all along and not of one amplitude
+    if found.unknown and test.without_lines:  # the lines keep their phase through the run, but not their amplitude
         test = test.without_lines
         found = _explained(before, test)
     if test.vibration and not before.fit.dwells[0].averaged and before.reread is not None:
         window_s = window_average.window_s(test.vibration)
         rested = before.reread(replace(before.settings, window_s=window_s))
         still = assess_candidates(rested.fit, frames=rested.frames)
-        still = still.without_lines or still  # what the windows let through is vibration, too
+        still = still.without_lines or still  # lines that are left after averaging are vibration, too
         found = _explained(rested, replace(still, vibration=test.vibration))
     found = replace(found, back_s=restoring_time_s(found))
     return replace(found, verdict=verdict_in_words(found))
 
 
 def _explained(before: Calibration, test: CandidateTests) -> Diagnosis:
-    """What explains the misfit, one effect or two, and what could as well; or nothing does."""
+    """Return the diagnosis by these tests: one effect or two with their look-alikes, unknown, or nothing missing."""
     found = _or_walk(_likeliest(before, test))
     if test.consistent is not False or dwell_noise_is_stated(before):
         return found
@@ -100,9 +104,10 @@ def _explained(before: Calibration, test: CandidateTests) -> Diagnosis:
 
 
 def _told_in_its_noise(found: Diagnosis) -> Diagnosis:
-    """The same where noise from dwell to dwell was estimated: by the noise that is left beside what explains most.
+    """Return the diagnosis repeated with the noise that is left beside the best explanation, where noise is estimated.
 
-    Estimated without it, or left out, the noise is another, and what is little in one is much in the other.
+    The noise from dwell to dwell is too large if it is estimated without the missing effect, and too small if it is
+    left out of the tests (``Noise.judging``). How significant an effect is depends on it.
     """
     before, test = found.before, found.test
     fitting = [
@@ -124,13 +129,14 @@ def _told_in_its_noise(found: Diagnosis) -> Diagnosis:
 
 
 def _likeliest(before: Calibration, test: CandidateTests) -> Diagnosis:
-    """One effect or two that explain the misfit, and those that look like them."""
+    """Return the diagnosis with the one effect or the two that explain the misfit, and their look-alikes."""
     nothing = Diagnosis(before, test, (), (), False, (), {}, None, "")
     if test.consistent is not False:
         return nothing
     suspects = _suspects(before, test)
-    # what explains all of it explains most: one that fits far behind the first has only made the noise large enough,
-    # but not one behind a walk that does not fit, which may take any path
+    # The effect that is missing has about the highest score. A suspect with a much lower score may still fit, because
+    # the noise estimated with it is larger; it is dropped. The score of a random walk that does not fit sets no such
+    # limit, since a walk can follow any misfit.
     leading = [test.scores[each.name] for each in suspects if each.fits or each.name != test.walking]
     least = max(leading, default=0.0) - 2.0 * EQUAL
     fitting = [each for each in suspects if each.fits and test.scores[each.name] > least]
@@ -148,11 +154,13 @@ def _likeliest(before: Calibration, test: CandidateTests) -> Diagnosis:
 
 
 def _clearly_better(found: Diagnosis, pairs: Pairs, first: str) -> Pairs:
-    """Pairs that do clearly better than the one effect that explains the misfit alone; those with a walk of the biases
-    where that is the one, or where two columns do."""
+    """Return the pairs that explain clearly more than the one effect ``first``, pairs with a random walk included.
+
+    Pairs with a walk are considered where ``first`` is the walk itself, or where two other effects do clearly better.
+    """
     test = found.test
     least = test.scores[first] + EQUAL
-    if first == test.walking:  # two columns have more directions to choose, which a path has not
+    if first == test.walking:  # two effects are fitted in their best directions, a walk is averaged over its paths
         columns = {pair: score for pair, score in pairs.items() if score > least + EQUAL}
         return columns | _pairs_with_walk(found, pairs, beyond=True)
     columns = {pair: score for pair, score in pairs.items() if score > least}
@@ -161,7 +169,7 @@ def _clearly_better(found: Diagnosis, pairs: Pairs, first: str) -> Pairs:
 
 
 def _or_walk(found: Diagnosis) -> Diagnosis:
-    """With a walk of the biases in the set, where the dwells are too few to tell its path from what was named."""
+    """Return the diagnosis with a random walk as a look-alike where the named effects fail the F-test."""
     model = found.before.fit.carried.model
     walk = walk_named(model.bench)
     if not walk or not found.missing or model.walks or walk in found.ambiguity:
@@ -173,7 +181,10 @@ def _or_walk(found: Diagnosis) -> Diagnosis:
 
 
 def _beside_lines(found: Diagnosis) -> Diagnosis | None:
-    """What explains the misfit beside the oscillation that makes the lines: that has no column to be paired with."""
+    """Return a diagnosis of what is left beside the oscillation that makes the lines, or None where nothing is named.
+
+    That oscillation has no columns in the scan, so that ``candidate_pairs`` cannot find it in a pair.
+    """
     test = found.test
     if not test.oscillating:
         return None
@@ -183,7 +194,8 @@ def _beside_lines(found: Diagnosis) -> Diagnosis | None:
         return None
     both = (*rest.missing, test.oscillating)
     ambiguity = (*both, *(name for name in rest.ambiguity if name not in both))
-    after = with_effects(found.before, both)  # alone, an oscillation may have been drawn to what the others explain
+    # both are fitted together: fitted alone, the oscillation may have taken up part of what the others explain
+    after = with_effects(found.before, both)
     return replace(
         rest, before=found.before, test=test, suspects=found.suspects, missing=both, ambiguity=ambiguity,
         after=after if fits_the_run(after, test, len(both)) else rest.after,
@@ -191,11 +203,11 @@ def _beside_lines(found: Diagnosis) -> Diagnosis | None:
 
 
 def _without_vibration(before: Calibration, test: CandidateTests) -> CandidateTests:
-    """The test as it is where an oscillation of one amplitude explains its lines; else they are vibration."""
+    """Return the test as it is if an oscillation of constant amplitude explains its lines, else that with vibration."""
     if test.without_lines is None:
         return test
     refit = with_effects(before, (test.oscillating,))
-    # what the coherent fit over the whole run finds of the amplitude that each stretch of readings shows
+    # amplitude of the coherent fit over the whole run, over the amplitude seen in each stretch of readings
     share = np.linalg.norm(refit.estimate.state[refit.model.parts[test.oscillating]]) / np.linalg.norm(
         test.lines[0].amplitude_mps2
     )
@@ -203,23 +215,20 @@ def _without_vibration(before: Calibration, test: CandidateTests) -> CandidateTe
 
 
 def _is_outdone(found: Diagnosis, suspect: Suspect) -> bool:
-    """Whether a formula that is no known effect explains the misfit better."""
+    """Tell whether a formula that is not a known effect explains the misfit clearly better than the suspect."""
     if suspect.name in found.test.best:
         return _outdone(found, suspect.refit, (suspect.name,))
     return _walks_not(found, suspect)
 
 
 def _one(found: Diagnosis, first: Suspect | None, pairs: Pairs) -> Diagnosis:
-    """One effect explains the misfit; with it, all that explain it as well and look like it, alone or in pairs.
-
-    None: a formula that is no known effect explains it better than any, and than a walk, which could take its path.
-    """
+    """Return the diagnosis with the effect ``first``, its look-alikes and equally good pairs; unknown if it is None."""
     test = found.test
     if first is None:
         return replace(found, unknown=True)
     close = test.rivals(first.name)
     close += [name for name in test.holding(first.name) if name not in close]
-    numbers = {name: test.best.get(name, WALKS) for name in (first.name, *close)}  # a walk, a line: no columns
+    numbers = {name: test.best.get(name, WALKS) for name in (first.name, *close)}  # walks and lines have no columns
     overlaps = {
         name: candidate_overlap(test, numbers[first.name], numbers[name]) for name in close if name != first.name
     }
@@ -231,20 +240,18 @@ def _one(found: Diagnosis, first: Suspect | None, pairs: Pairs) -> Diagnosis:
 
 
 def _both_fit(found: Diagnosis, names: tuple[str, str]) -> bool:
+    """Tell whether the model with both effects fits the run."""
     return fits_the_run(with_effects(found.before, names), found.test, len(names))
 
 
 def _beside(found: Diagnosis, together: Sequence[tuple[str, str]]) -> Diagnosis:
-    """With the pairs that explain as much in the ambiguity set."""
+    """Return the diagnosis with the pairs that explain as much, and their effects in the ambiguity set."""
     added = dict.fromkeys(name for pair in together for name in pair if name not in found.ambiguity)
     return replace(found, together=tuple(together), ambiguity=(*found.ambiguity, *added))
 
 
 def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool:
-    """Whether some formula explains the misfit better than the effects at the constants that were found for them.
-
-    Formulas that are known effects themselves do not count: together they are no effect that is unknown.
-    """
+    """Tell whether a formula, other than a known effect, explains the misfit clearly better than these effects do."""
     fitted, tests = found.before.fit, found.test.effective_tests
     effects = [effect for effect in refit.model.effects if str(effect) in names and not effect.walks]
     scanned = scan(fitted.carried, fitted.noise.judging, effects)
@@ -260,28 +267,29 @@ def _outdone(found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool
 
 
 def _refits_compare(found: Diagnosis, names: Sequence[str]) -> bool:
-    """Whether refits have one noise, so that it can be said what each leaves: what is large is not linear, and a scan
-    that says what each would lower chi-squared by is off by many times what noise does."""
+    """Tell whether all refits are judged by the same noise, so that their chi-squared may be compared.
+
+    For large effects this is better than the scan, which is linear and may be wrong by much more than the noise.
+    """
     return dwell_noise_is_stated(found.before) and all(name in found.test.best for name in names)
 
 
 def _clearly_less_left(found: Diagnosis, refit: Calibration, names: Sequence[str], alone: str) -> bool:
-    """Whether effects leave clearly less than one of them alone, or another, as far as refits can say that."""
+    """Tell whether the effects leave a clearly lower chi-squared than ``alone``; true if refits cannot be compared."""
     if not _refits_compare(found, (*names, alone)):
         return True
     return _left(found, refit, names) < _left(found, found.refit_with(alone), (alone,)) - EQUAL
 
 
 def _left(found: Diagnosis, refit: Calibration, names: Sequence[str], dof: int = 0) -> float:
-    """Chi-squared that effects, and a formula of ``dof``, leave, and what chance would have lowered it by."""
+    """Return the chi-squared of a refit plus the thresholds of its effects and of a formula of ``dof``."""
     test = found.test
     prices = [chance_fall(test.candidate(name), test.effective_tests) for name in names]
     return refit.consistency.statistic + sum(prices) + (threshold(dof, test.effective_tests) if dof else 0.0)
 
 
 def _formulas(found: Diagnosis) -> list[tuple[float, Family]]:
-    """Formulas that are no known effects, each with its fall of chi-squared less what chance would give it, the best
-    first."""
+    """Return the formulas that are no known effects, each with its fall of chi-squared less its threshold, in order."""
     test = found.test
     known = [test.candidate(name).effect for name in test.best]
     fitted = found.before.fit
@@ -292,10 +300,10 @@ def _formulas(found: Diagnosis) -> list[tuple[float, Family]]:
 
 
 def _walks_not(found: Diagnosis, first: Suspect) -> bool:
-    """Whether what could be a walk of the biases is one jump, or follows what the platform does rather than time.
+    """Tell whether a supposed random walk is rather one jump, or depends on something other than time.
 
-    A walk may take any path: what is simpler, likelier at whatever moment or of whatever shape it is, and leaves
-    nothing goes before it.
+    A walk can follow any path. A jump at any moment, or a family of formulas that are not of time, is preferred if it
+    is clearly likelier, averaged over all of its kind (``as_fall``), and fits the run.
     """
     if not first.refit.noise.walk_mps2_per_sqrt_s:
         return False
@@ -311,9 +319,11 @@ def _walks_not(found: Diagnosis, first: Suspect) -> bool:
 
 
 def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:
-    """Two effects explain the misfit where no single one does: they may mask each other. The best few are refitted.
+    """Return the diagnosis with the likeliest pair of effects that fits the run, or None.
 
-    alone: a single one that would do, if not as well; a walk can take any path, so it stays in the set.
+    It is None where no pair fits, or where a formula explains clearly more than the pair. alone: a single effect that
+    also explains the misfit, if clearly less well. If it is a random walk, which can take any path, it stays in the
+    ambiguity set.
     """
     test = found.test
     for pair in likeliest_pairs(test, pairs):
@@ -336,10 +346,10 @@ def _two(found: Diagnosis, pairs: Pairs, alone: str = "") -> Diagnosis | None:
 
 
 def _pairs_with_walk(found: Diagnosis, pairs: Pairs, beyond: bool = False) -> dict[Pair, float]:
-    """Pairs of an effect and a walk of the biases, for those effects that are likeliest beside a walk, where both do
-    better than the walk alone; ``beyond``: clearly so, and the effect is beyond chance beside the walk.
+    """Return pairs of an effect and a random walk that explain more than the walk alone, with their scores.
 
-    The walk beside the effect is judged by its likelihood, after a refit with both, against the ``pairs`` of columns.
+    Both are refitted, and the walk is judged by its likelihood beside the effect, so that the score compares with those
+    of the other ``pairs``. beyond: the pair has to be clearly better, and the effect significant beside the walk.
     """
     before, test = found.before, found.test
     if not test.walking:
@@ -358,7 +368,7 @@ def _pairs_with_walk(found: Diagnosis, pairs: Pairs, beyond: bool = False) -> di
 
 
 def _suspects(before: Calibration, test: CandidateTests) -> tuple[Suspect, ...]:
-    """The likeliest candidates, each refitted and judged anew."""
+    """Return the candidates with the highest scores, each refitted and tested for whether the model then fits."""
     out = list[Suspect]()
     for name in [name for name in test.ranked if test.scores[name] > 0][:_SHOWN]:
         refit = with_effects(before, (name,))
@@ -370,7 +380,11 @@ def _suspects(before: Calibration, test: CandidateTests) -> tuple[Suspect, ...]:
 
 
 def next_orientation(found: Diagnosis) -> tuple[Advice, str] | None:
-    """Where to go next, and why: to tell equal suspects apart, to size the one there is, or to show what is hidden."""
+    """The orientation to visit next and the reason in words, or None where no orientation would help.
+
+    Look-alikes are to be told apart; a single suspect is to be measured best; with no suspect, as many invisible
+    effects as possible are to be made visible.
+    """
     fitted, test = (found.judged or found.before).fit, found.test
     named = [name for name in found.ambiguity if name in test.best]
     if named and not found.unknown:

@@ -1,4 +1,4 @@
-"""The error of stepwise selection itself on orientations that it has not seen."""
+"""Nested cross-validation: the held-out error of stepwise selection itself."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ from kf_calib.support.threads import one_blas_thread
 
 @dataclass(frozen=True)
 class NestedCrossValidation:
-    """The held-out error with everything done anew without what is held out, the choice of the effects too.
+    """The held-out error with everything repeated without the held-out orientations, the choice of effects included.
 
-    expected_mps2: what noise alone would give. chosen: in how many of the ``folds`` each effect was in the last model.
+    rms_mps2: rms held-out error, m/s^2. expected_mps2: what noise alone would give. folds: number of folds. chosen: in
+    how many of the folds each effect was in the final model.
     """
 
     rms_mps2: float
@@ -35,10 +36,14 @@ class NestedCrossValidation:
 def nested_cross_validation(
     start: Calibration, folds: int = 6, on_fold: Callable[[float], None] | None = None
 ) -> NestedCrossValidation:
-    """Leave out every ``folds``-th orientation, improve on the others, predict it; each is left out once.
+    """The held-out error of stepwise selection: each fold is predicted by a model selected on all others.
 
-    Of equal explanations the first is taken: they predict alike, and a fold that stopped to ask would predict nothing.
-    Raises UnobservableError where the orientations of some fold do not determine the model it chose.
+    A fold is every ``folds``-th orientation. Where effects explain the misfit equally well, the first one is taken:
+    they predict nearly the same, and a fold that stopped there would predict nothing.
+
+    start: the calibration with the first model. folds: their number, at most the number of orientations. on_fold:
+    called after each fold with the share that is done. Raises UnobservableError where the other orientations do not
+    determine the model that was selected.
     """
     groups = orientations(start.fit.dwells)
     folds = min(folds, len(groups))
@@ -60,7 +65,7 @@ def nested_cross_validation(
 
 
 def _predicted(start: Calibration, result: Calibration, left: list[int]) -> tuple[Floats, Floats]:
-    """Squared errors of the dwell means left out, and their variances if noise is all there is, (3 len(left),) each."""
+    """Return the squared errors of the held-out dwell means and the variances that noise gives; (3 len(left),) each."""
     if result.estimate.undetermined.size:
         raise UnobservableError(
             "the orientations without those held out do not determine the model: the honest held-out error needs a "

@@ -1,4 +1,4 @@
-"""Whether a model with an effect leaves no more than noise would, by means that an effect of its kind has."""
+"""Checks of a refit: whether the model with an added effect leaves no more than noise would."""
 
 from __future__ import annotations
 
@@ -11,14 +11,18 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.fit import loss_within_range
 from kf_calib.estimation.results import Calibration
 
-_REFUSED = 0.002  # chance that what is really missing is turned down because noise beside it looks like something more
-_NEARLY = 2.71  # of chi-squared, of one constant: 10 %
+_REFUSED = 0.002  # probability that the effect that is missing is rejected because of noise in the rest of the misfit
+_NEARLY = 2.71  # rise of chi-squared that is not significant for one constant (10 %)
 
 
 def fits_the_run(refit: Calibration, before: CandidateTests, added: int = 1) -> bool:
-    """Whether nothing is left that noise would not leave, by means an effect of that kind has.
+    """Whether the refit leaves only noise, judged by its misfit, all remaining candidates, and trends within dwells.
 
-    A walk, or two effects ``added`` at once, can take up most of what is neither: what is left is judged more strictly.
+    A random walk has to move like one, and a constant must not end at a limit of its range. A random walk, or several
+    effects added at once, can absorb much of a misfit that they do not cause, so that stricter levels are used for
+    them.
+
+    refit: the run with the effect. before: the tests without it. added: number of effects that were added at once.
     """
     misfit, walks = refit.consistency.p_value, bool(refit.noise.walk_mps2_per_sqrt_s)
     least = LEVEL if walks else _REFUSED
@@ -33,15 +37,17 @@ def fits_the_run(refit: Calibration, before: CandidateTests, added: int = 1) -> 
 
 
 def _together(*p_values: float) -> float:
-    """The p-value of independent tests, none of which need be beyond chance alone (Fisher, 1932)."""
+    """Return the p-value of independent tests combined by Fisher's method (1932)."""
     from scipy.special import chdtrc
 
     return float(chdtrc(2 * len(p_values), -2.0 * sum(math.log(max(p, 1e-300)) for p in p_values)))
 
 
 def _at_an_end(refit: Calibration) -> bool:
-    """Whether a constant was looked for and ran to an end of its range, and none well within does nearly as well:
-    another, simpler effect is meant then."""
+    """Tell whether a constant was estimated at a limit of its range, with no value well inside nearly as good.
+
+    Another, simpler effect is then the likely cause.
+    """
     for effect in refit.model.effects:
         known = effect.unknown is None or effect.unknown.low * 1.01 < effect.value < effect.unknown.high * 0.99
         if not known and loss_within_range(refit.fit, effect) > _NEARLY:
@@ -50,8 +56,7 @@ def _at_an_end(refit: Calibration) -> bool:
 
 
 def _no_walk(refit: Calibration) -> bool:
-    """Whether walking biases take a step no walk would, as in one jump, or come back as none does: what goes to and fro
-    between bounds is none."""
+    """Tell whether the biases move unlike a random walk: by a significant jump, or with a significant return."""
     from scipy.special import ndtr
 
     steps = np.array([visit.innovation_mps2 / visit.innovation_sigma_mps2 for visit in refit.visits])
@@ -61,8 +66,10 @@ def _no_walk(refit: Calibration) -> bool:
 
 
 def restoring_time_s(found: Diagnosis) -> float | None:
-    """The time constant with which what is taken for a walk more likely comes back, s, where that is not too likely for
-    a walk: of walks one in twenty looks so."""
+    """The time constant of a drift that returns, in s, where that explains the run better than the random walk named.
+
+    None where no walk was named, or where the gain in likelihood is below what 1 of 20 true random walks exceeds.
+    """
     if found.after is None or not found.after.noise.walk_mps2_per_sqrt_s or found.test.walking not in found.missing:
         return None
     gain, back_s = found.after.fit.back_gain

@@ -1,4 +1,4 @@
-"""What a diagnosis gives."""
+"""Results of a diagnosis."""
 
 from __future__ import annotations
 
@@ -17,9 +17,11 @@ from kf_calib.support.printing import printed
 
 @dataclass(frozen=True)
 class Suspect:
-    """An effect that would explain something: p-value of the run, whether the model fits with it, its refit.
+    """An effect that explains a significant part of the misfit.
 
-    known: symbols of the effects that were in the model already.
+    name: of the effect. statistic: fall of chi-squared. dof: its degrees of freedom. p_value: family-wise p-value.
+    fits: whether the model with the effect fits the run. refit: the calibration with it. known: symbols of the effects
+    that were in the model before.
     """
 
     name: str
@@ -32,20 +34,25 @@ class Suspect:
 
     @property
     def coefficients(self) -> list[Parameter]:
-        """Of this effect in its refit."""
+        """The coefficients of this effect in its refit."""
         return [p for p in list(self.refit.parameters.values())[12:] if p.symbol not in self.known]
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """missing: the names that make the model fit (empty: nothing is missing, or none of the known ones does).
+    """What a diagnosis found.
 
-    ambiguity: every single effect that fits as well as the first, and those that do together; overlaps: of each with
-    it. together: the pairs among them that explain as much, and are no exchange of one effect for one that is alike.
-    alone: a single effect that would do in the place of two. as_scatter: what is missing could as well be dwells that
-    scatter by more than is stated, or, where nothing is named, what would fit is less likely than that; back_s: the
-    walk that is missing could go to and fro with this time constant (None: not as well). judged: the run by whose noise
-    effects were told from each other, where that was estimated (None: by that of ``before``).
+    before: the calibration that was diagnosed. test: the tests of all candidates. suspects: the significant ones, the
+    likeliest first. missing: names of the effects that make the model fit (empty: nothing is missing, or no known
+    effect fits). unknown: whether something is missing that no known effect explains. ambiguity: all effects that
+    explain as much, those named as missing included. overlaps: overlap of each look-alike with the effect that it could
+    replace. after: the calibration with the missing effects. verdict: the result in a sentence.
+
+    together: pairs of effects that explain as much. alone: a single effect that could replace two. as_scatter: scatter
+    from dwell to dwell larger than stated would explain the misfit as well, or, where no effect is named, better than
+    those that would fit. back_s: time constant with which the biases may return, s, in place of the random walk that is
+    named (None: they do not). judged: the run with the noise by which the effects were compared, where that noise was
+    estimated (None: it is that of ``before``).
     """
 
     before: Calibration
@@ -71,17 +78,17 @@ class Diagnosis:
 
     @property
     def residual_ratios(self) -> Floats:
-        """Residuals of the dwells (D, 3) over the sigma of their means."""
+        """Residuals of the dwell means (D, 3), over their sigma."""
         carried = self.before.carried
         spread = mean_covariances(self.before.noise.judging, carried.means, carried.state)
         return self.before.residuals_mps2 / np.sqrt(np.einsum("dii->di", spread))
 
     def refit_with(self, name: str) -> Calibration:
-        """The run with this effect, too: of a suspect it is there already."""
+        """The calibration with this effect added; that of a suspect is not computed again."""
         own = (suspect.refit for suspect in self.suspects if suspect.name == name)
         return next(own, None) or with_effects(self.before, (name,))
 
 
 def with_effects(before: Calibration, added: Sequence[str]) -> Calibration:
-    """The same run with further effects in the model."""
+    """The same run calibrated with further effects in the model."""
     return refitted(before, (*before.settings.effects, *added))

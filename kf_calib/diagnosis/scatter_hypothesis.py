@@ -1,8 +1,8 @@
-"""Scatter from dwell to dwell as the rival of every name: what raises a misfit may be no effect at all.
+"""Scatter from dwell to dwell as the alternative hypothesis to every effect.
 
-Scatter that was stated too small, or an orientation that was set worse than stated, looks like whatever effect comes
-nearest, and of many effects one comes near. Likelihoods say which of the two it is: that of scatter of any size against
-that of the effect, averaged over the directions and constants that it could have (``bayes_factor``).
+If scatter or setting error is larger than stated, the misfit resembles the nearest effect, and in a large catalogue
+some effect is always near. The two hypotheses are therefore compared by their likelihoods: that of scatter of any size,
+and that of the effect averaged over the directions and constants that it may have (``bayes_factor``).
 """
 
 from __future__ import annotations
@@ -31,10 +31,13 @@ from kf_calib.estimation.results import Calibration
 def explains_more_than_scatter(
     before: Calibration, test: CandidateTests, names: Sequence[str], refit: Calibration
 ) -> bool:
-    """Whether effects, with which the run was refitted, explain more than scatter from dwell to dwell would.
+    """Whether effects explain the misfit better than scatter from dwell to dwell would.
 
-    Where not all of it was stated, it is there in any case: effects have to stand out of it. Of a walk of the biases
-    and scatter that explain as much the scatter is likelier where none was stated.
+    Where scatter was stated, the effects must be likelier than scatter larger than stated. Where scatter or setting
+    error was not stated, they must be significant in an F-test against the noise from dwell to dwell. Where scatter was
+    not stated, that test suffices; only a random walk must be significantly likelier than scatter, too.
+
+    before: the run without the effects. test: its tests. names: of the effects. refit: the run with them.
     """
     noise, walks = before.noise, test.walking in names
     if not dwell_noise_is_stated(before) and not passes_f_test(before, test, names):
@@ -46,10 +49,12 @@ def explains_more_than_scatter(
 
 
 def could_be_scatter(before: Calibration, test: CandidateTests, names: Sequence[str], refit: Calibration) -> bool:
-    """Whether the odds of effects, with which the run was refitted, against scatter from dwell to dwell of more than is
-    stated are less than 99 to 1, where one of the effects is as likely to be missing as that.
+    """Whether scatter larger than stated remains a plausible explanation beside the effects: odds below 99 to 1.
 
-    Of n effects each is then the one in 1 of n runs; a walk of the biases, of which there is one, takes no such share.
+    Each of n effects is given a prior probability of 1/n against scatter. A random walk, of which there is only one, is
+    given an equal prior.
+
+    before: the run without the effects. test: its tests. names: of the effects. refit: the run with them.
     """
     columns = sum(name in test.best for name in names)
     least = columns * math.log(len(test.scores)) - math.log(LEVEL)
@@ -57,10 +62,12 @@ def could_be_scatter(before: Calibration, test: CandidateTests, names: Sequence[
 
 
 def fall_beyond_scatter(before: Calibration, test: CandidateTests, names: Sequence[str], refit: Calibration) -> float:
-    """By how much -2 log-likelihood is lower with effects than with scatter from dwell to dwell, or with setting error,
-    of more than is stated; infinite for what shows within dwells.
+    """By how much -2 log-likelihood is lower with the effects than with scatter or setting error larger than stated.
 
-    A walk of the biases beside other effects has to be likelier than scatter beside them, too.
+    A random walk beside other effects must also be likelier than scatter beside them. Infinite for an oscillation that
+    shows within dwells, which scatter cannot imitate.
+
+    before: the run without the effects. test: its tests. names: of the effects. refit: the run with them.
     """
     columns, walks = [name for name in names if name in test.best], test.walking in names
     scatter = 2.0 * before.fit.scatter_gain
@@ -74,6 +81,7 @@ def fall_beyond_scatter(before: Calibration, test: CandidateTests, names: Sequen
 
 
 def _worth(test: CandidateTests, columns: Sequence[str]) -> float:
+    """Return the Bayes factor of effects with columns, as a fall of chi-squared."""
     own = [test.best[name] for name in columns]
     if len(own) > 1:
         return joint_evidence_as_fall(test.scan, own)
@@ -82,21 +90,26 @@ def _worth(test: CandidateTests, columns: Sequence[str]) -> float:
 
 
 def _beyond_linear(before: Calibration, test: CandidateTests, columns: Sequence[str], refit: Calibration) -> float:
-    """What a refit lowers chi-squared of the dwells' means by, beyond what the scan says: what is large is not linear,
-    and its chi-squared is not that of the means to a part in a hundred."""
+    """Return by how much a refit lowers the chi-squared of the dwell means more than the linear scan predicts.
+
+    A large effect is not linear in its coefficients, and where the misfit is huge, the chi-squared of the scan differs
+    from that of the means by up to one per cent.
+    """
     if not dwell_noise_is_stated(before):
-        return 0.0  # a noise of its own
+        return 0.0  # the refit has estimated a noise of its own, so that its chi-squared does not compare
     bases = [test.candidate(name).basis for name in columns]
     linear, _ = test.scan.explained(np.concatenate(bases, axis=1))
     return max(before.fit.misfit - refit.fit.misfit - linear, 0.0)
 
 
 def passes_f_test(before: Calibration, test: CandidateTests, names: Sequence[str]) -> bool:
-    """Whether effects explain more than they would of whatever goes on from dwell to dwell, by however much: scatter, a
-    walk of the biases; few dwells cannot show it.
+    """Whether effects are significant in an F-test against irregular changes from dwell to dwell of unknown size.
 
-    F = (fall / q) / (rest / (dof - q)), q coefficients: a scatter as large as it needs to be is in fall and rest alike.
-    What shows within dwells is no matter of scatter between them.
+    F = (fall / q) / (rest / (dof - q)) with q coefficients. A common factor in the variance from dwell to dwell enters
+    the fall and the rest of chi-squared alike and cancels. With few dwells the test has little power. Effects that show
+    within dwells pass without a test, since changes from dwell to dwell cannot imitate them.
+
+    before: the run without the effects. test: its tests. names: of the effects.
     """
     from scipy.special import fdtrc
 
@@ -105,7 +118,7 @@ def passes_f_test(before: Calibration, test: CandidateTests, names: Sequence[str
         return True
     own = [test.candidate(name) for name in names]
     fall, dof = test.scan.explained(np.concatenate([each.basis for each in own], axis=1))
-    dof += sum(each.effect.unknown is not None for each in own)  # a constant that was looked for
+    dof += sum(each.effect.unknown is not None for each in own)  # a constant that was searched counts as one more
     freedom = misfit.dof - dof
     if freedom <= 0:
         return False
@@ -114,13 +127,15 @@ def passes_f_test(before: Calibration, test: CandidateTests, names: Sequence[str
 
 
 def dwell_noise_is_stated(before: Calibration) -> bool:
-    """Whether all noise from dwell to dwell was stated."""
+    """Whether both scatter and setting error were stated rather than estimated."""
     return before.noise.scatter_stated and before.noise.setting_stated
 
 
 def with_noise_as_stated(before: Calibration, refit: Calibration) -> Calibration:
-    """The run without the effects that a refit has, as if the bench had stated the noise from dwell to dwell that was
-    estimated with them: without them it would be estimated from what they explain."""
+    """The run without the added effects, with the noise from dwell to dwell as it was estimated in their refit.
+
+    Estimated without the effects, the noise would be too large, as it would contain what they explain.
+    """
     noise, bench = refit.noise, before.bench
     if not noise.setting_stated:
         bench = replace(bench, angle_sigma_deg=float(np.degrees(noise.setting_rad)))
@@ -130,9 +145,10 @@ def with_noise_as_stated(before: Calibration, refit: Calibration) -> Calibration
 
 
 def least_noisy(refits: Iterable[Calibration]) -> Calibration | None:
-    """Of fits of a run that with the least noise, by the determinants of its dwells' covariances."""
+    """The fit with the least noise, by the determinants of the covariances of its dwell means, or None."""
 
     def size(refit: Calibration) -> float:
+        """Return the log determinant of the covariances of all dwell means."""
         covariances = mean_covariances(refit.noise, refit.carried.means, refit.carried.state)
         return float(np.linalg.slogdet(covariances)[1].sum())
 
@@ -140,6 +156,6 @@ def least_noisy(refits: Iterable[Calibration]) -> Calibration | None:
 
 
 def scatter_is_possible(before: Calibration) -> bool:
-    """Whether dwells may scatter by more than was stated: it was found that they do, or so few cannot show it."""
+    """Whether dwells may scatter by more than was stated: the data show it, or are too few to exclude it."""
     noise, few = before.noise, before.consistency.dof < FEWEST
     return (not noise.scatter_stated and (few or bool(noise.scatter_mps2.any()))) or (not noise.setting_stated and few)

@@ -5,17 +5,17 @@
     reason = "Nothing is left that noise would not leave (p = 0.31)."
     model = ["second-order"]
 
-    [recording]                             # replaying the journal asks for this very file
+    [recording]                             # a replay of the journal refuses any other file
     name = "hidden.mcap"
     sha256 = "4f0e..."
 
-    [options]                               # of the command line, where they were given; a replay takes them from here
+    [options]                               # those given on the command line; a replay uses them again
     angle_sigma_deg = "0.002"
 
-    [sha256]                                # of the Python files under effects_from, which a replay asks leave to run
+    [sha256]                                # of the Python files under effects_from; a replay asks before it runs them
     "/home/me/my_effects.py" = "9c1a..."
 
-    [start]                                 # figures of the first model: SI, every digit
+    [start]                                 # figures of the first model in SI, with all digits
     held_out_rms_mps2 = 1.4e-5
 
     [[steps]]
@@ -24,7 +24,7 @@
     undone = false
     ...
 
-Figures are kept to the last bit, and a replay says whether it found the same.
+Figures keep all their digits, so that a replay can tell whether it gave the same numbers to the last bit.
 """
 
 from __future__ import annotations
@@ -51,7 +51,11 @@ from kf_calib.support.value_schema import FINITE, TEXT, Misfit, converted
 
 @dataclass(frozen=True)
 class Origin:
-    """What an improvement was made from: the recording, its fingerprint, options, and Python files of effects."""
+    """What an improvement was made from.
+
+    name: of the recording. sha256: fingerprint of the recording. options: those of the command line. programs: Python
+    files with effects.
+    """
 
     name: str
     sha256: str
@@ -60,7 +64,7 @@ class Origin:
 
     @classmethod
     def of(cls, recording: Path) -> Origin:
-        """Raises InputError where the recording cannot be read."""
+        """The origin of an improvement of this recording; raises InputError where it cannot be read."""
         try:
             digest = hashlib.sha256()
             for path in files_of(recording):
@@ -73,7 +77,7 @@ class Origin:
 
 @dataclass(frozen=True)
 class Choice:
-    """A step as a journal tells it: what to add, what to take out, who chose it, and the figures it led to."""
+    """One step in a journal: the effect added, those dropped, who chose it, and the figures that resulted."""
 
     added: str | None
     dropped: tuple[str, ...]
@@ -83,7 +87,11 @@ class Choice:
 
 @dataclass(frozen=True)
 class Journal:
-    """What a journal says: steps that were taken back are left out; start: figures of the first model."""
+    """The content of a journal, without steps that were undone.
+
+    origin: what it was made from. version: of the program. start: figures of the first model. choices: the steps.
+    asked: whether the user ended the improvement.
+    """
 
     origin: Origin
     version: str
@@ -92,7 +100,7 @@ class Journal:
     asked: bool
 
     def refuse_other(self, origin: Origin, path: Path | None) -> None:
-        """Raise InputError where the recording is not the one the journal was made from."""
+        """Raise InputError where the recording is not the one from which the journal was made."""
         if origin.sha256 != self.origin.sha256:
             raise InputError(
                 f"{path}: is the journal of another recording, {self.origin.name}: name that one, or put the same "
@@ -101,7 +109,7 @@ class Journal:
 
 
 def figures(found: Diagnosis) -> dict[str, float]:
-    """What is compared when a journal is replayed: the run's p-value, the errors, every parameter with its sigma."""
+    """The figures that are compared in a replay: the p-value, the errors, and every parameter with its sigma (SI)."""
     result, out = found.before, dict[str, float | None]()
     out |= {
         "p_value": found.test.p_value,
@@ -115,7 +123,10 @@ def figures(found: Diagnosis) -> dict[str, float]:
 
 
 def write(path: Path, state: Improvement, origin: Origin) -> None:
-    """Write a journal of the steps so far; the file is whole or not there, and one of that name is replaced."""
+    """Write a journal of the steps so far.
+
+    An existing file of that name is replaced as a whole; it is never left half written.
+    """
     import tomli_w
 
     table: dict[str, Any] = {
@@ -134,6 +145,7 @@ def write(path: Path, state: Improvement, origin: Origin) -> None:
 
 
 def _entry(step: SelectionStep) -> dict[str, Any]:
+    """Return the table of one step."""
     out: dict[str, Any] = {} if step.added is None else {"added": step.added}
     tests = [vars(each) for each in step.dropped]
     return out | {"by": step.by, "undone": step.undone, "dropped": tests, "figures": figures(step.found)}
@@ -187,13 +199,17 @@ def read(path: Path) -> Journal:
 
 
 def _choice(step: _Step) -> Choice:
+    """Return the choice that an entry of a journal records."""
     return Choice(step.get("added"), tuple(each["name"] for each in step["dropped"]), step["by"], step["figures"])
 
 
 def replayed(
     journal: Journal, start: Calibration, on_step: Callable[[Improvement], None] | None = None
 ) -> tuple[Improvement, float]:
-    """The steps of a journal taken again, and the largest relative difference from its figures: 0 to the last bit."""
+    """The steps of a journal repeated, and the largest relative difference from its figures (0: equal to the last bit).
+
+    start: the calibration with the first model. on_step: called after each step.
+    """
     state = begin(start)
     differences = [_difference(journal.start, figures(state.found))]
     for choice in journal.choices:
@@ -205,13 +221,14 @@ def replayed(
 
 
 def _difference(one: Mapping[str, float], other: Mapping[str, float]) -> float:
-    """The largest relative difference of two sets of figures; infinite where one has a figure the other lacks."""
+    """Return the largest relative difference of two sets of figures; infinite where their keys differ."""
     if one.keys() != other.keys():
         return float("inf")
     return max(abs(one[key] - other[key]) / max(abs(one[key]), abs(other[key]), 1e-300) for key in one)
 
 
 def _version() -> str:
+    """Return the version of this program."""
     from importlib.metadata import version
 
     return version("kf_calib")

@@ -1,12 +1,12 @@
-"""The loop: diagnose, add, refit, see the error fall, test what is in already; until there is a reason to stop.
+"""Stepwise selection: diagnose, add an effect, refit, test the effects already added, until there is a reason to stop.
 
-All of it works on the dwell factors of one pass over the data. A model is refitted from nothing but these factors and
-its list of effects, so that a journal of the steps, or the list alone, gives the same numbers bit for bit.
+Every step works on the dwell factors of one pass over the data. A refit depends on these factors and on the list of
+effects alone, so that a journal of the steps, or the list by itself, gives the same numbers bit for bit.
 
-Unattended, an effect is added only where nothing else would do as well: where two explain the misfit equally well the
-twelve parameters depend on which is taken, and that is a person's choice. Of several that are needed together, one is
-added at a time, first one that is the only choice beside the others; the next diagnosis may then know better.
-After every addition each effect of the model is tested for being taken out again; what the user put in stays.
+Without a user, an effect is added only where no other explains the misfit equally well. Where two do, the twelve
+parameters depend on the choice, which is left to a person. Where several effects are needed together, one is added at
+a time, beginning with one that has no look-alike beside the others; the next diagnosis may then say more.
+After each addition every effect of the model is tested for removal, except those that the user put in.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from kf_calib.estimation.calibration import refitted
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 
-_NEEDED = 0.01  # an effect whose removal would raise chi-squared by no more than chance does in 99 of 100 runs is not
-_NEAR_THRESHOLD = 8.0  # sigma; what is found only if it comes out large comes out too large on average
+_NEEDED = 0.01  # an effect is needed where its removal raises chi-squared significantly at this level
+_NEAR_THRESHOLD = 8.0  # sigma; an effect near the threshold is found only if noise enlarges it: estimates are too large
 
 Because = Literal["consistent", "unknown", "ambiguous", "asked", "undetermined"]
 By = Literal["diagnosis", "user"]
@@ -39,7 +39,7 @@ By = Literal["diagnosis", "user"]
 
 @dataclass(frozen=True)
 class Removal:
-    """What taking an effect out of a model would do: the rise of chi-squared, its degrees of freedom, its p-value."""
+    """The test of removing an effect from a model: rise of chi-squared, its degrees of freedom and its p-value."""
 
     name: str
     statistic: float
@@ -48,14 +48,16 @@ class Removal:
 
     @property
     def needed(self) -> bool:
+        """Whether the removal would raise chi-squared significantly."""
         return self.p_value < _NEEDED
 
 
 @dataclass(frozen=True)
 class SelectionStep:
-    """One change of the model: what was added (as it was written; None: nothing) and taken out, and what is so then.
+    """One change of the model.
 
-    found: the diagnosis of the model after the step. undone: the user took the step back.
+    added: the effect that was added, as it was written (None: no effect). dropped: effects that were taken out. by: who
+    chose the step. found: the diagnosis of the model after the step. undone: whether the user took the step back.
     """
 
     added: str | None
@@ -66,21 +68,22 @@ class SelectionStep:
 
     @property
     def result(self) -> Calibration:
+        """The calibration after the step."""
         return self.found.before
 
     @property
     def name(self) -> str | None:
-        """Of the effect that was added."""
+        """Name of the effect that was added, or None."""
         return None if self.added is None else _name(self.added, self.result)
 
     @cached_property
     def removals(self) -> tuple[Removal, ...]:
-        """The test of every effect that is in the model now."""
+        """The test of removing each effect that is in the model after the step."""
         return removals(self.result.fit)
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
-        """What must be known of an addition before its size is relied on."""
+        """Sentences of caution about the size or the significance of the effect that was added."""
         own = [each for each in self.removals if each.name == self.name]
         out = list[str]()
         for each in own:
@@ -105,7 +108,10 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Spread:
-    """By how much one of the twelve parameters differs between equal explanations, and its largest sigma (SI)."""
+    """The range of one of the twelve parameters over equally good explanations (SI).
+
+    parameter: the one with the largest sigma among them. lowest, highest: its extreme values.
+    """
 
     parameter: Parameter
     lowest: float
@@ -113,12 +119,17 @@ class Spread:
 
     @property
     def sigmas(self) -> float:
+        """The range in units of the largest sigma."""
         return (self.highest - self.lowest) / (self.parameter.sigma or np.nan)
 
 
 @dataclass(frozen=True)
 class Improvement:
-    """The steps from a first model to the last one, and why they ended there (``because``; None: still going on)."""
+    """The steps from a first model to the current one.
+
+    start: the diagnosis of the first model. history: all steps, those that were undone included. asked: whether the
+    user ended the improvement.
+    """
 
     start: Diagnosis
     history: tuple[SelectionStep, ...] = ()
@@ -129,37 +140,39 @@ class Improvement:
 
     @property
     def steps(self) -> tuple[SelectionStep, ...]:
-        """Those that hold."""
+        """The steps that were not undone."""
         return tuple(step for step in self.history if not step.undone)
 
     @property
     def found(self) -> Diagnosis:
-        """The diagnosis of the model as it stands."""
+        """The diagnosis of the current model."""
         return self.steps[-1].found if self.steps else self.start
 
     @property
     def result(self) -> Calibration:
+        """The calibration with the current model."""
         return self.found.before
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """The effects of the model as it stands, as ``effect_named`` takes them."""
+        """The effects of the current model, as text that ``effect_named`` accepts."""
         return tuple(self.result.settings.effects)
 
     @property
     def kept(self) -> set[str]:
-        """Effects that are never taken out unasked: the user's, and those that were out once and came back."""
+        """Effects that are never taken out automatically: those of the user, and those added again after a removal."""
         users = {step.name for step in self.steps if step.name and step.by == "user"}
         gone = {each.name for step in self.steps for each in step.dropped}
         return {str(effect) for effect in self.start.before.model.effects} | users | gone
 
     @cached_property
     def removals(self) -> tuple[Removal, ...]:
+        """The test of removing each effect of the current model."""
         return self.steps[-1].removals if self.steps else removals(self.result.fit)
 
     @property
     def because(self) -> Because:
-        """Why it stops here."""
+        """Why the improvement stops with the current model."""
         found = self.found
         if self.asked and found.test.consistent is False:
             return "asked"
@@ -171,7 +184,7 @@ class Improvement:
 
     @cached_property
     def reason(self) -> str:
-        """The same in a sentence or two."""
+        """The same in one or two sentences."""
         verdict, names = self.found.verdict, " and ".join(each.name for each in self.alternatives)
         far = max(self.spreads, key=lambda spread: spread.sigmas, default=None)
         differ = f"; the twelve differ by up to {far.sigmas:.1f} sigma ({far.parameter.symbol})" if far else ""
@@ -191,9 +204,9 @@ class Improvement:
 
     @cached_property
     def alternatives(self) -> tuple[Alternative, ...]:
-        """The effects among which this run cannot choose, each refitted beside the model as it stands.
+        """The effects among which this run cannot decide, each with its refit.
 
-        Where one of them was taken: the model as it stands, then with each of the others in its place.
+        If one of them was added already: the current model, then one with each of the others in its place.
         """
         if _rivals(self.found):
             return tuple(Alternative(name, self.found.refit_with(name)) for name in self.found.ambiguity)
@@ -208,13 +221,14 @@ class Improvement:
         return tuple(out)
 
     def _with_instead(self, place: int, name: str) -> Calibration:
+        """Return the calibration with another effect in one place of the list."""
         effects = list(self.effects)
         effects[place] = name
         return refitted(self.result, tuple(effects))
 
     @cached_property
     def spreads(self) -> tuple[Spread, ...]:
-        """Of each of the twelve that all alternatives determine."""
+        """The range over all alternatives of each of the twelve parameters that all of them determine."""
         out = list[Spread]()
         for symbol in paper_parameters.SYMBOLS if self.alternatives else ():
             own = [each.result.parameters[symbol] for each in self.alternatives]
@@ -229,9 +243,10 @@ def improve(
     accept_first: bool = False,
     on_step: Callable[[Improvement], None] | None = None,
 ) -> Improvement:
-    """Add what the diagnosis names, until nothing is missing or nothing can be named; a recording is calibrated first.
+    """Stepwise selection: add the effects that the diagnosis names until none is missing or none can be chosen.
 
-    accept_first: of effects that explain the misfit equally well, take the first instead of stopping.
+    run: a calibration, or a recording or source, which is calibrated first. accept_first: take the first of effects
+    that explain the misfit equally well instead of stopping. on_step: called after each step.
     """
     state = begin(run)
     while (name := next_effect(state.found, accept_first)) is not None:
@@ -242,22 +257,23 @@ def improve(
 
 
 def begin(run: Calibration | Source | str | PathLike[str]) -> Improvement:
+    """An improvement without steps, from the diagnosis of a run."""
     return Improvement(diagnose(run))
 
 
 def next_effect(found: Diagnosis, accept_first: bool = False) -> str | None:
-    """The effect to add next; None where nothing is missing, or where a person must choose."""
+    """The effect to add next; None where nothing is missing, or where the choice is left to a person."""
     if found.test.consistent is not False or not found.missing:
         return None
     if accept_first:
         return found.missing[0]
     if _rivals(found) or (found.as_scatter and found.test.walking not in found.missing):
-        return None  # of a walk that may be scatter the noise is as large either way
+        return None  # a random walk is excepted: the noise is as large whether it is a walk or scatter
     return found.missing[0] if len(found.missing) == 1 else _only_choice(found)
 
 
 def _only_choice(found: Diagnosis) -> str | None:
-    """Of effects that explain the misfit together, the first that nothing can stand for beside the others."""
+    """Return the first of several effects needed together that has no look-alike beside the others, or None."""
     before = found.before
     for name in found.missing:
         rest = [other for other in found.missing if other != name]
@@ -268,21 +284,23 @@ def _only_choice(found: Diagnosis) -> str | None:
 
 
 def _rivals(found: Diagnosis) -> list[str]:
-    """Effects that would do as well as those that are missing."""
+    """Return the effects that explain as much as those that are named as missing."""
     return [name for name in found.ambiguity if found.missing and name not in found.missing]
 
 
 def extend(state: Improvement, names: Sequence[str], by: By) -> Improvement:
-    """The effects added, a step each; after the last one whatever is not needed any more is taken out."""
+    """The improvement after adding several effects, one step each; after the last, those not needed are removed."""
     for name in names[:-1]:
         state = take_step(state, name, (), by)
     return take_step(state, names[-1], None, by)
 
 
 def take_step(state: Improvement, added: str | None, dropped: Sequence[str] | None, by: By) -> Improvement:
-    """One step: ``added`` goes in, then each of ``dropped`` out, by name; None: whatever is not needed.
+    """The improvement after one step: ``added`` goes into the model, then effects are taken out.
 
-    Raises InputError, in one sentence, where an effect cannot be added or is not there.
+    state: the improvement before. added: name or formula of an effect (None: no effect). dropped: names of effects to
+    take out (None: each that is not needed). by: who chose the step. Raises InputError where the effect cannot be
+    added, or where one to be dropped is not in the model.
     """
     if added is not None:
         _refuse(state.result, added)
@@ -296,7 +314,10 @@ def take_step(state: Improvement, added: str | None, dropped: Sequence[str] | No
 
 
 def undone(state: Improvement) -> Improvement:
-    """The last step that holds, taken back; it stays in the history."""
+    """The improvement with its last step undone, which stays in the history.
+
+    Raises InputError where there is no step to undo.
+    """
     last = max((k for k, step in enumerate(state.history) if not step.undone), default=None)
     if last is None:
         raise InputError("there is no step to undo.")
@@ -306,9 +327,10 @@ def undone(state: Improvement) -> Improvement:
 
 
 def removals(fitted: Fit) -> tuple[Removal, ...]:
-    """What taking each effect out would do: all others refitted, noise and linearisation as they are.
+    """The test of removing each effect from a fit: the others are refitted, noise and linearisation are kept.
 
-    Exact from one triangle where the effect is linear; a constant inside its columns counts as a coefficient.
+    For linear effects the test is exact and needs only one triangular factor. A constant inside the columns of an
+    effect counts as one of its coefficients.
     """
     from scipy.special import chdtrc
 
@@ -328,7 +350,7 @@ def removals(fitted: Fit) -> tuple[Removal, ...]:
 
 
 def _next_out(result: Calibration, kept: set[str], dropped: Sequence[str] | None, done: int) -> Removal | None:
-    """The next effect to take out of a model: the ``dropped`` in turn, else the one that is needed least."""
+    """Return the next effect to take out: the next of ``dropped``, or else the one that is needed least."""
     tests = {each.name: each for each in removals(result.fit)}
     if dropped is not None:
         return _there(tests, dropped[done]) if done < len(dropped) else None
@@ -337,6 +359,7 @@ def _next_out(result: Calibration, kept: set[str], dropped: Sequence[str] | None
 
 
 def _there(tests: dict[str, Removal], name: str) -> Removal:
+    """Return the test of an effect of the model by name."""
     if name not in tests:
         inside = f"it has {', '.join(tests)}." if tests else "it has the twelve parameters only."
         raise InputError(f"{name!r} is not in the model, so it cannot be dropped: {inside}")
@@ -344,16 +367,18 @@ def _there(tests: dict[str, Removal], name: str) -> Removal:
 
 
 def _less(result: Calibration, name: str) -> tuple[str, ...]:
+    """Return the effects of a model without one of them."""
     both = zip(result.model.effects, result.settings.effects, strict=True)
     return tuple(text for effect, text in both if str(effect) != name)
 
 
 def _name(text: str, result: Calibration) -> str:
-    """What the effect of a text is called: for a formula, what stands before its equals sign."""
+    """Return the name of the effect that a text stands for; of a formula, what stands before its equals sign."""
     return str(effect_named(text, result.bench))
 
 
 def _refuse(result: Calibration, text: str) -> None:
+    """Raise InputError where an effect cannot be added to the model."""
     refuse_unknown(text)
     effect = effect_named(text, result.bench)
     if len(merged(result.settings.effects, [text])) == len(result.settings.effects):

@@ -1,4 +1,4 @@
-"""A misfit that no known effect explains, described: which channel, driven by what, a formula to begin with."""
+"""Description of a misfit that no known effect explains: where it shows, what it depends on, and formulas to try."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from kf_calib.estimation.results import consistency
 from kf_calib.estimation.score_test import Frame, batches, columns_at_once
 from kf_calib.support import stage
 
-_CHANCE = 1e-4  # of a family to fall as much where nothing is missing: there are about a hundred
-_WITHIN = 0.01  # of trends within dwells
-_SAME = 0.99  # cosine above which a formula is a known effect
+_CHANCE = 1e-4  # significance level of one family, of which there are about a hundred
+_WITHIN = 0.01  # significance level of trends within dwells
+_SAME = 0.99  # cosine of the angle between a formula and a known effect above which they count as the same
 _DECAYS_S = (10, 30, 100, 300)
-_JUMPS = 100  # at most
+_JUMPS = 100  # largest number of moments at which a jump is tried
 
 JUMP = "time (a jump)"
 DECAY = "time (a decay)"
@@ -38,7 +38,11 @@ WITHIN = "time (irregular, within dwells too)"
 
 @dataclass(frozen=True)
 class Description:
-    """channel: x, y, z or all; driver: in words; share: of what is beyond noise; formulas: to add as they stand."""
+    """What an unknown misfit looks like.
+
+    channel: axis of the accelerometer in which it shows most (x, y, z, or all). driver: in words, what it depends on.
+    share: share of the chi-squared beyond noise that is explained. formulas: effects to add to the model as they stand.
+    """
 
     channel: str
     driver: str
@@ -47,16 +51,17 @@ class Description:
 
     @property
     def formula(self) -> str:
+        """The first of the formulas."""
         return self.formulas[0]
 
 
 @dataclass(frozen=True)
 class Family:
-    """Formulas with one driver, as a candidate of its own; fall: of chi-squared, with all of them; rank: of what they
-    see.
+    """Formulas of one driver, tested together as one candidate.
 
-    falls: with each of them alone; formulas: as they can be added. known: each of them is what some known effect is,
-    or nearly.
+    driver: in words, what the misfit would depend on. texts: the formulas. fall: fall of chi-squared with all of them.
+    rank: number of their columns that can be told from the model. falls: fall of chi-squared with each of them alone.
+    known: whether each of them equals a known effect, or nearly so.
     """
 
     driver: str
@@ -68,31 +73,34 @@ class Family:
 
     @property
     def formulas(self) -> tuple[str, ...]:
+        """The formulas as they can be added to a model, each with a name."""
         return tuple(_named(text, number) for number, text in enumerate(self.texts))
 
     @property
     def dof(self) -> int:
-        """One more where the moment of a jump, a time constant or a period is looked for, as an effect's constant
-        (``chance_fall``)."""
+        """Degrees of freedom: the rank, and one more where a moment, a time constant or a period is searched."""
         return self.rank + (self.rank > 0 and self.driver in (JUMP, DECAY, ARRIVAL, PERIODIC))
 
     @property
     def of_time(self) -> bool:
+        """Whether the family depends on time."""
         return self.driver.startswith("time")
 
     @property
     def score(self) -> float:
-        """The fall less what chance gives so many columns."""
+        """The fall of chi-squared less its threshold at the level of one family."""
         from scipy.special import chdtri
 
         return self.fall - float(chdtri(self.dof, _CHANCE)) if self.dof else 0.0
 
 
 def describe(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Description | None:
-    """The family of formulas that explains most of what the model leaves, if any explains more than chance would.
+    """Description of the misfit by the family of formulas that explains most of it; None where none is significant.
 
-    None of them does where the dwells are likelier to scatter or their biases to walk: to try is the walk, then. What
-    goes on within dwells, too, is a matter of time. residuals: of the dwells, (D, 3).
+    Where a random walk of the biases or scatter from dwell to dwell is likelier, or where the misfit also changes
+    within dwells and no family explains that, the misfit is described as irregular, and the formula to try is the walk.
+
+    fitted: the fit whose misfit is described. residuals: of the dwell means, (D, 3). trend: its test within dwells.
     """
     from scipy.special import chdtri
 
@@ -118,12 +126,12 @@ def describe(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Desc
 
 
 def one_digit_seconds(duration_s: float) -> str:
-    """To one digit, as 30 s."""
+    """A duration as text to one significant digit, as 30 s."""
     return f"{float(f'{duration_s:.1g}'):g} s"
 
 
 def _back_s(fitted: Fit, walk: str) -> float | None:
-    """With which time constant what goes to and fro comes back, s; None where it does so as a walk does."""
+    """Return the time constant, s, with which an irregular drift returns, or None if it is no different from a walk."""
     model = fitted.carried.model
     walked = fit(fitted.dwells, model + effect_named(walk, model.bench), 0.0, fitted.carried.slews)
     if not walked.noise.walk_mps2_per_sqrt_s:
@@ -133,12 +141,12 @@ def _back_s(fitted: Fit, walk: str) -> float | None:
 
 
 def _goes_on(trend: Trend | None) -> bool:
-    """Whether what is left goes on within dwells."""
+    """Tell whether the trends within dwells are significant."""
     return trend is not None and trend.p_value < _WITHIN
 
 
 def _trend_beside(fitted: Fit, family: Family) -> Trend | None:
-    """What is left of the trends with a family in the model."""
+    """Return the test of trends within dwells with the formulas of a family in the model."""
     model = fitted.carried.model
     for text in family.formulas:
         model += effect_named(text, model.bench)
@@ -146,9 +154,12 @@ def _trend_beside(fitted: Fit, family: Family) -> Trend | None:
 
 
 def families(fitted: Fit, known: Sequence[Effect] = (), frame: Frame | None = None) -> list[Family]:
-    """All families tried on what the model leaves, beside effects that are ``known``; once for each fit.
+    """All families of formulas, each tested on what the model leaves.
 
-    frame: that has the columns of all of these effects, or all but some.
+    The result is kept with the fit, so that it is computed once.
+
+    fitted: the fit. known: effects with which the formulas are compared. frame: with the columns of most of these
+    effects.
     """
     key = tuple((str(effect), effect.value) for effect in known)
     if key not in fitted.families:
@@ -160,9 +171,10 @@ def families(fitted: Fit, known: Sequence[Effect] = (), frame: Frame | None = No
 
 
 def _tried(fitted: Fit, frame: Frame, others: Sequence[Effect]) -> list[Family]:
+    """Return the families with their falls of chi-squared, tested together with the known effects."""
     bench, tried = fitted.carried.model.bench, list[tuple[str, list[str], list[Effect]]]()
     for driver, texts in _families(bench, fitted.dwells):
-        with contextlib.suppress(InputError):  # a jump so late, a decay so fast that the trial of a formula misses it
+        with contextlib.suppress(InputError):  # a very late jump or fast decay does not show when a formula is checked
             own = [formula(_named(text), bench.axes, bench.gravity_mps2, checked=False) for text in texts]
             tried.append((driver, texts, [*own]))
     stage.say(f"trying {sum(len(texts) for _, texts, _ in tried)} formulas")
@@ -183,19 +195,19 @@ def _tried(fitted: Fit, frame: Frame, others: Sequence[Effect]) -> list[Family]:
 
 
 def _named(text: str, number: int = 0) -> str:
-    """``:z = sin(q1)`` or ``sin(q1)`` as a formula with a name."""
+    """Return a formula with a name in front, from ``:z = sin(q1)`` or ``sin(q1)``."""
     name = f"mine{number + 1}" if number else "mine"
     return f"{name}{text}" if text.startswith(":") else f"{name} = {text}"
 
 
 def _channel(residuals: Floats) -> str:
-    """The accelerometer with most of the squared residuals (D, 3) of the dwells; all, where none stands out."""
+    """Return the axis of the accelerometer with most of the squared residuals (D, 3); "all" where none stands out."""
     squares = np.sum(residuals**2, axis=0)
     return "xyz"[int(np.argmax(squares))] if squares.max() > 0.7 * squares.sum() else "all"
 
 
 def _families(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
-    """What may drive a misfit, in words, and formulas of it; ``:place = ...`` turns a gimbal or the base."""
+    """Yield the drivers in words, each with formulas; ``:place = ...`` stands for a rotation of a gimbal or base."""
     yield from _of_force()
     yield from _of_gimbals(len(bench.axes))
     yield from _of_time(dwells)
@@ -203,6 +215,7 @@ def _families(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str
 
 
 def _of_force() -> Iterator[tuple[str, list[str]]]:
+    """Yield the formulas of the specific force."""
     yield "specific force, degree 2", ["a*a", "a*p", "a*o", "p*o", "p*p"]
     for terms in (["a**3"], ["a*a*p"], ["a*a*o"], ["a*p*o"], ["p**3"], ["o**3"], ["a**3", "a*p*p", "p**3", "a*a*p"]):
         yield "specific force, degree 3", terms
@@ -213,6 +226,7 @@ def _of_force() -> Iterator[tuple[str, list[str]]]:
 
 
 def _of_gimbals(count: int) -> Iterator[tuple[str, list[str]]]:
+    """Yield the formulas of the gimbal angles."""
     for k in range(1, count + 1):
         for n in (1, 2, 3, 4, 6):
             both = [f"{wave}({n}*q{k})" for wave in ("sin", "cos")]
@@ -224,6 +238,7 @@ def _of_gimbals(count: int) -> Iterator[tuple[str, list[str]]]:
 
 
 def _of_time(dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
+    """Yield the formulas of time: drift, jumps, decays and oscillations."""
     yield "time", ["t"]
     yield "time", ["t", "t*t"]
     moments_s = [moment for dwell in dwells for moment in (dwell.start_s, 0.5 * (dwell.start_s + dwell.end_s))][1:]
@@ -240,6 +255,7 @@ def _of_time(dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
 
 
 def _of_surroundings(bench: Bench) -> Iterator[tuple[str, list[str]]]:
+    """Yield the formulas of the temperature and of the previous orientation."""
     for terms in (["T"], ["T*T"], ["T", "T*T", "T**3"], ["a*T"], ["a*T*T"], ["a*T", "a*T*T"], ["p*T", "o*T"]):
         yield "temperature", terms
     if bench.axes:

@@ -12,7 +12,7 @@ from kf_calib.estimation.results import format_p
 
 
 def verdict_in_words(found: Diagnosis) -> str:
-    """One sentence on top."""
+    """The verdict of a diagnosis in one sentence, with what else it could be."""
     test = found.test
     if test.consistent is None:
         return "Nothing is left over to judge the model by: visit more orientations."
@@ -65,11 +65,12 @@ def verdict_in_words(found: Diagnosis) -> str:
 
 
 def _scattering(found: Diagnosis) -> str:
+    """Return the words for scatter from dwell to dwell as an explanation."""
     return f"dwells that scatter by more than is {'stated' if dwell_noise_is_stated(found.before) else 'estimated'}"
 
 
 def _size(found: Diagnosis) -> str:
-    """The largest coefficient of the first name, in sigma, with its unit; and the constant it has."""
+    """Return, as text, the most significant coefficient of the first missing effect and its constant, with sigmas."""
     assert found.after is not None
     parameters = found.after.parameters
     first = next(each for each in found.after.model.effects if str(each) == found.missing[0])
@@ -84,6 +85,7 @@ def _size(found: Diagnosis) -> str:
 
 
 def _held_out(found: Diagnosis) -> str:
+    """Return a sentence about the change of the held-out error, or "" where it is not known."""
     before, after = found.before, found.after
     assert after is not None
     if before.held_out_rms_mps2 is None or after.held_out_rms_mps2 is None or not after.held_out_floor_mps2:

@@ -1,11 +1,13 @@
-"""Trends within dwells: whether what is left of the readings goes on in a dwell as noise does.
+"""Trends within dwells: a test of whether the residuals change within dwells more than noise does.
 
-An effect that no column describes need not show in the means of dwells more than scatter would; but what jumps or turns
-in the course of a dwell leaves it with a slope and a bend. Of each dwell and channel the residual is taken along smooth
-shapes over it, Legendre's polynomials of degree 1 to 3 times 1 - u^2, less their mean: what shakes the platform as it
-arrives and leaves is no trend. Of noise of density kappa sigma^2 each has that variance; a random walk of the biases
-adds q^2 T times a constant, and 1/f noise of density h / f adds h times one, whatever the length T of the dwell
-(covariances min(s, t) and -ln |s - t|).
+An effect for which there is no column may show no more in the means of dwells than scatter would. If it jumps or turns
+during a dwell, however, it leaves a slope and a bend there. The residuals of each dwell and channel are projected on
+smooth shapes: Legendre polynomials of degree 1 to 3 times 1 - u^2, made orthogonal to a constant. The factor 1 - u^2
+reduces the weight of both ends, where the platform still shakes.
+
+Noise whose mean has the variance kappa sigma^2 / n gives each coefficient that same variance. A random walk of the
+biases adds q^2 T times a constant, and 1/f noise of density h / f adds h times a constant, whatever the length T of
+the dwell (from the covariances min(s, t) and -ln |s - t|).
 """
 
 from __future__ import annotations
@@ -25,19 +27,22 @@ from kf_calib.estimation.noise_model import Noise, flicker_sigma
 
 _DEGREE = 3
 _GRID = 600
-_FEWEST = 8  # readings of a dwell
+_FEWEST = 8  # readings that a dwell must have to be tested
 
 
 def shapes(u: Floats) -> Floats:
-    """A constant, and the shapes at places u from -1 to 1 in a dwell, (..., 1 + degrees), not yet orthogonal."""
+    """A constant and the shapes at places u from -1 to 1 in a dwell, (..., 1 + degrees), not yet orthogonal."""
     values: Floats = np.polynomial.legendre.legvander(u, _DEGREE).astype(float)
     values[..., 1:] *= (1.0 - u**2)[..., None]
     return values
 
 
 def variances(values: Floats) -> tuple[Floats, Floats]:
-    """What a walk of q^2 T = 1 and 1/f noise of h = 1 add to the coefficients on functions (n, k) over a dwell, made
-    orthogonal to those before them and of mean square 1; (k - 1,) each, the first function being constant."""
+    """Variances of the coefficients of a dwell under a random walk with q^2 T = 1, and under 1/f noise with h = 1.
+
+    values (n, k): functions over a dwell, the first a constant. Each is made orthogonal to those before it and of mean
+    square 1. Returns both variances, (k - 1,) each, of all but the constant.
+    """
     count = len(values)
     frame = np.linalg.qr(values)[0][:, 1:] * np.sqrt(count)
     at = (np.arange(count) + 0.5) / count
@@ -49,13 +54,17 @@ def variances(values: Floats) -> tuple[Floats, Floats]:
 
 @cache
 def _of_shapes() -> tuple[Floats, Floats]:
+    """Return the variances of the shapes on a fine grid."""
     return variances(shapes((2.0 * np.arange(_GRID) + 1.0) / _GRID - 1.0))
 
 
 @dataclass(frozen=True)
 class Trend:
-    """Mean square of all trends over what noise makes of them, its p-value, and the sums of dwells and channels (D, 3)
-    in that measure."""
+    """The test of all trends within dwells.
+
+    ratio: mean square of all coefficients over what noise gives. p_value: its p-value. sums (D, 3): sum of these ratios
+    for each dwell and channel.
+    """
 
     ratio: float
     p_value: float
@@ -63,20 +72,24 @@ class Trend:
 
     @property
     def most(self) -> tuple[int, int]:
-        """The dwell and the channel, counted from 1, that show most."""
+        """The dwell and the channel with the largest sum, both counted from 1."""
         dwell, channel = np.unravel_index(int(self.sums.argmax()), self.sums.shape)
         return int(dwell) + 1, int(channel) + 1
 
 
 def trend(fitted: Fit) -> Trend | None:
-    """The test of all trends that a fit leaves; None where there is nothing to judge or to judge by."""
+    """The test of trends within dwells in the residuals of a fit; None where it cannot be made."""
     return trend_beside(fitted.carried, fitted.noise.judging, fitted.state)
 
 
 def trend_beside(carried: Carried, noise: Noise, state: Floats) -> Trend | None:
-    """The same beside the columns that are carried, of the model at ``state`` (p,).
+    """The test of trends in the residuals of a model at ``state`` (p,).
 
-    F distributed: kappa of n readings is known to 4 kappa / n of its square, a walk's intensity to its own spread.
+    The ratio is F distributed: its denominator stands for the uncertainty of the noise itself. From n readings, kappa
+    is known with a relative variance of (4 kappa - 2) / n, and the intensity of a walk with that of its own estimate.
+
+    carried: dwells and columns of the model. noise: by which it is judged. Returns None where the dwells are averages,
+    where scatter was not stated, or where no dwell has enough readings.
     """
     from scipy.special import fdtrc
 
@@ -101,8 +114,9 @@ def trend_beside(carried: Carried, noise: Noise, state: Floats) -> Trend | None:
 
 
 def _squares(carried: Carried, state: Floats) -> tuple[Floats, Mask]:
-    """Squares of the residuals' coefficients (D, 3, degrees) on shapes of mean square 1, and which degrees (D, degrees)
-    a dwell has readings for."""
+    """Return the squared coefficients (D, 3, degrees) of the residuals on the shapes, scaled to mean square 1, and a
+    mask (D, degrees) of the degrees that the readings of each dwell determine.
+    """
     out, seen = np.zeros((len(carried.dwells), 3, _DEGREE)), np.zeros((len(carried.dwells), _DEGREE), bool)
     for places in alike(carried.dwells):
         dwells, columns = [carried.dwells[k] for k in places], np.array([carried.columns[k] for k in places])
@@ -117,8 +131,9 @@ def _squares(carried: Carried, state: Floats) -> tuple[Floats, Mask]:
 
 
 def _shapes_in(dwells: Sequence[DwellFactor], triangles: Floats) -> tuple[Floats, Mask]:
-    """Orthonormal columns (d, r, k) on the rows of the triangles of dwells of one shape, a column a degree from one up,
-    and of which each dwell tells (d, k)."""
+    """Return orthonormal columns (d, r, k) on the triangle rows of dwells of equal size, one column for each degree
+    from one up, and a mask (d, k) of the degrees that each dwell determines.
+    """
     ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
     counts, lengths = np.array([dwell.count for dwell in dwells]), ends[:, 1] - ends[:, 0]
     at = np.array([dwell.nodes.elapsed_s for dwell in dwells]).reshape(*triangles.shape[:2], 3)

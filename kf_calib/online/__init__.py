@@ -1,1 +1,1 @@
-"""A run while it runs: session, sequential test, status."""
+"""Evaluation of a run while it is being recorded: session, sequential test and status."""

@@ -1,17 +1,17 @@
-"""A filter in the course of a run that takes effects in and out without a restart.
+"""A Kalman filter that adds and removes effects in the course of a run without a restart.
 
-Its factor [R | z] carries the columns of more effects than its model has. The estimate of any choice of them is one
-small QR (``square_root_information.restrict``), and equals that of a filter that had run with this choice from the
-start. A dwell that closes is one update of the factor; effects whose columns were not carried are folded in from the
-dwell factors.
+Its square-root information factor [R | z] carries the columns of more effects than its model has. The estimate of any
+choice of these effects is one small QR (``square_root_information.restrict``), and equals that of a filter that had
+run with this choice from the start. A dwell that closes is one update of the factor. An effect whose columns were not
+carried is added by building the factor again from the dwell factors.
 
     running = Running.over(dwells, model, noise, state, candidates)
     running = running.after(dwell)               # as each dwell closes
-    running = running.with_effect("mine = a*T")  # in or out, at any time
+    running = running.with_effect("mine = a*T")  # added or removed at any time
     state, covariance, undetermined = running.solved()
 
-Noise and linearisation are those given; a constant inside an effect's columns stays at its value, and what shows in
-slews only is not here. ``calibrate`` iterates all of these.
+The noise and the linearisation are those given. A constant inside the columns of an effect keeps its value, and
+effects that show in slews only are not supported. ``calibrate`` iterates or estimates all of these.
 """
 
 from __future__ import annotations
@@ -38,9 +38,12 @@ from kf_calib.estimation.score_test import Scan, project
 
 @dataclass(frozen=True)
 class Running:
-    """carried: the dwells so far, with the columns of the model and of all candidates; inside: names of those effects
-    that are in the model; factor (P, P + 1): of all columns, its states counted from ``about``. left, rows: the sum of
-    squares that all columns together leave of so many whitened rows.
+    """A filter after some dwells of a run; every change gives a new one.
+
+    carried: the dwells so far, with the columns of the model and of all candidates. inside: names of those effects that
+    are in the model. noise, prior: those of the filter. factor (P, P + 1): square-root information factor of all
+    columns; its states are differences from ``about``. left: sum of squares that all columns together leave. rows:
+    number of whitened rows.
     """
 
     carried: Carried
@@ -61,7 +64,11 @@ class Running:
         candidates: Iterable[Effect] = (),
         prior: Prior | None = None,
     ) -> Running:
-        """The filter after ``dwells`` (one or more), linearised at the affine ``state`` (12,)."""
+        """The filter after ``dwells`` (one or more), linearised at the affine ``state`` (12,).
+
+        model: the effects to be estimated. noise: by which readings are weighted. candidates: further effects whose
+        columns are carried. prior: of the state (None: diffuse).
+        """
         every = model
         for effect in candidates:
             every += effect
@@ -72,23 +79,25 @@ class Running:
 
     @property
     def dwells(self) -> list[DwellFactor]:
+        """The dwells so far."""
         return self.carried.dwells
 
     @property
     def about(self) -> Floats:
-        """The state (P,) that the factor's states are counted from."""
+        """The state (P,) from which the states of the factor are counted."""
         return self.carried.state
 
     @cached_property
     def model(self) -> Model:
-        """The model as it stands: the twelve parameters and the effects inside, in the order they came."""
+        """The current model: the twelve parameters and the effects in it, in the order in which they were added."""
         known = {str(effect): effect for effect in self.carried.model.effects}
         return Model(self.carried.model.bench, tuple(known[name] for name in self.inside))
 
     def after(self, dwell: DwellFactor, exact: bool = True) -> Running:
-        """The filter after one more dwell: one update, unless it changes what earlier dwells are known to have felt.
+        """The filter after one more dwell.
 
-        Not ``exact``: earlier dwells stay as they were known when they closed.
+        It is one update, unless the dwell changes what is known of the conditions in earlier dwells; then the factor is
+        built again. exact: False leaves earlier dwells as they were known when they closed.
         """
         if exact:
             carried = Carried([*self.dwells, dwell], self.carried.model, self.about)
@@ -100,9 +109,9 @@ class Running:
         return more._updated(more._rows([-1])[0], steps(carried.dwells[-2:], self.noise)[-1])
 
     def with_effect(self, text: str) -> Running:
-        """With that effect (a name or a formula) in the model; raises InputError where it cannot be added."""
+        """The filter with an effect (a name or a formula) in its model; raises InputError where it cannot be added."""
         effect = effect_named(text, self.carried.model.bench)
-        _ = self.model + effect  # refuses what the model has
+        _ = self.model + effect  # raises where the model has the effect already
         inside = (*self.inside, str(effect))
         if str(effect) in self.carried.model.parts:
             return replace(self, inside=inside)
@@ -111,13 +120,16 @@ class Running:
         return replace(self, inside=inside, carried=Carried(self.dwells, every, at))._folded()
 
     def without(self, name: str) -> Running:
-        """With that effect out of the model; its columns are still carried."""
+        """The filter with an effect removed from its model, whose columns are still carried.
+
+        Raises InputError where the effect is not in the model.
+        """
         if name not in self.inside:
             raise InputError(f"{name} is not in the model: it has {', '.join(self.inside) or 'no effects'}.")
         return replace(self, inside=tuple(each for each in self.inside if each != name))
 
     def solved(self) -> tuple[Floats, Floats, Floats]:
-        """State (p,) of the model, covariance (p, p), and a basis (p, q) of the combinations not determined."""
+        """State (p,) of the model, its covariance (p, p), and a basis (p, q) of the combinations not determined."""
         kept = self._kept
         around = self.model.nominal_state() - self.about[kept]
         moved, covariance, undetermined = square_root_information.solve(
@@ -127,14 +139,14 @@ class Running:
 
     @property
     def state(self) -> Floats:
-        """The state (P,) of all columns: the estimate of the model, zero for what is only carried."""
+        """The state (P,) of all columns: the estimate for those of the model, zero for those that are only carried."""
         out = np.zeros(len(self.about))
         out[self._kept] = self.solved()[0]
         return out
 
     @cached_property
     def scan(self) -> Scan:
-        """What each effect that is carried and not in the model would explain."""
+        """The score tests of all effects that are carried but not in the model."""
         kept, parts = self._kept, self.carried.model.parts
         outside = [effect for effect in self.carried.model.effects if str(effect) not in self.inside]
         theirs = [range(*parts[str(effect)].indices(len(self.about))) for effect in outside]
@@ -144,23 +156,24 @@ class Running:
 
     @property
     def misfit(self) -> tuple[float, int]:
-        """What the model as it stands leaves: sum of squares, chi-squared of so many degrees of freedom."""
+        """The sum of squares that the current model leaves, and its degrees of freedom."""
         restricted = square_root_information.restrict(self.factor, self._kept)
         squares = self.left + float(np.sum(self.factor[:, -1] ** 2) - np.sum(restricted[:, -1] ** 2))
         return squares, self.rows - square_root_information.rank(restricted)
 
     @cached_property
     def _kept(self) -> list[int]:
-        """Places of the model's columns among all."""
+        """Numbers of the columns of the current model among all."""
         parts, count = self.carried.model.parts, len(self.about)
         return [*range(STATE_COUNT), *(k for name in self.inside for k in range(*parts[name].indices(count)))]
 
     def _updated(self, rows: Floats, walked: Floats) -> Running:
+        """Return the filter after an update with whitened rows and the variances of a random walk before them."""
         factor, left = square_root_information.update(self.factor, rows, walked)
         return replace(self, factor=factor, left=self.left + left, rows=self.rows + len(rows))
 
     def _folded(self) -> Running:
-        """The same with its factor made anew from the dwells."""
+        """Return the same filter with its factor built again from all dwells."""
         factor = square_root_information.start(self.prior, self.carried.model)
         factor[:, -1] -= factor[:, :-1] @ self.about
         variances = steps(self.dwells, self.noise)
@@ -172,7 +185,7 @@ class Running:
         return out
 
     def _rows(self, chosen: Sequence[int] | None = None) -> list[Floats]:
-        """Whitened rows of all dwells, or of those chosen."""
+        """Return the whitened rows of all dwells, or of those chosen."""
         chosen = range(len(self.dwells)) if chosen is None else chosen
         dwells, columns = [self.dwells[k] for k in chosen], [self.carried.columns[k] for k in chosen]
         return square_root_information.whiten(dwells, columns, self.noise.weights, self.about, self.about)

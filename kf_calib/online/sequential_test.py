@@ -1,13 +1,14 @@
-"""A run judged while it goes on: after every dwell, whether the model still agrees and which effects look missing.
+"""Sequential test of a run: after every dwell, whether the model still agrees and which effects seem to be missing.
 
-Whoever looks after every dwell looks often, and noise alone would cross a level for one look in one run of twenty. The
-chance of a false alarm is therefore spent: the k-th look has 1/(k (k + 1)) of it, and all looks together have no more
-than that of one run. A look is one update of a factor and one projection; noise, linearisation and threshold are found
-anew whenever the run has grown by a quarter. What an alarm means is for ``diagnose`` to say, from the same dwells.
+A test after every dwell is repeated many times, and would cross a fixed level by chance far more often than a single
+test. The false-alarm probability is therefore spent: the k-th test has 1/(k (k + 1)) of it, so that all tests together
+have no more than a single run. A test is one update of a factor and one projection. Noise, linearisation and threshold
+are computed again whenever the run has grown by a quarter. The cause of an alarm is found by ``diagnose``, from the
+same dwells.
 
     watch = Watch.over(dwells, bench)
     watch = watch.after(dwell)        # as each dwell closes
-    watch.alarm, watch.p_value, watch.suspects
+    watch.alarmed, watch.p_value, watch.suspects
 """
 
 from __future__ import annotations
@@ -29,14 +30,17 @@ from kf_calib.support.threads import one_blas_thread
 
 _GROWN = 1.25
 _FEWEST = 4
-"""Dwells with which a watch can begin: fewer determine no orientation-dependent parameter."""
+"""Number of dwells with which a watch can begin: fewer cannot determine scale factors and misalignments."""
 
 
 @dataclass(frozen=True)
 class Watch:
-    """running: the filter with the candidates' columns; looks: how often it was judged; alarmed: after how many dwells
-    the level was crossed first (None: never); fitted_at: with how many dwells the noise was found; tests: as how many
-    independent ones the candidates count."""
+    """The sequential test of a run; every dwell gives a new one.
+
+    running: filter that carries the columns of the candidates. fitted_at: number of dwells when noise and threshold
+    were computed. tests: effective number of independent tests among the candidates. looks: number of tests so far.
+    alarmed: number of dwells after which the level was first crossed (None: never).
+    """
 
     bench: Bench
     settings: Settings
@@ -55,9 +59,10 @@ class Watch:
         looks: int = 0,
         fitted: Fit | None = None,
     ) -> Watch:
-        """A watch over the dwells so far, at least four; they count as one look, after ``looks`` with another model.
+        """The sequential test after the first dwells, at least four, which count as one test.
 
-        fitted: the model fitted to these dwells, where that is known.
+        settings: of the calibration. looks: number of tests made before with another model. fitted: the model fitted to
+        these dwells, where it is known. Raises ValueError for fewer than four dwells.
         """
         settings = settings or Settings()
         if len(dwells) < _FEWEST:
@@ -66,9 +71,12 @@ class Watch:
             return cls(bench, settings, *_begun(dwells, bench, settings, fitted), looks)._looked()
 
     def after(self, dwell: DwellFactor, fitted: Fit | None = None) -> Watch:
-        """The watch after one more dwell. fitted: the model fitted to the dwells with it, where that is known."""
+        """The sequential test after one more dwell.
+
+        fitted: the model fitted to all dwells, this one included, where it is known.
+        """
         with one_blas_thread():
-            running = self.running.after(dwell, exact=False)  # made anew when it has grown by a quarter
+            running = self.running.after(dwell, exact=False)  # it is built again when the run has grown by a quarter
             if len(running.dwells) < _GROWN * self.fitted_at:
                 return replace(self, running=running)._looked()
             running, fitted_at, tests = _begun(running.dwells, self.bench, self.settings, fitted)
@@ -76,12 +84,15 @@ class Watch:
 
     @property
     def dwells(self) -> list[DwellFactor]:
+        """The dwells so far."""
         return self.running.dwells
 
     @cached_property
     def p_value(self) -> float | None:
-        """Of this look alone, as ``diagnose`` has it: the misfit's, the best candidate's or the trends' within dwells;
-        None: nothing to judge."""
+        """The p-value of the latest test alone: the smallest of misfit, candidates and trends, as in ``diagnose``.
+
+        None where nothing is left to judge by.
+        """
         from scipy.special import chdtrc
 
         statistic, dof = self.running.misfit
@@ -96,14 +107,14 @@ class Watch:
 
     @cached_property
     def trend(self) -> Trend | None:
-        """What goes on within dwells; None where lines would, too."""
+        """The test of trends within dwells; None where spectral lines would give trends as well."""
         found = trend_beside(self.running.carried, self.running.noise, self.running.state)
         shown = found is not None and found.p_value < LEVEL
         return None if shown and lines_of(self.dwells, LEVEL * REST) else found
 
     @property
     def suspects(self) -> list[str]:
-        """Names of what is beyond chance at this look, the likeliest first."""
+        """Names of the effects that are significant in the latest test, the one with the highest score first."""
         scan = self.running.scan
         scores = {
             str(each.effect): float(fall) - chance_fall(each, self.tests)
@@ -113,6 +124,7 @@ class Watch:
         return sorted((name for name, score in scores.items() if score > 0), key=lambda name: -scores[name])
 
     def _looked(self) -> Watch:
+        """Return the watch after a test, at the level that is spent on it."""
         if self.p_value is None:
             return self
         looks = self.looks + 1
@@ -124,16 +136,16 @@ class Watch:
 def _begun(
     dwells: Sequence[DwellFactor], bench: Bench, settings: Settings, fitted: Fit | None
 ) -> tuple[Running, int, float]:
-    """Noise, linearisation and threshold found from the dwells so far."""
+    """Return the filter with noise and linearisation from the dwells so far, their number, and the effective tests."""
     if fitted is None or fitted.carried.slews or len(fitted.dwells) != len(dwells):
         fitted = fit(list(dwells), Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s)
-    noise = replace(fitted.noise.judging, checked=True)  # a setting error counts in full where a misfit is judged
+    noise = replace(fitted.noise.judging, checked=True)  # a test of the misfit has to allow for all of a setting error
     running = Running.over(dwells, fitted.carried.model, noise, fitted.carried.state, _watched(fitted))
     return running, len(dwells), independent_tests(running.scan)
 
 
 def _watched(fitted: Fit) -> list[Effect]:
-    """One of each kind of candidates: an unknown constant stands at the middle of its range."""
+    """Return one candidate of each effect; an unknown constant has the middle value of its grid."""
     first = dict[str, list[Effect]]()
     for effect in candidates(fitted.carried.model):
         first.setdefault(str(effect), []).append(effect)

@@ -1,13 +1,13 @@
-"""A run evaluated while it goes on: batches in, a ``Standing`` out at every batch, a ``Judgement`` at every dwell.
+"""A run evaluated while it is recorded: batches of readings in, a ``Judgement`` out after every dwell.
 
-The thread that calls ``run`` folds the samples as they come, and looks into the open dwell after 1, 2, 4 ... s; a
-second one judges the dwells that have closed. Neither waits for the other, nor for whoever looks on. What is folded is
-what a replay of the recording folds: the result is the same to the last bit.
+The thread that calls ``run`` folds the readings as they come, and evaluates the open dwell after 1, 2, 4 ... s. A
+second thread judges the dwells that have closed. Neither waits for the other or for whoever shows the results. The
+readings are folded as a replay of the recording folds them: the final result is the same to the last bit.
 
     session = Session(source, settings)
     session.listeners.append(print)     # each judgement, from the judging thread: must not block
     final = session.run()
-    session.accept("second-order")      # from any thread, while it runs: the effect is in all that follows
+    session.accept("second-order")      # from any thread during the run: the effect is in all later judgements
 """
 
 from __future__ import annotations
@@ -33,18 +33,19 @@ _FIRST_LOOK_S = 1.0
 
 @dataclass(frozen=True)
 class _Closed:
-    """What is judged: the pass as it was when a dwell closed, and when that was in bench time."""
+    """A state to be judged: the pass when a dwell closed, and the bench time of that moment in s."""
 
     passed: Pass
     elapsed_s: float
 
 
 class Session:
-    """A source evaluated as it comes.
+    """The evaluation of a source as its readings come.
 
-    wanted: targets of sigmas by symbol, SI. every: judge after each dwell even where dwells close faster than that;
-    else the newest only. auto: accept what is missing and can be told from all else. again: what gives the samples once
-    more when the source has ended (its recording); None: they are gone then.
+    source: of the readings. settings: of the calibration. wanted: targets of sigmas by symbol, SI. every: judge after
+    each dwell, even where dwells close faster than they are judged; False: judge the newest only. auto: accept an
+    effect that is missing once it has been told from all others. again: gives the readings once more when the source
+    has ended, from its recording; None where there is none.
     """
 
     def __init__(
@@ -70,13 +71,16 @@ class Session:
         self._last: _Closed | None = None
 
     def run(self) -> Judgement:
-        """Evaluate the source to its end; the final judgement. Raises KfCalibError where nothing can be said."""
+        """Evaluate the source to its end and return the final judgement.
+
+        Raises KfCalibError where the readings allow no judgement.
+        """
         failure: Exception | None = None
         with one_blas_thread():  # for both threads: setting it in one would change the other's
             judge = threading.Thread(target=self._judge, name="judge", daemon=True)
             judge.start()
             try:
-                for batch in self.source:  # to its end whatever happens: the source may be recording
+                for batch in self.source:  # read to its end even after a failure, as the source may be recording
                     try:
                         if failure is None:
                             self._take(batch)
@@ -95,7 +99,7 @@ class Session:
             return self._conclude()
 
     def accept(self, *names: str) -> None:
-        """Put effects (names or formulas) into the model from now on. Raises InputError where one cannot be added."""
+        """Add effects (names or formulas) to the model from now on; raises InputError where one cannot be added."""
         with self._lock:
             model = Model.of(self.source.bench, self.settings.effects)
             for name in names:
@@ -108,14 +112,14 @@ class Session:
             self._lock.notify_all()
 
     def hurry(self) -> None:
-        """Judge nothing more but the end: the run is to be over."""
+        """Skip all judgements but the final one, because the run is to end."""
         with self._lock:
             self._hurried = True
             self._waiting.clear()
             self._lock.notify_all()
 
     def _refuse(self, model: Model, begun: bool = False) -> None:
-        """Raise InputError where the model needs what a source that comes only once does not give."""
+        """Raise InputError where the model needs more than a source whose readings come once can give."""
         if self.settings.engine != "block":
             raise InputError(
                 "a live run is evaluated from folded dwells, as the block engine does: leave out --engine, and check "
@@ -135,6 +139,7 @@ class Session:
             )
 
     def _take(self, batch: Batch) -> None:
+        """Fold a batch, hand over the dwells that it closes, and evaluate the open dwell when that is due."""
         passed, segmenter = self._passed, self._segmenter
         for rows in passed.rows_of(segmenter.push(batch)):
             passed.add(rows)
@@ -149,6 +154,7 @@ class Session:
         self._look(standing, elapsed_s)
 
     def _finish(self) -> None:
+        """Fold the last readings and hand over the dwells that are left."""
         passed = self._passed
         for rows in passed.rows_of(self._segmenter.finish()):
             passed.add(rows)
@@ -157,12 +163,13 @@ class Session:
             self._publish(samples=passed.tally.read, current=None)
 
     def _close_next(self, count: int, elapsed_s: float) -> None:
+        """Hand over the next closed dwells, one by one."""
         for _ in range(count):
             self._closed += 1
             self._close(elapsed_s)
 
     def _close(self, elapsed_s: float) -> None:
-        """Hand the dwells that have closed to be judged; nothing in them changes any more."""
+        """Hand the dwells that have closed to the judging thread; they do not change any more."""
         passed, folder = self._passed, Folder()
         folder.dwells, folder.slews = passed.folder.dwells[: self._closed], list(passed.folder.slews)
         closed = _Closed(replace(passed, tally=replace(passed.tally), folder=folder), elapsed_s)
@@ -177,7 +184,7 @@ class Session:
             self._lock.notify_all()
 
     def _look(self, standing: int | None, elapsed_s: float) -> None:
-        """Look into the open dwell when it has lasted 1, 2, 4 ... s; what is looked at stays where it is."""
+        """Evaluate a copy of the open dwell when it has lasted 1, 2, 4 ... s."""
         if standing is None:
             return
         folder, open_dwells = Folder(), self._passed.folder.dwells[self._closed :]
@@ -196,7 +203,7 @@ class Session:
             self._publish(current=here)
 
     def _judge(self) -> None:
-        """The judging thread: dwells as they close, in order."""
+        """Judge dwells as they close, in order; this is what the judging thread runs."""
         before = None
         while (closed := self._next()) is not None:
             with self._lock:
@@ -207,7 +214,7 @@ class Session:
                 with self._lock:
                     self._publish(problem=str(error))
                 continue
-            except Exception as error:  # the run goes on, and its end is judged anew
+            except Exception as error:  # the run goes on; its end is judged from the start
                 self.say(f"a dwell could not be judged: {error!r}")
                 continue
             before = judgement
@@ -215,18 +222,20 @@ class Session:
             self._automatic(judgement)
 
     def _next(self) -> _Closed | None:
+        """Wait for the next state to be judged; None after the end."""
         with self._lock:
             self._lock.wait_for(lambda: self._waiting or self._ended)
             return self._waiting.popleft() if self._waiting else None
 
     def _told(self, judgement: Judgement, elapsed_s: float) -> None:
+        """Publish a judgement and pass it to the listeners."""
         with self._lock:
             self._publish(judgement=judgement, judged_s=elapsed_s, problem="")
         for listener in list(self.listeners):
             listener(judgement)
 
     def _automatic(self, judgement: Judgement) -> None:
-        """With ``auto``: accept what is missing, once looks in a row have told it from all else."""
+        """With ``auto``, accept the missing effects once several judgements in a row have told them from all others."""
         if not (self.auto and judgement.alarm and judgement.look.settled):
             return
         found = judgement.found
@@ -238,6 +247,7 @@ class Session:
             self.say(str(error))
 
     def _conclude(self) -> Judgement:
+        """Return the final judgement of the whole run."""
         before = self.standing.judgement
         passed = replace(self._passed, settings=self.settings)
         again = None if self.again is None else self.again()
@@ -246,9 +256,10 @@ class Session:
         return final
 
     def say(self, notice: str) -> None:
-        """Have a sentence on the screen."""
+        """Show a sentence to the user."""
         with self._lock:
             self._publish(notice=notice)
 
     def _publish(self, **changed: object) -> None:
+        """Replace parts of the standing; to be called with the lock held."""
         self.standing = replace(self.standing, **changed)

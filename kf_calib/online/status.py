@@ -1,9 +1,9 @@
-"""How a run stands while it goes on: sigmas, verdict, what is missing, where to go next, and how long it takes.
+"""Status of a run while it is recorded: sigmas, verdict, missing effects, next orientation and remaining time.
 
-A ``Judgement`` is made when a dwell closes, from the dwell factors so far, by the code that evaluates a recording. A
-look at every dwell is a look too many for the chance of a false alarm that one run has: until the ``Watch`` raises its
-alarm the model counts as consistent. Trying all candidates is a ``Look``, which takes longer than all the rest: it is
-made again when it may say something else. The last judgement is that of ``diagnose``.
+A ``Judgement`` is made when a dwell closes, from the dwell factors so far, by the code that evaluates a recording. To
+keep the false-alarm probability of a single run, the model counts as consistent until the sequential test (``Watch``)
+raises its alarm. A ``Look`` tests all candidates; as it takes longer than all the rest, it is repeated only when its
+result may have changed. The final judgement is that of ``diagnose``.
 """
 
 from __future__ import annotations
@@ -31,23 +31,24 @@ from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.online.sequential_test import Watch
 from kf_calib.support.threads import one_blas_thread
 
-_FEWEST = 5  # dwells: with fewer nothing is left over to judge by
-_FEWEST_UNSTATED = 12  # where the noise from dwell to dwell has to be told from a misfit
-_QUIET = 0.1  # of the variance from dwell to dwell: readings whose mean is that good add nothing
-_LITTLE = 0.1  # of what a dwell has brought: more of it would bring less
-_STAYING = (2.0, 4.0, 8.0, 16.0, 32.0)
+_FEWEST = 5  # dwells before the model is judged: fewer leave no degrees of freedom
+_FEWEST_UNSTATED = 12  # the same where the noise from dwell to dwell has to be estimated, too
+_QUIET = 0.1  # share of the variance from dwell to dwell below which the noise of a mean no longer matters
+_LITTLE = 0.1  # share of the gain of a dwell below which a further gain no longer matters
+_STAYING = (2.0, 4.0, 8.0, 16.0, 32.0)  # lengths of the open dwell that are tried, as multiples of its present one
 
 
-_GROWN = 1.25  # by which a run has grown when all candidates are tried again
-_AGREEING = 3  # looks in a row that say the same
-_FREEDOM = 9  # degrees left over with what is missing in the model, at least
+_GROWN = 1.25  # factor by which a run has to grow before all candidates are tested again
+_AGREEING = 3  # number of looks in a row that have to agree
+_FREEDOM = 9  # degrees of freedom that the model with the missing effects has to leave
 
 
 @dataclass(frozen=True)
 class Look:
-    """All candidates tried against a run as it stood; diagnosed where the watch had raised its alarm.
+    """A test of all candidates against a run as it stood, with a diagnosis if the sequential test had raised its alarm.
 
-    agreed: how many looks in a row have said the same.
+    result: the calibration then. watch: the sequential test then (None: too few dwells). diagnosed: the diagnosis
+    (None: no alarm). agreed: number of looks in a row with the same result.
     """
 
     result: Calibration
@@ -57,25 +58,29 @@ class Look:
 
     @cached_property
     def found(self) -> Diagnosis:
+        """The diagnosis, or without an alarm a statement that nothing is significant so far."""
         return self.diagnosed or _not_judged(self.result, self.watch)
 
     @cached_property
     def going(self) -> tuple[Advice, str] | None:
-        """Where to go next, and why."""
+        """The orientation to visit next and the reason in words, or None."""
         return next_orientation(self.found)
 
     @property
     def settled(self) -> bool:
-        """Whether enough looks in a row have said the same, of enough dwells: after few, a wrong effect may be the only
-        one that fits."""
+        """Whether enough looks in a row agree, of enough dwells.
+
+        With few degrees of freedom, a wrong effect may be the only one that fits.
+        """
         after = None if self.diagnosed is None else self.diagnosed.after
         return self.agreed >= _AGREEING and (after is None or after.consistency.dof >= _FREEDOM)
 
     def again(self, result: Calibration, watch: Watch | None) -> Look:
-        """The look at the run as it stands now: this one, unless it may say something else."""
+        """The look at the run as it stands now: this one, unless its result may have changed."""
         return _look(result, watch, self) if self._is_due(result, watch) else self
 
     def _is_due(self, result: Calibration, watch: Watch | None) -> bool:
+        """Tell whether a new look is due: run, model or alarm has changed, or a diagnosis needs to be confirmed."""
         before = self.result
         if len(result.visits) >= _GROWN * len(before.visits) or result.settings.effects != before.settings.effects:
             return True
@@ -84,7 +89,7 @@ class Look:
         return self.diagnosed is not None and (not self.settled or self._is_followed(result))
 
     def _is_followed(self, result: Calibration) -> bool:
-        """Whether the platform has been where this look sent it."""
+        """Tell whether the platform has visited the orientation that this look advised."""
         if self.going is None:
             return False
         poses = np.array([visit.dwell.pose for visit in result.visits[len(self.result.visits) :]])
@@ -93,6 +98,7 @@ class Look:
 
 
 def _look(result: Calibration, watch: Watch | None, before: Look | None = None) -> Look:
+    """Return a look at the run; it counts agreement with the look before."""
     if not _alarmed(watch):
         return Look(result, watch)
     found = diagnose(result)
@@ -101,19 +107,24 @@ def _look(result: Calibration, watch: Watch | None, before: Look | None = None) 
 
 
 def _said(found: Diagnosis) -> tuple[object, ...]:
-    """What must be the same for two diagnoses to agree."""
+    """Return the parts of a diagnosis that have to be equal for two diagnoses to agree."""
     enough = found.after is not None and found.after.consistency.dof >= _FREEDOM
     return found.test.consistent, frozenset(found.missing), frozenset(found.ambiguity), enough
 
 
 def _alarmed(watch: Watch | None) -> bool:
+    """Tell whether the sequential test has raised its alarm."""
     return watch is not None and watch.alarmed is not None
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """A run after a dwell. look: at all candidates, made now or a few dwells ago. wanted (12,): target of each sigma,
-    SI; NaN where none is set. course: how the sigmas would go on, None while they are not determined."""
+    """What is known of a run after a dwell.
+
+    result: the calibration. look: the latest test of all candidates, which may be a few dwells old. watch: the
+    sequential test (None: too few dwells). wanted (12,): target of each sigma, SI; NaN where there is none. course:
+    predicted sigmas if the run goes on (None: not determined yet). final: whether the run has ended.
+    """
 
     result: Calibration
     look: Look
@@ -124,30 +135,31 @@ class Judgement:
 
     @property
     def found(self) -> Diagnosis:
-        """Of the look: of so many dwells as there were then."""
+        """The diagnosis of the latest look, which may be of fewer dwells."""
         return self.look.found
 
     @property
     def alarm(self) -> bool:
-        """Whether the stream, or in the end the run, is beyond chance."""
+        """Whether the sequential test, or after the end the whole run, rejects the model."""
         return (self.final or _alarmed(self.watch)) and self.found.test.consistent is False
 
     @property
     def consistent(self) -> bool | None:
+        """Whether the model agrees with the run; None while it is not judged."""
         if self.final:
             return self.found.test.consistent
         return None if self.watch is None or self.watch.p_value is None else not self.alarm
 
     @property
     def p_value(self) -> float | None:
-        """Of the run where it is final, else of the stream up to now; None while it is not judged."""
+        """The p-value of the whole run where it is final, else of the latest sequential test; None if not judged."""
         if self.final:
             return self.found.test.p_value
         return None if self.watch is None else self.watch.p_value
 
     @property
     def suspects(self) -> tuple[str, ...]:
-        """Names of what may be missing, the likeliest first."""
+        """Names of the effects that may be missing, the likeliest first; empty without an alarm."""
         if not self.alarm:
             return ()
         found = self.found
@@ -155,14 +167,14 @@ class Judgement:
 
     @property
     def disagreeing(self) -> tuple[int, int, float]:
-        """The dwell (from 1) and the accelerometer whose residual is largest in its sigma, and that ratio."""
+        """The dwell and the accelerometer (both from 1) with the largest residual in units of sigma, and that ratio."""
         ratios = replace(self.found, before=self.result).residual_ratios
         dwell, channel = np.unravel_index(int(np.argmax(np.abs(ratios))), ratios.shape)
         return int(dwell) + 1, int(channel) + 1, float(ratios[dwell, channel])
 
     @cached_property
     def verdict(self) -> str:
-        """In a few words, for a screen."""
+        """The verdict in a few words, for a screen."""
         if self.consistent is None:
             return (
                 f"not judged before {_least(self.result)} dwells" if self.watch is None else "nothing to judge by yet"
@@ -178,7 +190,10 @@ class Judgement:
 
     @cached_property
     def next_orientation(self) -> tuple[tuple[float, ...], str] | None:
-        """Gimbal angles, deg, and why: what tells suspects apart, else what sharpens the worst sigma."""
+        """Gimbal angles of the next orientation in deg, and the reason; None where there is no advice.
+
+        With suspects it tells them apart, else it reduces the worst sigma.
+        """
         going = self.look.going if self.final or self.alarm else None
         if going is not None:
             return going[0].gimbal_deg, going[1]
@@ -189,12 +204,15 @@ class Judgement:
 
     @cached_property
     def worst(self) -> Floats:
-        """Sizes (12,) by which a sigma counts as large."""
+        """Scales (12,) by which the sigmas are compared to find the worst."""
         return _sizes(self.result, self.wanted)
 
     @cached_property
     def left_s(self) -> Floats:
-        """Seconds (12,) to each target, or where there is none to half of the sigma; inf where never, NaN unknown."""
+        """Time (12,) until each sigma reaches its target, or half its value where there is no target, in s.
+
+        Infinite where it never will, NaN where it is not known.
+        """
         if self.course is None:
             return np.full(12, np.nan)
         sigma = self.result.estimate.sigma
@@ -203,9 +221,13 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Current:
-    """The open dwell: its number from 1, pose (k,), readings and seconds in it that are used, and the twelve sigmas
-    with it. enough: more of it no longer helps (None: not known yet). stay_s (12,): seconds more in it to each target,
-    inf where it does not lead there."""
+    """The open dwell.
+
+    number: of the dwell, from 1. pose (k,): gimbal angles, rad. readings, seconds: number and duration of the readings
+    used. sigma (12,): of the parameters with this dwell included. enough: whether staying longer no longer helps (None:
+    not known yet). stay_s (12,): further time in this dwell until each target is reached, s; infinite where it never
+    is.
+    """
 
     number: int
     pose: Floats
@@ -218,8 +240,12 @@ class Current:
 
 @dataclass(frozen=True)
 class Standing:
-    """What is known at a moment. elapsed_s: bench time of the last reading; judged_s: that of the judgement; problem:
-    why there is none; notice: the last thing that was done (an effect accepted or refused)."""
+    """What is known of a run at a moment.
+
+    samples: number of readings. elapsed_s: bench time of the last of them. dwells: number of closed dwells. current:
+    the open dwell. judgement: the latest judgement. judged_s: bench time of that judgement. problem: why there is none.
+    notice: the latest action, such as an effect that was accepted or refused. model: effects in the model.
+    """
 
     samples: int = 0
     elapsed_s: float = 0.0
@@ -233,14 +259,14 @@ class Standing:
 
     @property
     def sigma(self) -> Floats:
-        """1 sigma (12,) of the parameters, the open dwell included; NaN where not determined."""
+        """One sigma (12,) of the parameters with the open dwell included, SI; NaN where not determined."""
         if self.current is not None and np.isfinite(self.current.sigma).any():
             return self.current.sigma
         return np.full(12, np.nan) if self.judgement is None else self.judgement.result.estimate.sigma
 
     @property
     def left_s(self) -> Floats:
-        """Seconds (12,) to each target, by staying here or by going on, whichever is sooner."""
+        """Time (12,) until each target is reached, s: the shorter of staying in this orientation and going on."""
         if self.judgement is None:
             return np.full(12, np.nan)
         going = np.maximum(self.judgement.left_s - (self.elapsed_s - self.judged_s), 0.0)
@@ -248,13 +274,16 @@ class Standing:
 
 
 def targets(texts: Mapping[str, float]) -> Floats:
-    """Sigmas wanted (12,) by symbol, SI; NaN where there is none."""
+    """Targets (12,) of the sigmas in SI, from numbers by symbol; NaN where there is none."""
     return np.array([texts.get(symbol, np.nan) for symbol in paper_parameters.SYMBOLS])
 
 
 def judged(passed: Pass, wanted: Floats, before: Judgement | None = None) -> Judgement:
-    """The run after the dwells folded so far, ``before``: after fewer of them. Raises InputError where the readings
-    cannot be used as they are."""
+    """The judgement of the run after the dwells folded so far.
+
+    passed: the pass over the readings. wanted (12,): targets of the sigmas. before: the judgement after fewer dwells.
+    Raises InputError where the readings cannot be used as they are.
+    """
     settings, bench, dwells = passed.settings, passed.source.bench, passed.dwells
     with one_blas_thread():
         refuse_unusable(dwells, passed.tally, bench)
@@ -265,6 +294,7 @@ def judged(passed: Pass, wanted: Floats, before: Judgement | None = None) -> Jud
 
 
 def _watched(dwells: list[DwellFactor], result: Calibration, watch: Watch | None) -> Watch | None:
+    """Return the sequential test with all dwells so far, begun again if the model has changed; None if too few."""
     bench, settings = result.bench, result.settings
     if len(dwells) < _least(result):
         return None
@@ -276,13 +306,13 @@ def _watched(dwells: list[DwellFactor], result: Calibration, watch: Watch | None
 
 
 def _least(result: Calibration) -> int:
-    """Dwells before which the model is not judged."""
+    """Return the number of dwells before which the model is not judged."""
     stated = result.bench.angle_sigma_deg is not None and result.bench.scatter_sigma_mps2 is not None
     return _FEWEST if stated else _FEWEST_UNSTATED
 
 
 def _not_judged(result: Calibration, watch: Watch | None) -> Diagnosis:
-    """What can be said without an alarm: what the run could show so far, and that nothing is beyond chance."""
+    """Return a diagnosis without an alarm: nothing is significant so far, and what the run could show."""
     test = assess_candidates(result.fit, None if watch is None else watch.tests, frames=result.frames)
     said = "Nothing is beyond chance so far: no effect is missing that this run has shown."
     if watch is None:
@@ -291,7 +321,11 @@ def _not_judged(result: Calibration, watch: Watch | None) -> Diagnosis:
 
 
 def judge_whole_run(passed: Pass, wanted: Floats, watch: Watch | None, again: Source | None = None) -> Judgement:
-    """The last judgement: the calibration and the diagnosis of the whole run, as of its recording (``again``)."""
+    """The final judgement: the calibration and the diagnosis of the whole run.
+
+    passed: the pass over all readings. wanted (12,): targets of the sigmas. watch: the sequential test so far. again:
+    the recording, to be read once more where that is needed.
+    """
     with one_blas_thread():
         result = conclude(passed, again)
         look = Look(result, watch, diagnose(result))
@@ -299,18 +333,22 @@ def judge_whole_run(passed: Pass, wanted: Floats, watch: Watch | None, again: So
 
 
 def _course(result: Calibration, wanted: Floats) -> Course | None:
+    """Return the predicted sigmas if the run goes on, or None while nothing is determined."""
     return None if result.estimate.unseen.all() else course(result.fit, _sizes(result, wanted))
 
 
 def _sizes(result: Calibration, wanted: Floats) -> Floats:
-    """What sigmas are compared by (12,): their targets (inf where there is none); without any, rad, one and g."""
+    """Return scales (12,) for comparing sigmas: their targets (infinite without one); if none is set, rad, 1 and g."""
     if np.isfinite(wanted).any():
         return np.where(np.isfinite(wanted), wanted, np.inf)
     return np.array([result.bench.gravity_mps2 if unit == "m/s^2" else 1.0 for unit in paper_parameters.UNITS])
 
 
 def current(dwell: DwellFactor, judgement: Judgement | None) -> Current:
-    """The open dwell, as far as it is folded, beside the judgement of those before it."""
+    """The state of the open dwell, as far as it is folded.
+
+    dwell: the open dwell. judgement: of the dwells before it (None: there is none yet, so that sigmas are NaN).
+    """
     seconds, unknown = dwell.end_s - dwell.start_s, np.full(12, np.nan)
     here = Current(dwell.number, dwell.recorded_pose, dwell.count, seconds, unknown, None, unknown)
     if judgement is None:
@@ -326,7 +364,7 @@ def current(dwell: DwellFactor, judgement: Judgement | None) -> Current:
 
 
 def _quiet(dwell: DwellFactor, result: Calibration) -> bool:
-    """Whether the noise of the dwell's mean is well below what dwells scatter by anyway."""
+    """Tell whether the noise of the dwell's mean is well below the scatter from dwell to dwell."""
     noise, means = result.noise, result.carried.means[[-1]]
     means = replace(means, counts=np.array([float(dwell.count)]))
     whole = np.diag(mean_covariances(noise, means, result.carried.state)[0])
@@ -335,7 +373,7 @@ def _quiet(dwell: DwellFactor, result: Calibration) -> bool:
 
 
 def _saturated(before: Floats, now: Floats, doubled: Floats) -> bool | None:
-    """Whether as much again would bring less than a tenth of what this dwell has brought; None: nothing to go by."""
+    """Tell whether doubling the dwell would gain less than a tenth of what it has gained; None where unknown."""
     known = np.isfinite(before) & np.isfinite(now) & np.isfinite(doubled)
     if not known.any():
         return None

@@ -1,1 +1,1 @@
-"""Ways to look at a result: the console, JSON and Rerun. Views read results; nothing reads a view."""
+"""Presentation of results as console text, JSON objects and pictures. Views import results; results import no view."""

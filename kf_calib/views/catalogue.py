@@ -1,4 +1,4 @@
-"""The catalogue of effects: as a table, in detail, and as a JSON object."""
+"""The catalogue of effects as a table, in detail, and as JSON objects."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from kf_calib.views.tables import Table
 
 
 def overview(effects: Sequence[Effect]) -> RenderableType:
-    """Every effect in a line: name, what it is, its coefficients with their unit, what it is confused with."""
+    """The table that ``effects`` prints, with one line for each effect.
+
+    A line has the name of the effect, what it is, its coefficients and their unit, and the effects it is confused with.
+    """
     table = Table(title=f"{len(effects)} effects", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for heading in ("effect", "what it is", "coefficients", "unit", "confused with"):
         table.add_column(heading, no_wrap=heading in ("effect", "coefficients", "unit"))
@@ -32,6 +35,7 @@ def overview(effects: Sequence[Effect]) -> RenderableType:
 
 
 def _symbols(effect: Effect) -> str:
+    """Return the symbols of the coefficients of an effect, shortened where there are more than three."""
     found = [symbol(coefficient.symbol) for coefficient in effect.coefficients]
     stem = found[0][:-1] if found else ""
     if found == [f"{stem}{i}" for i in (1, 2, 3)]:
@@ -41,11 +45,12 @@ def _symbols(effect: Effect) -> str:
 
 
 def details(effects: Sequence[Effect]) -> RenderableType:
-    """Each effect with its formula, coefficients, scale for a prior, source, and what its checks had to say."""
+    """The report that ``effects NAME`` prints: formula, coefficients, prior scales, source and remarks of effects."""
     return Group(*(part for effect in effects for part in _detail(effect)))
 
 
 def _detail(effect: Effect) -> list[RenderableType]:
+    """Return the report of one effect, part by part."""
     table = Table(box=None, pad_edge=False, header_style="")
     for heading in ("coefficient", "unit", "prior scale"):
         table.add_column(heading)
@@ -60,7 +65,7 @@ def _detail(effect: Effect) -> list[RenderableType]:
 
 
 def formula_of(effect: Effect) -> str:
-    """What an effect adds to a reading, in the words of its class, or the user's formula."""
+    """What an effect adds to a reading: the user's formula, or the first paragraph of the docstring of its class."""
     text = as_text(effect)
     if "=" in text:
         return f"{effect.coefficients[0].symbol[:-1]}i * ({text.partition('=')[2].strip()})"
@@ -69,7 +74,10 @@ def formula_of(effect: Effect) -> str:
 
 
 def sight_report(sights: Sequence[Visibility], about: str) -> RenderableType:
-    """What ``effects --recording`` prints: each effect in a line, then what cannot be put into a cell."""
+    """The report that ``effects --recording`` prints: how well a run shows each effect, and notes below the table.
+
+    sights: one for each effect. about: title of the table.
+    """
     table = Table(title=about, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for heading in ("effect", "visible", "left of it", "smallest size", "confused with (overlap)"):
         right = heading == "left of it"
@@ -83,6 +91,7 @@ def sight_report(sights: Sequence[Visibility], about: str) -> RenderableType:
 
 
 def _sight_cells(sight: Visibility) -> list[str]:
+    """Return the cells of one effect in that table."""
     visible = {True: "yes", False: "no", None: "-"}[sight.visible]
     cells = [str(sight.effect), visible, "" if sight.share is None else f"{sight.share:.2g}"]
     if sight.smallest is None:
@@ -94,11 +103,15 @@ def _sight_cells(sight: Visibility) -> list[str]:
 
 
 def sights_object(sights: Sequence[Visibility], model: Sequence[str]) -> dict[str, Any]:
-    """What ``effects --recording --json`` prints: beside what is known of each effect, how this run shows it."""
+    """The JSON object of ``effects --recording``: each effect of the catalogue and how well the run shows it.
+
+    sights: one for each effect. model: names of the effects in the model of the run.
+    """
     return {"model": list(model), "effects": [{**_object(each.effect), **_seen_object(each)} for each in sights]}
 
 
 def _seen_object(sight: Visibility) -> dict[str, Any]:
+    """Return how well a run shows one effect, as a JSON object."""
     smallest = None
     if sight.smallest is not None:
         own, size = sight.smallest
@@ -115,11 +128,12 @@ def _seen_object(sight: Visibility) -> dict[str, Any]:
 
 
 def effects_object(effects: Sequence[Effect]) -> dict[str, Any]:
-    """What ``effects --json`` prints."""
+    """The JSON object of ``effects``."""
     return {"effects": [_object(effect) for effect in effects]}
 
 
 def _object(effect: Effect) -> dict[str, Any]:
+    """Return one effect of the catalogue as a JSON object."""
     unknown = effect.unknown
     return {
         "effect": str(effect),

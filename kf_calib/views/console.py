@@ -1,4 +1,4 @@
-"""Results as text: Rich tables for a terminal, the same as plain text elsewhere."""
+"""Results of a calibration as text: Rich tables on a terminal, the same as plain text elsewhere."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
 
 
 def symbol(name: str) -> str:
-    """``theta1`` as it is printed in the paper."""
+    """A symbol as it is printed in the paper, with Greek letters in place of names such as ``theta``."""
     for latin, greek in _GREEK.items():
         name = name.replace(latin, greek)
     return name
 
 
 def rounded(value: float, sigma: float) -> tuple[str, str]:
-    """Value and sigma as text, to two significant digits of sigma (GUM 7.2.6)."""
+    """A value and its sigma as text, rounded to two significant digits of sigma (GUM 7.2.6)."""
     if not (math.isfinite(sigma) and sigma > 0):
         return f"{value:.6g}", f"{sigma:.2g}"
     decimals = max(0, 1 - math.floor(math.log10(sigma)))
@@ -42,7 +42,7 @@ def rounded(value: float, sigma: float) -> tuple[str, str]:
 
 
 def _row(parameter: Parameter) -> tuple[str, str, str, str, str]:
-    """Symbol, value (angles in deg, the rest in the unit of the field), deviation from nominal, sigma, unit."""
+    """Return symbol, value, deviation from nominal, sigma and unit of a parameter; angles have values in deg."""
     if parameter.value is None or parameter.sigma is None:
         return symbol(parameter.symbol), "not seen", "", "", ""
     factor = parameter.per_si
@@ -56,7 +56,7 @@ def _row(parameter: Parameter) -> tuple[str, str, str, str, str]:
 
 
 def parameter_table(result: Calibration) -> Table:
-    """Value, deviation from nominal and sigma (1 sigma) of the twelve."""
+    """The table of the twelve parameters: value, deviation from nominal and one sigma."""
     walking = "; the biases walk: those at the end of the run" if result.noise.walk_mps2_per_sqrt_s else ""
     table = Table(title=f"Parameters (1σ{walking})", title_justify="left")
     for heading in ("parameter", "value", "less nominal", "sigma", "unit"):
@@ -67,7 +67,7 @@ def parameter_table(result: Calibration) -> Table:
 
 
 def without_table(result: Calibration, found: OutlyingDwell) -> Table:
-    """The parameters as a fit without an outlying dwell has them, and by how much they differ from those with it."""
+    """The table of the parameters fitted without an outlying dwell, and of their differences from those with it."""
     table = Table(title=f"Without dwell {found.number} (1σ)", title_justify="left")
     for heading in ("parameter", "value", "sigma", "unit", "less with it"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
@@ -81,7 +81,7 @@ def without_table(result: Calibration, found: OutlyingDwell) -> Table:
 
 
 def effect_table(result: Calibration) -> Table:
-    """Coefficients of the effects in the model, in units of the field, and how many sigma they are from zero."""
+    """The table of the coefficients of the effects in the model, with sigmas and ratios to them."""
     table = Table(title="Effects in the model (1σ)", title_justify="left")
     for heading in ("effect", "coefficient", "value", "sigma", "unit", "value / sigma"):
         table.add_column(heading, justify="left" if heading in ("effect", "coefficient", "unit") else "right")
@@ -100,7 +100,7 @@ def effect_table(result: Calibration) -> Table:
 
 
 def model_table(model: Model) -> Table:
-    """The twelve parameters and every effect of a model: symbols, unit, and the size a prior would call large."""
+    """The table of a model: the twelve parameters and every effect with its symbols, units and prior scales."""
     table = Table(title="Model", title_justify="left")
     for heading in ("effect", "what it is", "coefficient", "unit", "prior scale"):
         table.add_column(heading)
@@ -118,7 +118,7 @@ def model_table(model: Model) -> Table:
 
 
 def effect_rows(effect: Effect) -> list[tuple[str, str, str]]:
-    """Symbol, SI unit and scale of each coefficient; a constant inside the columns with its range."""
+    """Symbol, SI unit and prior scale of each coefficient of an effect; its constant has a range and no scale."""
     rows = [
         (
             symbol(c.symbol),
@@ -133,7 +133,7 @@ def effect_rows(effect: Effect) -> list[tuple[str, str, str]]:
 
 
 def noise_table(result: Calibration) -> Table:
-    """The noise model, an accelerometer a column."""
+    """The table of the noise model, with one column for each accelerometer."""
     noise, table = result.noise, Table(title="Noise (1σ)", title_justify="left")
     for heading in ("", "accelerometer 1", "accelerometer 2", "accelerometer 3", "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
@@ -150,7 +150,7 @@ def noise_table(result: Calibration) -> Table:
 
 
 def noise_origins(result: Calibration) -> tuple[str, str]:
-    """Where the scatter from dwell to dwell and the setting error of the angles come from."""
+    """Whether scatter and setting error were stated, estimated or not estimated, in words."""
     noise, few = result.noise, degrees_of_freedom(result.carried.means) < FEWEST
     scatter = "stated" if noise.scatter_stated else _NOT_ESTIMATED if few else "estimated"
     if not noise.setting_stated:
@@ -159,7 +159,7 @@ def noise_origins(result: Calibration) -> tuple[str, str]:
 
 
 def verdict(result: Calibration) -> str:
-    """One sentence: does the model agree with the measurements, and by how much is it off where it was not fitted."""
+    """One or two sentences: whether model and measurements agree, and the held-out error beside the noise floor."""
     judged = result.consistency
     if judged.p_value is None:
         text = "Nothing is left over to judge the model by."
@@ -178,7 +178,7 @@ def verdict(result: Calibration) -> str:
 
 
 def summary(result: Calibration) -> RenderableType:
-    """What a replay prints."""
+    """The report that ``replay`` prints."""
     tally, dwells = result.tally, [visit.dwell for visit in result.visits]
     head = (
         f"{tally.used - tally.gated} of {tally.read} readings used, {len(dwells)} dwells in "
@@ -195,7 +195,7 @@ def summary(result: Calibration) -> RenderableType:
 
 
 def comparison_table(compared: Comparison) -> RenderableType:
-    """What ``compare`` prints: each way's time, memory and largest difference from the block engine."""
+    """The table that ``compare`` prints: time, memory and difference from the block engine of each way of computing."""
     table = Table(title="The same recording, three ways", title_justify="left")
     for heading in ("way", "wall s", "peak MB", "largest difference, σ", "of diag P"):
         table.add_column(heading, justify="left" if heading == "way" else "right")
@@ -208,7 +208,7 @@ def comparison_table(compared: Comparison) -> RenderableType:
 
 
 def plain(renderable: RenderableType, width: int = 110) -> str:
-    """As text without colour or control characters."""
+    """A renderable as plain text without colour or control characters, in lines of at most ``width`` characters."""
     out = io.StringIO()
     PlainConsole(file=out, width=width, no_color=True).print(renderable)
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines())
@@ -216,10 +216,11 @@ def plain(renderable: RenderableType, width: int = 110) -> str:
 
 @printed.register
 def plain_summary(result: Calibration) -> str:
-    """What ``print`` shows of a calibration."""
+    """The text of a calibration that ``print`` shows."""
     return plain(summary(result))
 
 
 @printed.register
 def _plain_model(model: Model) -> str:
+    """Return the text of a model that ``print`` shows."""
     return plain(model_table(model))

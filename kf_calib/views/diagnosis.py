@@ -1,4 +1,4 @@
-"""A diagnosis for people and for programs."""
+"""A diagnosis as a report, and as a JSON object."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from kf_calib.views.terminal import note
 
 
 def description(found: Diagnosis) -> Description | None:
-    """What an unknown misfit looks like; None where the misfit is known (one dwell, too), or there is none."""
+    """Description of a misfit that no known effect explains; None for every other diagnosis."""
     if not found.unknown or found.before.outlying:
         return None
     return describe(found.before.fit, found.before.residuals_mps2, found.test.trend)
 
 
 def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
-    """What ``diagnose --json`` prints; p-values are those of the run."""
+    """The JSON object of ``diagnose``; its p-values are family-wise."""
     going = next_orientation(found)
     return found_object(found) | {"next_orientation": None if going is None else orientation_object(*going)}
 
 
 def found_object(found: Diagnosis) -> dict[str, Any]:
-    """The same but where to go next."""
+    """The same without the next orientation."""
     unknown = description(found)
     missing = "unknown" if found.unknown else found.missing[0] if found.missing else None
     return clean(
@@ -70,6 +70,7 @@ def found_object(found: Diagnosis) -> dict[str, Any]:
 
 
 def _trend_object(trend: Trend | None) -> dict[str, Any] | None:
+    """Return the test of trends within dwells as a JSON object, or None."""
     if trend is None:
         return None
     dwell, channel = trend.most
@@ -77,15 +78,21 @@ def _trend_object(trend: Trend | None) -> dict[str, Any] | None:
 
 
 def orientation_object(advice: Advice, why: str) -> dict[str, Any]:
-    """stay_s: how long to stay there, where that is longer than the dwells so far."""
+    """The advice where to go next as a JSON object.
+
+    advice: the orientation. why: the reason in words. The key stay_s is the time to stay there where it should be
+    longer than the dwells so far, in s.
+    """
     return clean({"gimbal_deg": list(advice.gimbal_deg), "stay_s": advice.stay_s, "why": why})
 
 
 def description_object(unknown: Description | None) -> dict[str, Any] | None:
+    """The description of an unknown misfit as a JSON object, or None."""
     return None if unknown is None else {**vars(unknown), "formula": unknown.formula}
 
 
 def _suspect_object(suspect: Suspect) -> dict[str, Any]:
+    """Return one suspect as a JSON object."""
     return {
         "effect": suspect.name,
         "statistic": suspect.statistic,
@@ -101,19 +108,20 @@ def _suspect_object(suspect: Suspect) -> dict[str, Any]:
 
 
 def verdict(found: Diagnosis) -> str:
-    """The diagnosis in a sentence or two; where the run is inconsistent, after what is wrong with its readings."""
+    """The verdict in one or two sentences; if the model is rejected, faults of the readings that bias it come first."""
     first = found.before.readings.biasing if found.test.consistent is False else []
     return " ".join([*(sentence[0].upper() + sentence[1:] for sentence in first), found.verdict])
 
 
 def _notes(found: Diagnosis) -> list[str]:
-    """Warnings that the verdict does not hold."""
+    """Return the warnings of the calibration that the verdict does not contain."""
     said = verdict(found)
-    return [warning for warning in found.before.warnings if warning[1:] not in said]  # which may begin a sentence
+    # compared without the first letter, which is a capital where the warning begins a sentence
+    return [warning for warning in found.before.warnings if warning[1:] not in said]
 
 
 def diagnosis_report(found: Diagnosis) -> RenderableType:
-    """What ``diagnose`` prints: the verdict, then what it rests on."""
+    """The report that ``diagnose`` prints: the verdict, then the evidence for it."""
     style = {True: "bold green", False: "bold yellow", None: "bold"}[found.test.consistent]
     parts: list[RenderableType] = [Text(verdict(found), style=style), *map(Text, of_what_p_is(found))]
     readings = found.before.readings
@@ -156,7 +164,10 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
 
 
 def of_what_p_is(found: Diagnosis) -> list[str]:
-    """What the p-value of a run is the probability of, and that of the misfit alone, which ``replay`` prints."""
+    """A sentence on what the p-value of a run means, beside that of the misfit alone, which ``replay`` prints.
+
+    Empty where nothing could be tested.
+    """
     if found.test.p_value is None:
         return []
     alone = found.before.consistency.p_value
@@ -169,11 +180,12 @@ def of_what_p_is(found: Diagnosis) -> list[str]:
 
 @printed.register
 def plain_report(found: Diagnosis) -> str:
-    """The same as plain text."""
+    """The text of a diagnosis that ``print`` shows."""
     return plain(diagnosis_report(found))
 
 
 def _suspect_table(found: Diagnosis) -> Table:
+    """Return the table of the suspects with their coefficients."""
     title = "Suspects (1σ; p: that noise alone lets any effect explain as much; held-out rms over its floor)"
     table = Table(title=title, title_justify="left")
     for heading in ("effect", "p", "χ² / dof", "fits", "symbol", "value", "sigma", "unit", "held out"):
@@ -196,7 +208,7 @@ def _suspect_table(found: Diagnosis) -> Table:
 
 
 def _dwell_table(found: Diagnosis) -> Table:
-    """The dwells that disagree most: residual over the sigma of the dwell's mean."""
+    """Return the table of the dwells that disagree most: their residuals over the sigma of their means."""
     table = Table(title="Where it fails: residual / σ of the dwell's mean", title_justify="left")
     for heading in ("dwell", "at s", "gimbals, deg", "1", "2", "3"):
         table.add_column(heading, justify="right")
@@ -209,6 +221,7 @@ def _dwell_table(found: Diagnosis) -> Table:
 
 
 def _detectable_table(sizes: list[Detectable]) -> Table:
+    """Return the table of the smallest detectable sizes."""
     table = Table(title="Smallest coefficient that would be found in 9 of 10 such runs", title_justify="left")
     for heading in ("effect", "size", "unit", "effect", "size", "unit"):
         table.add_column(heading, justify="right" if heading == "size" else "left")

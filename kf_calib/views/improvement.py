@@ -1,4 +1,4 @@
-"""An improvement for people and for programs: errors falling step by step, and the questions of a session."""
+"""Stepwise improvement as a report and as a JSON object, and the dialogue with the user."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from kf_calib.views.json import clean
 from kf_calib.views.tables import Bar, Table
 from kf_calib.views.terminal import note
 
-_WIDTH = 30  # characters of the longest bar
+_WIDTH = 30  # length of the longest bar in characters
 _EIGHTHS = " ▏▎▍▌▋▊▉"
 
 
@@ -35,9 +35,12 @@ def improvement_object(
     replay_difference: float | None,
     files: Mapping[str, Path | None],
 ) -> dict[str, Any]:
-    """What ``improve --json`` prints. A step's errors are those after it; p-values are those of the run.
+    """The JSON object of ``improve``.
 
-    replay_difference: largest relative difference from the figures of the journal that was replayed.
+    The errors of a step are those after it, and p-values are family-wise.
+
+    state: the improvement. honest: its nested cross-validation (None: not made). replay_difference: largest relative
+    difference from the figures of the journal that was replayed (None: no replay). files: paths written, by their keys.
     """
     unknown, going = description(state.found), next_orientation(state.found)
     return clean(
@@ -87,6 +90,7 @@ def improvement_object(
 
 
 def _figures(found: Diagnosis) -> dict[str, Any]:
+    """Return the p-value and the errors of a diagnosed model."""
     result = found.before
     return {
         "p_value": found.test.p_value,
@@ -98,7 +102,11 @@ def _figures(found: Diagnosis) -> dict[str, Any]:
 
 
 def _step_object(step: SelectionStep, before: Diagnosis) -> dict[str, Any]:
-    """p_value: of what was added, by the diagnosis before it; p_value_after: of the model then."""
+    """Return one step as a JSON object.
+
+    The key p_value is that of the added effect in the diagnosis before the step; p_value_after is that of the model
+    after it.
+    """
     return {
         "added": step.added,
         "by": step.by,
@@ -113,6 +121,7 @@ def _step_object(step: SelectionStep, before: Diagnosis) -> dict[str, Any]:
 
 
 def _removal_object(each: Removal) -> dict[str, Any]:
+    """Return the test of removing an effect as a JSON object."""
     return {
         "effect": each.name, "statistic": each.statistic, "dof": each.dof, "p_value": each.p_value,
         "needed": each.needed,
@@ -120,12 +129,13 @@ def _removal_object(each: Removal) -> dict[str, Any]:
 
 
 def _parameters(result: Calibration) -> list[dict[str, Any]]:
+    """Return all parameters of a calibration with their sigmas as JSON objects."""
     keys = ("symbol", "value", "sigma", "unit")
     return [{key: getattr(parameter, key) for key in keys} for parameter in result.parameters.values()]
 
 
 def notes(state: Improvement) -> list[str]:
-    """What was said of the recording, and of the last model."""
+    """Warnings about the recording, from the first model, and all warnings of the last model."""
     first = state.start.before
     of_models = evaluate_fit(first.fit, first.settings).warnings
     said = [sentence for sentence in first.warnings if sentence not in of_models]
@@ -135,7 +145,11 @@ def notes(state: Improvement) -> list[str]:
 def improvement_report(
     state: Improvement, honest: NestedCrossValidation | None, replay_difference: float | None
 ) -> RenderableType:
-    """What ``improve`` prints: the errors falling, why it stopped, what would settle it, the parameters."""
+    """The report that ``improve`` prints: the fall of the errors, why it stopped, what would help, and the parameters.
+
+    state: the improvement. honest: its nested cross-validation (None: not made). replay_difference: largest relative
+    difference from the figures of the journal that was replayed (None: no replay).
+    """
     style = "bold green" if state.because == "consistent" else "bold yellow"
     parts: list[RenderableType] = [
         progress(state), Text(f"Stopped, {state.because}: {state.reason}", style=style),
@@ -157,12 +171,12 @@ def improvement_report(
 
 
 def progress(state: Improvement) -> RenderableType:
-    """A line a step: held-out and in-sample rms as bars over the noise floor; below, what else is to be said of it."""
+    """The steps as a table: held-out and in-sample rms over the noise floor as numbers and bars, with remarks below."""
     floor = state.result.held_out_floor_mps2
     rows = [("start", state.start.before, state.start.test.p_value)]
     rows += [(_label(step), step.result, step.found.test.p_value) for step in state.steps]
     others = [each for each in state.alternatives if each.result is not state.result]
-    word = "+" if len(others) == len(state.alternatives) else "or"  # to add one, or in the place of the one taken
+    word = "+" if len(others) == len(state.alternatives) else "or"  # an effect to add, or one to replace the one taken
     rows += [(f"({word} {each.name})", each.result, None) for each in others]
     errors = [_errors(result, floor) for _, result, _ in rows]
     longest = max(error for both in errors for error in both if error is not None)
@@ -183,7 +197,7 @@ def progress(state: Improvement) -> RenderableType:
 
 
 def _errors(result: Calibration, floor: float | None) -> tuple[float | None, float]:
-    """Held-out and in-sample rms over the floor; without one, the latter alone in m/s^2."""
+    """Return held-out and in-sample rms over the noise floor; without a floor, the in-sample rms alone in m/s^2."""
     if not floor:
         return None, result.residual_rms_mps2
     held_out = result.held_out_rms_mps2
@@ -191,27 +205,30 @@ def _errors(result: Calibration, floor: float | None) -> tuple[float | None, flo
 
 
 def bar(value: float, longest: float) -> str:
-    """A bar of eighths of a character, the longest 30 characters."""
+    """A bar of block characters to an eighth of a character; that of the value ``longest`` has 30 characters."""
     eighths = max(1, round(8 * _WIDTH * value / longest)) if longest > 0 else 1
     return "█" * (eighths // 8) + _EIGHTHS[eighths % 8].strip()
 
 
 def _label(step: SelectionStep) -> str:
+    """Return the effects added and dropped in a step as a label."""
     said = [f"+ {step.added}"] if step.added else []
     return ", ".join([*said, *(f"- {each.name}" for each in step.dropped)])
 
 
 def _out(each: Removal) -> str:
+    """Return a sentence about an effect that was taken out."""
     return f"{each.name} was taken out: {_test(each)}."
 
 
 def _test(each: Removal) -> str:
+    """Return the test of removing an effect in words."""
     word = "needed" if each.needed else "not needed"
     return f"without {each.name} χ² rises by {each.statistic:.1f}, {each.dof} dof (p {format_p(each.p_value)}): {word}"
 
 
 def _spread_table(state: Improvement) -> Table:
-    """The twelve by each of the equal explanations: without any of them they would be wrong by more."""
+    """Return the table of the range of each parameter over the equally good explanations."""
     names = ", ".join(each.name for each in state.alternatives)
     table = Table(title=f"Parameters less nominal, with either of {names}", title_justify="left")
     for heading in ("parameter", "lowest", "highest", "sigma", "unit", "differ by, σ"):
@@ -222,6 +239,7 @@ def _spread_table(state: Improvement) -> Table:
 
 
 def _spread_row(each: Spread) -> tuple[str, ...]:
+    """Return the row of one parameter in that table."""
     own = each.parameter
     low, high = (
         rounded((value - own.nominal) * own.per_si, (own.sigma or 0.0) * own.per_si)
@@ -231,7 +249,7 @@ def _spread_row(each: Spread) -> tuple[str, ...]:
 
 
 def _settling(state: Improvement) -> list[str]:
-    """What would settle what is left: a formula to try, an orientation to visit."""
+    """Return sentences on what would settle an inconsistent run: a formula to try, an orientation to visit."""
     if state.found.test.consistent is not False:
         return []
     unknown, going, out = description(state.found), next_orientation(state.found), list[str]()
@@ -247,6 +265,7 @@ def _settling(state: Improvement) -> list[str]:
 
 
 def honest_sentence(honest: NestedCrossValidation) -> str:
+    """The result of nested cross-validation in a sentence."""
     times = ", ".join(f"{name} in {count}" for name, count in honest.chosen.items()) or "no effect in any"
     return (
         f"With the choice of effects repeated without what is held out ({honest.folds} folds): "
@@ -265,9 +284,11 @@ def session(
     on_step: Callable[[Improvement], None],
     busy: Callable[[], AbstractContextManager[object]] = nullcontext,
 ) -> Improvement:
-    """Ask what to do next until it is enough; ``ask`` takes a question and what an empty answer means.
+    """Ask the user what to do next until the user ends the improvement, and return it.
 
-    busy: entered while an answer is worked on.
+    state: the improvement at first. ask: takes a question and the meaning of an empty answer, and returns the answer.
+    show: shows a renderable. on_step: called after each step. busy: context that is entered while an answer is
+    computed.
     """
     shown: Improvement | None = None
     while True:
@@ -288,7 +309,10 @@ def session(
 
 
 def answered(state: Improvement, answer: str, options: list[tuple[str, ...]]) -> Improvement:
-    """The improvement after an answer; raises InputError, in one sentence, where it means nothing."""
+    """The improvement after an answer of the user; raises InputError where the answer cannot be understood or done.
+
+    options: the effects that may be chosen by number.
+    """
     word, _, rest = answer.partition(" ")
     rest = rest.strip()
     if answer == "u":
@@ -305,13 +329,14 @@ def answered(state: Improvement, answer: str, options: list[tuple[str, ...]]) ->
 
 
 def _options(found: Diagnosis) -> list[tuple[str, ...]]:
-    """What there is to choose from by number: what is missing, then single suspects."""
+    """Return the choices by number: the missing effects together, then each suspect."""
     out = [found.missing] if found.missing else []
     out += [(suspect.name,) for suspect in found.suspects if (suspect.name,) != found.missing]
     return out
 
 
 def _numbered(found: Diagnosis, options: list[tuple[str, ...]]) -> list[RenderableType]:
+    """Return the table of the choices, or nothing where there are none."""
     if not options:
         return []
     refits = {suspect.name: suspect for suspect in found.suspects}

@@ -1,4 +1,4 @@
-"""Results as JSON objects, with the keys that outside programs rely on; NaN and infinity become null."""
+"""Results as JSON objects with the keys on which other programs rely; NaN and infinity become null."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def replay_object(result: Calibration) -> dict[str, Any]:
-    """What ``replay --json`` prints."""
+    """The JSON object of ``replay``."""
     judged, noise, dwells = result.consistency, result.noise, [visit.dwell for visit in result.visits]
     return clean(
         {
@@ -53,6 +53,7 @@ def replay_object(result: Calibration) -> dict[str, Any]:
 
 
 def parameters_object(result: Calibration) -> list[dict[str, Any]]:
+    """All parameters of a calibration as JSON objects, in SI units."""
     return [
         {"symbol": p.symbol, "value": p.value, "sigma": p.sigma, "unit": p.unit, "nominal": p.nominal}
         for p in result.parameters.values()
@@ -60,7 +61,7 @@ def parameters_object(result: Calibration) -> list[dict[str, Any]]:
 
 
 def outlying_object(found: OutlyingDwell) -> dict[str, Any]:
-    """A dwell that alone does not fit, the turns of a gimbal that would explain it, and the parameters without it."""
+    """A dwell that alone does not fit, the gimbal errors that would explain it, and the parameters without it."""
     return {
         "dwell": found.number,
         "gimbal_deg": np.degrees(found.dwell.recorded_pose) if found.without.bench.axes else None,
@@ -72,7 +73,7 @@ def outlying_object(found: OutlyingDwell) -> dict[str, Any]:
 
 
 def readings_object(found: Readings) -> dict[str, Any]:
-    """Step, flat tops and outliers of the readings."""
+    """Quantisation, saturation and outliers of the readings."""
     return {
         "quantisation": [{**vars(each), "rms_mps2": each.rms_mps2} for each in found.quantisation],
         "saturation": [vars(each) for each in found.saturation],
@@ -81,7 +82,7 @@ def readings_object(found: Readings) -> dict[str, Any]:
 
 
 def compare_object(compared: Comparison) -> dict[str, Any]:
-    """What ``compare --json`` prints: parameters of each way beside its time, memory and distance."""
+    """The JSON object of ``compare``: parameters, time, memory and differences of each way of computing."""
     return clean(
         {
             "max_difference_sigma": compared.max_difference_sigma,
@@ -104,7 +105,7 @@ def compare_object(compared: Comparison) -> dict[str, Any]:
 
 
 def clean(value: Any) -> Any:
-    """As JSON can hold it: lists and plain numbers, null for what is not finite."""
+    """A value in types that JSON can hold: lists and plain numbers, with null for what is not finite."""
     if isinstance(value, dict):
         return {key: clean(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):

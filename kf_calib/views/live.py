@@ -1,4 +1,4 @@
-"""A run that goes on: a screen, a line a dwell, an object a dwell."""
+"""A live run as a screen, as one line of text for each dwell, and as one JSON object for each dwell."""
 
 from __future__ import annotations
 
@@ -23,13 +23,17 @@ if TYPE_CHECKING:
     from kf_calib.sources.live import Status
 
 _BAR, _NAME = 18, 30
-_TARGET_DECADES = 3.0  # of a full bar, over the target
-_COARSE, _DECADES = 1e-3, 5.0  # without a target: a full bar, of a radian, of one, of g; and the decades below it
+_TARGET_DECADES = 3.0  # decades above the target at which the bar of a sigma is full
+# Without a target: the sigma of a full bar in rad, 1 or g, and the decades below it at which the bar is empty.
+_COARSE, _DECADES = 1e-3, 5.0
 _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("µg", 1e6 / 9.80665)}
 
 
 def live_object(judgement: Judgement, standing: Standing, status: Status | None) -> dict[str, Any]:
-    """One line of ``live --json``: the keys of replay and of diagnose as they stand, and what is of a live run only."""
+    """The JSON object of ``live`` after a dwell: the keys of ``replay`` and ``diagnose``, and those of a live run.
+
+    judgement: of the run after the dwell. standing: what is known now. status: of the source (None: it has none).
+    """
     left = dict(zip(paper_parameters.SYMBOLS, judgement.left_s, strict=True))
     wanted = dict(zip(paper_parameters.SYMBOLS, judgement.wanted, strict=True))
     own = {
@@ -51,7 +55,7 @@ def live_object(judgement: Judgement, standing: Standing, status: Status | None)
 
 
 def _going(judgement: Judgement) -> dict[str, Any] | None:
-    """What the look advises, or while nothing is beyond chance what sharpens the sigmas."""
+    """Return the next orientation as a JSON object: as the diagnosis advises, or without an alarm, for the sigmas."""
     advised = judgement.look.going if judgement.final or judgement.alarm else None
     if advised is not None:
         return orientation_object(*advised)
@@ -60,11 +64,12 @@ def _going(judgement: Judgement) -> dict[str, Any] | None:
 
 
 def source_object(status: Status | None) -> dict[str, Any] | None:
+    """The state of a live source as a JSON object, or None."""
     return None if status is None else clean(asdict(status))
 
 
 def line(judgement: Judgement) -> str:
-    """A dwell in a line of text."""
+    """The state of a run after a dwell in one line of text."""
     result = judgement.result
     dwell, sigma = result.visits[-1].dwell, result.estimate.sigma
     seen = "sigmas not determined yet"
@@ -84,7 +89,11 @@ def line(judgement: Judgement) -> str:
 
 
 def screen(standing: Standing, status: Status | None, name: str, recording: str = "", hint: str = "") -> RenderableType:
-    """All that is known now, for a terminal of 80 x 24."""
+    """All that is known of a run now, for a terminal of 80 x 24 characters.
+
+    standing: what is known. status: of the source (None: it has none). name: of the source. recording: path of the file
+    that is written. hint: line at the bottom.
+    """
     judgement = standing.judgement
     parts: list[RenderableType] = [_link(standing, status, name, recording), _here(standing), _sigmas(standing)]
     if judgement is not None:
@@ -101,14 +110,17 @@ def screen(standing: Standing, status: Status | None, name: str, recording: str 
 
 
 def _set(judgement: Judgement) -> Mask:
+    """Return a mask (12,) of the parameters that have a target."""
     return np.isfinite(judgement.wanted)
 
 
 def _style(judgement: Judgement) -> str:
+    """Return the style in which the verdict is shown."""
     return {True: "bold green", False: "bold yellow", None: "bold"}[judgement.consistent]
 
 
 def _link(standing: Standing, status: Status | None, name: str, recording: str) -> Text:
+    """Return the lines about the source and the recording."""
     if status is None:
         return Text(f"{name}: {standing.samples} readings")
     out = Text.assemble((name if len(name) <= _NAME else f"{name[:_NAME]}...", "bold"), " ")
@@ -132,6 +144,7 @@ def _link(standing: Standing, status: Status | None, name: str, recording: str) 
 
 
 def _here(standing: Standing) -> Text:
+    """Return the line about the open dwell."""
     here = standing.current
     if here is None:
         return Text(f"{standing.dwells} dwells in {span(standing.elapsed_s)}; moving or settling")
@@ -145,7 +158,7 @@ def _here(standing: Standing) -> Text:
 
 
 def _sigmas(standing: Standing) -> RenderableType:
-    """The twelve, four a column group as in the paper: sigma, target and the time to it (or to half), and a bar."""
+    """Return the table of the twelve sigmas with their targets, the time to them (or to half the sigma), and bars."""
     table = Table.grid(padding=(0, 1))
     wanted = np.full(12, np.nan) if standing.judgement is None else standing.judgement.wanted
     for justify in ("left", "right", "left", "right", "right", "left"):
@@ -170,7 +183,7 @@ def _sigmas(standing: Standing) -> RenderableType:
 
 
 def _bar(sigma: float, wanted: float, k: int) -> Bar:
-    """A bar that is empty at the target; without one it shows the decades of sigma."""
+    """Return a bar for a sigma, in decades above its target; without one, in decades above a small sigma."""
     if math.isfinite(wanted):
         share = math.log10(max(sigma / wanted, 1e-9)) / _TARGET_DECADES
     else:
@@ -183,6 +196,7 @@ def _bar(sigma: float, wanted: float, k: int) -> Bar:
 
 
 def _fit(judgement: Judgement) -> Text:
+    """Return the line about the model, its NIS and its held-out error."""
     result = judgement.result
     judged = result.consistency
     text = f"12 parameters{''.join(f' + {effect}' for effect in result.model.effects)}; "
@@ -193,11 +207,12 @@ def _fit(judgement: Judgement) -> Text:
 
 
 def _angles(degrees: Floats | tuple[float, ...]) -> str:
+    """Return angles in deg as text, to a tenth of a degree."""
     return ", ".join(f"{round(float(angle), 1):g}" for angle in degrees)
 
 
 def span(seconds: float) -> str:
-    """``45 s``, ``12 min``, ``3.4 h``, ``5 d``; a dash where it is not known or never."""
+    """A duration as text, such as ``45 s``, ``12 min``, ``3.4 h`` or ``5 d``; "-" where it is unknown or infinite."""
     if not math.isfinite(seconds):
         return "-"
     for size, unit in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):

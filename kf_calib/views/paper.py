@@ -1,4 +1,4 @@
-"""The paper's experiment for people and for programs: Table 2 beside its own figures, and what they rest on."""
+"""The experiment of the paper as a report and as a JSON object: its Table 2 beside the figures computed here."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _WORDS = {1: "one", 2: "two", 3: "three"}
 
 
 def paper_object(found: Experiment, searched: ConditionSearch) -> dict[str, Any]:
-    """What ``paper --json`` prints; figures of table2 are per cent, ``optimal`` and ``nonoptimal`` by least squares."""
+    """The JSON object of ``paper``; its table2 is in per cent, with ``optimal`` and ``nonoptimal`` by least squares."""
     sets = {"optimal": found.optimal, "nonoptimal": found.nonoptimal}
     return clean(
         {
@@ -67,10 +67,12 @@ def paper_object(found: Experiment, searched: ConditionSearch) -> dict[str, Any]
 
 
 def _printed(name: str) -> Floats:
+    """Return the column (12,) that the paper prints for a set of orientations, in per cent."""
     return grebenkin2019.printed(OPTIMAL_PRINTED if name == "optimal" else NONOPTIMAL_PRINTED)
 
 
 def _row_object(found: Experiment, name: str) -> dict[str, Any]:
+    """Return the row of one parameter as a JSON object."""
     k, row = paper_parameters.SYMBOLS.index(name), {"parameter": name}
     for key, column in (("optimal", found.optimal), ("nonoptimal", found.nonoptimal)):
         row |= {
@@ -83,27 +85,32 @@ def _row_object(found: Experiment, name: str) -> dict[str, Any]:
 
 
 def _conditions_object(conditions: Conditions) -> dict[str, Any]:
+    """Return the conditions of an experiment as a JSON object."""
     return {**vars(conditions), "duration_s": conditions.duration_s}
 
 
 def _found_object(found: Found) -> dict[str, Any]:
+    """Return the nearest conditions of the search with their log-ratio as a JSON object."""
     return {**_conditions_object(found.conditions), "log_ratio": found.log_ratio}
 
 
 def _turning(found: Experiment) -> tuple[float, float]:
-    """Log-ratio of the optimal set's expectation to the print while the Earth turns: turned after gravity, or not."""
+    """Return the log-ratios of the optimal set's expectation to the print if the Earth turns gravity during the run.
+
+    The first is with each orientation set by gravity on arrival, the second by gravity at the start.
+    """
     column = _printed("optimal")
     figures = [grebenkin2019.optimal(found.conditions, each).expected for each in (True, False)]
     return float(grebenkin2019.log_ratio(figures[0], column)), float(grebenkin2019.log_ratio(figures[1], column))
 
 
 def paper_report(found: Experiment, searched: ConditionSearch) -> RenderableType:
-    """What ``paper`` prints."""
+    """The report that ``paper`` prints."""
     return Group(table2(found), *map(Text, sentences(found, searched)))
 
 
 def table2(found: Experiment) -> Table:
-    """Both sets: the print, the closed form, least squares and the filter."""
+    """The table of both sets of orientations: print, expectation in closed form, least squares and filter."""
     title = f"Table 2: mean |error| over the deviation to be found, %, {found.repetitions} repetitions"
     table = Table(title=title, title_justify="left")
     table.add_column("\nparameter")
@@ -116,23 +123,24 @@ def table2(found: Experiment) -> Table:
 
 
 def markdown(found: Experiment, searched: ConditionSearch) -> str:
-    """The same in one page for the Rerun view."""
+    """The same on one page of Markdown for the Rerun view."""
     head = "| | optimal % | batch | non-opt. % | batch |\n|:--|--:|--:|--:|--:|\n"
     rows = [f"| {symbol(name)} | " + " | ".join(np.array(_both(found, name))[[0, 2, 4, 6]]) + " |" for name in _order()]
     return head + "\n".join(rows) + "\n\n" + "\n\n".join(sentences(found, searched)) + "\n"
 
 
 def _order() -> list[str]:
-    """The rows of the paper: angles, scale factors, biases."""
+    """Return the symbols in the order of the paper: angles, scale factors, biases."""
     return [name for unit in dict.fromkeys(paper_parameters.UNITS) for name in _of_unit(unit)]
 
 
 def _of_unit(unit: str) -> list[str]:
+    """Return the symbols of the parameters with a unit."""
     return [name for name, own in zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True) if own == unit]
 
 
 def _both(found: Experiment, name: str) -> list[str]:
-    """Print, expectation, least squares and filter of the optimal set, then of the other."""
+    """Return print, expectation, least squares and filter of a parameter for the optimal set, then the other."""
     k, cells = paper_parameters.SYMBOLS.index(name), list[str]()
     for key, column in (("optimal", found.optimal), ("nonoptimal", found.nonoptimal)):
         figures = (column.orientations.expected[k], column.least_squares[k], column.kalman[k])
@@ -141,12 +149,13 @@ def _both(found: Experiment, name: str) -> list[str]:
 
 
 def sentences(found: Experiment, searched: ConditionSearch) -> list[str]:
-    """What the figures say, what they rest on, and what is inferred."""
+    """What the figures show, on which conditions they rest, and which of these were inferred; in sentences."""
     return [_scatter(found), rank_sentence(found), _inferred(found), *_searched(searched), _earth(found),
             _conditioning(found), _filter(found)]  # fmt: skip
 
 
 def _scatter(found: Experiment) -> str:
+    """Return a sentence on the scatter of a mean of so many repetitions."""
     column = _printed("optimal")
     expected = np.abs(column / found.optimal.orientations.expected - 1).max()
     off = np.abs(found.optimal.least_squares / column - 1).max()
@@ -158,7 +167,7 @@ def _scatter(found: Experiment) -> str:
 
 
 def rank_sentence(found: Experiment) -> str:
-    """Why the non-optimal set gives no finite errors as it is printed."""
+    """A sentence on why the non-optimal set gives no finite errors as it is printed."""
     rank = int(found.fixed.rank.min())
     same = " and ".join(f"orientations {one} and {other} share the vertical" for one, other in found.fixed.same_vector)
     return (
@@ -168,6 +177,7 @@ def rank_sentence(found: Experiment) -> str:
 
 
 def _inferred(found: Experiment) -> str:
+    """Return sentences on the conditions that were inferred from the paper's table."""
     column, hours = _printed("nonoptimal"), found.conditions.duration_s / 3600
     closed = grebenkin2019.log_ratio(found.nonoptimal.orientations.expected, column)
     ran = grebenkin2019.log_ratio(found.nonoptimal.least_squares, column)
@@ -180,6 +190,7 @@ def _inferred(found: Experiment) -> str:
 
 
 def _described(conditions: Conditions) -> str:
+    """Return the conditions of an experiment in words."""
     order = " ".join(conditions.sampled)
     sampled = "together" if conditions.sampled == TOGETHER else f"one after another ({order}) in each orientation"
     return (
@@ -189,6 +200,7 @@ def _described(conditions: Conditions) -> str:
 
 
 def _searched(searched: ConditionSearch) -> list[str]:
+    """Return sentences on the search for conditions that give the paper's figures."""
     together, in_turn, worst = searched.together, searched.in_turn, int(searched.bias_excess.argmax())
     return [
         f"Of {searched.tried} conditions tried ({len(AZIMUTHS_DEG)} azimuths, {len(PERIODS_S)} periods, "
@@ -205,6 +217,7 @@ def _searched(searched: ConditionSearch) -> list[str]:
 
 
 def _earth(found: Experiment) -> str:
+    """Return sentences on the optimal set if the Earth turned during the run."""
     turned, left = _turning(found)
     return (
         "The optimal set above has gravity fixed. Were the Earth to turn as inferred, its expectation would be "
@@ -214,6 +227,7 @@ def _earth(found: Experiment) -> str:
 
 
 def _conditioning(found: Experiment) -> str:
+    """Return a sentence on the condition numbers of both sets."""
     parts = [
         f"{name} {each.condition_numbers.max():.4g} ({each.condition_numbers_in_g.max():.3g} in units of g)"
         for name, each in (("optimal", found.optimal.orientations), ("non-optimal", found.nonoptimal.orientations))
@@ -222,6 +236,7 @@ def _conditioning(found: Experiment) -> str:
 
 
 def _filter(found: Experiment) -> str:
+    """Return a sentence on the difference between filter and least squares."""
     largest = max(found.optimal.difference_sigma, found.nonoptimal.difference_sigma)
     return (
         f"Filter and least squares differ by at most {largest:.2g} σ in any repetition: D is linear in the deviations, "
@@ -230,4 +245,5 @@ def _filter(found: Experiment) -> str:
 
 
 def _percent(part: float) -> str:
+    """Return a share as text in per cent."""
     return f"{100 * part:.1f} %"

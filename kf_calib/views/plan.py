@@ -1,4 +1,4 @@
-"""A plan for people, for programs, and as lines that a bench (or ``simulate --plan``) runs."""
+"""A plan of orientations as a report, as a JSON object, and as CSV that a bench or ``simulate --plan`` can run."""
 
 from __future__ import annotations
 
@@ -25,13 +25,16 @@ _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": (
 
 
 def gimbal_names(made: Plan) -> list[str]:
-    """``1_y``, ``2_z``, ...: number and axis, outer first."""
+    """Number and axis of each gimbal from the outermost inwards, such as ``1_y`` and ``2_z``."""
     axes = made.prospect.model.bench.to_metadata()["axes"].split()
     return [f"{k}_{axis.replace(',', ';')}" for k, axis in enumerate(axes, 1)]
 
 
 def plan_object(made: Plan, beside_paper: bool = False) -> dict[str, Any]:
-    """What ``plan --json`` prints: angles in deg, sigmas in SI."""
+    """The JSON object of ``plan``; angles are in deg, sigmas in SI.
+
+    beside_paper: add the figures of the paper's set of orientations.
+    """
     symbols, before = made.prospect.symbols, made.prospect.last is not None
     out = {
         "axes": made.prospect.model.bench.to_metadata()["axes"],
@@ -68,26 +71,28 @@ def plan_object(made: Plan, beside_paper: bool = False) -> dict[str, Any]:
 
 
 def _named(symbols: tuple[str, ...], values: Floats | None) -> dict[str, float] | None:
+    """Return values by symbol, or None."""
     return None if values is None else dict(zip(symbols, values.tolist(), strict=True))
 
 
 def mean_error_percent(sigma: Floats) -> Floats:
-    """The figure of the paper's Table 2 that sigmas (12,) give: sqrt(2/pi) sigma over the deviation, per cent."""
+    """The mean absolute error as in the paper's Table 2, sqrt(2/pi) sigma over the deviation, in per cent (12,)."""
     return 100.0 * math.sqrt(2.0 / math.pi) * sigma / DEVIATIONS
 
 
 def generalised_ratio(made: Plan) -> float:
-    """Geometric mean of the principal sigmas, of the plan over that of the paper's set."""
+    """The generalised sigma of the plan, the geometric mean of its principal sigmas, over that of the paper's set."""
     return made.generalised_sigma / made.papers_generalised_sigma
 
 
 def plan_report(made: Plan, beside_paper: bool = False) -> RenderableType:
-    """What ``plan`` prints."""
+    """The report that ``plan`` prints."""
     return Group(_orientations(made), _sigmas(made, beside_paper), *map(Text, sentences(made, beside_paper)),
                  *map(note, made.remarks))  # fmt: skip
 
 
 def _orientations(made: Plan) -> Table:
+    """Return the table of the orientations in their order."""
     table = Table(title=f"{len(made.poses)} orientations, in this order", title_justify="left")
     for heading in (
         "",
@@ -104,6 +109,7 @@ def _orientations(made: Plan) -> Table:
 
 
 def _sigmas(made: Plan, beside_paper: bool) -> Table:
+    """Return the table of the predicted sigmas."""
     table = Table(title="Predicted sigma (1σ)", title_justify="left")
     columns = _columns(made, beside_paper)
     for heading in ("parameter", *columns, "unit"):
@@ -117,7 +123,7 @@ def _sigmas(made: Plan, beside_paper: bool) -> Table:
 
 
 def _columns(made: Plan, beside_paper: bool) -> dict[str, tuple[Floats, bool]]:
-    """Headings, values (p,), and whether they are per cent."""
+    """Return for each heading of that table the values (p,) and whether they are in per cent."""
     out = dict[str, tuple[Floats, bool]]()
     if made.prospect.last is not None:
         out["now"] = made.sigma[0], False
@@ -133,13 +139,14 @@ def _columns(made: Plan, beside_paper: bool) -> dict[str, tuple[Floats, bool]]:
 
 
 def _figure(value: float, percent: bool, per_si: float) -> str:
+    """Return a number as text; "not seen" where it is not finite."""
     if not math.isfinite(value):
         return "not seen"
     return f"{value:.3g} %" if percent else f"{value * per_si:.3g}"
 
 
 def sentences(made: Plan, beside_paper: bool = False) -> list[str]:
-    """What the plan is worth."""
+    """The quality of the plan in sentences."""
     count = len(made.prospect.symbols)
     told = [
         f"Aim {made.search.aim.name}: {made.search.aim.measures} {made.cost:.4g}. Condition number "
@@ -158,7 +165,7 @@ def sentences(made: Plan, beside_paper: bool = False) -> list[str]:
 
 
 def write_csv(made: Plan, path: Path) -> None:
-    """Names of the gimbals, then a line of angles in deg for each dwell."""
+    """Write a CSV file with the names of the gimbals, then one line of angles in deg for each dwell."""
     header = ",".join(f"gimbal_{name}_deg" for name in gimbal_names(made))
     rows = [",".join(repr(float(angle)) for angle in row) for row in made.gimbal_deg]
     write_whole(path, ("\n".join([header, *rows]) + "\n").encode())

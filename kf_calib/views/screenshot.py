@@ -1,7 +1,7 @@
-"""A picture of a Rerun recording as it opens, rendered without a window: for reports, and for machines with no display.
+"""A picture of a Rerun recording, rendered without a window, for reports and for machines with no display.
 
-Rerun's viewer runs headless on a free port of this machine, loads the file, is asked for its picture, and is ended.
-It draws with Vulkan; where there is no graphics card, Mesa's software driver does.
+The viewer of Rerun runs headless on a free port of this machine, loads the file, gives its picture, and is ended. It
+draws with Vulkan, by the software driver of Mesa where there is no graphics card.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from kf_calib.support.output_files import whole
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
 
-_PATIENCE_S = 60.0  # software rendering on a busy machine; the usual time is 2 s
-_MENU_PX = 36  # the window's own top bar, which stays as an empty strip when its menu is hidden; cut off
-_IDLE_S = 3.0  # a viewer that listens, loads nothing and shows nothing, has refused the file
+_PATIENCE_S = 60.0  # enough for software rendering on a busy machine; the usual time is 2 s
+_MENU_PX = 36  # height of the window's top bar, which stays as an empty strip when its menu is hidden, and is cut off
+_IDLE_S = 3.0  # a viewer that is idle for this long without showing anything has refused the file
 _POLL_S = 0.05
-_SETTLED = 2  # equal pictures in a row: views size their axes over the first frames
+_SETTLED = 2  # equal pictures in a row that are needed, as views still size their axes in the first frames
 
 
 class ScreenshotError(KfCalibError):
@@ -42,11 +42,11 @@ def screenshot(
     timeline: str | None = None,
     time: float | None = None,
 ) -> Path:
-    """Draw a recording into a PNG of ``size`` (width, height) pixels, and return its path.
+    """Draw a recording into a PNG file of ``size`` (width, height) pixels, and return its path.
 
-    ``timeline`` and ``time`` move the cursor first (s on a timeline of durations, a count on a sequence);
-    without them the picture is what the file opens with. Raises ScreenshotError, and
-    InputError where the PNG cannot be written.
+    ``timeline`` and ``time`` move the cursor first (s on a timeline of durations, a count on a sequence); without them
+    the picture shows the recording as it opens. Raises ScreenshotError where the viewer cannot draw it, and InputError
+    where the PNG file cannot be written.
     """
     rrd, png = Path(rrd_path).resolve(), Path(png_path).resolve()
     if not rrd.is_file():
@@ -62,7 +62,7 @@ def screenshot(
 
 @contextmanager
 def viewer(rrd: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
-    """A headless viewer that has loaded the file; its process is ended whatever happens."""
+    """A headless viewer that has loaded the file; its process is ended in any case."""
     with tempfile.TemporaryDirectory(prefix="kf_calib_") as folder:
         port, log = free_port(), Path(folder, "viewer.log")
         command = [
@@ -80,20 +80,21 @@ def viewer(rrd: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
 
 
 def free_port() -> int:
+    """Number of a port of this machine that is free."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def binary() -> str:
-    """The viewer itself: the script of the same name would be a second process, which outlives a kill."""
+    """Path of the viewer itself; the script of the same name would start it as a process that outlives a kill."""
     import rerun_cli
 
     return str(Path(rerun_cli.__file__).with_name("rerun.exe" if sys.platform == "win32" else "rerun"))
 
 
 def _loaded(process: subprocess.Popen[bytes], port: int, log: Path) -> ViewerClient:
-    """The viewer, once it listens and has read the file; raises where it ended or time ran out."""
+    """Return the viewer once it has loaded the file; raise ScreenshotError if it ends or takes too long."""
     from rerun.experimental import ViewerClient
 
     began = idle_since = clock.monotonic()
@@ -104,7 +105,7 @@ def _loaded(process: subprocess.Popen[bytes], port: int, log: Path) -> ViewerCli
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             state = client.get_state()
-        except Exception:  # not listening yet: the client raises what its transport raises
+        except Exception:  # not listening yet; the client raises whatever its transport raises
             idle_since = clock.monotonic()
             continue
         if state.loading:
@@ -114,7 +115,7 @@ def _loaded(process: subprocess.Popen[bytes], port: int, log: Path) -> ViewerCli
         elif clock.monotonic() > idle_since + _IDLE_S:
             try:
                 client.take_screenshot()
-            except Exception:  # it listens before it has found a graphics driver, or ends for want of one
+            except Exception:  # the viewer listens before it has found a graphics driver, and ends if it finds none
                 idle_since = clock.monotonic()
                 continue
             raise ScreenshotError("the file holds nothing that Rerun can show: write it again with --rrd.")
@@ -122,7 +123,7 @@ def _loaded(process: subprocess.Popen[bytes], port: int, log: Path) -> ViewerCli
 
 
 def obituary(log: str) -> str:
-    """Why the viewer ended, from its log."""
+    """Why the viewer ended, from its log, in one sentence."""
     if any(word in log for word in ("render context", "graphics adapter", "Vulkan")):
         return (
             "the Rerun viewer found no graphics driver: install Vulkan's software driver "
@@ -134,7 +135,7 @@ def obituary(log: str) -> str:
 
 
 def _seek(client: ViewerClient, timeline: str, time: float | None) -> None:
-    """Show a timeline, its cursor at ``time`` (None: where it is)."""
+    """Show a timeline with its cursor at ``time`` (None: the cursor is not moved)."""
     known = {line.name: line.time_type for line in client.get_state().recordings[0].timelines}
     if timeline not in known:
         raise ScreenshotError(f"the recording has no timeline {timeline!r}: use one of {', '.join(sorted(known))}.")
@@ -147,7 +148,7 @@ def _seek(client: ViewerClient, timeline: str, time: float | None) -> None:
 
 
 def _settled(client: ViewerClient) -> bytes:
-    """The picture (PNG), once it stays the same: layouts and axes take a few frames."""
+    """Return the picture (PNG) once it no longer changes, as layouts and axes take a few frames."""
     picture, equal, deadline = b"", 0, clock.monotonic() + _PATIENCE_S
     while equal < _SETTLED and clock.monotonic() < deadline:
         try:
@@ -160,7 +161,7 @@ def _settled(client: ViewerClient) -> bytes:
 
 
 def _write(picture: bytes, png: Path) -> None:
-    """The picture without the window's top bar."""
+    """Write the picture without the window's top bar."""
     from PIL import Image
 
     window = Image.open(io.BytesIO(picture))

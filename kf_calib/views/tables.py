@@ -1,4 +1,4 @@
-"""Tables that fit the screen: text folds between its words, and numbers stay whole however narrow the screen is."""
+"""Tables that fit the screen: text is folded between words, and numbers are never cut, however narrow the screen is."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.table import Column
 from rich.text import Text
 
-_GLUE = "\u00a0"  # no line ends at it
-_READABLE = 16  # characters of a column of text, at least, where it has more
-_NARROWEST = 20  # characters of a line, at least, of a record
+_GLUE = "\u00a0"  # a space at which no line is broken
+_READABLE = 16  # smallest width of a column of text that is longer than this, in characters
+_NARROWEST = 20  # smallest width of a record, in characters
 
 
 class Bar(Text):
-    """A number drawn as a bar: the first thing that a narrow screen does without."""
+    """A number drawn as a bar, which is left out first where the screen is narrow."""
 
 
 class Table(rich.table.Table):
-    """A table whose right-aligned columns hold numbers, which are never folded; other columns fold between words.
+    """A table whose right-aligned columns hold numbers, which are never folded; other columns are folded between words.
 
-    Where that does not fit, the frame is left out, then bars; and where that is not enough, each row becomes a record
-    of a line or more, every cell behind the heading of its column.
+    Where the table does not fit, its frame is left out, then its bars. If that is not enough, each row becomes a record
+    of one or more lines, in which every cell follows the heading of its column.
     """
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -40,22 +40,23 @@ class Table(rich.table.Table):
         yield Text(self._without_bars()._records(max(options.max_width, _NARROWEST)))
 
     def _of(self, columns: list[Column]) -> Table:
-        """The same rows with other columns."""
+        """Return the same rows with other columns."""
         other = copy.copy(self)
         other.columns = [replace(column, _index=k) for k, column in enumerate(columns)]
         return other
 
     def _unframed(self) -> Table:
-        """The same with a line under the headings in place of a frame."""
+        """Return the same table with a line under the headings in place of a frame."""
         other = copy.copy(self)
         other.box, other.show_edge, other.padding = self.box and SIMPLE_HEAD, False, (0, 0 if self.box else 1)
         return other
 
     def _without_bars(self) -> Table:
+        """Return the same table without columns of bars."""
         return self._of([column for column in self.columns if not any(isinstance(cell, Bar) for cell in column.cells)])
 
     def _fitting(self, console: Console, options: ConsoleOptions) -> list[int] | None:
-        """The widths of the columns, all of their text where there is room for it; None where numbers would be cut."""
+        """Return the widths of the columns, as wide as their text if there is room; None if numbers would be cut."""
         widths, least = [_widest(column) for column in self.columns], [_least(column) for column in self.columns]
         unbounded = options.update(width=1 << 16)
         frame = rich.table.Table.__rich_measure__(self, console, unbounded).maximum - sum(widths)
@@ -63,12 +64,13 @@ class Table(rich.table.Table):
         spare = [width - own for width, own in zip(widths, least, strict=True)]
         if over > sum(spare):
             return None
-        for k in range(len(spare)):  # columns give way in proportion to what they can do without
+        for k in range(len(spare)):  # each column is narrowed in proportion to the width that it can spare
             cut = -(-over * spare[k] // max(sum(spare[k:]), 1))
             widths[k], over = widths[k] - cut, over - cut
         return widths
 
     def _records(self, width: int) -> str:
+        """Return the rows as records of text."""
         headings, cells = [_said(column.header) for column in self.columns], [list(c.cells) for c in self.columns]
         lines = [*textwrap.wrap(_said(self.title or ""), width)]
         for number, row in enumerate(self.rows):
@@ -87,20 +89,22 @@ class Table(rich.table.Table):
 
 
 def _said(cell: RenderableType | None) -> str:
-    """A cell on one line."""
+    """Return the text of a cell on one line."""
     return " ".join(str(cell or "").split())
 
 
 def _lengths(texts: list[str]) -> int:
+    """Return the width of the longest of some texts."""
     return max(map(cell_len, texts), default=0)
 
 
 def _widest(column: Column) -> int:
+    """Return the width of a column whose text is not folded."""
     return _lengths([line for cell in (column.header, *column.cells) for line in str(cell).splitlines()])
 
 
 def _least(column: Column) -> int:
-    """How narrow a column may become: its numbers whole, its text in words."""
+    """Return the smallest width of a column: its numbers are not folded, its text is folded between words."""
     if column.no_wrap:
         return _widest(column)
     words = _lengths(str(column.header).split())

@@ -1,4 +1,4 @@
-"""The Rich console that results are drawn on: what it draws is text, and nothing in it reaches the terminal as more."""
+"""The Rich console on which results are drawn: control characters in a text never reach the terminal as commands."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from kf_calib.support.plain_text import printable, sentence
 
 
 class PlainConsole(Console):
-    """Reads no markup in what it is given, and draws characters that command a terminal as their codes."""
+    """A console that reads no markup in its text, and shows control characters as their codes."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, **settings)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """The segments of a renderable with control characters in its text replaced."""
         for text, style, control in super().render(renderable, options):
             yield Segment(text if control else printable(text), style, control)
 
 
 def note(said: str) -> Text:
-    """What is worth knowing beside a result, in a line of its own."""
+    """A remark beside a result, on a line of its own."""
     return Text(f"Note: {sentence(said)}", style="yellow")
