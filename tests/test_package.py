@@ -48,7 +48,7 @@ def test_the_citation_is_of_this_version_and_licence() -> None:
 
 
 def test_the_licence_of_every_locked_package_is_listed(licences: ModuleType) -> None:
-    rows = re.findall(r"^\| ([\w.-]+) \| ([\w.]+) \| (.*) \|$", licences.PAGE.read_text(), re.MULTILINE)
+    rows = re.findall(r"^\| ([\w.-]+) \| (\d[\w.]*) \| (.*) \|$", licences.PAGE.read_text(), re.MULTILINE)
     listed = {name: (version, licence) for name, version, licence in rows}
     wanted = {name: version for lock in licences.TABLES.values() for name, version in licences.locked(lock).items()}
     assert {name: version for name, (version, _) in listed.items()} == wanted, "run tools/licences"
