@@ -74,7 +74,10 @@ class Candidate:
         for it and against the other."""
         if not 0 < self.dof <= other.dof:
             return False
-        return float(np.linalg.svd(self.basis.T @ other.basis, compute_uv=False)[-1]) > cosine
+        cosines = self.basis.T @ other.basis
+        if np.vdot(cosines, cosines) <= self.dof * cosine**2:  # the smallest is no larger than their root mean square
+            return False
+        return float(np.linalg.svd(cosines, compute_uv=False)[-1]) > cosine
 
     def overlap(self, other: Candidate) -> float:
         """Cosine of the smallest principal angle: 1 where some combination of the one mimics one of the other."""
