@@ -45,7 +45,7 @@ class Mounting:
         return cls(bench, tuple(range(len(bench.axes))))
 
     def poses(self, recorded: Floats) -> Floats:
-        """Poses (D, k) in rad, or quaternions x y z w, from the recorded ones."""
+        """Poses (D, k) in rad, or quaternions x y z w, from the poses as recorded."""
         if self.bench.axes:
             return recorded[:, self.order] * self.angle_unit
         x, y, z, w = recorded[:, [1, 2, 3, 0]].T if self.real_first else recorded.T

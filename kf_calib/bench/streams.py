@@ -57,7 +57,7 @@ class Stream:
 class Batch:
     """A stretch of the raw streams as they arrived, each with its own stamps; any of them may be empty."""
 
-    accel: Stream  # (n, 3) m/s^2
+    accel: Stream  # readings (n, 3), m/s^2
     pose: Stream  # (m, k) rad, or (m, 4) quaternion x y z w
     temperature: Stream = field(default_factory=lambda: Stream.empty(1))  # (l, 1) degC
 

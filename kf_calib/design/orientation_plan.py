@@ -235,7 +235,7 @@ def fewest(search: Search, timing: Timing, seed: int = 0, on_try: Callable[[int]
     copies, tried = search.scheme.copies, dict[int, float]()
 
     def ratio(count: int) -> float:
-        """What the best ``count`` orientations measure."""
+        """Return the aim of the best ``count`` orientations; infinite if they leave parameters undetermined."""
         if count not in tried:
             on_try(count * copies)
             enough = not optimality_criteria.unseen(search.factor(search.candidate_rows[search.exchanged(count)])).any()

@@ -15,7 +15,7 @@ from kf_calib.bench.arrays import Floats
 
 _ITERATIONS = 60
 _STILL = 1e-3  # relative change of kappa
-_LONG = 500  # readings of a block
+_LONG = 500  # in blocks of more readings than this, a parabola removes almost nothing of white noise
 _GONE = 1e-9  # relative to the variance
 
 
@@ -47,7 +47,7 @@ class Autoregression:
 
     @property
     def inflation(self) -> float:
-        """kappa = var(e) / (var(x) (1 - sum a)^2)."""
+        """The inflation kappa = var(e) / (var(x) (1 - sum a)^2)."""
         return float(self.innovation / self.variance / (1.0 - self.coefficients.sum()) ** 2)
 
     def autocovariances(self, known: Floats, size: int) -> Floats:

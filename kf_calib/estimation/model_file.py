@@ -1,9 +1,9 @@
 """Model files: the effects of a model as TOML, to keep and to share.
 
     effects = ["bend", "mine = fx*fy*T"]
-    effects_from = ["my_effects.py"]        # files of a user's own classes, relative to this one
+    effects_from = ["my_effects.py"]        # files that define a user's own effects, relative to this one
 
-    [sha256]                                # of these files when the model was saved
+    [sha256]                                # checksums of these files when the model was saved
     "my_effects.py" = "4f0e..."
 
     [[coefficients]]                        # estimates of the run; for information only, not read
@@ -15,7 +15,7 @@
 A file under ``effects_from`` is a program. Reading a model runs none; ``ModelFile.load`` runs those that it may::
 
     model = model_file.read("model.toml")
-    model.load(named=["my_effects.py"])     # or, where all that came with the model is trusted, trust=True
+    model.load(named=["my_effects.py"])     # or trust=True, to run all files that the model names
     calibrate("run.mcap", Settings(effects=model.effects))
 """
 
@@ -151,5 +151,5 @@ def _relative(file: Path, path: Path) -> str:
     """Return the path of a program relative to the model file."""
     try:
         return Path(os.path.relpath(file, path.resolve().parent)).as_posix()
-    except ValueError:  # another drive
+    except ValueError:  # the file is on another drive
         return file.as_posix()

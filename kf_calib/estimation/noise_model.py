@@ -33,7 +33,7 @@ TOO_SHORT = 4.0
 
 _AVERAGES = 60  # a block needs at least so many averages for their own correlation to be estimated
 _WANDER = 6
-_ROUNDING = 1e-14  # of a dwell's variance
+_ROUNDING = 1e-14  # relative to a dwell's variance
 
 
 @dataclass(frozen=True)

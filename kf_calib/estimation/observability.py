@@ -53,7 +53,7 @@ class Visibility:
         return None if self.share is None else self.share > 0.0
 
     def __str__(self) -> str:
-        """The same in a sentence."""
+        """The visibility in one sentence."""
         if self.share is None:
             return f"{self.effect}: {self.why}"
         seen = f"visible, {self.share:.2g} of its column is left beside the rest of the model"

@@ -90,7 +90,7 @@ def _turns(dwell: DwellFactor, means: Means, rest: Calibration) -> Iterator[Turn
     at_s = np.array([0.5 * (dwell.start_s + dwell.end_s)])
 
     def at(gimbal: int, turn_rad: float) -> Means:
-        """The dwell's means with the gravity that the platform would feel there."""
+        """Return the dwell's means with the specific force that the platform would have at this angle of the gimbal."""
         pose = dwell.pose.copy()
         pose[gimbal] += turn_rad
         force, design = bench.specific_force(at_s, pose[None]), means.design.copy()

@@ -240,9 +240,9 @@ class _Path:
         bands[0, 1:, :3] += pauses[:, None]
         bands[0, 1:-1, :3] += pauses[1:, None]
         bands[0, :-1, 3:] += pauses[:, None]
-        bands[3, 1:-1, :3] += pauses[1:, None]  # a and s of one dwell lead to the next
-        bands[3, :-1, 3:] -= pauses[:, None]  # s, and the next a
-        bands[6, 1:-1, :3] -= pauses[1:, None]  # a, and the next a
+        bands[3, 1:-1, :3] += pauses[1:, None]  # a and s of one dwell, whose sum leads to the next a
+        bands[3, :-1, 3:] -= pauses[:, None]  # s and the next a
+        bands[6, 1:-1, :3] -= pauses[1:, None]  # a and the next a
         return bands.reshape(7, -1)
 
 

@@ -205,7 +205,7 @@ class OutlyingDwell:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The result of a run."""
+    """The result of a run: the fit, the estimate after each dwell and at the end, and the tests of the model."""
 
     bench: Bench
     settings: Settings
