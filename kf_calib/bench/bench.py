@@ -276,8 +276,10 @@ def _frame_with_up(up: str) -> Floats:
 
 
 def turn(vector: Floats, axis: Floats, angle_rad: Floats | float) -> Floats:
-    """Rot(axis, angle) vector (..., 3) by Rodrigues' formula; vector is (3,) or (n, 3), angle is a scalar or (n,),
-    rad."""
+    """The vector (..., 3) rotated about a unit axis by an angle, Rot(axis, angle) vector, by Rodrigues' formula.
+
+    ``vector`` is (3,) or (n, 3); ``angle_rad`` is a scalar or (n,).
+    """
     cos, sin = np.cos(angle_rad)[..., None], np.sin(angle_rad)[..., None]
     along = (vector @ axis)[..., None] * axis
     x, y, z = axis.tolist()

@@ -1,9 +1,13 @@
 """Restricted maximum likelihood (REML) estimates of setting error, scatter and random walk from the dwells' means.
 
-The mean readings of dwell d have the covariance V_d = diag(kappa sigma_w^2 / n + sigma_s^2) + sigma_alpha^2 S (|f|^2 I
-- f f^T) S^T about the model, and a random walk of the biases adds a step from each dwell to the next. The variances
-sigma_s^2, sigma_alpha^2 and q^2 are those of ``restricted_likelihood``. If from each mean its share of the mean before
-is subtracted, the walk correlates only neighbouring differences, so that the covariance is banded.
+The mean readings of dwell d have about the model the covariance
+
+  V_d = diag(kappa sigma_w^2 / n + sigma_s^2) + sigma_alpha^2 S (|f|^2 I - f f^T) S^T,
+
+where S holds the sensitivities and f is the specific force. A random walk of the biases adds a step from each dwell to
+the next. The variances sigma_s^2, sigma_alpha^2 and q^2 are those of ``restricted_likelihood``. If from each mean its
+share of the mean before is subtracted, the walk correlates only neighbouring differences, so that the covariance is
+banded.
 """
 
 from __future__ import annotations
@@ -238,10 +242,10 @@ def restricted_log_likelihood(
 
 
 def _reduced(means: Means, prior: Floats | None = None) -> tuple[Means, Floats]:
-    """Replace the columns without a prior by an orthonormal basis (D, 3, r) and subtract from the readings what it
-    explains.
+    """Return the means with an orthonormal basis (D, 3, r) in place of the columns without a prior, and the prior's
+    rows.
 
-    Returns the means and the prior's rows in these columns. The change of basis alters the likelihood only by a
+    What the basis explains is subtracted from the readings. The change of basis alters the likelihood only by a
     constant, and the rounding of readings of size g no longer matters.
     """
     design = means.design.reshape(-1, means.design.shape[2])

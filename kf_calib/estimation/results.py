@@ -1,5 +1,4 @@
-"""The results of a calibration: parameters, the estimate after each dwell, and the consistency of model and
-readings."""
+"""The results of a calibration: parameters, the estimate after each dwell, and the test of consistency."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ class Scan:
 
     @cached_property
     def statistics(self) -> Floats:
-        """Score statistics (n,): the decrease of chi-squared if each candidate alone is added.
+        """Score statistics (n,): the decrease of chi-squared if each candidate alone is added, |basis^T r|^2.
 
         Each is chi-squared distributed with the candidate's degrees of freedom if the model is complete.
         """
@@ -123,8 +123,9 @@ class Scan:
 
 
 class Frame:
-    """The whitened columns C of ``effects`` over all dwells, factored as C = basis (m, r) @ coordinates (r, q), with an
-    orthonormal basis.
+    """The whitened columns of ``effects`` over all dwells, in an orthonormal basis of their own.
+
+      columns (m, q) = basis (m, r) @ coordinates (r, q)
 
     A frame can be used with every model of the same dwells that is judged by the same noise. Small rotations and input
     axes remain linearised at ``state``, the state with which the frame was made.
@@ -243,8 +244,12 @@ def scan(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Scan:
 
 
 def project(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
-    """Make the scan from a triangular factor [H | G | z]: its first ``width`` columns are the model's, followed by
-    ``counts[k]`` columns of each effect k."""
+    """Make the scan from a triangular factor [H | G | z].
+
+    upper: the factor.
+    width: number of columns H of the model.
+    effects: the candidates; counts: number of columns of each in G.
+    """
     sizes, rest = np.linalg.norm(upper[:, width:-1], axis=0), _beside(upper, width)
     units = np.where(sizes > 0, sizes, 1.0)
     columns, residual = rest[:-1, :-1] / units, rest[:-1, -1]
@@ -268,8 +273,8 @@ def _beside(rows: Floats, width: int) -> Floats:
 def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
     """Decrease of chi-squared (n,) if each of many effects of one kind, alone, is added: the ``statistics`` of a scan.
 
-    Because nothing else is needed, the rows are not reduced by QR. For n columns in d rows this costs of the order of d
-    n operations instead of d n^2.
+    Because nothing else is needed, the rows are not reduced by QR. For n columns in d rows the cost is then
+    proportional to d times n instead of d times n^2.
     """
     if effects[0].oscillates and len(effects) > _MANY and not carried.carrier_hz:
         rows, width = _judged(carried.dwells, carried.columns, noise, carried.state, carried.model.count)
@@ -312,8 +317,7 @@ def whiten_model(
 def whitened_columns(
     carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats, stimulus: Stimulus
 ) -> Floats:
-    """The columns G (m, q) of ``whiten_model``, computed for some effects at a time so that memory stays close to that
-    of the result."""
+    """The columns G (m, q) of ``whiten_model``, computed for a few effects at a time, which saves memory."""
     sizes, out, first = [len(effect.coefficients) for effect in effects], np.zeros((0, 0)), 0
     for part in batches(sizes, columns_at_once(carried)) or [[]]:
         rows, width = whiten_model(carried, noise, [effects[k] for k in part], state, stimulus)

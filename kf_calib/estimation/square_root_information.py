@@ -224,6 +224,8 @@ def update(factor: Floats, rows: Floats, walked: Floats = _STILL) -> tuple[Float
     """Time and measurement update with whitened rows (m, s + p + 1): the new factor and the normalised innovation
     squared.
 
+      without a walk: QR of [R | z] stacked on the rows gives [R+ | z+] stacked on [0 | e],  NIS = e' e
+
     ``walked`` (2,) are the variances of the biases' steps in the pause before the dwell and within the dwell.
     """
     width, (upper, count) = len(factor), random_walk.advance(factor, walked, rows)
@@ -317,6 +319,8 @@ def ranks(factors: Floats, tolerance: float = 1e-9) -> NDArray[np.intp]:
 
 def solve(factor: Floats, around: Floats, tolerance: float = 1e-9) -> tuple[Floats, Floats, Floats]:
     """State (p,), covariance (p, p) and a basis (p, q) of the combinations of states that are not determined.
+
+      x = R^-1 z,  P = R^-1 R^-T
 
     Combinations that are not determined keep their value in ``around`` (p,), and the covariance does not include their
     variance. ``tolerance`` is the singular value of the scaled R below which a combination is not determined.
