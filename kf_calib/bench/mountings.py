@@ -24,11 +24,11 @@ _MOST_CHANGES = 2
 class Mounting:
     """One interpretation of the recorded poses.
 
-    bench: the bench as it would have to be stated.
-    order: the column of the recorded angles that belongs to each gimbal.
-    angle_unit: rad per unit of the recorded angles.
-    conjugate: the recorded quaternions are of the inverse rotation; real_first: their real part comes first.
-    words: the differences in words; changes: how many things differ from what is stated.
+    - bench: the bench as it would have to be stated.
+    - order: the column of the recorded angles that belongs to each gimbal.
+    - angle_unit: rad per unit of the recorded angles.
+    - conjugate: the recorded quaternions are of the inverse rotation; real_first: their real part comes first.
+    - words: the differences in words; changes: how many things differ from what is stated.
     """
 
     bench: Bench

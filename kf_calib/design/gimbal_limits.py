@@ -26,10 +26,10 @@ Range = tuple[float, float]
 class Reach:
     """The limits of a bench.
 
-    limits_deg: range of each limited gimbal, by its number from 0.
-    zones_deg: forbidden boxes, each given by ranges of some gimbals.
-    grid_deg: angles have to be multiples of it; positions_deg: the possible poses. If both are None, any angle is
-        possible.
+    - limits_deg: range of each limited gimbal, by its number from 0.
+    - zones_deg: forbidden boxes, each given by ranges of some gimbals.
+    - grid_deg: angles have to be multiples of it; positions_deg: the possible poses. If both are None, any angle is
+      possible.
     """
 
     bench: Bench

@@ -39,10 +39,10 @@ _WAITS = (0.0, 0.25, 1.0)  # possible waits, as shares of the duration so far
 class Advice:
     """The next orientation.
 
-    gimbal_deg: its gimbal angles.
-    before, after: separation in sigma before and after a dwell there.
-    stay_s: how long to stay; None for a dwell of the usual length.
-    told: names of the effects that it tells apart.
+    - gimbal_deg: its gimbal angles.
+    - before, after: separation in sigma before and after a dwell there.
+    - stay_s: how long to stay; None for a dwell of the usual length.
+    - told: names of the effects that it tells apart.
     """
 
     gimbal_deg: tuple[float, ...]
@@ -117,9 +117,9 @@ def to_show(fitted: Fit, hidden: Sequence[Effect]) -> tuple[Advice, int] | None:
 class Course:
     """The predicted decrease of the twelve sigmas over a sequence of orientations, each of which reduces them most.
 
-    gimbal_deg: the first orientation.
-    sigma (N + 1, 12): the sigmas now and after each dwell.
-    dwells: number of dwells so far; each_s: duration of a dwell and the slew to it.
+    - gimbal_deg: the first orientation.
+    - sigma (N + 1, 12): the sigmas now and after each dwell.
+    - dwells: number of dwells so far; each_s: duration of a dwell and the slew to it.
     """
 
     gimbal_deg: tuple[float, ...]

@@ -49,9 +49,9 @@ _ICOSAHEDRON = _icosahedron()
 class Last:
     """The dwell before the future ones.
 
-    end_s: when it ended.
-    pose (k,), force_mps2 (3,), temperature_c: its conditions.
-    variance_mps2_2 (3,): variances of its readings.
+    - end_s: when it ended.
+    - pose (k,), force_mps2 (3,), temperature_c: its conditions.
+    - variance_mps2_2 (3,): variances of its readings.
     """
 
     end_s: float
@@ -69,11 +69,11 @@ class Last:
 class Prospect:
     """The expected measurements of future dwells.
 
-    model, state (p,): what is estimated, and where it is linearised.
-    noise, readings, dwell_s: noise, number of readings and duration of a dwell.
-    known (p, p): information factor of what is known already; zeros for nothing.
-    last: the dwell before; None if there is none.
-    pause_s: time from its end to the beginning of the next dwell.
+    - model, state (p,): what is estimated, and where it is linearised.
+    - noise, readings, dwell_s: noise, number of readings and duration of a dwell.
+    - known (p, p): information factor of what is known already; zeros for nothing.
+    - last: the dwell before; None if there is none.
+    - pause_s: time from its end to the beginning of the next dwell.
     """
 
     model: Model

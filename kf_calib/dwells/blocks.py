@@ -25,13 +25,13 @@ _TURNING_DEG = 1.0  # within one block; a platform that only creeps turns by les
 class Block:
     """Up to 4000 consecutive readings of one dwell, or of the slew that ended it.
 
-    dwell: number of the dwell, counted from 1.
-    arrival_s: its arrival according to the angles; felt_s: according to the readings, from which settling is counted;
-        None if not known separately.
-    elapsed_s (n,): time since the first sample of the recording.
-    accel_mps2 (n, 3): the readings.
-    pose (1, k): the mean pose if the platform stands still; (n, k) if it creeps.
-    temperature_c (n,): NaN where it was not measured.
+    - dwell: number of the dwell, counted from 1.
+    - arrival_s: its arrival according to the angles; felt_s: according to the readings, from which settling is counted;
+      None if not known separately.
+    - elapsed_s (n,): time since the first sample of the recording.
+    - accel_mps2 (n, 3): the readings.
+    - pose (1, k): the mean pose if the platform stands still; (n, k) if it creeps.
+    - temperature_c (n,): NaN where it was not measured.
     """
 
     dwell: int
@@ -57,9 +57,9 @@ class Block:
 class Tally:
     """Counts of what became of every sample that was read; ``sentences`` reports those that a user should know.
 
-    slewing: readings of slews that were used; moving: readings not used because the platform moved.
-    short_dwells: dwells too short for the whole margin after the arrival; least_settling_s: the shortest margin used.
-    turned_deg: largest rotation of the platform within a block that counts as still.
+    - slewing: readings of slews that were used; moving: readings not used because the platform moved.
+    - short_dwells: dwells too short for the whole margin after the arrival; least_settling_s: the shortest margin used.
+    - turned_deg: largest rotation of the platform within a block that counts as still.
     """
 
     read: int = 0

@@ -77,14 +77,14 @@ class DwellEvent(Enum):
 class OpenDwell:
     """The open dwell.
 
-    number: its number, counted from 1.
-    arrival_ns: its arrival according to the angles.
-    felt_ns: its arrival according to the readings, from which settling is counted.
-    first_pose_ns: stamp of the first pose message that belongs to it.
-    settling_ns: length of the margin left out after the arrival; None while it is not known whether the dwell is long
-        enough for the whole margin.
-    pose (1, k): mean pose from the messages of its first block; pose_sigma_rad: its uncertainty.
-    turns: whole turns by which its poses go beyond the angles as recorded.
+    - number: its number, counted from 1.
+    - arrival_ns: its arrival according to the angles.
+    - felt_ns: its arrival according to the readings, from which settling is counted.
+    - first_pose_ns: stamp of the first pose message that belongs to it.
+    - settling_ns: length of the margin left out after the arrival; None while it is not known whether the dwell is long
+      enough for the whole margin.
+    - pose (1, k): mean pose from the messages of its first block; pose_sigma_rad: its uncertainty.
+    - turns: whole turns by which its poses go beyond the angles as recorded.
     """
 
     number: int

@@ -30,9 +30,9 @@ _LEAK = 0.05  # bins into which a line leaks more than this share of the level a
 class Line:
     """A spectral line.
 
-    p_value: the probability that noise alone has a peak as high anywhere in the spectrum.
-    channel: the channel (from 0) in which it stands out most.
-    amplitude_mps2 (3,): its amplitude in each channel.
+    - p_value: the probability that noise alone has a peak as high anywhere in the spectrum.
+    - channel: the channel (from 0) in which it stands out most.
+    - amplitude_mps2 (3,): its amplitude in each channel.
     """
 
     frequency_hz: float

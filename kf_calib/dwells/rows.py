@@ -23,13 +23,13 @@ REGRESSORS = ("1", "f_x", "f_y", "f_z")
 class Nodes:
     """The conditions of the platform at m instants; the three nodes of a piece are its beginning, middle and end.
 
-    elapsed_s, since_arrival_s (m,): time since the first sample and since the arrival.
-    force_mps2 (m, 3): specific force in the platform frame.
-    pose (m, k): gimbal angles, rad, or quaternion.
-    temperature_c (m,): NaN where it was not measured.
-    rate_radps, rate_change_radps2 (m, 3): angular rate of the platform in its own frame and its derivative; None if the
-        platform stands.
-    variance_mps2_2 (m, 3): variance of the readings, if averages of them were folded; else None.
+    - elapsed_s, since_arrival_s (m,): time since the first sample and since the arrival.
+    - force_mps2 (m, 3): specific force in the platform frame.
+    - pose (m, k): gimbal angles, rad, or quaternion.
+    - temperature_c (m,): NaN where it was not measured.
+    - rate_radps, rate_change_radps2 (m, 3): angular rate of the platform in its own frame and its derivative; None if
+      the platform stands.
+    - variance_mps2_2 (m, 3): variance of the readings, if averages of them were folded; else None.
     """
 
     elapsed_s: Floats
@@ -71,17 +71,17 @@ def on_basis(values: Floats) -> Floats:
 class Rows:
     """Regressors and readings of one block.
 
-    columns (n, 4): the regressors.
-    readings (n, 3): the readings, m/s^2.
-    innovation (3, n): the readings less their least-squares fit within the block.
-    static: the regressors are the same in every row, so that the innovation is the reading less the mean.
-    pieces: for each piece its slice of the rows, u (n',) from -1 to 1, and its nodes.
-    moving: the block belongs to the slew after the dwell.
-    gated (3, m): for each rejected reading, the channels in which it is an outlier; None if none was rejected.
-    raw: the rows before averaging, if the readings were averaged.
-    taken: number of readings that a row stands for.
-    pose_sigma_rad: uncertainty of the pose due to noise of the angles.
-    turns: whole turns by which the pose goes beyond the angles as recorded.
+    - columns (n, 4): the regressors.
+    - readings (n, 3): the readings, m/s^2.
+    - innovation (3, n): the readings less their least-squares fit within the block.
+    - static: the regressors are the same in every row, so that the innovation is the reading less the mean.
+    - pieces: for each piece its slice of the rows, u (n',) from -1 to 1, and its nodes.
+    - moving: the block belongs to the slew after the dwell.
+    - gated (3, m): for each rejected reading, the channels in which it is an outlier; None if none was rejected.
+    - raw: the rows before averaging, if the readings were averaged.
+    - taken: number of readings that a row stands for.
+    - pose_sigma_rad: uncertainty of the pose due to noise of the angles.
+    - turns: whole turns by which the pose goes beyond the angles as recorded.
     """
 
     dwell: int
@@ -104,10 +104,10 @@ def model_rows(
 ) -> Iterator[Rows]:
     """Rows of every block, without outliers; both engines and batch least squares work on the same rows.
 
-    gate_sigma: limit of the innovation gate in robust standard deviations; None for no gate.
-    window_s: length of the windows over which readings are averaged; 0 for no averaging. Blocks that are too short for
-        the windows are left out. The gate then acts on the averages, because a vibration that comes and goes produces
-        outliers of its own in the single readings.
+    - gate_sigma: limit of the innovation gate in robust standard deviations; None for no gate.
+    - window_s: length of the windows over which readings are averaged; 0 for no averaging. Blocks that are too short
+      for the windows are left out. The gate then acts on the averages, because a vibration that comes and goes produces
+      outliers of its own in the single readings.
     """
     standing: tuple[Floats, Floats] | None = None  # a pose and its specific force, which all blocks of a dwell share
     for block in blocks:

@@ -70,11 +70,11 @@ class Autocovariance:
 class Piece:
     """One piece of a dwell.
 
-    triangle (K + 3, K + 3): the triangular factor of [1 u u^2 ... | z1 z2 z3].
-    nodes: the conditions at its three nodes.
-    count: number of readings, or of averages of them, that were folded.
-    carrier_hz: frequency of the carrier; 0 for none.
-    taken: number of readings that ``count`` stands for.
+    - triangle (K + 3, K + 3): the triangular factor of [1 u u^2 ... | z1 z2 z3].
+    - nodes: the conditions at its three nodes.
+    - count: number of readings, or of averages of them, that were folded.
+    - carrier_hz: frequency of the carrier; 0 for none.
+    - taken: number of readings that ``count`` stands for.
     """
 
     triangle: Floats
@@ -88,14 +88,14 @@ class Piece:
 class DwellFactor:
     """The sufficient statistics of one dwell.
 
-    number: its number, counted from 1.
-    pieces: its pieces in order of time.
-    autocovariance, spectrum: of its first readings.
-    trace: sums of its readings in cells of the run's clock.
-    moving: True for the slew after the dwell of that number, which is folded like a dwell.
-    came_from: the dwell before it, if that one has been left out of the fit; else None.
-    pose_sigma_rad: uncertainty of its pose due to noise of the angles.
-    turns: whole turns of each gimbal by which its pose goes beyond the angles as recorded.
+    - number: its number, counted from 1.
+    - pieces: its pieces in order of time.
+    - autocovariance, spectrum: of its first readings.
+    - trace: sums of its readings in cells of the run's clock.
+    - moving: True for the slew after the dwell of that number, which is folded like a dwell.
+    - came_from: the dwell before it, if that one has been left out of the fit; else None.
+    - pose_sigma_rad: uncertainty of its pose due to noise of the angles.
+    - turns: whole turns of each gimbal by which its pose goes beyond the angles as recorded.
     """
 
     number: int

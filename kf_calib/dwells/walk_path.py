@@ -24,9 +24,9 @@ _LEAST = 1e-12  # relative to the largest variance; smaller modes are rounding
 class WalkPath:
     """The effect of a random walk of intensity q = 1 on the r rows of a dwell's triangles.
 
-    step (r,): the change of the rows per unit of the bias's step s over the dwell, for a given bias at its end.
-    modes (r, k), variances (k,): principal axes of the remaining covariance, given s.
-    rest (pieces,): the contribution of W to the sums of squares about the parabolas.
+    - step (r,): the change of the rows per unit of the bias's step s over the dwell, for a given bias at its end.
+    - modes (r, k), variances (k,): principal axes of the remaining covariance, given s.
+    - rest (pieces,): the contribution of W to the sums of squares about the parabolas.
     """
 
     step: Floats
@@ -44,8 +44,8 @@ class WalkPath:
 def walk_path_of(begins_s: Floats, ends_s: Floats, counts: Sequence[int], triangles: Floats) -> WalkPath:
     """The effect for a dwell with the given pieces.
 
-    begins_s, ends_s (pieces,): first and last time of each piece; counts: their numbers of readings.
-    triangles (pieces, K, K): triangular factors over the basis [1 u u^2 ...].
+    - begins_s, ends_s (pieces,): first and last time of each piece; counts: their numbers of readings.
+    - triangles (pieces, K, K): triangular factors over the basis [1 u u^2 ...].
     """
     root, end = _root(begins_s, ends_s, counts)
     onto = (triangles[:, :, :3] @ root).reshape(-1, root.shape[2])

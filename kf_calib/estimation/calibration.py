@@ -53,9 +53,9 @@ def calibrate(
     """Calibrate from a source or from the recording at a path: fold dwells, fit the noise, run the filter, judge the
     misfit.
 
-    settings: how to evaluate it.
-    on_progress: called with the share of the source that has been read.
-    plain: a fit of the same model to dwells without a carrier, if it is already known that they need one.
+    - settings: how to evaluate it.
+    - on_progress: called with the share of the source that has been read.
+    - plain: a fit of the same model to dwells without a carrier, if it is already known that they need one.
 
     Raises InputError if the source holds nothing usable, and UnobservableError if the orientations determine no
     parameter.
@@ -86,8 +86,9 @@ def conclude(
 ) -> Calibration:
     """The calibration of a completed pass.
 
-    again: the same samples, to be read once more by models that need them folded in another way; None if they are gone.
-    plain: a fit that is known not to suffice; the pass has then not begun.
+    - again: the same samples, to be read once more by models that need them folded in another way; None if they are
+      gone.
+    - plain: a fit that is known not to suffice; the pass has then not begun.
     """
     settings, bench = passed.settings, passed.source.bench
     dwells = passed.dwells if plain is None else plain.dwells

@@ -106,10 +106,10 @@ def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Float
 class Means:
     """Means over each of D dwells.
 
-    design (D, 3, p): the model's columns.
-    readings (D, 3), force_mps2 (D, 3): readings and specific force.
-    counts (D,): number of readings.
-    ends_s (D, 2): when each dwell begins and ends.
+    - design (D, 3, p): the model's columns.
+    - readings (D, 3), force_mps2 (D, 3): readings and specific force.
+    - counts (D,): number of readings.
+    - ends_s (D, 2): when each dwell begins and ends.
     """
 
     design: Floats
@@ -187,11 +187,11 @@ class Carried:
 class Samples:
     """Rows of one piece, sample by sample.
 
-    dwell: number of the dwell; moving: True for the slew after it.
-    elapsed_s (n,): times of the samples.
-    observation (n, 3, p): the design H.
-    regressors (n, 4): the regressors 1, f_x, f_y, f_z of the dwell's nuisance states.
-    readings (n, 3): the readings.
+    - dwell: number of the dwell; moving: True for the slew after it.
+    - elapsed_s (n,): times of the samples.
+    - observation (n, 3, p): the design H.
+    - regressors (n, 4): the regressors 1, f_x, f_y, f_z of the dwell's nuisance states.
+    - readings (n, 3): the readings.
     """
 
     dwell: int

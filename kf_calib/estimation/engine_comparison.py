@@ -35,11 +35,11 @@ _TRACED = 300  # readings over which the memory of filterpy is measured
 class Way:
     """One way of estimating and its cost.
 
-    wall_s: elapsed time, s.
-    peak_mb: peak memory of numpy and Python, MB. It is measured in a separate run, because this slows down many small
-        steps several times; filterpy's is measured over its first few hundred readings, since it keeps none.
-    max_difference_sigma: largest absolute difference of a parameter from the block engine, in sigma.
-    max_relative_variance: largest relative difference of a variance.
+    - wall_s: elapsed time, s.
+    - peak_mb: peak memory of numpy and Python, MB. It is measured in a separate run, because this slows down many small
+      steps several times; filterpy's is measured over its first few hundred readings, since it keeps none.
+    - max_difference_sigma: largest absolute difference of a parameter from the block engine, in sigma.
+    - max_relative_variance: largest relative difference of a variance.
     """
 
     estimate: Estimate

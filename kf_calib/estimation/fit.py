@@ -175,10 +175,10 @@ def fit(
 ) -> Fit:
     """Estimate the noise, the linearisation and the model's unknown constants in turn until they no longer change.
 
-    dwells: the dwells in order of time.
-    model: the model to fit.
-    walk_mps2_per_sqrt_s: stated intensity of the random walk of the biases, m/s^2/s^(1/2).
-    slews: the slews; used only if the model has effects that show in slews only.
+    - dwells: the dwells in order of time.
+    - model: the model to fit.
+    - walk_mps2_per_sqrt_s: stated intensity of the random walk of the biases, m/s^2/s^(1/2).
+    - slews: the slews; used only if the model has effects that show in slews only.
     """
     within, bench = within_dwells(dwells, walk_mps2_per_sqrt_s), model.bench
     within = replace(within, walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)

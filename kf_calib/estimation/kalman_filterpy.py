@@ -46,10 +46,10 @@ def estimate(
 ) -> Posterior:
     """Run the filter over all samples and return the posterior.
 
-    nominal_state (p,): mean of the prior; prior_covariance (p, p): None for a diffuse prior.
-    linearised_at: where the nuisance states are linearised.
-    scale (p,): approximate change of a reading per unit of each state, m/s^2.
-    form: which of filterpy's filters is used.
+    - nominal_state (p,): mean of the prior; prior_covariance (p, p): None for a diffuse prior.
+    - linearised_at: where the nuisance states are linearised.
+    - scale (p,): approximate change of a reading per unit of each state, m/s^2.
+    - form: which of filterpy's filters is used.
 
     The biases walk with the intensity in ``noise`` from reading to reading (process noise Q).
     """

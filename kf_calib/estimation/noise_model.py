@@ -40,18 +40,18 @@ _ROUNDING = 1e-14  # relative to a dwell's variance
 class Noise:
     """The parameters of the noise model.
 
-    sigma_mps2 (3,): sigma_w of each accelerometer.
-    inflation (3,): kappa of each accelerometer.
-    setting_rad: sigma_alpha.
-    scatter_mps2 (3,): sigma_s of each accelerometer; zeros if not given.
-    setting_stated, scatter_stated: whether these parts were stated rather than estimated.
-    checked: whether the setting error is weighted. It is if the scatter is stated, or if there are enough orientations
-        to check that a setting error only turns the specific force; readings along the specific force, which no
-        rotation changes, then get more weight. Otherwise dwells are weighted by their scatter alone and the setting
-        error is a considered parameter (Schmidt), which enlarges the covariance but does not change the estimate.
-    slew_sigma_mps2 (3,): the effective sigma in slews; None if no slews are used.
-    walk_mps2_per_sqrt_s: the intensity q of the random walk of each bias.
-    walk_spread: the sigma of ln q; None if q was stated or is zero.
+    - sigma_mps2 (3,): sigma_w of each accelerometer.
+    - inflation (3,): kappa of each accelerometer.
+    - setting_rad: sigma_alpha.
+    - scatter_mps2 (3,): sigma_s of each accelerometer; zeros if not given.
+    - setting_stated, scatter_stated: whether these parts were stated rather than estimated.
+    - checked: whether the setting error is weighted. It is if the scatter is stated, or if there are enough
+      orientations to check that a setting error only turns the specific force; readings along the specific force, which
+      no rotation changes, then get more weight. Otherwise dwells are weighted by their scatter alone and the setting
+      error is a considered parameter (Schmidt), which enlarges the covariance but does not change the estimate.
+    - slew_sigma_mps2 (3,): the effective sigma in slews; None if no slews are used.
+    - walk_mps2_per_sqrt_s: the intensity q of the random walk of each bias.
+    - walk_spread: the sigma of ln q; None if q was stated or is zero.
     """
 
     sigma_mps2: Floats

@@ -31,12 +31,12 @@ _CONFUSED, _TWINS, _NAMED = 0.5, 0.99, 3  # overlap worth naming, overlap of loo
 class Visibility:
     """How well these orientations show one effect beside a model.
 
-    share: largest share of one of its columns that the model leaves (0: invisible); None if it has no column in dwells,
-        for the reason in ``why``.
-    unseen: symbols of coefficients that are not determined.
-    smallest: the coefficient with the largest smallest detectable size, and this size in SI.
-    rivals: name and overlap of the effects that overlap most with it.
-    degeneracy: exact degeneracies, in words.
+    - share: largest share of one of its columns that the model leaves (0: invisible); None if it has no column in
+      dwells, for the reason in ``why``.
+    - unseen: symbols of coefficients that are not determined.
+    - smallest: the coefficient with the largest smallest detectable size, and this size in SI.
+    - rivals: name and overlap of the effects that overlap most with it.
+    - degeneracy: exact degeneracies, in words.
     """
 
     effect: Effect

@@ -29,7 +29,7 @@ from kf_calib.estimation.noise_model import Noise, steps
 _SEEN = 1e-6  # a column of which the model leaves less than this share counts as explained
 _NEW = 1e-9  # a smaller share of a column beside those before it is rounding
 _SPARE = 18  # points beyond the phase, rad, that passes during a dwell; the error is then 1e-10 of a column
-_AT_ONCE = 64  # frequencies that are processed together
+_AT_ONCE = 64  # frequencies that are processed together that are processed together
 _LEAST_PAUSE = 1e-6  # of the largest variance of a step: the variance over a pause is at least this
 
 Waves = NDArray[np.complex128]
@@ -64,9 +64,10 @@ class Periodogram:
     def falls(self, rows: Floats, own: Floats, first: int) -> Floats:
         """Decrease of chi-squared (N,) if the oscillation at each frequency is added to a model.
 
-        rows (r, c): whitened rows [H | E | z]. The columns H, ``first`` of them, have to be the same for every model
-            because their products are computed only once.
-        own (m, c): the same columns in the rows of the dwells alone, before they are whitened with respect to the walk.
+        - rows (r, c): whitened rows [H | E | z]. The columns H, ``first`` of them, have to be the same for every model
+          because their products are computed only once.
+        - own (m, c): the same columns in the rows of the dwells alone, before they are whitened with respect to the
+          walk.
         """
         if self._first is None:
             self._first = _Beside.nothing(rows[:, -1], own[:, -1]).with_columns(rows[:, :first], own[:, :first])
@@ -97,8 +98,8 @@ class Periodogram:
     def _lowered(self, along_model: Floats, along_left: Floats) -> Floats:
         """Return the decrease of chi-squared (N,).
 
-        along_model (N, 6, p): products of the waves with an orthonormal basis of the model's columns.
-        along_left (N, 6): products of the waves with the residual of the readings.
+        - along_model (N, 6, p): products of the waves with an orthonormal basis of the model's columns.
+        - along_left (N, 6): products of the waves with the residual of the readings.
         """
         sizes = np.sqrt(np.maximum(np.einsum("nii->ni", self._squares), 1e-300))
         gram = self._squares - along_model @ np.swapaxes(along_model, 1, 2)
@@ -149,9 +150,9 @@ class Periodogram:
 class _Beside:
     """The orthonormalised columns of a model and the residual of the readings.
 
-    rows (r, p): the columns in all whitened rows; own (m, p): the same columns in the rows of the dwells alone.
-    left (r,), own_left (m,): the residual of the readings in both sets of rows.
-    known: products of the oscillations with ``own`` and ``own_left``.
+    - rows (r, p): the columns in all whitened rows; own (m, p): the same columns in the rows of the dwells alone.
+    - left (r,), own_left (m,): the residual of the readings in both sets of rows.
+    - known: products of the oscillations with ``own`` and ``own_left``.
     """
 
     rows: Floats

@@ -84,9 +84,10 @@ def advance(factor: Floats, steps: Floats, rows: Floats) -> tuple[Floats, int]:
     The caller drops these rows and columns. This is the square-root information form (Bierman, 1977, ch. V), which is
     valid for a singular factor, too.
 
-    factor (p, p + 1): [R | z] with the biases at the end of the dwell before.
-    steps (2,): variances of each bias's step in the pause and within the dwell.
-    rows (m, 3 + p + 1): [S | H | z], where S are the columns of the steps within the dwell; S is absent without a walk.
+    - factor (p, p + 1): [R | z] with the biases at the end of the dwell before.
+    - steps (2,): variances of each bias's step in the pause and within the dwell.
+    - rows (m, 3 + p + 1): [S | H | z], where S are the columns of the steps within the dwell; S is absent without a
+      walk.
     """
     width = len(factor)
     inside = rows.shape[1] - width - 1

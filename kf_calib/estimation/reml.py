@@ -46,9 +46,9 @@ Parts = tuple[Part, ...]
 class Likelihood:
     """The restricted likelihood of the dwells' means, with a given noise and any further parts of it.
 
-    alone: the likelihood without further parts.
-    shapes: the covariances (k, D, 6, 3) that each part contributes per unit of its variances.
-    units (k,): the natural size of each number of a part, chosen as large as the misfit.
+    - alone: the likelihood without further parts.
+    - shapes: the covariances (k, D, 6, 3) that each part contributes per unit of its variances.
+    - units (k,): the natural size of each number of a part, chosen as large as the misfit.
     """
 
     alone: Restricted
@@ -81,11 +81,11 @@ def with_dwell_parts(
     estimated with fewer than 6 degrees of freedom between dwells. If there are too few orientations to tell a setting
     error from scatter, the whole misfit counts as scatter.
 
-    within: the noise within dwells.
-    means: the dwells' means; state (p,): where they are linearised.
-    angle_sigma_deg, scatter_mps2: the stated parts; None if not stated.
-    walks: estimate the intensity of a random walk of the biases.
-    near: sizes found before for similar means, which shorten the searches.
+    - within: the noise within dwells.
+    - means: the dwells' means; state (p,): where they are linearised.
+    - angle_sigma_deg, scatter_mps2: the stated parts; None if not stated.
+    - walks: estimate the intensity of a random walk of the biases.
+    - near: sizes found before for similar means, which shorten the searches.
 
     Returns the noise, and the sizes found for each combination, to be passed as ``near`` the next time.
     """

@@ -26,10 +26,10 @@ _STEPS, _HALVES = 100, 30
 class Point:
     """The likelihood at given variances.
 
-    cost: minus the log-likelihood.
-    misfit: chi-squared z' P z.
-    slope (k,): derivatives of the cost by the variances.
-    information (k, k): average of their observed and expected information.
+    - cost: minus the log-likelihood.
+    - misfit: chi-squared z' P z.
+    - slope (k,): derivatives of the cost by the variances.
+    - information (k, k): average of their observed and expected information.
     """
 
     cost: float
@@ -42,9 +42,9 @@ class Point:
 class Restricted:
     """The restricted likelihood as a function of the variances.
 
-    rows (3 D, p + 1): [A | z].
-    prior (q, p + 1): whitened rows of prior knowledge of x.
-    fixed (D, 6, 3), shapes (k, D, 6, 3): V_0 and K_k, in the layout of ``banded``.
+    - rows (3 D, p + 1): [A | z].
+    - prior (q, p + 1): whitened rows of prior knowledge of x.
+    - fixed (D, 6, 3), shapes (k, D, 6, 3): V_0 and K_k, in the layout of ``banded``.
     """
 
     rows: Floats

@@ -51,9 +51,9 @@ class Parameter:
 class Estimate:
     """An estimate of the state.
 
-    state (p,): the twelve affine states, then the coefficients of effects.
-    covariance (p, p): its covariance.
-    undetermined (p, q): a basis of the combinations of states that are not determined.
+    - state (p,): the twelve affine states, then the coefficients of effects.
+    - covariance (p, p): its covariance.
+    - undetermined (p, q): a basis of the combinations of states that are not determined.
     """
 
     state: Floats
@@ -116,11 +116,11 @@ class Estimate:
 class Visit:
     """One dwell and the filter's step on it.
 
-    estimate: the estimate after the dwell.
-    nis, dof: the normalised innovation squared and its degrees of freedom, which may be 0.
-    innovation_mps2 (3,), innovation_sigma_mps2 (3,): the mean reading less its prediction from the dwells before, and
-        its sigma; NaN while the prediction is not determined.
-    residual_mps2 (3,): the mean reading less its prediction by the final estimate.
+    - estimate: the estimate after the dwell.
+    - nis, dof: the normalised innovation squared and its degrees of freedom, which may be 0.
+    - innovation_mps2 (3,), innovation_sigma_mps2 (3,): the mean reading less its prediction from the dwells before, and
+      its sigma; NaN while the prediction is not determined.
+    - residual_mps2 (3,): the mean reading less its prediction by the final estimate.
     """
 
     dwell: DwellFactor
@@ -174,10 +174,10 @@ class Turn:
 class OutlyingDwell:
     """A dwell that does not fit the others.
 
-    error_mps2 (3,): its mean reading less its prediction.
-    p_value: the p-value over all dwells of the run.
-    turns: corrections of one gimbal's angle, each of which explains it.
-    without: the calibration from all other dwells, which is consistent.
+    - error_mps2 (3,): its mean reading less its prediction.
+    - p_value: the p-value over all dwells of the run.
+    - turns: corrections of one gimbal's angle, each of which explains it.
+    - without: the calibration from all other dwells, which is consistent.
     """
 
     dwell: DwellFactor

@@ -47,15 +47,15 @@ _MANY = 100  # above this number of oscillations, a periodogram is faster
 class Candidate:
     """One candidate effect, with any unknown constant at one value, after projection off the model.
 
-    effect: the candidate.
-    columns (d, q): the projected columns, per unit of each coefficient.
-    basis (d, k): an orthonormal basis of the span of ``columns``; k is the degrees of freedom of the test.
-    directions (d, q): the vectors in that span that are nearest to the columns; they do not depend on the choice of
-        ``basis``.
-    inverse (q, k): maps a residual r to coefficients, ``inverse @ basis.T @ r``.
-    hidden (q,): True for each coefficient that the run does not determine.
-    visibility: the largest share of a column's norm that the projection leaves, 0 to 1.
-    tried: the number of values of the unknown constant of which this is the best; each counts as a separate test.
+    - effect: the candidate.
+    - columns (d, q): the projected columns, per unit of each coefficient.
+    - basis (d, k): an orthonormal basis of the span of ``columns``; k is the degrees of freedom of the test.
+    - directions (d, q): the vectors in that span that are nearest to the columns; they do not depend on the choice of
+      ``basis``.
+    - inverse (q, k): maps a residual r to coefficients, ``inverse @ basis.T @ r``.
+    - hidden (q,): True for each coefficient that the run does not determine.
+    - visibility: the largest share of a column's norm that the projection leaves, 0 to 1.
+    - tried: the number of values of the unknown constant of which this is the best; each counts as a separate test.
     """
 
     effect: Effect
@@ -246,9 +246,9 @@ def scan(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Scan:
 def project(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
     """Make the scan from a triangular factor [H | G | z].
 
-    upper: the factor.
-    width: number of columns H of the model.
-    effects: the candidates; counts: number of columns of each in G.
+    - upper: the factor.
+    - width: number of columns H of the model.
+    - effects: the candidates; counts: number of columns of each in G.
     """
     sizes, rest = np.linalg.norm(upper[:, width:-1], axis=0), _beside(upper, width)
     units = np.where(sizes > 0, sizes, 1.0)
@@ -303,9 +303,9 @@ def whiten_model(
     """Whitened rows [H | W | G | z] (m, c) of the model in ``carried`` and of ``effects``, and the number of columns
     before G.
 
-    W: columns of the slow part of a stated scatter, see ``square_root_information.misfit_rows``.
-    state: where small rotations and input axes are linearised; by default at the state in ``carried``.
-    stimulus: the stimulus of the dwells at that state, if it is already known.
+    - W: columns of the slow part of a stated scatter, see ``square_root_information.misfit_rows``.
+    - state: where small rotations and input axes are linearised; by default at the state in ``carried``.
+    - stimulus: the stimulus of the dwells at that state, if it is already known.
     """
     at, dwells = carried.state if state is None else state, carried.dwells
     added = candidate_columns(dwells, effects, carried.model.bench, at, stimulus)

@@ -17,15 +17,15 @@ Engine = Literal["block", "filterpy"]
 class Settings:
     """How a run is evaluated; raises InputError if a value is not possible.
 
-    engine: the filter that is used.
-    prior: prior knowledge of the parameters.
-    stillness: how dwells are recognised.
-    gate_sigma: limit of the innovation gate in robust standard deviations; None for no gate.
-    walk_mps2_per_sqrt_s: intensity of the random walk of the biases (process noise); 0 for none.
-    effects: names of the effects in the model, or the name of one.
-    window_s: length of the windows over which readings are averaged first. With 0 they are averaged only for effects
-        that depend on vibration, over a second or as long as the observed vibration requires.
-    left_out: numbers of dwells (from 1) that are not used.
+    - engine: the filter that is used.
+    - prior: prior knowledge of the parameters.
+    - stillness: how dwells are recognised.
+    - gate_sigma: limit of the innovation gate in robust standard deviations; None for no gate.
+    - walk_mps2_per_sqrt_s: intensity of the random walk of the biases (process noise); 0 for none.
+    - effects: names of the effects in the model, or the name of one.
+    - window_s: length of the windows over which readings are averaged first. With 0 they are averaged only for effects
+      that depend on vibration, over a second or as long as the observed vibration requires.
+    - left_out: numbers of dwells (from 1) that are not used.
     """
 
     engine: Engine = "block"

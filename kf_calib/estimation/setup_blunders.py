@@ -83,9 +83,9 @@ class Means:
 class Affine:
     """The least-squares fit of the mean readings by the specific force.
 
-    sensitivity (3, 3): rows s_i.
-    left: rms of the residuals, g.
-    nominal (3, 3): nominal sensitivities.
+    - sensitivity (3, 3): rows s_i.
+    - left: rms of the residuals, g.
+    - nominal (3, 3): nominal sensitivities.
     """
 
     sensitivity: Floats

@@ -83,11 +83,11 @@ class Saturation:
 class Outliers:
     """The readings rejected by the gate.
 
-    count, share: their number, and as a share of all readings.
-    by_channel: number by channel; a reading that is an outlier in two channels counts in both.
-    clustered_p: probability over the run that outliers spread at random are as dense in any sequence of dwells; None if
-        there are none, if there is one dwell only, or if coarse steps or saturation cause some.
-    dwells: numbers of the dwells in the densest sequence.
+    - count, share: their number, and as a share of all readings.
+    - by_channel: number by channel; a reading that is an outlier in two channels counts in both.
+    - clustered_p: probability over the run that outliers spread at random are as dense in any sequence of dwells; None
+      if there are none, if there is one dwell only, or if coarse steps or saturation cause some.
+    - dwells: numbers of the dwells in the densest sequence.
     """
 
     count: int = 0
@@ -152,10 +152,10 @@ class Readings:
 class _Seen:
     """What is kept of a dwell.
 
-    ends (6,): the largest value of each channel and of its negative; stuck (6,): number of readings at these values.
-    count: number of readings.
-    distinct (3,): number of distinct values in ``sampled`` readings; values: some of them, by channel.
-    rejected: number of rejected readings; out (3,): number by channel.
+    - ends (6,): the largest value of each channel and of its negative; stuck (6,): number of readings at these values.
+    - count: number of readings.
+    - distinct (3,): number of distinct values in ``sampled`` readings; values: some of them, by channel.
+    - rejected: number of rejected readings; out (3,): number by channel.
     """
 
     number: int

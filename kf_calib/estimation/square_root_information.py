@@ -47,14 +47,14 @@ def whiten(
     and the scatter (three offsets) are states with Gaussian priors, linearised at ``state``. The residuals within a
     dwell, which do not depend on the states, are not in the result.
 
-    columns: the model's columns at the nodes of each dwell, (pieces, K, 3, p) each.
-    about (p,): if given, z is the readings less the model's prediction from this state, and the solution is a
-        correction to it. Readings of size g exceed their sigma by a factor of 1e6 or more, so that this keeps their
-        rounding from being the largest error of later computations.
-    flicker_mps2 (3,): sqrt(h) of 1/f noise with spectral density h / f; its slow components within a dwell are nuisance
-        states, too.
-    reduced: reduce the rows to the rank of their columns. Without it all rows are returned, which is faster if there
-        are many columns.
+    - columns: the model's columns at the nodes of each dwell, (pieces, K, 3, p) each.
+    - about (p,): if given, z is the readings less the model's prediction from this state, and the solution is a
+      correction to it. Readings of size g exceed their sigma by a factor of 1e6 or more, so that this keeps their
+      rounding from being the largest error of later computations.
+    - flicker_mps2 (3,): sqrt(h) of 1/f noise with spectral density h / f; its slow components within a dwell are
+      nuisance states, too.
+    - reduced: reduce the rows to the rank of their columns. Without it all rows are returned, which is faster if there
+      are many columns.
     """
     inside = 3 if noise.walk_mps2_per_sqrt_s else 0
     informative = np.append(np.ones(inside), _units(columns)) if reduced else None
@@ -194,9 +194,9 @@ def _informative(rows: Floats, units: Floats) -> list[Floats]:
 class FilterStep:
     """The filter after one dwell and the slew that follows it.
 
-    factor (p, p + 1): the factor [R | z].
-    nis: the normalised innovation squared of the dwell.
-    dof: the degrees of freedom of ``nis``.
+    - factor (p, p + 1): the factor [R | z].
+    - nis: the normalised innovation squared of the dwell.
+    - dof: the degrees of freedom of ``nis``.
     """
 
     factor: Floats
@@ -253,10 +253,10 @@ def run(
 ) -> list[FilterStep]:
     """Run the filter over all dwells and return its state after each.
 
-    first: the factor of the prior.
-    rows: the whitened rows of each dwell.
-    walked: the variances (2,) of the biases' steps before and within each dwell.
-    following: the whitened rows of the slew after each dwell, which may be empty.
+    - first: the factor of the prior.
+    - rows: the whitened rows of each dwell.
+    - walked: the variances (2,) of the biases' steps before and within each dwell.
+    - following: the whitened rows of the slew after each dwell, which may be empty.
 
     A step's factor is the one after the slew; its innovation is that of the dwell alone.
     """
