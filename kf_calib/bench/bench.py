@@ -108,16 +108,19 @@ def _format_axis(axis: Vector) -> str:
 
 @dataclass(frozen=True)
 class Bench:
-    """What is known of the bench before the first sample (metadata record ``kf_calib.bench``).
+    """The description of the bench that is known before the first sample (metadata record ``kf_calib.bench``).
 
     - axes: unit vectors of the gimbal axes, outer to inner; empty if attitude quaternions are recorded instead of
       angles.
     - gravity_mps2: local gravity.
-    - reference, latitude_deg, height_m, azimuth_deg: see the top of this file.
+    - reference: ``base`` if angles are relative to the bench, ``inertial`` if the platform is held fixed in inertial
+      space.
+    - latitude_deg, height_m: the place of the bench; azimuth_deg: the azimuth of its x axis from North toward East.
     - angle_sigma_deg: setting error, one standard deviation; None if it is unknown and has to be estimated.
     - scatter_sigma_mps2: scatter of each accelerometer from dwell to dwell, one standard deviation; None if it is
       unknown and has to be estimated.
     - nominal: nominal parameters that differ from the paper's, in rad, 1 and m/s^2.
+    - notes: free text such as the serial number of the block.
     - up: the axis that points up when all angles are zero. The azimuth is that of x, or of y if x is vertical.
     - channels: the channel of the recording for accelerometers 1, 2, 3, negative if its sign is reversed.
     - joints: names of the gimbals' joints, outer to inner, if angles come as joint states; empty if their names tell.

@@ -28,7 +28,7 @@ _BANDS, _BAND_POINTS = 40, 16  # bands of equal ratio, with at least so many fre
 _DEGREE = 3  # degree of the polynomial through the logarithms of these medians
 _ROUNDING = 1e-12  # relative to a reading
 _KNOTS = 1000
-_TALL = 32  # so many of the tallest peaks are compared by their p-values
+_TALL = 32  # number of tallest peaks that are compared by their p-values
 _MEDIAN_EFFICIENCY = 0.48  # efficiency of the median of independent exponential variates
 
 

@@ -191,7 +191,7 @@ def _spread(elapsed_s: Floats) -> tuple[Floats, Floats]:
     return (elapsed_s - middle) / half, np.array([elapsed_s[0], middle, elapsed_s[-1]])
 
 
-_GATED = 32  # a block needs at least so many averages for outliers to be recognised
+_GATED = 32  # least number of averages of a block among which outliers can be recognised
 _EDGES_S = np.concatenate([2.0 ** np.arange(6), 60.0 * np.arange(1, 20_000)])
 """Dwells are cut into pieces 1, 2, 4 ... 32 s after the arrival and then at every full minute."""
 

@@ -33,7 +33,7 @@ BLOCK_SAMPLES = 4000
 columns at such distances evict each other from it."""
 _LAST_NS = 1 << 62  # later than any stamp
 _HOLD_NS = SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
-_SLEW_READINGS = 8  # a slew needs at least so many readings to be used
+_SLEW_READINGS = 8  # least number of readings of a slew that is used
 _REST_NS = 2 * SECOND_NS  # least length of a dwell that is recognised from readings alone
 _PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
 _SURE = 3  # fewer messages do not determine the noise of an encoder

@@ -19,11 +19,11 @@ from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError, check_number
 
 _SECOND_NS = 1_000_000_000
-_BEFORE = 3  # a message is compared with at least so many others
+_BEFORE = 3  # least number of messages with which one is compared
 _APART_NS = 2 * _SECOND_NS  # messages farther apart than this do not determine a departure
 _CREEPING_NS = 10 * _SECOND_NS  # creep that lasts longer than this is taken as permanent
 _LARGEST_DEG = 5.0  # largest tolerance; at it, a platform turning at 10 deg/s would count as still
-_PARTS = 8  # the mean poses of so many parts of a block are compared
+_PARTS = 8  # number of parts of a block whose mean poses are compared
 
 HISTORY = _BEFORE + 2
 """Number of messages before those of ``Stillness.history_ns`` that are needed if messages are infrequent."""
@@ -77,7 +77,7 @@ class Stillness:
 
     @property
     def history_ns(self) -> int:
-        """How long before an interval messages are needed to judge it, ns."""
+        """Time before an interval from which on messages are needed to judge it, ns."""
         return _CREEPING_NS + 6 * self.window_ns
 
     def intervals(
@@ -101,7 +101,7 @@ class Stillness:
         return (reach[:-1] > times[:-1]) & steps, int(reach[-1])
 
     def departure_ns(self, pose: Stream, is_quaternion: bool, arrived_ns: int, end_ns: int) -> int:
-        """When the platform began to leave a dwell that lasts from ``arrived_ns`` to ``end_ns``.
+        """Stamp, ns, at which the platform began to leave a dwell that lasts from ``arrived_ns`` to ``end_ns``.
 
         Because the angles are sampled, it may have left up to one sampling period earlier than they show.
         """
@@ -155,8 +155,8 @@ class Stillness:
         return (apart > allowed) & (bends[:, 0] > 0)
 
     def rest_ns(self, pose: Stream, is_quaternion: bool, arrived_ns: int, until_ns: int) -> tuple[int, bool]:
-        """When the platform came to rest in a dwell since ``arrived_ns``, and whether what is known until ``until_ns``
-        suffices to tell.
+        """Stamp, ns, at which the platform came to rest in a dwell since ``arrived_ns``, and whether this is certain by
+        ``until_ns``.
 
         A message shows the platform at rest if it agrees with the mean of the messages in the following two settling
         margins, to within ``rest_rad`` or four sigma of the encoder. A dwell that creeps throughout is used from its
@@ -192,10 +192,10 @@ class Stillness:
         return bool((apart > np.maximum(self.rest_rad, 8.0 * sigma)).any())
 
     def moved_between(self, accel: Stream, begin_ns: int, end_ns: int, gravity_mps2: float) -> tuple[int, int]:
-        """Begin and end of a motion without angles, from the readings between two poses.
+        """Stamps, ns, of the beginning and the end of a motion without angles, from the readings between two poses.
 
-        The readings are averaged over windows of a quarter of a second. The old dwell ends where they leave its level,
-        and the new one begins where they reach the level at which they end, first to a coarse limit and then to three
+        The readings are averaged over windows of a quarter of a second. The old dwell ends where the averages leave its
+        level, and the new one begins where they reach their final level, first to a coarse limit and then to three
         sigma.
         """
         part = slice(*np.searchsorted(accel.time_ns, (begin_ns, end_ns)))
@@ -214,9 +214,10 @@ class Stillness:
         return leave, max(arrive, leave)
 
     def felt_ns(self, accel: Stream, since_ns: int, arrival_ns: int, gravity_mps2: float) -> int:
-        """When the readings after the last angle before an arrival reached the level that they have just after it.
+        """Stamp, ns, at which the readings reached the level that they have just after an arrival.
 
-        That level is the mean over half a window, which begins a quarter of a window after the arrival.
+        Only readings since ``since_ns``, the last angle before the arrival, are considered. The level is the mean over
+        half a window, which begins a quarter of a window after the arrival.
         """
         quarter_ns = self.window_ns // 4
         stamps = since_ns, arrival_ns + quarter_ns, arrival_ns + 3 * quarter_ns

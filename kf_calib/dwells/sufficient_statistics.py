@@ -29,7 +29,7 @@ from kf_calib.dwells.rows import Nodes, Rows, basis, parabola
 from kf_calib.dwells.walk_path import WalkPath, walk_path_of
 
 _LAGS = 64
-_CORRELATED_SAMPLES = 8192  # the autocovariance of a dwell is accumulated over at least so many of its first readings
+_CORRELATED_SAMPLES = 8192  # first readings of a dwell over which its autocovariance is accumulated, at least
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class DwellFactor:
 
     @property
     def averaged(self) -> bool:
-        """Whether averages of readings were folded, not the readings themselves."""
+        """Whether averages of readings were folded instead of the readings themselves."""
         return self.pieces[0].nodes.variance_mps2_2 is not None
 
     @cached_property

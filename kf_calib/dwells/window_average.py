@@ -23,8 +23,8 @@ WINDOW_S = 1.0
 """Default length of a window, s."""
 
 _CYCLES = 20.0  # cycles in a window: a millionth of an oscillation is left, and slow changes are still resolved
-_WINDOWS = 4  # a block holds at least so many consecutive windows
-_OVERLAP = 3  # each reading lies in so many windows; the squares of Hann windows then add up to a constant
+_WINDOWS = 4  # least number of consecutive windows in a block
+_OVERLAP = 3  # number of windows in which each reading lies; the squares of Hann windows then add up to a constant
 _SHORTEST_S = 0.5  # shorter blocks are left out, since a window in them would not cover several periods of vibration
 
 

@@ -31,7 +31,7 @@ _SHORT = 8.0  # if blocks are shorter than this times kappa, the three channels 
 TOO_SHORT = 4.0
 """If blocks are shorter than this times kappa, they do not determine how slow their noise is."""
 
-_AVERAGES = 60  # a block needs at least so many averages for their own correlation to be estimated
+_AVERAGES = 60  # least number of averages of a block from which their own correlation is estimated
 _WANDER = 6
 _ROUNDING = 1e-14  # relative to a dwell's variance
 

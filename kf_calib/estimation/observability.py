@@ -1,7 +1,7 @@
-"""What a run can tell about an effect before it is fitted: whether it is visible, its smallest detectable size, and its
+"""The predictions that a run allows about an effect before it is fitted: visibility, smallest detectable size and
 look-alikes.
 
-This depends only on the columns, not on the misfit: the effect and the catalogue are projected off the model
+They depend only on the columns, not on the misfit: the effect and the catalogue are projected off the model
 (``score_test``).
 """
 
@@ -29,12 +29,12 @@ _CONFUSED, _TWINS, _NAMED = 0.5, 0.99, 3  # overlap worth naming, overlap of loo
 
 @dataclass(frozen=True)
 class Visibility:
-    """How well these orientations show one effect beside a model.
+    """The visibility of one effect in these orientations, beside a model.
 
     - share: largest share of one of its columns that the model leaves (0: invisible); None if it has no column in
       dwells, for the reason in ``why``.
     - unseen: symbols of coefficients that are not determined.
-    - smallest: the coefficient with the largest smallest detectable size, and this size in SI.
+    - smallest: the coefficient that is hardest to detect, and its smallest detectable size in SI.
     - rivals: name and overlap of the effects that overlap most with it.
     - degeneracy: exact degeneracies, in words.
     """

@@ -32,7 +32,7 @@ FEWEST = 6
 """With fewer degrees of freedom between dwells than this, nothing is estimated."""
 
 ENOUGH_DIRECTIONS = 12
-"""So many spread directions of gravity suffice to check that a setting error only turns the specific force."""
+"""With this many directions of gravity, if spread, it can be checked that a setting error only turns the force."""
 
 _SIGNIFICANT = 5.41  # 1 % point of the likelihood-ratio statistic of a variance against zero, half of a chi2 with 1 dof
 _WALK = 0.5  # a walk has to gain at least this much log-likelihood

@@ -218,7 +218,7 @@ class Calibration:
     reread: Callable[..., Calibration] | None = field(default=None, repr=False, compare=False)
     """Evaluates the same source again, for models that need the readings folded in another way."""
     readings: Readings = field(default_factory=Readings)
-    """What the readings themselves show, independently of the model."""
+    """Defects of the readings, found independently of the model."""
     outlying: tuple[OutlyingDwell, ...] = ()
     """The dwell that alone does not fit, or several if any one of them could be the cause."""
     frames: list[Frame] = field(default_factory=list[Frame], repr=False, compare=False)

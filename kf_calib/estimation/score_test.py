@@ -37,7 +37,7 @@ _SEEN = 1e-6
 _SAME = 1.0 - 1e-6
 """Two directions count as equal if the cosine of the angle between them is above this."""
 
-_TOGETHER = 24  # at least so many columns are whitened at a time; this bounds the memory beyond that of the result
+_TOGETHER = 24  # least number of columns that are whitened at a time; more would take more memory
 _CELLS = 10_000  # columns times dwells that are whitened at a time, if this allows more columns
 _OF_ONE_KIND = 400  # columns whitened at a time if there are many effects of one kind
 _MANY = 100  # above this number of oscillations, a periodogram is faster

@@ -15,11 +15,11 @@ Engine = Literal["block", "filterpy"]
 
 @dataclass(frozen=True)
 class Settings:
-    """How a run is evaluated; raises InputError if a value is not possible.
+    """The settings by which a run is evaluated; raises InputError if a value is not possible.
 
     - engine: the filter that is used.
     - prior: prior knowledge of the parameters.
-    - stillness: how dwells are recognised.
+    - stillness: tolerances by which dwells are recognised.
     - gate_sigma: limit of the innovation gate in robust standard deviations; None for no gate.
     - walk_mps2_per_sqrt_s: intensity of the random walk of the biases (process noise); 0 for none.
     - effects: names of the effects in the model, or the name of one.

@@ -52,7 +52,13 @@ Channels = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Means:
-    """Of D dwells the recorded poses (D, k), mean readings (D, 3), middles, s (D,), and numbers."""
+    """Means over D dwells.
+
+    - poses (D, k): poses as recorded.
+    - readings (D, 3): mean readings.
+    - middle_s (D,): middle of each dwell.
+    - numbers: numbers of the dwells.
+    """
 
     poses: Floats
     readings: Floats

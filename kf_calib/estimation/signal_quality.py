@@ -150,7 +150,7 @@ class Readings:
 
 @dataclass
 class _Seen:
-    """What is kept of a dwell.
+    """The record that is kept of a dwell.
 
     - ends (6,): the largest value of each channel and of its negative; stuck (6,): number of readings at these values.
     - count: number of readings.

@@ -26,7 +26,7 @@ from kf_calib.estimation.prior import Prior
 
 _SLOW = np.arange(1, 5)
 _STILL = np.zeros(2)
-_AT_ONCE = 1 << 17  # so many numbers are processed together, so that they stay in the cache
+_AT_ONCE = 1 << 17  # numbers that are processed together, so that they stay in the cache
 
 
 def whiten(
