@@ -106,6 +106,7 @@ def _of_attitude() -> Iterator[_Change]:
 
 def _reversed_gimbals(gimbals: Collection[int]) -> Callable[[Mounting], Mounting]:
     """Return the change that reverses the sense of some gimbals."""
+
     def made(mounting: Mounting) -> Mounting:
         axes = list(mounting.bench.axes)
         for k in gimbals:
@@ -118,6 +119,7 @@ def _reversed_gimbals(gimbals: Collection[int]) -> Callable[[Mounting], Mounting
 
 def _reordered_axes(order: Sequence[int]) -> Callable[[Mounting], Mounting]:
     """Return the change that puts the gimbal axes into another order."""
+
     def made(mounting: Mounting) -> Mounting:
         axes = tuple(mounting.bench.axes[k] for k in order)
         return replace(mounting, bench=replace(mounting.bench, axes=axes))
