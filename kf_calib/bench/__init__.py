@@ -1,1 +1,1 @@
-"""What the platform makes the block feel: gimbals, rotations, gravity, sample streams, the twelve parameters."""
+"""The bench: gimbals, rotations, gravity, sample streams and the paper's twelve parameters."""

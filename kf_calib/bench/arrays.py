@@ -1,4 +1,4 @@
-"""Types of arrays, by what they hold."""
+"""Array types, named by what the arrays hold."""
 
 from __future__ import annotations
 

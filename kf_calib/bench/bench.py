@@ -1,14 +1,15 @@
-"""The bench: gimbal chain, Earth and gravity; platform angles in, specific force of the platform out.
+"""The bench: its gimbals, gravity and the Earth's rotation; it converts platform angles to specific force in the
+platform.
 
-Frames (right-handed): n = North, Up, East; b = bench, n turned about the vertical by the azimuth;
-u = the frame in which gimbal axes and sensors are named, b turned so that its axis ``up`` points up (u = b for y);
-p = platform. ``C_bp = C_bu Rot(axis1, q1) Rot(axis2, q2) ...``, outer axis first, each gimbal turning about
-that axis of its parent; ``f_p = C_bp^T f_b``. All angles zero: the axis ``up`` of the platform points up, by default y,
-and accelerometer 2 reads +g; with ``up`` z, as ROS has it, accelerometer 3 does.
+All frames are right-handed. n has the axes North, Up, East. b is the bench, n turned about the vertical by the azimuth.
+u is the frame in which gimbal axes and sensors are named: b turned so that its axis ``up`` points up (u = b if ``up``
+is y). p is the platform. The attitude is ``C_bp = C_bu Rot(axis1, q1) Rot(axis2, q2) ...``, outer axis first, where
+each gimbal turns about the given axis of its parent, and ``f_p = C_bp^T f_b``. With all angles zero, the axis ``up`` of
+the platform points up. By default this is y, and accelerometer 2 reads +g; with z, as in ROS, accelerometer 3 does.
 
-Reference ``base``: angles are relative to the bench, ``f_b = (0, g, 0)``. Reference ``inertial``: the platform is
-held in inertial space, angles are relative to the bench frame as it stood at the first sample, and gravity turns
-with the Earth: ``f_b(t) = Rot(omega, |omega| t) (0, g, 0)``.
+With the reference ``base``, angles are relative to the bench and ``f_b = (0, g, 0)``. With the reference ``inertial``,
+the platform is held fixed in inertial space, angles are relative to the bench frame at the time of the first sample,
+and gravity turns with the Earth: ``f_b(t) = Rot(omega, |omega| t) (0, g, 0)``.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from kf_calib.errors import BenchError
 from kf_calib.support.plain_text import cut
 
 EARTH_RATE_RADPS = 7.292115e-5
-"""Earth's rotation in inertial space (WGS 84), rad/s: 15.041 deg/h."""
+"""Rate of the Earth's rotation in inertial space (WGS 84), rad/s: 15.041 deg/h."""
 
 Vector = tuple[float, float, float]
 _LETTERS: dict[str, Vector] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -35,12 +36,13 @@ CHANNELS = (1, 2, 3)
 
 
 def normal_gravity(latitude_deg: float, height_m: float = 0.0) -> float:
-    """Normal gravity on the WGS 84 ellipsoid, m/s^2 (Somigliana), continued to ``height_m`` above it.
+    """Normal gravity at a latitude and a height above the WGS 84 ellipsoid, m/s^2 (Somigliana's formula).
 
-    gamma = gamma_e (1 + k sin^2 B) / sqrt(1 - e^2 sin^2 B);
-    gamma_h = gamma (1 - 2 (1 + f + m - 2 f sin^2 B) h/a + 3 h^2/a^2).
-    Source: NGA.STND.0036 (WGS 84, 2014), eq. 4-1 and 4-3. Local gravity differs by up to about 1e-3 m/s^2:
-    a metrologist states a measured value instead.
+      gamma = gamma_e (1 + k sin^2 B) / sqrt(1 - e^2 sin^2 B)
+      gamma_h = gamma (1 - 2 (1 + f + m - 2 f sin^2 B) h/a + 3 h^2/a^2)
+
+    Source: NGA.STND.0036 (WGS 84, 2014), eq. 4-1 and 4-3. Local gravity differs from it by up to about 1e-3 m/s^2, so
+    that a measured value should be stated where one is available. Raises BenchError if the latitude is out of range.
     """
     if not abs(latitude_deg) <= 90.0:
         raise BenchError(f"latitude {latitude_deg:g} deg is not between -90 and 90: give latitude_deg in degrees.")
@@ -52,11 +54,13 @@ def normal_gravity(latitude_deg: float, height_m: float = 0.0) -> float:
 
 
 def parse_axes(text: str) -> tuple[Vector, ...]:
-    """Axes, outer to inner, from ``"y z x"``: letters (a minus sign reverses) or three comma-separated numbers."""
+    """Gimbal axes, outer to inner, from text such as ``"y z x"``: letters (a minus sign reverses the axis) or three
+    comma-separated numbers each."""
     return tuple(_parse_axis(word) for word in text.split())
 
 
 def _parse_axis(word: str) -> Vector:
+    """Return the unit vector of one axis given as a letter or as three numbers."""
     sign, letter = (-1.0, word[1:]) if word.startswith("-") else (1.0, word)
     if letter.lower() in _LETTERS:
         x, y, z = _LETTERS[letter.lower()]
@@ -71,13 +75,14 @@ def _parse_axis(word: str) -> Vector:
             f"axis {cut(word, 60)!r} is not known: give each gimbal axis, outer first, as x, y, z or three "
             'comma-separated numbers, for example --axes "y z x".'
         )
-    if abs(length - 1.0) < 1e-12:  # a unit vector survives being written and read again
+    if abs(length - 1.0) < 1e-12:  # so that a unit vector does not change when written and read
         length = 1.0
     return (numbers[0] / length, numbers[1] / length, numbers[2] / length)
 
 
 def parse_channels(text: str) -> tuple[int, int, int]:
-    """``"1,-2,3"``: which channel of the recording each accelerometer is, with a minus where its sign is reversed."""
+    """The channel of the recording that belongs to each accelerometer, from text such as ``"1,-2,3"``; a minus reverses
+    its sign."""
     words = text.strip("[] ").replace(",", " ").split()
     try:
         first, second, third = (int(word) for word in words)
@@ -92,6 +97,7 @@ def parse_channels(text: str) -> tuple[int, int, int]:
 
 
 def _format_axis(axis: Vector) -> str:
+    """Write an axis as a letter if it is a coordinate axis, else as three numbers."""
     for letter, unit in _LETTERS.items():
         if axis == unit:
             return letter
@@ -102,15 +108,22 @@ def _format_axis(axis: Vector) -> str:
 
 @dataclass(frozen=True)
 class Bench:
-    """What is known of the bench before the first sample (metadata record ``kf_calib.bench``).
+    """The description of the bench that is known before the first sample (metadata record ``kf_calib.bench``).
 
-    axes: unit vectors, outer to inner; empty where an attitude quaternion is recorded instead of angles.
-    angle_sigma_deg: repeatability of setting an orientation, 1 sigma; None: not known, to be estimated.
-    scatter_sigma_mps2: scatter of each sensor from dwell to dwell, 1 sigma; None: not known, to be estimated.
-    joints: names of the gimbals' joints where angles come as joint states, outer to inner; empty: told by their names.
-    nominal: nominal parameters that differ from the paper's, in the units of the estimates (rad, 1, m/s^2).
-    up: the axis that points up when all angles are zero; the azimuth is that of x (of y where x is vertical).
-    channels: which channel of the recording accelerometers 1, 2, 3 are, negative where the sign is reversed.
+    - axes: unit vectors of the gimbal axes, outer to inner; empty if attitude quaternions are recorded instead of
+      angles.
+    - gravity_mps2: local gravity.
+    - reference: ``base`` if angles are relative to the bench, ``inertial`` if the platform is held fixed in inertial
+      space.
+    - latitude_deg, height_m: the place of the bench; azimuth_deg: the azimuth of its x axis from North toward East.
+    - angle_sigma_deg: setting error, one standard deviation; None if it is unknown and has to be estimated.
+    - scatter_sigma_mps2: scatter of each accelerometer from dwell to dwell, one standard deviation; None if it is
+      unknown and has to be estimated.
+    - nominal: nominal parameters that differ from the paper's, in rad, 1 and m/s^2.
+    - notes: free text such as the serial number of the block.
+    - up: the axis that points up when all angles are zero. The azimuth is that of x, or of y if x is vertical.
+    - channels: the channel of the recording for accelerometers 1, 2, 3, negative if its sign is reversed.
+    - joints: names of the gimbals' joints, outer to inner, if angles come as joint states; empty if their names tell.
     """
 
     axes: tuple[Vector, ...]
@@ -148,17 +161,19 @@ class Bench:
 
     @property
     def axis_letters(self) -> tuple[str, ...]:
-        """Letters of the gimbal axes, outer to inner; empty where one has none, or two have the same."""
+        """Letters of the gimbal axes, outer to inner; empty if an axis has no letter or two have the same."""
         letters = tuple(_format_axis(axis).removeprefix("-") for axis in self.axes)
         return letters if len(set(letters)) == len(letters) and set(letters) <= set(_LETTERS) else ()
 
     @property
     def pose_width(self) -> int:
+        """Number of columns of a pose: the number of gimbals, or 4 for quaternions."""
         return len(self.axes) or 4
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str], has_angles: bool = True) -> Bench:
-        """The bench from the strings of a metadata record (docs/format.md), or from options of the same names."""
+        """The bench described by the strings of a metadata record (docs/format.md) or by options of the same names;
+        raises BenchError."""
         from kf_calib.bench.keys import FREE_TEXT, NUMBERS, known
 
         given = known(metadata)
@@ -186,7 +201,7 @@ class Bench:
         )
 
     def to_metadata(self) -> dict[str, str]:
-        """The strings of a metadata record; ``from_metadata`` of it gives this bench again."""
+        """The strings of a metadata record from which ``from_metadata`` makes this bench again."""
         from kf_calib.bench.keys import FORMAT_VERSION, NUMBERS
 
         numbers = {key: getattr(self, key) for key in NUMBERS}
@@ -203,9 +218,9 @@ class Bench:
         }
 
     def attitude(self, pose: ArrayLike) -> Floats:
-        """C_bp (n, 3, 3) of poses (n, k): gimbal angles in rad, or quaternions x y z w."""
+        """Attitude matrices C_bp (n, 3, 3) of poses (n, k): gimbal angles in rad, or quaternions x y z w."""
         columns = [self.to_platform(np.eye(3)[:, i], np.asarray(pose, float)) for i in range(3)]
-        return np.stack(columns, axis=1)  # row i of C_bp is bench axis i seen in the platform
+        return np.stack(columns, axis=1)  # row i of C_bp is bench axis i in platform coordinates
 
     def readings(self, channels: Floats) -> Floats:
         """Readings (n, 3) of accelerometers 1, 2, 3 from the channels (n, 3) of a recording."""
@@ -215,7 +230,7 @@ class Bench:
         return channels[:, np.abs(places) - 1] * np.sign(places)
 
     def to_platform(self, vector: Floats, pose: Floats) -> Floats:
-        """C_bp^T vector: a bench vector (3,) or (n, 3) seen in the platform at poses (n, k); returns (n, 3)."""
+        """C_bp^T vector (n, 3): a bench vector (3,) or (n, 3) in platform coordinates at poses (n, k)."""
         if self.up != "y":
             vector = vector @ _frame_with_up(self.up).T
         if not self.axes:
@@ -227,7 +242,8 @@ class Bench:
 
     @property
     def earth_rate_radps(self) -> Floats:
-        """Earth's rotation seen from the bench frame, (3,) rad/s; needs the latitude."""
+        """The Earth's rotation vector (3,), rad/s, in bench coordinates; raises BenchError if the latitude is not
+        known."""
         if self.latitude_deg is None:
             raise BenchError("the Earth's rotation needs the latitude: give latitude_deg (--latitude).")
         latitude, azimuth = math.radians(self.latitude_deg), math.radians(self.azimuth_deg)
@@ -235,7 +251,8 @@ class Bench:
         return EARTH_RATE_RADPS * np.array([north * math.cos(azimuth), up, -north * math.sin(azimuth)])
 
     def specific_force(self, elapsed_s: Floats, pose: Floats) -> Floats:
-        """f_p (n, 3), m/s^2, at ``elapsed_s`` (n,) since the first sample and poses (n, k)."""
+        """Specific force f_p (n, 3), m/s^2, in the platform at times ``elapsed_s`` (n,) since the first sample and
+        poses (n, k)."""
         up = np.broadcast_to([0.0, self.gravity_mps2, 0.0], (len(elapsed_s), 3))
         if self.reference == "inertial":
             rate = self.earth_rate_radps
@@ -247,21 +264,26 @@ class Bench:
 def metadata_of(values: Mapping[str, Any]) -> dict[str, str]:
     """The strings of a metadata record from values of JSON or TOML.
 
-    Raises ValueError or RecursionError for integers of thousands of digits and for lists in lists without end.
+    Raises ValueError or RecursionError for integers of thousands of digits and for excessively nested lists.
     """
     return {key: value if isinstance(value, str) else json.dumps(value, default=str) for key, value in values.items()}
 
 
 def _frame_with_up(up: str) -> Floats:
-    """C_ub (3, 3): bench vectors seen in the frame u whose axis ``up`` points up and whose x (y where x is vertical)
-    points where the bench's x does."""
+    """Return C_ub (3, 3), which transforms bench vectors to the frame u whose axis ``up`` points up.
+
+    The x axis of u, or its y axis if x is vertical, has the direction of the bench's x axis.
+    """
     vertical = np.array(_parse_axis(up))
     level = np.array(_LETTERS["y" if up.endswith("x") else "x"])
-    return np.column_stack([level, vertical, np.cross(level, vertical)])  # the bench's x, y, z as seen in u
+    return np.column_stack([level, vertical, np.cross(level, vertical)])  # the bench's x, y, z in coordinates of u
 
 
 def turn(vector: Floats, axis: Floats, angle_rad: Floats | float) -> Floats:
-    """Rot(axis, angle) vector by Rodrigues' formula; vector (3,) or (n, 3), angle scalar or (n,); returns (..., 3)."""
+    """The vector (..., 3) rotated about a unit axis by an angle, Rot(axis, angle) vector, by Rodrigues' formula.
+
+    ``vector`` is (3,) or (n, 3); ``angle_rad`` is a scalar or (n,).
+    """
     cos, sin = np.cos(angle_rad)[..., None], np.sin(angle_rad)[..., None]
     along = (vector @ axis)[..., None] * axis
     x, y, z = axis.tolist()
@@ -272,6 +294,7 @@ def turn(vector: Floats, axis: Floats, angle_rad: Floats | float) -> Floats:
 
 
 def _turn_by_quaternion(vector: Floats, imaginary: Floats, real: Floats) -> Floats:
+    """Rotate vectors by quaternions given by their imaginary and real parts."""
     shape = np.broadcast_shapes(vector.shape, imaginary.shape)
     vector, imaginary = np.broadcast_to(vector, shape), np.broadcast_to(imaginary, shape)
     doubled = 2.0 * np.cross(imaginary, vector)
@@ -281,10 +304,11 @@ def _turn_by_quaternion(vector: Floats, imaginary: Floats, real: Floats) -> Floa
 def unwrap_pose(
     pose: Floats, is_quaternion: bool, before: tuple[Floats, Floats] | None = None
 ) -> tuple[Floats, Floats]:
-    """Poses (n, k) made continuous: angles within half a turn, quaternions on the sign, of the pose before.
+    """Poses (n, k) made continuous, and the whole turns (n, k) or signs (n, 1) that were applied.
 
-    And what makes them so: whole turns (n, k) that are added, or signs (n, 1). before: the last pose of those before
-    these, as it was recorded, and its turns or sign. Poses that come in parts become the same to the last bit.
+    Each angle is brought within half a turn of the one before, and each quaternion to the sign that is nearer to the
+    one before. ``before`` holds the last earlier pose as it was recorded and its turns or sign; with it, poses that
+    arrive in parts give exactly the same result as all at once.
     """
     last, made_so = (pose[0], np.ones(1) if is_quaternion else np.zeros(pose.shape[1])) if before is None else before
     stacked = np.vstack([last, pose])
@@ -296,7 +320,8 @@ def unwrap_pose(
 
 
 def interpolate_pose(at_ns: Times, time_ns: Times, pose: Floats, is_quaternion: bool) -> Floats:
-    """Poses at ``at_ns``: straight lines between continuous angles, slerp between quaternions; held at the ends."""
+    """Poses at ``at_ns``, linear between continuous angles and by slerp between quaternions; constant beyond the
+    ends."""
     before = np.clip(np.searchsorted(time_ns, at_ns, side="right") - 1, 0, max(len(time_ns) - 2, 0))
     after = np.minimum(before + 1, len(time_ns) - 1)
     span = np.maximum(time_ns[after] - time_ns[before], 1)
@@ -308,11 +333,11 @@ def interpolate_pose(at_ns: Times, time_ns: Times, pose: Floats, is_quaternion: 
 
 
 def slerp(start: Floats, end: Floats, weight: Floats) -> Floats:
-    """Quaternions (n, 4) on the great arc from ``start`` to ``end`` at ``weight`` (n, 1); the shorter way round."""
+    """Quaternions (n, 4) on the shorter great arc from ``start`` to ``end`` at the fraction ``weight`` (n, 1)."""
     start = start / np.linalg.norm(start, axis=-1, keepdims=True)
     end = end / np.linalg.norm(end, axis=-1, keepdims=True)
     end = np.where(np.sum(start * end, axis=-1, keepdims=True) < 0, -end, end)
-    # atan2 of the chord halves keeps small arcs exact, where acos of a dot product near 1 loses half the digits
+    # atan2 of the two chords is exact for small arcs, where acos of a dot product near 1 loses half the digits
     half = np.arctan2(np.linalg.norm(end - start, axis=-1), np.linalg.norm(end + start, axis=-1))[:, None]
     arc = 2.0 * half
     near = arc < 1e-12
@@ -323,7 +348,8 @@ def slerp(start: Floats, end: Floats, weight: Floats) -> Floats:
 
 
 def pose_distance(one: Floats, other: Floats, is_quaternion: bool) -> Floats:
-    """How far apart two poses (..., k) are, rad: the largest angle difference, or the angle of the rotation."""
+    """Distance of two poses (..., k), rad: the largest difference of an angle, or the angle of rotation between
+    quaternions."""
     if not is_quaternion:
         return np.max(np.abs(one - other), axis=-1)
     one = one / np.linalg.norm(one, axis=-1, keepdims=True)
@@ -334,10 +360,11 @@ def pose_distance(one: Floats, other: Floats, is_quaternion: bool) -> Floats:
 
 
 def mean_pose(pose: Floats) -> Floats:
-    """The mean (k,) of continuous poses (n, k) that lie close together (quaternions: of one sign, then normalised)."""
+    """Mean (k,) of continuous poses (n, k) that lie close together; quaternions have to be of one sign, and the mean is
+    not normalised."""
     return pose.mean(axis=0)
 
 
 def axes_of(names: Iterable[str]) -> tuple[Vector, ...]:
-    """Axes from single words: ``axes_of("yzx")``."""
+    """Axes from single words or letters, as in ``axes_of("yzx")``."""
     return parse_axes(" ".join(names))

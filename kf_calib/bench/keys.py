@@ -1,4 +1,5 @@
-"""What each key that describes a bench must be: for records in recordings, streams, TOML files, options and Python."""
+"""The keys that describe a bench, and the check of their values in recordings, streams, TOML files, options and
+Python."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from kf_calib.support.plain_text import COMMANDS, LONGEST, cut
 
 FORMAT_VERSION = "1"
 UP = ("y", "z", "x", "-y", "-z", "-x")
-"""Axes that can point up when all angles are zero."""
+"""The axes that can point up when all angles are zero."""
 NUMBERS = ("gravity_mps2", "latitude_deg", "height_m", "azimuth_deg", "angle_sigma_deg", "scatter_sigma_mps2")
 FREE_TEXT = ("block_serial", "bench", "operator", "note")
 
@@ -28,7 +29,7 @@ _OF_SYMBOL = {
 
 
 def _between(least: float, most: float, value: Any) -> float:
-    """The value as a number within limits; text is none, nor is true."""
+    """Return the value as a number within limits; text and booleans are refused."""
     if not isinstance(value, int | float) or isinstance(value, bool):
         raise ValueError("it must be a valid number")
     if not (isinstance(value, int) or math.isfinite(value)):
@@ -41,20 +42,22 @@ def _between(least: float, most: float, value: Any) -> float:
 
 
 def _text(value: Any) -> str:
+    """Return text without control characters."""
     if not isinstance(value, str) or len(value) > LONGEST or _COMMAND.search(value):
         raise ValueError("it must be text without control characters")
-    value.encode()  # raises a ValueError where half a character is in it
+    value.encode()  # raises ValueError for an unpaired surrogate
     return value
 
 
 def _one_of(known: tuple[str, ...], value: Any) -> str:
+    """Return the value if it is one of those known."""
     if value not in known:
         raise ValueError(f"it must be one of {', '.join(known)}")
     return value
 
 
 def _nominal(value: Any) -> dict[str, float]:
-    """Values of the paper's parameters by symbol."""
+    """Return the values of the paper's parameters by symbol."""
     if not isinstance(value, dict):
         raise ValueError("it must be a valid dictionary")
     out = dict[str, float]()
@@ -70,13 +73,14 @@ def _nominal(value: Any) -> dict[str, float]:
 
 
 class Key(NamedTuple):
-    """read: gives the value as its type, or raises ValueError. words: what it must be, for people."""
+    """One key: ``read`` converts its value or raises ValueError, and ``words`` tell a user what the value must be."""
 
     read: Callable[[Any], Any]
     words: str
 
 
 def _number(least: float, most: float, words: str) -> Key:
+    """Make the key of a number between limits."""
     return Key(partial(_between, least, most), f"a finite number from {least:g} to {most:g}, {words}")
 
 
@@ -113,7 +117,7 @@ KEYS: Mapping[str, Key] = {
 
 
 def known(metadata: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of a bench's keys, checked, without numbers that are left empty. Raises BenchError, with the key."""
+    """The checked values of a bench's keys, without numbers that were left empty; raises BenchError, naming the key."""
     for key in metadata:
         if key not in KEYS:
             raise BenchError(f"bench key {cut(key, 60)!r} is not known: use one of {', '.join(sorted(KEYS))}.")
@@ -121,7 +125,8 @@ def known(metadata: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def checked(key: str, value: Any) -> Any:
-    """The value of a key as its type; numbers and the nominal parameters may be text. Raises BenchError."""
+    """The value of a key, converted to its type; numbers and nominal parameters may be given as text. Raises
+    BenchError."""
     read, words = KEYS[key]
     try:
         return read(_plain(key, value))
@@ -133,7 +138,7 @@ def checked(key: str, value: Any) -> Any:
 
 
 def _plain(key: str, value: Any) -> Any:
-    """Text that stands for a number, for JSON or for an axis as that; numbers of numpy as Python's."""
+    """Convert text that stands for a number, for JSON or for an axis, and numbers of numpy to those of Python."""
     match value:
         case str() if key == "nominal":
             try:

@@ -1,7 +1,7 @@
-"""What the recorded poses of a run could mean: the bench as it is stated, or with a few things other than stated.
+"""The possible interpretations of a run's recorded poses: the bench as stated, or with a few things different.
 
-The senses and the order of the gimbals, the order and the unit of their angles, the axis that is up, and of attitude
-quaternions their sense and the order of their parts.
+What may differ is the sense and the order of the gimbals, the order and the unit of their angles and the axis that is
+up; for attitude quaternions, their sense and the order of their components.
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ _MOST_CHANGES = 2
 
 @dataclass(frozen=True)
 class Mounting:
-    """A guess at what the recording means: the bench as it would have to be stated.
+    """One interpretation of the recorded poses.
 
-    order: column of the recorded angles that belongs to each gimbal; angle_unit: rad per unit of the recorded angles;
-    changes: how many things differ from what is stated; conjugate, real_first: of attitude quaternions, those of the
-    opposite rotation, with the real part before the others.
+    - bench: the bench as it would have to be stated.
+    - order: the column of the recorded angles that belongs to each gimbal.
+    - angle_unit: rad per unit of the recorded angles.
+    - conjugate: the recorded quaternions are of the inverse rotation; real_first: their real part comes first.
+    - words: the differences in words; changes: how many things differ from what is stated.
     """
 
     bench: Bench
@@ -39,11 +41,11 @@ class Mounting:
 
     @classmethod
     def stated(cls, bench: Bench) -> Mounting:
-        """As the bench says."""
+        """The interpretation that the bench states."""
         return cls(bench, tuple(range(len(bench.axes))))
 
     def poses(self, recorded: Floats) -> Floats:
-        """Poses (D, k) in rad, or quaternions x y z w, from the recorded ones."""
+        """Poses (D, k) in rad, or quaternions x y z w, from the poses as recorded."""
         if self.bench.axes:
             return recorded[:, self.order] * self.angle_unit
         x, y, z, w = recorded[:, [1, 2, 3, 0]].T if self.real_first else recorded.T
@@ -52,7 +54,7 @@ class Mounting:
 
 
 def mountings(stated: Mounting) -> Iterator[Mounting]:
-    """What the recorded poses could mean, the fewest changes first; as stated first of all."""
+    """Yield the possible interpretations, beginning with the stated one, in order of the number of changes."""
     possible = [*_of_up(stated.bench), *(_of_gimbals(stated.bench) if stated.bench.axes else _of_attitude())]
     for count in range(_MOST_CHANGES + 1):
         for chosen in itertools.combinations(possible, count):
@@ -65,7 +67,7 @@ def mountings(stated: Mounting) -> Iterator[Mounting]:
 
 @dataclass(frozen=True)
 class _Change:
-    """One thing that may be other than stated; of one kind there is one change at a time."""
+    """One thing that may differ from what is stated; changes of the same kind exclude each other."""
 
     kind: str
     words: str
@@ -73,7 +75,7 @@ class _Change:
 
 
 def _of_gimbals(bench: Bench) -> Iterator[_Change]:
-    """Sense and order of the gimbals, order and unit of the recorded angles."""
+    """Yield changes of the sense and order of the gimbals and of the order and unit of the recorded angles."""
     every, letters = range(len(bench.axes)), bench.to_metadata()["axes"].split()
     for k in every:
         yield _Change(f"sense {k}", f"gimbal {letters[k]} turns the other way", _reversed_gimbals((k,)))
@@ -89,18 +91,22 @@ def _of_gimbals(bench: Bench) -> Iterator[_Change]:
 
 
 def _of_up(bench: Bench) -> Iterator[_Change]:
+    """Yield changes of the axis that points up."""
     for up in UP:
         if up != bench.up:
             yield _Change("up", f"{up} is up when all angles are zero", _with_up(up))
 
 
 def _of_attitude() -> Iterator[_Change]:
+    """Yield changes of the sense and of the order of components of attitude quaternions."""
     inverted, first = "the attitude is that of the bench in the platform", "the quaternion has its real part first"
     yield _Change("sense", inverted, lambda mounting: replace(mounting, conjugate=True))
     yield _Change("order", first, lambda mounting: replace(mounting, real_first=True))
 
 
 def _reversed_gimbals(gimbals: Collection[int]) -> Callable[[Mounting], Mounting]:
+    """Return the change that reverses the sense of some gimbals."""
+
     def made(mounting: Mounting) -> Mounting:
         axes = list(mounting.bench.axes)
         for k in gimbals:
@@ -112,6 +118,8 @@ def _reversed_gimbals(gimbals: Collection[int]) -> Callable[[Mounting], Mounting
 
 
 def _reordered_axes(order: Sequence[int]) -> Callable[[Mounting], Mounting]:
+    """Return the change that puts the gimbal axes into another order."""
+
     def made(mounting: Mounting) -> Mounting:
         axes = tuple(mounting.bench.axes[k] for k in order)
         return replace(mounting, bench=replace(mounting.bench, axes=axes))
@@ -120,12 +128,15 @@ def _reordered_axes(order: Sequence[int]) -> Callable[[Mounting], Mounting]:
 
 
 def _reordered(order: tuple[int, ...]) -> Callable[[Mounting], Mounting]:
+    """Return the change that assigns the recorded angles to the gimbals in another order."""
     return lambda mounting: replace(mounting, order=order)
 
 
 def _with_unit(angle_unit: float) -> Callable[[Mounting], Mounting]:
+    """Return the change of the unit of the recorded angles."""
     return lambda mounting: replace(mounting, angle_unit=angle_unit)
 
 
 def _with_up(up: str) -> Callable[[Mounting], Mounting]:
+    """Return the change of the axis that points up."""
     return lambda mounting: replace(mounting, bench=replace(mounting.bench, up=up))

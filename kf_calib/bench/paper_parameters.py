@@ -1,11 +1,13 @@
-"""The seed paper's twelve parameters and the affine state they are a closed form of.
+"""The paper's twelve parameters and the affine state, from which they follow in closed form.
 
-Reading i = s_i . f + b_i with the sensitivity s_i = K_i E_i. For accelerometers 1 and 3
-``E = (cos phi cos theta, sin theta, -sin phi cos theta)``, for 2
-``E = (sin nu1, sqrt(1 - sin^2 nu1 - sin^2 nu2), -sin nu2)`` (M. D. Grebenkin, Vestnik MEPhI 8(3), 2019, eq. 1-6).
-E_2 always has a positive y, so an accelerometer 2 that points the other way has a negative K2: parameters and state
-are one to one.
-State order: s1x s1y s1z b1, s2x s2y s2z b2, s3x s3y s3z b3. Angles in rad, K without unit, b in m/s^2.
+The reading of accelerometer i is s_i . f + b_i with the sensitivity s_i = K_i E_i. For accelerometers 1 and 3, ``E =
+(cos phi cos theta, sin theta, -sin phi cos theta)``; for accelerometer 2, ``E = (sin nu1, sqrt(1 - sin^2 nu1 - sin^2
+nu2), -sin nu2)`` (M. D. Grebenkin, Vestnik MEPhI 8(3), 2019, eq. 1-6). The y component of E_2 is always positive, so
+that an accelerometer 2 of opposite direction has a negative K2; parameters and state then determine each other
+uniquely.
+
+The order of the state is s1x s1y s1z b1, s2x s2y s2z b2, s3x s3y s3z b3. Angles are in rad, K has no unit, b is in
+m/s^2.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from kf_calib.errors import BenchError
 
 SYMBOLS = ("theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3")
 BIASES = [3, 7, 11]
-"""Where the three biases are in the affine state (s1, b1, s2, b2, s3, b3)."""
+"""Indices of the three biases in the affine state (s1, b1, s2, b2, s3, b3)."""
 UNITS = ("rad", "rad", "1", "m/s^2") * 3
 NOMINAL: dict[str, float] = dict.fromkeys(SYMBOLS, 0.0) | {
     "theta1": math.radians(0.5), "theta3": math.radians(0.5), "phi3": -math.pi / 2, "K1": 1.0, "K2": 1.0, "K3": 1.0,
@@ -28,7 +30,8 @@ NOMINAL: dict[str, float] = dict.fromkeys(SYMBOLS, 0.0) | {
 
 
 def nominal(differing: Mapping[str, float] | None = None) -> Floats:
-    """The nominal parameters (12,): the paper's, except for those given (rad, 1, m/s^2)."""
+    """The nominal parameters (12,): the paper's, except for those given (rad, 1, m/s^2); raises BenchError for an
+    unknown symbol."""
     unknown = sorted(set(differing or ()) - set(SYMBOLS))
     if unknown:
         raise BenchError(f"nominal names {unknown[0]!r}, which is no parameter: use {', '.join(SYMBOLS)}.")
@@ -46,14 +49,17 @@ def state_of(parameters: Floats) -> Floats:
 
 
 def _axis(i: int, p1: float, p2: float) -> Floats:
+    """Return the unit vector E of accelerometer i (from 0) from its two angles."""
     if i == 1:
         return np.array([math.sin(p1), math.sqrt(1 - math.sin(p1) ** 2 - math.sin(p2) ** 2), -math.sin(p2)])
     return np.array([math.cos(p2) * math.cos(p1), math.sin(p1), -math.sin(p2) * math.cos(p1)])
 
 
 def parameters_of(state: Floats) -> Floats:
-    """The paper's parameters (..., 12) of affine states (..., 12); ``state_of`` gives these states again, whatever way
-    the axes point: K1, K3 are positive, K2 has the sign of s2y."""
+    """The paper's parameters (..., 12) of affine states (..., 12).
+
+    This inverts ``state_of`` for any direction of the axes: K1 and K3 are positive, and K2 has the sign of s2y.
+    """
     out = np.empty_like(state)
     for i in range(3):
         s = state[..., 4 * i : 4 * i + 3]
@@ -68,7 +74,8 @@ def parameters_of(state: Floats) -> Floats:
 
 
 def jacobian(state: Floats) -> Floats:
-    """d parameters / d state (12, 12) at an affine state, in closed form; carries a covariance over."""
+    """The Jacobian d parameters / d state (12, 12) at an affine state in closed form, by which covariances are
+    transformed."""
     out = np.zeros((12, 12))
     for i in range(3):
         rows = slice(4 * i, 4 * i + 4)
@@ -88,12 +95,13 @@ def jacobian(state: Floats) -> Floats:
 
 
 def _arcsine_gradient(axis: Floats, k: int) -> Floats:
-    """Gradient of asin(s_k / K) with respect to s, times K; ``axis`` = s / K."""
+    """Return the gradient of asin(s_k / K) with respect to s, times K, where ``axis`` = s / K."""
     return (np.eye(3)[k] - axis[k] * axis) / math.sqrt(1 - axis[k] ** 2)
 
 
 def sensitivity_jacobian(parameters: Floats) -> Floats:
-    """d state / d parameters (12, 12), in closed form: its blocks are the paper's H transposed (see ``h_rows``)."""
+    """The Jacobian d state / d parameters (12, 12) in closed form; its blocks are the transposes of the paper's H (see
+    ``h_rows``)."""
     out = np.zeros((12, 12))
     for i, (p1, p2, scale, _) in enumerate(np.reshape(parameters, (3, 4))):
         c1, s1, c2, s2 = math.cos(p1), math.sin(p1), math.cos(p2), math.sin(p2)
@@ -109,16 +117,16 @@ def sensitivity_jacobian(parameters: Floats) -> Floats:
 
 
 def h_rows(parameters: Floats) -> Floats:
-    """The paper's H (3, 3, 3), eq. 8-10: of each accelerometer the rows d(KE)/dp1, d(KE)/dp2, E.
+    """The paper's H (3, 3, 3), eq. 8-10: the rows d(KE)/dp1, d(KE)/dp2 and E of each accelerometer.
 
-    What the paper prints differs. Each of these is checked by finite differences in tests/test_paper_experiment.py:
+    The printed formulas differ in these points, each checked by finite differences in tests/test_paper_experiment.py:
 
     - (5) has g_j on the right-hand side again, although the left-hand side is the reading less g_j.
     - (8): d E_z / d theta and d E_z / d phi have the sign of the opposite Z axis; the row of K has the right one.
     - (9): the root sqrt(1 - sin nu1 - sin nu2) lacks the squares.
     - (10): both derivatives of E_z have a sqrt(1 - sin^2 psi3) where sqrt(1 - cos^2 psi3) = -sin psi3 is meant, as in
       its row of K: at psi3 = -90 deg d E_z / d theta is 0 instead of -sin theta3, d E_z / d phi is 0/0 instead of 0.
-      The figures were not computed so: K3 of Table 2 would be off by 2.5 %.
+      The paper's figures were not computed in this way, since K3 of Table 2 would be off by 2.5 %.
     - psi is phi; Table 1 names nu2 a second nu1, and has 30 arcsec as the nominal value of both, where (3) has 0.
     """
     jacobian = sensitivity_jacobian(parameters)
@@ -126,18 +134,21 @@ def h_rows(parameters: Floats) -> Floats:
 
 
 def design(force_mps2: Floats, parameters: Floats) -> Floats:
-    """The paper's D (3, n, 4), eq. 6-7: d reading / d (p1, p2, K, b) of each accelerometer, a row [H f, 1] a reading.
+    """The paper's D (3, n, 4), eq. 6-7: the derivatives [H f, 1] of each accelerometer's readings by (p1, p2, K, b).
 
-    force_mps2 (3, n, 3): the specific force at each reading of each accelerometer; (n, 3): the same for all three.
+    ``force_mps2`` is the specific force at each reading of each accelerometer (3, n, 3), or the same for all three (n,
+    3).
     """
     slopes = np.broadcast_to(force_mps2, (3, *np.shape(force_mps2)[-2:])) @ h_rows(parameters).transpose(0, 2, 1)
     return np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=2)
 
 
 def optimal_directions(parameters: Floats) -> Floats:
-    """The paper's optimal set: unit vectors (3, 4, 3), the specific force in four orientations for each accelerometer.
+    """The paper's optimal set: unit vectors (3, 4, 3) of the specific force in four orientations for each
+    accelerometer.
 
-    Along h2 x h3, h1 x h3 and h1 x h2 one parameter alone is excited; the fourth is opposite to the third.
+    Along h2 x h3, h1 x h3 and h1 x h2, the reading depends on only one of the three parameters; the fourth direction is
+    opposite to the third.
     """
     h1, h2, h3 = np.moveaxis(h_rows(parameters), 1, 0)
     along = np.stack([np.cross(h2, h3), np.cross(h1, h3), np.cross(h1, h2)], axis=1)

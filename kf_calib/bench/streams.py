@@ -1,8 +1,8 @@
-"""What a bench delivers: streams of stamped values, and the sources they come from.
+"""The data that a bench delivers: streams of stamped values, and the sources that provide them.
 
-Stamps are integer nanoseconds (``time_ns``); readings are specific force in m/s^2 (+g when the sensitive
-axis points up); gimbal angles are in rad, outer axis first. A *pose* is either the gimbal angles (k columns)
-or, where the bench has no gimbal axes, the attitude quaternion platform -> bench (x, y, z, w).
+Stamps are integers in nanoseconds (``time_ns``). Readings are specific force in m/s^2, +g if the sensitive axis points
+up. Gimbal angles are in rad, outer axis first. A *pose* consists of the gimbal angles (k columns) or, if the bench has
+no gimbal axes, of the attitude quaternion from platform to bench (x, y, z, w).
 """
 
 from __future__ import annotations
@@ -28,11 +28,12 @@ class Stream:
 
     @classmethod
     def empty(cls, width: int) -> Stream:
+        """A stream without samples."""
         return cls(np.empty(0, np.int64), np.empty((0, width)))
 
     @classmethod
     def joined(cls, streams: Sequence[Stream]) -> Stream:
-        """One after another; there is at least one."""
+        """The concatenation of at least one stream."""
         if len(streams) == 1:
             return streams[0]
         times, values = zip(*((each.time_ns, each.values) for each in streams), strict=True)
@@ -54,19 +55,18 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """One stretch of the raw streams as they arrived, each with stamps of its own; any may be empty."""
+    """A stretch of the raw streams as they arrived, each with its own stamps; any of them may be empty."""
 
-    accel: Stream  # (n, 3) m/s^2
+    accel: Stream  # readings (n, 3), m/s^2
     pose: Stream  # (m, k) rad, or (m, 4) quaternion x y z w
     temperature: Stream = field(default_factory=lambda: Stream.empty(1))  # (l, 1) degC
 
 
 class Source(Protocol):
-    """Where batches come from: a recording, a live bench, the simulator.
+    """A source of batches: a recording, a live bench or the simulator.
 
-    ``warnings`` grows while the source is read (what was lost, what was not understood).
-    ``fraction`` is how much has been read, 0 to 1 (NaN where the end is not known).
-    A recording can be iterated again from its start.
+    ``warnings`` grows while the source is read, and tells what was lost or not understood. ``fraction`` is the share
+    that has been read, 0 to 1 (NaN if the end is not known). A recording can be iterated again from its start.
     """
 
     @property

@@ -1,1 +1,1 @@
-"""Where to point: criteria, limits, exact designs, the next orientation."""
+"""The choice of orientations: criteria, limits, exact designs and the next orientation."""

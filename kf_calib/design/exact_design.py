@@ -1,16 +1,15 @@
-"""Exact designs: which orientations serve an aim best, and how far they are from the best that could be.
+"""Exact optimal designs: the orientations that serve an aim best, and a bound on how far they are from the optimum.
 
-A start by exchange over candidates, then scipy's L-BFGS-B over the continuous angles within their bounds. The slope
-comes from the aim as a function of the factor alone (``optimality_criteria.slope``), so that any aim can be planned
-for.
+The search begins by exchange over candidates and continues with scipy's L-BFGS-B over the continuous angles within
+their bounds. The gradient is computed from the aim as a function of the information factor alone
+(``optimality_criteria.slope``), so that any such aim can be planned for.
 
-D-optimality has a bound that needs no optimum (Kiefer and Wolfowitz, 1960): with M the information of any design of N
-dwells, M0 what is known already and I(x) the information of a dwell at x,
+For D-optimality there is a bound that does not require the optimum (Kiefer and Wolfowitz, 1960). With M the information
+of any design of N dwells, M0 the prior information and I(x) the information of a dwell at x,
 
-    det M*^(1/p) <= det M^(1/p) (tr(M0 M^-1) + N max_x tr(I(x) M^-1)) / p.
+  det M*^(1/p) <= det M^(1/p) (tr(M0 M^-1) + N max_x tr(I(x) M^-1)) / p.
 
-Where nothing is known already, N tr(I(x) M^-1) is the variance function; its maximum is p at the
-optimum, and there only.
+Without prior information, N tr(I(x) M^-1) is the variance function; its maximum is p at the optimum and only there.
 """
 
 from __future__ import annotations
@@ -33,21 +32,22 @@ from kf_calib.errors import InputError, UnobservableError
 
 _TIE = 1e-3
 _UNTIL = {"maxiter": 200, "ftol": 1e-11, "gtol": 1e-9}
-_FIRST = 32  # candidates that promise most, tried exactly
+_FIRST = 32  # the most promising candidates, which are evaluated exactly
 _SWEEPS = 12
 _SCATTERED, _ABOUT = 256, 48
-_OTHERS = 6  # random starts of an exchange that no polishing follows
-_FEW = 16  # orientations that one start may lead into a corner
+_OTHERS = 6  # random starts of an exchange without continuous refinement
+_FEW = 16  # up to this number of orientations, several starts are needed
 _STEP_RAD = 1e-5
 _WEIGHINGS = 1000
 
 
 @dataclass(frozen=True)
 class Scheme:
-    """What is visited for every orientation chosen: it, ``repeats`` times, and its antipode (gravity turned over).
+    """The visits for each chosen orientation: ``repeats`` visits of it and, optionally, of its antipode (gravity
+    reversed).
 
-    turned: the gimbal that turns gravity over when it goes half a turn and the others as ``signs`` say (-1: to the
-    other side of zero); None: no antipodes.
+    ``turned`` is the gimbal that reverses gravity if it is rotated by 180 deg and the others are multiplied by
+    ``signs``; None for no antipodes.
     """
 
     repeats: int = 1
@@ -56,22 +56,25 @@ class Scheme:
 
     @property
     def copies(self) -> int:
+        """Number of visits for each orientation."""
         return self.repeats * (1 if self.turned is None else 2)
 
     def visits(self, poses: Floats) -> Floats:
-        """Poses (copies * n, k) of orientations (n, k), those of one together."""
+        """Poses (copies * n, k) of orientations (n, k); the visits of one orientation are consecutive."""
         if self.turned is None:
             return np.repeat(poses, self.repeats, axis=0)
         both = np.stack([poses, self.antipodes(poses)], axis=1)
         return np.repeat(both, self.repeats, axis=0).reshape(-1, poses.shape[1])
 
     def antipodes(self, poses: Floats) -> Floats:
+        """Poses (n, k) at which gravity is reversed."""
         other = poses * np.array(self.signs)
         other[:, self.turned] += np.pi
         return wrapped(other)
 
     @classmethod
     def of(cls, reach: Reach, repeats: int, antipodal: bool) -> Scheme:
+        """The scheme for a bench; raises InputError if antipodes are wanted and no gimbal reverses gravity."""
         if not antipodal:
             return cls(repeats)
         bench, width = reach.bench, len(reach.bench.axes)
@@ -92,18 +95,18 @@ class Scheme:
 
 @dataclass(frozen=True)
 class Search:
-    """Orientations are looked for within ``reach`` that make ``aim`` of the factor least."""
+    """A search for the orientations within ``reach`` that minimise ``aim``."""
 
     prospect: Prospect
     reach: Reach
     aim: Aim
     scheme: Scheme = Scheme()
     at_s: Floats | None = None
-    """The middles of the dwells where the orientations are a sequence of visits; None: each might be the next."""
+    """Middles of the dwells if the orientations are a sequence of visits; None if each might be the next."""
 
     @cached_property
     def candidates(self) -> Floats:
-        """Orientations (n, k) to choose from, of those that tell the same the least turned one."""
+        """Orientations (n, k) to choose from; of several with the same information, the one that is rotated least."""
         poses = self.reach.candidates
         if self.scheme.turned is not None:
             poses = poses[self.reach.allowed(self.scheme.antipodes(poses))]
@@ -115,6 +118,7 @@ class Search:
 
     @cached_property
     def candidate_rows(self) -> Floats:
+        """Whitened rows of the candidates."""
         return self.rows(self.candidates)
 
     def rows(self, poses: Floats) -> Floats:
@@ -123,11 +127,11 @@ class Search:
         return rows.reshape(len(poses), -1, rows.shape[2])
 
     def factor(self, rows: Floats) -> Floats:
-        """Factor (p, p) of what is known and rows (n, r, p)."""
+        """Information factor (p, p) of the prior information and rows (n, r, p)."""
         return triangle(np.vstack([self.prospect.start, rows.reshape(-1, rows.shape[-1])]))
 
     def refuse_unseen(self) -> None:
-        """Raise UnobservableError where even all candidates together leave parameters undetermined."""
+        """Raise UnobservableError if all candidates together leave parameters undetermined."""
         if not optimality_criteria.unseen(self.prospect.start).any():
             return
         lost = optimality_criteria.unseen(self.factor(self.candidate_rows))
@@ -139,7 +143,7 @@ class Search:
             )
 
     def best(self, count: int) -> Floats:
-        """``count`` orientations (count, k)."""
+        """The best ``count`` orientations found, (count, k)."""
         chosen = self.exchanged(count)
         poses = self.candidates[chosen]
         if not self.reach.continuous:
@@ -149,23 +153,26 @@ class Search:
         return min([poses, *polished], key=self.cost)
 
     def measure(self, poses: Floats) -> float:
-        """The aim of orientations (n, k)."""
+        """Value of the aim for orientations (n, k)."""
         return float(self.aim(self.factor(self.rows(poses))))
 
     def cost(self, poses: Floats) -> float:
+        """The cost that is minimised, for orientations (n, k)."""
         return float(self._score(self.factor(self.rows(poses))))
 
     def _score(self, factors: Floats, power: float = math.inf) -> Floats:
-        """The aim; of sets that serve it alike the one that tells more of everything is better."""
+        """Return the aim plus a small share of D, which decides between designs of equal aim."""
         return self.aim(factors, power) + _TIE * optimality_criteria.D(factors)
 
     def _scattered(self, count: int, seed: int) -> Floats:
+        """Choose random candidates to start from."""
         return np.random.default_rng(seed).choice(self.candidates, count)
 
     def exchanged(self, count: int) -> list[int]:
-        """Numbers of candidates: greedy, then exchanged; where they are all there is, from random starts as well.
+        """Indices of the best candidates, found by greedy choice followed by exchange.
 
-        Greedy by D, which every dwell can improve: a largest sigma falls only when all that is as large does.
+        If the candidates are the only possible orientations, random starts are tried as well. The greedy choice uses D,
+        which every dwell improves; a maximum over several sigmas falls only if all of the largest ones do.
         """
         rows, greedy = self.candidate_rows, list[int]()
         for _ in range(count):
@@ -176,7 +183,7 @@ class Search:
         return min(found, key=lambda each: float(self._score(self.factor(rows[each]))))
 
     def _exchanged(self, start: list[int]) -> list[int]:
-        """Each dwell exchanged for the best there is, until none changes."""
+        """Exchange each dwell for the best candidate until none changes."""
         rows, chosen = self.candidate_rows, list(start)
         for _ in range(_SWEEPS):
             before = list(chosen)
@@ -190,7 +197,10 @@ class Search:
         return chosen
 
     def _choice(self, score: Score, rest: Floats) -> tuple[int, float]:
-        """The candidate to go with rows ``rest`` (n, r, p), and the cost of both; those that promise most are tried."""
+        """Return the candidate that goes best with rows ``rest`` (n, r, p), and the cost of both.
+
+        If there are many candidates, only the most promising ones are evaluated.
+        """
         rows, upper = self.candidate_rows, self.factor(rest)
         wide = len(rows) > 8 * _FIRST
         tried = self._promising(score, upper) if wide else np.arange(len(rows))
@@ -200,7 +210,10 @@ class Search:
         return int(tried[k]), float(costs[k])
 
     def _promising(self, score: Score, upper: Floats) -> Ints:
-        """Candidates that the slope of the aim favours, a little of all of them added to what there is."""
+        """Return the candidates that the gradient of the aim favours.
+
+        To make the gradient finite, a little of all candidates is added to the rows so far.
+        """
         rows = self.candidate_rows
         some = (0.1 / math.sqrt(len(rows))) * rows.reshape(-1, rows.shape[2])
         spread = triangle(np.vstack([upper, some]))
@@ -209,7 +222,7 @@ class Search:
         return np.argsort(promise)[:_FIRST]
 
     def polished(self, poses: Floats) -> Floats:
-        """The orientations moved within their rooms to the least cost."""
+        """The orientations moved within their bounds to a local minimum of the cost."""
         shape, rooms = poses.shape, self._rooms(poses)
         for power in self.aim.powers:
             found = minimize(
@@ -220,6 +233,7 @@ class Search:
         return np.where(np.isfinite(rooms).any(axis=2), poses, wrapped(poses))
 
     def _rooms(self, poses: Floats) -> Floats:
+        """Return the bounds (n, k, 2) of each orientation within which it and its antipode are allowed."""
         rooms = self.reach.rooms(poses)
         if self.scheme.turned is None:
             return rooms
@@ -231,6 +245,7 @@ class Search:
         return np.stack([np.maximum(rooms, theirs)[..., 0], np.minimum(rooms, theirs)[..., 1]], axis=2)
 
     def _with_slope(self, flat: Floats, shape: tuple[int, int], power: float) -> tuple[float, Floats]:
+        """Return the cost and its gradient by all angles."""
         poses, gradient = flat.reshape(shape), np.empty(shape)
         rows = self.rows(poses)
         upper = self.factor(rows)
@@ -243,7 +258,8 @@ class Search:
         return float(self._score(upper, power)), gradient.ravel()
 
     def variance_function(self, rows: Floats, poses: Floats) -> tuple[float, float]:
-        """tr(M0 M^-1), and the largest tr(I(x) M^-1) that can be reached, M of the design ``rows`` (n, r, p)."""
+        """tr(M0 M^-1) and the largest tr(I(x) M^-1) that can be reached, where M is the information of the design
+        ``rows`` (n, r, p)."""
         inverse = np.linalg.inv(self.factor(rows))
 
         def at(poses: Floats) -> Floats:
@@ -259,10 +275,10 @@ class Search:
         return float(np.square(self.prospect.start @ inverse).sum()), largest
 
     def d_bound(self, rows: Floats) -> float:
-        """An upper bound of log det M*^(1/p) over all designs of as many orientations as ``rows`` (n, r, p).
+        """An upper bound of log det M*^(1/p) over all designs of as many orientations as ``rows`` (n, r, p) has.
 
-        Of three: by the design itself, which is tight where that is the optimum, by the best weights of candidates, and
-        by balanced directions.
+        It is the least of three bounds: from the design itself, which is tight at the optimum, from the best weights of
+        the candidates, and from balanced directions.
         """
         bounds, balanced = list[float](), self.prospect.balanced(len(rows) * self.scheme.copies)
         for design in (rows, self._weighted(len(rows)), *([] if balanced is None else [balanced])):
@@ -273,7 +289,8 @@ class Search:
         return min(bounds)
 
     def _weighted(self, count: int) -> Floats:
-        """Rows (c, r, p) of the candidates times the roots of their D-optimal weights, by multiplicative steps."""
+        """Return the rows (c, r, p) of the candidates times the roots of their D-optimal weights, found by
+        multiplicative updates."""
         rows = self.candidate_rows
         weights = np.full(len(rows), 1.0 / len(rows))
         for _ in range(_WEIGHINGS):
@@ -286,7 +303,8 @@ class Search:
         return np.sqrt(count * weights)[:, None, None] * rows
 
     def next(self) -> Floats:
-        """The orientation (k,) after which the cost is least: scattered ones first, then ever closer about the best."""
+        """The next orientation (k,) after which the cost is least, found by random search that narrows about the
+        best."""
         if not self.reach.continuous:
             return self._first_of(self.candidates)
         rng, (low, high) = np.random.default_rng(0), self.reach.bounds.T
@@ -298,14 +316,16 @@ class Search:
         return wrapped(best)
 
     def _allowed(self, poses: Floats) -> Mask:
+        """Return a mask of the poses that are allowed together with their antipodes."""
         inside = self.reach.allowed(wrapped(poses))
         return inside if self.scheme.turned is None else inside & self.reach.allowed(self.scheme.antipodes(poses))
 
     def _first_of(self, poses: Floats) -> Floats:
+        """Return the pose after which the cost is least."""
         rows, start = self.rows(poses), self.prospect.start
         so_far = np.broadcast_to(start, (len(rows), *start.shape))
         return poses[int(np.argmin(self._score(triangle(np.concatenate([so_far, rows], axis=1)))))]
 
     def without_limits(self) -> Search:
-        """The same over all that the axes can reach."""
+        """The same search over all orientations that the axes can reach."""
         return replace(self, reach=Reach(self.reach.bench), scheme=Scheme())

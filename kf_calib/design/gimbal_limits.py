@@ -1,7 +1,7 @@
-"""Which orientations a bench can take: limits of its gimbals, forbidden zones, a grid or a list of positions.
+"""The orientations that a bench can take: limits of its gimbals, forbidden zones, and a grid or a list of positions.
 
-Angles are between -180 and 180 deg, and a gimbal goes from one to the next by the straight way between the numbers, as
-a simulated bench does. ``poses`` are (n, k), rad.
+Angles are between -180 and 180 deg, and a gimbal moves from one to the next without crossing 180 deg, as a simulated
+bench does. ``poses`` are (n, k), rad.
 """
 
 from __future__ import annotations
@@ -24,9 +24,12 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Reach:
-    """limits_deg: of gimbals, by their number. zones_deg: boxes, each of ranges by gimbal, no angle of which is taken.
+    """The limits of a bench.
 
-    grid_deg: angles are multiples of it; positions_deg: the list there is; neither: any angle.
+    - limits_deg: range of each limited gimbal, by its number from 0.
+    - zones_deg: forbidden boxes, each given by ranges of some gimbals.
+    - grid_deg: angles have to be multiples of it; positions_deg: the possible poses. If both are None, any angle is
+      possible.
     """
 
     bench: Bench
@@ -37,11 +40,12 @@ class Reach:
 
     @property
     def continuous(self) -> bool:
+        """Whether angles are not restricted to a grid or a list."""
         return self.grid_deg is None and self.positions_deg is None
 
     @property
     def free(self) -> bool:
-        """Whether nothing but the axes binds."""
+        """Whether there is no restriction other than the axes."""
         return self.continuous and not self.limits_deg and not self.zones_deg
 
     @cached_property
@@ -51,7 +55,7 @@ class Reach:
 
     @cached_property
     def candidates(self) -> Floats:
-        """Allowed poses (n, k) to choose from, the least turned first; raises InputError where there is none."""
+        """Allowed poses (n, k) to choose from, the least rotated first; raises InputError if there are none."""
         if self.positions_deg is not None:
             poses = np.radians(np.asarray(self.positions_deg, float))
         else:
@@ -66,11 +70,12 @@ class Reach:
         return poses[np.argsort(np.abs(poses).sum(axis=1).round(9), kind="stable")]
 
     def _values(self, j: int) -> Floats:
+        """Return the candidate angles of one gimbal, rad."""
         low, high = self.bounds[j]
         if self.grid_deg is not None:
             step = math.radians(self.grid_deg)
             values: Floats = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
-            twice = j not in self.limits_deg and len(values) > 1 and _turns(values)  # -180 and 180 deg are one
+            twice = j not in self.limits_deg and len(values) > 1 and _turns(values)  # -180 and 180 deg are the same
             return values[: len(values) - twice]
         count = int(_POSES ** (1.0 / len(self.bench.axes)) + 1e-9)
         if j not in self.limits_deg:
@@ -79,7 +84,7 @@ class Reach:
         return np.unique(values)
 
     def allowed(self, poses: Floats) -> Mask:
-        """Which poses (n, k) are within the limits and in no forbidden zone, (n,) bool."""
+        """Mask (n,) of the poses (n, k) that are within the limits and in no forbidden zone."""
         low, high = self.bounds.T
         inside = ((poses >= low - 1e-9) & (poses <= high + 1e-9)).all(axis=1)
         for zone in self.zones_deg:
@@ -91,19 +96,20 @@ class Reach:
         return inside
 
     def rooms(self, poses: Floats) -> Floats:
-        """About each allowed pose (n, k) a box of allowed ones, (n, k, 2); unlimited gimbals may go round in it."""
+        """A box of allowed poses about each allowed pose (n, k), as (n, k, 2); gimbals without limits may go full
+        circle in it."""
         out = np.repeat(self.bounds[None], len(poses), axis=0)
         out[:, [j for j in range(poses.shape[1]) if j not in self.limits_deg]] = [-np.inf, np.inf]
         for room, pose in zip(out, poses, strict=True):
             for zone in self.zones_deg:
                 away = {j: _aside(pose[j], np.radians(ends)) for j, ends in zone.items()}
                 j = max(away, key=lambda each: min(away[each]))
-                below, above = away[j]  # to the zone's begin going up, to its end going down
+                below, above = away[j]  # upwards to the zone's beginning, downwards to its end
                 room[j] = max(room[j, 0], pose[j] - above + 1e-9), min(room[j, 1], pose[j] + below - 1e-9)
         return out
 
     def crosses(self, start: Floats, end: Floats) -> Mask:
-        """Which straight ways from ``start`` (..., k) to ``end`` (..., k) lead through a forbidden zone."""
+        """Mask of the straight ways from ``start`` (..., k) to ``end`` (..., k) that lead through a forbidden zone."""
         hit = np.zeros(np.broadcast_shapes(start.shape, end.shape)[:-1], bool)
         step = end - start
         for zone in self.zones_deg:
@@ -123,24 +129,26 @@ class Reach:
 
 
 def _turns(values: Floats) -> bool:
-    """Whether the last of evenly spaced angles is the first again."""
+    """Tell whether the last of evenly spaced angles equals the first."""
     return bool(abs(values[-1] - values[0] - 2.0 * np.pi) < 1e-9)
 
 
 def _aside(angle: float, zone: Floats) -> tuple[float, float]:
-    """How far up an angle may go before a zone begins, and how far down before it ends; negative inside."""
+    """Return how far an angle may increase before a zone begins, and how far decrease before it ends; negative
+    inside."""
     below, above = (zone[0] - angle) % (2.0 * np.pi), (angle - zone[1]) % (2.0 * np.pi)
     inside = (angle - zone[0]) % (2.0 * np.pi) <= zone[1] - zone[0]
     return (-1.0, -1.0) if inside else (float(below), float(above))
 
 
 def wrapped(poses: Floats) -> Floats:
-    """Angles from -180 up to 180 deg, rad."""
+    """Angles wrapped to the range from -180 to 180 deg, rad."""
     return np.pi - (np.pi - poses) % (2.0 * np.pi)
 
 
 def gimbal_named(text: str, bench: Bench) -> int:
-    """The number of a gimbal from its number (1: outer), its place (outer, middle, inner) or its axis (x, y, z)."""
+    """Number of a gimbal from its number (1 is the outer one), its place (outer, middle, inner) or its axis (x, y, z);
+    raises InputError."""
     names = bench.to_metadata()["axes"].split()
     count = len(names)
     places = dict(zip(_PLACES if count == 3 else ("outer", "inner")[:count], range(count), strict=False))
@@ -153,7 +161,7 @@ def gimbal_named(text: str, bench: Bench) -> int:
 
 
 def ranges(text: str, bench: Bench) -> dict[int, Range]:
-    """Ranges in deg by gimbal from ``z=-90:90`` or ``outer=0:30,x=-10:10``; raises InputError."""
+    """Ranges in deg by gimbal from text such as ``z=-90:90`` or ``outer=0:30,x=-10:10``; raises InputError."""
     out = dict[int, Range]()
     for part in text.split(","):
         name, equals, ends = part.strip().partition("=")

@@ -1,4 +1,5 @@
-"""Where to go next: the orientation that tells two suspects apart, shows what none has, or sharpens the twelve."""
+"""The choice of the next orientation: to tell effects apart, to make effects visible, or to reduce the twelve
+sigmas."""
 
 from __future__ import annotations
 
@@ -22,23 +23,26 @@ from kf_calib.estimation.noise_model import Noise, steps
 from kf_calib.estimation.square_root_information import accumulate, whiten
 
 ENOUGH = 6.0
-"""Sigma apart: of two equally likely the wrong one is taken once in a thousand, and more tells no more."""
+"""Separation in sigma that suffices: of two equally likely effects the wrong one is then chosen once in a thousand
+cases."""
 
 _POSES = 640
 _STEP_DEG = 5.0
 _STEPS = 12
-_WAY_S = 10.0  # to the next orientation, where there has been none
-_TOLD = 0.1  # sigma: effects that are less apart after any next dwell are told apart by none
-_MOVE = 3.0  # dwells: what it costs to go somewhere and stay for one
-_WAITS = (0.0, 0.25, 1.0)  # of the run so far, that may be spent where it goes next
+_WAY_S = 10.0  # assumed time to the next orientation after a single dwell
+_TOLD = 0.1  # sigma; effects with a smaller separation after any next dwell cannot be told apart
+_MOVE = 3.0  # dwells; the cost of one more visit
+_WAITS = (0.0, 0.25, 1.0)  # possible waits, as shares of the duration so far
 
 
 @dataclass(frozen=True)
 class Advice:
-    """Gimbal angles of the next orientation, deg; separation: in sigma, before and after a dwell there.
+    """The next orientation.
 
-    stay_s: how long to stay there, where it takes more than a dwell as they were so far.
-    told: what it tells apart.
+    - gimbal_deg: its gimbal angles.
+    - before, after: separation in sigma before and after a dwell there.
+    - stay_s: how long to stay; None for a dwell of the usual length.
+    - told: names of the effects that it tells apart.
     """
 
     gimbal_deg: tuple[float, ...]
@@ -49,13 +53,14 @@ class Advice:
 
 
 def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequence[Effect]) -> Advice | None:
-    """The orientation after which the effect ``one`` of this size differs most from each of the ``others``.
+    """The orientation after which the effect ``one`` with these coefficients differs most from each of the ``others``;
+    None without gimbals.
 
-    Separation: what is left of its signal, in sigma, when the model and the other have explained all they can; the
-    smallest over the others (no others: over the model alone). What differs in time only is told apart by time: a
-    longer stay is advised where the square of the separation grows by more an hour with it, to go somewhere being worth
-    three dwells, and 6 sigma as much as more. An effect that holds this one as a special case is told apart nowhere,
-    and left out.
+    The separation is the size in sigma of the part of its signal that the model and the other effect cannot explain;
+    the smallest over the others counts (over the model alone if there are no others). Effects that differ in their
+    course in time only are told apart by waiting: a longer stay is advised if it increases the squared separation more
+    per unit of time. One more visit is taken to cost three dwells, and separations above 6 sigma count as 6. Another
+    effect that contains this one as a special case cannot be told apart anywhere and is left out.
     """
     poses = _poses(fitted)
     if poses is None:
@@ -78,8 +83,8 @@ def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequen
 def _separations(
     fitted: Fit, one: Effect, coefficients: Floats, others: Sequence[Effect], poses: Floats, waits_s: Floats
 ) -> tuple[float, Floats]:
-    """What is left of an effect, in sigma, when the model and others have explained all they can: now, and after a
-    dwell at each pose after each wait (w, m)."""
+    """Return the separation of an effect from the model and others, in sigma: now, and after a dwell at each pose after
+    each wait (w, m)."""
     factor, rows = _with_next(fitted, [*others, one], poses, waits_s=waits_s)
     count = factor.shape[1] - len(coefficients)
     mix = np.zeros((factor.shape[1], count + 1))
@@ -90,7 +95,8 @@ def _separations(
 
 
 def to_show(fitted: Fit, hidden: Sequence[Effect]) -> tuple[Advice, int] | None:
-    """The orientation that shows most of what is ``hidden`` so far, each at the scale of its kind; and how many."""
+    """The orientation that makes most of the ``hidden`` effects visible, each of the scale of its kind, and their
+    number; None without gimbals."""
     poses = _poses(fitted)
     if poses is None or not hidden:
         return None
@@ -109,10 +115,11 @@ def to_show(fitted: Fit, hidden: Sequence[Effect]) -> tuple[Advice, int] | None:
 
 @dataclass(frozen=True)
 class Course:
-    """How the twelve sigmas would fall over the orientations that sharpen them most, one after another.
+    """The predicted decrease of the twelve sigmas over a sequence of orientations, each of which reduces them most.
 
-    gimbal_deg: the first of them; sigma (N + 1, 12): now and after each; dwells: so far; each_s: a dwell and the way
-    to it.
+    - gimbal_deg: the first orientation.
+    - sigma (N + 1, 12): the sigmas now and after each dwell.
+    - dwells: number of dwells so far; each_s: duration of a dwell and the slew to it.
     """
 
     gimbal_deg: tuple[float, ...]
@@ -121,14 +128,16 @@ class Course:
     each_s: float
 
     def sharpened(self, sizes: Floats) -> tuple[str, float]:
-        """The parameter whose sigma is largest over ``sizes`` (12,), and by which factor its sigma falls next."""
+        """The parameter whose sigma is largest relative to ``sizes`` (12,), and the factor by which the next dwell
+        reduces it."""
         worst = int(np.argmax(self.sigma[0] / sizes))
         return paper_parameters.SYMBOLS[worst], float(self.sigma[1, worst] / self.sigma[0, worst])
 
     def seconds_to(self, wanted: Floats, sigma: Floats) -> Floats:
-        """Seconds (12,) until each sigma is as wanted (12,); beyond the course they fall by the root of the dwells.
+        """Seconds (12,) until each sigma is as small as ``wanted`` (12,); beyond the course, sigmas fall with the root
+        of the dwells.
 
-        ``sigma`` (12,): as they are now; NaN counts as far from any target.
+        ``sigma`` (12,) are the present sigmas; NaN counts as larger than any target.
         """
         last, steps = self.sigma[-1], len(self.sigma) - 1
         reached = self.sigma <= wanted
@@ -138,17 +147,18 @@ class Course:
 
 
 def course(fitted: Fit, sizes: Floats, count: int = _STEPS) -> Course | None:
-    """The orientations that sharpen the twelve parameters most, each chosen after those before it.
+    """The sequence of orientations that reduce the twelve sigmas most, each chosen after those before it; None without
+    gimbals.
 
-    Of the candidates the one that makes the sum of (sigma / size)^2 smallest, which is ruled by the worst. ``sizes``
-    (12,): targets, or what sigmas are compared by; inf for what does not matter. None without gimbals.
+    Each minimises the sum of (sigma / size)^2, which the worst parameter dominates. ``sizes`` (12,) are targets or
+    scales of comparison, infinite for parameters that do not matter.
     """
     poses = _poses(fitted)
     if poses is None:
         return None
     factor, (rows,) = _with_next(fitted, [], poses, fitted.noise)
     jacobian = paper_parameters.jacobian(fitted.carried.state[:STATE_COUNT])
-    at_least = np.diag(1.0 / np.maximum(fitted.carried.sizes, 1.0))  # what is not seen at all: to the size of g
+    at_least = np.diag(1.0 / np.maximum(fitted.carried.sizes, 1.0))  # keeps all sigmas finite, at the size of g
     root = np.asarray(np.linalg.inv(triangle(np.vstack([factor, at_least]))), float)
     sigmas, first = [_sigmas(root, jacobian)], 0
     for number in range(count):
@@ -163,21 +173,22 @@ def course(fitted: Fit, sizes: Floats, count: int = _STEPS) -> Course | None:
 
 
 def _each_s(fitted: Fit) -> float:
-    """How long a dwell and the way to it take."""
+    """Return the usual duration of a dwell and the slew to it, s."""
     ends_s = fitted.carried.means.ends_s
     lengths = np.diff(ends_s[:, 0]) if len(ends_s) > 1 else np.ptp(ends_s, axis=1) + _WAY_S
     return float(np.median(lengths))
 
 
 def _sigmas(roots: Floats, jacobian: Floats) -> Floats:
-    """Sigmas (..., 12) of the paper's parameters from roots (..., p, p) of covariances."""
+    """Return the sigmas (..., 12) of the paper's parameters from roots (..., p, p) of covariances."""
     return np.asarray(np.linalg.norm(jacobian @ roots[..., :STATE_COUNT, :], axis=-1))
 
 
 def _narrowed(root: Floats, rows: Floats) -> Floats:
-    """Roots S (m, p, p) of the covariance S S^T after each of m sets of whitened rows (m, r, p), from that before.
+    """Return roots S (m, p, p) of the covariance S S^T after each of m sets of whitened rows (m, r, p), from the root
+    before.
 
-    S - S W^T M^-T (M + I)^-1 W, W the rows times S, M M^T = I + W W^T (Andrews, 1968).
+    The new root is S - S W^T M^-T (M + I)^-1 W, where W are the rows times S and M M^T = I + W W^T (Andrews, 1968).
     """
     seen = rows @ root
     turned, one = np.swapaxes(seen, 1, 2), np.eye(rows.shape[1])
@@ -188,8 +199,10 @@ def _narrowed(root: Floats, rows: Floats) -> Floats:
 
 
 def _poses(fitted: Fit) -> Floats | None:
-    """Gimbal angles (m, k) to choose from, rad: multiples of 45 deg and a spread of others, but not where the platform
-    is, which would not be set anew; None without gimbals."""
+    """Return gimbal angles (m, k), rad, to choose from; None without gimbals.
+
+    They are multiples of 45 deg and random others; the present pose is excluded, since it would not be set anew.
+    """
     count = len(fitted.carried.model.bench.axes)
     if not count:
         return None
@@ -208,8 +221,8 @@ def _with_next(
     noise: Noise | None = None,
     waits_s: Sequence[float] | Floats = (0.0,),
 ) -> tuple[Floats, Floats]:
-    """Triangle of the run so far over [H | G], and whitened rows (w, m, 3, p + q) of a dwell's mean after each wait at
-    each pose."""
+    """Return the triangular factor of [H | G] of the run so far, and the whitened rows (w, m, 3, p + q) of a dwell's
+    mean after each wait at each pose."""
     carried, noise = fitted.carried, noise or fitted.noise.judging
     model, state = carried.model, carried.state
     added = candidate_columns(carried.dwells, effects, model.bench, state)

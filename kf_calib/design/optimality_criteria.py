@@ -1,14 +1,14 @@
-"""What a set of orientations is good for: a number for an information factor, the smaller the better.
+"""Optimality criteria for sets of orientations, as functions of the information factor; smaller is better.
 
-An ``Aim`` is a function of the factor R (p, p), R^T R the information about the states. The planner asks for no more,
-so whatever can be told from R may be an aim: sizes of the twelve, or how far an effect or two can be told apart.
-The factors are those of a ``Prospect``: of parameters in their units (rad, 1, g; effects: their scale).
+An ``Aim`` is a function of the factor R (p, p), where R^T R is the information about the states. Anything that can be
+computed from R may be an aim, such as the sigmas of the twelve parameters or the separation of two effects. The factors
+are those of a ``Prospect``, of parameters in its units (rad, 1, g; effects: their scale).
 
-    D          log of the geometric mean of the principal sigmas: the generalised variance
-    A          log of the rms of all sigmas
-    E          log of the largest principal sigma, of any combination of the parameters
-    minimax    log of the largest sigma of a parameter, relative to what is tolerated
-    condition  log of the condition number of R
+  D          log of the geometric mean of the principal sigmas: the generalised variance
+  A          log of the rms of all sigmas
+  E          log of the largest principal sigma, of any combination of the parameters
+  minimax    log of the largest sigma of a parameter, relative to what is tolerated
+  condition  log of the condition number of R
 """
 
 from __future__ import annotations
@@ -39,9 +39,11 @@ Score = Callable[[Floats, float], Floats]
 
 @dataclass(frozen=True)
 class Aim:
-    """cost(factors (..., p, p), power) -> (...): smaller is better; a logarithm, so that what it measures is exp(cost).
+    """A criterion ``cost(factors (..., p, p), power) -> (...)``, which is the logarithm of the quantity that it
+    measures.
 
-    powers: where the cost has kinks it is led there by power means of these exponents; infinity: the cost itself.
+    If the cost has kinks, the optimisation uses power means with the exponents ``powers`` in turn; infinity stands for
+    the cost itself.
     """
 
     name: str
@@ -54,18 +56,22 @@ class Aim:
 
 
 def _geometric(factors: Floats, power: float) -> Floats:
+    """Return the log of the geometric mean of the principal sigmas."""
     return -np.log(np.abs(np.einsum("...ii->...i", regular(factors)))).mean(axis=-1)
 
 
 def _root_mean_square(factors: Floats, power: float) -> Floats:
+    """Return the log of the rms of all sigmas."""
     return 0.5 * np.log((sigmas(factors) ** 2).mean(axis=-1))
 
 
 def _principal(factors: Floats, power: float) -> Floats:
+    """Return the log of the largest principal sigma."""
     return _largest(-np.log(_singular(factors)), power)
 
 
 def _condition(factors: Floats, power: float) -> Floats:
+    """Return the log of the condition number."""
     logs = np.log(_singular(factors))
     return _largest(logs, power) + _largest(-logs, power)
 
@@ -77,7 +83,8 @@ CONDITION = Aim("condition", "condition number", _condition, _SOFT)
 
 
 def minimax(tolerated: Floats) -> Aim:
-    """The largest sigma over what is tolerated of it, (p,) in the units of the factors; infinity: anything is."""
+    """The aim to minimise the largest sigma relative to ``tolerated`` (p,), in the units of the factors; infinity
+    tolerates any."""
     asked = np.isfinite(tolerated)
 
     def cost(factors: Floats, power: float) -> Floats:
@@ -91,7 +98,8 @@ NAMED: dict[str, Aim] = {aim.name: aim for aim in (D, A, E, minimax(np.ones(12))
 
 
 def _largest(logs: Floats, power: float) -> Floats:
-    """Of logarithms (..., n): the largest, or the logarithm of the power mean, which has no kinks."""
+    """Return the largest of logarithms (..., n), or for finite ``power`` the logarithm of their power mean, which is
+    smooth."""
     top = logs.max(axis=-1)
     if not math.isfinite(power):
         return top
@@ -99,7 +107,7 @@ def _largest(logs: Floats, power: float) -> Floats:
 
 
 def regular(factors: Floats) -> Floats:
-    """Triangles with no zero on the diagonal: what is not seen gets a sigma of 1e12 of the best seen, not infinity."""
+    """Triangular factors without zeros on the diagonal; states that are not determined get large but finite sigmas."""
     size = np.abs(factors).max(axis=(-2, -1))[..., None, None]
     floor = _TINY * np.where(size > 0, size, 1.0)
     diagonal = np.abs(factors) < floor
@@ -107,27 +115,28 @@ def regular(factors: Floats) -> Floats:
 
 
 def _singular(factors: Floats) -> Floats:
+    """Return the singular values, none of which is zero."""
     values = np.linalg.svd(factors, compute_uv=False)
     return np.maximum(values, _TINY * np.maximum(values[..., :1], 1e-300))
 
 
 def sigmas(factors: Floats) -> Floats:
-    """1 sigma (..., p) of the states of factors (..., p, p)."""
+    """Sigmas (..., p) of the states of factors (..., p, p)."""
     return np.linalg.norm(np.linalg.inv(regular(factors)), axis=-1)
 
 
 def unseen(factor: Floats) -> Mask:
-    """Which states (p,) a factor does not determine."""
+    """Mask (p,) of the states that a factor does not determine."""
     _, singular, right = np.linalg.svd(factor)
     lost = right[singular <= 1e-9 * max(float(singular[0]), 1e-300)]
     return np.asarray((np.abs(lost) > 1e-6).any(axis=0))
 
 
 def slope(aim: Score, factor: Floats, power: float) -> Floats:
-    """G (p, p), symmetric: what an aim changes by when the information becomes R^T (1 + B) R is tr(G B).
+    """The gradient G (p, p) of an aim, symmetric: if the information becomes R^T (1 + B) R, the aim changes by tr(G B).
 
-    By central differences R (1 +- h N), upper triangular N; relative to R itself, so that it holds however badly the
-    parameters are seen.
+    It is computed by central differences R (1 +- h N) with upper triangular N. These are relative to R itself and so
+    remain accurate however weakly parameters are determined.
     """
     count, h = len(factor), 1e-5
     rows, columns = np.triu_indices(count)
@@ -140,7 +149,8 @@ def slope(aim: Score, factor: Floats, power: float) -> Floats:
 
 
 def tolerated(texts: tuple[str, ...], gravity_mps2: float) -> Floats:
-    """What is tolerated of each parameter (12,), in rad, 1, g, from ``K=2ppm``, ``b2=20ug``, ``angles=0.1arcsec``."""
+    """Tolerated sigma of each parameter (12,), in rad, 1 and g, from texts such as ``K=2ppm``, ``b2=20ug``,
+    ``angles=0.1arcsec``; raises InputError."""
     out = np.full(len(paper_parameters.SYMBOLS), np.inf)
     for text in texts:
         name, equals, size = text.replace(" ", "").partition("=")
@@ -158,12 +168,13 @@ def tolerated(texts: tuple[str, ...], gravity_mps2: float) -> Floats:
 
 
 def _names_of(symbol: str) -> set[str]:
-    """A parameter goes by its symbol, by that without its number, and the angles together as ``angles``."""
+    """Return the names of a parameter: its symbol, its symbol without number, and ``angles`` for an angle."""
     kind = symbol.rstrip("123")
     return {symbol, kind, *(["angles"] if kind in _KINDS["rad"] else [])}
 
 
 def _size(text: str, size: str, kind: str) -> float:
+    """Return the size in SI of a number with a unit."""
     unit = size.lstrip("+-.0123456789")
     if unit[:1] in ("e", "E") and unit[1:2] and unit[1] in "+-0123456789":
         unit = unit[1:].lstrip("+-0123456789")

@@ -1,12 +1,12 @@
-"""Orientations for the bench at hand: which ones, in which order, and how well the parameters will be known.
+"""Plans of a calibration: which orientations, in which order, and how well the parameters will be known.
 
-    prospect = Prospect.of_bench(bench, sigma_mps2=1e-4, readings=100, dwell_s=30.0)   # or Prospect.after(run.fit)
-    search = Search(prospect, Reach(bench, {1: (-90.0, 90.0)}), aims.D)
-    made = plan(search, 12, Timing(dwell_s=30.0, slew_degps=20.0))
-    made.gimbal_deg, made.sigma[-1], made.d_efficiency
+  prospect = Prospect.of_bench(bench, sigma_mps2=1e-4, readings=100, dwell_s=30.0)   # or Prospect.after(run.fit)
+  search = Search(prospect, Reach(bench, {1: (-90.0, 90.0)}), optimality_criteria.D)
+  made = plan(search, 12, Timing(dwell_s=30.0, slew_degps=20.0))
+  made.gimbal_deg, made.sigma[-1], made.d_efficiency
 
-Whatever is a function of the information factor can be planned for (``optimality_criteria``); the sigmas predicted are
-those of the filter after each dwell, the dwells in their order.
+Any function of the information factor can be planned for (``optimality_criteria``). The predicted sigmas are those of
+the filter after each dwell, in the order of the plan.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.reml import directions
 from kf_calib.support.threads import one_blas_thread
 
-_DIGITS = 2  # of an angle in deg
-_LITTLE = 1  # of degrees of freedom: no judgement of a model
-_WEAK = 10.0  # times the sigma by balanced directions
-_MOST = 400  # dwells a plan with --fewest may have
+_DIGITS = 2  # decimals of an angle in deg
+_LITTLE = 1  # with so few degrees of freedom the model cannot be judged
+_WEAK = 10.0  # relative to the sigma with balanced directions
+_MOST = 400  # largest number of dwells with --fewest
 
 
 @dataclass(frozen=True)
 class Plan:
-    """poses (n, k), rad, in the order they are visited."""
+    """A plan with its poses (n, k), rad, in the order of the visits."""
 
     search: Search
     poses: Floats
@@ -46,21 +46,23 @@ class Plan:
 
     @property
     def prospect(self) -> Prospect:
+        """The predicted information of the search."""
         return self.search.prospect
 
     @property
     def gimbal_deg(self) -> Floats:
+        """The gimbal angles (n, k), deg."""
         return np.degrees(self.poses).round(10) + 0.0
 
     @cached_property
     def at_s(self) -> Floats:
-        """The middle of each dwell (n,), on the clock of the run so far."""
+        """Middles of the dwells (n,), s, on the clock of the run so far."""
         last = self.prospect.last
         return middles_s(self.poses, self.timing) + (last.end_s + PAUSE_S if last else 0.0)
 
     @cached_property
     def factors(self) -> Floats:
-        """What is known before the first dwell and after each, (n + 1, p, p)."""
+        """Information factors (n + 1, p, p) before the first dwell and after each."""
         out = [self.prospect.start]
         for rows in self.prospect.rows(self.poses, self.at_s):
             out.append(triangle(np.vstack([out[-1], rows])))
@@ -68,21 +70,21 @@ class Plan:
 
     @cached_property
     def sigma(self) -> Floats:
-        """1 sigma (n + 1, p) of the parameters in SI, before the first dwell and after each; NaN: not determined."""
+        """Sigmas (n + 1, p) of the parameters in SI before the first dwell and after each; NaN if not determined."""
         out = optimality_criteria.sigmas(self.factors) * self.prospect.units
         return np.where([optimality_criteria.unseen(factor) for factor in self.factors], np.nan, out)
 
     @cached_property
     def directions(self) -> Floats:
-        """Where the specific force points in the platform frame, (n, 3)."""
+        """Unit vectors (n, 3) of the specific force in the platform frame."""
         force = self.prospect.stimulus(self.poses, self.at_s).force_mps2
         return force / np.linalg.norm(force, axis=1, keepdims=True)
 
     @cached_property
     def condition_number(self) -> float:
-        """The paper's: of the readings per unit of the twelve parameters (rad, 1, g), a row for a dwell and channel.
+        """The paper's condition number: that of the readings' derivatives by the twelve parameters (rad, 1, g).
 
-        After a run so far: of the factor, which has its dwells, too.
+        For a plan that continues a run it is that of the factor, which includes the run's dwells.
         """
         if self.prospect.last is not None:
             return float(np.linalg.cond(self.factors[-1][:STATE_COUNT, :STATE_COUNT]))
@@ -92,18 +94,18 @@ class Plan:
 
     @cached_property
     def cost(self) -> float:
-        """What the aim measures, after the last dwell."""
+        """The quantity that the aim measures, after the last dwell."""
         return float(np.exp(self.search.aim(self.factors[-1])))
 
     @cached_property
     def generalised_sigma(self) -> float:
-        """Geometric mean of the principal sigmas of the twelve (rad, 1, g) that this plan adds by itself."""
+        """Geometric mean of the principal sigmas of the twelve (rad, 1, g) from this plan alone."""
         rows = self.prospect.rows(self.poses, self.at_s)[:, :, :STATE_COUNT].reshape(-1, STATE_COUNT)
         return math.exp(float(optimality_criteria.D(triangle(rows))))
 
     @cached_property
     def papers_generalised_sigma(self) -> float:
-        """The same of the paper's set, as many readings in each of its orientations."""
+        """The same for the paper's optimal set with as many readings in each of its orientations."""
         covariances = papers_covariances(self.prospect)
         units = self.prospect.units[:STATE_COUNT].reshape(3, 4)
         scaled = covariances / (units[:, :, None] * units[:, None, :])
@@ -111,36 +113,43 @@ class Plan:
 
     @cached_property
     def _rows(self) -> Floats:
+        """Return the whitened rows of the plan's dwells."""
         return self.prospect.rows(self.poses)
 
     @cached_property
     def _everywhere(self) -> Search:
+        """Return the search without limits of the gimbals."""
         return self.search.without_limits()
 
     @cached_property
     def d_efficiency(self) -> float:
-        """(det M / det M*)^(1/p), at least: M* the best information of as many dwells, no limits on the gimbals."""
+        """A lower bound of the D-efficiency (det M / det M*)^(1/p), where M* is the best information of as many dwells
+        without limits of the gimbals."""
         return self._efficiency(self._everywhere)
 
     @cached_property
     def d_efficiency_within_reach(self) -> float:
-        """The same where M* keeps the limits."""
+        """The same where M* observes the limits."""
         return self._efficiency(replace(self.search, scheme=type(self.search.scheme)()))
 
     def _efficiency(self, search: Search) -> float:
+        """Return a lower bound of the D-efficiency relative to the best design of a search."""
         own = -2.0 * float(optimality_criteria.D(search.factor(self._rows)))
         return math.exp(own - search.d_bound(self._rows))
 
     @cached_property
     def largest_variance(self) -> float:
-        """N max_x tr(I(x) M^-1) + tr(M0 M^-1), no limits on the gimbals; the number of parameters where D-optimal."""
+        """N max_x tr(I(x) M^-1) + tr(M0 M^-1) without limits of the gimbals; the number of parameters if the plan is
+        D-optimal."""
         known, largest = self._everywhere.variance_function(self._rows, self._everywhere.candidates)
         return known + len(self.poses) * largest
 
     @cached_property
     def balanced_sigma(self) -> Floats | None:
-        """1 sigma (p,) in SI by as many dwells in balanced directions; of white noise the closed form
-        sigma sqrt(3/N)/g of angles and scale factors, sigma/sqrt(N) of biases. None with effects in the model."""
+        """Sigmas (p,) in SI from as many dwells in balanced directions; None if there are effects in the model.
+
+        In white noise these are sigma sqrt(3/N)/g for angles and scale factors and sigma/sqrt(N) for biases.
+        """
         balanced = self.prospect.balanced(len(self.poses))
         return (
             None if balanced is None else optimality_criteria.sigmas(self.search.factor(balanced)) * self.prospect.units
@@ -153,18 +162,20 @@ class Plan:
 
     @cached_property
     def slews_s(self) -> Floats:
-        """Seconds of the slews between the dwells (n - 1,), and to the first where the platform stands somewhere."""
+        """Durations of the slews between the dwells (n - 1,), s, preceded by that to the first if the present pose is
+        known."""
         last = self.prospect.last
         way = self.poses if last is None else np.vstack([last.pose, self.poses])
         return slews_s(way[1:], way[:-1], self.timing.slew_degps)
 
     @property
     def duration_s(self) -> float:
+        """Duration of the whole plan, s."""
         return float(len(self.poses) * self.timing.dwell_s + self.slews_s.sum())
 
     @cached_property
     def remarks(self) -> list[str]:
-        """What a reader of the plan must know, one sentence each."""
+        """One sentence on each thing that a reader of the plan must know."""
         said = list[str]()
         through = int(self.search.reach.crosses(self.poses[:-1], self.poses[1:]).sum())
         if through:
@@ -177,7 +188,7 @@ class Plan:
         return [*said, *self._weaknesses()]
 
     def _weaknesses(self) -> Iterator[str]:
-        """Where a plan from nothing leaves little to go by."""
+        """Yield the weaknesses of a plan that does not continue a run."""
         if self.prospect.last is not None:
             return
         different, count = directions(self.directions), len(self.prospect.symbols)
@@ -199,7 +210,7 @@ class Plan:
 
 
 def plan(search: Search, count: int, timing: Timing, seed: int = 0) -> Plan:
-    """The plan of ``count`` dwells; raises UnobservableError where it would leave parameters unseen, naming them."""
+    """The plan of ``count`` dwells; raises UnobservableError, naming them, if parameters would remain undetermined."""
     copies = search.scheme.copies
     if count < 1 or count % copies:
         raise InputError(f"{count} dwells are no whole number of {copies} visits each: ask for a multiple of {copies}.")
@@ -210,19 +221,21 @@ def plan(search: Search, count: int, timing: Timing, seed: int = 0) -> Plan:
         poses = _rounded(search, search.scheme.visits(chosen))
         made = Plan(search, _ordered(search, poses, timing, seed), timing)
         if search.reach.continuous and search.prospect.model.bench.reference == "inertial" and copies == 1:
-            sequence = replace(search, at_s=made.at_s)  # gravity turns on while the visits follow each other
+            sequence = replace(search, at_s=made.at_s)  # gravity turns with the Earth during the plan
             made = Plan(search, _rounded(search, sequence.polished(made.poses)), timing)
         _refuse_unseen(made)
         return made
 
 
 def fewest(search: Search, timing: Timing, seed: int = 0, on_try: Callable[[int], None] = lambda count: None) -> Plan:
-    """The plan of fewest dwells whose aim, relative sigmas, is at most 1 (``optimality_criteria.minimax`` of what is
-    tolerated)."""
+    """The plan with the fewest dwells whose aim, relative sigmas, is at most 1 (``optimality_criteria.minimax``).
+
+    ``on_try`` is called with each number of dwells that is tried. Raises InputError if too many would be needed.
+    """
     copies, tried = search.scheme.copies, dict[int, float]()
 
     def ratio(count: int) -> float:
-        """What the best ``count`` orientations measure."""
+        """Return the aim of the best ``count`` orientations; infinite if they leave parameters undetermined."""
         if count not in tried:
             on_try(count * copies)
             enough = not optimality_criteria.unseen(search.factor(search.candidate_rows[search.exchanged(count)])).any()
@@ -233,7 +246,7 @@ def fewest(search: Search, timing: Timing, seed: int = 0, on_try: Callable[[int]
         search.refuse_unseen()
         count = 1
         while (excess := ratio(count)) > 1.0:
-            # sigma falls with the root of the number at best: a step by that never goes too far without a prior
+            # sigma falls at best with the root of the number, so that without a prior such a step never goes too far
             guess = count + 1 if math.isinf(excess) else max(math.floor(count * excess**2), count + 1)
             if guess * copies > _MOST:
                 raise InputError(
@@ -247,8 +260,8 @@ def fewest(search: Search, timing: Timing, seed: int = 0, on_try: Callable[[int]
 
 
 def papers_covariances(prospect: Prospect) -> Floats:
-    """Covariances (3, 4, 4) in SI of each accelerometer's four parameters by the paper's optimal set: four orientations
-    for each alone."""
+    """Covariances (3, 4, 4) in SI of each accelerometer's four parameters from its own four orientations in the paper's
+    optimal set."""
     parameters = paper_parameters.nominal(prospect.model.bench.nominal)
     force = prospect.model.bench.gravity_mps2 * paper_parameters.optimal_directions(parameters)
     made = paper_parameters.design(force, parameters)
@@ -257,12 +270,12 @@ def papers_covariances(prospect: Prospect) -> Floats:
 
 
 def papers_sigma(prospect: Prospect) -> Floats:
-    """1 sigma (12,) in SI by the paper's optimal set."""
+    """Sigmas (12,) in SI from the paper's optimal set."""
     return np.sqrt(np.einsum("ijj->ij", papers_covariances(prospect))).ravel()
 
 
 def _rounded(search: Search, poses: Floats) -> Floats:
-    """Angles that can be dialled, still within the limits."""
+    """Return angles rounded to what can be dialled, within the limits."""
     if not search.reach.continuous:
         return poses
     rounded = np.radians(np.degrees(poses).round(_DIGITS))
@@ -272,12 +285,14 @@ def _rounded(search: Search, poses: Floats) -> Floats:
 
 
 def _ordered(search: Search, poses: Floats, timing: Timing, seed: int) -> Floats:
+    """Return the poses in the order of the visits."""
     last, bench = search.prospect.last, search.prospect.model.bench
     force = bench.specific_force(np.zeros(len(poses)), poses)
     return poses[order(poses, force, timing, search.reach, last.pose if last else None, seed)]
 
 
 def _refuse_unseen(made: Plan) -> None:
+    """Raise UnobservableError if the plan leaves parameters undetermined."""
     lost = optimality_criteria.unseen(made.factors[-1])
     if lost.any():
         names = ", ".join(symbol for symbol, own in zip(made.prospect.symbols, lost, strict=True) if own)

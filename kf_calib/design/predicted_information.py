@@ -1,8 +1,8 @@
-"""What dwells still to come would tell: whitened rows for any orientation, before it is visited.
+"""The information that future dwells will give: their whitened rows for any orientation, before it is visited.
 
-The states are the paper's parameters about where they are thought to be, in rad, 1 and g, then the effects' in their
-scale. A row is divided by its noise: that of the readings, averaged over the dwell, and the setting error and scatter
-of the dwell (``noise_model.mean_covariances``).
+The states are the paper's parameters about their expected values, in rad, 1 and g, then the coefficients of effects in
+their scale. A row is whitened by its noise: that of the readings, averaged over the dwell, and the dwell's setting
+error and scatter (``noise_model.mean_covariances``).
 """
 
 from __future__ import annotations
@@ -29,13 +29,14 @@ from kf_calib.estimation.noise_model import Noise, considered_information, lift_
 from kf_calib.estimation.prior import Prior
 
 PAUSE_S = 60.0
-"""Until a plan begins that goes on with a run; or the next dwell, where there were no two that would tell."""
+"""Pause before the first dwell of a plan that continues a run, and between dwells if the run has a single dwell."""
 
 _SINCE_ARRIVAL_S = 15.0
 
 
 def _icosahedron() -> Floats:
-    """Its vertices (12, 3): means over them of all polynomials up to degree 5 are those over the sphere."""
+    """Return the vertices (12, 3) of an icosahedron; means over them of polynomials up to degree 5 equal those over the
+    sphere."""
     golden = 0.5 * (1.0 + math.sqrt(5.0))
     corners = np.array([[0.0, one, other * golden] for one in (1.0, -1.0) for other in (1.0, -1.0)])
     return np.concatenate([np.roll(corners, k, axis=1) for k in range(3)]) / math.hypot(1.0, golden)
@@ -46,7 +47,12 @@ _ICOSAHEDRON = _icosahedron()
 
 @dataclass(frozen=True)
 class Last:
-    """The dwell before those to come: when it ended, pose (k,), specific force (3,), temperature, variances (3,)."""
+    """The dwell before the future ones.
+
+    - end_s: when it ended.
+    - pose (k,), force_mps2 (3,), temperature_c: its conditions.
+    - variance_mps2_2 (3,): variances of its readings.
+    """
 
     end_s: float
     pose: Floats
@@ -61,10 +67,13 @@ class Last:
 
 @dataclass(frozen=True)
 class Prospect:
-    """model, state (p,): what is estimated, and where it is linearised. noise, readings: of a dwell of ``dwell_s``.
+    """The expected measurements of future dwells.
 
-    known (p, p): factor of what is known already, of the states; zeros: nothing. last: the dwell before; None: none.
-    pause_s: from its end until the next dwell begins.
+    - model, state (p,): what is estimated, and where it is linearised.
+    - noise, readings, dwell_s: noise, number of readings and duration of a dwell.
+    - known (p, p): information factor of what is known already; zeros for nothing.
+    - last: the dwell before; None if there is none.
+    - pause_s: time from its end to the beginning of the next dwell.
     """
 
     model: Model
@@ -78,7 +87,7 @@ class Prospect:
 
     @classmethod
     def of_bench(cls, bench: Bench, sigma_mps2: float, readings: float, dwell_s: float) -> Prospect:
-        """Of a run that has not begun: nothing is known, and dwells scatter by what the bench states."""
+        """The prospect of a run that has not begun: nothing is known, and dwells scatter as the bench states."""
         model = Model(bench)
         scatter = np.full(3, bench.scatter_sigma_mps2 or 0.0)
         setting_rad = math.radians(bench.angle_sigma_deg or 0.0)
@@ -87,7 +96,8 @@ class Prospect:
 
     @classmethod
     def following(cls, fitted: Fit) -> Prospect:
-        """Of a run so far, dwells to come like those it has had; what is known by it is left out."""
+        """The prospect after a run so far, with dwells like those of the run; the information from the run is not
+        included."""
         carried, last = fitted.carried, fitted.dwells[-1]
         dwell_s = float(np.median([dwell.end_s - dwell.start_s for dwell in fitted.dwells]))
         temperature_c = float(last.pieces[-1].nodes.temperature_c[-1])
@@ -99,7 +109,7 @@ class Prospect:
 
     @classmethod
     def after(cls, fitted: Fit, prior: Prior | None = None) -> Prospect:
-        """Of a run so far, with what is known by it: the filter's own factor."""
+        """The prospect after a run so far, with the information from it: the filter's own factor."""
         carried, noise, made = fitted.carried, fitted.noise, replace(cls.following(fitted), pause_s=PAUSE_S)
         first = square_root_information.start(prior or Prior(), carried.model)
         steps = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)
@@ -110,13 +120,13 @@ class Prospect:
 
     @cached_property
     def units(self) -> Floats:
-        """SI units (p,) a unit of each state is worth: rad, 1, g, and the scale of effects."""
+        """Size (p,) in SI of the unit of each state: rad, 1, g, and the scale of effects."""
         scales = np.array([coefficient.scale for coefficient in self.model.coefficients])
         return np.append(np.tile([1.0, 1.0, 1.0, self.model.bench.gravity_mps2], 3), scales)
 
     @cached_property
     def transform(self) -> Floats:
-        """d affine state / d state of the prospect, (p, p)."""
+        """The Jacobian d affine state / d state of the prospect, (p, p)."""
         out = np.diag(self.units)
         twelve = paper_parameters.sensitivity_jacobian(paper_parameters.parameters_of(self.state[:STATE_COUNT]))
         out[:STATE_COUNT, :STATE_COUNT] = twelve * self.units[:STATE_COUNT]
@@ -124,30 +134,34 @@ class Prospect:
 
     @cached_property
     def start(self) -> Floats:
-        """Factor (p, p) of what is known already, of the states of the prospect."""
+        """Information factor (p, p) of what is known already, for the states of the prospect."""
         return triangle(self.known @ self.transform)
 
     @property
     def symbols(self) -> tuple[str, ...]:
+        """Symbols of the states."""
         return (*paper_parameters.SYMBOLS, *(coefficient.symbol for coefficient in self.model.coefficients))
 
     @property
     def still_s(self) -> float:
-        """The part of a dwell whose readings are used."""
+        """Duration of the part of a dwell whose readings are used, s."""
         margins = Stillness()
         return max(self.dwell_s - margins.settle_s - margins.lead_s, 0.5 * self.dwell_s)
 
     def rows(self, poses: Floats, at_s: Floats | None = None) -> Floats:
         """Whitened rows (n, 3, p) of dwells at poses (n, k), rad.
 
-        ``at_s`` (n,): the middles of dwells that follow each other. Without it each would be the next.
+        ``at_s`` (n,) are the middles of consecutive dwells; without it, each pose is that of the next dwell.
         """
         stimulus = self.stimulus(poses, at_s)
         return self.whitened(self.model.columns(stimulus, self.state), stimulus) @ self.transform
 
     def balanced(self, count: int) -> Floats | None:
-        """Whitened rows (12, 3, p) that ``count`` dwells have in all, their directions spread as the vertices of an
-        icosahedron, wherever the gimbals may go; None where effects are in the model, which may depend on more."""
+        """Whitened rows (12, 3, p) equivalent to ``count`` dwells in directions spread as the vertices of an
+        icosahedron, without regard to limits.
+
+        None if there are effects in the model, which may depend on more than the direction.
+        """
         if self.model.effects:
             return None
         stimulus = self.stimulus(np.zeros((len(_ICOSAHEDRON), len(self.model.bench.axes))))
@@ -156,9 +170,9 @@ class Prospect:
         return math.sqrt(count / len(_ICOSAHEDRON)) * rows
 
     def columns(self, effects: Sequence[Effect], poses: Floats, wait_s: float = 0.0) -> Floats:
-        """Whitened columns (n, 3, p + q) of the affine model and further effects, of the next dwell at each pose.
+        """Whitened columns (n, 3, p + q) of the affine model and further effects for the next dwell at each pose.
 
-        wait_s: of the usual length, but so long after the arrival.
+        The dwell has the usual length but begins ``wait_s`` later after the arrival.
         """
         stimulus = self.stimulus(poses)
         since_arrival_s = stimulus.since_arrival_s + wait_s
@@ -167,6 +181,7 @@ class Prospect:
         return self.whitened(np.concatenate(own, axis=2), stimulus)
 
     def whitened(self, design: Floats, stimulus: Stimulus) -> Floats:
+        """The design (n, 3, p) of dwells' means, whitened by their noise."""
         count = len(stimulus)
         means = Means(design, np.zeros((count, 3)), stimulus.force_mps2, np.full(count, self.readings),
                       np.zeros((count, 2)))  # fmt: skip
@@ -174,7 +189,7 @@ class Prospect:
         return np.asarray(np.linalg.solve(root, design), float)
 
     def stimulus(self, poses: Floats, at_s: Floats | None = None) -> Stimulus:
-        """What the block would feel at poses (n, k)."""
+        """The expected conditions at poses (n, k)."""
         bench, count, last = self.model.bench, len(poses), self.last
         following = at_s is not None
         if at_s is None:
@@ -201,7 +216,7 @@ class Prospect:
 
 
 def _less(factor: Floats, more: Floats) -> Floats:
-    """The factor (p, p) of the covariance P + P B P, B = ``more`` (p, p): what is considered only
+    """Return the factor (p, p) of the covariance P + P B P, where B = ``more`` (p, p) is due to considered parameters
     (``noise_model.considered_information``)."""
     if not more.any() or np.linalg.matrix_rank(
         square_root_information.scale_columns(np.column_stack([factor, factor[:, :1]]))[0]

@@ -1,8 +1,8 @@
-"""In which order orientations are visited: slews short, and time uncorrelated with the direction of gravity.
+"""The order in which orientations are visited: slews are short, and time is uncorrelated with the direction of gravity.
 
-A drift of a sensor in proportion to time passes for a change of its parameters as far as the times of the visits go
-with the columns of the model. The number for it: the multiple correlation of the times with the three components of
-the specific force, 0 to 1.
+A sensor drift that is linear in time is mistaken for a change of the parameters to the extent that the times of the
+visits are correlated with the columns of the model. This is measured by the multiple correlation of the times with the
+three components of the specific force, 0 to 1.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from kf_calib.bench.arrays import Floats, Ints
 from kf_calib.design.gimbal_limits import Reach
 
 PEAK_OVER_MEAN = 1.875
-"""Of the speed of a minimum-jerk slew."""
+"""Ratio of peak to mean speed of a minimum-jerk slew."""
 
-_CROSSING_S = 1e4  # what a way through a forbidden zone costs: no order takes one that can avoid it
-_AGAIN_S = 1e3  # what it costs not to leave an orientation that is to be visited again
+_CROSSING_S = 1e4  # cost of a way through a forbidden zone, which is avoided if possible
+_AGAIN_S = 1e3  # cost of two successive visits of the same orientation
 _MOVES, _FRUITLESS, _STARTS = 400, 12, 6
 
 
 @dataclass(frozen=True)
 class Timing:
-    """How long a dwell is, how fast the fastest gimbal slews, the greatest correlation of time that is tolerated."""
+    """Duration of a dwell, s; peak speed of a slew, deg/s; and the largest correlation with time that is tolerated."""
 
     dwell_s: float
     slew_degps: float
@@ -33,43 +33,46 @@ class Timing:
 
 
 def slews_s(one: Floats, other: Floats, slew_degps: float) -> Floats:
-    """Seconds from pose to pose (..., k), rad: the gimbal that has farthest to go reaches the greatest speed."""
+    """Durations of slews between poses (..., k), rad, in seconds; the gimbal with the longest way reaches the peak
+    speed."""
     return PEAK_OVER_MEAN * np.degrees(np.abs(one - other)).max(axis=-1) / slew_degps
 
 
 def middles_s(poses: Floats, timing: Timing) -> Floats:
-    """Middle of each dwell (n,), from the beginning of the first."""
+    """Middle of each dwell (n,), s, from the beginning of the first."""
     return _middles(slews_s(poses[1:], poses[:-1], timing.slew_degps)[None], timing.dwell_s)[0]
 
 
 def _middles(slews: Floats, dwell_s: float) -> Floats:
-    """(b, n) from the slews (b, n - 1) between the dwells."""
+    """Return the middles (b, n) from the slews (b, n - 1) between the dwells."""
     steps = np.concatenate([np.full((len(slews), 1), 0.5 * dwell_s), slews + dwell_s], axis=1)
     return np.cumsum(steps, axis=1)
 
 
 def time_correlation(middles: Floats, columns: Floats) -> float:
-    """Multiple correlation of times (n,) with columns (n, c); 1 where there are no more times than columns can fit."""
+    """Multiple correlation of times (n,) with columns (n, c); 1 if the columns can fit any times."""
     return float(_correlations(middles[None], _space(columns))[0])
 
 
 def _space(columns: Floats) -> Floats:
-    """Orthonormal basis (n, r) of the columns (n, c) about their means."""
+    """Return an orthonormal basis (n, r) of the columns (n, c) about their means."""
     left, singular, _ = np.linalg.svd(columns - columns.mean(axis=0), full_matrices=False)
     return left[:, singular > 1e-6 * max(float(singular[0]), 1e-300)]
 
 
 def _correlations(times: Floats, space: Floats) -> Floats:
-    """Of times (b, n), each by visit."""
+    """Return the multiple correlations of times (b, n), each in order of the visits."""
     centred = times - times.mean(axis=1, keepdims=True)
     spread = np.linalg.norm(centred, axis=1)
     return np.linalg.norm(centred @ space, axis=1) / np.where(spread > 0, spread, 1.0)
 
 
 def order(poses: Floats, columns: Floats, timing: Timing, reach: Reach, start: Floats | None, seed: int = 0) -> Ints:
-    """The order (n,) of visits to poses (n, k): least time in slews among those that keep the correlation small.
+    """The order (n,) of visits to poses (n, k) with the least time in slews among those that keep the correlation
+    small.
 
-    By swaps and reversals from several random orders. ``start`` (k,): where the platform stands; None: anywhere.
+    It is found by swaps and reversals from several random orders. ``start`` (k,) is the present pose; None if it does
+    not matter.
     """
     count = len(poses)
     if count < 2:
@@ -101,6 +104,7 @@ def order(poses: Floats, columns: Floats, timing: Timing, reach: Reach, start: F
 
 
 def _improved(tour: Ints, cost: Callable[[Ints], Floats], rng: np.random.Generator) -> tuple[Ints, float]:
+    """Improve an order by random moves until a number of them in sequence brings no gain."""
     least, fruitless = float(cost(tour[None])[0]), 0
     while fruitless < _FRUITLESS:
         moved = _moves(tour, rng)
@@ -113,7 +117,7 @@ def _improved(tour: Ints, cost: Callable[[Ints], Floats], rng: np.random.Generat
 
 
 def _moves(tour: Ints, rng: np.random.Generator) -> Ints:
-    """The tour (n,) with two visits swapped, or those between two reversed, at random: (m, n)."""
+    """Return random variants (m, n) of an order (n,), with two visits swapped or those between two reversed."""
     count = len(tour)
     ends = np.sort(rng.integers(0, count, (_MOVES, 2)), axis=1)
     low, high = ends.T[:, :, None]

@@ -1,1 +1,1 @@
-"""From a stream of samples to square-root sufficient statistics of each dwell."""
+"""The segmentation of sample streams into dwells, and the square-root sufficient statistics of each dwell."""

@@ -1,4 +1,4 @@
-"""Blocks of readings of one dwell, and the account of what became of all readings."""
+"""Blocks of readings of one dwell, and the count of what became of all readings."""
 
 from __future__ import annotations
 
@@ -12,22 +12,26 @@ from kf_calib.dwells.slew_kinematics import Curve
 from kf_calib.dwells.stationarity import Stillness
 
 LARGEST_MPS2 = 1e12
-"""Beyond any reading, counts of a 32-bit converter included: those are for the check of the unit to tell."""
+"""Readings beyond this are dropped. Counts of a 32-bit converter are below it, so that the check of the unit sees
+them."""
 LARGEST_RAD = 1e6
-"""Beyond any angle: 160 000 turns, of which a double keeps the fraction to 1e-10 rad."""
+"""Angles beyond this are dropped: 160 000 turns, of which a double keeps the fraction to 1e-10 rad."""
 LARGEST_C = 1e6
-"""Beyond any temperature."""
-_TURNING_DEG = 1.0  # in a block: a platform that only creeps stays below
+"""Temperatures beyond this are dropped."""
+_TURNING_DEG = 1.0  # within one block; a platform that only creeps turns by less
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Up to 4000 consecutive readings of one dwell, which began at ``arrival_s``, or of the slew that ended it.
+    """Up to 4000 consecutive readings of one dwell, or of the slew that ended it.
 
-    dwell: its number, counted from 1.
-    arrival_s: as the angles tell it; felt_s: as the readings do, from which on they settle (None: not known better).
-    elapsed_s (n,) since the first sample of the recording; accel_mps2 (n, 3); pose (1, k): the mean of the angle
-    messages while the platform stands still, or (n, k) where it creeps; temperature_c (n,), NaN where not measured.
+    - dwell: number of the dwell, counted from 1.
+    - arrival_s: its arrival according to the angles; felt_s: according to the readings, from which settling is counted;
+      None if not known separately.
+    - elapsed_s (n,): time since the first sample of the recording.
+    - accel_mps2 (n, 3): the readings.
+    - pose (1, k): the mean pose if the platform stands still; (n, k) if it creeps.
+    - temperature_c (n,): NaN where it was not measured.
     """
 
     dwell: int
@@ -37,25 +41,25 @@ class Block:
     pose: Floats
     temperature_c: Floats
     curve: Curve | None = None
-    """How the angles went, in a slew; None in a dwell."""
+    """The course of the angles in a slew; None in a dwell."""
     variance_mps2_2: Floats | None = None
-    """Of averaged readings: variance (n, 3) of those that each was made of."""
+    """Variance (n, 3) of the readings in each average, if the block holds averages."""
     taken: int = 1
-    """How many readings each new one stands for."""
+    """Number of readings that each row stands for."""
     felt_s: float | None = None
     pose_sigma_rad: float = 0.0
-    """What the noise of the angles leaves uncertain of the pose, 1 sigma."""
+    """Standard deviation of the pose due to noise of the angles."""
     turns: tuple[int, ...] = ()
-    """Whole turns of each gimbal by which ``pose`` goes beyond the angles as they were recorded; () of quaternions."""
+    """Whole turns of each gimbal by which ``pose`` goes beyond the angles as recorded; () for quaternions."""
 
 
 @dataclass
 class Tally:
-    """What became of every sample that was read; ``sentences`` says what a user should know of it.
+    """Counts of what became of every sample that was read; ``sentences`` reports those that a user should know.
 
-    slewing: used though the platform moved; moving: not used because it did. short_dwells: those too short for the
-    whole margin after their arrival, least_settling_s: what the shortest had. turned_deg: how far the platform turned,
-    at most, in a block that counts as still.
+    - slewing: readings of slews that were used; moving: readings not used because the platform moved.
+    - short_dwells: dwells too short for the whole margin after the arrival; least_settling_s: the shortest margin used.
+    - turned_deg: largest rotation of the platform within a block that counts as still.
     """
 
     read: int = 0
@@ -80,6 +84,7 @@ class Tally:
     turned_deg: float = 0.0
 
     def sentences(self) -> list[str]:
+        """One sentence for each kind of sample that was dropped or rejected."""
         backward_s = self.first_backward_s or 0.0
         said = {
             "not_finite": "readings that were not finite (NaN or infinite), dropped: {}.",
@@ -96,7 +101,7 @@ class Tally:
         return [text.format(getattr(self, key)) for key, text in said.items() if getattr(self, key)]
 
     def unmet(self, stillness: Stillness) -> list[str]:
-        """What was asked for and could not be done, one sentence each."""
+        """One sentence for each setting that could not be followed."""
         said, one = list[str](), self.short_dwells == 1
         if self.short_dwells:
             said.append(
@@ -113,6 +118,6 @@ class Tally:
 
 
 def within(values: Floats, largest: float) -> Mask | None:
-    """Which rows (m, k) hold nothing that is not finite or beyond ``largest``; None: all of them."""
+    """Mask of the rows (m, k) whose values are all finite and at most ``largest``; None if all rows are."""
     size = np.abs(values)
     return None if size.max(initial=0.0) <= largest else np.asarray((size <= largest).all(axis=1))

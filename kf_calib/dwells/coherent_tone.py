@@ -1,9 +1,10 @@
-"""The readings of dwells in cells of the run's clock, and the search for an oscillation that keeps its phase.
+"""The search for an oscillation that keeps its phase over the whole run.
 
-Spectra of segments are averaged in power, which does not show an oscillation as weak as one that a fit over the whole
-run would find. Here the means of cells of all dwells, each dwell less its parabola, are transformed at once: a sinusoid
-of one phase all along then adds up in amplitude. It is looked for from a cycle or two a dwell, where a parabola leaves
-most of it, up to the few hertz that the cells hold.
+Spectra that are averaged in power do not show an oscillation as weak as a fit over the whole run would detect. Here the
+readings of all dwells are averaged in cells of the run's clock, the parabola of each dwell is removed, and all cells
+are transformed at once, so that a sinusoid of constant phase adds up in amplitude. The search begins at about 1.5
+cycles per dwell, above which a parabola leaves most of the oscillation, and ends at the few hertz that the cells
+resolve.
 """
 
 from __future__ import annotations
@@ -18,24 +19,25 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.dwells.line_spectrum import Line, independent
 
-_CELL_S = 0.125  # at most, where readings come more often
-_LONGEST = 1 << 15  # cells of a dwell that are kept: more than an hour
-_LONGEST_RUN = 1 << 20  # cells of a run that are transformed at once: a day and a half
-_FEWEST_CYCLES = 1.5  # a dwell: of fewer a parabola takes more than half
-_HIGHEST = 0.75  # of half the rate of cells
-_BANDS, _BAND_POINTS = 40, 16  # of equal ratio, and frequencies in each at least, whose median gives the noise under it
-_DEGREE = 3  # of the curve through them, in logarithms
-_ROUNDING = 1e-12  # of a reading
+_CELL_S = 0.125  # largest length of a cell, unless readings are less frequent
+_LONGEST = 1 << 15  # cells of a dwell that are kept at most: more than an hour
+_LONGEST_RUN = 1 << 20  # cells of a run that are transformed at most: a day and a half
+_FEWEST_CYCLES = 1.5  # per dwell; of a slower oscillation a parabola takes more than half
+_HIGHEST = 0.75  # highest frequency, as a share of half the rate of cells
+_BANDS, _BAND_POINTS = 40, 16  # bands of equal ratio, with at least so many frequencies; their medians give the noise
+_DEGREE = 3  # degree of the polynomial through the logarithms of these medians
+_ROUNDING = 1e-12  # relative to a reading
 _KNOTS = 1000
-_TALL = 32  # of all heights; how well the noise is known under each decides among them
-_MEDIAN_EFFICIENCY = 0.48  # of the median of independent exponential variates
+_TALL = 32  # number of tallest peaks that are compared by their p-values
+_MEDIAN_EFFICIENCY = 0.48  # efficiency of the median of independent exponential variates
 
 
 @dataclass(frozen=True)
 class Cells:
-    """The run's clock in cells of ``readings`` readings, which come every ``step_s``.
+    """The division of the run's clock into cells of ``readings`` readings each, which come every ``step_s``.
 
-    Cells of another length would hold now more and now fewer readings: a beat, at which slow noise shows again.
+    A cell has a whole number of readings because the count would otherwise alternate between cells, and the resulting
+    beat would fold slow noise into the band.
     """
 
     step_s: float
@@ -43,7 +45,7 @@ class Cells:
 
     @classmethod
     def of(cls, elapsed_s: Floats) -> Cells | None:
-        """For readings that come as these do; None for too few."""
+        """Cells for readings at these times; None if there are too few readings."""
         if len(elapsed_s) < 3:
             return None
         step_s = float(np.median(np.diff(elapsed_s)))
@@ -51,16 +53,18 @@ class Cells:
 
     @property
     def cell_s(self) -> float:
+        """Length of a cell, s."""
         return self.step_s * self.readings
 
     def places(self, elapsed_s: Floats) -> NDArray[np.intp]:
-        """Of instants: readings on time lie in the middle between the ends of two steps."""
+        """Numbers of the cells in which these times lie; readings on schedule lie in the middle of their step."""
         return ((elapsed_s / self.step_s + 0.5) / self.readings).astype(np.intp)
 
 
 @dataclass(frozen=True)
 class Trace:
-    """Sums (m, 3) and counts (m,) of a dwell's readings in consecutive cells of the run's clock from ``first`` on."""
+    """Sums (m, 3) and counts (m,) of a dwell's readings in consecutive cells of the run's clock, beginning with cell
+    ``first``."""
 
     cell_s: float = _CELL_S
     first: int = 0
@@ -69,7 +73,7 @@ class Trace:
 
     @classmethod
     def of(cls, readings: Floats, elapsed_s: Floats, into: Cells) -> Trace:
-        """Of a block (n, 3) at instants (n,), which rise."""
+        """The sums of a block of readings (n, 3) at increasing times (n,)."""
         cells = into.places(elapsed_s)
         starts = np.append(0, np.flatnonzero(cells[1:] != cells[:-1]) + 1)
         places, length = cells[starts] - cells[0], int(cells[-1] - cells[0]) + 1
@@ -98,7 +102,8 @@ class Trace:
 
     @property
     def left(self) -> Floats:
-        """Sums (m, 3) less the parabola nearest to the readings."""
+        """The sums (m, 3) after the least-squares parabola of the readings, weighted by their counts, has been
+        removed."""
         roots = np.sqrt(self.counts)[:, None]
         seen = roots[:, 0] > 0
         curve = np.linalg.qr(roots[seen] * np.vander(np.linspace(-1.0, 1.0, len(self)), 3)[seen])[0]
@@ -109,7 +114,7 @@ class Trace:
 
 
 def band_hz(traces: Sequence[Trace]) -> tuple[float, float]:
-    """From which frequency to which ``tone`` looks for an oscillation; infinite where it cannot."""
+    """Lowest and highest frequency at which ``tone`` searches; infinite if it cannot."""
     seen = [trace for trace in traces if len(trace)]
     if not seen or np.diff(_ends(seen)) > _LONGEST_RUN:
         return np.inf, np.inf
@@ -118,22 +123,22 @@ def band_hz(traces: Sequence[Trace]) -> tuple[float, float]:
 
 
 def _ends(traces: Sequence[Trace]) -> tuple[int, int]:
-    """The first cell of a run and that after the last."""
+    """Return the first cell of a run and the one after the last."""
     return min(trace.first for trace in traces), max(trace.first + len(trace) for trace in traces)
 
 
 def _usual_s(traces: Sequence[Trace]) -> float:
-    """Length of the dwell in which the middle of all cells lies."""
+    """Return the length of the dwell that contains the median cell when dwells are sorted by length."""
     lengths = np.sort([len(trace) for trace in traces])
     return float(lengths[np.searchsorted(np.cumsum(lengths), 0.5 * lengths.sum())] * traces[0].cell_s)
 
 
 def tone(traces: Sequence[Trace], level: float = 0.01) -> Line | None:
-    """The likeliest oscillation of one frequency and one phase in all dwells, if its p-value of the run is below
-    ``level``; None where there is none, or where what there is keeps no phase.
+    """The most likely oscillation of constant frequency and phase in all dwells, or None.
 
-    Its height is the mean over the channels of |X|^2 over the noise around, which is gamma distributed with 2 degrees
-    of freedom a channel where there is none.
+    It is returned if its p-value over the whole band is below ``level`` and if it keeps its phase from dwell to dwell.
+    The test statistic at a frequency is the mean over the channels of |X|^2 divided by the noise level, which without
+    an oscillation is gamma distributed with 2 degrees of freedom per channel.
     """
     from scipy.special import fdtrc
 
@@ -172,9 +177,11 @@ def tone(traces: Sequence[Trace], level: float = 0.01) -> Line | None:
 
 
 def _steady(traces: Sequence[Trace], frequency_hz: float, noise: Floats, moving: Mask) -> bool:
-    """Whether more than half of the power at a frequency keeps its phase from dwell to dwell: else it is vibration.
+    """Tell whether more than half of the power at a frequency keeps its phase from dwell to dwell; otherwise it is
+    vibration.
 
-    noise (c,): what |X|^2 of all dwells is without it; in a dwell it is less by its share of the readings.
+    ``noise`` (c,) is the expected |X|^2 over all dwells without the oscillation; in a single dwell it is proportional
+    to the number of readings.
     """
     waves = [
         np.exp(-2j * np.pi * frequency_hz * trace.cell_s * (trace.first + np.arange(len(trace)))) @ trace.left
@@ -189,8 +196,11 @@ def _steady(traces: Sequence[Trace], frequency_hz: float, noise: Floats, moving:
 
 
 def _kept(half_phase: Floats) -> Floats:
-    """What a parabola over a dwell leaves of the power of a sinusoid that has the phase 2 x in it: 1 - sum over l of
-    (2 l + 1) j_l(x)^2, j_l the spherical Bessel functions, l = 0, 1, 2."""
+    """Return the share of a sinusoid's power that remains after a parabola over a dwell is removed.
+
+    If the phase advances by 2 x over the dwell, the share is 1 - sum over l = 0, 1, 2 of (2 l + 1) j_l(x)^2, where j_l
+    are the spherical Bessel functions.
+    """
     from scipy.special import spherical_jn
 
     orders = np.arange(3)[:, None]
@@ -198,10 +208,11 @@ def _kept(half_phase: Floats) -> Floats:
 
 
 def _levels(power: Floats, frequency_hz: Floats, padded: float) -> tuple[Floats, Floats]:
-    """The noise (c, b) under |X|^2 (c, b) as a smooth curve, and the relative variance (b,) to which it is known.
+    """Return the noise level (c, b) of |X|^2 (c, b) as a smooth curve, and the relative variance (b,) of the curve.
 
-    Medians of bands do not follow a line; a cubic in logarithms follows white noise and what rises to low frequencies.
-    ``padded``: frequencies a 1/run.
+    The curve is a cubic through the logarithms of medians in bands. Medians are insensitive to lines, and a cubic
+    follows white noise as well as noise that rises to low frequencies. ``padded`` is the number of frequencies per
+    independent one.
     """
     x = np.log(frequency_hz)
     x = 2.0 * (x - x[0]) / (x[-1] - x[0]) - 1.0

@@ -1,4 +1,4 @@
-"""The order of stamps, and what the platform angles tell of a dwell: arrival, departure."""
+"""The order of stamps in a stream, and the arrivals and departures that delimit dwells."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from kf_calib.bench.streams import Stream
 from kf_calib.dwells.blocks import Tally
 
 SECOND_NS = 1_000_000_000
-_LEAP_NS = 10 * SECOND_NS  # a stamp this far ahead, with the next one behind it, is a damaged stamp
+_LEAP_NS = 10 * SECOND_NS  # a stamp this far ahead is damaged if the next one is earlier
 
 
 class StampOrder:
-    """Keeps the samples of a stream whose stamps advance; counts the others."""
+    """Keeps the samples of a stream whose stamps increase, and counts the others."""
 
     def __init__(self) -> None:
         self.last_ns: int | None = None
@@ -36,6 +36,7 @@ class StampOrder:
         return self._one_by_one(stream, tally or Tally(), first_ns)
 
     def _one_by_one(self, stream: Stream, tally: Tally, first_ns: int | None) -> Stream:
+        """Check the stamps one at a time, as needed where one is out of order or far ahead."""
         stamps: list[int] = stream.time_ns.tolist()
         keep = np.zeros(len(stamps), bool)
         for i, stamp in enumerate(stamps):
@@ -48,7 +49,7 @@ class StampOrder:
                         tally.first_backward_s = (self.last_ns - (first_ns or stamps[0])) / SECOND_NS
                 continue
             if self.last_ns is not None and stamp - self.last_ns >= _LEAP_NS:
-                if i + 1 == len(stamps) and not self._ended:  # only the next stamp can tell a gap from a damaged stamp
+                if i + 1 == len(stamps) and not self._ended:  # the next stamp tells a gap from damage
                     self._held = stream[i:]
                     break
                 if i + 1 < len(stamps) and stamps[i + 1] < stamp:
@@ -59,25 +60,31 @@ class StampOrder:
         return stream[keep]
 
     def flush(self) -> Stream:
-        """What was held back at the end of the stream; to be passed through once more."""
+        """Return the samples that were held back at the end of the stream; they have to be passed through once more."""
         self._ended = True
         held, self._held = self._held, Stream.empty(0)
         return held
 
 
 class DwellEvent(Enum):
+    """What happens at a stamp: the platform leaves a dwell or arrives in one."""
+
     LEAVE = 0
     ARRIVE = 1
 
 
 @dataclass
 class OpenDwell:
-    """The open dwell: its number, its arrival, and the first pose message that belongs to it.
+    """The open dwell.
 
-    felt_ns: the arrival as the readings tell it; what settles counts from there.
-    settling_ns: what is left out after the arrival; None while the dwell may still be too short for the whole margin.
-    pose (1, k): where the platform stands, from the messages of the dwell's first block; pose_sigma_rad: of these.
-    turns: by which its poses go beyond the angles as they were recorded.
+    - number: its number, counted from 1.
+    - arrival_ns: its arrival according to the angles.
+    - felt_ns: its arrival according to the readings, from which settling is counted.
+    - first_pose_ns: stamp of the first pose message that belongs to it.
+    - settling_ns: length of the margin left out after the arrival; None while it is not known whether the dwell is long
+      enough for the whole margin.
+    - pose (1, k): mean pose from the messages of its first block; pose_sigma_rad: its uncertainty.
+    - turns: whole turns by which its poses go beyond the angles as recorded.
     """
 
     number: int
@@ -91,13 +98,15 @@ class OpenDwell:
 
 
 def carry_on(slow: Stream, at_ns: Times) -> Floats:
-    """A slow quantity at ``at_ns`` (n,): the line through its last two samples, for as long as they lie apart.
+    """A slowly varying quantity at ``at_ns`` (n,), extrapolated from its last two samples; NaN before the first sample.
 
-    Nothing waits for the next sample, and holding the last would be late by half their distance. NaN before the first.
+    The line through the last two samples is followed for as long as they lie apart, and the value is held afterwards.
+    This does not wait for the next sample, and avoids the delay of half a sampling period that holding the last value
+    has.
     """
     if not len(slow):
         return np.full(len(at_ns), np.nan)
-    counts = np.diff(np.searchsorted(at_ns, slow.time_ns), prepend=0, append=len(at_ns))  # before the first, of each
+    counts = np.diff(np.searchsorted(at_ns, slow.time_ns), prepend=0, append=len(at_ns))  # before the first, after each
     begins_ns, levels = np.append(0, slow.time_ns), np.append(np.nan, slow.values[:, 0])
     steps_ns = np.append([1, 1], np.diff(slow.time_ns))
     rises = np.where(steps_ns > 0, np.append([0.0, 0.0], np.diff(slow.values[:, 0])), 0.0)

@@ -1,8 +1,8 @@
-"""The innovation gate: single readings that disagree with the rest of their dwell are rejected and counted.
+"""The innovation gate: rejects and counts single readings that disagree with the rest of their dwell.
 
-The innovation of a reading is judged after the dwell's own level has been removed, so that an orientation in which
-the model fails (the evidence of a missing effect) is never rejected as a whole.
-Innovations are (3, n), a channel a row: reductions along contiguous memory are several times faster.
+The innovation of a reading is taken about the level of the dwell itself, so that an orientation in which the model
+fails, which is the evidence for a missing effect, is never rejected as a whole. Innovations are stored as (3, n), one
+row per channel, because reductions along contiguous memory are several times faster.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ _GAUSSIAN_MAD = 1.4826  # median absolute deviation -> sigma, for Gaussian noise
 
 
 def innovations(columns: Floats, readings: Floats, static: bool, keep: Mask | None = None) -> Floats:
-    """Readings (n, 3) less their least-squares fit by the columns (n, c) within the block; (3, n).
+    """Readings (n, 3) less their least-squares fit by the columns (n, c) within the block, as (3, n).
 
-    In a ``static`` block (constant columns, a still platform) the fit is the mean. ``keep``: the readings fitted.
+    In a ``static`` block (constant columns, platform at rest) the fit is the mean. ``keep`` selects the readings that
+    are fitted.
     """
     channels = np.ascontiguousarray(readings.T)
     chosen = slice(None) if keep is None else keep
@@ -30,10 +31,11 @@ def innovations(columns: Floats, readings: Floats, static: bool, keep: Mask | No
 
 
 def inliers(columns: Floats, readings: Floats, innovation: Floats, static: bool, threshold: float) -> Mask | None:
-    """Which readings pass, (n,) bool; None: all of them.
+    """Mask (n,) of the readings that pass the gate; None if all do.
 
-    A reading is rejected where any channel's innovation, from the block's median, exceeds ``threshold`` robust sigma
-    (1.4826 times the median absolute deviation; the plain deviation where that is zero, as on coarse steps).
+    A reading is rejected if the innovation in any channel differs from the block's median by more than ``threshold``
+    robust standard deviations: 1.4826 times the median absolute deviation or, where that is zero because of coarse
+    quantisation, the ordinary standard deviation.
     """
     count = len(readings)
     if count < 8:
@@ -56,16 +58,20 @@ def inliers(columns: Floats, readings: Floats, innovation: Floats, static: bool,
 
 
 def channels(rejected: Floats, kept: Floats, threshold: float) -> Mask:
-    """In which channels rejected readings lie out, (3, m) bool, from innovations (3, m) and those kept (3, n).
+    """Mask (3, m) of the channels in which rejected readings are outliers, from the innovations of rejected (3, m) and
+    kept (3, n) readings.
 
-    One at least: the channel that is farthest out in its own sigma.
+    At least one channel is marked, the one with the largest deviation in its own sigma.
     """
     score = np.abs(rejected) / np.maximum(kept.std(axis=1, keepdims=True), 1e-12)
     return score >= np.minimum(threshold, score.max(axis=0))
 
 
 def _plainly_clean(innovation: Floats, threshold: float) -> bool:
-    """Whether the medians can be spared: no reading stands out, and the rms is that of the bulk (of a sample of it)."""
+    """Tell whether a quick test already shows that there are no outliers, so that the medians need not be computed.
+
+    No reading may stand out, and the rms must agree with a robust estimate from a sample.
+    """
     rms = np.sqrt(np.einsum("ij,ij->i", innovation, innovation) / innovation.shape[1])
     if (np.maximum(innovation.max(axis=1), -innovation.min(axis=1)) > min(4.5, threshold) * rms).any():
         return False

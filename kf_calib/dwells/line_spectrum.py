@@ -1,9 +1,9 @@
-"""The averaged power spectrum of the readings within dwells, and the test for lines in it.
+"""The averaged power spectrum of the readings within dwells, and a test for spectral lines.
 
-Readings less their parabola are cut into segments of equal length, tapered by Hann's window (a strong line or a steep
-noise then stays near its own bins), and |X|^2 is averaged. A bin is a line where it stands out of the noise under it;
-that is an autoregression for the slope of a coloured noise, a cubic in logarithms for its rise to low frequencies, and
-the median of the bins around for what these leave.
+Readings without their parabola are cut into segments of equal length and multiplied by a Hann window, which confines a
+strong line or steep noise to nearby bins; then |X|^2 is averaged over the segments. A bin is a line if it stands out of
+the noise level, which is the product of an autoregressive spectrum (the slope of coloured noise), a cubic in logarithms
+(the rise to low frequencies) and the median of the neighbouring bins (the remainder).
 """
 
 from __future__ import annotations
@@ -17,20 +17,22 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Mask
 
 _LENGTHS = np.array(sorted([4000, *(2**k for k in range(6, 12)), *(3 * 2**k for k in range(5, 11))]))
-_FIRST_BIN = 3  # below, the parabola has taken the power
+_FIRST_BIN = 3  # in lower bins the parabola has removed the power
 _ORDER = 8
-_NEIGHBOURS, _OWN = 32, 3  # bins on either side that give the level, less those a line may fill
-_MEDIAN_EFFICIENCY = 0.45  # of the median of bins that Hann's window has made alike, against as many independent ones
-_BENT, _CUBIC = 128, 3  # up to this bin noise may rise to low frequencies as no autoregression does (1/f)
+_NEIGHBOURS, _OWN = 32, 3  # bins on either side that give the level, without those that a line may fill
+_MEDIAN_EFFICIENCY = 0.45  # efficiency of the median of bins that the Hann window has correlated
+_BENT, _CUBIC = 128, 3  # up to this bin a rise that no autoregression follows (1/f) is fitted
 _MOST = 5
-_LEAK = 0.05  # of the level: bins in which a line leaves more are not searched for another
+_LEAK = 0.05  # bins into which a line leaks more than this share of the level are not searched for another
 
 
 @dataclass(frozen=True)
 class Line:
-    """A peak of the spectrum over its surroundings; channel: where it stands out most; amplitude_mps2 (3,).
+    """A spectral line.
 
-    p_value: of the run, how likely noise without a line has a peak as high, anywhere in the spectrum.
+    - p_value: the probability that noise alone has a peak as high anywhere in the spectrum.
+    - channel: the channel (from 0) in which it stands out most.
+    - amplitude_mps2 (3,): its amplitude in each channel.
     """
 
     frequency_hz: float
@@ -41,7 +43,8 @@ class Line:
 
 @dataclass(frozen=True)
 class _Sum:
-    """Of segments of one length: power |X|^2 summed (bins, 3), segments, seconds they last in all."""
+    """Sums over segments of one length: the power |X|^2 (bins, 3), the number of segments, and their total duration,
+    s."""
 
     power: Floats
     segments: int
@@ -53,7 +56,7 @@ class _Sum:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Power of segments of readings, summed by length of segment: at most 48 kB a length."""
+    """Power of segments of readings, summed separately for each length of segment; at most 48 kB for each length."""
 
     sums: dict[int, _Sum] = field(default_factory=dict)
 
@@ -63,7 +66,8 @@ class Spectrum:
 
     @classmethod
     def of(cls, left: Floats, elapsed_s: Floats) -> Spectrum:
-        """Of a block (3, n) without its parabola, at instants (n,); in segments of the longest length that fits."""
+        """The spectrum of a block (3, n) without its parabola at times (n,), in segments of the longest length that
+        fits."""
         count = left.shape[1]
         place = int(np.searchsorted(_LENGTHS, count, side="right")) - 1
         if place < 0:
@@ -77,9 +81,9 @@ class Spectrum:
 
 
 def lines(spectra: Iterable[Spectrum], level: float = 0.01) -> tuple[Line, ...]:
-    """The lines of a run whose p-value is below ``level``, the likeliest first, from the spectra of its dwells.
+    """The lines of a run whose p-value is below ``level``, the most significant first, from the spectra of its dwells.
 
-    The length of segment in which most readings came is used; channels that do not vary are left out.
+    The segment length that covers most readings is used; channels that do not vary are left out.
     """
     length, own = _most(spectra)
     if own is None:
@@ -91,25 +95,26 @@ def lines(spectra: Iterable[Spectrum], level: float = 0.01) -> tuple[Line, ...]:
 
 
 def lowest_hz(spectra: Iterable[Spectrum]) -> float:
-    """From which frequency on ``lines`` looks for lines; infinite where there is no spectrum."""
+    """Lowest frequency at which ``lines`` searches; infinite if there is no spectrum."""
     own = _most(spectra)[1]
     return np.inf if own is None else _FIRST_BIN * own.segments / own.duration_s
 
 
 def _most(spectra: Iterable[Spectrum]) -> tuple[int, _Sum | None]:
-    """The length of segment in which most readings came, and the sum over these segments."""
+    """Return the segment length that covers most readings, and the sum over its segments."""
     total = reduce(Spectrum.__add__, spectra, Spectrum())
     length = max(total.sums, key=lambda each: each * total.sums[each].segments, default=0)
     return length, total.sums.get(length)
 
 
 class _Search:
-    """For lines in the sum of segments of one length.
+    """The search for lines in the sum of segments of one length.
 
-    A bin's height is the mean over the channels of power over level. In white noise a channel's share of it is gamma
-    distributed with 2 degrees of freedom a segment, so the mean has up to 6, fewer where channels share their noise.
-    Over a level from the median of n neighbours it is about F distributed, as from a mean of 0.45 n bins; of fewer
-    where the cubic follows single bins.
+    The statistic of a bin is the mean over the channels of power divided by noise level. In white noise, power over
+    level is gamma distributed with 2 degrees of freedom per segment in each channel, so that the mean has up to 6 per
+    segment, fewer if the channels share noise. Because the level is estimated from the median of n neighbours, which is
+    as precise as the mean of 0.45 n bins, the statistic is approximately F distributed; it has fewer denominator
+    degrees of freedom where the cubic follows single bins.
     """
 
     def __init__(self, own: _Sum, length: int, moving: Mask) -> None:
@@ -122,6 +127,7 @@ class _Search:
         self.freedom = 2.0 * own.segments * independent(self.heights[_FIRST_BIN:-1, moving])
 
     def lines(self, level: float) -> tuple[Line, ...]:
+        """The lines whose p-value is below ``level``."""
         found, open_ = list[Line](), self._peaks()
         bins = len(self.height) - _FIRST_BIN - 1
         while open_.any() and len(found) < _MOST:
@@ -135,7 +141,7 @@ class _Search:
         return tuple(found)
 
     def _peaks(self) -> Mask:
-        """Bins (b,) that are at least as high as both their neighbours."""
+        """Return a mask (b,) of the bins that are at least as high as both neighbours."""
         out = np.zeros(len(self.height), bool)
         inner = self.height[1:-1]
         out[1:-1] = (inner >= self.height[:-2]) & (inner >= self.height[2:])
@@ -143,7 +149,7 @@ class _Search:
         return out
 
     def _chance(self, k: int) -> float:
-        """That noise alone makes bin ``k`` as high."""
+        """Return the probability that noise alone makes bin ``k`` as high as it is."""
         from scipy.special import fdtrc
 
         neighbours = max(min(2 * (_NEIGHBOURS - _OWN), len(self.height) - 2 * _OWN), 1)
@@ -151,8 +157,9 @@ class _Search:
         return float(fdtrc(self.freedom, self.freedom / relative, self.height[k]))
 
     def _line(self, k: int, p_value: float) -> tuple[Line, float]:
-        """The line in bin ``k``, and between which bins it lies: Hann's lobe is sin(pi x) / (pi x (1 - x^2)) / 2."""
-        # heights over the level at one bin: under a strong line the level itself has slopes
+        """Return the line in bin ``k`` and its position between bins, from the main lobe of the Hann window, sin(pi x)
+        / (pi x (1 - x^2)) / 2."""
+        # heights relative to the level at one bin, since a strong line makes the level itself vary
         near = np.maximum((self.power[k - 2 : k + 3] / self.level[k])[:, self.moving].mean(axis=1) - 1.0, 0.0)
         at = 1 + int(np.argmax(near[1:-1]))
         side = 1 if near[at + 1] >= near[at - 1] else -1
@@ -167,31 +174,31 @@ class _Search:
 
 
 def independent(heights: Floats) -> float:
-    """How many independent channels the mean of heights (b, c) is worth: c^2 / sum of their correlations."""
+    """Effective number of independent channels in the mean of heights (b, c): c^2 / sum of their correlation matrix."""
     count = heights.shape[1]
     if count == 1:
         return 1.0
-    bounded = np.minimum(heights, np.quantile(heights, 0.95, axis=0))  # a line in all channels is not what is meant
+    bounded = np.minimum(heights, np.quantile(heights, 0.95, axis=0))  # a line in all channels must not count
     return float(count**2 / np.clip(np.corrcoef(bounded.T), 0.0, 1.0).sum())
 
 
 def _leakage(bins: Floats) -> Floats:
-    """At most what a line of height 1 leaves so many bins away."""
+    """Return an upper bound of what a line of height 1 leaks into a bin at this distance."""
     away = np.maximum(np.abs(bins), 1.5)
     return np.where(np.abs(bins) < _OWN, np.inf, 1.0 / (np.pi * away * (away**2 - 1.0)) ** 2)
 
 
 def _level(power: Floats, segments: int) -> Floats:
-    """The noise under each bin (b,): an autoregression, a rise to low frequencies, the neighbours' median.
+    """Return the noise level (b,) in each bin, as described at the top of this file.
 
-    Lines are cut off before the autoregression is fitted, or it would follow them.
+    Lines are cut off before the autoregression is fitted, because it would follow them.
     """
     from scipy.linalg import solve_toeplitz
     from scipy.special import gammaincinv
 
     length = 2 * (len(power) - 1)
     bound, slope = _running_median(power, 6, 0), power
-    for _ in range(4):  # a steep rise to low frequencies is let in bit by bit, a line is not: nothing near it rises
+    for _ in range(4):  # iterating admits a steep rise to low frequencies, but no line: its neighbours do not rise
         cut = np.minimum(power, 3.0 * bound)
         cut[:_FIRST_BIN] = cut[_FIRST_BIN]
         gamma = np.fft.irfft(cut, length)[: min(_ORDER, length // 32) + 1]
@@ -205,7 +212,7 @@ def _level(power: Floats, segments: int) -> Floats:
 
 
 def _rise(ratio: Floats) -> Floats:
-    """What a cubic in logarithms makes of the lowest bins (b,); what stands out of it does not bend it."""
+    """Return a robust cubic in logarithms through the lowest bins (b,); what stands out of it does not bend it."""
     frame, out = _cubic(len(ratio)), np.ones(len(ratio))
     logs = np.log(np.maximum(ratio[_FIRST_BIN : _FIRST_BIN + len(frame)], 1e-300))
     bounded = logs
@@ -220,7 +227,7 @@ def _rise(ratio: Floats) -> Floats:
 
 
 def _leverages(count: int) -> Floats:
-    """By how much each bin (b,) pulls the cubic to itself."""
+    """Return the leverage of each bin (b,) on the cubic."""
     frame, out = _cubic(count), np.zeros(count)
     out[_FIRST_BIN : _FIRST_BIN + len(frame)] = (frame**2).sum(axis=1)
     return out
@@ -228,13 +235,14 @@ def _leverages(count: int) -> Floats:
 
 @lru_cache(maxsize=16)
 def _cubic(count: int) -> Floats:
-    """1, x, x^2, x^3 of x the logarithm of the lowest bins, made orthonormal, (n, 4)."""
+    """Return an orthonormal basis (n, 4) of 1, x, x^2, x^3, where x is the logarithm of the lowest bin numbers."""
     x = np.log(np.arange(_FIRST_BIN, min(_BENT, count - 1)))
     return np.linalg.qr(np.vander(x - x.mean(), _CUBIC + 1))[0]
 
 
 def _running_median(values: Floats, reach: int, own: int) -> Floats:
-    """Median (b,) of ``reach`` bins on either side less ``own`` next to it; the window is shifted at the ends."""
+    """Return the median (b,) of ``reach`` bins on either side without the nearest ``own``; the window is shifted at the
+    ends."""
     count = len(values) - _FIRST_BIN - 1
     size = min(2 * reach + 1, count)
     k = np.arange(len(values))
@@ -246,5 +254,5 @@ def _running_median(values: Floats, reach: int, own: int) -> Floats:
 
 @lru_cache(maxsize=16)
 def _taper(length: int) -> Floats:
-    """Hann's window (n,)."""
+    """Return the Hann window (n,)."""
     return 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)

@@ -1,4 +1,4 @@
-"""The one matrix operation everything stands on: rows in, an upper triangle out."""
+"""The QR decompositions on which all estimates rest."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 
-_PART = 1024  # rows of a part that is taken at once: with its copies it stays in the processor's cache
+_PART = 1024  # rows that are decomposed at once, so that they and their copies stay in the cache
 
 
 def triangle(rows: NDArray[np.floating[Any]]) -> Floats:
-    """R of the QR decomposition of rows (..., m, n): (..., min(m, n), n), same normal equations R^T R as the rows.
+    """The factor R (..., min(m, n), n) of the QR decomposition of rows (..., m, n), so that R^T R equals rows^T rows.
 
-    Orthogonal transforms only: the condition number is that of the rows, not its square.
+    Only orthogonal transformations are used, so that the condition number is that of the rows, not its square.
     """
     count, width = rows.shape[-2:]
     part = max(_PART, 4 * width)
@@ -26,14 +26,16 @@ def triangle(rows: NDArray[np.floating[Any]]) -> Floats:
 
 
 def orthonormal(rows: Floats) -> tuple[Floats, Floats]:
-    """Q (m, k) and R (k, n) of rows (m, n), k the smaller of m and n; Q may be written into the rows: there is no room
-    for both."""
+    """The factors Q (m, k) and R (k, n) of the QR decomposition of rows (m, n), where k is the smaller of m and n.
+
+    To save memory, Q may overwrite the rows.
+    """
     count, width = rows.shape
     part = max(_PART, 4 * width)
     if count < 2 * part or not width:
         return np.linalg.qr(rows)
     parts = [slice(k, min(k + part, count)) for k in range(0, count - width, part)]
-    parts[-1] = slice(parts[-1].start, count)  # no part has fewer rows than columns
+    parts[-1] = slice(parts[-1].start, count)  # so that no part has fewer rows than columns
     upper = np.empty((len(parts) * width, width))
     for k, own in enumerate(parts):
         rows[own], upper[k * width : (k + 1) * width] = np.linalg.qr(rows[own])

@@ -1,4 +1,4 @@
-"""Rows of the readings of one block: model columns known at the nodes of its pieces, gated, averaged where asked."""
+"""Rows of one block of readings: the regressors, the readings with outliers removed, and the nodes of its pieces."""
 
 from __future__ import annotations
 
@@ -21,12 +21,15 @@ REGRESSORS = ("1", "f_x", "f_y", "f_z")
 
 @dataclass(frozen=True, slots=True)
 class Nodes:
-    """What the block feels at m instants.
+    """The conditions of the platform at m instants; the three nodes of a piece are its beginning, middle and end.
 
-    elapsed_s, since_arrival_s, temperature_c (m,); force_mps2 (m, 3); pose (m, k). The three nodes of a
-    piece are its beginning, middle and end. temperature_c is NaN where it is not measured. rate_radps,
-    rate_change_radps2 (m, 3): the platform's omega in its own frame, and its derivative; None where it stands.
-    variance_mps2_2 (m, 3): of the readings, where averages of them were folded; else None.
+    - elapsed_s, since_arrival_s (m,): time since the first sample and since the arrival.
+    - force_mps2 (m, 3): specific force in the platform frame.
+    - pose (m, k): gimbal angles, rad, or quaternion.
+    - temperature_c (m,): NaN where it was not measured.
+    - rate_radps, rate_change_radps2 (m, 3): angular rate of the platform in its own frame and its derivative; None if
+      the platform stands.
+    - variance_mps2_2 (m, 3): variance of the readings, if averages of them were folded; else None.
     """
 
     elapsed_s: Floats
@@ -40,14 +43,14 @@ class Nodes:
 
     @property
     def regressors(self) -> Floats:
-        """1, f_x, f_y, f_z (m, 4)."""
+        """The regressors 1, f_x, f_y, f_z (m, 4)."""
         return np.column_stack([np.ones(len(self.force_mps2)), self.force_mps2])
 
 
 def parabola(values: Floats) -> Floats:
-    """Coefficients (..., 3, c) on 1, u, u^2 of the parabola with ``values`` (..., 3, c) at u = -1, 0, 1.
+    """Coefficients (..., 3, c) on 1, u, u^2 of the parabola through ``values`` (..., 3, c) at u = -1, 0, 1.
 
-    Equal values give exact zeros: a column that stands still has no rows but its mean's.
+    Equal values give coefficients of exactly zero on u and u^2, so that a constant column contributes only to the mean.
     """
     first, middle, last = values[..., 0, :], values[..., 1, :], values[..., 2, :]
     out = np.empty(values.shape)
@@ -57,7 +60,8 @@ def parabola(values: Floats) -> Floats:
 
 
 def on_basis(values: Floats) -> Floats:
-    """Coefficients (..., K, c) on ``basis`` of columns known at their nodes (..., K, c), K = 3, or 9 on a carrier."""
+    """Coefficients (..., K, c) on ``basis`` of columns given by their values at the nodes (..., K, c); K = 3, or 9 on a
+    carrier."""
     if values.shape[-2] == 3:
         return parabola(values)
     return np.concatenate([parabola(part) for part in np.split(values, values.shape[-2] // 3, axis=-2)], axis=-2)
@@ -65,13 +69,19 @@ def on_basis(values: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Model columns and readings of one block: columns (n, 4), readings (n, 3), innovation within the block (3, n).
+    """Regressors and readings of one block.
 
-    static: the columns are the same in every row, and the innovation is the readings less their mean.
-    pieces: parts of the rows, u (n',) from -1 to 1 over each, and its nodes. moving: of the slew after the dwell.
-    gated: in which channels each reading lay out that is not among them, (3, m) bool; None: there were none.
-    raw: the rows before they were averaged, where they were; taken: how many readings a row then stands for.
-    pose_sigma_rad: of the pose, by the noise of the angles. turns: by which it goes beyond the angles as recorded.
+    - columns (n, 4): the regressors.
+    - readings (n, 3): the readings, m/s^2.
+    - innovation (3, n): the readings less their least-squares fit within the block.
+    - static: the regressors are the same in every row, so that the innovation is the reading less the mean.
+    - pieces: for each piece its slice of the rows, u (n',) from -1 to 1, and its nodes.
+    - moving: the block belongs to the slew after the dwell.
+    - gated (3, m): for each rejected reading, the channels in which it is an outlier; None if none was rejected.
+    - raw: the rows before averaging, if the readings were averaged.
+    - taken: number of readings that a row stands for.
+    - pose_sigma_rad: uncertainty of the pose due to noise of the angles.
+    - turns: whole turns by which the pose goes beyond the angles as recorded.
     """
 
     dwell: int
@@ -92,14 +102,16 @@ class Rows:
 def model_rows(
     blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0, window_s: float = 0.0
 ) -> Iterator[Rows]:
-    """Rows of every block, outliers gated out; the same rows feed both engines and batch least squares.
+    """Rows of every block, without outliers; both engines and batch least squares work on the same rows.
 
-    window_s: rows of readings averaged over windows of that length, 0: they are not. Blocks too short for it are left
-    out, and outliers are sought among the averages: a vibration that comes and goes has its own in the readings.
+    - gate_sigma: limit of the innovation gate in robust standard deviations; None for no gate.
+    - window_s: length of the windows over which readings are averaged; 0 for no averaging. Blocks that are too short
+      for the windows are left out. The gate then acts on the averages, because a vibration that comes and goes produces
+      outliers of its own in the single readings.
     """
-    standing: tuple[Floats, Floats] | None = None  # a pose and its force: the same for all blocks of a dwell
+    standing: tuple[Floats, Floats] | None = None  # a pose and its specific force, which all blocks of a dwell share
     for block in blocks:
-        if block.curve is not None:  # not gated: what an effect in a slew adds is no outlier
+        if block.curve is not None:  # not gated, since an effect that shows in slews would be rejected
             yield _slew_rows(block, bench, block.curve)
             continue
         static = len(block.pose) == 1 and bench.reference == "base"
@@ -123,6 +135,7 @@ def model_rows(
 
 
 def _kept(block: Block, keep: Mask) -> Block:
+    """Return the block with only the readings in ``keep``."""
     pose = block.pose if len(block.pose) == 1 else block.pose[keep]
     return replace(
         block,
@@ -135,7 +148,7 @@ def _kept(block: Block, keep: Mask) -> Block:
 
 
 def _rows(block: Block, bench: Bench, force: Floats | None) -> Rows:
-    """The rows of a block; ``force`` (1, 3) where the platform stands and gravity with it, else None."""
+    """Return the rows of a block; ``force`` (1, 3) is the specific force if it is constant, else None."""
     since_s = block.elapsed_s - block.arrival_s
     edges = _EDGES_S[: int(np.searchsorted(_EDGES_S, since_s[-1]))]
     cuts = np.unique(np.concatenate([[0], np.searchsorted(since_s, edges), [len(since_s)]]))
@@ -152,7 +165,7 @@ def _rows(block: Block, bench: Bench, force: Floats | None) -> Rows:
 
 
 def _slew_rows(block: Block, bench: Bench, curve: Curve) -> Rows:
-    """The rows of a slew, in pieces of 2 deg."""
+    """Return the rows of a slew, in pieces of 2 deg."""
     pieces = tuple(
         _slew_piece(block, slice(a, b), bench, curve) for a, b in itertools.pairwise(curve.cuts(block.elapsed_s))
     )
@@ -161,6 +174,7 @@ def _slew_rows(block: Block, bench: Bench, curve: Curve) -> Rows:
 
 
 def _slew_piece(block: Block, part: slice, bench: Bench, curve: Curve) -> tuple[slice, Floats, Nodes]:
+    """Return the slice, u and the nodes of one piece of a slew."""
     own = block.elapsed_s[part]
     u, at = _spread(own)
     pose = curve.angles(at)
@@ -172,17 +186,18 @@ def _slew_piece(block: Block, part: slice, bench: Bench, curve: Curve) -> tuple[
 
 
 def _spread(elapsed_s: Floats) -> tuple[Floats, Floats]:
-    """u (n,) from -1 to 1 over readings, and the times of the nodes (3,)."""
+    """Return u (n,) from -1 to 1 over the readings, and the times of the nodes (3,)."""
     middle, half = 0.5 * (elapsed_s[0] + elapsed_s[-1]), max(0.5 * (elapsed_s[-1] - elapsed_s[0]), 1e-9)
     return (elapsed_s - middle) / half, np.array([elapsed_s[0], middle, elapsed_s[-1]])
 
 
-_GATED = 32  # averages of a block, at least, among which an outlier can be told
+_GATED = 32  # least number of averages of a block among which outliers can be recognised
 _EDGES_S = np.concatenate([2.0 ** np.arange(6), 60.0 * np.arange(1, 20_000)])
-"""A dwell is cut into pieces where 1, 2, 4 ... s have passed since the arrival, and at every further minute."""
+"""Dwells are cut into pieces 1, 2, 4 ... 32 s after the arrival and then at every full minute."""
 
 
 def _piece(block: Block, part: slice, bench: Bench, force: Floats | None) -> tuple[slice, Floats, Nodes]:
+    """Return the slice, u and the nodes of one piece of a dwell."""
     own, warm = block.elapsed_s[part], block.temperature_c[part]
     u, at = _spread(own)
     pose = np.repeat(block.pose, 3, axis=0) if len(block.pose) == 1 else _values_at_nodes(u, block.pose[part])
@@ -195,7 +210,7 @@ def _piece(block: Block, part: slice, bench: Bench, force: Floats | None) -> tup
 
 
 def _temperatures(u: Floats, measured: Floats) -> Floats:
-    """Temperature (3,) at u = -1, 0, 1: the line nearest to what was measured; NaN where any of it is missing."""
+    """Return the temperature (3,) at u = -1, 0, 1 from a straight-line fit; NaN if any measurement is missing."""
     level = measured.mean()
     if not math.isfinite(level) or measured[0] == measured[-1] == level:
         return np.full(3, level)
@@ -205,7 +220,8 @@ def _temperatures(u: Floats, measured: Floats) -> Floats:
 
 
 def basis(u: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -> Floats:
-    """1, u, u^2 as rows (3, n); on a carrier these, and these times its cosine and times its sine, (9, n)."""
+    """Basis functions of a piece: 1, u, u^2 as rows (3, n); on a carrier also their products with its cosine and its
+    sine, (9, n)."""
     if elapsed_s is not None and carrier_hz:
         plain, phase = basis(u), 2.0 * np.pi * carrier_hz * elapsed_s
         return np.concatenate([plain, plain * np.cos(phase), plain * np.sin(phase)])
@@ -216,6 +232,6 @@ def basis(u: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -
 
 
 def _values_at_nodes(u: Floats, values: Floats) -> Floats:
-    """Values (3, k) at u = -1, 0, 1 of the parabola nearest to samples (n, k)."""
+    """Return the values (3, k) at u = -1, 0, 1 of the least-squares parabola through samples (n, k)."""
     fitted = np.linalg.lstsq(basis(u).T, values, rcond=1e-9)[0]
     return basis(np.array([-1.0, 0.0, 1.0])).T @ fitted

@@ -1,10 +1,13 @@
-"""Dwells: the stretches in which the platform stands still, cut from the raw streams as they arrive.
+"""Segmentation of the raw streams into dwells, the stretches in which the platform stands still, as samples arrive.
 
-What is still is judged on the platform angles (``stationarity``). Where angles are absent during a motion (two messages
-far apart in time and in angle) the readings decide where the one dwell ended and the next began, if they rest at all: a
-slew may be slow for messages that are seldom. Samples of a slew stay in the recording and out of the static fit; so do
-``settle_s`` after each arrival and ``lead_s`` before each departure (of short dwells no more than a third and a tenth).
-What comes out does not depend on how the streams were chopped into batches.
+Whether the platform stands still is decided from its angles (``stationarity``). Where no angles were recorded during a
+motion, so that two consecutive messages are far apart in time and in angle, the accelerometer readings decide when the
+first dwell ended and the second began. There may be no dwell at all between such messages, because the platform may
+have moved slowly all the time while few angle messages arrived.
+
+Samples of a slew are not used in the static fit. Neither are those of the first ``settle_s`` after each arrival and of
+the last ``lead_s`` before each departure; in short dwells these margins are at most a third and a tenth of the dwell.
+The result does not depend on how the streams were divided into batches.
 """
 
 from __future__ import annotations
@@ -26,20 +29,22 @@ from kf_calib.dwells.stationarity import HISTORY, Stillness, encoder_sigma
 from kf_calib.errors import InputError
 
 BLOCK_SAMPLES = 4000
-"""Samples of one block at the most: few enough for the cache; no power of two, whose columns would evict each other."""
-_LAST_NS = 1 << 62  # after every stamp
+"""Largest number of samples of a block. A block then fits into the cache; the number is not a power of two because
+columns at such distances evict each other from it."""
+_LAST_NS = 1 << 62  # later than any stamp
 _HOLD_NS = SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
-_SLEW_READINGS = 8  # of a slew, at least
-_REST_NS = 2 * SECOND_NS  # a dwell that readings alone tell of, between angles that differ, lasts at least
+_SLEW_READINGS = 8  # least number of readings of a slew that is used
+_REST_NS = 2 * SECOND_NS  # least length of a dwell that is recognised from readings alone
 _PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
-_SURE = 3  # messages: of fewer the noise of an encoder cannot be taken
+_SURE = 3  # fewer messages do not determine the noise of an encoder
 
 
 @dataclass
 class Segmenter:
-    """Cuts batches into blocks of dwells; ``push`` what has arrived, then ``finish``.
+    """Cuts batches into blocks of dwells: call ``push`` with each batch and ``finish`` at the end.
 
-    slews: blocks of the motions from dwell to dwell, too, as far as angles were recorded in them.
+    If ``slews`` is set, blocks of the motions between dwells are also returned, provided that angles were recorded
+    during them.
     """
 
     bench: Bench
@@ -54,45 +59,45 @@ class Segmenter:
                 "/platform/angles, or leave out the effects that show in slews only."
             )
         self.first_ns: int | None = None
-        self.dwell_count = 0  # so many have begun; that is also the number of the latest
+        self.dwell_count = 0  # number of dwells that have begun, and the number of the latest
         self._accel = Stream.empty(3)
         self._pose = Stream.empty(self.bench.pose_width)
-        self._turns = np.empty((0, len(self.bench.axes) or 1))  # by which each pose goes beyond what was recorded
-        self._early = list[Stream]()  # poses, as recorded, that the readings have not reached
-        self._before: tuple[Floats, Floats] | None = None  # the last pose as recorded, and its turns
+        self._turns = np.empty((0, len(self.bench.axes) or 1))  # whole turns that were added to each recorded pose
+        self._early = list[Stream]()  # recorded poses that are later than the readings so far
+        self._before: tuple[Floats, Floats] | None = None  # the last recorded pose and its turns
         self._temperature = Stream.empty(1)
         self._orders = (StampOrder(), StampOrder(), StampOrder())
         self._decided_ns: int | None = None  # intervals of poses before this stamp have been judged
-        self._cover_ns = -_LAST_NS  # a still window judged earlier reaches to here
+        self._cover_ns = -_LAST_NS  # end of the latest window that was judged as still
         self._dwell: OpenDwell | None = None
-        self._encoder_rad = 0.0  # noise of a message, as the dwell before showed it
+        self._encoder_rad = 0.0  # noise of an angle message, estimated in the last dwell
         self._begun = False
 
     def push(self, batch: Batch) -> Iterator[Block]:
-        """Blocks that are complete once this batch is known."""
+        """Yield the blocks that are complete once this batch is known."""
         self._take(batch)
         yield from self._advance(final=False)
 
     def finish(self) -> Iterator[Block]:
-        """The blocks still open at the end of the streams."""
+        """Yield the blocks that are still open at the end of the streams."""
         accel, pose, temperature = (order.flush() for order in self._orders)
         self._take(Batch(accel, pose, temperature), final=True)
         yield from self._advance(final=True)
 
     @property
     def standing(self) -> int | None:
-        """Number of the dwell that is open; None while the platform moves, or is not known to stand."""
+        """Number of the open dwell; None if the platform moves or is not yet known to stand still."""
         return None if self._dwell is None else self._dwell.number
 
     @property
     def arrival_s(self) -> float:
-        """When the open dwell began, since the first sample; NaN where none is open."""
+        """Time of arrival of the open dwell, s since the first sample; NaN if no dwell is open."""
         if self._dwell is None or self.first_ns is None:
             return math.nan
         return (self._dwell.arrival_ns - self.first_ns) / SECOND_NS
 
     def waiting(self) -> list[Block]:
-        """The readings of the open dwell that wait for their block to fill, in a block that is not taken from it."""
+        """The readings of the open dwell that do not yet fill a block, as a block; the segmenter is not changed."""
         horizon = self._horizon(final=False)
         if self._dwell is None or horizon is None:
             return []
@@ -101,7 +106,8 @@ class Segmenter:
         return list(aside._emit(horizon, closing=True))
 
     def _take(self, batch: Batch, final: bool = False) -> None:
-        """Add a batch to what waits to be judged; in the end, what was held back comes a second time."""
+        """Add a batch to the samples that wait to be judged; at the end it consists of samples that were held back
+        before."""
         if not final:
             self.tally.read += len(batch.accel)
             batch = replace(batch, accel=Stream(batch.accel.time_ns, self.bench.readings(batch.accel.values)))
@@ -116,6 +122,7 @@ class Segmenter:
             self._temperature += self._orders[2](warm)
 
     def _take_readings(self, accel: Stream) -> None:
+        """Drop unusable readings and add the others to those that wait."""
         if not len(accel):
             return
         readable = within(accel.values, LARGEST_MPS2)
@@ -130,8 +137,11 @@ class Segmenter:
         self._accel += accel
 
     def _take_poses(self, pose: Stream, final: bool) -> None:
-        """Poses wait for the readings: when a platform came and left is judged by both, and must not depend on which
-        of them was ahead on the way here. ``_early`` has those that came too soon."""
+        """Add the poses up to the time of the latest reading; later ones wait in ``_early``.
+
+        Arrivals and departures are judged from poses and readings together, and the result must not depend on which
+        stream was delivered first.
+        """
         if len(pose):
             sound, counts = self._sound(pose.values), Tally()
             pose = self._orders[1](pose[sound], counts)
@@ -152,7 +162,7 @@ class Segmenter:
         self._turns = np.concatenate([self._turns, turns])
 
     def _sound(self, poses: Floats) -> Mask:
-        """Which poses can be used, (m,) bool: angles that can be, and quaternions of nearly unit length."""
+        """Return a mask (m,) of usable poses: finite angles of possible size, or quaternions of nearly unit length."""
         readable = within(poses, LARGEST_RAD)
         readable = np.ones(len(poses), bool) if readable is None else readable
         if self.bench.axes:
@@ -160,6 +170,7 @@ class Segmenter:
         return readable & (np.abs(np.linalg.norm(np.where(readable[:, None], poses, 0.0), axis=1) - 1.0) < 0.01)
 
     def _advance(self, final: bool) -> Iterator[Block]:
+        """Process the arrivals and departures that can be judged by now and yield the blocks that become complete."""
         for stamp, event, settles in self._judge(final):
             if event is DwellEvent.ARRIVE:
                 felt_ns = self._felt_ns(stamp)
@@ -178,9 +189,9 @@ class Segmenter:
         if self._dwell is not None:
             if final:
                 yield from self._emit(horizon, closing=True)
-            elif self._dwell.settling_ns is None or len(self._accel) >= BLOCK_SAMPLES:  # else there is nothing to do
+            elif self._dwell.settling_ns is None or len(self._accel) >= BLOCK_SAMPLES:  # otherwise no block is complete
                 yield from self._emit(min(horizon, self._resting_ns()), closing=False)
-        elif final or not self._slewing():  # an arrival may be felt since the last angle before it
+        elif final or not self._slewing():  # readings from the last angle before an arrival on may still be needed
             before = int(np.searchsorted(self._pose.time_ns, self._decided_ns or horizon)) - 1
             self._discard(horizon if final or before < 0 else min(horizon, int(self._pose.time_ns[before])))
         self._forget()
@@ -189,7 +200,8 @@ class Segmenter:
             self._accel = Stream.empty(3)
 
     def _judge(self, final: bool) -> list[tuple[int, DwellEvent, bool]]:
-        """Arrivals and departures in the pose intervals that can be judged by now: (stamp, event, has to settle)."""
+        """Return the arrivals and departures that can be judged by now: (stamp, event, whether the dwell has to
+        settle)."""
         times, poses = self._pose.time_ns, self._pose.values
         start = 0 if self._decided_ns is None else int(np.searchsorted(times, self._decided_ns))
         times, poses = times[start:], poses[start:]
@@ -207,13 +219,15 @@ class Segmenter:
         return events
 
     def _lone_pose(self, times: Times) -> list[tuple[int, DwellEvent, bool]]:
-        """A single pose message makes one dwell of all the readings around it."""
+        """Return an arrival before all readings if the run has a single pose message, so that it is one dwell."""
         if self._begun or not len(times) or not len(self._accel):
             return []
         self._begun, self._decided_ns = True, int(times[0])
         return [(int(min(self._accel.time_ns[0], times[0])), DwellEvent.ARRIVE, False)]
 
     def _events(self, times: Times, still: Mask) -> list[tuple[int, DwellEvent, bool]]:
+        """Return the arrivals and departures in consecutive intervals between poses, of which ``still`` tells whether
+        each is still."""
         in_dwell, events = self._dwell is not None, list[tuple[int, DwellEvent, bool]]()
         arrived_ns = self._dwell.arrival_ns if self._dwell else 0
         unresolved = ~still & (np.diff(times[: len(still) + 1]) > self.stillness.window_ns)
@@ -242,10 +256,15 @@ class Segmenter:
         return events
 
     def _departed_ns(self, arrived_ns: int, end_ns: int) -> int:
+        """Return when the platform began to leave a dwell that lasts from ``arrived_ns`` to ``end_ns`` by its
+        angles."""
         return self.stillness.departure_ns(self._pose, not self.bench.axes, arrived_ns, end_ns)
 
     def _felt_ns(self, arrival_ns: int) -> int:
-        """When an arrival was felt: angles tell it to their period only, and too early where a slew ends gently."""
+        """Return the time of an arrival as the readings show it.
+
+        The angles give the arrival only to within their sampling period, and too early if a slew ends gently.
+        """
         last = int(np.searchsorted(self._pose.time_ns, arrival_ns)) - 1
         if last < 0:
             return arrival_ns
@@ -253,12 +272,13 @@ class Segmenter:
         return self.stillness.felt_ns(self._accel, since_ns, arrival_ns, self.bench.gravity_mps2)
 
     def _next_pose_ns(self, stamp: int) -> int:
-        """The first pose message at or after an arrival: the dwell's own poses start there."""
+        """Return the stamp of the first pose message at or after an arrival, with which the poses of the dwell
+        begin."""
         index = int(np.searchsorted(self._pose.time_ns, stamp))
         return int(self._pose.time_ns[min(index, len(self._pose) - 1)])
 
     def _horizon(self, final: bool) -> int | None:
-        """Readings before this stamp can be released."""
+        """Return the stamp before which readings can be released; None if none can be yet."""
         if self._decided_ns is None:
             if not final and len(self._accel) <= _PENDING_SAMPLES:
                 return None
@@ -268,14 +288,14 @@ class Segmenter:
         return self._decided_ns - self.stillness.lead_ns - self.stillness.window_ns
 
     def _resting_ns(self) -> int:
-        """Readings of the open dwell before this stamp are not those of a slew that may have begun."""
+        """Return the stamp before which the readings of the open dwell cannot belong to a slew that may have begun."""
         assert self._dwell is not None and self._decided_ns is not None
         last = int(np.searchsorted(self._pose.time_ns, self._decided_ns))
         until_ns = self._departed_ns(self._dwell.arrival_ns, self._decided_ns)
         return min(until_ns, int(self._pose.time_ns[max(last - 1, 0)])) - self.stillness.lead_ns
 
     def _discard(self, until_ns: int) -> None:
-        """Drop the readings before ``until_ns``: the platform was moving, or no angle was known."""
+        """Drop and count the readings before ``until_ns``, during which the platform moved or no angle was known."""
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
         first_pose = int(self._pose.time_ns[0]) if len(self._pose) and not self.dwell_count else -_LAST_NS
         early = int(np.searchsorted(self._accel.time_ns[:count], first_pose - _HOLD_NS))
@@ -284,12 +304,15 @@ class Segmenter:
         self._accel = self._accel[count:]
 
     def _slewing(self) -> bool:
-        """Whether readings wait for the end of a slew, to be used."""
+        """Tell whether the waiting readings may belong to a slew that will be used."""
         return self.slews and self.dwell_count > 0 and len(self._accel) <= _PENDING_SAMPLES
 
     def _slew(self, arrival_ns: int) -> Iterator[Block]:
-        """Blocks of the readings between the last dwell and an arrival, if angles came all the way, no farther
-        apart than half a second and a quarter of the way."""
+        """Yield blocks of the readings between the last dwell and an arrival.
+
+        Nothing is yielded unless angles were recorded over the whole slew, no farther apart than the window of
+        ``stillness`` in time and a quarter of the motion in angle.
+        """
         count = int(np.searchsorted(self._accel.time_ns, arrival_ns))
         if not self._slewing() or count < _SLEW_READINGS or self.first_ns is None:
             return
@@ -299,7 +322,7 @@ class Segmenter:
         times, poses = self._pose.time_ns[around], self._pose.values[around]
         if len(times) < 4 or times[0] > begin_ns or times[-1] < end_ns or np.diff(times).max() > window_ns:
             return
-        if np.abs(np.diff(poses, axis=0)).max() > np.ptp(poses, axis=0).max() / 4.0:  # too fast for its messages
+        if np.abs(np.diff(poses, axis=0)).max() > np.ptp(poses, axis=0).max() / 4.0:  # too few messages
             return
         curve = Curve.through(self.bench, (times - self.first_ns) / SECOND_NS, poses)
         warm, elapsed_s = carry_on(self._temperature, accel.time_ns), (accel.time_ns - self.first_ns) / SECOND_NS
@@ -312,9 +335,11 @@ class Segmenter:
         self._accel = self._accel[count:]
 
     def _emit(self, until_ns: int, closing: bool, left: bool = False) -> Iterator[Block]:
-        """Blocks of the open dwell from the readings before ``until_ns``; a last short one when it closes.
+        """Yield blocks of the open dwell from its readings before ``until_ns``; the last block may be short if the
+        dwell closes.
 
-        left: it closes because the platform has left; a dwell in which a run ends is short by no choice.
+        ``left`` tells that the dwell closes because the platform left. A dwell that is short because the run ends is
+        not reported as too short.
         """
         assert self._dwell is not None
         dwell, settle_ns = self._dwell, self.stillness.settle_ns
@@ -339,12 +364,14 @@ class Segmenter:
         self._accel = self._accel[first:]
 
     def _is_unsure(self, times: Times) -> bool:
-        """Whether there are so few messages of a noisy encoder to these readings that they do not tell its noise."""
+        """Tell whether an encoder is noisy and has so few messages during these readings that its noise cannot be
+        estimated."""
         if not len(times) or self._encoder_rad <= self.stillness.rest_rad:
             return False
         return int(np.diff(np.searchsorted(self._pose.time_ns, (times[0], times[-1])))[0]) < _SURE
 
     def _block(self, accel: Stream) -> Block:
+        """Make a block of the open dwell from these readings."""
         assert self._dwell is not None and self.first_ns is not None
         self.tally.used += len(accel)
         elapsed_s = (accel.time_ns - self.first_ns) / SECOND_NS
@@ -358,7 +385,7 @@ class Segmenter:
         )  # fmt: skip
 
     def _dwell_turns(self) -> tuple[int, ...]:
-        """Of the open dwell, by its first pose."""
+        """Return the whole turns of the open dwell, taken from its first pose."""
         assert self._dwell is not None
         if self._dwell.turns is None:
             first = int(np.searchsorted(self._pose.time_ns, self._dwell.first_pose_ns))
@@ -366,12 +393,13 @@ class Segmenter:
         return self._dwell.turns
 
     def _block_pose(self, accel_ns: Times) -> Floats:
+        """Return the pose of a block: (1, k) if the platform stands still, (n, k) if it creeps."""
         assert self._dwell is not None
         times, poses = self._pose.time_ns, self._pose.values
         own = int(np.searchsorted(times, self._dwell.first_pose_ns))
         first = max(int(np.searchsorted(times, accel_ns[0])), own)
         last = max(int(np.searchsorted(times, accel_ns[-1], side="right")), own)
-        if first == last:  # no message inside the block: the latest of this dwell before it, else its first
+        if first == last:  # no message inside the block: take the latest one before it, or the first of the dwell
             first = max(first - 1, own)
             last = first + 1
         inside = poses[first:last]
@@ -383,9 +411,10 @@ class Segmenter:
         return interpolate_pose(accel_ns, times[around], poses[around], not self.bench.axes)
 
     def _standing_pose(self, inside: Floats) -> Floats:
-        """The dwell's pose (1, k); taken anew only where a block's mean has left it by more than the encoder's noise.
+        """Return the pose (1, k) of the dwell; it is replaced only if a block's mean differs from it by more than the
+        encoder's noise.
 
-        A platform that stands still has one pose: the columns of its dwell are then constant to the last bit.
+        A platform at rest has a single pose, which makes the columns of its dwell constant to the last bit.
         """
         assert self._dwell is not None
         mean = mean_pose(inside)[None, :]
@@ -399,10 +428,10 @@ class Segmenter:
         return known
 
     def _forget(self) -> None:
-        """Drop poses and temperatures that no pending reading needs."""
+        """Drop the poses and temperatures that no waiting reading needs."""
         oldest = int(self._accel.time_ns[0]) if len(self._accel) else (self._decided_ns or 0)
         oldest = min(oldest, (self._decided_ns or oldest) - self.stillness.history_ns)
-        if self.slews:  # a slew's curve begins a window before it
+        if self.slews:  # the curve of a slew begins one window before the slew
             oldest -= self.stillness.window_ns + self.stillness.lead_ns
         kept = slice(max(int(np.searchsorted(self._pose.time_ns, oldest)) - HISTORY, 0), None)
         self._pose, self._turns = self._pose[kept], self._turns[kept]
@@ -410,7 +439,7 @@ class Segmenter:
 
 
 def dwell_blocks(source: Source, segmenter: Segmenter) -> Iterator[Block]:
-    """All blocks of a source, in order."""
+    """Yield all blocks of a source, in order."""
     for batch in source:
         yield from segmenter.push(batch)
     yield from segmenter.finish()

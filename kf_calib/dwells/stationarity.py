@@ -1,8 +1,9 @@
-"""When the platform counts as still, and when exactly it came to rest and left: from its angles, and from the readings.
+"""Detection of rest from the platform angles: when the platform is still, and when exactly it arrived and left.
 
-Angles tell of a motion to their period only, and a slew that begins and ends gently is within any tolerance for some
-time: what is left over is looked for in the messages of the dwell itself, and in the readings. The noise of an encoder
-is taken from second differences of its messages, in which a platform that creeps does not show: sigma^2 = <d^2> / 6.
+Angles determine a motion only to within their sampling period, and a slew that begins and ends gently stays within any
+tolerance for some time. The remaining motion is detected from the messages of the dwell itself and from the readings.
+The noise of an encoder is estimated from second differences of its messages, to which slow creep does not contribute:
+sigma^2 = <d^2> / 6.
 """
 
 from __future__ import annotations
@@ -18,19 +19,19 @@ from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError, check_number
 
 _SECOND_NS = 1_000_000_000
-_BEFORE = 3  # messages, at least, that one is held against
-_APART_NS = 2 * _SECOND_NS  # messages that lie farther apart tell no departure
-_CREEPING_NS = 10 * _SECOND_NS  # from when on a platform that still creeps is taken as one that goes on so
-_LARGEST_DEG = 5.0  # of a tolerance: a platform that turns at 10 deg/s would be still
-_PARTS = 8  # of a block, whose mean poses are compared
+_BEFORE = 3  # least number of messages with which one is compared
+_APART_NS = 2 * _SECOND_NS  # messages farther apart than this do not determine a departure
+_CREEPING_NS = 10 * _SECOND_NS  # creep that lasts longer than this is taken as permanent
+_LARGEST_DEG = 5.0  # largest tolerance; at it, a platform turning at 10 deg/s would count as still
+_PARTS = 8  # number of parts of a block whose mean poses are compared
 
 HISTORY = _BEFORE + 2
-"""Messages before those of ``Stillness.history_ns`` that are of use, where they are seldom."""
+"""Number of messages before those of ``Stillness.history_ns`` that are needed if messages are infrequent."""
 
 
 @dataclass(frozen=True)
 class Stillness:
-    """Tolerance and window by which intervals are judged, margins that are left out after an arrival and before a
+    """The tolerance and window by which intervals are judged, and the margins left out after an arrival and before a
     departure."""
 
     tolerance_deg: float = 0.05
@@ -51,37 +52,45 @@ class Stillness:
 
     @property
     def tolerance_rad(self) -> float:
+        """The tolerance in rad."""
         return math.radians(self.tolerance_deg)
 
     @property
     def rest_rad(self) -> float:
-        """Within which a platform is at rest, as far as a good encoder can tell: a fiftieth of the tolerance."""
+        """A fiftieth of the tolerance, within which the platform counts as fully at rest."""
         return self.tolerance_rad / 50.0
 
     @property
     def window_ns(self) -> int:
+        """The window in ns."""
         return round(self.window_s * _SECOND_NS)
 
     @property
     def settle_ns(self) -> int:
+        """The margin after an arrival in ns."""
         return round(self.settle_s * _SECOND_NS)
 
     @property
     def lead_ns(self) -> int:
+        """The margin before a departure in ns."""
         return round(self.lead_s * _SECOND_NS)
 
     @property
     def history_ns(self) -> int:
-        """How long before an interval messages are of use."""
+        """Time before an interval from which on messages are needed to judge it, ns."""
         return _CREEPING_NS + 6 * self.window_ns
 
     def intervals(
         self, times: Times, poses: Floats, is_quaternion: bool, known: Mask, covered_ns: int
     ) -> tuple[Mask, int]:
-        """Which intervals between consecutive messages are still, (m - 1,) bool, and how far a still window reaches.
+        """Mask (m - 1,) of the intervals between consecutive messages that are still, and the end of the last still
+        window.
 
-        Still is what lies in a window over which no step and no difference of ends exceeds the tolerance. known (m,):
-        the window that begins with a message is over; covered_ns: how far one judged earlier reaches.
+        An interval is still if it lies in a window in which neither a step nor the difference between the ends exceeds
+        the tolerance.
+
+        - known (m,): whether the window that begins with each message is complete.
+        - covered_ns: end of the last window that was judged as still before.
         """
         ends = np.minimum(np.searchsorted(times, times + self.window_ns), len(times) - 1)
         steps = pose_distance(poses[1:], poses[:-1], is_quaternion) <= self.tolerance_rad
@@ -92,9 +101,9 @@ class Stillness:
         return (reach[:-1] > times[:-1]) & steps, int(reach[-1])
 
     def departure_ns(self, pose: Stream, is_quaternion: bool, arrived_ns: int, end_ns: int) -> int:
-        """When, in a dwell from ``arrived_ns`` to ``end_ns``, the platform began to creep away.
+        """Stamp, ns, at which the platform began to leave a dwell that lasts from ``arrived_ns`` to ``end_ns``.
 
-        It may have left, by what angles cannot tell, as long before as messages lie apart.
+        Because the angles are sampled, it may have left up to one sampling period earlier than they show.
         """
         away = self.creeping_from(pose, is_quaternion, arrived_ns, end_ns)
         if away is None:
@@ -104,13 +113,14 @@ class Stillness:
         return max(int(standing_ns) - max(apart_ns - self.lead_ns, 0), arrived_ns)
 
     def creeping_from(self, pose: Stream, is_quaternion: bool, arrived_ns: int, until_ns: int) -> int | None:
-        """Since which message the platform, in a dwell from ``arrived_ns`` on, has been creeping by ``until_ns``.
+        """Index of the message from which on the platform has been creeping until ``until_ns``, in a dwell since
+        ``arrived_ns``.
 
-        None: it rests, or creeps for so long that it is taken as one that goes on so.
+        None if the platform is at rest, or if it has been creeping for so long that this is taken as permanent.
         """
         arrived, last = np.searchsorted(pose.time_ns, (arrived_ns, until_ns + 1)).tolist()
         begin = last
-        for span_ns in (self.window_ns, _CREEPING_NS + self.window_ns):  # most of the time nothing moves
+        for span_ns in (self.window_ns, _CREEPING_NS + self.window_ns):  # the short span suffices most of the time
             judged = max(int(np.searchsorted(pose.time_ns, until_ns - span_ns)), arrived)
             first = int(np.searchsorted(pose.time_ns, until_ns - span_ns - 4 * self.window_ns))
             first = max(min(first, judged - HISTORY), arrived)
@@ -127,9 +137,11 @@ class Stillness:
         return begin if pose.time_ns[last - 1] - pose.time_ns[begin] <= _CREEPING_NS else None
 
     def _away(self, pose: Stream, is_quaternion: bool) -> Mask:
-        """Which messages are away from rest: not the mean of those half a window to two windows before, (m,) bool.
+        """Return a mask (m,) of the messages that show the platform away from rest.
 
-        To ``rest_rad`` or four sigma of the encoder; where messages are seldom, of a few. The first are not judged.
+        A message is compared with the mean of those one to four windows before it, and is away if it differs by more
+        than ``rest_rad`` and four sigma of the encoder. If messages are infrequent, the few before it are used. The
+        first messages are not judged.
         """
         times, own = pose.time_ns, pose.values - pose.values[0]
         ends = np.minimum(np.searchsorted(times, times - self.window_ns), np.maximum(np.arange(len(times)) - 1, 0))
@@ -143,12 +155,12 @@ class Stillness:
         return (apart > allowed) & (bends[:, 0] > 0)
 
     def rest_ns(self, pose: Stream, is_quaternion: bool, arrived_ns: int, until_ns: int) -> tuple[int, bool]:
-        """When, in a dwell from ``arrived_ns`` on, the platform had come to rest; whether what is known until
-        ``until_ns`` is enough to tell.
+        """Stamp, ns, at which the platform came to rest in a dwell since ``arrived_ns``, and whether this is certain by
+        ``until_ns``.
 
-        A message is of a platform at rest where it agrees with the mean of those of the next two margins for settling,
-        a few at least, to ``rest_rad`` or four sigma of them. A dwell that creeps all along is used from its arrival,
-        and so is one whose messages are farther apart than that.
+        A message shows the platform at rest if it agrees with the mean of the messages in the following two settling
+        margins, to within ``rest_rad`` or four sigma of the encoder. A dwell that creeps throughout is used from its
+        arrival, and so is one whose messages are farther apart than these margins.
         """
         first, last = np.searchsorted(pose.time_ns, (arrived_ns, until_ns)).tolist()
         times, poses, span_ns = pose.time_ns[first:last], pose.values[first:last], 2 * self.settle_ns
@@ -166,7 +178,8 @@ class Stillness:
         return arrived_ns, True
 
     def creeps(self, poses: Floats) -> bool:
-        """Whether the messages (n, k) of a block tell of more than noise about one pose: by the means of its parts."""
+        """Tell whether the messages (n, k) of a block vary by more than noise about one pose, from the means of its
+        parts."""
         count, spread = len(poses), np.ptp(poses, axis=0).max()
         if count < 2 or spread <= self.rest_rad:
             return False
@@ -179,11 +192,11 @@ class Stillness:
         return bool((apart > np.maximum(self.rest_rad, 8.0 * sigma)).any())
 
     def moved_between(self, accel: Stream, begin_ns: int, end_ns: int, gravity_mps2: float) -> tuple[int, int]:
-        """When a motion without angles began and ended, from the readings between two poses.
+        """Stamps, ns, of the beginning and the end of a motion without angles, from the readings between two poses.
 
-        The readings are averaged over windows of a quarter of a second. The old dwell lasts while they stay at its
-        level, the new one reaches back as far as they are at the level they end on; then as far as they are there to
-        three sigma.
+        The readings are averaged over windows of a quarter of a second. The old dwell ends where the averages leave its
+        level, and the new one begins where they reach their final level, first to a coarse limit and then to three
+        sigma.
         """
         part = slice(*np.searchsorted(accel.time_ns, (begin_ns, end_ns)))
         times, values = accel.time_ns[part], accel.values[part]
@@ -201,10 +214,10 @@ class Stillness:
         return leave, max(arrive, leave)
 
     def felt_ns(self, accel: Stream, since_ns: int, arrival_ns: int, gravity_mps2: float) -> int:
-        """When, since the last angle before an arrival, the readings came to the level they have just after it.
+        """Stamp, ns, at which the readings reached the level that they have just after an arrival.
 
-        That level is of half a window, which begins a quarter of it after the arrival and is over before this is
-        judged.
+        Only readings since ``since_ns``, the last angle before the arrival, are considered. The level is the mean over
+        half a window, which begins a quarter of a window after the arrival.
         """
         quarter_ns = self.window_ns // 4
         stamps = since_ns, arrival_ns + quarter_ns, arrival_ns + 3 * quarter_ns
@@ -222,20 +235,23 @@ class Stillness:
 
 
 def encoder_sigma(poses: Floats) -> Floats:
-    """Noise of a message, 1 sigma (k,), rad, from poses (n, k); 0 for fewer than three."""
+    """Noise of an angle message, one standard deviation (k,), rad, from poses (n, k); 0 for fewer than three."""
     return (
         np.sqrt(np.mean(np.diff(poses, 2, axis=0) ** 2, axis=0) / 6.0) if len(poses) > 2 else np.zeros(poses.shape[1])
     )
 
 
 def _summed(values: Floats) -> Floats:
-    """Sums (n + 1, k) of the first values (n, k), of none at first."""
+    """Return the cumulative sums (n + 1, k) of values (n, k), beginning with zero."""
     return np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
 
 
 def _standing(means: Floats, coarse: Floats, fine: Floats) -> int:
-    """In how many windows, from the first on, the means (n, 3) of readings say that the platform stood where it did;
-    none where they never leave that level, and cannot tell."""
+    """Return the number of windows, from the first on, in which the mean readings (n, 3) show the platform at its first
+    position.
+
+    It is 0 if they never leave that level and therefore cannot tell.
+    """
     near = np.all(np.abs(means - means[0]) <= coarse, axis=1)
     if near.all():
         return 0

@@ -1,14 +1,16 @@
-"""Dwells folded into small triangles: all that is kept of the samples.
+"""Square-root sufficient statistics of dwells: small triangular matrices, which are all that is kept of the samples.
 
-A dwell is cut into pieces, short after the arrival and longer later (1, 1, 2, 4 ... 60 s). Over a piece every model
-column is smooth: it is taken as a parabola through its values at the piece's beginning, middle and end (its *nodes*).
-The readings are folded by QR against the parabola's basis, [1 u u^2 | z1 z2 z3] -> 6 x 6, unwhitened. Any column known
-at the nodes, of any model, then has its exact rows from the triangles: noise model, filter and diagnosis need no second
-pass over the data, and a column that changes (another tau, another E) is evaluated anew at a few hundred nodes.
+A dwell is cut into pieces, short ones after the arrival and longer ones later (1, 1, 2, 4 ... 60 s). Over a piece every
+column of a model is smooth and is approximated by the parabola through its values at the beginning, middle and end of
+the piece, its *nodes*. The readings are reduced by QR together with the basis of the parabola, [1 u u^2 | z1 z2 z3] ->
+6 x 6, without whitening. From this triangle, the rows of any column that is known at the nodes follow without further
+approximation, whatever the model. Noise model, filter and diagnosis therefore need no second pass over the data, and a
+column that changes (with a time constant or a sensitivity) is evaluated again at a few hundred nodes only.
 
-A column that oscillates within a piece is no parabola. For it the dwells are folded on a *carrier* f0 near its
-frequency: the basis is 1, u, u^2 and these times cos 2 pi f0 t and sin 2 pi f0 t, the triangle 12 x 12, and a column is
-known by nine nodes, three of its plain part and three of each envelope. K is 3 below, or 9 on a carrier.
+A column that oscillates within a piece is not a parabola. For such columns the dwells are folded on a *carrier* of a
+frequency f0 near that of the oscillation: the basis is 1, u, u^2 and the products of these with cos 2 pi f0 t and sin 2
+pi f0 t, the triangle is 12 x 12, and a column is known by nine values, three of its plain part and three of each
+envelope. The number of basis functions is called K below; it is 3, or 9 on a carrier.
 """
 
 from __future__ import annotations
@@ -27,14 +29,16 @@ from kf_calib.dwells.rows import Nodes, Rows, basis, parabola
 from kf_calib.dwells.walk_path import WalkPath, walk_path_of
 
 _LAGS = 64
-_CORRELATED_SAMPLES = 8192  # readings of a dwell whose autocovariance is accumulated
+_CORRELATED_SAMPLES = 8192  # first readings of a dwell over which its autocovariance is accumulated, at least
 
 
 @dataclass(frozen=True)
 class Autocovariance:
-    """Sums of lagged products within blocks of readings less their parabola: products (L + 1, 3), pairs (L + 1,).
+    """Sums of lagged products (L + 1, 3) within blocks of readings less their parabola, and the numbers of pairs (L +
+    1,).
 
-    Without the parabola a drift would count as noise, and the test that should find it would be silenced.
+    The parabola is removed because a drift would otherwise count as noise, and the test for the drift would lose its
+    power.
     """
 
     products: Floats = field(default_factory=lambda: np.zeros((_LAGS + 1, 3)))
@@ -52,7 +56,7 @@ class Autocovariance:
 
     @classmethod
     def of(cls, left: Floats) -> Autocovariance:
-        """Of innovations (3, n) less their parabola."""
+        """The sums for one block of readings (3, n) from which the parabola has been removed."""
         count = left.shape[1]
         padded = 1 << (count + _LAGS).bit_length()
         spectrum = np.fft.rfft(left, padded, axis=1)
@@ -64,9 +68,13 @@ class Autocovariance:
 
 @dataclass(frozen=True)
 class Piece:
-    """A stretch of a dwell, folded: triangle (K + 3, K + 3) over [1 u u^2 ... | z1 z2 z3], and its nodes (3).
+    """One piece of a dwell.
 
-    count: of what was folded, readings or averages of them; taken: of readings.
+    - triangle (K + 3, K + 3): the triangular factor of [1 u u^2 ... | z1 z2 z3].
+    - nodes: the conditions at its three nodes.
+    - count: number of readings, or of averages of them, that were folded.
+    - carrier_hz: frequency of the carrier; 0 for none.
+    - taken: number of readings that ``count`` stands for.
     """
 
     triangle: Floats
@@ -78,12 +86,16 @@ class Piece:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class DwellFactor:
-    """One dwell: its pieces in order of time, its readings in cells of the run's clock, and the autocovariance and the
-    spectrum of its first readings.
+    """The sufficient statistics of one dwell.
 
-    moving: it is the slew after the dwell of that number, folded like a dwell. came_from: the dwell before it, where
-    that one is left out (None: it is there, or there was none). pose_sigma_rad: of its pose, by noise of the angles.
-    turns: whole turns of each gimbal by which its pose goes beyond the angles as they were recorded.
+    - number: its number, counted from 1.
+    - pieces: its pieces in order of time.
+    - autocovariance, spectrum: of its first readings.
+    - trace: sums of its readings in cells of the run's clock.
+    - moving: True for the slew after the dwell of that number, which is folded like a dwell.
+    - came_from: the dwell before it, if that one has been left out of the fit; else None.
+    - pose_sigma_rad: uncertainty of its pose due to noise of the angles.
+    - turns: whole turns of each gimbal by which its pose goes beyond the angles as recorded.
     """
 
     number: int
@@ -98,22 +110,22 @@ class DwellFactor:
 
     @property
     def carrier_hz(self) -> float:
-        """What it was folded on; 0: no carrier."""
+        """Frequency of the carrier on which the dwell was folded; 0 for none."""
         return self.pieces[0].carrier_hz
 
     @property
     def width(self) -> int:
-        """K, functions in the basis of a piece."""
+        """The number K of basis functions of a piece."""
         return self.pieces[0].triangle.shape[1] - 3
 
     @cached_property
     def triangles(self) -> Floats:
-        """Of the pieces, (pieces, K + 3, K + 3)."""
+        """The triangles of the pieces, (pieces, K + 3, K + 3)."""
         return np.array([piece.triangle for piece in self.pieces])
 
     @cached_property
     def nodes(self) -> Nodes:
-        """What it felt at the nodes of all its pieces, in order."""
+        """The nodes of all pieces, in order of time."""
         every = [piece.nodes for piece in self.pieces]
         return Nodes(
             elapsed_s=np.concatenate([each.elapsed_s for each in every]),
@@ -127,42 +139,44 @@ class DwellFactor:
 
     @cached_property
     def regressors(self) -> Floats:
-        """Rows of 1, f_x, f_y, f_z of each piece, (pieces, K, 4)."""
+        """The rows of the regressors 1, f_x, f_y, f_z in each piece, (pieces, K, 4)."""
         values = self.nodes.regressors.reshape(len(self.pieces), 3, -1)
         return self.triangles[:, : self.width, :3] @ parabola(values)
 
     @cached_property
     def squares(self) -> Floats:
-        """Sums of squares of the readings about the functions of the basis, (pieces, 3)."""
+        """Sums of squares (pieces, 3) of the readings about their fit by the basis functions."""
         return (self.triangles[:, self.width :, self.width :] ** 2).sum(axis=1)
 
     @cached_property
     def counts(self) -> Floats:
-        """Readings of each piece, (pieces,)."""
+        """Number of readings of each piece, (pieces,)."""
         return np.array([piece.count for piece in self.pieces], float)
 
     @cached_property
     def variances(self) -> Floats:
-        """Variance of the readings within each piece (pieces, 3), about a parabola; short pieces have their dwell's."""
+        """Variance of the readings about their fit within each piece, (pieces, 3); short pieces have the value pooled
+        over the dwell."""
         squares, spare = self.squares, np.maximum(self.counts - float(self.width), 0.0)[:, None]
         pooled = squares.sum(axis=0) / max(spare.sum(), 1)
         return np.where(spare >= 8, squares / np.maximum(spare, 1), pooled)
 
     @cached_property
     def walk(self) -> WalkPath:
-        """What a walk of the biases does in it."""
+        """The effect of a random walk of the biases on the rows of this dwell."""
         ends = np.array([piece.nodes.elapsed_s[[0, -1]] for piece in self.pieces])
         triangles = self.triangles[:, : self.width, : self.width]
         return walk_path_of(ends[:, 0], ends[:, 1], [piece.count for piece in self.pieces], triangles)
 
     @property
     def averaged(self) -> bool:
-        """Whether averages of readings were folded."""
+        """Whether averages of readings were folded instead of the readings themselves."""
         return self.pieces[0].nodes.variance_mps2_2 is not None
 
     @cached_property
     def shaking(self) -> tuple[Floats, Floats]:
-        """Variance of the readings at the nodes of each piece (pieces, 3, 3), and of how many, (pieces,)."""
+        """Variance of the readings at the nodes of each piece, (pieces, 3, 3), and the number of readings behind it,
+        (pieces,)."""
         taken = np.array([piece.taken for piece in self.pieces], float)
         if not self.averaged:
             return np.repeat(self.variances[:, None], 3, axis=1), taken
@@ -170,14 +184,17 @@ class DwellFactor:
 
     @property
     def start_s(self) -> float:
+        """Time of the first reading since the first sample, s."""
         return float(self.pieces[0].nodes.elapsed_s[0])
 
     @property
     def end_s(self) -> float:
+        """Time of the last reading since the first sample, s."""
         return float(self.pieces[-1].nodes.elapsed_s[-1])
 
     @cached_property
     def count(self) -> int:
+        """Number of readings, or of averages of them, that were folded."""
         return sum(piece.count for piece in self.pieces)
 
     @cached_property
@@ -188,21 +205,23 @@ class DwellFactor:
 
     @cached_property
     def recorded_pose(self) -> Floats:
-        """Mean pose (k,) with its angles as they were recorded, not continued beyond a turn from dwell to dwell."""
+        """Mean pose (k,) with the angles as they were recorded, without the whole turns added to make them
+        continuous."""
         return self.pose - 2.0 * np.pi * np.array(self.turns) if self.turns else self.pose
 
     @cached_property
     def factor(self) -> Floats:
-        """Triangle (7, 7) over [1 f_x f_y f_z | z1 z2 z3]."""
+        """Triangular factor (7, 7) of [1 f_x f_y f_z | z1 z2 z3] over the whole dwell."""
         return _folded(self.rows([piece.nodes.regressors for piece in self.pieces]))
 
     @cached_property
     def means(self) -> Floats:
-        """Means of the regressors and readings, (7,): 1, f (3), z (3)."""
+        """Means (7,) of the regressors 1, f_x, f_y, f_z and of the three readings."""
         return self.factor[0] / self.factor[0, 0]
 
     def rows(self, columns: Sequence[Floats]) -> Floats:
-        """Rows [X | z1 z2 z3] of plain columns known at the nodes of each piece, (3, c): ((K + 3) pieces, c + 3)."""
+        """Rows [X | z1 z2 z3], ((K + 3) pieces, c + 3), of columns without an oscillating part, given as (3, c) at the
+        nodes of each piece."""
         width = columns[0].shape[1]
         out = np.zeros((len(self.pieces), self.width + 3, width + 3))
         out[:, :3, :width] = self.triangles[:, :3, :3] @ parabola(np.array(columns))
@@ -210,7 +229,7 @@ class DwellFactor:
         return out.reshape(-1, width + 3)
 
     def merged(self, others: Sequence[DwellFactor]) -> DwellFactor:
-        """The same dwell from this and other stretches of samples."""
+        """This dwell merged with further blocks of its samples."""
         pieces = (piece for each in (self, *others) for piece in each.pieces)
         return replace(
             self,
@@ -221,14 +240,15 @@ class DwellFactor:
         )
 
     def repeated(self, times: float) -> DwellFactor:
-        """The same dwell as if its readings had come that many times over."""
+        """This dwell as if each of its readings had been taken ``times`` times."""
         pieces = (
             replace(own, triangle=own.triangle * times**0.5, count=round(own.count * times)) for own in self.pieces
         )
         return replace(self, pieces=tuple(pieces))
 
     def prefixes(self) -> Iterator[DwellFactor]:
-        """The dwell as it stood after 1, 2, 4 ... of its pieces, and in the end."""
+        """Yield the dwell as it was after its first pieces, for a growing number of pieces, and finally the whole
+        dwell."""
         size = 1
         while size < len(self.pieces):
             yield replace(self, pieces=self.pieces[:size])
@@ -237,13 +257,13 @@ class DwellFactor:
 
 
 def fold(rows: Rows, carrier_hz: float = 0.0) -> tuple[Piece, ...]:
-    """The pieces of one block of rows."""
+    """Fold one block of rows into pieces."""
     width = 9 if carrier_hz else 3
     channels = rows.innovation if rows.static else rows.readings.T
-    level = rows.readings[0] - channels[:, 0]  # what the innovation of a standing platform lacks of the readings
+    level = rows.readings[0] - channels[:, 0]  # what was subtracted from the readings to give the innovation
     pieces = list[Piece]()
     for part, u, nodes in rows.pieces:
-        stacked = np.empty((width + 3, len(u)))  # rows along memory: what LAPACK wants, and faster to fill
+        stacked = np.empty((width + 3, len(u)))  # contiguous rows are what LAPACK needs and are faster to fill
         stacked[:width], stacked[width:] = basis(u, rows.elapsed_s[part], carrier_hz), channels[:, part]
         folded = _folded(stacked.T)
         folded[0, width:] += folded[0, 0] * level
@@ -252,7 +272,7 @@ def fold(rows: Rows, carrier_hz: float = 0.0) -> tuple[Piece, ...]:
 
 
 def less_curve(innovation: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -> Floats:
-    """Innovations (3, n) less their parabola; what goes with a carrier is no noise either."""
+    """Innovations (3, n) with their parabola removed and, on a carrier, also its oscillating basis functions."""
     count = innovation.shape[1]
     curve = _parabola(count)
     if carrier_hz:
@@ -262,12 +282,12 @@ def less_curve(innovation: Floats, elapsed_s: Floats | None = None, carrier_hz: 
 
 @lru_cache(maxsize=4)
 def _parabola(count: int) -> Floats:
-    """1, u, u^2 made orthonormal, (n, 3)."""
+    """Return an orthonormal basis (n, 3) of 1, u, u^2."""
     return np.linalg.qr(basis(np.linspace(-1.0, 1.0, count)).T)[0]
 
 
 def _folded(stacked: Floats) -> Floats:
-    """The square triangle of rows (n, c), padded with zeros where there are fewer rows than columns."""
+    """Return the square triangular factor of rows (n, c), padded with zeros if there are fewer rows than columns."""
     width = stacked.shape[1]
     if len(stacked) < width:
         stacked = np.vstack([stacked, np.zeros((width - len(stacked), width))])
@@ -275,12 +295,12 @@ def _folded(stacked: Floats) -> Floats:
 
 
 def rate_or_zero(rate: Floats | None) -> Floats:
-    """The rate at the nodes of a piece; none where the platform stands."""
+    """Angular rate at the nodes of a piece; zeros if the platform stands."""
     return np.zeros((3, 3)) if rate is None else rate
 
 
 def dwells_before(dwells: Sequence[DwellFactor]) -> list[DwellFactor]:
-    """The dwell before each dwell, itself in the first; before a slew, the dwell it left."""
+    """The dwell before each dwell; for the first, that dwell itself; for a slew, the dwell that it left."""
     out, last = list[DwellFactor](), dwells[0]
     for dwell in dwells:
         out.append(dwell.came_from or last)
@@ -289,14 +309,17 @@ def dwells_before(dwells: Sequence[DwellFactor]) -> list[DwellFactor]:
 
 
 def dwells_without(dwells: Sequence[DwellFactor], left_out: Collection[int]) -> list[DwellFactor]:
-    """The dwells but those at the places ``left_out``; each still knows the step by which it was reached."""
+    """The dwells without those at the indices ``left_out``; each keeps the dwell from which it was reached."""
     told = [replace(dwell, came_from=last) for dwell, last in zip(dwells, dwells_before(dwells), strict=True)]
     return [dwell for k, dwell in enumerate(told) if k not in left_out]
 
 
 def lines_of(dwells: Sequence[DwellFactor], level: float = 0.01) -> tuple[Line, ...]:
-    """Oscillations in the readings of dwells, by a test of ``level``: the lines of their spectra, else one that is too
-    weak for these and keeps its phase from dwell to dwell."""
+    """Oscillations in the readings of dwells at the significance ``level``.
+
+    These are the lines of the averaged spectrum or, if there are none, a single oscillation that is too weak to appear
+    there but keeps its phase from dwell to dwell. The p-values account for both tests.
+    """
     seen = lines((dwell.spectrum for dwell in dwells), 0.5 * level)
     steady = None if seen else tone([dwell.trace for dwell in dwells], 0.5 * level)
     found = seen or ((steady,) if steady else ())
@@ -304,7 +327,7 @@ def lines_of(dwells: Sequence[DwellFactor], level: float = 0.01) -> tuple[Line, 
 
 
 def alike(dwells: Sequence[DwellFactor]) -> list[list[int]]:
-    """Places of dwells that have as many pieces of one width: their arrays can be worked on together."""
+    """Indices of dwells, grouped by number of pieces and basis functions, so that a group's arrays can be stacked."""
     places = dict[tuple[int, int], list[int]]()
     for k, dwell in enumerate(dwells):
         places.setdefault((len(dwell.pieces), dwell.width), []).append(k)
@@ -312,41 +335,45 @@ def alike(dwells: Sequence[DwellFactor]) -> list[list[int]]:
 
 
 class _Growing:
-    """Dwells, or slews, one after another; the last grows block by block.
+    """A sequence of dwells, or of slews, to which blocks are added in order of time.
 
-    Its blocks are merged when it is asked for: merged as they come, all that it holds would be copied at every block.
+    The blocks of the last dwell are merged only when the sequence is read; merging each as it arrives would copy the
+    whole dwell every time.
     """
 
     def __init__(self, folded: Iterable[DwellFactor] = ()) -> None:
         self._folded, self._blocks = list(folded), list[DwellFactor]()
 
     def add(self, block: DwellFactor) -> None:
+        """Add a block of the last dwell or of a new one."""
         if self._last(block.number) is None:
             self.folded.append(block)
-        elif block.autocovariance.count:  # of its first readings: how many more are wanted is seen in the dwell
+        elif block.autocovariance.count:  # merged now, since ``correlated`` reads the count from the dwell
             self._folded[-1] = self._folded[-1].merged([block])
         else:
             self._blocks.append(block)
 
     def correlated(self, number: int) -> int:
-        """Readings in the autocovariance of the dwell of that number, which is the last or is still to come."""
+        """Number of readings in the autocovariance of the dwell of this number, which is either the last or a new
+        one."""
         last = self._last(number)
         return last.autocovariance.count if last else 0
 
     @property
     def folded(self) -> list[DwellFactor]:
-        """All of them, each with all its blocks."""
+        """All dwells, each with all its blocks."""
         if self._blocks:
             self._folded[-1] = self._folded[-1].merged(self._blocks)
             self._blocks = []
         return self._folded
 
     def _last(self, number: int) -> DwellFactor | None:
+        """Return the last dwell if it has this number, else None."""
         return self._folded[-1] if self._folded and self._folded[-1].number == number else None
 
 
 class Folder:
-    """Folds rows into the lists of dwell factors and of slews, one after another, on a carrier where one is given."""
+    """Folds rows into sequences of dwells and of slews, on a carrier if its frequency is not 0."""
 
     def __init__(self, carrier_hz: float = 0.0) -> None:
         self._dwells, self._slews = _Growing(), _Growing()
@@ -355,6 +382,7 @@ class Folder:
 
     @property
     def dwells(self) -> list[DwellFactor]:
+        """The dwells folded so far."""
         return self._dwells.folded
 
     @dwells.setter
@@ -363,6 +391,7 @@ class Folder:
 
     @property
     def slews(self) -> list[DwellFactor]:
+        """The slews folded so far."""
         return self._slews.folded
 
     @slews.setter
@@ -370,6 +399,7 @@ class Folder:
         self._slews = _Growing(slews)
 
     def add(self, rows: Rows) -> None:
+        """Fold one block of rows into its dwell or slew."""
         growing = self._slews if rows.moving else self._dwells
         block = DwellFactor(
             rows.dwell, fold(rows, self.carrier_hz), moving=rows.moving, pose_sigma_rad=rows.pose_sigma_rad,

@@ -1,10 +1,10 @@
-"""A random walk of the biases: process noise between the dwells and within them.
+"""The effect of a random walk of the biases on the rows of a dwell.
 
-b(t) = b(t_0) + W(t), W a Brownian path of intensity q (m/s^2 per sqrt(s)) that steps from reading to reading. Kept of a
-dwell's piece are the coefficients of its parabola; those of W have a covariance known in closed form. The filter's bias
-is the one at the END of a dwell: its rows lead with the columns of the step that the biases take in it, and given that
-step what W does within the dwell is independent of all other dwells. What W does beside the parabolas is not used, and
-is taken out of the noise of a reading.
+The bias is b(t) = b(t_0) + W(t), where W is a Brownian path of intensity q (m/s^2 per sqrt(s)) that steps from reading
+to reading. Of each piece of a dwell, the coefficients of a parabola are kept; the covariance of those of W is known in
+closed form. The filter's bias is the one at the end of a dwell. Therefore the rows of a dwell begin with columns for
+the step s that the biases take within it; given s, the path within the dwell is independent of all other dwells. The
+deviation of W from the parabolas is not used and is subtracted from the noise of a reading.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 
-_LEAST = 1e-12  # of the largest variance: smaller modes are rounding
+_LEAST = 1e-12  # relative to the largest variance; smaller modes are rounding
 
 
 @dataclass(frozen=True)
 class WalkPath:
-    """What a walk of q = 1 does in a dwell, on the r rows of its pieces' triangles.
+    """The effect of a random walk of intensity q = 1 on the r rows of a dwell's triangles.
 
-    step (r,): rows per unit of the bias's step s over the dwell, b at its end being known. modes (r, k), variances
-    (k,): principal axes of what is left of W given s. rest (pieces,): what W adds to the sums of squares about the
-    parabolas.
+    - step (r,): the change of the rows per unit of the bias's step s over the dwell, for a given bias at its end.
+    - modes (r, k), variances (k,): principal axes of the remaining covariance, given s.
+    - rest (pieces,): the contribution of W to the sums of squares about the parabolas.
     """
 
     step: Floats
@@ -35,14 +35,18 @@ class WalkPath:
     rest: Floats
 
     def whiten(self, rows: Floats, ratio: float) -> Floats:
-        """Rows (r, c) of unit noise times V^(-1/2), V = I + ``ratio``^2 sum of variances times modes modes^T."""
+        """Rows (r, c) of unit noise multiplied by V^(-1/2), where V = I + ``ratio``^2 sum of variances times modes
+        modes^T."""
         shrink = 1.0 - 1.0 / np.sqrt(1.0 + ratio**2 * self.variances)
         return rows - self.modes @ (shrink[:, None] * (self.modes.T @ rows))
 
 
 def walk_path_of(begins_s: Floats, ends_s: Floats, counts: Sequence[int], triangles: Floats) -> WalkPath:
-    """Of a dwell whose pieces last from ``begins_s`` to ``ends_s`` and have ``triangles`` (pieces, K, K) over [1 u u^2
-    ...], K the rows kept of each."""
+    """The effect for a dwell with the given pieces.
+
+    - begins_s, ends_s (pieces,): first and last time of each piece; counts: their numbers of readings.
+    - triangles (pieces, K, K): triangular factors over the basis [1 u u^2 ...].
+    """
     root, end = _root(begins_s, ends_s, counts)
     onto = (triangles[:, :, :3] @ root).reshape(-1, root.shape[2])
     total = float(end @ end)
@@ -55,9 +59,11 @@ def walk_path_of(begins_s: Floats, ends_s: Floats, counts: Sequence[int], triang
 
 
 def _root(begins_s: Floats, ends_s: Floats, counts: Sequence[int]) -> tuple[Floats, Floats]:
-    """W by independent unit normals: coefficients of its parabolas (pieces, 3, n), its last value (n,).
+    """Return W as a linear function of n independent unit normals: its parabolas' coefficients (pieces, 3, n) and its
+    last value (n,).
 
-    Four normals a piece: its parabola's coefficients, and where W is when the next piece begins.
+    There are four normals for each piece: three for the coefficients of its parabola and one for the value of W when
+    the next piece begins.
     """
     size = len(counts)
     pauses = np.maximum(np.append(begins_s[1:] - ends_s[:-1], 0.0), 0.0)
@@ -76,26 +82,27 @@ def _root(begins_s: Floats, ends_s: Floats, counts: Sequence[int]) -> tuple[Floa
 
 @lru_cache(maxsize=4096)
 def _moments(count: int) -> tuple[Floats, float]:
-    """Of a walk with unit steps over ``count`` readings, from zero at the first.
+    """Return moments of a walk with unit steps over ``count`` readings that begins at zero.
 
-    Covariance (4, 4) of its parabola's coefficients on 1, u, u^2 and its last value; its mean sum of squares about the
-    parabola.
+    They are the covariance (4, 4) of the coefficients of its parabola on 1, u, u^2 and of its last value, and the mean
+    sum of squares about the parabola.
     """
     u = np.linspace(-1.0, 1.0, count)
     design = np.column_stack([np.ones(count), u, u * u]) if count > 1 else np.array([[1.0, 0.0, 0.0]])
     last = np.zeros((count, 1))
     last[-1] = 1.0
     weights = np.hstack([np.linalg.pinv(design).T, last])
-    later = np.cumsum(weights[::-1], axis=0)[::-1][1:]  # the sum over all readings that a step moves
+    later = np.cumsum(weights[::-1], axis=0)[::-1][1:]  # each step moves all later readings
     covariance = later.T @ later
     inside = float(np.trace(design.T @ design @ covariance[:3, :3]))
     return covariance, max(0.5 * count * (count - 1) - inside, 0.0)
 
 
 def lagged(period_s: float, size: int, pairs: Floats) -> Floats:
-    """What a walk of q = 1 adds to the sums of lagged products (L + 1,) of ``pairs`` readings, about the parabola of
-    blocks of ``size``.
+    """Contribution of a walk of intensity q = 1 to the sums of lagged products (L + 1,) about the parabolas of blocks
+    of ``size`` readings.
 
-    The residual has its mean square at lag 0 and loses half of q^2 times the lag, as the walk does.
+    The residual has its mean square at lag 0 and loses half of q^2 times the lag, as the walk itself does. ``pairs`` (L
+    + 1,) are the numbers of products.
     """
     return period_s * pairs * np.maximum(_moments(size)[1] / size - 0.5 * np.arange(len(pairs)), 0.0)

@@ -1,8 +1,8 @@
-"""Readings averaged over windows of a second or more, before anything else is made of them.
+"""Averages of the readings over smooth windows of a second or more, taken before all other processing.
 
-Vibration of the bench is thousands of times the noise of a good accelerometer, and averages away a thousand times
-better than noise of that size would: what it leaves in the mean of a dwell are the cycles cut off at the ends. Windows
-that rise and fall smoothly cut nothing off, and what remains of the readings in them is their noise at low frequencies.
+Vibration of the bench is thousands of times larger than the noise of a good accelerometer, but it averages out much
+faster than noise of that size; what remains in the mean of a dwell are the incomplete cycles at its ends. Windows that
+rise and fall smoothly have no such remainder, and only the noise at low frequencies is left in the averages.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from kf_calib.dwells.blocks import Block
 from kf_calib.dwells.line_spectrum import Line
 
 WINDOW_S = 1.0
-"""Usual length of a window."""
+"""Default length of a window, s."""
 
-_CYCLES = 20.0  # a window: a millionth of an oscillation is left, and windows are short enough for what comes and goes
-_WINDOWS = 4  # one after another, at least, in a block
-_OVERLAP = 3  # each reading lies in as many windows: with them a Hann window's squares add up to a constant
-_SHORTEST_S = 0.5  # blocks that are shorter are left out: a window in them is no longer than the vibration's periods
+_CYCLES = 20.0  # cycles in a window: a millionth of an oscillation is left, and slow changes are still resolved
+_WINDOWS = 4  # least number of consecutive windows in a block
+_OVERLAP = 3  # number of windows in which each reading lies; the squares of Hann windows then add up to a constant
+_SHORTEST_S = 0.5  # shorter blocks are left out, since a window in them would not cover several periods of vibration
 
 
 def window_s(lines: Iterable[Line]) -> float:
-    """Length of windows that average away the strongest of the lines that a vibration makes in the readings.
+    """Length of the windows that average out the strongest of the lines in the readings, s.
 
-    One that is read too slowly is seen at another frequency, and leaves as much as if it had that.
+    A vibration that is sampled too slowly appears at another frequency and leaves as much as one of that frequency.
     """
     strongest = max(lines, key=lambda line: float(np.linalg.norm(line.amplitude_mps2)), default=None)
     return WINDOW_S if strongest is None else max(WINDOW_S, _CYCLES / strongest.frequency_hz)
@@ -39,7 +39,8 @@ def window_s(lines: Iterable[Line]) -> float:
 
 @cache
 def correlations() -> Floats:
-    """Of an average with itself and the next two, (3,): windows overlap, and white noise makes averages alike."""
+    """Correlations (3,) of an average of white noise with itself and the next two, which the overlap of windows
+    produces."""
     weights = np.sin(np.pi * (np.arange(3000) + 0.5) / 3000.0) ** 4
     shifted = [weights[: len(weights) - k * len(weights) // _OVERLAP] for k in range(_OVERLAP)]
     return np.array([own @ weights[-len(own) :] for own in shifted]) / (weights @ weights)
@@ -47,16 +48,17 @@ def correlations() -> Floats:
 
 @cache
 def inflation() -> float:
-    """kappa of averages of white noise: their spectral density at zero frequency over that of their variance."""
+    """Inflation kappa of averages of white noise: their spectral density at frequency zero relative to that of white
+    noise of their variance."""
     return float(2.0 * correlations().sum() - 1.0)
 
 
 def averaged(block: Block, length_s: float = WINDOW_S) -> Block | None:
-    """A block of averages over windows cos^4, with the variance of the readings in each; None: it is too short.
+    """The block averaged over cos^4 windows, with the variance of the readings in each; None if the block is too short.
 
-    Side lobes of the window fall as the fifth power of the frequency: at 30 cycles a window 1e-7 of an oscillation is
-    left. A window is hardly longer than a quarter of the block. Variances are about a parabola over the block: what
-    shakes has no mean in a window as short.
+    The side lobes of the window fall as the fifth power of the frequency; with 30 cycles in a window, 1e-7 of an
+    oscillation remains. A window is hardly longer than a quarter of the block. The variances are taken about a parabola
+    over the block, because a vibration has no mean within so short a window.
     """
     count, span_s = len(block.elapsed_s), float(block.elapsed_s[-1] - block.elapsed_s[0])
     step = math.ceil(min(length_s / max(span_s, 1e-9), 1.0 / _WINDOWS) * count / _OVERLAP)

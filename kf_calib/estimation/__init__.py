@@ -1,1 +1,1 @@
-"""Noise model, filters, least squares, the fit and its results."""
+"""The noise model, the filters, least squares, the fit of a model and its results."""

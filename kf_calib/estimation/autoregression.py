@@ -1,7 +1,7 @@
-"""An autoregression of the noise of readings, from their autocovariance about a parabola.
+"""Autoregressive models of the noise of readings, estimated from their autocovariance about a parabola.
 
-Its spectral density at zero frequency, over that of white noise of the same variance, is kappa: by so much longer the
-mean of readings takes to become certain (Percival and Walden, 1993, ch. 9).
+The spectral density of such a model at frequency zero, divided by that of white noise of the same variance, is the
+inflation kappa, by which correlation increases the variance of a mean (Percival and Walden, 1993, ch. 9).
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 
 _ITERATIONS = 60
-_STILL = 1e-3  # of kappa
-_LONG = 500  # readings of a block
-_GONE = 1e-9  # of the variance
+_STILL = 1e-3  # relative change of kappa
+_LONG = 500  # in blocks of more readings than this, a parabola removes almost nothing of white noise
+_GONE = 1e-9  # relative to the variance
 
 
 @dataclass(frozen=True)
 class Autoregression:
-    """x_t = sum a_k x_(t-k) + e_t: coefficients a (p,), variance of e, and of x."""
+    """The model x_t = sum a_k x_(t-k) + e_t with coefficients a (p,), the variance ``innovation`` of e and ``variance``
+    of x."""
 
     coefficients: Floats = field(default_factory=lambda: np.zeros(0))
     innovation: float = 1.0
@@ -29,7 +30,8 @@ class Autoregression:
 
     @classmethod
     def of(cls, gamma: Floats, count: int) -> Autoregression:
-        """Of autocovariances (L + 1,) from ``count`` readings: Levinson and Durbin over orders, that of least BIC."""
+        """The model fitted to autocovariances (L + 1,) of ``count`` readings by the Levinson-Durbin recursion, with the
+        order of least BIC."""
         a, innovation, level = np.zeros(0), float(gamma[0]), float(gamma[0])
         best, best_score = cls(a, innovation, level), count * np.log(innovation)
         for order in range(1, len(gamma)):
@@ -45,11 +47,12 @@ class Autoregression:
 
     @property
     def inflation(self) -> float:
-        """kappa = var(e) / (var(x) (1 - sum a)^2)."""
+        """The inflation kappa = var(e) / (var(x) (1 - sum a)^2)."""
         return float(self.innovation / self.variance / (1.0 - self.coefficients.sum()) ** 2)
 
     def autocovariances(self, known: Floats, size: int) -> Floats:
-        """At lags 0 ... size - 1: the ``known`` ones up to its order, then as it goes on."""
+        """Autocovariances at lags 0 ... size - 1: the ``known`` ones up to the order of the model, then by its
+        recursion."""
         order = len(self.coefficients)
         out = np.zeros(size)
         out[: order + 1] = known[: order + 1]
@@ -62,10 +65,11 @@ class Autoregression:
 
 
 def expected_products(gamma: Floats, lags: int) -> Floats:
-    """What lagged products (lags + 1,) of n readings of autocovariances ``gamma`` (n,) about their parabola sum to.
+    """Expected sums of lagged products (lags + 1,) of n readings with autocovariances ``gamma`` (n,), about their
+    parabola.
 
-    The sums along the diagonals of P G P, G the Toeplitz matrix of gamma and P = 1 - Q Q^T: P G P = G - Q W^T - W Q^T,
-    W = (1 - Q Q^T / 2) G Q.
+    These are the sums along the diagonals of P G P, where G is the Toeplitz matrix of gamma and P = 1 - Q Q^T projects
+    off the parabola: P G P = G - Q W^T - W Q^T with W = (1 - Q Q^T / 2) G Q.
     """
     count = len(gamma)
     curve = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), 3))[0]
@@ -79,20 +83,22 @@ def expected_products(gamma: Floats, lags: int) -> Floats:
 
 
 def unbiased(raw: Floats, count: int, size: int) -> tuple[Autoregression, float]:
-    """The autoregression, and the variance, of readings whose autocovariances about the parabolas of blocks of ``size``
+    """The model and the variance of readings whose autocovariances about the parabolas of blocks of ``size`` readings
     are ``raw`` (L + 1,).
 
-    A parabola takes what is slow out of a block: of noise correlated over a twentieth of it half. What it takes of the
-    autoregression is put back, until that stands still.
+    A parabola removes slow noise from a block, half of it if it is correlated over a twentieth of the block. The
+    expected loss under the model is added to the autocovariances and the model is fitted again, until kappa no longer
+    changes.
     """
     return _unbiased(raw.tobytes(), count, size)
 
 
-@lru_cache(maxsize=64)  # the same for every model of a run
+@lru_cache(maxsize=64)  # the result is the same for every model of a run
 def _unbiased(raw_bytes: bytes, count: int, size: int) -> tuple[Autoregression, float]:
+    """Compute ``unbiased`` from the bytes of ``raw``, which can be cached."""
     raw = np.frombuffer(raw_bytes)
     gamma, kappa, lags, model = raw, 0.0, len(raw) - 1, Autoregression.of(raw, count)
-    if not len(model.coefficients) and size > _LONG:  # white, and a parabola takes next to nothing of it
+    if not len(model.coefficients) and size > _LONG:  # white noise, of which a parabola removes almost nothing
         return model, float(raw[0])
     for _ in range(_ITERATIONS):
         if abs(model.inflation - kappa) < _STILL * model.inflation:

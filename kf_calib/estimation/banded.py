@@ -1,7 +1,7 @@
-"""Covariances of 3 D numbers in which each three go with themselves and with the next three alone: linear in D.
+"""Banded covariances of 3 D numbers, in which each three are correlated among themselves and with the next three only.
 
-They are kept by their columns, (D, 6, 3): the covariance of the three with themselves, and below it that of the next
-three with them; zeros in the last.
+All operations take time proportional to D. A matrix is stored by columns as (D, 6, 3): for each three their own
+covariance, and below it the covariance of the next three with them (zeros for the last).
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 
-_BELOW = np.arange(6)[:, None] - np.arange(3)  # a place's distance from the diagonal
+_BELOW = np.arange(6)[:, None] - np.arange(3)  # distance of an entry from the diagonal
 _KEPT, _BAND = _BELOW >= 0, np.maximum(_BELOW, 0)
-_TWICE = np.repeat([1.0, 2.0], 3)[:, None]  # what is beside the diagonal is there on either side
+_TWICE = np.repeat([1.0, 2.0], 3)[:, None]  # blocks beside the diagonal occur on both sides
 
 
 def root(columns: Floats) -> Floats:
-    """The lower triangular root as LAPACK keeps it, its diagonals (6, 3 D) from the main one down."""
+    """The lower Cholesky factor in LAPACK's band storage: its diagonals (6, 3 D) from the main one down."""
     padded = np.zeros((len(columns), 8, 3))
     padded[:, :6] = columns
     bands = padded[:, np.arange(3)[:, None] + np.arange(6), np.arange(3)[:, None]].reshape(-1, 6).T
@@ -31,17 +31,17 @@ def root(columns: Floats) -> Floats:
 
 
 def solved(lower: Floats, rows: Floats, transposed: bool = False) -> Floats:
-    """The inverse of the root, or of its transpose, times rows (3 D, c)."""
+    """The inverse of the Cholesky factor, or of its transpose, times rows (3 D, c)."""
     if not rows.size:
-        return rows  # scipy's wrapper would write beyond them
+        return rows  # scipy's wrapper would write beyond empty arrays
     return cast("Floats", _lapack("tbtrs")(lower, rows, uplo="L", trans="T" if transposed else "N")[0])
 
 
 def inverse(columns: Floats, lower: Floats) -> Floats:
-    """The inverse's entries in the same places, from the roots L of the pivots forward and U of those backward.
+    """The entries of the inverse within the band, from block Cholesky factors L of a forward and U of a backward
+    elimination.
 
-    Block elimination from both ends: X_d = L_d^-T (I - M' M)^-1 L_d^-1, M = U_{d+1}^-1 L_{d+1,d}; below it
-    -X_{d+1} L_{d+1,d} L_d^-1.
+      X_d = L_d^-T (I - M' M)^-1 L_d^-1,  M = U_{d+1}^-1 L_{d+1,d};  below it: -X_{d+1} L_{d+1,d} L_d^-1
     """
     forward, out = _unbanded(lower), np.zeros_like(columns)
     back, beside = np.linalg.inv(forward[:, :3]), forward[:-1, 3:]
@@ -56,19 +56,19 @@ def inverse(columns: Floats, lower: Floats) -> Floats:
 
 
 def outer(rows: Floats) -> Floats:
-    """Of rows (3 D, c), the entries of rows rows^T in these places."""
+    """The entries of rows rows^T within the band, for rows (3 D, c)."""
     blocks = rows.reshape(-1, 3, rows.shape[1])
     later = np.concatenate([blocks[1:], np.zeros((1, *blocks.shape[1:]))])
     return np.concatenate([blocks, later], axis=1) @ np.swapaxes(blocks, 1, 2)
 
 
 def traces(one: Floats, others: Floats) -> Floats:
-    """Of the products of one with others (k, D, 6, 3), (k,)."""
+    """Traces (k,) of the products of one matrix with others (k, D, 6, 3)."""
     return others.reshape(len(others), one.size) @ (_TWICE * one).ravel()
 
 
 def products(columns: Floats, vector: Floats) -> Floats:
-    """Of matrices (k, D, 6, 3) with a vector (3 D,): (3 D, k)."""
+    """Products (3 D, k) of matrices (k, D, 6, 3) with a vector (3 D,)."""
     blocks = vector.reshape(-1, 3)
     both = columns @ blocks[:, :, None]
     out = both[:, :, :3, 0]
@@ -78,7 +78,7 @@ def products(columns: Floats, vector: Floats) -> Floats:
 
 
 def _reversed(columns: Floats) -> Floats:
-    """The same numbers in reverse order."""
+    """Return the matrix with the order of all numbers reversed."""
     out = np.zeros_like(columns)
     out[:, :3] = columns[::-1, 2::-1, ::-1]
     out[:-1, 3:] = np.swapaxes(columns[-2::-1, 3:], 1, 2)[:, ::-1, ::-1]
@@ -86,11 +86,13 @@ def _reversed(columns: Floats) -> Floats:
 
 
 def _unbanded(lower: Floats) -> Floats:
+    """Return the storage by columns (D, 6, 3) from LAPACK's band storage of a lower triangular matrix."""
     return np.where(_KEPT, lower.T.reshape(-1, 3, 6)[:, np.arange(3), _BAND], 0.0)
 
 
 @lru_cache(maxsize=2)
 def _lapack(name: str) -> Callable[..., Any]:
+    """Return a LAPACK routine for doubles."""
     from scipy.linalg import get_lapack_funcs
 
     return cast("Callable[..., Any]", get_lapack_funcs(name, dtype=np.float64))

@@ -1,7 +1,8 @@
-"""Batch least squares on the same columns: every row of the recording in one dense system.
+"""Batch least squares with the same columns: all rows of a recording in one dense system.
 
-The textbook's alternative to the filter, and its judge: generalised least squares with the noise model's covariance,
-solved by one call of LAPACK. Its memory grows with the recording; the filter's does not.
+This is the textbook alternative to the filter and the reference for it: generalised least squares with the covariance
+of the noise model, solved by one QR decomposition. Its memory grows with the length of the recording, while that of the
+filter does not.
 """
 
 from __future__ import annotations
@@ -15,18 +16,20 @@ from kf_calib.estimation.dwell_columns import Samples
 from kf_calib.estimation.measurement_model import dwell_map
 from kf_calib.estimation.noise_model import Noise
 
-_SEEN = 1e-9  # a smaller singular value, beside the largest, is rounding
+_SEEN = 1e-9  # singular values that are smaller relative to the largest are rounding
 
 
 def least_squares(
     samples: Iterable[Samples], noise: Noise, linearised_at: Floats, around: Floats
 ) -> tuple[Floats, Floats]:
-    """State (p,) and covariance (p, p) of all samples; diffuse prior, no process noise.
+    """State (p,) and covariance (p, p) from all samples, with a diffuse prior and without process noise.
 
-    Combinations of the state that the samples do not determine keep their value ``around``, and are not in the
-    covariance.
-    Rows of a dwell have covariance V = I + B B^T after division by the white sigma, B the dwell's nuisance columns
-    times their sigmas; V^(-1/2) = I - U (1 - (1 + s^2)^(-1/2)) U^T from the thin SVD of B.
+    Combinations of the state that the samples do not determine keep their value in ``around`` (p,), and their variance
+    is not in the covariance.
+
+    After division by the white sigma, the rows of a dwell have the covariance V = I + B B^T, where B holds the dwell's
+    nuisance columns times their sigmas. They are whitened by V^(-1/2) = I - U (1 - (1 + s^2)^(-1/2)) U^T from the thin
+    SVD of B.
     """
     by_dwell: dict[tuple[int, bool], list[Samples]] = {}
     for piece in samples:
@@ -45,7 +48,7 @@ def least_squares(
 
 
 def _whitened(pieces: list[Samples], noise: Noise, linearised_at: Floats) -> Floats:
-    """Whitened rows [H | z] (3 n, p + 1) of one dwell's samples."""
+    """Return the whitened rows [H | z] (3 n, p + 1) of one dwell's samples."""
     sigma, used = noise.effective_sigma_mps2, noise.dwell_sigmas > 0
     nuisances = dwell_map(linearised_at)[:, :, used] * noise.dwell_sigmas[used]
     rows = np.concatenate([np.concatenate([p.observation, p.readings[:, :, None]], axis=2) for p in pieces])

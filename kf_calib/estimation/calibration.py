@@ -1,8 +1,8 @@
-"""The main job: a source in, the twelve parameters with their covariance, the noise and the misfit out.
+"""The calibration of a source: twelve parameters with their covariance, the noise model and the misfit.
 
-One pass folds the recording into a factor a dwell (``folding.Folder``); everything after it (noise model, filter
-steps, leave-one-orientation-out) works on the factors. The estimate after each dwell is reported with the noise model
-of the whole run, so the curves of a replay do not jump when the noise becomes better known.
+One pass folds the recording into sufficient statistics of each dwell (``sufficient_statistics.Folder``). Everything
+after it (noise model, filter, leave-one-orientation-out) works on these. The estimate after each dwell is reported with
+the noise model of the whole run, so that the curves of a replay do not jump when the noise becomes better known.
 """
 
 from __future__ import annotations
@@ -50,10 +50,15 @@ def calibrate(
     on_progress: Callable[[float], None] | None = None,
     plain: Fit | None = None,
 ) -> Calibration:
-    """Evaluate a source (or the recording at a path): fold dwells, model the noise, run the filter, judge the misfit.
+    """Calibrate from a source or from the recording at a path: fold dwells, fit the noise, run the filter, judge the
+    misfit.
 
-    plain: the fit of the same model to the dwells as they are, which is known to need them folded on a carrier.
-    Raises InputError where the source holds nothing usable, UnobservableError where one orientation was visited only.
+    - settings: how to evaluate it.
+    - on_progress: called with the share of the source that has been read.
+    - plain: a fit of the same model to dwells without a carrier, if it is already known that they need one.
+
+    Raises InputError if the source holds nothing usable, and UnobservableError if the orientations determine no
+    parameter.
     """
     source, settings = opened(source), settings or Settings()
     with one_blas_thread():
@@ -68,7 +73,7 @@ def calibrate(
 
 
 def _window_s(source: Source, settings: Settings, on_progress: Callable[[float], None] | None) -> float:
-    """Length of the windows that average the vibration in a source away: from a pass of its own."""
+    """Return the length of windows that average out the vibration in a source, from a pass of its own."""
     plain = Pass(source, replace(settings, effects=()))
     return window_average.window_s(lines_of(plain.fold(on_progress)))
 
@@ -79,10 +84,11 @@ def conclude(
     on_progress: Callable[[float], None] | None = None,
     plain: Fit | None = None,
 ) -> Calibration:
-    """The calibration of a pass that has come to its end.
+    """The calibration of a completed pass.
 
-    again: the same samples to be read once more, for models that need them folded otherwise; None: they are gone.
-    plain: the pass has not begun, since its fit is known, and does not do.
+    - again: the same samples, to be read once more by models that need them folded in another way; None if they are
+      gone.
+    - plain: a fit that is known not to suffice; the pass has then not begun.
     """
     settings, bench = passed.settings, passed.source.bench
     dwells = passed.dwells if plain is None else plain.dwells
@@ -104,7 +110,7 @@ def conclude(
 
 
 def with_remarks(result: Calibration, passed: Pass) -> Calibration:
-    """The result with what its pass counted and saw, and a sentence on each thing that a user must know."""
+    """The result with the counts and observations of its pass and a sentence on everything that a user must know."""
     outlying = outlying_dwells(result, lambda some: evaluate_fit(_fit_again(result, some), result.settings))
     own = [effect for effect in result.model.effects if of_the_users(effect)]
     notes = [f"{sight}." for sight in visibility_of(result.fit, own)]
@@ -118,15 +124,14 @@ def with_remarks(result: Calibration, passed: Pass) -> Calibration:
 
 
 def _fit_again(result: Calibration, dwells: list[DwellFactor]) -> Fit:
-    """The same model fitted to some of the dwells."""
+    """Fit the same model to other dwells."""
     return fit(dwells, result.model, result.settings.walk_mps2_per_sqrt_s, result.carried.slews)
 
 
 def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
-    """The same run with these effects in the model, whatever was in it before: from the dwell factors alone.
+    """The same run with these effects in the model instead of those it had, computed from the sufficient statistics.
 
-    Only effects that need other factors (an oscillation its carrier, some the slews, some averages of the readings)
-    cost another pass over the source.
+    Another pass over the source is needed only by effects that require other statistics: a carrier, slews or averages.
     """
     key = tuple(effects)
     if key not in before.refits:
@@ -135,6 +140,7 @@ def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
 
 
 def _refitted(before: Calibration, effects: tuple[str, ...]) -> Calibration:
+    """Fit the model with these effects, and read the source again if its statistics do not suffice."""
     settings = replace(before.settings, effects=effects)
     model = Model.of(before.bench, settings.effects)
     stage.say(f"refitting with {' + '.join(map(str, model.effects))}" if model.effects else "refitting the twelve")
@@ -152,12 +158,13 @@ def _refitted(before: Calibration, effects: tuple[str, ...]) -> Calibration:
 def evaluate(
     dwells: list[DwellFactor], bench: Bench, settings: Settings, slews: Sequence[DwellFactor] = ()
 ) -> Calibration:
-    """The calibration from dwell factors alone, and those of slews if effects show in them; no pass over the data."""
+    """The calibration from sufficient statistics of dwells and, if effects show in them, of slews, without a pass over
+    the data."""
     return evaluate_fit(fit(dwells, Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s, slews), settings)
 
 
 def evaluate_fit(fitted: Fit, settings: Settings) -> Calibration:
-    """The filter run over a fit, its innovations, and the judgement of the misfit."""
+    """The calibration from a fit: the filter's steps with their innovations, and the test of the misfit."""
     carried, noise, model = fitted.carried, fitted.noise, fitted.carried.model
     first = square_root_information.start(settings.prior, model)
     steps = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)
@@ -179,9 +186,10 @@ def filterpy_estimate(
     on_progress: Callable[[float], None] | None = None,
     at_most: float = math.inf,
 ) -> Estimate:
-    """The same posterior by filterpy's filter, sample by sample: a second pass over the source.
+    """The same estimate from filterpy's filter, sample by sample, in a second pass over the source.
 
-    on_progress: with the share of readings that are done. at_most: stop after about so many readings.
+    ``on_progress`` is called with the share of the readings that are done; the pass stops after about ``at_most``
+    readings.
     """
     prior, model = result.settings.prior, result.model
     scale = np.concatenate([np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), result.carried.sizes[STATE_COUNT:]])
@@ -201,7 +209,7 @@ def filterpy_estimate(
 def _counted(
     samples: Iterable[Samples], carried: Carried, on_progress: Callable[[float], None] | None, at_most: float
 ) -> Iterator[Samples]:
-    """The same samples, their share told as each stretch of them is done, up to a number of readings."""
+    """Yield the same samples, report the share that is done, and stop after a number of readings."""
     total, done = sum(dwell.count for dwell in [*carried.dwells, *carried.slews]), 0
     for piece in samples:
         yield piece
@@ -213,7 +221,7 @@ def _counted(
 
 
 def _refuse_absent(left_out: Sequence[int], dwells: Sequence[DwellFactor]) -> None:
-    """Raise InputError where a dwell is to be left out that is not there: another one was meant."""
+    """Raise InputError if a dwell that is to be left out does not exist, since another one was probably meant."""
     absent = sorted(set(left_out) - {dwell.number for dwell in dwells})
     if absent and dwells:
         raise InputError(
@@ -223,7 +231,7 @@ def _refuse_absent(left_out: Sequence[int], dwells: Sequence[DwellFactor]) -> No
 
 
 def refuse_unseen(result: Calibration) -> None:
-    """Raise UnobservableError where the orientations determine none of the twelve parameters."""
+    """Raise UnobservableError if the orientations determine none of the twelve parameters."""
     if result.estimate.unseen.all():
         dwells = (
             "1 dwell of this run shows" if len(result.visits) == 1 else f"{len(result.visits)} dwells of this run show"
@@ -238,6 +246,7 @@ def refuse_unseen(result: Calibration) -> None:
 def _visits(
     fitted: Fit, steps: list[FilterStep], residuals: Floats, extra: Floats, settings: Settings
 ) -> tuple[Visit, ...]:
+    """Return for each dwell its innovation, its residual and the estimate after it."""
     carried, means, around = fitted.carried, fitted.carried.means, fitted.carried.model.nominal_state()
     own, walked = mean_covariances(fitted.noise, means, carried.state), to_mean(fitted.steps)
     first, extra = (
@@ -255,7 +264,7 @@ def _visits(
         if not known[k].undetermined.size:
             rows = means.design[k]
             innovation = means.readings[k] - rows @ known[k].state
-            predicted_by = np.maximum(np.diag(rows @ known[k].covariance @ rows.T), 0.0)  # rounding, where known little
+            predicted_by = np.maximum(np.diag(rows @ known[k].covariance @ rows.T), 0.0)  # negative by rounding only
             sigma = np.sqrt(predicted_by + np.diag(own[k]))
         visits.append(Visit(dwell, reached[k + 1], step.nis, step.dof, innovation, sigma, residuals[k]))
     return tuple(visits)

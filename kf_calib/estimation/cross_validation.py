@@ -1,4 +1,4 @@
-"""Leave one orientation out: how far its mean readings are from what all other dwells predict."""
+"""Cross-validation by leaving out one orientation: its mean readings are predicted from all other dwells."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from kf_calib.estimation.noise_model import considered_information, lift_roundin
 from kf_calib.estimation.prior import Prior
 
 SAME_POSE_DEG = 1.0
-"""Dwells whose gravity directions are closer than this are visits of one orientation."""
+"""Dwells whose directions of gravity and poses differ by less than this are visits of one orientation."""
 
 
 def orientations(dwells: Sequence[DwellFactor]) -> list[list[int]]:
-    """Dwells grouped by orientation: the same direction of gravity in the platform, and nearly the same pose."""
+    """Indices of the dwells grouped by orientation, that is by direction of gravity in the platform and by pose."""
     means = np.array([dwell.means for dwell in dwells])
     direction = means[:, 1:4] / np.linalg.norm(means[:, 1:4], axis=1, keepdims=True)
     place = np.column_stack([direction, [dwell.pose for dwell in dwells]])
@@ -37,40 +37,42 @@ def orientations(dwells: Sequence[DwellFactor]) -> list[list[int]]:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Mean readings of the dwells less what all other orientations predict, (D, 3), and its covariance (D, 3, 3)."""
+    """Mean readings of the dwells less their prediction from all other orientations (D, 3), and the covariance (D, 3,
+    3)."""
 
     errors_mps2: Floats
     covariance: Floats
 
     @property
     def rms_mps2(self) -> float:
+        """Held-out error: the rms over all dwells and channels."""
         return float(np.sqrt(np.mean(self.errors_mps2**2)))
 
     @property
     def floor_mps2(self) -> float:
-        """The rms that noise alone would give."""
+        """Noise floor: the rms that noise alone would give."""
         return float(np.sqrt(np.mean(np.einsum("dii->di", self.covariance))))
 
     @property
     def statistics(self) -> Floats:
-        """Chi-squared (D,) of each dwell's error, of 3 degrees of freedom."""
+        """Chi-squared (D,) of each dwell's error, with 3 degrees of freedom."""
         solved = np.linalg.solve(lift_rounding(self.covariance), self.errors_mps2[:, :, None])[:, :, 0]
         return np.asarray(np.einsum("di,di->d", self.errors_mps2, solved))
 
 
 def held_out(fitted: Fit) -> HeldOut | None:
-    """Errors of the dwell means of orientations left out of the fit.
+    """The held-out errors of all dwells; None if the fit without some orientation would be undetermined.
 
-    None where a fit without one of the orientations is undetermined. Slews are left out of no fit.
+    Slews are not left out of any fit.
     """
     predicted = (_beside if fitted.noise.walk_mps2_per_sqrt_s else _without)(fitted, orientations(fitted.dwells))
     return None if predicted is None else HeldOut(*predicted)
 
 
 def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | None:
-    """Errors (D, 3) and their covariance (D, 3, 3) where the biases stand.
+    """Return the errors (D, 3) and their covariance (D, 3, 3) if the biases are constant.
 
-    Factors of the orientations before and after the one left out are merged: no refit from the start.
+    The fit without an orientation is found by merging the factors of the orientations before it and after it.
     """
     carried, noise, around = fitted.carried, fitted.noise.judging, fitted.carried.model.nominal_state()
     rows = fitted.rows(noise.weights)
@@ -102,12 +104,15 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
 
 
 def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | None:
-    """The same where the biases walk: they are known by the dwells before and after the one left out (a smoother of two
-    filters, one forward and one backward in time; Fraser and Potter, 1969)."""
+    """Return the errors and their covariance if the biases follow a random walk.
+
+    The biases during a dwell are then estimated from the dwells before and after it by a two-filter smoother, with one
+    filter forward and one backward in time (Fraser and Potter, 1969).
+    """
     carried, noise, steps = fitted.carried, fitted.noise.judging, fitted.steps
     rows, means, around = fitted.all_rows(noise.weights), carried.means, carried.model.nominal_state()
     errors, spreads = np.zeros((len(rows), 3)), mean_covariances(noise, means, carried.state)
-    spreads += (steps[:, 1] / 12.0)[:, None, None] * np.eye(3)  # of a path's mean about the middle of its ends
+    spreads += (steps[:, 1] / 12.0)[:, None, None] * np.eye(3)  # variance of a path's mean about the mean of its ends
     alone, ways = _passes(rows, steps, ()), dict[int, list[tuple[int, Floats]]]()
     for group in groups:
         heads, tails = alone if len(group) == 1 else _passes(rows, steps, group)
@@ -116,7 +121,7 @@ def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | Non
             order = [*range(count, upper.shape[1] - 1), *range(count), upper.shape[1] - 1]
             ways.setdefault(count, []).append((k, upper[: len(around) + count, order]))
     for count, own in ways.items():
-        half = np.hstack([-0.5 * np.eye(3), np.zeros((3, count - 3))])  # the mean is half a step short of the end
+        half = np.hstack([-0.5 * np.eye(3), np.zeros((3, count - 3))])  # the mean lies half a step before the end
         found = square_root_information.solve_all(
             np.array([upper for _, upper in own]), np.append(around, np.zeros(count))
         )
@@ -130,7 +135,7 @@ def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | Non
 
 
 def _passes(rows: Sequence[Floats], steps: Floats, left_out: Sequence[int]) -> tuple[list[Floats], list[Floats]]:
-    """Factors of the biases before each dwell from the dwells before, and at its end from those after it."""
+    """Return the factors before each dwell from the dwells before it, and those at its end from the dwells after it."""
     width = rows[0].shape[1] - 4
     known = [own[:0] if k in left_out else own for k, own in enumerate(rows)]
     heads, tails = [np.zeros((width, width + 1))], [np.zeros((width, width + 1))]

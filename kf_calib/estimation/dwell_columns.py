@@ -1,4 +1,4 @@
-"""Columns of a model, or of effects, over dwells that are kept as sufficient statistics; their means, and their rows
+"""The columns of models and effects over dwells that are kept as sufficient statistics, their means, and their rows
 sample by sample."""
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor, alike, dwells_bef
 from kf_calib.effects import Effect, Stimulus
 from kf_calib.estimation.measurement_model import Model, effect_columns
 
-_VIBRATING = 15.0  # mean squared deviation of the variances in their own sigma; autocorrelation alone makes up to 10
+_VIBRATING = 15.0  # mean squared deviation of the variances in units of sigma; autocorrelation alone gives up to 10
 
 
 def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> Stimulus:
-    """The nodes of all pieces of all dwells and slews, in order; rotations are linearised at the affine ``state``."""
+    """The conditions at the nodes of all pieces of all dwells and slews, in order; rotations are linearised at
+    ``state``."""
     nodes = [dwell.nodes for dwell in dwells]
     before = [last for dwell, last in zip(dwells, dwells_before(dwells), strict=True) for _ in dwell.pieces]
     elapsed_s = np.concatenate([each.elapsed_s for each in nodes])
@@ -44,10 +45,11 @@ def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> S
 
 
 def _signal_only(dwells: Sequence[DwellFactor], temperature_c: Floats) -> Floats:
-    """Temperatures (m,) at the nodes; their mean where they only scatter, as a thermometer does in a steady room.
+    """Return the temperatures (m,) at the nodes, or their mean if they only scatter as a thermometer does in a steady
+    room.
 
-    Means of dwells that follow each other differ as much as any two (von Neumann's ratio near 1), and by no more than
-    temperatures within a dwell.
+    They only scatter if the means of consecutive dwells differ as much as any two means do (von Neumann's ratio near 1)
+    and by no more than temperatures within a dwell.
     """
     counts = np.array([3 * len(dwell.pieces) for dwell in dwells])
     firsts = np.cumsum(counts) - counts
@@ -56,15 +58,15 @@ def _signal_only(dwells: Sequence[DwellFactor], temperature_c: Floats) -> Floats
         return temperature_c
     spread = np.add.reduceat((temperature_c - np.repeat(means, counts)) ** 2, firsts) / counts
     between, within = means.var(), float(spread.mean())
-    alike = np.mean(np.diff(means) ** 2) > between  # 2 var on average where one says nothing of the next
+    alike = np.mean(np.diff(means) ** 2) > between  # about 2 var if consecutive means are independent
     if alike and between < 2.0 * within:
         return np.full(len(temperature_c), means.mean())
     return temperature_c
 
 
 def _varying(dwells: Sequence[DwellFactor]) -> Floats:
-    """Variances of the readings (pieces, nodes, 3) where they vary beyond what their estimates scatter by, else their
-    mean."""
+    """Return the variances of the readings (pieces, nodes, 3), or their mean if they vary no more than their estimates
+    scatter."""
     at_nodes, counts = (np.concatenate(parts) for parts in zip(*(dwell.shaking for dwell in dwells), strict=True))
     variances = at_nodes.mean(axis=1)
     mean = np.average(variances, axis=0, weights=counts)
@@ -84,13 +86,15 @@ def candidate_columns(
     state: Floats,
     stimulus: Stimulus | None = None,
 ) -> list[Floats]:
-    """Columns of effects that are in no model yet, like ``columns_of``; stimulus: of these dwells, if known."""
+    """The columns of effects that are not in the model, in the form of ``columns_of``; ``stimulus`` may be given if it
+    is known."""
     stimulus = stimulus or stimulus_of(dwells, bench, state)
     return _by_dwell(dwells, lambda s: effect_columns(effects, s), stimulus)
 
 
 def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> list[Floats]:
-    """Columns of a stimulus (m, 3, p) by dwell; on a carrier the plain part's nodes, then those of the envelopes."""
+    """Split the columns of a stimulus (m, 3, p) by dwell; on a carrier the nodes of both envelopes follow those of the
+    plain part."""
     parts = [columns(stimulus)]
     if stimulus.carrier_hz:
         parts += [columns(replace(stimulus, part=part)) for part in (1, 2)]
@@ -100,8 +104,13 @@ def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Float
 
 @dataclass(frozen=True, repr=False)
 class Means:
-    """Of D dwells: mean model columns (D, 3, p), readings (D, 3), specific force (D, 3); counts of readings (D,), when
-    each begins and ends (D, 2)."""
+    """Means over each of D dwells.
+
+    - design (D, 3, p): the model's columns.
+    - readings (D, 3), force_mps2 (D, 3): readings and specific force.
+    - counts (D,): number of readings.
+    - ends_s (D, 2): when each dwell begins and ends.
+    """
 
     design: Floats
     readings: Floats
@@ -114,6 +123,7 @@ class Means:
 
 
 def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
+    """The means of dwells with these columns."""
     design = np.zeros((len(dwells), *columns[0].shape[2:]))
     for places in alike(dwells):
         own, batch = np.array([columns[k] for k in places]), [dwells[k] for k in places]
@@ -129,10 +139,10 @@ def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
 
 
 class Carried:
-    """Dwells with the columns of a model: all that noise model, filter and diagnosis work on.
+    """Dwells with the columns of a model: the common input of noise model, filter and diagnosis.
 
-    ``state`` (p,): where small rotations and input axes are linearised. slews, slew_columns: of the motions, where an
-    effect in the model shows in them; everything else is of dwells only.
+    ``state`` (p,) is where small rotations and input axes are linearised. ``slews`` and ``slew_columns`` belong to the
+    motions and are used only if an effect of the model shows in slews; everything else refers to dwells only.
     """
 
     def __init__(
@@ -145,7 +155,7 @@ class Carried:
         self.slew_columns = [own for each, own in zip(every, columns, strict=True) if each.moving]
 
     def followed_by(self, dwell: DwellFactor) -> Carried:
-        """With one more dwell; the columns of the others stay as they are."""
+        """The same with one more dwell; the columns of the others are not computed again."""
         out = Carried.__new__(Carried)
         out.dwells, out.slews, out.model, out.state = [*self.dwells, dwell], self.slews, self.model, self.state
         last = stimulus_of(out.dwells, self.model.bench, self.state).ending(3 * len(dwell.pieces))
@@ -155,18 +165,19 @@ class Carried:
 
     @cached_property
     def means(self) -> Means:
+        """The means over each dwell."""
         return means_of(self.dwells, self.columns)
 
     @property
     def carrier_hz(self) -> float:
-        """What the dwells were folded on; 0: no carrier."""
+        """Frequency of the carrier on which the dwells were folded; 0 for none."""
         return self.dwells[0].carrier_hz
 
     @property
     def sizes(self) -> Floats:
-        """What a unit of each state makes in a reading, about, (p,); 1 where nothing."""
+        """Largest change of a reading per unit of each state, (p,); 1 for a state that changes none."""
         largest = np.abs(self.means.design).max(axis=(0, 1))
-        seen_within = [own[:, 3:] for own in self.columns if self.carrier_hz]  # envelopes leave little in a mean
+        seen_within = [own[:, 3:] for own in self.columns if self.carrier_hz]  # oscillations average out in a mean
         for own in (*seen_within, *self.slew_columns):
             largest = np.maximum(largest, np.abs(own).max(axis=(0, 1, 2)))
         return np.where(largest > 0, largest, 1.0)
@@ -174,9 +185,13 @@ class Carried:
 
 @dataclass(frozen=True)
 class Samples:
-    """Rows of one piece, sample by sample: H (n, 3, p), regressors of the dwell states (n, 4), readings (n, 3).
+    """Rows of one piece, sample by sample.
 
-    elapsed_s (n,). moving: of the slew after the dwell.
+    - dwell: number of the dwell; moving: True for the slew after it.
+    - elapsed_s (n,): times of the samples.
+    - observation (n, 3, p): the design H.
+    - regressors (n, 4): the regressors 1, f_x, f_y, f_z of the dwell's nuisance states.
+    - readings (n, 3): the readings.
     """
 
     dwell: int
@@ -188,7 +203,8 @@ class Samples:
 
 
 def samples_of(rows: Iterable[Rows], carried: Carried) -> Iterator[Samples]:
-    """A second pass over the rows with the columns of the first: what filterpy and batch least squares work on."""
+    """Yield samples from a second pass over the rows, with the columns of the first; for filterpy and batch least
+    squares."""
     every, columns = [*carried.dwells, *carried.slews], [*carried.columns, *carried.slew_columns]
     known = {(each.number, each.moving): iter(own) for each, own in zip(every, columns, strict=True)}
     for block in rows:

@@ -1,4 +1,4 @@
-"""One pass over a source: readings in, dwells out."""
+"""One pass over a source, which folds its readings into dwells."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from kf_calib.estimation.signal_quality import ReadingsMonitor
 
 @dataclass
 class Pass:
-    """One pass over a source: the rows as they come, what was counted and seen, and the dwells folded so far."""
+    """One pass over a source, with the counts and observations made on the way and the dwells folded so far."""
 
     source: Source
     settings: Settings
@@ -33,25 +33,28 @@ class Pass:
     watch: ReadingsMonitor = field(default_factory=ReadingsMonitor)
 
     def segmenter(self) -> Segmenter:
-        """What cuts the source into dwells, and into slews where an effect of the model shows in them."""
+        """The segmenter for this source, which also returns slews if the model has effects that show in slews only."""
         slews = bool(Model.of(self.source.bench, self.settings.effects).dynamic)
         return Segmenter(self.source.bench, self.settings.stillness, self.tally, slews)
 
     def rows(self) -> Iterator[Rows]:
+        """Rows of all blocks of the source."""
         return self.rows_of(dwell_blocks(self.source, self.segmenter()))
 
     def rows_of(self, blocks: Iterable[Block]) -> Iterator[Rows]:
+        """Rows of the given blocks, averaged over windows if the settings or the model's effects require it."""
         model = Model.of(self.source.bench, self.settings.effects)
         usual_s = window_average.WINDOW_S if model.averages else 0.0
         window_s = 0.0 if model.oscillates else self.settings.window_s or usual_s
         return model_rows(blocks, self.source.bench, self.tally, self.settings.gate_sigma, window_s)
 
     def add(self, rows: Rows) -> None:
+        """Fold the rows of one block and record what they show."""
         self.folder.add(rows)
         self.watch.add(rows.raw or rows)
 
     def fold(self, on_progress: Callable[[float], None] | None = None) -> list[DwellFactor]:
-        """All dwells of the source that hold enough readings to be used."""
+        """Read the whole source and return its usable dwells."""
         for rows in self.rows():
             self.add(rows)
             if on_progress is not None:
@@ -60,8 +63,8 @@ class Pass:
 
     @property
     def dwells(self) -> list[DwellFactor]:
-        """Those folded so far that are used: of at least 8 readings, fewer cannot show their own noise, and not left
-        out by the settings."""
+        """The usable dwells so far: of at least 8 readings, since fewer do not show their own noise, and not left out
+        by the settings."""
         left_out = self.settings.left_out
         if not left_out:
             return [dwell for dwell in self.folder.dwells if dwell.count >= 8]
@@ -70,7 +73,8 @@ class Pass:
 
 
 def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> None:
-    """Raise InputError where there is nothing to calibrate from, or where the readings are not in m/s^2."""
+    """Raise InputError if there is nothing to calibrate from or if the readings are not in m/s^2, and BlunderError for
+    a set-up that cannot be right."""
     if not tally.read:
         raise InputError("the recording holds no accelerometer readings: check that the logger wrote any.")
     if tally.poses_dropped and not tally.poses:

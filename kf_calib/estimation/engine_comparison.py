@@ -1,7 +1,8 @@
-"""The same recording three ways: block engine, filterpy sample by sample, batch least squares.
+"""The same recording evaluated in three ways: by the block engine, by filterpy sample by sample, and by batch least
+squares.
 
-The three agree to rounding on a diffuse prior without process noise. Where they may differ, and why: a stated prior
-and a walk of the biases are known to the filters only; the gate is shared by all three.
+With a diffuse prior and without process noise the three agree to rounding. They may differ if a prior is stated or if
+the biases walk, because only the filters use these. The gate is common to all three.
 """
 
 from __future__ import annotations
@@ -27,16 +28,18 @@ from kf_calib.support import stage
 
 Result = TypeVar("Result")
 
-_TRACED = 300  # readings over which the memory of filterpy is traced
+_TRACED = 300  # readings over which the memory of filterpy is measured
 
 
 @dataclass(frozen=True)
 class Way:
-    """One way of estimating: wall seconds, peak memory in MB (numpy's and Python's), distance from the block engine.
+    """One way of estimating and its cost.
 
-    Tracing memory makes many small steps several times slower, so it is traced in a run of its own; filterpy's over its
-    first few hundred readings, since it keeps none of them.
-    max_difference_sigma: largest |difference| of the twelve parameters in sigma; max_relative_variance: of diag P.
+    - wall_s: elapsed time, s.
+    - peak_mb: peak memory of numpy and Python, MB. It is measured in a separate run, because this slows down many small
+      steps several times; filterpy's is measured over its first few hundred readings, since it keeps none.
+    - max_difference_sigma: largest absolute difference of a parameter from the block engine, in sigma.
+    - max_relative_variance: largest relative difference of a variance.
     """
 
     estimate: Estimate
@@ -48,12 +51,15 @@ class Way:
 
 @dataclass(frozen=True)
 class Comparison:
+    """The results of the three ways, and remarks on why they may differ."""
+
     result: Calibration
     ways: dict[str, Way]
     remarks: tuple[str, ...]
 
     @property
     def max_difference_sigma(self) -> float:
+        """Largest difference of a parameter between any way and the block engine, in sigma."""
         return max(way.max_difference_sigma for way in self.ways.values())
 
 
@@ -62,9 +68,9 @@ def compare(
     settings: Settings | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> Comparison:
-    """Run all three ways, each over a source (or the recording at a path) from its start, and measure them.
+    """Evaluate a source (or the recording at a path) in all three ways and measure each.
 
-    on_progress: how much of each way is done; it begins anew with each.
+    ``on_progress`` is called with the share that is done, which begins again for each way.
     """
     source = opened(source)
     settings = replace(settings or Settings(), engine="block")
@@ -91,11 +97,13 @@ def compare(
 
 
 def _timed(run: Callable[[], Result]) -> tuple[Result, float]:
+    """Return the result of a call and its duration, s."""
     begin = time.perf_counter()
     return run(), time.perf_counter() - begin
 
 
 def _peak_mb(run: Callable[[], object]) -> float:
+    """Return the peak memory of a call, MB."""
     tracemalloc.start()
     run()
     peak = tracemalloc.get_traced_memory()[1]
@@ -104,7 +112,8 @@ def _peak_mb(run: Callable[[], object]) -> float:
 
 
 def _against(way: Way, reference: Estimate) -> Way:
-    """Distances over the twelve parameters and the effects, as far as they are determined."""
+    """Return the way with its distances from the reference, over all parameters and coefficients that are
+    determined."""
     ones = np.concatenate([way.estimate.parameters, way.estimate.effects])
     others = np.concatenate([reference.parameters, reference.effects])
     sigma = np.concatenate([reference.sigma, reference.effect_sigma])
@@ -118,6 +127,7 @@ def _against(way: Way, reference: Estimate) -> Way:
 
 
 def _remarks(settings: Settings, result: Calibration) -> list[str]:
+    """Return sentences on why the ways may differ."""
     said = []
     if not settings.prior.diffuse:
         said.append("a prior was stated: the filters use it, batch least squares does not, so it may differ.")

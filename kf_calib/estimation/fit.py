@@ -1,8 +1,9 @@
-"""The model and the noise model fitted to the dwells, in turn: what the filter then runs on.
+"""The iterated fit of the model and the noise model to the dwells; the filter runs on its result.
 
-Small rotations and input axes are linearised at the estimate; constants inside an effect's columns (time constants,
-frequencies) are looked for on a grid and refined by Gauss-Newton, their derivative being one more column; the dwell
-parts of the noise and a walk of the biases are found by likelihood.
+Small rotations and input axes are linearised at the current estimate. Constants inside an effect's formula (time
+constants, frequencies) are searched on a grid and refined by Gauss-Newton steps, in which the derivative with respect
+to the constant is one more column. The setting error, the scatter and the random walk of the biases are estimated by
+restricted likelihood.
 """
 
 from __future__ import annotations
@@ -29,19 +30,19 @@ from kf_calib.estimation.reml import Part, gain_of, misfit, restoring_gain, with
 from kf_calib.estimation.score_test import falls
 
 WALK = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5, "µg/√s", 1e6 / 9.80665)
-"""The intensity of a walk of the biases as a parameter."""
+"""The intensity of the random walk of the biases, as a parameter in the results."""
 
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
 _EXACT_RAD = 1e-9
-_STILL = 2.5e-4  # a step of ln(value), in reaches, that ends the search
+_STILL = 2.5e-4  # the search ends when no step of ln(value) exceeds this share of its largest allowed step
 
 
 @dataclass(frozen=True, repr=False)
 class Fit:
-    """Dwells with the fitted model's columns, and the noise they are weighted by.
+    """The dwells with the columns of the fitted model, and the noise by which they are weighted.
 
-    spreads: 1 sigma of ln(value) of each constant without derivative, by its effect.
+    ``spreads`` gives, by effect, the sigma of ln(value) of each constant without a derivative.
     """
 
     carried: Carried
@@ -50,22 +51,23 @@ class Fit:
 
     @property
     def dwells(self) -> list[DwellFactor]:
+        """The dwells that were fitted."""
         return self.carried.dwells
 
     @property
     def steps(self) -> Floats:
-        """Variances (D, 2) of the biases' steps before and in each dwell; zeros where they do not walk."""
+        """Variances (D, 2) of the biases' steps before and within each dwell; zeros if they do not walk."""
         return steps(self.dwells, self.noise)
 
     @cached_property
     def state(self) -> Floats:
-        """The estimate (p,) by these columns; where biases walk, those after the last dwell."""
+        """The estimate (p,) from all readings; if the biases walk, it holds their values after the last dwell."""
         factor = square_root_information.accumulate(self.all_rows(), self.steps)[:-1]
         return square_root_information.solve(factor, self.carried.model.nominal_state())[0]
 
     @cached_property
     def judged(self) -> list[Floats]:
-        """Rows [H | W | z] by which the misfit is judged."""
+        """Whitened rows [H | W | z] by which the misfit is judged, see ``square_root_information.misfit_rows``."""
         carried = self.carried
         return square_root_information.misfit_rows(
             self.dwells, carried.columns, self.noise.judging, carried.state, carried.model.count
@@ -73,7 +75,7 @@ class Fit:
 
     @cached_property
     def following(self) -> list[Floats]:
-        """Whitened rows [H | z] of what slew follows each dwell; (0, p + 1) where none does."""
+        """Whitened rows [H | z] of the slews that follow each dwell; (0, p + 1) where none is used."""
         carried, noise = self.carried, self.noise.weights.of(moving=True)
         out = [np.zeros((0, carried.model.count + 1))] * len(self.dwells)
         if carried.slews:
@@ -85,7 +87,8 @@ class Fit:
         return out
 
     def all_rows(self, noise: Noise | None = None) -> list[Floats]:
-        """Whitened rows of each dwell and the slew after it, in which the biases stand."""
+        """Whitened rows of each dwell together with those of the slews after it; within a slew the biases are
+        constant."""
         out = list[Floats]()
         for own, more in zip(self.rows(noise), self.following, strict=True):
             standing = np.zeros((len(more), own.shape[1] - more.shape[1]))
@@ -94,16 +97,17 @@ class Fit:
 
     @cached_property
     def families(self) -> dict[Any, Any]:
-        """The formulas that were tried on what this fit leaves (``unknown_effect.families``), by what else was
-        tried."""
+        """Cache of the formulas that were tried on the residuals of this fit (``unknown_effect.families``), by the
+        other effects tried."""
         return {}
 
     @cached_property
     def considered(self) -> Floats:
-        """What the constants without derivative add to the information about the gain, (p, p).
+        """Contribution B (p, p) of the constants without a derivative to the covariance, which becomes P + P B P.
 
-        b b^T times the variance, b = A^T W g, g the change of the readings from 1 sigma below to 1 sigma above: with it
-        the covariance is P + P b b^T P, as a Schmidt-Kalman filter's that knows of a parameter it does not estimate.
+        B is the sum of b b^T with b = A^T W g, where A is the design, W the weights and g the change of the readings if
+        the constant changes by 1 sigma. The constants are considered parameters: known to be uncertain, but not
+        estimated (Schmidt-Kalman filter).
         """
         carried, out = self.carried, np.zeros((self.carried.model.count,) * 2)
         for effect in carried.model.stepped:
@@ -120,7 +124,7 @@ class Fit:
 
     @cached_property
     def walk_gain(self) -> float:
-        """What a walk of the biases gains in log-likelihood over none, beside what a stated scatter may be.
+        """Gain in log-likelihood of a random walk of the biases over none, given the stated scatter.
 
         Scatter that was estimated from the same misfit is left out.
         """
@@ -128,33 +132,39 @@ class Fit:
 
     @cached_property
     def scatter_gain(self) -> float:
-        """The same of more than is stated of what is anew in every dwell: scatter of the sensors, or setting error."""
+        """Gain in log-likelihood of more noise that is independent from dwell to dwell, scatter or setting error, than
+        was stated."""
         return max(self._gain_of("common"), self._gain_of("setting"))
 
     @cached_property
     def misfit(self) -> float:
-        """Chi-squared of the dwells' means, in the likelihood that these are gains in."""
+        """Chi-squared of the dwells' means under the same likelihood as ``walk_gain`` and ``scatter_gain``."""
         noise, means, prior = self._wandering
         return misfit(noise, means, self.carried.state, prior)
 
     def _gain_of(self, part: Part) -> float:
+        """Return the gain in log-likelihood of one part of the noise."""
         noise, means, prior = self._wandering
         return gain_of(part, noise, means, self.carried.state, prior)
 
     @cached_property
     def _wandering(self) -> tuple[Noise, Means, Floats]:
+        """Return the noise without a walk, the means with columns for slow scatter, and the prior of these columns."""
         noise, carried = replace(self.noise.judging, walk_mps2_per_sqrt_s=0.0), self.carried
         return noise, *with_slow_scatter(carried.dwells, noise, carried.means)
 
     @cached_property
     def back_gain(self) -> tuple[float, float]:
-        """What a walk that comes back gains in log-likelihood over the walk of the biases that the fit has, beside what
-        a stated scatter may be; and the time constant with which it comes back, s."""
+        """Gain in log-likelihood of a mean-reverting (Gauss-Markov) walk over the fitted random walk, and its time
+        constant, s.
+
+        The slow part of a stated scatter is allowed for.
+        """
         _, means, prior = self._wandering
         return restoring_gain(self.noise.judging, means, self.carried.state, prior)
 
     def rows(self, noise: Noise | None = None) -> list[Floats]:
-        """Whitened rows [H | z] of each dwell, by the weights of the fit or by another noise."""
+        """Whitened rows [H | z] of each dwell, with the weights of the fit or with another noise."""
         return square_root_information.whiten(
             self.dwells, self.carried.columns, noise or self.noise.weights, self.carried.state
         )
@@ -163,7 +173,13 @@ class Fit:
 def fit(
     dwells: list[DwellFactor], model: Model, walk_mps2_per_sqrt_s: float = 0.0, slews: Sequence[DwellFactor] = ()
 ) -> Fit:
-    """Noise, linearisation and the model's unknowns, each given the others, until they stand still."""
+    """Estimate the noise, the linearisation and the model's unknown constants in turn until they no longer change.
+
+    - dwells: the dwells in order of time.
+    - model: the model to fit.
+    - walk_mps2_per_sqrt_s: stated intensity of the random walk of the biases, m/s^2/s^(1/2).
+    - slews: the slews; used only if the model has effects that show in slews only.
+    """
     within, bench = within_dwells(dwells, walk_mps2_per_sqrt_s), model.bench
     within = replace(within, walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
     slews = [slew for slew in slews if slew.number >= dwells[0].number] if model.dynamic else []
@@ -187,14 +203,15 @@ def fit(
         fitted = replace(fitted, carried=carried, noise=noise)
         if model.walks:
             within = within_dwells(dwells, noise.walk_mps2_per_sqrt_s)
-        # where columns step, they hold the input axes to where they are taken to be: that gives way slowly
+        # a constant without a derivative holds the input axes near their linearisation, so that convergence is slow
         if number >= _PASSES - 1 and (np.abs(moved) <= _STILL * reach).all() and not model.stepped:
             break
     return fitted
 
 
 def _setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:
-    """The setting error that is stated, and beside it what the angles' noise leaves uncertain of the dwells' poses."""
+    """Return the stated setting error, deg, combined with the uncertainty of the dwells' poses from noise of the
+    angles."""
     pose_rad = float(np.sqrt(np.mean([dwell.pose_sigma_rad**2 for dwell in dwells])))
     if bench.angle_sigma_deg is None or pose_rad < _EXACT_RAD:
         return bench.angle_sigma_deg
@@ -202,7 +219,8 @@ def _setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:
 
 
 def _solved(fitted: Fit) -> tuple[Floats, Floats]:
-    """The estimate (p,) with unknowns at zero, and how far these would move (p,), zeros elsewhere."""
+    """Return the estimate (p,) with the unknown constants at zero, and the steps (p,) of these constants, zeros
+    elsewhere."""
     state = fitted.state.copy()
     moved = np.zeros_like(state)
     places = list(fitted.carried.model.unknowns)
@@ -211,7 +229,8 @@ def _solved(fitted: Fit) -> tuple[Floats, Floats]:
 
 
 def _reach(fitted: Fit) -> Floats:
-    """How far each state may move in one step (p,): unknowns by their kind, the others are not moved."""
+    """Return the largest allowed step (p,) of each state: for an unknown constant by its kind, 1 for the others, which
+    are not moved."""
     model, reach = fitted.carried.model, np.ones(fitted.carried.model.count)
     if model.unknowns:
         stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
@@ -221,10 +240,11 @@ def _reach(fitted: Fit) -> Floats:
 
 
 def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
-    """Sigma (3,) of white readings that would leave the slews' rows as far from ``state`` as they are.
+    """Return the sigmas (3,) of white readings that explain the residuals of the slews about ``state``.
 
-    The channels' ratio is that of their residuals; the level makes the mean square of the whitened rows' residuals one.
-    These rows are weighted sums over whole slews, so that what is correlated along a slew (angles, vibration) counts.
+    The ratio of the channels is that of their residuals. The level is set so that the mean square of the whitened
+    residuals is one. The rows are weighted sums over whole slews, so that noise that is correlated along a slew (of
+    angles, by vibration) is included.
     """
     carried, rows = fitted.carried, np.concatenate(fitted.following)
     squares, counts = np.zeros(3), 0
@@ -245,7 +265,7 @@ def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
 
 
 def _placed(fitted: Fit) -> Model:
-    """The model with each unknown at that value of its grid at which its effect explains most."""
+    """Return the model with each unknown constant at the grid value at which its effect lowers chi-squared most."""
     model = fitted.carried.model
     stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
     for effect in model.unknowns.values():
@@ -255,9 +275,11 @@ def _placed(fitted: Fit) -> Model:
 
 
 def _averaged(fitted: Fit) -> tuple[Model, dict[str, float]]:
-    """The model with each constant without derivative at its mean by likelihood, and 1 sigma of its logarithm.
+    """Return the model with each constant without a derivative at its posterior mean, and the sigma of each constant's
+    logarithm.
 
-    Likelihood exp(fall of chi^2 / 2), the prior flat in ln(value): between two poses no value is likelier than another.
+    The likelihood is exp(decrease of chi^2 / 2) and the prior is flat in ln(value). The likelihood is constant between
+    values at which the columns step.
     """
     model, spreads = fitted.carried.model, dict[str, float]()
     stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
@@ -273,19 +295,21 @@ def _averaged(fitted: Fit) -> tuple[Model, dict[str, float]]:
 
 
 def _best(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> int:
-    """Which of the same effect at several values explains most beside the ``rest`` of the model."""
+    """Return the index of the value in ``grid`` at which the effect lowers chi-squared most beside the ``rest`` of the
+    model."""
     return int(np.argmax(_falls(fitted, rest, grid)))
 
 
 def _falls(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> Floats:
-    """By how much the same effect at several values would lower chi-squared beside the ``rest`` of the model."""
+    """Return the decrease of chi-squared for the same effect at several values, each added to the ``rest`` of the
+    model."""
     state = np.concatenate([fitted.carried.state[:12], np.zeros(rest.count - 12)])
     return falls(Carried(fitted.dwells, rest, state), fitted.noise.weights, grid)
 
 
 def loss_within_range(fitted: Fit, effect: Effect) -> float:
-    """By how much chi-squared is larger with the constant of an effect at the best value well within its range, by a
-    factor of two, than where it is."""
+    """Increase of chi-squared if the constant of an effect is moved from its value to the best grid value that is at
+    least a factor of two inside its range."""
     assert effect.unknown is not None
     stimulus = stimulus_of(fitted.dwells, fitted.carried.model.bench, fitted.carried.state)
     within = [v for v in effect.grid(stimulus) if 2.0 * effect.unknown.low < v < 0.5 * effect.unknown.high]

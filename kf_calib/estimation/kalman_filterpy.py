@@ -1,8 +1,8 @@
-"""The reference engine: filterpy's Kalman filter, sample by sample, as a textbook has it.
+"""The reference engine: filterpy's Kalman filter, applied sample by sample as in a textbook.
 
-The state is in units of m/s^2 (g s_i, b_i, effects), followed by the nuisance states of the current dwell, which
-start again from their prior at each new dwell. filterpy's square-root form is used: its plain form loses digits of
-the covariance after tens of thousands of static samples with a wide prior (``form="plain"`` shows it).
+The state is in units of m/s^2 (g s_i, b_i, effects) and is followed by the nuisance states of the current dwell, which
+are reset to their prior at each new dwell. filterpy's square-root form is used, because its plain form loses digits of
+the covariance after tens of thousands of static samples with a wide prior (``form="plain"`` shows this).
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from kf_calib.estimation.measurement_model import STATE_COUNT, dwell_map
 from kf_calib.estimation.noise_model import Noise
 
 _DIFFUSE = 1e5
-"""A diffuse prior's sigma in sigmas of one reading: wide enough to bias nothing, narrow enough for doubles."""
+"""Sigma of a diffuse prior, in sigmas of one reading: wide enough not to bias, narrow enough for double precision."""
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """State (p,), covariance (p, p), sum of the samples' normalised innovations squared and their number."""
+    """State (p,), covariance (p, p), the sum of the samples' normalised innovations squared, and the number of
+    samples."""
 
     state: Floats
     covariance: Floats
@@ -43,10 +44,14 @@ def estimate(
     scale: Floats,
     form: Literal["square-root", "plain"] = "square-root",
 ) -> Posterior:
-    """Run the filter over all samples.
+    """Run the filter over all samples and return the posterior.
 
-    prior_covariance None: diffuse. scale (p,): m/s^2 that a unit of each state makes in a reading, about.
-    The biases walk by the noise's intensity from reading to reading (process noise Q).
+    - nominal_state (p,): mean of the prior; prior_covariance (p, p): None for a diffuse prior.
+    - linearised_at: where the nuisance states are linearised.
+    - scale (p,): approximate change of a reading per unit of each state, m/s^2.
+    - form: which of filterpy's filters is used.
+
+    The biases walk with the intensity in ``noise`` from reading to reading (process noise Q).
     """
     count, used = len(nominal_state), np.flatnonzero(noise.dwell_sigmas > 0)
     nuisances = dwell_map(linearised_at)[:, :, used]
@@ -77,11 +82,11 @@ def estimate(
 def repeated(
     observations: Floats, readings: Floats, sigma_mps2: float, start: Floats, start_root: Floats
 ) -> tuple[Floats, Floats]:
-    """One experiment many times over: its final states (p, r) and the covariance (n, p, p) after every sample.
+    """Final states (p, r) of r repetitions of one experiment, and the covariance (n, p, p) after every sample.
 
-    observations (n, m, p) and the prior, ``start`` (p,) with covariance L L^T, L = ``start_root`` (p, p), are the same
-    in all repetitions, and so are gains and covariance: filterpy's filter runs once, its state a column a repetition.
-    readings (n, m, r).
+    The observations (n, m, p) and the prior, ``start`` (p,) with covariance L L^T, L = ``start_root`` (p, p), are the
+    same in all repetitions; therefore the gains and covariances are, too, and filterpy's filter runs once with one
+    column of its state for each repetition. ``readings`` is (n, m, r).
     """
     from filterpy.kalman import SquareRootKalmanFilter
 
@@ -98,7 +103,7 @@ def repeated(
 
 
 class _Filter:
-    """One of filterpy's two filters behind the few calls needed here."""
+    """Either of filterpy's two filters behind a common interface."""
 
     def __init__(self, form: str, state: Floats, root: NDArray[np.floating[Any]], dwell_sigmas: Floats) -> None:
         from filterpy.kalman import KalmanFilter, SquareRootKalmanFilter
@@ -118,7 +123,8 @@ class _Filter:
         self.kf = kf
 
     def enter_dwell(self, sigma_mps2: Floats) -> None:
-        """The nuisance states start from their prior, independent of everything before; readings have this sigma."""
+        """Reset the nuisance states to their prior, independent of everything before, and set the sigma of a
+        reading."""
         if self.plain:
             self.kf.R = np.diag(sigma_mps2**2)
         else:
@@ -131,7 +137,7 @@ class _Filter:
         matrix[own, own] = np.diag(sigma)
 
     def walk(self, variance: float) -> None:
-        """Time update with F = I, the biases' steps of that variance; filterpy's Q is the identity until it is set."""
+        """Do a time update with F = I in which the biases take steps of this variance."""
         steps = np.zeros(len(self.kf.x))
         steps[3:STATE_COUNT:4] = variance
         if self.plain:
@@ -141,11 +147,12 @@ class _Filter:
         self.kf.predict()
 
     def update(self, observation: Floats, reading: Floats) -> float:
-        """One sample; returns its normalised innovation squared, y S^-1 y."""
+        """Update with one sample and return its normalised innovation squared, y' S^-1 y."""
         self.kf.H = observation
         self.kf.update(reading)
         return float(self.kf.y @ self.kf.SI @ self.kf.y)
 
     def posterior(self) -> tuple[Floats, Floats]:
+        """State and covariance without the nuisance states."""
         part = slice(0, self.count)
         return self.kf.x[part].copy(), self.kf.P[part, part].copy()

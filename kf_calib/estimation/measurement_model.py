@@ -1,4 +1,7 @@
-"""The measurement model: what each accelerometer reads per unit of each state, of the twelve parameters and effects."""
+"""The measurement model: the change of each accelerometer's reading per unit of each state.
+
+The states are the twelve that determine the paper's parameters, followed by the coefficients of effects.
+"""
 
 from __future__ import annotations
 
@@ -21,24 +24,28 @@ from kf_calib.support.printing import printed
 STATE_COUNT = 12
 _ROUNDING_MPS2 = 1e-13
 DWELL_STATES = 6
-"""Nuisance states of a dwell: three small rotations (setting error), three offsets (sensor scatter)."""
+"""Number of nuisance states of a dwell: three small rotations (setting error) and three offsets (scatter)."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """The twelve parameters and any effects; immutable, composed by + and -."""
+    """The twelve parameters and any effects. A model is immutable; + and - return a model with an effect more or
+    less."""
 
     bench: Bench
     effects: tuple[Effect, ...] = ()
 
     @classmethod
     def of(cls, bench: Bench, names: Iterable[str] = ()) -> Model:
+        """The model with the effects of these names."""
         model = cls(bench)
         for name in names:
             model += effect_named(name, bench)
         return model
 
     def __add__(self, effect: Effect) -> Model:
+        """The model with one effect more; raises InputError if it, or one of its coefficients, is in the model
+        already."""
         taken = {c.symbol: each for each in self.effects for c in _states_of(each)}
         if any(str(each) == str(effect) for each in self.effects):
             raise InputError(f"{effect} is in the model already: name it once, or take it out first.")
@@ -51,69 +58,73 @@ class Model:
         return replace(self, effects=(*self.effects, effect))
 
     def __sub__(self, effect: Effect) -> Model:
+        """The model without the effect of this name."""
         return replace(self, effects=tuple(each for each in self.effects if str(each) != str(effect)))
 
     def __str__(self) -> str:
-        """A table: symbols, units, and the size a prior would call large."""
+        """A table of the symbols, their units and the size that a prior would call large."""
         return printed(self)
 
     @property
     def sum(self) -> str:
-        """The model as a sum of its parts, in a line."""
+        """The model written as a sum of its parts, in one line."""
         return " + ".join(["twelve parameters", *map(str, self.effects)])
 
     @cached_property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        """Of all effects, in the order of the state after the twelve; an effect's unknown comes after its own."""
+        """The coefficients of all effects, in the order of the state after the twelve; an effect's unknown constant
+        follows its coefficients."""
         return tuple(coefficient for effect in self.effects for coefficient in _states_of(effect))
 
     @cached_property
     def parts(self) -> dict[str, slice]:
-        """Where in the state each effect stands, by name."""
+        """The slice of the state that belongs to each effect, by name."""
         ends = np.cumsum([STATE_COUNT, *(len(_states_of(effect)) for effect in self.effects)]).tolist()
         return {str(effect): slice(a, b) for effect, (a, b) in zip(self.effects, itertools.pairwise(ends), strict=True)}
 
     @property
     def walks(self) -> bool:
-        """Whether an effect lets the biases walk."""
+        """Whether an effect makes the biases follow a random walk."""
         return any(effect.walks for effect in self.effects)
 
     @property
     def dynamic(self) -> tuple[Effect, ...]:
-        """The effects that show in slews only."""
+        """The effects that appear in slews only."""
         return tuple(effect for effect in self.effects if effect.dynamic)
 
     @property
     def oscillates(self) -> bool:
-        """Whether an effect may be faster than a piece of a dwell, so that the dwells are folded on a carrier."""
+        """Whether an effect may oscillate within a piece of a dwell, so that the dwells have to be folded on a
+        carrier."""
         return any(effect.oscillates for effect in self.effects)
 
     @property
     def averages(self) -> bool:
-        """Whether an effect needs averaged readings; an oscillation would go with the vibration."""
+        """Whether an effect needs averaged readings. Averaging would remove an oscillation together with the vibration,
+        so this is False if the model has one."""
         return any(effect.averages for effect in self.effects) and not self.oscillates
 
     @property
     def unknowns(self) -> dict[int, Effect]:
-        """The effects with a constant among the states, by the place of its state."""
+        """The effects whose unknown constant is a state, by the index of that state."""
         return {self.parts[str(each)].stop - 1: each for each in self.effects if each.unknown and each.smooth}
 
     @property
     def stepped(self) -> tuple[Effect, ...]:
-        """The effects with a constant that has no derivative: it is no state."""
+        """The effects whose unknown constant has no derivative and is therefore not a state."""
         return tuple(each for each in self.effects if each.unknown and not each.smooth)
 
     def moved(self, state: Floats) -> Model:
-        """The model with its unknowns where ``state`` (p,) puts them: value times exp(state)."""
+        """The model with each unknown constant multiplied by exp of its state in ``state`` (p,)."""
         moved = {str(each): each.at(each.value * math.exp(state[k])) for k, each in self.unknowns.items()}
         return replace(self, effects=tuple(moved.get(str(each), each) for each in self.effects))
 
     def with_effect(self, effect: Effect) -> Model:
-        """The model with that effect in the place of the one of the same name."""
+        """The model in which this effect replaces the one of the same name."""
         return replace(self, effects=tuple(effect if str(each) == str(effect) else each for each in self.effects))
 
     def natural(self, state: Floats) -> tuple[Floats, Floats]:
-        """Values of the effects' coefficients (q,) at ``state`` (p,), and how much of each a unit of its state is."""
+        """Values (q,) of the effects' coefficients at ``state`` (p,), and the derivative (q,) of each by its state."""
         values, gains = state[STATE_COUNT:].copy(), np.ones(len(state) - STATE_COUNT)
         for k, effect in self.unknowns.items():
             values[k - STATE_COUNT] = effect.value * (1.0 + state[k])
@@ -122,15 +133,17 @@ class Model:
 
     @property
     def count(self) -> int:
+        """Number of states p."""
         return STATE_COUNT + len(self.coefficients)
 
     def nominal_state(self) -> Floats:
-        """The state (p,) of nominal parameters and no effect."""
+        """The state (p,) at nominal parameters and without effects."""
         twelve = paper_parameters.state_of(paper_parameters.nominal(self.bench.nominal))
         return np.concatenate([twelve, np.zeros(len(self.coefficients))])
 
     def columns(self, stimulus: Stimulus, state: Floats) -> Floats:
-        """H (m, 3, p): what each accelerometer reads per unit of each state, linearised at ``state`` (p,)."""
+        """The design H (m, 3, p): the change of each accelerometer's reading per unit of each state, linearised at
+        ``state`` (p,)."""
         out = np.zeros((len(stimulus), 3, self.count))
         for i in range(3) if not stimulus.part else ():
             out[:, i, 4 * i : 4 * i + 3] = stimulus.force_mps2
@@ -147,7 +160,7 @@ class Model:
 
 
 def effect_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
-    """What each accelerometer reads more per unit of each coefficient of the effects, (m, 3, q)."""
+    """The change (m, 3, q) of each accelerometer's reading per unit of each coefficient of the effects."""
     own = [
         np.zeros((len(stimulus), 3, len(each.coefficients)))
         if stimulus.part and not each.oscillates
@@ -156,12 +169,14 @@ def effect_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
     ]
     columns = np.concatenate([np.zeros((len(stimulus), 3, 0)), *own], axis=2)
     scales = np.array([coefficient.scale for each in effects for coefficient in each.coefficients])
-    # what a large coefficient would not lift above rounding is nothing: a vertical axis cannot tilt gravity
+    # set to zero what even a large coefficient would not raise above rounding, as for the tilt of a vertical axis
     columns[np.abs(columns) * scales < _ROUNDING_MPS2] = 0.0
     return columns
 
 
 def _states_of(effect: Effect) -> tuple[Coefficient, ...]:
+    """Return the coefficients that are states: those of the effect and, if it has a derivative, its unknown
+    constant."""
     unknown = effect.unknown
     if unknown is None or not effect.smooth:
         return effect.coefficients
@@ -169,9 +184,11 @@ def _states_of(effect: Effect) -> tuple[Coefficient, ...]:
 
 
 def dwell_map(state: Floats) -> Floats:
-    """N (3, 4, 6): the nuisance states of a dwell on the regressors, linearised at ``state``.
+    """N (3, 4, 6): the coefficients of a dwell's nuisance states on the regressors 1, f_x, f_y, f_z, linearised at
+    ``state``.
 
-    Columns 0-2: rotation alpha, whose coefficient in channel i is f x s_i; columns 3-5: offset of sensor i.
+    Columns 0 to 2 belong to the small rotation alpha, whose derivative in channel i is f x s_i; columns 3 to 5 are the
+    offsets of the three accelerometers.
     """
     out = np.zeros((3, len(REGRESSORS), DWELL_STATES))
     for i in range(3):

@@ -1,12 +1,12 @@
 """Model files: the effects of a model as TOML, to keep and to share.
 
     effects = ["bend", "mine = fx*fy*T"]
-    effects_from = ["my_effects.py"]        # files of a user's own classes, relative to this one
+    effects_from = ["my_effects.py"]        # files that define a user's own effects, relative to this one
 
-    [sha256]                                # of these files when the model was saved
+    [sha256]                                # checksums of these files when the model was saved
     "my_effects.py" = "4f0e..."
 
-    [[coefficients]]                        # what the run it was saved from found; for people, read by nobody
+    [[coefficients]]                        # estimates of the run; for information only, not read
     symbol = "mine1"
     value = 1.2e-7
     sigma = 3.0e-9
@@ -15,7 +15,7 @@
 A file under ``effects_from`` is a program. Reading a model runs none; ``ModelFile.load`` runs those that it may::
 
     model = model_file.read("model.toml")
-    model.load(named=["my_effects.py"])     # or, where all that came with the model is trusted, trust=True
+    model.load(named=["my_effects.py"])     # or trust=True, to run all files that the model names
     calibrate("run.mcap", Settings(effects=model.effects))
 """
 
@@ -46,6 +46,8 @@ _Path = Annotated[str, StringConstraints(min_length=1, max_length=4096, pattern=
 
 
 class _Content(TypedDict):
+    """The content of a model file."""
+
     effects: list[TEXT]
     effects_from: NotRequired[list[_Path]]
     sha256: NotRequired[dict[_Path, TEXT]]
@@ -57,20 +59,20 @@ _KEYS = tuple(_Content.__annotations__)
 
 @dataclass(frozen=True)
 class ModelFile:
-    """What a model file says: texts of effects, files that define some of them."""
+    """The content of a model file: the texts of effects and the Python files that define some of them."""
 
     path: Path
     effects: tuple[str, ...]
     programs: tuple[Program, ...] = ()
 
     def allowed(self, named: Sequence[Path] = (), trust: bool = False) -> Allowed:
-        """The Python files that may be run for it: those named, or with ``trust`` all. Raises InputError."""
+        """The Python files that may be run for this model: those named, or all with ``trust``. Raises InputError."""
         return allowed(self.path, self.programs, named, trust)
 
     def load(self, named: Sequence[str | Path] = (), trust: bool = False) -> tuple[str, ...]:
-        """Run those Python files, and see that all effects exist; returns what has changed since it was saved.
+        """Run these Python files, check that all effects exist, and return what has changed since the model was saved.
 
-        Raises InputError, with the path, where one may not be run or cannot be used.
+        Raises InputError, with the path, if a file may not be run or cannot be used.
         """
         found = self.allowed([Path(name) for name in named], trust)
         with _telling(self.path):
@@ -82,9 +84,9 @@ class ModelFile:
 
 
 def read(path: str | Path) -> ModelFile:
-    """Read a model file and check all that can be checked before the Python files that it names have run.
+    """Read a model file and check what can be checked before the Python files that it names are run.
 
-    Raises InputError, with the path, where the file cannot be read or used.
+    Raises InputError, with the path, if the file cannot be read or used.
     """
     path = Path(path)
     table = table_of(path, _EXAMPLE)
@@ -108,6 +110,7 @@ def read(path: str | Path) -> ModelFile:
 
 @contextmanager
 def _telling(path: Path) -> Iterator[None]:
+    """Add the path to the message of an InputError."""
     try:
         yield
     except InputError as error:
@@ -115,9 +118,9 @@ def _telling(path: Path) -> Iterator[None]:
 
 
 def write(path: Path, result: Calibration) -> None:
-    """Write the model of a result with what was found for its coefficients; the file is whole or not there.
+    """Write the model of a result with the coefficients that were found; the file is written completely or not at all.
 
-    A file of that name is replaced. Raises InputError where it cannot be written.
+    A file of that name is replaced. Raises InputError if it cannot be written.
     """
     own = result.model.effects
     table: dict[str, Any] = {"effects": [effects.as_text(effect) for effect in own]}
@@ -129,13 +132,15 @@ def write(path: Path, result: Calibration) -> None:
 
 
 def _toml(table: dict[str, Any]) -> bytes:
+    """Return the bytes of the file."""
     import tomli_w
 
     return ("# Model of kf_calib: kf-calib replay RECORDING --model THIS_FILE\n" + tomli_w.dumps(table)).encode()
 
 
 def _coefficients(result: Calibration) -> Iterable[dict[str, Any]]:
-    """Symbol, value, sigma and unit of all but the twelve; without value and sigma where they were not seen."""
+    """Yield symbol, value, sigma and unit of all parameters but the twelve; value and sigma are absent if not
+    determined."""
     twelve = len(result.estimate.parameters)
     for parameter in list(result.parameters.values())[twelve:]:
         seen = {"value": parameter.value, "sigma": parameter.sigma} if parameter.value is not None else {}
@@ -143,7 +148,8 @@ def _coefficients(result: Calibration) -> Iterable[dict[str, Any]]:
 
 
 def _relative(file: Path, path: Path) -> str:
+    """Return the path of a program relative to the model file."""
     try:
         return Path(os.path.relpath(file, path.resolve().parent)).as_posix()
-    except ValueError:  # another drive
+    except ValueError:  # the file is on another drive
         return file.as_posix()

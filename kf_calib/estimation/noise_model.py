@@ -1,10 +1,11 @@
-"""The noise model: what the readings of a still platform scatter by, within a dwell and from dwell to dwell.
+"""The noise model: how the readings of a platform at rest scatter, within a dwell and from dwell to dwell.
 
-Three parts (all 1 sigma). sigma_w: the noise of a reading within a dwell, with an inflation kappa for its
-autocorrelation (kappa = spectral density at zero frequency / that of white noise of the same variance, so that the
-mean of n readings has variance kappa sigma_w^2 / n). sigma_alpha: the setting error, one small rotation a dwell, common
-to the three accelerometers. sigma_s: the scatter of each sensor from dwell to dwell. Each is stated or estimated
-(``reml``). Beside them the biases may walk at random, by q times the square root of the time.
+It has three parts, each given as one standard deviation. sigma_w is the noise of a reading within a dwell; its
+autocorrelation is described by the inflation kappa, the spectral density at frequency zero divided by that of white
+noise of the same variance, so that the mean of n readings has the variance kappa sigma_w^2 / n. sigma_alpha is the
+setting error, one small rotation per dwell that all three accelerometers share. sigma_s is the scatter of each
+accelerometer from dwell to dwell. The setting error and the scatter are either stated or estimated (``reml``). In
+addition the biases may follow a random walk of intensity q, whose standard deviation after the time t is q sqrt(t).
 """
 
 from __future__ import annotations
@@ -22,29 +23,35 @@ from kf_calib.estimation.autoregression import expected_products, unbiased
 from kf_calib.estimation.dwell_columns import Means
 
 FLOOR_MPS2 = 1e-9
-"""Readings that are exactly constant get this sigma: the rounding of a double is 1e-15 m/s^2."""
+"""Least sigma of a reading, used where readings are exactly constant; the rounding of a double is about 1e-15 m/s^2."""
 
 _MAX_ORDER = 20
-_LONGEST = 2.0  # kappa at most, as a part of a block
-_SHORT = 8.0  # kappa: in blocks no longer than that one correlation is found for the three channels
+_LONGEST = 2.0  # kappa is at most the readings in a block divided by this
+_SHORT = 8.0  # if blocks are shorter than this times kappa, the three channels share one correlation
 TOO_SHORT = 4.0
-"""Kappa: blocks no longer than that do not tell how slow their noise is."""
+"""If blocks are shorter than this times kappa, they do not determine how slow their noise is."""
 
-_AVERAGES = 60  # of a block, at least, from which their own correlation is taken
+_AVERAGES = 60  # least number of averages of a block from which their own correlation is estimated
 _WANDER = 6
-_ROUNDING = 1e-14  # of a dwell's variance
+_ROUNDING = 1e-14  # relative to a dwell's variance
 
 
 @dataclass(frozen=True)
 class Noise:
-    """sigma_mps2, inflation, scatter_mps2: (3,) each; setting_rad; which of the dwell parts were stated.
+    """The parameters of the noise model.
 
-    checked: the scatter is stated, or the orientations are enough to check that a setting error only turns the specific
-    force. The estimate then leans on the readings along it, which no rotation changes; otherwise dwells weigh by their
-    scatter alone, and the setting error is *considered* (Schmidt): it enlarges the covariance and moves no estimate.
-    slew_sigma_mps2 (3,): what stands for sigma and inflation in slews; None where none are used.
-    walk_mps2_per_sqrt_s: intensity q of the random walk of each bias; walk_spread: 1 sigma of ln q, None where q was
-    stated or is zero.
+    - sigma_mps2 (3,): sigma_w of each accelerometer.
+    - inflation (3,): kappa of each accelerometer.
+    - setting_rad: sigma_alpha.
+    - scatter_mps2 (3,): sigma_s of each accelerometer; zeros if not given.
+    - setting_stated, scatter_stated: whether these parts were stated rather than estimated.
+    - checked: whether the setting error is weighted. It is if the scatter is stated, or if there are enough
+      orientations to check that a setting error only turns the specific force; readings along the specific force, which
+      no rotation changes, then get more weight. Otherwise dwells are weighted by their scatter alone and the setting
+      error is a considered parameter (Schmidt), which enlarges the covariance but does not change the estimate.
+    - slew_sigma_mps2 (3,): the effective sigma in slews; None if no slews are used.
+    - walk_mps2_per_sqrt_s: the intensity q of the random walk of each bias.
+    - walk_spread: the sigma of ln q; None if q was stated or is zero.
     """
 
     sigma_mps2: Floats
@@ -64,28 +71,29 @@ class Noise:
 
     @property
     def effective_sigma_mps2(self) -> Floats:
-        """Sigma (3,) of white readings whose mean is as uncertain as that of the true, correlated ones."""
+        """Sigma (3,) of white readings whose mean has the same variance as the mean of the correlated readings."""
         return np.maximum(self.sigma_mps2, FLOOR_MPS2) * np.sqrt(self.inflation)
 
     @property
     def weights(self) -> Noise:
-        """The noise by which dwells are weighted."""
+        """The noise by which dwells are weighted in the fit."""
         return self if self.checked else replace(self, setting_rad=0.0)
 
     @property
     def judging(self) -> Noise:
-        """The noise by which a misfit is judged: scatter that was estimated from the same misfit is left out."""
+        """The noise by which the misfit is judged: without scatter that was itself estimated from this misfit."""
         return self if self.scatter_stated else replace(self, scatter_mps2=np.zeros(3))
 
     def of(self, moving: bool) -> Noise:
-        """The noise in dwells, or that in slews."""
+        """The noise that applies in slews if ``moving``, else the noise in dwells."""
         if not moving or self.slew_sigma_mps2 is None:
             return self
         return replace(self, sigma_mps2=self.slew_sigma_mps2, inflation=np.ones(3), walk_mps2_per_sqrt_s=0.0)
 
     @property
     def dwell_sigmas(self) -> Floats:
-        """Sigma (6,) of a dwell's nuisance states: three rotations in rad, three offsets in m/s^2; 0: absent."""
+        """Prior sigmas (6,) of a dwell's nuisance states: three rotations in rad and three offsets in m/s^2; 0 for a
+        state that is absent."""
         return np.concatenate([np.full(3, self.setting_rad), self.scatter_mps2])
 
 
@@ -96,10 +104,11 @@ def steps(dwells: Sequence[DwellFactor], noise: Noise) -> Floats:
 
 
 def within_dwells(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float = 0.0) -> Noise:
-    """sigma_w and kappa of each accelerometer, pooled over the pieces; a known walk of the biases is not in them.
+    """The noise within dwells, sigma_w and kappa of each accelerometer, pooled over all pieces.
 
-    The sum of squares about a parabola has expectation sigma^2 (n - 3 kappa) over a piece of 40 kappa readings or more;
-    where there is none, sigma_w is that of the autocovariance.
+    The contribution of a random walk of known intensity is subtracted. Over a piece of n readings, the sum of squares
+    about a parabola has the expectation sigma^2 (n - 3 kappa) if n is at least 40 kappa. If there is no such piece,
+    sigma_w is taken from the autocovariance.
     """
     total = dwells[0].autocovariance
     for dwell in dwells[1:]:
@@ -122,7 +131,8 @@ def within_dwells(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float = 0
 
 
 def _lagged(dwells: Sequence[DwellFactor]) -> Floats:
-    """What a walk of q = 1 adds to the sums of lagged products (L + 1, 1) of all dwells."""
+    """Return what a random walk of intensity q = 1 contributes to the sums of lagged products (L + 1, 1) of all
+    dwells."""
     out = 0.0 * dwells[0].autocovariance.pairs
     for dwell in dwells:
         known, period_s = dwell.autocovariance, (dwell.end_s - dwell.start_s) / max(dwell.count - 1, 1)
@@ -132,9 +142,11 @@ def _lagged(dwells: Sequence[DwellFactor]) -> Floats:
 
 
 def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
-    """kappa, and the variance, from an autoregression fitted to the autocovariance (``autoregression``).
+    """Return kappa and the variance of one channel from an autoregression fitted to its autocovariance
+    (``autoregression``).
 
-    Never below 1: a noise that averages faster than white is not relied on; and no larger than a block can tell.
+    kappa is limited from below to 1, so that noise whose average falls faster than that of white noise is not relied
+    on, and from above to what blocks of this length can show.
     """
     if total.count < 64 or total.products[0, channel] <= 0:
         return 1.0, 0.0
@@ -146,9 +158,11 @@ def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
 
 
 def _alike(total: Autocovariance) -> tuple[Floats, Floats]:
-    """The same of blocks that are short for their correlation, of which a channel alone tells little: one for all.
+    """Return kappa (3,) and the variances (3,) with one autocorrelation for all channels, for blocks that are short for
+    their correlation time.
 
-    Where they are too short to tell, it is taken to be as slow as they allow.
+    A single channel then contains too little information. If the blocks are too short even together, kappa is set to
+    the largest value that they allow.
     """
     varying = total.products[0] > 0
     channels, size = int(varying.sum()), total.count / total.blocks
@@ -160,7 +174,10 @@ def _alike(total: Autocovariance) -> tuple[Floats, Floats]:
 
 
 def _of_averages(total: Autocovariance, channel: int) -> tuple[float, float]:
-    """The same of averages over windows that overlap: of few what white noise makes, of many no less."""
+    """Return kappa and the variance of one channel for averages over overlapping windows.
+
+    For short blocks kappa is that of averaged white noise; for long ones it is estimated, but not below that value.
+    """
     if not total.count:
         return 1.0, 0.0
     size, kappa = round(total.count / total.blocks), window_average.inflation()
@@ -172,12 +189,13 @@ def _of_averages(total: Autocovariance, channel: int) -> tuple[float, float]:
 
 
 def slow_scatter(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floats], Floats]:
-    """The slow part of a stated scatter: columns at the nodes of each dwell (pieces, nodes, 3, q), constant in it, and
-    the sigma (q,) of their coefficients.
+    """Columns (pieces, nodes, 3, q) for the slow part of a stated scatter in each dwell, and the prior sigmas (q,) of
+    their coefficients.
 
-    What a bench states as scatter from dwell to dwell may be flicker: as large, but alike in dwells that follow each
-    other, which looks like a drift. Of 1/f noise of density h / f, dwell means vary by s^2 = h ln D about the mean of D
-    dwells, and its part sqrt(2) cos(pi k t / T) of a run of length T has the variance h / k.
+    Scatter that is stated for a bench may be flicker noise, which has the same size but is similar in consecutive
+    dwells and so looks like a drift. With 1/f noise of spectral density h / f, the means of D dwells have the variance
+    s^2 = h ln D about their common mean, and the component sqrt(2) cos(pi k t / T) of a run of length T has the
+    variance h / k. The columns are these components for k = 1 ... 6, constant within a dwell.
     """
     channels = np.flatnonzero(noise.scatter_mps2 > 0)
     if len(dwells) < 4 or not channels.size:
@@ -194,38 +212,47 @@ def slow_scatter(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floa
 
 
 def flicker_sigma(noise: Noise, dwells: int) -> Floats:
-    """sqrt(h) (3,) of a scatter stated for so many dwells, were it flicker."""
+    """sqrt(h) (3,) of the 1/f noise that would produce the stated scatter over ``dwells`` dwells."""
     return noise.scatter_mps2 / np.sqrt(np.log(max(dwells, 2)))
 
 
 def mean_covariances(noise: Noise, means: Means, state: Floats) -> Floats:
-    """Covariance (D, 3, 3) of the dwells' mean readings about the model.
+    """Covariances (D, 3, 3) of the dwells' mean readings about the model.
 
-    diag(kappa sigma_w^2 / n + sigma_s^2) + sigma_alpha^2 S (|f|^2 I - f f^T) S^T, S the sensitivities (rows).
+      diag(kappa sigma_w^2 / n + sigma_s^2) + sigma_alpha^2 S (|f|^2 I - f f^T) S^T
+
+    S holds the sensitivities of the accelerometers in its rows, f is the specific force.
     """
     own = noise.effective_sigma_mps2**2 / means.counts[:, None] + noise.scatter_mps2**2
     return own[:, :, None] * np.eye(3) + noise.setting_rad**2 * setting_covariances(means, state)
 
 
 def lift_rounding(covariances: Floats) -> Floats:
-    """Covariances (D, 3, 3) with as much more in all directions as is rounding: a setting error alone does not turn the
-    force along itself, and where noise is far below it, rounding decides whether there is a root."""
+    """Covariances (D, 3, 3) with a small multiple of the identity added, so that a Cholesky factor exists.
+
+    The covariance of a setting error is singular along the specific force. If the other noise is far below the setting
+    error, rounding would decide whether the matrix is positive definite.
+    """
     least = _ROUNDING * np.einsum("dii->d", covariances)
     return np.asarray(covariances + least[:, None, None] * np.eye(3), float)
 
 
 def setting_covariances(means: Means, state: Floats) -> Floats:
-    """Covariance (D, 3, 3) of the mean readings per unit variance of a random small rotation."""
+    """Covariances (D, 3, 3) of the mean readings that a random small rotation of unit variance per axis produces."""
     force, sensitivity = means.force_mps2, state[:12].reshape(3, 4)[:, :3]
     across = np.einsum("di,di->d", force, force)[:, None, None] * np.eye(3) - force[:, :, None] * force[:, None, :]
     return sensitivity @ across @ sensitivity.T
 
 
 def considered_information(noise: Noise, means: Means, state: Floats) -> Floats:
-    """What each dwell's setting error adds to the information about the gain, (D, p, p); zeros where it is weighted.
+    """Contribution B (D, p, p) of each dwell's setting error to the covariance P + P (sum of B) P; zeros if it is
+    weighted.
 
-    With weights W and design A, the covariance is P + P B P, B = sum A^T W dV W A, dV the setting error's part: the
-    Schmidt-Kalman filter's covariance (Bierman, 1977, ch. VIII), in batch terms a sandwich.
+      B = A^T W V W A
+
+    A is the design, W the weights and V the setting error's covariance of the mean readings. This is the covariance of
+    the Schmidt-Kalman filter (G. J. Bierman, Factorization Methods, 1977, ch. VIII); in regression it is known as a
+    sandwich.
     """
     count = means.design.shape[2]
     if noise.checked or not noise.setting_rad:

@@ -1,6 +1,7 @@
-"""What a run can say of an effect before anyone fits it: is it visible, how small may it be, what is it confused with.
+"""The predictions that a run allows about an effect before it is fitted: visibility, smallest detectable size and
+look-alikes.
 
-All from the columns, nothing from the misfit: the effect and the catalogue are projected off the model
+They depend only on the columns, not on the misfit: the effect and the catalogue are projected off the model
 (``score_test``).
 """
 
@@ -20,18 +21,22 @@ from kf_calib.estimation.score_test import Candidate, Scan, scan
 from kf_calib.support.threads import one_blas_thread
 
 LEVEL, POWER = 0.01, 0.9
-"""Found is what a run in which nothing is missing shows with this chance; smallest sizes are found in this share."""
+"""Significance level of a detection, and the share of runs in which an effect of the smallest detectable size is
+found."""
 
-_CONFUSED, _TWINS, _NAMED = 0.5, 0.99, 3  # overlaps worth naming; that cannot be told apart; how many are named
+_CONFUSED, _TWINS, _NAMED = 0.5, 0.99, 3  # overlap worth naming, overlap of look-alikes, number of effects named
 
 
 @dataclass(frozen=True)
 class Visibility:
-    """One effect as these orientations show it beside a model.
+    """The visibility of one effect in these orientations, beside a model.
 
-    share: the largest part of one of its columns that the model leaves (0: invisible); None where it has no column in
-    dwells, and ``why`` says so. unseen: symbols not determined. smallest: (coefficient, SI size) found in 9 of 10 runs,
-    the largest over its coefficients. rivals: (name, overlap), the closest first. degeneracy: exact ones, in words.
+    - share: largest share of one of its columns that the model leaves (0: invisible); None if it has no column in
+      dwells, for the reason in ``why``.
+    - unseen: symbols of coefficients that are not determined.
+    - smallest: the coefficient that is hardest to detect, and its smallest detectable size in SI.
+    - rivals: name and overlap of the effects that overlap most with it.
+    - degeneracy: exact degeneracies, in words.
     """
 
     effect: Effect
@@ -44,10 +49,11 @@ class Visibility:
 
     @property
     def visible(self) -> bool | None:
+        """Whether anything of it is left beside the model; None if it has no column in dwells."""
         return None if self.share is None else self.share > 0.0
 
     def __str__(self) -> str:
-        """The same in a sentence."""
+        """The visibility in one sentence."""
         if self.share is None:
             return f"{self.effect}: {self.why}"
         seen = f"visible, {self.share:.2g} of its column is left beside the rest of the model"
@@ -64,12 +70,12 @@ class Visibility:
 
     @property
     def at_value(self) -> float | None:
-        """Where the constant inside the columns stands (SI)."""
+        """Value of the effect's unknown constant (SI); None if it has none."""
         return None if self.effect.unknown is None else self.effect.value
 
     @property
     def at(self) -> str:
-        """The same in words, for after a coefficient."""
+        """The value of the unknown constant in words, to follow a coefficient."""
         unknown = self.effect.unknown
         if unknown is None:
             return ""
@@ -77,7 +83,8 @@ class Visibility:
 
 
 def visibility_of(fitted: Fit, effects: Sequence[Effect]) -> list[Visibility]:
-    """Of each effect, beside the model without it; an effect with a constant at that value where it shows best."""
+    """The visibility of each effect beside the model without it; an unknown constant is at the value at which the
+    effect shows best."""
     with one_blas_thread():
         model = fitted.carried.model
         inside = [each for each in effects if str(each) in model.parts]
@@ -88,7 +95,8 @@ def visibility_of(fitted: Fit, effects: Sequence[Effect]) -> list[Visibility]:
 
 
 def _beside(fitted: Fit, model: Model, effects: Sequence[Effect]) -> list[Visibility]:
-    """Of effects that are not in ``model``, against each other and the catalogue."""
+    """Return the visibility of effects that are not in ``model``, with their overlaps with each other and with the
+    catalogue."""
     bench, named = model.bench, {str(each) for each in effects}
     others = [effect_named(name, bench) for name in names(bench) if name not in named | set(model.parts)]
     tried = [at for each in (*effects, *others) if _has_columns(each) for at in _values(each)]
@@ -99,14 +107,17 @@ def _beside(fitted: Fit, model: Model, effects: Sequence[Effect]) -> list[Visibi
 
 
 def _has_columns(effect: Effect) -> bool:
+    """Tell whether an effect has columns in dwells."""
     return not (effect.dynamic or effect.walks)
 
 
 def _values(effect: Effect) -> list[Effect]:
+    """Return the effect at each value of a coarse grid of its unknown constant, or alone if it has none."""
     return [effect] if effect.unknown is None else [effect.at(value) for value in effect.unknown.grid(2.0)]
 
 
 def _sight(found: Scan, effect: Effect) -> Visibility:
+    """Return the visibility of one effect from the scan of all."""
     if effect.dynamic:
         return Visibility(effect, None, why="shows in slews only, which are not looked at here")
     if effect.walks:
@@ -128,14 +139,15 @@ def _sight(found: Scan, effect: Effect) -> Visibility:
 
 
 def smallest_size(candidate: Candidate, tests: int) -> tuple[Coefficient, float] | None:
-    """The coefficient that must be largest to be found in 9 of 10 runs among ``tests`` effects, and that size (SI)."""
+    """The coefficient that is hardest to detect among ``tests`` effects, and the size (SI) that is found in 9 of 10
+    runs; None if none is determined."""
     from scipy.special import chdtri, chndtrinc
 
     sizes: Floats = np.linalg.norm(candidate.columns, axis=0)
     seen = np.flatnonzero(~candidate.hidden & (sizes > 0))
     if not (candidate.dof and seen.size):
         return None
-    threshold = float(chdtri(candidate.dof, 0.5 * LEVEL / tests))  # half: the misfit as a whole is tested beside
+    threshold = float(chdtri(candidate.dof, 0.5 * LEVEL / tests))  # half, since the misfit as a whole is tested, too
     worst = int(seen[np.argmin(sizes[seen])])
     needed = float(np.sqrt(chndtrinc(threshold, candidate.dof, 1.0 - POWER)))
     return candidate.effect.coefficients[worst], needed / float(sizes[worst])

@@ -1,4 +1,4 @@
-"""Dwells folded anew on a carrier near the frequency of an oscillation in the model."""
+"""Folding of the dwells on a carrier near the frequency of an oscillation in the model."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import consistency
 from kf_calib.support import stage
 
-_CARRIERS = 3  # passes at most in search of one
-_CYCLES = 50.0  # a dwell, of a line that may be what is left of a slow oscillation
-_SLOW = 0.3  # cycles of a slow oscillation in a dwell: its parabola leaves less than a thousandth of its power
-_NEAR = 0.06  # cycles between oscillation and carrier in a piece: a parabola then leaves 1e-3 of its amplitude
+_CARRIERS = 3  # largest number of passes in search of a carrier
+_CYCLES = 50.0  # cycles per dwell; a line below may be the remainder of a slow oscillation
+_SLOW = 0.3  # cycles per dwell; of a slower oscillation a parabola leaves less than a thousandth of the power
+_NEAR = 0.06  # cycles by which oscillation and carrier may differ in a piece; a parabola then leaves 1e-3 of it
 
 
 def on_carrier(
     passed: Pass, dwells: list[DwellFactor], plain: Fit | None, on_progress: Callable[[float], None] | None
 ) -> tuple[Pass, Fit]:
-    """The source folded again on a carrier at the frequency of the model's oscillation, until it is near enough.
+    """The source folded again on a carrier near the frequency of the model's oscillation, and the fit to it.
 
-    The first carrier is the line in the spectrum; without one, the oscillation is slow, and found on the plain dwells.
-    What a parabola leaves of a slow one makes a line of a few cycles a dwell: there the likelier one is taken.
+    The first carrier is the strongest line in the spectrum; if there is none, the oscillation is slow and is fitted to
+    the plain dwells. A line of only a few cycles per dwell may be the remainder of a slow oscillation after the
+    parabola was removed; then both are tried and the more likely one is taken.
     """
     seen = lines_of(dwells)
     if not seen:
@@ -39,14 +40,17 @@ def on_carrier(
 
 
 def _unlikeliness(fitted: Fit) -> float:
-    """-2 ln of the likelihood of the noise within dwells and of the misfit of the model, but for a constant."""
+    """Return -2 ln of the likelihood of the noise within dwells and of the misfit, up to a constant."""
     sigma, count = fitted.noise.effective_sigma_mps2, sum(dwell.count for dwell in fitted.dwells)
     return 2.0 * count * float(np.log(sigma).sum()) + consistency(fitted).statistic
 
 
 def holds_its_oscillation(fitted: Fit) -> bool:
-    """Whether the dwells are folded so that they hold the model's oscillation, if it has one: on a carrier, or it is so
-    slow that a parabola over a dwell does, or what that leaves would count as correlated noise."""
+    """Tell whether the dwells are folded so that the model's oscillation, if it has one, can be fitted.
+
+    They are if they are folded on a carrier, or if the oscillation is so slow that a parabola over a dwell describes it
+    and its remainder shows no line.
+    """
     dwells = fitted.dwells
     if not fitted.carried.model.oscillates or dwells[0].carrier_hz:
         return True
@@ -55,7 +59,8 @@ def holds_its_oscillation(fitted: Fit) -> bool:
 
 
 def _nearer(passed: Pass, carrier: float | Fit, on_progress: Callable[[float], None] | None) -> tuple[Pass, Fit]:
-    """The source folded on a carrier, in Hz or where a fit has the oscillation, and the fit there."""
+    """Fold the source on a carrier, given in Hz or by the oscillation of a fit, until it is near the fitted
+    oscillation."""
     carrier_hz = _oscillation_hz(carrier) if isinstance(carrier, Fit) else carrier
     for left in reversed(range(_CARRIERS)):
         stage.say(f"reading on a carrier of {carrier_hz:.3g} Hz")
@@ -70,10 +75,12 @@ def _nearer(passed: Pass, carrier: float | Fit, on_progress: Callable[[float], N
 
 
 def fitted_to(passed: Pass, dwells: list[DwellFactor]) -> Fit:
+    """The fit of the settings' model to these dwells."""
     settings = passed.settings
     model = Model.of(passed.source.bench, settings.effects)
     return fit(dwells, model, settings.walk_mps2_per_sqrt_s, passed.folder.slews)
 
 
 def _oscillation_hz(fitted: Fit) -> float:
+    """Return the frequency of the model's oscillation."""
     return next(effect.value for effect in fitted.carried.model.effects if effect.oscillates)

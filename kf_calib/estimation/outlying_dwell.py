@@ -1,10 +1,11 @@
-"""One dwell that alone does not fit: a pose mistyped or misread, a knock, a cable that pulled.
+"""The search for one dwell that alone does not fit: a pose mistyped or misread, a knock, a cable that pulled.
 
-Each dwell is predicted by a fit to all others; its error e (3,) has the covariance C of that prediction and of its own
-noise, and e^T C^-1 e / 3 is F distributed with 3 and nu degrees of freedom: nu is infinite where the noise from dwell
-to dwell is stated, else what all others leave over to estimate it by. A dwell is outlying where this is beyond chance
-at the level of the run, all others agree without it, and either a turn of one gimbal explains its readings or it is off
-by more than any known effect makes.
+Each dwell is predicted by a fit to all others. Its error e (3,) has the covariance C, the sum of that of the prediction
+and of the dwell's own noise, and e^T C^-1 e / 3 is F distributed with 3 and nu degrees of freedom. nu is infinite if
+the noise from dwell to dwell is stated; otherwise it is the degrees of freedom that the other dwells leave to estimate
+it. A dwell is outlying if three things hold: its error is significant at the level of the run, all other dwells are
+consistent without it, and either a rotation of one gimbal explains its readings or its error is larger than any known
+effect causes.
 """
 
 from __future__ import annotations
@@ -22,36 +23,36 @@ from kf_calib.estimation.noise_model import lift_rounding, mean_covariances
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Turn
 from kf_calib.support.tail_probabilities import f_tail
 
-LEVEL = 1e-6  # of the run: a dwell that is called wrong must be so beyond doubt
-_MOST_LEFT = -2.0 * math.log(1e-4)  # chi-squared that a turn leaves, of 2 degrees of freedom: three channels less it
-_GROSS = 0.02  # g: more than a known effect makes in one dwell
-_NEARLY = 0.3  # of the largest statistic: dwells as far off are tried too
+LEVEL = 1e-6  # significance over the whole run; a dwell must be wrong beyond doubt
+_MOST_LEFT = -2.0 * math.log(1e-4)  # limit of chi-squared after a rotation; three channels less one angle leave 2 dof
+_GROSS = 0.02  # g; larger than any known effect in one dwell
+_NEARLY = 0.3  # relative to the largest statistic; dwells above it are tried, too
 _TRIED = 4
-_GRID = 360  # turns at which a gimbal is tried first
-_REFINED = 6  # steps of Gauss-Newton
-_STEP = 1e-4  # rad, of its differences
-_FARTHEST = 0.02  # rad, of one of its steps
+_GRID = 360  # rotations of a gimbal that are tried first
+_REFINED = 6  # Gauss-Newton steps
+_STEP = 1e-4  # rad, for difference quotients
+_FARTHEST = 0.02  # rad, largest Gauss-Newton step
 
 
 def outlying_in_words(found: Sequence[OutlyingDwell]) -> str:
-    """What is said of the dwells of which any one could be it; '' where there are none."""
+    """A sentence on the outlying dwell, or on those of which any one could be it; '' if there is none."""
     return " Or ".join(map(str, found))
 
 
 def outlying_dwells(
     result: Calibration, evaluate: Callable[[list[DwellFactor]], Calibration]
 ) -> tuple[OutlyingDwell, ...]:
-    """The dwell that alone does not fit; several where any one of them could be it, none where none does.
+    """The dwell that alone does not fit, or several if any one of them could be the cause; empty if none is.
 
-    evaluate: the calibration from some of the dwells, by the same model.
+    ``evaluate`` makes a calibration from some of the dwells with the same model.
     """
     left_out, dwells = result.held_out, result.fit.dwells
     if left_out is None or len(dwells) < 6 or result.noise.walk_mps2_per_sqrt_s:
         return ()
     statistics = left_out.statistics
-    if statistics.max() < 30.0:  # no dwell can be beyond the level
+    if statistics.max() < 30.0:  # no dwell can be significant
         return ()
-    ratios = (statistics / statistics.max()).round(9)  # of dwells as far off, to rounding, the first comes first
+    ratios = (statistics / statistics.max()).round(9)  # rounded, so that the first of equal dwells comes first
     order = np.argsort(-ratios, kind="stable")[:_TRIED]
     tried = [k for k in order.tolist() if ratios[k] > _NEARLY]
     found = [_judged(result, k, evaluate(dwells_without(dwells, (k,)))) for k in tried]
@@ -59,7 +60,7 @@ def outlying_dwells(
 
 
 def _judged(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell | None:
-    """Dwell ``k`` against the calibration from all others; None where they disagree too, or it is within chance."""
+    """Judge dwell ``k`` against the calibration from all others; None if those disagree or if it is within chance."""
     if rest.consistency.consistent is not True:
         return None
     dwells, estimate, noise = result.fit.dwells, rest.estimate, rest.noise
@@ -77,19 +78,19 @@ def _judged(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell | N
 
 
 def _covariance(rest: Calibration, means: Means) -> Floats:
-    """Of the mean reading of one dwell less its prediction, (3, 3)."""
+    """Return the covariance (3, 3) of one dwell's mean reading less its prediction."""
     design, estimate = means.design[0], rest.estimate
     own = mean_covariances(rest.noise, means, estimate.state)
     return lift_rounding(own + design @ estimate.covariance @ design.T)[0]
 
 
 def _turns(dwell: DwellFactor, means: Means, rest: Calibration) -> Iterator[Turn]:
-    """Turns of single gimbals with which the prediction would be right to within its covariance."""
+    """Yield the rotations of single gimbals with which the prediction is correct to within its covariance."""
     bench, state = rest.bench, rest.estimate.state
     at_s = np.array([0.5 * (dwell.start_s + dwell.end_s)])
 
     def at(gimbal: int, turn_rad: float) -> Means:
-        """The dwell's means with the gravity that the platform would feel there."""
+        """Return the dwell's means with the specific force that the platform would have at this angle of the gimbal."""
         pose = dwell.pose.copy()
         pose[gimbal] += turn_rad
         force, design = bench.specific_force(at_s, pose[None]), means.design.copy()
@@ -104,7 +105,7 @@ def _turns(dwell: DwellFactor, means: Means, rest: Calibration) -> Iterator[Turn
         grid = np.linspace(-np.pi, np.pi, _GRID, endpoint=False).tolist()
         turn = min(grid, key=lambda each, g=gimbal: float(np.sum(error(g, each) ** 2)))
         curvature = 1e-300
-        for _ in range(_REFINED):  # Gauss-Newton, what is uncertain of the pose being so where it would be
+        for _ in range(_REFINED):  # Gauss-Newton, with the pose's uncertainty taken at the new angle
             ahead, behind = (error(gimbal, turn + step) for step in (_STEP, -_STEP))
             slope, here, weight = (ahead - behind) / (2.0 * _STEP), error(gimbal, turn), _weight(rest, at(gimbal, turn))
             curvature = max(float(slope @ weight @ slope), 1e-300)
@@ -116,4 +117,5 @@ def _turns(dwell: DwellFactor, means: Means, rest: Calibration) -> Iterator[Turn
 
 
 def _weight(rest: Calibration, means: Means) -> Floats:
+    """Return the inverse covariance of the dwell's error."""
     return np.asarray(np.linalg.inv(_covariance(rest, means)), float)

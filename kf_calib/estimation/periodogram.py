@@ -1,10 +1,11 @@
-"""Oscillations at many frequencies against a model: by how much each would lower chi-squared.
+"""The decrease of chi-squared by an oscillation at each of many frequencies, each added alone to a model.
 
-The whitened columns of an oscillation of frequency f in a dwell about t_d, cosine + i sine of each accelerometer, are
-e^(2 pi i f t_d) times columns Gamma_d(f) that change with f no faster than the dwell is long. They are worked out at a
-few Chebyshev points of the band and interpolated between; sums over the dwells are matrix products with e^(2 pi i f
-t_d). It is the periodogram of Lomb and Scargle beside any linear model, in noise that is neither white nor alike in all
-dwells. What the biases' walk explains is taken out through its banded precision.
+For a dwell whose middle is at t_d, the whitened columns of an oscillation of frequency f, as cosine + i sine for each
+accelerometer, are e^(2 pi i f t_d) times columns Gamma_d(f). These vary slowly with f, the more slowly the shorter the
+dwell. They are therefore computed at a few Chebyshev points of the band and interpolated between, and sums over the
+dwells become matrix products with e^(2 pi i f t_d). The result generalises the Lomb-Scargle periodogram to any linear
+model and to noise that is neither white nor equal in all dwells. What a random walk of the biases explains is removed
+by means of its banded precision matrix.
 """
 
 from __future__ import annotations
@@ -25,17 +26,17 @@ from kf_calib.estimation.dwell_columns import Carried, candidate_columns
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise, steps
 
-_SEEN = 1e-6  # of a column beside the model: less is nothing
-_NEW = 1e-9  # of a column beside those before: less is rounding
-_SPARE = 18  # points beyond the phase, rad, that a dwell goes through: 1e-10 of a column
-_AT_ONCE = 64  # frequencies
-_LEAST_PAUSE = 1e-6  # of the largest step of a walk: no pause is taken to be shorter
+_SEEN = 1e-6  # a column of which the model leaves less than this share counts as explained
+_NEW = 1e-9  # a smaller share of a column beside those before it is rounding
+_SPARE = 18  # points beyond the phase, rad, that passes during a dwell; the error is then 1e-10 of a column
+_AT_ONCE = 64  # frequencies that are processed together that are processed together
+_LEAST_PAUSE = 1e-6  # of the largest variance of a step: the variance over a pause is at least this
 
 Waves = NDArray[np.complex128]
 
 
 class Periodogram:
-    """Of the ``effect`` at ``values_hz`` (N,), in the dwells carried and the noise by which they are judged."""
+    """The periodogram of an oscillating ``effect`` at frequencies ``values_hz`` (N,), for given dwells and noise."""
 
     def __init__(self, carried: Carried, noise: Noise, effect: Effect, values_hz: Floats) -> None:
         self.values_hz, self.state, self.noise = values_hz, carried.state, noise
@@ -61,10 +62,12 @@ class Periodogram:
         self._first: _Beside | None = None
 
     def falls(self, rows: Floats, own: Floats, first: int) -> Floats:
-        """By how much the oscillation at each frequency would lower chi-squared (N,) beside a model.
+        """Decrease of chi-squared (N,) if the oscillation at each frequency is added to a model.
 
-        rows (r, c): whitened [H | E | z], of which H, ``first`` columns, is the same in all models, so that it is
-        worked out once; own (m, c): the same of the dwells alone, their walk not yet taken out.
+        - rows (r, c): whitened rows [H | E | z]. The columns H, ``first`` of them, have to be the same for every model
+          because their products are computed only once.
+        - own (m, c): the same columns in the rows of the dwells alone, before they are whitened with respect to the
+          walk.
         """
         if self._first is None:
             self._first = _Beside.nothing(rows[:, -1], own[:, -1]).with_columns(rows[:, :first], own[:, :first])
@@ -77,8 +80,8 @@ class Periodogram:
         return self._lowered(np.concatenate([base.known[:, :, :-1], more], axis=2), left)
 
     def _along(self, columns: Floats) -> Floats:
-        """Products (N, 6, c) of cosines and sines of the three accelerometers, in that order, with columns (m, c) that
-        the rows of the dwells have."""
+        """Return the products (N, 6, c) of the cosines and then the sines of the three accelerometers with columns (m,
+        c) in the dwells' rows."""
         count, points = columns.shape[1], self._shares.shape[1]
         if not count:
             return np.zeros((len(self.values_hz), 6, 0))
@@ -93,8 +96,11 @@ class Periodogram:
         return np.concatenate([out.real, out.imag], axis=1)
 
     def _lowered(self, along_model: Floats, along_left: Floats) -> Floats:
-        """Chi-squared (N,) lowered, from the products (N, 6, p) with the model's columns, made orthonormal, and (N, 6)
-        with what they leave of the readings."""
+        """Return the decrease of chi-squared (N,).
+
+        - along_model (N, 6, p): products of the waves with an orthonormal basis of the model's columns.
+        - along_left (N, 6): products of the waves with the residual of the readings.
+        """
         sizes = np.sqrt(np.maximum(np.einsum("nii->ni", self._squares), 1e-300))
         gram = self._squares - along_model @ np.swapaxes(along_model, 1, 2)
         gram, along = gram / (sizes[:, :, None] * sizes[:, None, :]), along_left / sizes
@@ -102,10 +108,10 @@ class Periodogram:
         return np.einsum("ni,nij,nj->n", along, inverse, along)
 
     def _products_of_waves(self) -> Floats:
-        """Products (N, 6, 6) of cosines and sines with each other.
+        """Return the products (N, 6, 6) of the cosines and sines with each other.
 
-        conj(Gamma_i) Gamma_j has no phase, so its sum over the dwells is smooth in f; Gamma_i Gamma_j has twice that of
-        its dwell.
+        conj(Gamma_i) Gamma_j contains no phase of the dwell, so that its sum over the dwells is a smooth function of f;
+        Gamma_i Gamma_j contains twice the phase of its dwell.
         """
         points, same, twice = self._shares.shape[1], 0.0, list[Waves]()
         for part in _parts(self._ends):
@@ -124,7 +130,8 @@ class Periodogram:
         return out
 
     def _explained_by_path(self, path: _Path, part: slice, turning: Waves) -> Floats:
-        """What a walk's path takes of the products (n, 6, 6) of some frequencies."""
+        """Return the part of the products (n, 6, 6) that the random walk of the biases explains, for some
+        frequencies."""
         points, count = self._shares.shape[1], len(self._middles_s)
         sums = path.products(self._waves.reshape(len(self._waves), -1)).reshape(count, 6, points, 3)
         found = np.einsum("np,dqpi->dqni", self._shares[part], sums, optimize=True) * turning.T[:, None, :, None]
@@ -133,7 +140,7 @@ class Periodogram:
         return np.swapaxes(solved, 1, 2) @ solved
 
     def _turning(self) -> Iterator[tuple[slice, Waves]]:
-        """Frequencies, some at a time, and e^(2 pi i f t_d) (n, D) of them."""
+        """Yield slices of the frequencies and e^(2 pi i f t_d) (n, D) for each."""
         for first in range(0, len(self.values_hz), _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
             yield part, np.exp(2j * np.pi * self.values_hz[part, None] * self._middles_s)
@@ -141,8 +148,12 @@ class Periodogram:
 
 @dataclass
 class _Beside:
-    """Columns of a model made orthonormal in its noise, as ``rows`` (r, p) and as rows of the dwells, ``own`` (m, p);
-    left, own_left: what they leave of the readings. known: products of the oscillations with own and own_left."""
+    """The orthonormalised columns of a model and the residual of the readings.
+
+    - rows (r, p): the columns in all whitened rows; own (m, p): the same columns in the rows of the dwells alone.
+    - left (r,), own_left (m,): the residual of the readings in both sets of rows.
+    - known: products of the oscillations with ``own`` and ``own_left``.
+    """
 
     rows: Floats
     own: Floats
@@ -152,14 +163,15 @@ class _Beside:
 
     @classmethod
     def nothing(cls, left: Floats, own_left: Floats) -> _Beside:
+        """A model without columns."""
         return cls(np.zeros((len(left), 0)), np.zeros((len(own_left), 0)), left, own_left)
 
     def with_columns(self, rows: Floats, own: Floats) -> _Beside:
-        """With further columns, as far as they are not in these."""
+        """The model with further columns, orthogonalised against those it has; what they add nothing to is dropped."""
         scale = np.linalg.norm(rows, axis=0)
         scale = np.where(scale > 0, scale, 1.0)
         rows, own = rows / scale, own / scale
-        for _ in range(2):  # twice, or the rounding of what is large stays in what is left
+        for _ in range(2):  # projecting twice removes the rounding errors of large components
             share = self.rows.T @ rows
             rows, own = rows - self.rows @ share, own - self.own @ share
         _, singular, right = np.linalg.svd(rows, full_matrices=False)
@@ -173,8 +185,11 @@ class _Beside:
 
 
 class _Path:
-    """The biases' walk as unknowns that belong to dwells: the way a from the beginning of the run to that of a dwell,
-    and the step s within it, (D, 6), with the precision that the rows and the walk itself give them."""
+    """The random walk of the biases as unknowns of each dwell (D, 6): the path a from the beginning of the run to that
+    of the dwell, and the step s within it.
+
+    ``rows`` and the walk's own variances determine their precision matrix, which is kept as a banded Cholesky factor.
+    """
 
     def __init__(self, rows: Floats, ends: list[int], steps: Floats) -> None:
         from scipy.linalg import cholesky_banded
@@ -182,22 +197,22 @@ class _Path:
         self._unit, self._ends = float(np.sqrt(steps.max())), ends
         inside, biases = rows[:, :3], rows[:, 3:][:, BIASES]
         self._columns = self._unit * np.concatenate([biases, inside + biases], axis=1)
-        self._columns[: ends[1], :3] = 0.0  # the first dwell is where the way begins
+        self._columns[: ends[1], :3] = 0.0  # the path begins with the first dwell
         self._root = cholesky_banded(self._bands(steps / self._unit**2), lower=True)
 
     def products(self, columns: NDArray[Any]) -> NDArray[Any]:
-        """Products (6 D, c) of the path's columns with others (m, c)."""
+        """Products (6 D, c) of the path's columns with columns (m, c)."""
         return np.concatenate([self._columns[part].T @ columns[part] for part in _parts(self._ends)])
 
     def whitened(self, sides: Floats) -> Floats:
-        """The root of the precision divided out of products (6 D, c)."""
+        """Products (6 D, c) multiplied by the inverse of the Cholesky factor."""
         from scipy.linalg import get_lapack_funcs
 
-        solve: Any = get_lapack_funcs("tbtrs", dtype=np.float64)  # solve_banded does not know that it is triangular
+        solve: Any = get_lapack_funcs("tbtrs", dtype=np.float64)  # solve_banded ignores triangularity
         return solve(self._root, np.asfortranarray(sides), uplo="L")[0]
 
     def freed(self, columns: Floats) -> Floats:
-        """Columns (m, c) less what the path explains of them."""
+        """Columns (m, c) with the part that the path explains removed."""
         from scipy.linalg import cho_solve_banded
 
         found = np.asarray(cho_solve_banded((self._root, True), self.products(columns)), float).reshape(
@@ -209,7 +224,11 @@ class _Path:
         return out
 
     def _bands(self, steps: Floats) -> Floats:
-        """The precision as bands (7, 6 D): s of variance ``steps`` (D, 2)[1], the next a = a + s + the pause's step."""
+        """Return the precision as bands (7, 6 D).
+
+        The step s within a dwell has the variance ``steps[:, 1]``. The next a is a + s plus the step in the pause, of
+        variance ``steps[:, 0]``.
+        """
         count = len(steps)
         bands = np.zeros((7, count, 6))
         for k, part in enumerate(_parts(self._ends)):
@@ -218,26 +237,26 @@ class _Path:
                 bands[apart, k, : 6 - apart] = np.diag(own, -apart)
         within, pauses = 1.0 / steps[:, 1], 1.0 / np.maximum(steps[1:, 0], _LEAST_PAUSE)
         bands[0, :, 3:] += within[:, None]
-        bands[0, 0, :3] += 1.0  # the first a is not there
+        bands[0, 0, :3] += 1.0  # the first a is fixed at zero; 1 keeps the matrix regular
         bands[0, 1:, :3] += pauses[:, None]
         bands[0, 1:-1, :3] += pauses[1:, None]
         bands[0, :-1, 3:] += pauses[:, None]
-        bands[3, 1:-1, :3] += pauses[1:, None]  # a and s of one dwell lead to the next
-        bands[3, :-1, 3:] -= pauses[:, None]  # s, and the next a
-        bands[6, 1:-1, :3] -= pauses[1:, None]  # a, and the next a
+        bands[3, 1:-1, :3] += pauses[1:, None]  # a and s of one dwell, whose sum leads to the next a
+        bands[3, :-1, 3:] -= pauses[:, None]  # s and the next a
+        bands[6, 1:-1, :3] -= pauses[1:, None]  # a and the next a
         return bands.reshape(7, -1)
 
 
 def _parts(ends: list[int]) -> list[slice]:
-    """The rows of each dwell."""
+    """Return the slice of rows of each dwell."""
     return [slice(a, b) for a, b in itertools.pairwise(ends)]
 
 
 def _points(values_hz: Floats, longest_s: float) -> tuple[Floats, Floats]:
-    """Chebyshev points (k,) of a band, and the shares (N, k) by which what is known there is interpolated; all of the
-    values where these are as few.
+    """Return Chebyshev points (k,) of a band and the weights (N, k) that interpolate from them to ``values_hz``.
 
-    Products of two columns go through twice the phase of a dwell of ``longest_s``.
+    If there are no more values than points, the points are the values. Products of two columns pass through twice the
+    phase that a dwell of ``longest_s`` does, which determines the number of points.
     """
     low, high = float(values_hz.min()), float(values_hz.max())
     count = int(np.ceil(np.pi * (high - low) * longest_s)) + _SPARE

@@ -1,4 +1,4 @@
-"""What is believed of the parameters before the first reading."""
+"""Prior knowledge of the parameters before the first reading."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from kf_calib.errors import check_number
 
 @dataclass(frozen=True)
 class Prior:
-    """What is believed before the first sample: 1 sigma of misalignment (rad), scale factor (1) and bias (m/s^2).
+    """Prior standard deviations of misalignment (rad), scale factor (1) and bias (m/s^2).
 
-    ``Prior()`` is diffuse: it says nothing, and the estimate equals least squares.
+    ``Prior()`` is diffuse: it contains no information, and the estimate equals that of least squares.
     """
 
     misalignment_rad: float | None = None
@@ -29,6 +29,7 @@ class Prior:
 
     @property
     def diffuse(self) -> bool:
+        """Whether any of the sigmas is missing, so that the prior contains no information."""
         return self.misalignment_rad is None or self.scale is None or self.bias_mps2 is None
 
     def covariance(self, parameters: Floats) -> Floats:
@@ -45,4 +46,4 @@ PRIORS: dict[str, Prior] = {
     "navigation": Prior(misalignment_rad=5e-3, scale=2e-3, bias_mps2=2e-2),
     "mems": Prior(misalignment_rad=0.1, scale=0.1, bias_mps2=1.0),
 }
-"""Grades a user can state; each is about twice what a sensor of that grade is sold with."""
+"""Priors by grade of accelerometer; each is about twice as wide as the specification of sensors of that grade."""

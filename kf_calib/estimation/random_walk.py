@@ -1,7 +1,7 @@
-"""A random walk of the biases as process noise of the filter (Bierman, 1977), and of the means of dwells.
+"""A random walk of the biases as process noise of the filter (Bierman, 1977) and in the means of dwells.
 
-The filter's bias is the one at the END of a dwell: its rows lead with the columns of the step that the biases take in
-it (``dwells.walk_path``).
+The filter's bias is the one at the end of a dwell. The rows of a dwell therefore begin with columns for the step that
+the biases take within it (``dwells.walk_path``).
 """
 
 from __future__ import annotations
@@ -19,8 +19,11 @@ from kf_calib.dwells.qr import triangle
 
 @dataclass(frozen=True)
 class Links:
-    """Of the means of a path over D dwells, per q^2: each less ``share`` (D - 1,) of the one before has the variance
-    ``alone`` (D,), and with the next of these the covariance ``beside`` (D - 1,), with others none."""
+    """The covariance of the means of a path over D dwells, per q^2.
+
+    If ``share`` (D - 1,) times the mean before is subtracted from each mean, the differences have the variances
+    ``alone`` (D,) and the covariances ``beside`` (D - 1,) with the next one; all other covariances are zero.
+    """
 
     share: Floats
     alone: Floats
@@ -28,12 +31,17 @@ class Links:
 
 
 def mean_links(ends_s: Floats, held_s: float = math.inf) -> Links:
-    """Of dwells from ``ends_s`` (D, 2), of a walk that comes back with the time constant ``held_s``."""
+    """The links for dwells that begin and end at ``ends_s`` (D, 2); ``held_s`` is the time constant of a mean-reverting
+    walk."""
     return _free(ends_s) if math.isinf(held_s) else _held(ends_s, held_s)
 
 
 def _free(ends_s: Floats) -> Links:
-    """Of a walk: its mean over a dwell of T is T / 3 from its beginning and its end, the two T / 6 alike."""
+    """Return the links of a random walk.
+
+    Over a dwell of length T, the difference of its mean from its first value has the variance T / 3, so has that from
+    its last value, and the two have the covariance T / 6.
+    """
     spans, pauses = ends_s[:, 1] - ends_s[:, 0], np.append(0.0, np.maximum(ends_s[1:, 0] - ends_s[:-1, 1], 0.0))
     alone = pauses + spans / 3.0
     alone[1:] += spans[:-1] / 3.0
@@ -41,9 +49,11 @@ def _free(ends_s: Floats) -> Links:
 
 
 def _held(ends_s: Floats, held_s: float) -> Links:
-    """Of a walk that comes back with a time constant tau: covariance tau / 2 exp(-|t - s| / tau).
+    """Return the links of a mean-reverting walk with the time constant tau and the covariance tau / 2 exp(-|t - s| /
+    tau).
 
-    Its mean over a dwell of T has covariance a = tau / T (1 - exp(-T / tau)) with either end, over tau / 2.
+    The covariance of its mean over a dwell of length T with its value at either end is tau / T (1 - exp(-T / tau))
+    times tau / 2.
     """
     spans = np.maximum(ends_s[:, 1] - ends_s[:, 0], 1e-6 * held_s) / held_s
     near = -np.expm1(-spans) / spans
@@ -63,16 +73,21 @@ def variances(begins_s: Floats, ends_s: Floats, intensity: float) -> Floats:
 
 
 def to_mean(steps: Floats) -> Floats:
-    """Variance (D,) of the way from the bias at the end of a dwell to its mean over the next."""
+    """Variance (D,) of the change from the bias at the end of a dwell to its mean over the next dwell."""
     return steps[:, 0] + steps[:, 1] / 3.0
 
 
 def advance(factor: Floats, steps: Floats, rows: Floats) -> tuple[Floats, int]:
-    """Time and measurement update: the triangle [w | H | z], and how many steps w lead it, to be left out.
+    """Time and measurement update: the triangular factor of [w | H | z], and the number of leading rows and columns of
+    steps w.
 
-    factor [R | z] (p, p + 1) of the biases at the end of the dwell before; ``steps`` (2,): variances of each bias's
-    step in the pause and in the dwell; rows [S | H | z] (m, 3 + p + 1), S the columns of the steps in the dwell;
-    without S where there is none. SRIF form (Bierman, 1977, ch. V), valid for a singular factor.
+    The caller drops these rows and columns. This is the square-root information form (Bierman, 1977, ch. V), which is
+    valid for a singular factor, too.
+
+    - factor (p, p + 1): [R | z] with the biases at the end of the dwell before.
+    - steps (2,): variances of each bias's step in the pause and within the dwell.
+    - rows (m, 3 + p + 1): [S | H | z], where S are the columns of the steps within the dwell; S is absent without a
+      walk.
     """
     width = len(factor)
     inside = rows.shape[1] - width - 1
@@ -93,8 +108,10 @@ def advance(factor: Floats, steps: Floats, rows: Floats) -> tuple[Floats, int]:
 
 
 def recede(factor: Floats, steps: Floats, rows: Floats) -> Floats:
-    """The factor of the biases before a dwell and its pause, from that of the biases at its end (from what came later)
-    and its rows: ``advance`` backward in time."""
+    """The factor with the biases before a dwell and its pause, from the factor with the biases at its end and its rows.
+
+    The factor contains what came later; this is ``advance`` backward in time.
+    """
     width, biases = len(factor), BIASES
     sigma = _sigmas(steps, rows.shape[1] - width - 1)
     out = np.zeros((len(sigma) + width + len(rows), len(sigma) + width + 1))
@@ -108,19 +125,20 @@ def recede(factor: Floats, steps: Floats, rows: Floats) -> Floats:
 
 
 def _sigmas(steps: Floats, inside: int) -> Floats:
-    """Of the steps w in their order: three in the dwell where its rows have columns of them, three in the pause."""
+    """Return the sigmas of the steps w in their order: three within the dwell if its rows have columns for them, three
+    in the pause."""
     variances = ([steps[1]] if inside else []) + ([steps[0]] if steps[0] > 0 else [])
     return np.sqrt(np.repeat(variances, 3))
 
 
 def whiten_walk(rows: Sequence[Floats], steps: Floats) -> Floats:
-    """Rows (m, c) of unit noise from rows [S | X] of each dwell, the walk being in their noise; X (r, c): any columns,
-    of which the first twelve are the parameters', the biases those at the end of the dwell.
+    """Rows (m, c) of unit noise from the rows [S | X] of each dwell, with the walk of the biases as part of the noise.
 
-    A square-root information filter of the walk alone: its state, the way w from the bias at the beginning of the run
-    to that at the end of a dwell, is found from each dwell by QR, and all of X is its right-hand side. What is left of
-    a dwell's rows is their innovation, of unit noise and independent of all others. Rows before those of the dwells
-    have no S and are kept as they are.
+    X (r, c) are any columns of which the first twelve belong to the parameters, with the biases at the end of the
+    dwell. The result is computed by a square-root information filter whose only state is the path w of the biases from
+    the beginning of the run to the end of a dwell. It is estimated from each dwell by QR with all columns of X as
+    right-hand sides; what remains of a dwell's rows is their innovation, which has unit noise and is independent of all
+    others. Rows that precede those of the dwells have no S and are returned unchanged.
     """
     above, dwells = rows[: len(rows) - len(steps)], rows[len(rows) - len(steps) :]
     upper, right, out = np.zeros((0, 3)), np.zeros((0, dwells[0].shape[1] - 3)), list(above)
@@ -130,10 +148,10 @@ def whiten_walk(rows: Sequence[Floats], steps: Floats) -> Floats:
         biases = own[:, 3:][:, BIASES]
         design = np.zeros((count + len(own) + (0 if len(upper) else 3), first + 3))
         design[:first, :first] = np.diag(np.repeat(1.0 / np.sqrt(unknown), 3))
-        if len(upper):  # w before is w less the steps in the pause and in the dwell
+        if len(upper):  # the path before is w less the steps in the pause and in the dwell
             design[first:count] = np.hstack([-upper] * len(unknown) + [upper])
             design[count:] = np.hstack([np.zeros((len(own), first - 3)), own[:, :3], biases])
-        else:  # the first dwell: the way is the step within it
+        else:  # in the first dwell the path is the step within it
             design[:3], design[3:] = np.eye(3) / np.sqrt(inside), own[:, :3] + biases
         sides = np.zeros((len(design), right.shape[1]))
         sides[first:count], sides[len(design) - len(own) :] = right, own[:, 3:]
@@ -145,7 +163,7 @@ def whiten_walk(rows: Sequence[Floats], steps: Floats) -> Floats:
 
 
 def predict(factor: Floats, variance: float) -> Floats:
-    """Time update alone: the three biases take a step of that variance, 0: none."""
+    """Time update alone: the factor after a step of this variance in each of the three biases; unchanged if it is 0."""
     if variance <= 0:
         return factor
     upper, count = advance(factor, np.array([variance, 0.0]), np.zeros((0, factor.shape[1])))

@@ -1,4 +1,4 @@
-"""What a user must know of a calibration, in sentences."""
+"""Sentences on what a user must know about a calibration."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from kf_calib.estimation.results import Consistency, Estimate
 
 
 def misfit_remark(judged: Consistency, residuals: Floats, bench: Bench, noise: Noise) -> str:
-    """What may be the matter where the dwells do not fit the model, from residuals (D, 3); '' where they fit."""
+    """A sentence on what may be wrong if the dwells do not fit the model, from residuals (D, 3); '' if they fit."""
     rms = float(np.sqrt(np.mean(residuals**2)))
     if rms > 0.03 * bench.gravity_mps2:
         return (
@@ -35,18 +35,18 @@ def misfit_remark(judged: Consistency, residuals: Floats, bench: Bench, noise: N
 
 
 def unstated(noise: Noise) -> list[str]:
-    """Bench keys of the noise from dwell to dwell that the recording does not state."""
+    """The bench keys of the noise from dwell to dwell that the recording does not state."""
     known = {"angle_sigma_deg": noise.setting_stated, "scatter_sigma_mps2": noise.scatter_stated}
     return [key for key, stated in known.items() if not stated]
 
 
 def beyond_stated(noise: Noise, bench: Bench) -> bool:
-    """Whether the setting error holds more than is stated: what the angles' own noise leaves uncertain of a pose."""
+    """Tell whether the setting error is larger than stated, because noise of the angles makes the poses uncertain."""
     return bench.angle_sigma_deg is not None and np.degrees(noise.setting_rad) > 1.1 * bench.angle_sigma_deg
 
 
 def _beyond_noise(noise: Noise) -> str:
-    """What dwells may scatter by beside an effect."""
+    """Return what else than an effect may make the dwells scatter."""
     keys = " and ".join(unstated(noise))
     if keys:
         return f"there is noise from dwell to dwell, which was not stated ({keys})"
@@ -56,7 +56,7 @@ def _beyond_noise(noise: Noise) -> str:
 def remarks_on(
     carried: Carried, noise: Noise, estimate: Estimate, judged: Consistency, residuals: Floats
 ) -> Iterator[str]:
-    """What a reader of the numbers must know, one sentence each."""
+    """Yield one sentence on each thing that a reader of the numbers must know."""
     model, dwells = carried.model, carried.dwells
     if model.dynamic and not carried.slews:
         yield (

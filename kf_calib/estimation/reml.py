@@ -1,9 +1,13 @@
-"""The dwell parts of the noise by restricted maximum likelihood of the dwell means: setting error, scatter, walk.
+"""Restricted maximum likelihood (REML) estimates of setting error, scatter and random walk from the dwells' means.
 
-The means of the readings of D dwells scatter about the model by V_d = diag(kappa sigma_w^2 / n + sigma_s^2) +
-sigma_alpha^2 S (|f|^2 I - f f^T) S^T; a walk of the biases by steps from one to the next. The squares of the sizes are
-the variances of ``restricted_likelihood``; of each mean less its share of the one before, a walk leaves those beside
-each other correlated, and no others.
+The mean readings of dwell d have about the model the covariance
+
+  V_d = diag(kappa sigma_w^2 / n + sigma_s^2) + sigma_alpha^2 S (|f|^2 I - f f^T) S^T,
+
+where S holds the sensitivities and f is the specific force. A random walk of the biases adds a step from each dwell to
+the next. The variances sigma_s^2, sigma_alpha^2 and q^2 are those of ``restricted_likelihood``. If from each mean its
+share of the mean before is subtracted, the walk correlates only neighbouring differences, so that the covariance is
+banded.
 """
 
 from __future__ import annotations
@@ -25,14 +29,14 @@ from kf_calib.estimation.restricted_likelihood import Point, Restricted
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
 FEWEST = 6
-"""Degrees of freedom between dwells; with fewer nothing is estimated."""
+"""With fewer degrees of freedom between dwells than this, nothing is estimated."""
 
 ENOUGH_DIRECTIONS = 12
-"""Of gravity in the platform: where they are spread they check that a setting error only turns the specific force."""
+"""With this many directions of gravity, if spread, it can be checked that a setting error only turns the force."""
 
-_SIGNIFICANT = 5.41  # 1 % point of the likelihood ratio of a variance against zero: half of chi2 with 1 dof
-_WALK = 0.5  # of log-likelihood that a walk has to gain
-_HELD = 12  # time constants of a walk that is held back
+_SIGNIFICANT = 5.41  # 1 % point of the likelihood-ratio statistic of a variance against zero, half of a chi2 with 1 dof
+_WALK = 0.5  # a walk has to gain at least this much log-likelihood
+_HELD = 12  # time constants that are tried for a mean-reverting walk
 
 Part = Literal["setting", "common", "scatter", "walk"]
 Parts = tuple[Part, ...]
@@ -40,17 +44,23 @@ Parts = tuple[Part, ...]
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Of the dwell means, by any of some parts beside a noise: shapes (k, D, 6, 3) of each part's numbers in ``units``
-    (k,), which are as large as the misfit."""
+    """The restricted likelihood of the dwells' means, with a given noise and any further parts of it.
+
+    - alone: the likelihood without further parts.
+    - shapes: the covariances (k, D, 6, 3) that each part contributes per unit of its variances.
+    - units (k,): the natural size of each number of a part, chosen as large as the misfit.
+    """
 
     alone: Restricted
     shapes: Mapping[Part, Floats]
     units: Mapping[Part, Floats]
 
     def of(self, parts: Parts) -> Restricted:
+        """The likelihood with these parts, whose sizes are in ``units``."""
         return replace(self.alone, shapes=np.concatenate([self.alone.shapes, *(self.shapes[part] for part in parts)]))
 
     def without(self) -> Point:
+        """The likelihood evaluated without any further part."""
         return self.alone.at(np.zeros(0))
 
 
@@ -63,16 +73,21 @@ def with_dwell_parts(
     walks: bool = False,
     near: Mapping[Parts, Floats] | None = None,
 ) -> tuple[Noise, Mapping[Parts, Floats]]:
-    """The noise with its dwell parts: as stated, else estimated by restricted maximum likelihood where significant.
+    """Complete the noise within dwells by setting error, scatter and, if ``walks``, the random walk of the biases.
 
-    Of the parts not stated (the scatter one number for all accelerometers, or one each), the combination with the best
-    likelihood is taken, each number charged for by the 1 % point of its ratio against zero. ``walks``: the intensity
-    of a walk of the biases is found with each, and not charged for. Fewer than 6 degrees of freedom between dwells:
-    nothing is estimated. Too few orientations to tell a setting error from the sensors' scatter: the whole misfit
-    counts as scatter.
+    Parts that are stated are taken as they are. Of the combinations of the other parts (scatter as one number for all
+    accelerometers or one for each), the one with the largest restricted likelihood is taken, less a charge per number:
+    the 1 % point of its likelihood ratio against zero. The intensity of a walk has a smaller charge. Nothing is
+    estimated with fewer than 6 degrees of freedom between dwells. If there are too few orientations to tell a setting
+    error from scatter, the whole misfit counts as scatter.
 
-    Second: the sizes that each combination was searched to. Given as ``near`` with means that have changed little, they
-    shorten the searches.
+    - within: the noise within dwells.
+    - means: the dwells' means; state (p,): where they are linearised.
+    - angle_sigma_deg, scatter_mps2: the stated parts; None if not stated.
+    - walks: estimate the intensity of a random walk of the biases.
+    - near: sizes found before for similar means, which shorten the searches.
+
+    Returns the noise, and the sizes found for each combination, to be passed as ``near`` the next time.
     """
     stated = replace(
         within,
@@ -92,13 +107,13 @@ def with_dwell_parts(
     combinations = _combinations(stated, walks)
     likelihood = _likelihood(stated.weights, {part for parts in combinations for part in parts}, means, state)
     without = likelihood.without()
-    if not walks and chi_squared_tail(free, without.misfit) > 0.1:  # spares the search
+    if not walks and chi_squared_tail(free, without.misfit) > 0.1:  # the model already fits
         return stated, {}
     return _chosen(stated, likelihood, combinations, without, near or {})
 
 
 def _combinations(stated: Noise, walks: bool) -> list[Parts]:
-    """Of the parts that may be estimated."""
+    """Return the combinations of parts that may be estimated; the last one contains all others."""
     settings: list[Parts] = [()] if stated.setting_stated or not stated.checked else [(), ("setting",)]
     scatters: list[Parts] = [()] if stated.scatter_stated else [(), ("common",)]
     if stated.checked and not stated.scatter_stated:
@@ -110,10 +125,10 @@ def _combinations(stated: Noise, walks: bool) -> list[Parts]:
 def _chosen(
     stated: Noise, likelihood: Likelihood, combinations: Sequence[Parts], without: Point, near: Mapping[Parts, Floats]
 ) -> tuple[Noise, Mapping[Parts, Floats]]:
-    """The noise with the best of the combinations, and the sizes of each.
+    """Return the noise with the best combination of parts, and the sizes found for each combination.
 
-    The last of them has all others within it, so that none is likelier: what it leaves to be gained by those that are
-    charged for more spares their search.
+    The last combination contains all others, so that its likelihood bounds theirs. A combination whose charge leaves
+    nothing to gain under this bound is not searched.
     """
     charges = {parts: _charge(parts, likelihood) for parts in combinations}
     best, score, most, found = (), -without.cost, math.inf, dict(near)
@@ -135,26 +150,28 @@ def _chosen(
 
 
 def _charge(parts: Parts, likelihood: Likelihood) -> float:
-    """What parts have to gain in log-likelihood."""
+    """Return the log-likelihood that the parts have to gain in order to be taken."""
     return sum(_WALK if part == "walk" else 0.5 * _SIGNIFICANT * len(likelihood.units[part]) for part in parts)
 
 
 def _last_spread(curvature: Floats) -> float:
-    """1 sigma of the last of some logarithms, the others being found with it."""
+    """Return the sigma of the last of some logarithms that were estimated together, from the ``curvature`` of the
+    cost."""
     values, vectors = np.linalg.eigh(curvature)
-    seen = values > 1e-3  # the others are parts that have run to zero
+    seen = values > 1e-3  # directions without curvature belong to parts whose estimate is zero
     return float(np.sqrt(np.sum(vectors[-1, seen] ** 2 / values[seen])))
 
 
 def _setting_is_checked(force_mps2: Floats) -> bool:
-    """Whether the readings along f overdetermine what they see by 3 or more: f^T S f + f^T b, 9 numbers at most."""
+    """Tell whether the readings along f overdetermine their model f^T S f + f^T b, of at most 9 numbers, by 3 or
+    more."""
     x, y, z = force_mps2.T / np.linalg.norm(force_mps2, axis=1).mean()
     design = np.column_stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z])
     return directions(force_mps2) - int(np.linalg.matrix_rank(design, tol=0.02)) >= ENOUGH_DIRECTIONS - 9
 
 
 def directions(force_mps2: Floats) -> int:
-    """How many different directions forces (D, 3) have, to a hundredth."""
+    """Number of different directions among the forces (D, 3), rounded to a hundredth."""
     unit = force_mps2 / np.linalg.norm(force_mps2, axis=1).mean()
     return len(np.unique(np.round(unit, 2) + 0.0, axis=0))
 
@@ -165,9 +182,9 @@ def degrees_of_freedom(means: Means) -> int:
 
 
 def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats) -> float:
-    """What more of a part of the noise, as much as is likeliest, gains in log-likelihood.
+    """Gain in log-likelihood if a part of the noise is raised to its most likely size.
 
-    ``means`` and ``prior`` as ``with_slow_scatter`` has them.
+    ``means`` and ``prior`` are those that ``with_slow_scatter`` returns.
     """
     means, prior = _reduced(means, prior)
     likelihood = _likelihood(noise, {part}, means, state, prior)
@@ -176,10 +193,10 @@ def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats
 
 
 def restoring_gain(noise: Noise, means: Means, state: Floats, prior: Floats) -> tuple[float, float]:
-    """What a walk that is held back gains in log-likelihood over the walk that is in the noise, and the time constant
-    with which it comes back, s (a Gauss-Markov process of any variance; that of infinite time constant is the walk).
+    """Gain in log-likelihood of a mean-reverting walk over the random walk in the noise, and its time constant, s.
 
-    ``means`` and ``prior`` as ``with_slow_scatter`` has them.
+    The mean-reverting walk is a Gauss-Markov process of any variance; with an infinite time constant it is the random
+    walk. ``means`` and ``prior`` are those that ``with_slow_scatter`` returns.
     """
     means, prior = _reduced(means, prior)
     free, still = _likelihood(noise, (), means, state, prior).without(), replace(noise, walk_mps2_per_sqrt_s=0.0)
@@ -194,8 +211,8 @@ def restoring_gain(noise: Noise, means: Means, state: Floats, prior: Floats) -> 
 
 
 def with_slow_scatter(dwells: Sequence[DwellFactor], noise: Noise, means: Means) -> tuple[Means, Floats]:
-    """Means with the columns of what a stated scatter may have in common in dwells that follow each other, and the
-    rows of their prior (q, p + q + 1)."""
+    """Means with additional columns for the slow part of a stated scatter (``noise_model.slow_scatter``), and the rows
+    (q, p + q + 1) of the prior of their coefficients."""
     columns, sigma = slow_scatter(dwells, noise)
     design = np.concatenate([means.design, [own[0, 0] for own in columns]], axis=2)
     prior = np.zeros((len(sigma), design.shape[2] + 1))
@@ -204,8 +221,10 @@ def with_slow_scatter(dwells: Sequence[DwellFactor], noise: Noise, means: Means)
 
 
 def misfit(noise: Noise, means: Means, state: Floats, prior: Floats | None = None) -> float:
-    """Chi-squared of the dwell means about their generalised least-squares fit; ``prior`` (q, p + 1): rows of what is
-    known of the coefficients."""
+    """Chi-squared of the dwells' means about their generalised least-squares fit.
+
+    ``prior`` (q, p + 1) are whitened rows of prior knowledge about the coefficients.
+    """
     means, prior = _reduced(means, prior)
     return _likelihood(noise, (), means, state, prior).without().misfit
 
@@ -213,17 +232,21 @@ def misfit(noise: Noise, means: Means, state: Floats, prior: Floats | None = Non
 def restricted_log_likelihood(
     noise: Noise, means: Means, state: Floats, prior: Floats | None = None, held_s: float = math.inf
 ) -> float:
-    """Of the dwell means, up to a constant. ``prior`` as in ``misfit``; held_s: with which a walk of the biases comes
-    back."""
+    """Restricted log-likelihood of the dwells' means, up to a constant.
+
+    ``prior`` is as in ``misfit``; ``held_s`` is the time constant with which a walk of the biases reverts to its mean,
+    infinite for a random walk.
+    """
     means, prior = _reduced(means, prior)
     return -_likelihood(noise, (), means, state, prior, held_s).without().cost
 
 
 def _reduced(means: Means, prior: Floats | None = None) -> tuple[Means, Floats]:
-    """The same with an orthonormal basis (D, 3, r) of the columns of which nothing is known, and the readings less what
-    it explains; the prior's rows of that.
+    """Return the means with an orthonormal basis (D, 3, r) in place of the columns without a prior, and the prior's
+    rows.
 
-    Another basis changes the likelihood by a constant; the rounding of readings of size g is out of it.
+    What the basis explains is subtracted from the readings. The change of basis alters the likelihood only by a
+    constant, and the rounding of readings of size g no longer matters.
     """
     design = means.design.reshape(-1, means.design.shape[2])
     prior = np.zeros((0, design.shape[1] + 1)) if prior is None else prior
@@ -246,7 +269,7 @@ def _likelihood(
     prior: Floats | None = None,
     held_s: float = math.inf,
 ) -> Likelihood:
-    """Of reduced means."""
+    """Return the likelihood of means from ``_reduced``, with the parts that may be added."""
     count, units = len(means.counts), _units(means)
     standing = "walk" not in parts and not noise.walk_mps2_per_sqrt_s
     path = Links(*(np.zeros(count - k) for k in (1, 0, 1))) if standing else mean_links(means.ends_s, held_s)
@@ -271,8 +294,10 @@ def _likelihood(
 
 
 def _linked(own: Floats, path: Links) -> Floats:
-    """Covariances (..., D, 6, 3), as ``banded`` keeps them, of means each less its share of the one before; ``own``
-    (..., D, 3, 3) is that of the means where each is independent of the others."""
+    """Return the covariances (..., D, 6, 3), in the layout of ``banded``, of means less their share of the mean before.
+
+    ``own`` (..., D, 3, 3) are the covariances of the means themselves, which are independent of each other.
+    """
     share, out = path.share[:, None, None], np.zeros((*own.shape[:-2], 6, 3))
     out[..., :3, :] = own
     out[..., 1:, :3, :] += share**2 * own[..., :-1, :, :]
@@ -281,7 +306,7 @@ def _linked(own: Floats, path: Links) -> Floats:
 
 
 def _units(means: Means) -> dict[Part, Floats]:
-    """Each number of the parts as large as the misfit of reduced means."""
+    """Return a size for each number of the parts at which it would explain the misfit of the reduced means."""
     size = np.sqrt(np.mean(means.readings**2, axis=0)) + FLOOR_MPS2
     span_s = max(float(means.ends_s[-1, 1] - means.ends_s[0, 0]), 1e-9)
     return {
@@ -293,7 +318,7 @@ def _units(means: Means) -> dict[Part, Floats]:
 
 
 def _with(noise: Noise, parts: tuple[Part, ...], sizes: Floats) -> Noise:
-    """The noise with its parts of these sizes: one number each, of a scatter that differs three."""
+    """Return the noise with its parts at these sizes: three numbers for "scatter", one for every other part."""
     left = iter(sizes.tolist())
     for part in parts:
         if part == "setting":

@@ -1,7 +1,9 @@
-"""The restricted likelihood of the variances in correlated means, and where it is largest.
+"""The restricted likelihood of the variances in correlated means, and its maximum.
 
-Means z = A x + e of covariance V = V_0 + sum v_k K_k; the coefficients x are integrated out (Patterson and Thompson,
-1971): l = -1/2 (log|V| + log|A' V^-1 A| + z' P z), P = V^-1 - V^-1 A (A' V^-1 A)^-1 A' V^-1, but for a constant.
+The means are z = A x + e, where e has the covariance V = V_0 + sum v_k K_k. With the coefficients x integrated out
+(Patterson and Thompson, 1971), the log-likelihood of the variances v_k is, up to a constant,
+
+  l = -1/2 (log|V| + log|A' V^-1 A| + z' P z),  P = V^-1 - V^-1 A (A' V^-1 A)^-1 A' V^-1.
 """
 
 from __future__ import annotations
@@ -14,16 +16,21 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.estimation import banded
 from kf_calib.estimation.noise_model import lift_rounding
 
-_LEAST = 1e-4  # of the size that a search begins with: as small is none
-_NEAR = 0.5  # ln of a size: a search that moves it by more did not begin close to its end
-_ENOUGH = 1e-9  # what is left to gain of the log-likelihood ends a search
+_LEAST = 1e-4  # relative to the size at which a search begins; smaller sizes count as zero
+_NEAR = 0.5  # if ln of a size changes by more, the search did not begin near its end
+_ENOUGH = 1e-9  # the search ends when less log-likelihood than this can be gained
 _STEPS, _HALVES = 100, 30
 
 
 @dataclass(frozen=True)
 class Point:
-    """At some variances: minus the log-likelihood, chi-squared z' P z, the cost's derivatives (k,) by the variances,
-    and their information (k, k)."""
+    """The likelihood at given variances.
+
+    - cost: minus the log-likelihood.
+    - misfit: chi-squared z' P z.
+    - slope (k,): derivatives of the cost by the variances.
+    - information (k, k): average of their observed and expected information.
+    """
 
     cost: float
     misfit: float
@@ -33,8 +40,12 @@ class Point:
 
 @dataclass(frozen=True)
 class Restricted:
-    """rows [A | z] (3 D, p + 1); prior (q, p + 1): rows of unit noise of what is known of x; V_0 (D, 6, 3) and K_k
-    (k, D, 6, 3), kept as ``banded`` does."""
+    """The restricted likelihood as a function of the variances.
+
+    - rows (3 D, p + 1): [A | z].
+    - prior (q, p + 1): whitened rows of prior knowledge of x.
+    - fixed (D, 6, 3), shapes (k, D, 6, 3): V_0 and K_k, in the layout of ``banded``.
+    """
 
     rows: Floats
     prior: Floats
@@ -42,8 +53,12 @@ class Restricted:
     shapes: Floats
 
     def at(self, variances: Floats) -> Point:
-        """With y = P z the derivatives are (tr(P K_k) - y' K_k y) / 2 (Searle, Casella and McCulloch, 1992, sec. 6.6);
-        y' K_k P K_l y / 2 is the mean of the information observed and expected (Gilmour, Thompson and Cullis, 1995)."""
+        """The likelihood and its derivatives at ``variances`` (k,).
+
+        With y = P z, the derivatives of the cost are (tr(P K_k) - y' K_k y) / 2 (Searle, Casella and McCulloch, 1992,
+        sec. 6.6), and y' K_k P K_l y / 2 is the average of observed and expected information (Gilmour, Thompson and
+        Cullis, 1995).
+        """
         wider = variances @ self.shapes.reshape(len(variances), self.fixed.size)
         covariance = self.fixed + wider.reshape(self.fixed.shape)
         covariance[:, :3] = lift_rounding(covariance[:, :3])
@@ -61,10 +76,10 @@ class Restricted:
         return Point(float(cost), misfit, 0.5 * banded.traces(inner, self.shapes), information)
 
     def most_likely(self, near: Floats | None = None) -> tuple[Floats, Point]:
-        """The likeliest sizes (k,), roots of the variances, and the point there.
+        """The sizes (k,), roots of the variances, at which the likelihood is largest, and the likelihood there.
 
-        The search begins at ones. It is shorter from sizes ``near`` its end; if it does not end near them, they count
-        for nothing.
+        The search begins at ones, or at ``near``, which makes it shorter. If it ends far from ``near``, it is repeated
+        from ones, so that ``near`` has no influence on the result.
         """
         if near is not None:
             begin = np.maximum(near, 10.0 * _LEAST)
@@ -74,7 +89,8 @@ class Restricted:
         return self._search(np.ones(len(self.shapes)))
 
     def curvature(self, sizes: Floats) -> Floats:
-        """Second derivatives (k, k) of the cost by the logarithms of the sizes: differences of the first."""
+        """Second derivatives (k, k) of the cost by the logarithms of the sizes, from differences of the first
+        derivatives."""
         step, out = 1e-3, np.zeros((len(sizes),) * 2)
         for k in range(len(sizes)):
             for sign in (1.0, -1.0):
@@ -84,10 +100,11 @@ class Restricted:
         return 0.5 * (out + out.T)
 
     def _search(self, sizes: Floats) -> tuple[Floats, Point]:
-        """Newton's method by the sizes s, to which the cost is even: the way to zero has no edge.
+        """Minimise the cost by Newton's method over the sizes s, in which the cost is an even function, so that zero is
+        no boundary.
 
-        The curvature there is 4 s s' times that by the variances, and on its diagonal 2 slope, taken as positive: from
-        far above a step then loses about half of a size, from far below it doubles it.
+        The Hessian is taken as 4 s s' times the information about the variances plus 2 |slope| on its diagonal. From
+        far above the minimum, a step then halves a size approximately; from far below it doubles it.
         """
         point = self.at(sizes**2)
         for _ in range(_STEPS):
@@ -103,7 +120,7 @@ class Restricted:
         return np.where(sizes > _LEAST, sizes, 0.0), point
 
     def _lower(self, sizes: Floats, step: Floats, point: Point) -> tuple[Floats, Point] | None:
-        """Where a step leads, or the first of its halves that costs less; None where none does."""
+        """Return the sizes and the point after the step, halved until the cost is lower; None if it never is."""
         for _ in range(_HALVES):
             moved = np.maximum(sizes + step, _LEAST)
             there = self.at(moved**2)

@@ -1,4 +1,4 @@
-"""What a calibration gives: parameters, the course of the estimate, consistency."""
+"""The results of a calibration: parameters, the estimate after each dwell, and the test of consistency."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from kf_calib.support.printing import printed
 from kf_calib.support.tail_probabilities import f_tail
 from kf_calib.support.threads import one_blas_thread
 
-_HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # a larger sigma means: not seen by this run
+_HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # larger sigmas: not determined
 _SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """An estimate with its sigma in SI units; value and sigma are None where the orientations cannot see it.
+    """An estimated parameter and its sigma in SI units; both are None if the orientations do not determine it.
 
-    Deviations times ``per_si`` are in ``shown_unit``, the unit of the field.
+    A deviation from nominal times ``per_si`` is in ``shown_unit``, the usual unit of the field.
     """
 
     symbol: str
@@ -49,7 +49,12 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Estimate:
-    """State (p,): the affine twelve, then effects; its covariance; basis (p, q) of the combinations not determined."""
+    """An estimate of the state.
+
+    - state (p,): the twelve affine states, then the coefficients of effects.
+    - covariance (p, p): its covariance.
+    - undetermined (p, q): a basis of the combinations of states that are not determined.
+    """
 
     state: Floats
     covariance: Floats
@@ -57,18 +62,18 @@ class Estimate:
 
     @cached_property
     def parameters(self) -> Floats:
-        """The paper's parameters (12,)."""
+        """The paper's twelve parameters (12,)."""
         return paper_parameters.parameters_of(self.state[:STATE_COUNT])
 
     @cached_property
     def parameter_covariance(self) -> Floats:
-        """Their covariance (12, 12), carried over by the closed-form Jacobian."""
+        """Covariance (12, 12) of the twelve parameters, J P J^T with the closed-form Jacobian J."""
         jacobian = paper_parameters.jacobian(self.state[:STATE_COUNT])
         return jacobian @ self.covariance[:STATE_COUNT, :STATE_COUNT] @ jacobian.T
 
     @cached_property
     def unseen(self) -> Mask:
-        """Which of the twelve the orientations do not determine, (12,) bool."""
+        """Mask (12,) of the parameters that the orientations do not determine."""
         sigma = np.sqrt(np.diag(self.parameter_covariance))
         unseen = sigma > np.array([_HOPELESS[unit] for unit in paper_parameters.UNITS])
         if self.undetermined.size:
@@ -78,26 +83,27 @@ class Estimate:
 
     @cached_property
     def _lost(self) -> Floats:
+        """Return the basis of undetermined combinations with each column scaled to length 1."""
         return self.undetermined / np.linalg.norm(self.undetermined, axis=0)
 
     @cached_property
     def determined(self) -> Mask:
-        """Which numbers of the state the orientations determine, (p,) bool."""
+        """Mask (p,) of the states that the orientations determine."""
         return np.asarray(np.linalg.norm(self._lost, axis=1) < 1e-9)
 
     @cached_property
     def sigma(self) -> Floats:
-        """1 sigma of the twelve (12,); NaN where not determined."""
+        """Sigmas (12,) of the twelve parameters; NaN where not determined."""
         return np.where(self.unseen, np.nan, np.sqrt(np.diag(self.parameter_covariance)))
 
     @cached_property
     def effects(self) -> Floats:
-        """Coefficients of the effects (q,)."""
+        """Coefficients (q,) of the effects."""
         return self.state[STATE_COUNT:]
 
     @cached_property
     def effect_sigma(self) -> Floats:
-        """1 sigma of the coefficients (q,); NaN where not determined."""
+        """Sigmas (q,) of the coefficients of effects; NaN where not determined."""
         sigma = np.sqrt(np.diag(self.covariance)[STATE_COUNT:])
         if self.undetermined.size:
             lost = np.abs(self.undetermined[STATE_COUNT:]).max(axis=1)
@@ -108,10 +114,13 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Visit:
-    """One dwell as the filter saw it; the estimate is the one after it.
+    """One dwell and the filter's step on it.
 
-    innovation_mps2 (3,) is the dwell's mean reading less its prediction from the dwells before, with its sigma
-    (NaN while the prediction is undetermined); residual_mps2 (3,) is against the final estimate. dof may be 0.
+    - estimate: the estimate after the dwell.
+    - nis, dof: the normalised innovation squared and its degrees of freedom, which may be 0.
+    - innovation_mps2 (3,), innovation_sigma_mps2 (3,): the mean reading less its prediction from the dwells before, and
+      its sigma; NaN while the prediction is not determined.
+    - residual_mps2 (3,): the mean reading less its prediction by the final estimate.
     """
 
     dwell: DwellFactor
@@ -125,10 +134,12 @@ class Visit:
 
 @dataclass(frozen=True)
 class Consistency:
-    """Do the dwells agree with the model within the noise? None where nothing is left over to judge by.
+    """A test of whether the dwells agree with the model within the noise.
 
-    The statistic is the sum of the normalised innovations squared, chi-squared with ``dof`` (F with ``noise_dof`` where
-    the noise itself was estimated from few readings). Scatter that was estimated from the same misfit is left out.
+    The statistic is the sum of the normalised innovations squared, chi-squared distributed with ``dof`` degrees of
+    freedom; its quotient by ``dof`` is tested against an F distribution, because the noise itself was estimated from
+    finitely many readings. Scatter that was estimated from the same misfit is left out. ``p_value`` and ``consistent``
+    are None if there are no degrees of freedom.
     """
 
     statistic: float
@@ -138,12 +149,14 @@ class Consistency:
 
     @property
     def nis_per_dof(self) -> float | None:
+        """The statistic divided by its degrees of freedom; None if there are none."""
         return self.statistic / self.dof if self.dof > 0 else None
 
 
 @dataclass(frozen=True)
 class Turn:
-    """A gimbal (from 0) that explains a dwell's readings at another angle: as it was recorded and as it would be."""
+    """A gimbal (numbered from 0) whose angle, if corrected, explains a dwell's readings: its recorded and its corrected
+    angle."""
 
     gimbal: int
     axis: str
@@ -159,8 +172,13 @@ class Turn:
 
 @dataclass(frozen=True)
 class OutlyingDwell:
-    """A dwell and what it is off by, mean reading less prediction (3,); p_value: of the run. turns: of single gimbals,
-    that explain it; without: the calibration from all other dwells, which agrees with itself."""
+    """A dwell that does not fit the others.
+
+    - error_mps2 (3,): its mean reading less its prediction.
+    - p_value: the p-value over all dwells of the run.
+    - turns: corrections of one gimbal's angle, each of which explains it.
+    - without: the calibration from all other dwells, which is consistent.
+    """
 
     dwell: DwellFactor
     number: int
@@ -186,7 +204,7 @@ class OutlyingDwell:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The result of a run."""
+    """The result of a run: the fit, the estimate after each dwell and at the end, and the tests of the model."""
 
     bench: Bench
     settings: Settings
@@ -198,54 +216,57 @@ class Calibration:
     tally: Tally
     warnings: tuple[str, ...]
     reread: Callable[..., Calibration] | None = field(default=None, repr=False, compare=False)
-    """The same source evaluated anew: for models that need its readings folded otherwise."""
+    """Evaluates the same source again, for models that need the readings folded in another way."""
     readings: Readings = field(default_factory=Readings)
-    """What the readings themselves show, whatever the model."""
+    """Defects of the readings, found independently of the model."""
     outlying: tuple[OutlyingDwell, ...] = ()
-    """The dwell that alone does not fit, or those of which any one could be it."""
+    """The dwell that alone does not fit, or several if any one of them could be the cause."""
     frames: list[Frame] = field(default_factory=list[Frame], repr=False, compare=False)
-    """The candidates' columns, kept for all models of the run."""
+    """The candidates' whitened columns, shared by all models of the run."""
 
     @cached_property
     def refits(self) -> dict[tuple[str, ...], Calibration]:
-        """The models that were asked for (``refitted``), by their effects: none is fitted twice."""
+        """Cache of the models fitted by ``refitted``, by their effects."""
         return {}
 
     @cached_property
     def held_out(self) -> HeldOut | None:
-        """What each orientation is predicted to read by a fit without it; None where there are too few."""
+        """The predictions of each orientation by a fit to all others; None if there are too few orientations."""
         with one_blas_thread():
             return held_out(self.fit)
 
     @property
     def held_out_rms_mps2(self) -> float | None:
-        """Rms error of the mean readings of orientations that were left out."""
+        """Held-out error: the rms of mean readings less their prediction by a fit without their orientation, m/s^2."""
         return None if self.held_out is None else self.held_out.rms_mps2
 
     @property
     def held_out_floor_mps2(self) -> float | None:
-        """What noise alone would give."""
+        """Noise floor: the held-out error that noise alone would give, m/s^2."""
         return None if self.held_out is None else self.held_out.floor_mps2
 
     @property
     def noise(self) -> Noise:
+        """The fitted noise model."""
         return self.fit.noise
 
     @property
     def carried(self) -> Carried:
+        """The dwells with the columns of the fitted model."""
         return self.fit.carried
 
     @property
     def model(self) -> Model:
+        """The fitted model."""
         return self.carried.model
 
     @property
     def parameters(self) -> dict[str, Parameter]:
-        """The twelve parameters, then the effects' coefficients, by symbol."""
+        """The twelve parameters, then the coefficients of effects and the constants in them, by symbol."""
         estimate, nominal = self.estimate, paper_parameters.nominal(self.bench.nominal)
         coefficients, (effects, gains) = self.model.coefficients, self.model.natural(self.estimate.state)
         sigmas = estimate.effect_sigma * gains
-        sigmas = np.where((gains != 1.0) & (sigmas > effects), np.nan, sigmas)  # a constant not known within itself
+        sigmas = np.where((gains != 1.0) & (sigmas > effects), np.nan, sigmas)  # not known: sigma over value
         found = [
             *zip(
                 paper_parameters.SYMBOLS,
@@ -265,7 +286,7 @@ class Calibration:
         for effect in self.model.stepped:
             assert effect.unknown is not None
             constant, spread = effect.unknown, self.fit.spreads[str(effect)]
-            sigma = effect.value * spread if spread < 1.0 else math.nan  # not known within itself
+            sigma = effect.value * spread if spread < 1.0 else math.nan  # sigma over value
             found.append((constant.symbol, effect.value, sigma, 0.0, constant.unit))
             shown.append((constant.shown_unit, constant.per_si))
         return {
@@ -282,11 +303,12 @@ class Calibration:
 
     @property
     def residuals_mps2(self) -> Floats:
-        """Mean readings of the dwells less the final estimate, (D, 3)."""
+        """Residuals (D, 3): mean readings of the dwells less their prediction by the final estimate."""
         return np.array([visit.residual_mps2 for visit in self.visits])
 
     def considering(self, state: Floats, covariance: Floats) -> Estimate:
-        """Another engine's state and covariance, the latter enlarged by what is considered only."""
+        """The estimate from another engine's state and covariance, with the considered parameters added to the
+        covariance."""
         extra = (
             considered_information(self.noise, self.carried.means, self.carried.state).sum(axis=0) + self.fit.considered
         )
@@ -295,11 +317,12 @@ class Calibration:
     def __str__(self) -> str:
         return printed(self)
 
-    def __repr__(self) -> str:  # of all arrays in it, it would be megabytes
+    def __repr__(self) -> str:  # the generated one would print every array, which is megabytes
         return f"<Calibration: {self.model.sum}, {len(self.visits)} dwells, p {format_p(self.consistency.p_value)}>"
 
     def trace(self) -> Iterator[tuple[float, int, Estimate]]:
-        """(elapsed_s, number of the dwell, estimate) within and after every dwell: after a second, two, four ..."""
+        """Yield (elapsed_s, number of the dwell, estimate) several times within each dwell, at growing intervals, and
+        at its end."""
         model, state, around = self.model, self.carried.state, self.model.nominal_state()
         factor = square_root_information.start(self.settings.prior, model)
         extra = np.zeros((model.count, model.count))
@@ -318,7 +341,7 @@ class Calibration:
                 factor, _ = square_root_information.update(factor, self.fit.following[index])
 
     def during(self, dwell: DwellFactor) -> Estimate:
-        """The estimate were a dwell that follows the run, and is not in it yet, to end as it is now."""
+        """The estimate as if ``dwell``, which follows the run and is not yet complete, ended now."""
         fitted, (factor, extra) = self.fit, self.reached
         both, state = [fitted.dwells[-1], dwell], self.carried.state
         own = columns_of(both, self.model, state)[1:]
@@ -329,7 +352,7 @@ class Calibration:
 
     @cached_property
     def reached(self) -> tuple[Floats, Floats]:
-        """The filter's factor after the last dwell, and what is considered only, as in the covariance."""
+        """The filter's factor [R | z] after the last dwell, and the contribution (p, p) of considered parameters."""
         fitted, first = self.fit, square_root_information.start(self.settings.prior, self.model)
         last = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)[-1]
         extra = considered_information(self.noise, self.carried.means, self.carried.state)
@@ -337,12 +360,13 @@ class Calibration:
 
 
 def estimate_of(factor: Floats, nominal_state: Floats, extra: Floats) -> Estimate:
-    """The estimate of a factor, its covariance P enlarged by what is considered: P + P B P, B = ``extra`` (12, 12)."""
+    """The estimate from a factor [R | z], with the covariance P enlarged to P + P B P by considered parameters, B =
+    ``extra`` (p, p)."""
     return estimates(factor[None], nominal_state, extra)[0]
 
 
 def estimates(factors: Floats, nominal_state: Floats, extra: Floats) -> list[Estimate]:
-    """The same of many factors (n, p, p + 1), ``extra`` (n, p, p)."""
+    """The estimates from many factors (n, p, p + 1), as ``estimate_of``; ``extra`` is (p, p) or (n, p, p)."""
     states, covariances, undetermined = zip(*square_root_information.solve_all(factors, nominal_state), strict=True)
     covariance = np.array(covariances)
     covariance = covariance + covariance @ extra @ covariance
@@ -350,7 +374,7 @@ def estimates(factors: Floats, nominal_state: Floats, extra: Floats) -> list[Est
 
 
 def consistency(fitted: Fit) -> Consistency:
-    """Whether the dwells agree with the fitted model within the noise it is judged by."""
+    """Test whether the dwells agree with the fitted model within the noise by which the misfit is judged."""
     noise, dwells, rows = fitted.noise, fitted.dwells, fitted.judged
     upper = square_root_information.accumulate(rows, fitted.steps)
     statistic = float(upper[-1, -1] ** 2)
@@ -364,5 +388,5 @@ def consistency(fitted: Fit) -> Consistency:
 
 
 def format_p(p_value: float | None) -> str:
-    """``= 0.034``, or a bound where the number has underflowed."""
+    """Format a p-value as ``= 0.034``, or as a bound if it has underflowed."""
     return "= -" if p_value is None else "< 1e-300" if p_value < 1e-300 else f"= {p_value:.2g}"

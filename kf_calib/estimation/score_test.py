@@ -1,10 +1,13 @@
-"""Candidates against a model: what each would explain, what it cannot be told from, how small it may be.
+"""Score tests of candidate effects against a fitted model, and what the tests share: the candidates' whitened columns.
 
-The candidates' columns G are evaluated and whitened once for a run and its noise, and written in an orthonormal frame
-of their own. Beside any model H, readings z, and columns that come later only these are whitened; what they have in
-the frame and beside it is a small matrix, in which G and z are projected off H. Everything asked of a candidate is
-then read from that: its score test, its coefficients, its overlap with any other, and the size at which it would be
-found.
+Let H be the whitened columns of the model, G those of a candidate effect and z the whitened readings. G and z are
+projected onto the orthogonal complement of H. The projections answer every question about the candidate: its score
+statistic, its coefficients and their sigmas, its overlap with any other candidate, and the smallest size that would be
+detected.
+
+The columns of all candidates are evaluated and whitened once per run and noise model and are written in an orthonormal
+basis of their own (``Frame``). To test them against another model, only that model's columns and the readings have to
+be whitened; the projection is then done on a small matrix.
 """
 
 from __future__ import annotations
@@ -29,26 +32,30 @@ from kf_calib.estimation.noise_model import Noise, steps
 from kf_calib.estimation.periodogram import Periodogram
 
 _SEEN = 1e-6
-"""A candidate of which the model leaves less than this share is invisible."""
+"""A candidate is invisible if the model leaves less than this share of its columns."""
 
 _SAME = 1.0 - 1e-6
-"""Cosine above which two directions are one."""
+"""Two directions count as equal if the cosine of the angle between them is above this."""
 
-_TOGETHER = 24  # columns, at least, that are whitened at a time: memory stays that of the result
-_CELLS = 10_000  # columns times dwells that are whitened at a time, where that is more
-_OF_ONE_KIND = 400  # the same of many effects of one kind
-_MANY = 100  # oscillations, of which a periodogram is quicker
+_TOGETHER = 24  # least number of columns that are whitened at a time; more would take more memory
+_CELLS = 10_000  # columns times dwells that are whitened at a time, if this allows more columns
+_OF_ONE_KIND = 400  # columns whitened at a time if there are many effects of one kind
+_MANY = 100  # above this number of oscillations, a periodogram is faster
 
 
 @dataclass(frozen=True, repr=False)
 class Candidate:
-    """One effect (its unknown at one value) as far as the model does not explain it.
+    """One candidate effect, with any unknown constant at one value, after projection off the model.
 
-    basis (d, k): orthonormal, of what is left of its columns; directions (d, q): those of the basis that are nearest to
-    the columns, whichever way the basis is turned; inverse (q, k): coefficients = inverse @ basis^T r;
-    columns (d, q): what is left of the columns, per unit of the coefficients; hidden (q,): which of these are not
-    determined; visibility: the largest share of a column that is left; tried: the best of so many values of its
-    constant, each a test of its own.
+    - effect: the candidate.
+    - columns (d, q): the projected columns, per unit of each coefficient.
+    - basis (d, k): an orthonormal basis of the span of ``columns``; k is the degrees of freedom of the test.
+    - directions (d, q): the vectors in that span that are nearest to the columns; they do not depend on the choice of
+      ``basis``.
+    - inverse (q, k): maps a residual r to coefficients, ``inverse @ basis.T @ r``.
+    - hidden (q,): True for each coefficient that the run does not determine.
+    - visibility: the largest share of a column's norm that the projection leaves, 0 to 1.
+    - tried: the number of values of the unknown constant of which this is the best; each counts as a separate test.
     """
 
     effect: Effect
@@ -62,16 +69,21 @@ class Candidate:
 
     @property
     def dof(self) -> int:
+        """Degrees of freedom of the test: the rank of the projected columns."""
         return self.basis.shape[1]
 
     @cached_property
     def sigma(self) -> Floats:
-        """Of the coefficients (q,), were it the only effect added; infinite where not determined."""
+        """Sigmas (q,) of the coefficients if only this effect is added; infinite where a coefficient is not
+        determined."""
         return np.where(self.hidden, np.inf, np.linalg.norm(self.inverse, axis=1))
 
     def within(self, other: Candidate, cosine: float = _SAME) -> bool:
-        """Whether all that it can do the other can do, too, by the largest principal angle: then no reading can speak
-        for it and against the other."""
+        """Tell whether the span of this candidate lies inside the span of the other.
+
+        The criterion is the cosine of the largest principal angle. If it holds, the other explains whatever this one
+        explains, so that no readings can favour this candidate over the other.
+        """
         if not 0 < self.dof <= other.dof:
             return False
         cosines = self.basis.T @ other.basis
@@ -80,7 +92,8 @@ class Candidate:
         return float(np.linalg.svd(cosines, compute_uv=False)[-1]) > cosine
 
     def overlap(self, other: Candidate) -> float:
-        """Cosine of the smallest principal angle: 1 where some combination of the one mimics one of the other."""
+        """Cosine of the smallest principal angle between the two spans; 1 if they share a direction, so that the run
+        cannot tell some combination of the one from one of the other."""
         if not (self.dof and other.dof):
             return 0.0
         return float(np.linalg.svd(self.basis.T @ other.basis, compute_uv=False)[0])
@@ -88,32 +101,37 @@ class Candidate:
 
 @dataclass(frozen=True, repr=False)
 class Scan:
-    """Candidates in a common orthonormal frame of d dimensions, and the residual (d,) there, of unit noise."""
+    """The candidates and the whitened residual (d,) of the model, in a common orthonormal basis of d dimensions."""
 
     candidates: tuple[Candidate, ...]
     residual: Floats
 
     @cached_property
     def statistics(self) -> Floats:
-        """By how much adding each candidate would lower chi-squared; chi-squared of its dof if nothing is missing."""
+        """Score statistics (n,): the decrease of chi-squared if each candidate alone is added, |basis^T r|^2.
+
+        Each is chi-squared distributed with the candidate's degrees of freedom if the model is complete.
+        """
         return np.array([np.sum((each.basis.T @ self.residual) ** 2) for each in self.candidates])
 
     def explained(self, columns: Floats) -> tuple[float, int]:
-        """By how much all of these columns (d, q) of the frame together lower chi-squared, and their rank."""
+        """Decrease of chi-squared if all of these columns (d, q) are added together, and the rank of the columns."""
         left, singular, _ = np.linalg.svd(columns, full_matrices=False)
         spanned = left[:, singular > 1e-6]
         return float(np.sum((spanned.T @ self.residual) ** 2)), spanned.shape[1]
 
     def coefficients(self, candidate: Candidate) -> Floats:
-        """Coefficients (q,) of a candidate, were it the only effect added."""
+        """Estimated coefficients (q,) of a candidate if only this effect is added."""
         return candidate.inverse @ (candidate.basis.T @ self.residual)
 
 
 class Frame:
-    """The whitened columns of ``effects`` over all dwells, C = basis (m, r) coordinates (r, q), basis orthonormal.
+    """The whitened columns of ``effects`` over all dwells, in an orthonormal basis of their own.
 
-    It serves every model of the same dwells that is judged by the same noise; rotations and input axes stay linearised
-    at the ``state`` it was made with.
+      columns (m, q) = basis (m, r) @ coordinates (r, q)
+
+    A frame can be used with every model of the same dwells that is judged by the same noise. Small rotations and input
+    axes remain linearised at ``state``, the state with which the frame was made.
     """
 
     def __init__(self, carried: Carried, noise: Noise, effects: Sequence[Effect]) -> None:
@@ -128,7 +146,7 @@ class Frame:
         self._last: tuple[Carried, Floats, Floats, int] | None = None
 
     def only(self, effects: Sequence[Effect]) -> Frame:
-        """The frame with no others than these effects, which it has to have."""
+        """The same frame restricted to ``effects``, all of which it must contain."""
         own = dict(zip(map(_key, self.effects), self.parts, strict=True))
         out = copy.copy(self)
         out.effects = list(effects)
@@ -139,22 +157,24 @@ class Frame:
         return out
 
     def has(self, effect: Effect) -> bool:
-        """Whether the effect, at the value where its constant stands, is among its own."""
+        """Tell whether the frame contains this effect with its unknown constant at this value."""
         return _key(effect) in map(_key, self.effects)
 
     def lines(self, level: float) -> tuple[Line, ...]:
-        """Oscillations in the readings of the dwells (``sufficient_statistics.lines_of``), whatever the model."""
+        """Oscillations found in the readings at the significance ``level`` (see ``sufficient_statistics.lines_of``);
+        they do not depend on the model."""
         if level not in self._lines:
             self._lines[level] = lines_of(self.dwells, level)
         return self._lines[level]
 
     def serves(self, carried: Carried, noise: Noise) -> bool:
-        """Whether these dwells are the frame's, judged by the same noise."""
+        """Tell whether the frame was made for exactly these dwells and this noise."""
         same = len(carried.dwells) == len(self.dwells) and all(map(_is, carried.dwells, self.dwells))
         return same and all(np.array_equal(getattr(noise, key), getattr(self.noise, key)) for key in _OF_NOISE)
 
     def scan(self, carried: Carried, more: Sequence[Effect] = ()) -> Scan:
-        """Those of the effects that the model carried does not have, and ``more`` behind them, beside that model."""
+        """Project the frame's effects, without those that the model contains, and then the effects ``more`` off the
+        model in ``carried``."""
         kept = [k for k, effect in enumerate(self.effects) if str(effect) not in carried.model.parts]
         inside, outside, width = self._model(carried)
         more_inside, more_outside = self._split(whitened_columns(carried, self.noise, more, self.state, self._stimulus))
@@ -174,21 +194,24 @@ class Frame:
         )
 
     def _model(self, carried: Carried) -> tuple[Floats, Floats, int]:
-        """[H | W | z] of a model in the frame and beside it, and how many columns come before z; kept for the next
-        scan beside the same."""
+        """Return the columns [H | W | z] of a model, inside the frame and outside it, and the number of columns before
+        z; the result is cached for the next scan of the same model."""
         if self._last is None or self._last[0] is not carried:
             rows, width = whiten_model(carried, self.noise, [], self.state, self._stimulus)
             self._last = carried, *self._split(rows), width
         return self._last[1:]
 
     def _split(self, rows: Floats) -> tuple[Floats, Floats]:
-        """Columns (m, c) as coordinates (r, c) in the frame, and what is beside it (m, c)."""
+        """Split columns (m, c) into their coordinates (r, c) in the frame and the remainder (m, c) orthogonal to it."""
         inside = self.basis.T @ rows
         return inside, rows - self.basis @ inside
 
     def falls(self, carried: Carried, effect: Effect, values_hz: Floats) -> Floats:
-        """By how much an oscillation at each of these frequencies, alone, would lower chi-squared (n,) beside the model
-        carried; the same frequencies every time."""
+        """Decrease of chi-squared (n,) if an oscillation at each frequency, alone, is added to the model in
+        ``carried``.
+
+        The periodogram is computed at the first call, so ``values_hz`` has to be the same in every call.
+        """
         if self._periodogram is None:
             self._periodogram = Periodogram(carried, self.noise, effect, values_hz)
         rows, width = _judged(carried.dwells, carried.columns, self.noise, self.state, STATE_COUNT)
@@ -200,21 +223,23 @@ _OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps
 
 
 def _parts(effects: Sequence[Effect]) -> list[slice]:
-    """Where the columns of each effect are."""
+    """Return the slice of columns that belongs to each effect."""
     ends = np.cumsum([0, *(len(effect.coefficients) for effect in effects)]).tolist()
     return [slice(a, b) for a, b in itertools.pairwise(ends)]
 
 
 def _key(effect: Effect) -> tuple[str, float]:
+    """Return what identifies an effect together with the value of its constant."""
     return str(effect), effect.value
 
 
 def _is(one: object, other: object) -> bool:
+    """Tell whether both are the same object."""
     return one is other
 
 
 def scan(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Scan:
-    """Project ``effects`` off the model carried."""
+    """Project ``effects`` off the model in ``carried`` without a frame."""
     rows, width = whiten_model(carried, noise, effects)
     return project(
         square_root_information.accumulate([rows]), width, effects, [len(effect.coefficients) for effect in effects]
@@ -222,7 +247,12 @@ def scan(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Scan:
 
 
 def project(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
-    """The scan of a triangle [H | G | z] whose first ``width`` columns are the model's, then ``counts`` an effect."""
+    """Make the scan from a triangular factor [H | G | z].
+
+    - upper: the factor.
+    - width: number of columns H of the model.
+    - effects: the candidates; counts: number of columns of each in G.
+    """
     sizes, rest = np.linalg.norm(upper[:, width:-1], axis=0), _beside(upper, width)
     units = np.where(sizes > 0, sizes, 1.0)
     columns, residual = rest[:-1, :-1] / units, rest[:-1, -1]
@@ -233,20 +263,21 @@ def project(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequen
 
 
 def _beside(rows: Floats, width: int) -> Floats:
-    """What rows [H | G | z] hold of G and z beside the first ``width`` columns."""
+    """Project the columns [G | z] of rows [H | G | z] off H, the first ``width`` columns."""
     left, singular, _ = np.linalg.svd(
         square_root_information.scale_columns(rows[:, : width + 1])[0], full_matrices=False
     )
     explained, rest = left[:, singular > 1e-9], rows[:, width:]
-    for _ in range(2):  # twice, or the rounding of what is large stays in what is left
+    for _ in range(2):  # projecting twice removes the rounding errors that large components leave in the remainder
         rest = rest - explained @ (explained.T @ rest)
     return rest
 
 
 def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
-    """By how much each of many effects of one kind, alone, would lower chi-squared (n,): a scan's ``statistics``.
+    """Decrease of chi-squared (n,) if each of many effects of one kind, alone, is added: the ``statistics`` of a scan.
 
-    Nothing else is asked of them, so the rows are not folded: of n columns in d rows that takes d n, not d n^2.
+    Because nothing else is needed, the rows are not reduced by QR. For n columns in d rows the cost is then
+    proportional to d times n instead of d times n^2.
     """
     if effects[0].oscillates and len(effects) > _MANY:
         rows, width = _judged(carried.dwells, carried.columns, noise, carried.state, carried.model.count)
@@ -272,9 +303,13 @@ def whiten_model(
     state: Floats | None = None,
     stimulus: Stimulus | None = None,
 ) -> tuple[Floats, int]:
-    """Rows [H | W | G | z] (m, c) of unit noise of the model carried and of ``effects``, and how many columns come
-    before G. state: where rotations and input axes are linearised, other than where the model is; stimulus: of the
-    dwells there, where it is known."""
+    """Whitened rows [H | W | G | z] (m, c) of the model in ``carried`` and of ``effects``, and the number of columns
+    before G.
+
+    - W: columns of the slow part of a stated scatter, see ``square_root_information.misfit_rows``.
+    - state: where small rotations and input axes are linearised; by default at the state in ``carried``.
+    - stimulus: the stimulus of the dwells at that state, if it is already known.
+    """
     at, dwells = carried.state if state is None else state, carried.dwells
     added = candidate_columns(dwells, effects, carried.model.bench, at, stimulus)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
@@ -285,7 +320,7 @@ def whiten_model(
 def whitened_columns(
     carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats, stimulus: Stimulus
 ) -> Floats:
-    """G (m, q) of ``whiten_model``, some effects at a time: it takes no more memory than the result."""
+    """The columns G (m, q) of ``whiten_model``, computed for a few effects at a time, which saves memory."""
     sizes, out, first = [len(effect.coefficients) for effect in effects], np.zeros((0, 0)), 0
     for part in batches(sizes, columns_at_once(carried)) or [[]]:
         own = _columns_of_some(carried, noise, [effects[k] for k in part], state, stimulus)
@@ -310,12 +345,13 @@ def _columns_of_some(
 
 
 def columns_at_once(carried: Carried) -> int:
-    """How many columns are whitened at a time: more of few dwells, for which calls cost more than what they do."""
+    """Number of columns to whiten at a time; it is larger for few dwells, where the overhead of the calls dominates."""
     return max(_TOGETHER, _CELLS // len(carried.dwells))
 
 
 def batches(sizes: Sequence[int], columns: int) -> list[list[int]]:
-    """Numbers of effects of so many columns each, in order, as many together as have about ``columns``."""
+    """Split effects with the given numbers of columns into consecutive groups of about ``columns`` columns; return the
+    effects' indices."""
     ends = (np.cumsum(sizes) // columns).tolist()
     return [[k for k, end in enumerate(ends) if end == each] for each in dict.fromkeys(ends)]
 
@@ -323,22 +359,23 @@ def batches(sizes: Sequence[int], columns: int) -> list[list[int]]:
 def _judged(
     dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats, width: int
 ) -> tuple[list[Floats], int]:
-    """``square_root_information.misfit_rows`` with all rows that the dwells have."""
+    """Call ``square_root_information.misfit_rows`` without reducing the rows to the rank of their columns."""
     return square_root_information.misfit_rows(dwells, columns, noise, state, width, reduced=False)
 
 
 def _stacked(rows: Sequence[Floats], dwells: Sequence[DwellFactor], noise: Noise) -> Floats:
-    """All rows, a walk of the biases taken out of their noise."""
+    """Concatenate all rows; if the biases walk, whiten them with respect to the walk."""
     return random_walk.whiten_walk(rows, steps(dwells, noise)) if _inside(noise) else np.concatenate(rows)
 
 
 def _inside(noise: Noise) -> int:
-    """How many columns lead a dwell's rows, of the steps that the biases take in it."""
+    """Number of leading columns of a dwell's rows that belong to the steps of the biases within the dwell."""
     return 3 if noise.walk_mps2_per_sqrt_s else 0
 
 
 def _candidate(effect: Effect, columns: Floats, units: Floats) -> Candidate:
-    """``columns`` (d, q) in the frame, each divided by what it was before the projection, ``units`` (q,)."""
+    """Make a candidate from its projected ``columns`` (d, q), each divided by its norm before the projection, ``units``
+    (q,)."""
     left, singular, right = np.linalg.svd(columns, full_matrices=False)
     seen = singular > _SEEN
     lost = np.eye(len(units)) - right[seen].T @ right[seen]

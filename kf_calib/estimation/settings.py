@@ -1,4 +1,4 @@
-"""What a calibration is asked for."""
+"""The settings of a calibration."""
 
 from __future__ import annotations
 
@@ -15,13 +15,17 @@ Engine = Literal["block", "filterpy"]
 
 @dataclass(frozen=True)
 class Settings:
-    """How a run is evaluated. Raises InputError where a value cannot be.
+    """The settings by which a run is evaluated; raises InputError if a value is not possible.
 
-    walk_mps2_per_sqrt_s: random walk of the biases (process noise), 0: none. effects: names of those in the model, or
-    the name of one.
-    window_s: readings are averaged over windows of that length first; 0: only for effects that go with vibration, then
-    over windows of a second, or as long as the vibration needs that is seen. left_out: numbers of dwells (from 1) that
-    are not used.
+    - engine: the filter that is used.
+    - prior: prior knowledge of the parameters.
+    - stillness: tolerances by which dwells are recognised.
+    - gate_sigma: limit of the innovation gate in robust standard deviations; None for no gate.
+    - walk_mps2_per_sqrt_s: intensity of the random walk of the biases (process noise); 0 for none.
+    - effects: names of the effects in the model, or the name of one.
+    - window_s: length of the windows over which readings are averaged first. With 0 they are averaged only for effects
+      that depend on vibration, over a second or as long as the observed vibration requires.
+    - left_out: numbers of dwells (from 1) that are not used.
     """
 
     engine: Engine = "block"

@@ -1,14 +1,15 @@
-"""Blunders of a set-up: what is wrong with a run before any estimate of it means anything.
+"""Detection of mistakes in the set-up that make any estimate from the run meaningless.
 
-The model is linear in s_i = K_i E_i, so a reversed channel, exchanged channels or a reversed gimbal fit it exactly: no
-p-value notices. What notices is the estimate itself: an accelerometer whose axis lies more than 45 deg from nominal.
+The model is linear in s_i = K_i E_i. Reversed or exchanged channels and a reversed gimbal can therefore be fitted
+exactly, and no p-value shows them. The estimate itself does: the axis of an accelerometer then lies more than 45 deg
+from nominal.
 
-    mean reading of dwell d, channel i:  z_di = s_i . f_d + b_i        (D dwells; f_d from the angles)
+  mean reading of dwell d, channel i:  z_di = s_i . f_d + b_i        (D dwells; f_d from the angles)
 
-``refuse`` fits this to the means of the dwells, in a millisecond, and raises ``BlunderError`` where the result cannot
-be a calibration. The message says what is wrong and, where the reason is known, which options mend it: orders and signs
-of the channels (48), senses and order of the gimbals, the unit of the angles and the axis that is up are tried, the
-fewest changes first. Nothing is applied unasked. Changes that give the same readings are all named.
+``refuse`` fits this to the means of the dwells and raises ``BlunderError`` if the result cannot be a calibration. The
+message says what is wrong and, if the cause is known, which options correct it. To find the cause it tries the orders
+and signs of the channels (48), the sense and order of the gimbals, the unit of the angles and the axis that is up, with
+the fewest changes first. No correction is applied automatically, and all changes that give the same readings are named.
 """
 
 from __future__ import annotations
@@ -29,29 +30,35 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects.effect import G
 from kf_calib.errors import BlunderError
 
-_FARTHEST = math.cos(math.radians(45.0))  # of an axis from nominal
-_GAIN = (0.5, 2.0)  # of a scale factor over nominal: beyond it is another unit or no accelerometer
-_DEAD = 0.05  # g: means of a channel that stay within it feel nothing
-_TURNED = 1.0  # g: where gravity along the channel should have changed by more
-_CHANGED = 0.1  # g: where gravity should have changed by more, a reading that stays the same to its last digit is stuck
-_UNEXPLAINED = 0.05  # rms of what is left of the mean readings, g: beyond it the angles do not explain them
-_BETTER = 0.2  # of what is left: a change that mends leaves less than this share
-_SPREAD = 0.2  # least singular value of the directions over sqrt(D); 0.577 where they are spread evenly
-_BIAS = 0.3  # 1 sigma of a bias, g: what decides where the orientations do not determine it
-_NOMINAL = 0.15  # rms from nominal, g, of readings that have no blunder: biases, scale factors and mounting together
-_MOST_DWELLS = 96  # that are looked at: of more, some all along the run
-_MOST_CHANGES = 4  # of gimbals and channels together
-_MOST_NAMED = 3  # changes that would do equally well
-_ALIKE = 0.05  # of what three scale factors have in common: they differ by less
-_LITTLE = 20e-6  # of a scale factor: not worth a word
-_STUCK = 1e-9  # relative: readings that differ by less are one value
+_FARTHEST = math.cos(math.radians(45.0))  # largest angle of an axis from nominal
+_GAIN = (0.5, 2.0)  # range of a scale factor over nominal; outside it is another unit or no accelerometer
+_DEAD = 0.05  # g; a channel whose means vary by less is dead
+_TURNED = 1.0  # g; if gravity along it should have changed by more
+_CHANGED = 0.1  # g; a constant reading is stuck if gravity along it should have changed by more
+_UNEXPLAINED = 0.05  # g; if the residual rms is larger, the angles do not explain the mean readings
+_BETTER = 0.2  # a change explains the readings if it leaves less than this share of the residual
+_SPREAD = 0.2  # least singular value of the directions over sqrt(D); 0.577 if they are spread evenly
+_BIAS = 0.3  # g; prior sigma of a bias, which matters if the orientations do not determine it
+_NOMINAL = 0.15  # g; largest rms deviation from nominal without a mistake, from biases, scale factors and mounting
+_MOST_DWELLS = 96  # so many dwells are used at most, spread over the run
+_MOST_CHANGES = 4  # largest number of changes of gimbals and channels together
+_MOST_NAMED = 3  # largest number of equally good changes in a message
+_ALIKE = 0.05  # three scale factors share a deviation if they differ by less than this share of it
+_LITTLE = 20e-6  # a smaller deviation of the scale factors is not reported
+_STUCK = 1e-9  # readings with a smaller relative difference are equal
 
 Channels = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
 class Means:
-    """Of D dwells: recorded poses (D, k), mean readings (D, 3), when their middle was, s (D,), and their numbers."""
+    """Means over D dwells.
+
+    - poses (D, k): poses as recorded.
+    - readings (D, 3): mean readings.
+    - middle_s (D,): middle of each dwell.
+    - numbers: numbers of the dwells.
+    """
 
     poses: Floats
     readings: Floats
@@ -60,6 +67,7 @@ class Means:
 
     @classmethod
     def of(cls, dwells: Sequence[DwellFactor]) -> Means:
+        """The means of these dwells."""
         return cls(
             np.array([dwell.recorded_pose for dwell in dwells]),
             np.array([dwell.means[4:] for dwell in dwells]),
@@ -72,14 +80,19 @@ class Means:
         return Means(self.poses[part], self.readings[part], self.middle_s[part], numbers)
 
     def force(self, mounting: Mounting) -> Floats:
-        """Specific force (D, 3) in the platform, in units of gravity."""
+        """Specific force (D, 3) in the platform in units of gravity, if the poses mean what ``mounting`` says."""
         bench = mounting.bench
         return bench.specific_force(self.middle_s, mounting.poses(self.poses)) / bench.gravity_mps2
 
 
 @dataclass(frozen=True)
 class Affine:
-    """Mean readings by the specific force, least squares: sensitivity (3, 3), rows s_i; left: what remains, g rms."""
+    """The least-squares fit of the mean readings by the specific force.
+
+    - sensitivity (3, 3): rows s_i.
+    - left: rms of the residuals, g.
+    - nominal (3, 3): nominal sensitivities.
+    """
 
     sensitivity: Floats
     left: float
@@ -87,17 +100,17 @@ class Affine:
 
     @cached_property
     def scales(self) -> Floats:
-        """|s_i| over nominal, (3,)."""
+        """|s_i| divided by its nominal value, (3,)."""
         return np.linalg.norm(self.sensitivity, axis=1) / np.linalg.norm(self.nominal, axis=1)
 
     @cached_property
     def cosines(self) -> Floats:
-        """Of the angles between axis i and the nominal axis of accelerometer j, (3, 3)."""
+        """Cosines (3, 3) of the angles between axis i and the nominal axis of accelerometer j."""
         own, nominal = (rows / np.linalg.norm(rows, axis=1)[:, None] for rows in (self.sensitivity, self.nominal))
         return own @ nominal.T
 
     def is_near(self, channels: Channels = CHANNELS) -> bool:
-        """Whether every axis is near nominal, and every scale factor, with the channels in this order and of these
+        """Tell whether all axes and scale factors are near nominal with the channels in this order and with these
         signs."""
         own = np.abs(channels) - 1
         cosines = np.sign(channels) * self.cosines[own, [0, 1, 2]]
@@ -106,9 +119,9 @@ class Affine:
 
 
 def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
-    """Raise BlunderError, a sentence on what it looks like, where these cannot be dwells of the bench as it is stated.
+    """Raise BlunderError, saying what is probably wrong, if these cannot be dwells of the bench as it is stated.
 
-    Says nothing while the orientations are too few to tell.
+    Nothing is raised while there are too few orientations to tell.
     """
     step = -(-len(dwells) // _MOST_DWELLS)
     means, stated = Means.of(dwells[::step]), Mounting.stated(bench)
@@ -133,13 +146,13 @@ def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
 
 
 def _affine(means: Means, mounting: Mounting) -> Affine | None:
-    """The fit, None where the orientations do not show all three axes."""
+    """Return the fit; None if the orientations do not determine all three axes."""
     force = means.force(mounting)
     if not _shows_all(force):
         return None
     readings = means.readings / mounting.bench.gravity_mps2
     columns = np.column_stack([force, np.ones(len(force))])
-    held = np.vstack([columns, [0.0, 0.0, 0.0, 0.05 / _BIAS]])  # readings of gravity are good to 0.05 g, say
+    held = np.vstack([columns, [0.0, 0.0, 0.0, 0.05 / _BIAS]])  # readings are assumed good to 0.05 g
     solution = np.linalg.lstsq(held, np.vstack([readings, np.zeros((1, 3))]), rcond=None)[0]
     freedom = max(len(force) - 4, 1) / len(force)
     left = math.sqrt(np.mean((readings - columns @ solution) ** 2) / freedom)
@@ -147,17 +160,17 @@ def _affine(means: Means, mounting: Mounting) -> Affine | None:
 
 
 def _shows_all(force: Floats) -> bool:
-    """Whether directions (D, 3) determine three axes."""
+    """Tell whether directions (D, 3) determine three axes."""
     return len(force) >= 3 and np.linalg.svd(force, compute_uv=False)[-1] > _SPREAD * math.sqrt(len(force))
 
 
 def _nominal(bench: Bench) -> Floats:
-    """Nominal sensitivities (3, 3)."""
+    """Return the nominal sensitivities (3, 3)."""
     return paper_parameters.state_of(paper_parameters.nominal(bench.nominal)).reshape(3, 4)[:, :3]
 
 
 def _refuse_silent(means: Means, stated: Mounting) -> None:
-    """Refuse where a channel keeps one value, or hardly changes, although gravity along it should change by far."""
+    """Refuse a channel that is constant, or nearly so, although gravity along it should change much."""
     readings, count = means.readings, len(means.readings)
     expected = means.force(stated) @ _nominal(stated.bench).T
     same = np.abs(readings - readings[-1]) <= _STUCK * np.abs(readings[-1])
@@ -178,7 +191,7 @@ def _refuse_silent(means: Means, stated: Mounting) -> None:
 
 
 def _refuse_wrong_gain(found: Affine, bench: Bench) -> None:
-    """Refuse where one channel feels gravity by another factor than the others, as in another unit."""
+    """Refuse a channel that measures gravity by another factor than the others, as in another unit."""
     for i, scale in enumerate(found.scales.tolist()):
         if not _GAIN[0] < scale < _GAIN[1]:
             others = " and ".join(f"{other:.3g}" for other in np.delete(found.scales, i))
@@ -190,19 +203,23 @@ def _refuse_wrong_gain(found: Affine, bench: Bench) -> None:
 
 @dataclass(frozen=True)
 class Mending:
-    """A mounting and an order and signs of channels with which all axes are near nominal."""
+    """A mounting and an assignment of the channels with which all axes are near nominal."""
 
     mounting: Mounting
     channels: Channels
 
     @property
     def changes(self) -> int:
+        """Number of changes from what is stated."""
         return self.mounting.changes + _changes_of(self.channels)
 
 
 def _changes_of(channels: Channels) -> int:
-    """How many things are wrong where the channels are in this order: an exchange or a cycle, and each sign; all signs
-    are one thing, the sense of the readings."""
+    """Return the number of changes in an assignment of the channels.
+
+    A different order counts as one change and each sign as one; if all signs are reversed, they count as one, the sense
+    of the readings.
+    """
     reversed_ = sum(channel < 0 for channel in channels)
     order = tuple(map(abs, channels)) != CHANNELS
     return order + (1 if reversed_ == 3 else reversed_)
@@ -213,11 +230,12 @@ _WIRINGS: tuple[Channels, ...] = tuple(
     for a, b, c in itertools.permutations(CHANNELS)
     for i, j, k in itertools.product((1, -1), repeat=3)
 )
-"""Which channel each accelerometer may be, and of which sign: 48."""
+"""The 48 assignments of channels, with signs, to accelerometers."""
 
 
 def _mendings(means: Means, stated: Mounting, found: Affine | None) -> list[Mending]:
-    """The mountings with the fewest changes that explain the readings with all axes near nominal."""
+    """Return the mountings and assignments with the fewest changes that explain the readings with all axes near
+    nominal."""
     left = _UNEXPLAINED if found is None or found.left < _UNEXPLAINED else max(_BETTER * found.left, 0.01)
     out, fewest = list[Mending](), _MOST_CHANGES
     for mounting in mountings(stated):
@@ -232,11 +250,12 @@ def _mendings(means: Means, stated: Mounting, found: Affine | None) -> list[Mend
                 fewest = mending.changes
                 out.append(mending)
     equal = [each for each in out if each.changes == fewest]
-    return sorted(equal, key=lambda each: each.mounting.changes > 0 and each.channels != CHANNELS)  # mixtures last
+    return sorted(equal, key=lambda each: each.mounting.changes > 0 and each.channels != CHANNELS)  # mixed changes last
 
 
 def _what_is_wrong(found: Affine | None, bench: Bench) -> str:
-    """The channels whose axes are far from nominal; else, that the angles do not explain the readings."""
+    """Name the channels whose axes are far from nominal or, if there are none, say that the angles do not explain the
+    readings."""
     if found is None:
         return "the readings show the platform in many orientations, the angles in few"
     cosines, numbers = np.diag(found.cosines), [abs(channel) for channel in bench.channels]
@@ -251,12 +270,12 @@ def _what_is_wrong(found: Affine | None, bench: Bench) -> str:
 
 
 def _channels(numbers: Sequence[int]) -> str:
-    """``channel 2 reads``, ``channels 1, 3 read``."""
+    """Write ``channel 2 reads`` or ``channels 1, 3 read``."""
     return f"channel {numbers[0]} reads" if len(numbers) == 1 else f"channels {', '.join(map(str, numbers))} read"
 
 
 def _question(stated: Bench, mendings: Sequence[Mending]) -> str:
-    """What each of equal mendings means, and the options that state it."""
+    """Say what each of several equally good changes means, and which options state it."""
     said = list(dict.fromkeys((" and ".join(_reasons(stated, each)), _advice(stated, each)) for each in mendings))
     if len(said) == 1:
         reason, advice = said[0]
@@ -267,6 +286,7 @@ def _question(stated: Bench, mendings: Sequence[Mending]) -> str:
 
 
 def _reasons(stated: Bench, mending: Mending) -> list[str]:
+    """Return the changes in words."""
     out, channels = list(mending.mounting.words), mending.channels
     moved = [k for k, channel in enumerate(channels, 1) if abs(channel) != k]
     negative = sorted(-channel for channel in channels if channel < 0)
@@ -284,12 +304,12 @@ def _reasons(stated: Bench, mending: Mending) -> list[str]:
 
 
 def _wired(stated: Bench, channels: Channels) -> str:
-    """The channels of the recording, where those that are stated are in the order and of the signs ``channels``."""
+    """Return the option's value for channels in the order and with the signs ``channels``, relative to those stated."""
     return ",".join(str(int(math.copysign(1, channel)) * stated.channels[abs(channel) - 1]) for channel in channels)
 
 
 def _advice(stated: Bench, mending: Mending) -> str:
-    """The options that state a mounting, and what there is no option for in words."""
+    """Return the options that state a mounting and, where there is no option, what to do."""
     mounting, options, words = mending.mounting, list[str](), list[str]()
     if mounting.bench.axes != stated.axes:
         options.append(f'--axes "{mounting.bench.to_metadata()["axes"]}"')
@@ -309,14 +329,15 @@ def _advice(stated: Bench, mending: Mending) -> str:
 
 
 def _refuse_exchange(means: Means, stated: Mounting) -> None:
-    """Refuse where channels change their order or signs in the course of the run: nominal on both sides of a dwell."""
+    """Refuse a run in which the channels change their order or signs between two dwells, with both parts near
+    nominal."""
     if len(means.numbers) < 6:
         return
     bench = stated.bench
     expected, readings = means.force(stated) @ _nominal(bench).T, means.readings / bench.gravity_mps2
     wired = np.stack([readings[:, np.abs(own) - 1] * np.sign(own) for own in _WIRINGS])  # (48, D, 3)
     squares = ((wired - expected) ** 2).sum(axis=2)
-    before = np.cumsum(squares, axis=1)[:, :-1]  # of dwells up to k, as each wiring would have them
+    before = np.cumsum(squares, axis=1)[:, :-1]  # sums over the dwells up to k, for each assignment
     after = squares.sum(axis=1, keepdims=True) - before
     k = int(np.argmin(before.min(axis=0) + after.min(axis=0)))
     first, then = int(before[:, k].argmin()), int(after[:, k].argmin())
@@ -332,7 +353,7 @@ def _refuse_exchange(means: Means, stated: Mounting) -> None:
 
 
 def _one_dwell(means: Means, stated: Mounting) -> bool:
-    """Whether without a single dwell all axes are near nominal, and the angles explain the readings."""
+    """Tell whether without some single dwell all axes are near nominal and the angles explain the readings."""
     for k in range(len(means.numbers)):
         found = _affine(means[np.arange(len(means.numbers)) != k], stated)
         if found is not None and found.is_near() and found.left < _UNEXPLAINED:
@@ -341,7 +362,8 @@ def _one_dwell(means: Means, stated: Mounting) -> bool:
 
 
 def common_scale(scales: Floats, sigmas: Floats, bench: Bench) -> str:
-    """A sentence on scale factors (3,), over nominal and with sigma, that are all off by the same; '' where not."""
+    """A sentence on three scale factors (3,), relative to nominal, that all deviate by the same amount; '' if they do
+    not."""
     off = scales - 1.0
     level = float(off.mean())
     same = np.abs(off - level).max() < max(3.0 * float(sigmas.max()), _ALIKE * abs(level))

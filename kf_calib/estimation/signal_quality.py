@@ -1,17 +1,17 @@
-"""What the readings themselves show, apart from any model: their step, flat tops, and where outliers lie.
+"""Defects of the readings that show independently of any model: quantisation, saturation and outliers.
 
-Three defects that no column of a model stands for are found from the values of each accelerometer:
+Three defects that no column of a model describes are found from the values of each accelerometer.
 
-- *quantisation*: all values lie on one grid. Its step is the greatest common divisor of the differences of values,
-  to rounding. A step q well below the noise s is harmless; the mean of a dwell is off by up to
-  q/2 exp(-2 pi^2 s^2 / q^2), which averaging does not lessen: it matters where that is seen beside the mean's sigma.
-- *saturation*: readings pile up at the channel's largest or smallest value. Noise of sigma s that leaves a share b of a
-  dwell's n readings below a top step of width q would put n (1 - Phi(Phi^-1(b) + q/s)) readings above it; at the end of
-  the range there are none.
-- *outliers*: readings the gate rejected. Spread at random over the run, their number in any stretch of dwells is
-  binomial.
+  - *Quantisation*: all values lie on one grid, whose step is the greatest common divisor of the differences of values,
+    up to rounding. A step q well below the noise s is harmless. The mean of a dwell is off by up to
+    q/2 exp(-2 pi^2 s^2 / q^2), which averaging does not reduce; it matters if it is visible beside the mean's sigma.
+  - *Saturation*: readings accumulate at the channel's largest or smallest value. If noise of sigma s leaves a share b
+    of a dwell's n readings below a top step of width q, it should put n (1 - Phi(Phi^-1(b) + q/s)) readings above it;
+    at the end of the range there are none.
+  - *Outliers*: readings that the gate rejected. If they are spread at random over the run, their number in any sequence
+    of dwells is binomial.
 
-``ReadingsMonitor`` looks at each block as it passes and keeps a few numbers a dwell; ``judged`` says what they mean.
+``ReadingsMonitor`` looks at each block as it passes and keeps a few numbers for each dwell; ``judged`` interprets them.
 """
 
 from __future__ import annotations
@@ -27,17 +27,18 @@ from kf_calib.dwells.rows import Rows
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.noise_model import Noise
 
-_SAMPLE = 256  # readings of a dwell whose values are compared; a step below a twentieth of the noise goes unnoticed
-_VALUES = 32  # distinct values of a dwell that are kept
-_ROUNDING = (2.0**-22, 2.0**-49)  # of the largest value: of float32 stored, of float64 computed
-_CROWDED = 20.0  # readings missing above a flat top: noise leaves them out with probability e^-20
-_CLUSTERED = 1e-3  # run-level p of outliers spread at random
-_COUNTABLE = 512  # dwells at most whose stretches are all looked at; beyond, neighbours are taken together
+_SAMPLE = 256  # readings of a dwell whose values are compared; a step below a twentieth of the noise is not noticed
+_VALUES = 32  # largest number of distinct values of a dwell that are kept
+_ROUNDING = (2.0**-22, 2.0**-49)  # relative to the largest value: rounding of stored float32 and of computed float64
+_CROWDED = 20.0  # readings missing above a flat top; noise alone would omit them with probability e^-20
+_CLUSTERED = 1e-3  # p-value of the run below which outliers count as clustered
+_COUNTABLE = 512  # if there are more dwells, neighbours are pooled
 
 
 @dataclass(frozen=True)
 class Quantisation:
-    """The step of a channel (1, 2, 3), its rms step/sqrt(12) beside the noise, and by how much it can move a mean."""
+    """The quantisation of a channel (1, 2, 3): its step, the noise, the largest error of a mean that it causes, and
+    whether this matters."""
 
     channel: int
     step_mps2: float
@@ -47,6 +48,7 @@ class Quantisation:
 
     @property
     def rms_mps2(self) -> float:
+        """Rms rounding error of a reading, step / sqrt(12)."""
         return self.step_mps2 / math.sqrt(12.0)
 
     def __str__(self) -> str:
@@ -61,7 +63,8 @@ class Quantisation:
 
 @dataclass(frozen=True)
 class Saturation:
-    """A channel (1, 2, 3) cut off at a level: share of its readings stuck there, and the numbers of the dwells."""
+    """The saturation of a channel (1, 2, 3): the level, the share of its readings at it, and the numbers of the
+    dwells."""
 
     channel: int
     level_mps2: float
@@ -78,10 +81,13 @@ class Saturation:
 
 @dataclass(frozen=True)
 class Outliers:
-    """Readings rejected by the gate; by_channel counts one twice where it lies out in two channels.
+    """The readings rejected by the gate.
 
-    clustered_p: run-level probability of so many in any stretch of dwells (whose numbers are ``dwells``) were they
-    spread at random; None where there are none, or one dwell only, or where coarse steps or flat tops make some.
+    - count, share: their number, and as a share of all readings.
+    - by_channel: number by channel; a reading that is an outlier in two channels counts in both.
+    - clustered_p: probability over the run that outliers spread at random are as dense in any sequence of dwells; None
+      if there are none, if there is one dwell only, or if coarse steps or saturation cause some.
+    - dwells: numbers of the dwells in the densest sequence.
     """
 
     count: int = 0
@@ -92,6 +98,7 @@ class Outliers:
 
     @property
     def clustered(self) -> bool:
+        """Whether the outliers are significantly clustered."""
         return self.clustered_p is not None and self.clustered_p < _CLUSTERED
 
     def __str__(self) -> str:
@@ -106,7 +113,7 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Readings:
-    """What was found of a run."""
+    """The defects that were found in a run."""
 
     quantisation: tuple[Quantisation, ...] = ()
     saturation: tuple[Saturation, ...] = ()
@@ -114,17 +121,17 @@ class Readings:
 
     @property
     def biasing(self) -> list[str]:
-        """What spoils the estimate, a sentence each."""
+        """One sentence on each defect that biases the estimate."""
         return [*map(str, self.saturation), *(str(each) for each in self.quantisation if each.matters)]
 
     @property
     def warnings(self) -> list[str]:
-        """What a user must know, a sentence each."""
+        """One sentence on each defect that a user must know."""
         return self.biasing + [str(self.outliers)] * self.outliers.clustered
 
     @property
     def findings(self) -> list[str]:
-        """All that was found, harmless or not, in a few words each."""
+        """All findings, harmless or not, in a few words each."""
         out = self.outliers
         crowded = f", crowded in {_dwells(out.dwells)}" if out.clustered else ""
         return [
@@ -143,11 +150,12 @@ class Readings:
 
 @dataclass
 class _Seen:
-    """Of the dwell of that number.
+    """The record that is kept of a dwell.
 
-    ends (6,): the largest of the three channels, and of their negatives; stuck (6,): readings there.
-    distinct (3,): how many values ``sampled`` readings had; values: some of them, by channel. rejected: readings; out
-    (3,): in which channel.
+    - ends (6,): the largest value of each channel and of its negative; stuck (6,): number of readings at these values.
+    - count: number of readings.
+    - distinct (3,): number of distinct values in ``sampled`` readings; values: some of them, by channel.
+    - rejected: number of rejected readings; out (3,): number by channel.
     """
 
     number: int
@@ -162,12 +170,13 @@ class _Seen:
 
 
 class ReadingsMonitor:
-    """Accumulates what the readings show, block by block; slews are passed over."""
+    """Accumulates what the readings show, block by block; slews are ignored."""
 
     def __init__(self) -> None:
         self._dwells: dict[int, _Seen] = {}
 
     def add(self, rows: Rows) -> None:
+        """Take in one block of rows."""
         if rows.moving:
             return
         seen = self._dwells.get(rows.dwell)
@@ -180,20 +189,20 @@ class ReadingsMonitor:
             seen.out = seen.out + rows.gated.sum(axis=1)
 
     def judged(self, dwells: Sequence[DwellFactor], noise: Noise) -> Readings:
-        """What it means for a run of these dwells and this noise."""
+        """The defects of a run with these dwells and this noise."""
         seen = [self._dwells[dwell.number] for dwell in dwells]
         steps = [_step(seen, channel) for channel in range(3)]
         grids = [_quantisation(i, q, noise, seen) for i, q in enumerate(steps) if q is not None]
         grids = [each for each in grids if each.matters or each.step_mps2 > 8.0 * _storage(seen, each.channel - 1)]
         flat = tuple(_saturations(seen, steps, np.array([_spread(dwell) for dwell in dwells]), noise))
         outliers = _outliers(seen)
-        if flat or any(each.matters for each in grids):  # the gate takes what is off a flat top, or off by a step
+        if flat or any(each.matters for each in grids):  # the gate also rejects readings next to a flat top or a step
             outliers = replace(outliers, clustered_p=None, dwells=())
         return Readings(tuple(grids), flat, outliers)
 
 
 def _first_seen(number: int, readings: Floats) -> _Seen:
-    """A dwell with what the values of its first block say of steps."""
+    """Make the record of a dwell from its first block, with the distinct values in it."""
     sample = np.sort(readings[:: -(-len(readings) // _SAMPLE)].T)
     new = sample[:, 1:] != sample[:, :-1]
     distinct, size = 1.0 + new.sum(axis=1), sample.shape[1]
@@ -205,7 +214,7 @@ def _first_seen(number: int, readings: Floats) -> _Seen:
 
 
 def _reach(seen: _Seen, rows: Rows) -> None:
-    """Takes in the ends of a block; readings there are counted only where the dwell has none farther out."""
+    """Update the largest and smallest values of a dwell, and the number of readings at them, with a block."""
     channels = rows.innovation if rows.static else np.ascontiguousarray(rows.readings.T)
     places = channels.argmax(axis=1).tolist() + channels.argmin(axis=1).tolist()
     for side, place in enumerate(places):
@@ -218,24 +227,24 @@ def _reach(seen: _Seen, rows: Rows) -> None:
 
 
 def _spread(dwell: DwellFactor) -> Floats:
-    """Standard deviation of the readings within a dwell (3,)."""
+    """Return the standard deviation (3,) of the readings within a dwell."""
     spare = dwell.count - dwell.width * len(dwell.pieces)
     return np.sqrt(dwell.squares.sum(axis=0) / max(spare, 1))
 
 
 def _storage(seen: Sequence[_Seen], channel: int) -> float:
-    """The step of float32 at the channel's largest reading."""
+    """Return the spacing of float32 at the channel's largest reading."""
     largest = max(float(np.abs(each.ends[channel::3]).max()) for each in seen)
     return float(np.spacing(np.float32(largest)))
 
 
 def _repeating(seen: Sequence[_Seen], channel: int) -> Mask:
-    """Dwells (D,) whose values repeat: no more distinct ones than half the readings."""
+    """Return a mask (D,) of the dwells whose sampled readings have at most half as many distinct values."""
     return np.array([each.distinct[channel] <= each.sampled / 2 for each in seen])
 
 
 def _step(seen: Sequence[_Seen], channel: int) -> float | None:
-    """The step of the grid on which all readings of a channel lie; None where there is none."""
+    """Return the step of the grid on which all readings of a channel lie; None if there is none."""
     if _repeating(seen, channel).mean() < 0.95:
         return None
     values = np.unique(np.concatenate([each.values[channel] for each in seen]))
@@ -244,10 +253,10 @@ def _step(seen: Sequence[_Seen], channel: int) -> float | None:
 
 
 def common_step(values: Floats, tolerance: float) -> float | None:
-    """The step q of a grid v0 + k q that holds ``values`` (n,), each to within ``tolerance``; None: there is no such.
+    """The step q of a grid v0 + k q on which ``values`` (n,) lie, each to within ``tolerance``; None if there is none.
 
-    Euclid's algorithm on the differences of neighbours, three of them or more; q is at least eight tolerances.
-    Differences of so many steps that rounding hides their number say nothing.
+    It is found by Euclid's algorithm on at least three differences of neighbouring values, and is at least eight
+    tolerances. Differences of so many steps that rounding makes their number uncertain are not used.
     """
     steps = np.diff(np.sort(values))
     steps = steps[steps > 2.0 * tolerance]
@@ -255,13 +264,13 @@ def common_step(values: Floats, tolerance: float) -> float | None:
         return None
     step, error, known = float(steps.min()), 4.0 * tolerance, 0
     while step >= 8.0 * tolerance:
-        certain = steps[steps <= max(1.5 * step, 0.1 * step**2 / error)]  # those whose number of steps is known
+        certain = steps[steps <= max(1.5 * step, 0.1 * step**2 / error)]  # those whose number of steps is certain
         multiples = np.rint(certain / step)
         over, allowed = np.abs(certain - step * multiples), 2.0 * tolerance + error * multiples
         if (over > allowed).any():
             first = int(np.where(over > allowed, over, np.inf).argmin())
             step, error, known = float(over[first]), float(allowed[first]), 0
-        elif len(certain) > known:  # the better the step is known, the larger differences count
+        elif len(certain) > known:  # a more precise step makes larger differences usable
             known, error = len(certain), 2.0 * tolerance * math.sqrt(len(certain)) / float(multiples.sum())
             step = float(certain.sum() / multiples.sum())
         else:
@@ -270,8 +279,9 @@ def common_step(values: Floats, tolerance: float) -> float | None:
 
 
 def _quantisation(index: int, step: float, noise: Noise, seen: Sequence[_Seen]) -> Quantisation:
+    """Judge the quantisation of one channel."""
     variance = float(noise.sigma_mps2[index]) ** 2
-    dither = max(variance - step**2 / 12.0, 0.0)  # what else there is to spread the readings over steps
+    dither = max(variance - step**2 / 12.0, 0.0)  # noise that spreads the readings over several steps
     error = 0.5 * step * math.exp(-2.0 * math.pi**2 * dither / step**2)
     count = float(np.median([each.count for each in seen]))
     seen_from = 0.5 * math.sqrt(variance * float(noise.inflation[index]) / count)
@@ -282,24 +292,25 @@ def _quantisation(index: int, step: float, noise: Noise, seen: Sequence[_Seen]) 
 def _saturations(
     seen: Sequence[_Seen], steps: Sequence[float | None], spreads: Floats, noise: Noise
 ) -> Iterator[Saturation]:
-    """The ends of a channel's range at which readings pile up; ``spreads`` (D, 3) within the dwells."""
+    """Yield the ends of a channel's range at which readings accumulate; ``spreads`` (D, 3) are the standard deviations
+    within dwells."""
     ends, stuck = (np.array([getattr(each, key) for each in seen]) for key in ("ends", "stuck"))
     counts = np.array([each.count for each in seen], float)
     reached = ends == ends.max(axis=0)
     for side in range(6):
         i = side % 3
-        inside = ~(reached[:, i] | reached[:, i + 3])  # dwells that show the noise where nothing can be cut off
+        inside = ~(reached[:, i] | reached[:, i + 3])  # dwells away from the ends, which show the noise
         step, sigma = steps[i], float(spreads[inside, i].min(initial=np.inf))
         if not (0.0 < sigma < np.inf) or (step is None and _repeating(seen, i)[inside].mean() > 0.5):
             continue
         width = max(step or 0.0, float(np.spacing(np.float32(ends[:, side].max()))))
         if width > 2.0 * sigma:
-            continue  # a dwell may then have one value anywhere
+            continue  # a dwell may then have a single value at any level
         sigma, at = math.sqrt(sigma**2 - width**2 / 12.0), reached[:, side]
         if stuck[at, side].sum() <= _CROWDED * float(noise.inflation[i]):
-            continue  # no more can be missing above a value than there are at it
+            continue  # no more can be missing above a value than are at it
         missing = missing_above(stuck[:, side], counts, width / sigma) / float(noise.inflation[i])
-        usual = float(np.median(missing[inside]))  # noise that is not Gaussian has flat tops at every level
+        usual = float(np.median(missing[inside]))  # non-Gaussian noise has flat tops at every level
         if missing[at].sum() > _CROWDED and missing[at].mean() > 4.0 * usual:
             level = float(ends[at, side][0]) * (1.0 if side < 3 else -1.0)
             which = tuple(each.number for each, is_cut in zip(seen, at & (stuck[:, side] > 1), strict=True) if is_cut)
@@ -307,7 +318,8 @@ def _saturations(
 
 
 def missing_above(stuck: Floats, counts: Floats, step_sigmas: float) -> Floats:
-    """Readings that Gaussian noise would put above the top value of each dwell, (D,), from how many are at it."""
+    """Number of readings (D,) that Gaussian noise would put above the top value of each dwell, from the number at that
+    value."""
     from scipy.special import ndtr, ndtri
 
     below = np.clip(1.0 - stuck / counts, 0.5 / counts, None)
@@ -315,6 +327,7 @@ def missing_above(stuck: Floats, counts: Floats, step_sigmas: float) -> Floats:
 
 
 def _outliers(seen: Sequence[_Seen]) -> Outliers:
+    """Return the outliers and where they cluster."""
     gated = np.array([each.rejected for each in seen], float)
     counts = np.array([each.count + each.rejected for each in seen], float)
     total = int(gated.sum())
@@ -328,10 +341,11 @@ def _outliers(seen: Sequence[_Seen]) -> Outliers:
 
 
 def clustering(hits: Floats, counts: Floats) -> tuple[float | None, slice]:
-    """Run-level p of ``hits`` (D,) among ``counts`` (D,) readings, and the stretch of the D dwells that has most.
+    """The p-value over the run of the densest sequence of dwells for ``hits`` (D,) among ``counts`` (D,) readings, and
+    that sequence.
 
-    Given their sum, hits in a stretch are binomial; stretches of 1, 2, 4 ... dwells are looked at, and the least tail
-    probability is multiplied by their number: at most the size it states, however few the hits.
+    Given their sum, the hits in a sequence are binomial. Sequences of 1, 2, 4 ... dwells are tried, and the least tail
+    probability is multiplied by their number (Bonferroni), so that the p-value is an upper bound.
     """
     from scipy.special import betainc
 
@@ -342,7 +356,7 @@ def clustering(hits: Floats, counts: Floats) -> tuple[float | None, slice]:
     length = 1
     while 2 * length <= len(starts):
         inside, share = (each[length:] - each[:-length] for each in sums)
-        least = np.maximum(inside, 1.0)  # the chance of so many is an incomplete beta function
+        least = np.maximum(inside, 1.0)  # a binomial tail is an incomplete beta function
         tails = np.where(inside > 0, betainc(least, sums[0][-1] - least + 1.0, share / sums[1][-1]), 1.0)
         first, tried = int(tails.argmin()), tried + len(tails)
         if tails[first] < best:
@@ -354,7 +368,7 @@ def clustering(hits: Floats, counts: Floats) -> tuple[float | None, slice]:
 
 
 def _dwells(numbers: Sequence[int]) -> str:
-    """``dwell 2``, ``3 dwells (2, 5, 9)``; no more than six of them."""
+    """Write ``dwell 2`` or ``3 dwells (2, 5, 9)``, with at most six numbers."""
     if len(numbers) == 1:
         return f"dwell {numbers[0]}"
     return f"{len(numbers)} dwells ({', '.join(map(str, numbers[:6]))}{' ...' * (len(numbers) > 6)})"

@@ -1,8 +1,9 @@
-"""The block engine: a square-root information filter over dwell factors.
+"""The square-root information filter that takes in one dwell at a time.
 
-A dwell's factor is whitened by the noise model, its nuisance states (setting error, scatter) are eliminated, and the
-rows that remain update the running factor [R | z] by QR. The posterior, least squares and leave-one-orientation-out
-all come from such factors.
+The rows of a dwell are whitened by the noise model, the dwell's nuisance states (setting error, scatter) are
+eliminated, and the remaining rows update the running factor [R | z] by QR, where R'R is the information and z = R x.
+The estimate after each dwell, the batch solution and the leave-one-orientation-out predictions are all computed from
+such factors (G. J. Bierman, Factorization Methods for Discrete Sequential Estimation, 1977).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from kf_calib.estimation.prior import Prior
 
 _SLOW = np.arange(1, 5)
 _STILL = np.zeros(2)
-_AT_ONCE = 1 << 17  # numbers of rows worked on together, so that they stay in the cache
+_AT_ONCE = 1 << 17  # numbers that are processed together, so that they stay in the cache
 
 
 def whiten(
@@ -37,17 +38,23 @@ def whiten(
     flicker_mps2: Floats | None = None,
     reduced: bool = True,
 ) -> list[Floats]:
-    """Rows [S | H | z] of unit noise (r, s + p + 1) of each dwell, its nuisance states eliminated by QR.
+    """Whitened rows [S | H | z] (r, s + p + 1) of each dwell, with unit noise and the dwell's nuisance states
+    eliminated by QR.
 
-    S: of the steps that the biases take in the dwell, where they walk (s 3, else 0); H has the biases at its end.
+    S are the columns of the steps that the biases take within the dwell (s = 3 if they walk, else s = 0), and H (p
+    columns) refers to the biases at the end of the dwell. The rows of channel i are divided by the sigma of white
+    readings whose mean has the same variance as that of the correlated readings. The setting error (three rotations)
+    and the scatter (three offsets) are states with Gaussian priors, linearised at ``state``. The residuals within a
+    dwell, which do not depend on the states, are not in the result.
 
-    ``columns``: the model's, at the nodes of each dwell. Channel i's rows are divided by the sigma of a white reading
-    that averages like the true one; the setting error (three rotations) and the scatter (three offsets) enter as states
-    with their priors, linearised at ``state``. What a dwell's rows leave over among themselves is not in the result.
-    ``about`` (p,): z is the readings less what the model reads there, and states solved for count from it. A reading of
-    size g is 1e6 sigma and more: its rounding is then no longer the largest error of whatever follows.
-    ``flicker_mps2`` (3,): sqrt(h) of 1/f noise of density h / f, whose slow parts within a dwell are states, too.
-    ``reduced``: to as few rows as the columns have rank; else all are there, which is faster where columns are many.
+    - columns: the model's columns at the nodes of each dwell, (pieces, K, 3, p) each.
+    - about (p,): if given, z is the readings less the model's prediction from this state, and the solution is a
+      correction to it. Readings of size g exceed their sigma by a factor of 1e6 or more, so that this keeps their
+      rounding from being the largest error of later computations.
+    - flicker_mps2 (3,): sqrt(h) of 1/f noise with spectral density h / f; its slow components within a dwell are
+      nuisance states, too.
+    - reduced: reduce the rows to the rank of their columns. Without it all rows are returned, which is faster if there
+      are many columns.
     """
     inside = 3 if noise.walk_mps2_per_sqrt_s else 0
     informative = np.append(np.ones(inside), _units(columns)) if reduced else None
@@ -65,7 +72,8 @@ def whiten(
 
 
 def _batches(dwells: Sequence[DwellFactor], width: int) -> Iterator[list[int]]:
-    """Places of dwells whose rows are of one shape, as many at once as leave their ``width`` columns in the cache."""
+    """Group the indices of dwells whose rows have one shape, limited so that their ``width`` columns fit into the
+    cache."""
     for places in alike(dwells):
         first = dwells[places[0]]
         most = max(_AT_ONCE // (3 * len(first.pieces) * first.width * (width + 1)), 1)
@@ -80,9 +88,11 @@ def _weighted(
     about: Floats | None,
     flicker_mps2: Floats | None,
 ) -> tuple[Floats, int]:
-    """Rows [nuisances | S | H | z] of unit noise of dwells of one shape (d, r, n), and how many nuisances they have.
+    """Return the whitened rows [nuisances | S | H | z] (d, r, n) of dwells of one shape, and the number of nuisance
+    columns.
 
-    ``columns`` (d, pieces, K, 3, p). The rows of the channels come one after another, then those of the priors.
+    ``columns`` is (d, pieces, K, 3, p). The rows of the three channels follow one another; the rows of the priors come
+    last.
     """
     sigma, sigmas = noise.effective_sigma_mps2, noise.dwell_sigmas
     used, slow = np.flatnonzero(sigmas > 0), 0 if flicker_mps2 is None else len(_SLOW)
@@ -119,7 +129,7 @@ def _weighted(
 
 
 def _less(rows: Floats, count: int) -> Floats:
-    """Rows (d, r, n) without the first ``count`` columns, projected off them."""
+    """Project rows (d, r, n) off their first ``count`` columns and drop these columns."""
     nuisances = np.linalg.qr(rows[..., :count])[0]
     return rows[..., count:] - nuisances @ (np.swapaxes(nuisances, 1, 2) @ rows[..., count:])
 
@@ -132,10 +142,12 @@ def misfit_rows(
     width: int,
     reduced: bool = True,
 ) -> tuple[list[Floats], int]:
-    """Rows [H | W | G | z] by which a misfit is judged, and how many columns come before G (of the first ``width``: H).
+    """Rows [H | W | G | z] by which the misfit is judged, and the number of columns before G; H is the first ``width``
+    columns.
 
-    W: what a stated scatter may have in common in dwells that follow each other (``noise_model.slow_scatter``); its
-    coefficients have a prior, the rows of which come first. Within dwells it may go on as 1/f noise does.
+    W are columns for the slow part of a stated scatter, which consecutive dwells have in common
+    (``noise_model.slow_scatter``). Their coefficients have a prior, whose rows come first in the list. Within a dwell
+    the slow components of 1/f noise are nuisance states.
     """
     slow, sigma = slow_scatter(dwells, noise)
     if not sigma.size:
@@ -160,22 +172,24 @@ def misfit_columns(dwells: Sequence[DwellFactor], columns: Sequence[Floats], noi
 
 
 def _waves(dwell: DwellFactor) -> Floats:
-    """sqrt(2) cos(pi k t / T) over a dwell of length T, (pieces, nodes, k)."""
+    """Return sqrt(2) cos(pi k t / T) over a dwell of length T at its nodes, (pieces, nodes, k)."""
     at = np.array([piece.nodes.elapsed_s for piece in dwell.pieces]) - dwell.start_s
     return np.sqrt(2.0) * np.cos(np.pi * _SLOW * (at / max(dwell.end_s - dwell.start_s, 1e-9))[..., None])
 
 
 def _units(columns: Sequence[Floats]) -> Floats:
-    """The largest each column becomes in the run (p,); one figure for all sensitivities."""
+    """Return the largest absolute value (p,) of each column in the run, with one common value for all sensitivities and
+    1 for the biases."""
     largest = np.max([np.abs(own).max(axis=(0, 1, 2)) for own in columns], axis=0)
     largest[:STATE_COUNT] = np.tile([*[largest[:STATE_COUNT].max()] * 3, 1.0], 3)
     return np.where(largest > 0, largest, 1.0)
 
 
 def _informative(rows: Floats, units: Floats) -> list[Floats]:
-    """Of rows [H | z] of dwells (d, r, n) as few as H has rank: what the rows leave over is split off.
+    """Reduce rows [H | z] of dwells (d, r, n) to as many rows as H has rank, and drop the residuals.
 
-    A still dwell has rank 3. By SVD: QR would spread the residuals over rows that columns of rounding size lead.
+    A dwell without motion has rank 3. An SVD is used because QR would spread the residuals over rows in which only
+    columns of rounding size are nonzero.
     """
     left, singular, _ = np.linalg.svd(rows[..., :-1] / units, full_matrices=False)
     ranks = (singular > 1e-9 * singular[:, :1]).sum(axis=1)
@@ -186,8 +200,12 @@ def _informative(rows: Floats, units: Floats) -> list[Floats]:
 
 @dataclass(frozen=True)
 class FilterStep:
-    """The filter after one dwell and its slew: factor [R | z] (p, p + 1); the dwell's normalised innovation squared and
-    its degrees of freedom."""
+    """The filter after one dwell and the slew that follows it.
+
+    - factor (p, p + 1): the factor [R | z].
+    - nis: the normalised innovation squared of the dwell.
+    - dof: the degrees of freedom of ``nis``.
+    """
 
     factor: Floats
     nis: float
@@ -195,14 +213,15 @@ class FilterStep:
 
 
 def prior_covariance(prior: Prior, model: Model) -> Floats:
-    """Covariance (p, p) of a stated prior about the nominal parameters; effects have the scale of their kind."""
+    """Covariance (p, p) of a stated prior about the nominal parameters; the sigma of each effect's coefficient is its
+    ``scale``."""
     out = np.diag([0.0] * STATE_COUNT + [coefficient.scale**2 for coefficient in model.coefficients])
     out[:STATE_COUNT, :STATE_COUNT] = prior.covariance(paper_parameters.nominal(model.bench.nominal))
     return out
 
 
 def start(prior: Prior, model: Model) -> Floats:
-    """The factor [R | z] (p, p + 1) of a prior about the nominal parameters and no effect; zeros for a diffuse one."""
+    """Factor [R | z] (p, p + 1) of the prior about the nominal parameters and no effects; zeros for a diffuse prior."""
     if prior.diffuse:
         return np.zeros((model.count, model.count + 1))
     root = np.linalg.inv(np.linalg.cholesky(prior_covariance(prior, model)))
@@ -210,9 +229,12 @@ def start(prior: Prior, model: Model) -> Floats:
 
 
 def update(factor: Floats, rows: Floats, walked: Floats = _STILL) -> tuple[Floats, float]:
-    """Time and measurement update with whitened rows (m, s + p + 1): the factor, and the normalised innovation squared.
+    """Time and measurement update with whitened rows (m, s + p + 1): the new factor and the normalised innovation
+    squared.
 
-    ``walked`` (2,): variances of the biases' steps in the pause before the dwell and in the dwell.
+      without a walk: QR of [R | z] stacked on the rows gives [R+ | z+] stacked on [0 | e],  NIS = e' e
+
+    ``walked`` (2,) are the variances of the biases' steps in the pause before the dwell and within the dwell.
     """
     width, (upper, count) = len(factor), random_walk.advance(factor, walked, rows)
     left = upper[count + width :, -1]
@@ -220,24 +242,31 @@ def update(factor: Floats, rows: Floats, walked: Floats = _STILL) -> tuple[Float
 
 
 def restrict(factor: Floats, kept: Sequence[int]) -> Floats:
-    """The factor [R | z] (k, k + 1) of the states ``kept``, in that order, the others held at zero: one small QR.
+    """Factor [R | z] (k, k + 1) of the states with indices ``kept``, in that order, with all other states fixed at
+    zero.
 
-    What a filter carries of effects that are not in its model is conditioned away, and is there when they are added.
+    A filter may carry effects that are not in its model. This conditions on their absence by one small QR; the full
+    factor remains available for when they are added.
     """
     return triangle(factor[:, [*kept, -1]])[: len(kept)]
 
 
 def row_rank(rows: Floats) -> int:
-    """How many rows [H | z] of a dwell carry something of the model."""
+    """Number of rows [H | z] of a dwell that depend on the states."""
     return int(rows[:, :-1].any(axis=1).sum())
 
 
 def run(
     first: Floats, rows: Iterable[Floats], walked: Iterable[Floats], following: Iterable[Floats]
 ) -> list[FilterStep]:
-    """The recursion over dwells, ``walked`` the variances of the biases' steps of each; rows ``following`` of its slew.
+    """Run the filter over all dwells and return its state after each.
 
-    A step's factor is that after the slew, its innovation that of the dwell.
+    - first: the factor of the prior.
+    - rows: the whitened rows of each dwell.
+    - walked: the variances (2,) of the biases' steps before and within each dwell.
+    - following: the whitened rows of the slew after each dwell, which may be empty.
+
+    A step's factor is the one after the slew; its innovation is that of the dwell alone.
     """
     factors, after, told = [first], list[Floats](), list[tuple[float, int]]()
     for dwell_rows, variances, more in zip(rows, walked, following, strict=True):
@@ -253,10 +282,10 @@ def run(
 
 
 def accumulate(rows: Sequence[Floats], walked: Floats | None = None) -> Floats:
-    """The triangle [H | z] of all rows (a diffuse prior), the residual in its last row.
+    """Triangular factor [H | z] of all rows with a diffuse prior; the last row holds the norm of the residual.
 
-    ``walked`` (D, 2): variances of the biases' steps before and in each dwell, the last D of the rows; without a walk
-    all rows are folded at once.
+    ``walked`` (D, 2) are the variances of the biases' steps before and within each dwell; the dwells' rows are the last
+    D in ``rows``. Without a walk all rows are reduced by one QR.
     """
     if walked is None or not walked.any():
         stacked = rows[0] if len(rows) == 1 else np.concatenate(rows)
@@ -272,9 +301,9 @@ def accumulate(rows: Sequence[Floats], walked: Floats | None = None) -> Floats:
 
 
 def scale_columns(factor: Floats) -> tuple[Floats, Floats]:
-    """R (..., p, p) of a factor in units in which its columns are of the same order, and those units (..., p).
+    """R (..., p, p) of a factor with its columns scaled to a similar size, and the scales (..., p).
 
-    One unit for all sensitivities and one for all biases: a column of rounding size must stay small.
+    All sensitivities share one scale and all biases another, so that a column of rounding size remains small.
     """
     size = np.linalg.norm(factor[..., :-1], axis=-2)
     twelve = size[..., :STATE_COUNT].reshape(*size.shape[:-1], 3, 4)
@@ -286,26 +315,29 @@ def scale_columns(factor: Floats) -> tuple[Floats, Floats]:
 
 
 def rank(factor: Floats, tolerance: float = 1e-9) -> int:
-    """How many combinations of the states the factor determines."""
+    """Number of combinations of states that the factor determines: the rank of R."""
     return int(ranks(factor, tolerance))
 
 
 def ranks(factors: Floats, tolerance: float = 1e-9) -> NDArray[np.intp]:
-    """The same of many factors (..., p, p + 1)."""
+    """Ranks (...) of many factors (..., p, p + 1), as ``rank``."""
     singular = np.linalg.svd(scale_columns(factors)[0], compute_uv=False)
     return np.asarray((singular > tolerance).sum(axis=-1))
 
 
 def solve(factor: Floats, around: Floats, tolerance: float = 1e-9) -> tuple[Floats, Floats, Floats]:
-    """State (p,), covariance (p, p) and a basis (p, q) of the combinations not determined.
+    """State (p,), covariance (p, p) and a basis (p, q) of the combinations of states that are not determined.
 
-    Undetermined combinations keep their value ``around``; their variance is not in the covariance.
+      x = R^-1 z,  P = R^-1 R^-T
+
+    Combinations that are not determined keep their value in ``around`` (p,), and the covariance does not include their
+    variance. ``tolerance`` is the singular value of the scaled R below which a combination is not determined.
     """
     return solve_all(factor[None], around, tolerance)[0]
 
 
 def solve_all(factors: Floats, around: Floats, tolerance: float = 1e-9) -> list[tuple[Floats, Floats, Floats]]:
-    """The same of many factors (n, p, p + 1)."""
+    """Solve many factors (n, p, p + 1); each result is as in ``solve``."""
     upper, scale = scale_columns(factors)
     left, singular, right = np.linalg.svd(upper)
     seen = singular > tolerance
