@@ -52,9 +52,8 @@ def live_object(judgement: Judgement, standing: Standing, status: Status | None)
 
 def _going(judgement: Judgement) -> dict[str, Any] | None:
     """What the look advises, or while nothing is beyond chance what sharpens the sigmas."""
-    advised = judgement.look.going if judgement.final or judgement.alarm else None
-    if advised is not None:
-        return orientation_object(*advised)
+    if judgement.advised is not None:
+        return orientation_object(*judgement.advised)
     going = None if judgement.final else judgement.next_orientation
     return None if going is None else {"gimbal_deg": list(going[0]), "stay_s": None, "why": going[1]}
 
