@@ -173,15 +173,15 @@ class Judgement:
         return f"orientation {dwell} disagrees: accelerometer {channel} by {ratio:+.1f} sigma; {named}"
 
     @property
-    def advised(self) -> tuple[Advice, str] | None:
+    def advice(self) -> tuple[Advice, str] | None:
         """Where to go next because of what is missing, and why; None while nothing is beyond chance."""
         return self.found.next_orientation if self.final or self.alarm else None
 
     @cached_property
     def next_orientation(self) -> tuple[tuple[float, ...], str] | None:
         """Gimbal angles, deg, and why: what tells suspects apart, else what sharpens the worst sigma."""
-        if self.advised is not None:
-            return self.advised[0].gimbal_deg, self.advised[1]
+        if self.advice is not None:
+            return self.advice[0].gimbal_deg, self.advice[1]
         if self.course is None:
             return None
         symbol, fall = self.course.sharpened(self.worst)

@@ -52,8 +52,8 @@ def live_object(judgement: Judgement, standing: Standing, status: Status | None)
 
 def _going(judgement: Judgement) -> dict[str, Any] | None:
     """What the look advises, or while nothing is beyond chance what sharpens the sigmas."""
-    if judgement.advised is not None:
-        return orientation_object(*judgement.advised)
+    if judgement.advice is not None:
+        return orientation_object(*judgement.advice)
     going = None if judgement.final else judgement.next_orientation
     return None if going is None else {"gimbal_deg": list(going[0]), "stay_s": None, "why": going[1]}
 

@@ -15,7 +15,7 @@ from helpers.paths import SHARED
 from helpers.synthetic import Run, plan_of
 
 from kf_calib.cli import cli
-from kf_calib.diagnosis import candidate_tests
+from kf_calib.diagnosis import candidate_tests, results
 from kf_calib.diagnosis.candidate_tests import EQUAL, assess_candidates, chance_fall, independent_tests
 from kf_calib.diagnosis.detectability import detectable
 from kf_calib.diagnosis.missing_effect import diagnose
@@ -70,6 +70,19 @@ def test_what_is_in_no_catalogue_is_unknown(name: str, driver: str) -> None:
     shown = diagnosis_object(found)
     assert shown["missing"] == "unknown" and shown["unknown"]["formula"] == shape.formulas[0]
     assert assess_candidates(with_effects(found.before, shape.formulas).fit).consistent
+
+
+def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Object and report read what the diagnosis has worked out once: without its functions they say the same."""
+    from kf_calib.views.console import plain
+    from kf_calib.views.diagnosis import diagnosis_object, diagnosis_report
+
+    found = diagnose(run("encoder-harmonic-3:z=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
+    shown, printed = diagnosis_object(found), plain(diagnosis_report(found))
+    assert shown["unknown"] and shown["detectable"] and "To try:" in printed
+    for name in ("describe", "detectable", "advise", "mean_covariances"):
+        monkeypatch.delattr(results, name)
+    assert diagnosis_object(found) == shown and plain(diagnosis_report(found)) == printed
 
 
 def test_a_formula_that_explains_more_than_a_known_effect_speaks_against_it() -> None:
