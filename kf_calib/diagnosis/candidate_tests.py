@@ -23,6 +23,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import consistency
 from kf_calib.estimation.score_test import Candidate, Frame, Scan
 from kf_calib.support import stage
+from kf_calib.support.tail_probabilities import sidak
 
 LEVEL = 0.01
 """Probability of a false alarm in one run."""
@@ -209,14 +210,14 @@ def assess_candidates(
         if name not in best or score > scores.get(name, -np.inf):
             best[name] = k
             if candidate.dof:
-                own = run_level(float(chdtrc(candidate.dof, statistics[k])), candidate.tried)
-                scores[name], p_values[name] = score, run_level(own, tests)
+                own = sidak(float(chdtrc(candidate.dof, statistics[k])), candidate.tried)
+                scores[name], p_values[name] = score, sidak(own, tests)
     name, paths = _walking(fitted), 0.0
     if name:
         # The likelihood uses the chi-squared of the dwells' means. Where the misfit is huge, that exceeds the
         # chi-squared of the scan by up to one per cent, which must not count for the walk.
         fall = max(2.0 * fitted.walk_gain - max(fitted.misfit - agreed.statistic, 0.0), 0.0)
-        p_values[name] = run_level(0.5 * float(chdtrc(1, fall)), tests)
+        p_values[name] = sidak(0.5 * float(chdtrc(1, fall)), tests)
         beyond = fall - threshold(1, tests)
         paths = _beside_best(found, scores, tests) if beyond > 0.0 else 0.0
         scores[name] = beyond + paths
@@ -327,11 +328,6 @@ def independent_tests(found: Scan, seed: int = 0) -> float:
     if not len(seen):
         return 1.0
     return LEVEL / max(float(np.quantile(_smallest_p(found, seen, seed), LEVEL)), 1e-12)
-
-
-def run_level(p_value: float, tests: float) -> float:
-    """The family-wise p-value 1 - (1 - p)^n: the chance that any of n independent tests gives p or less (Šidák)."""
-    return float(-np.expm1(tests * np.log1p(-min(p_value, 1.0 - 1e-16))))
 
 
 def _smallest_p(found: Scan, seen: NDArray[np.intp], seed: int) -> Floats:

@@ -15,8 +15,6 @@ from os import PathLike
 import numpy as np
 
 from kf_calib.bench.streams import Source
-from kf_calib.design import next_orientation as advise
-from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.bayes_factor import as_fall
 from kf_calib.diagnosis.candidate_tests import (
     EQUAL,
@@ -377,27 +375,3 @@ def _suspects(before: Calibration, test: CandidateTests) -> tuple[Suspect, ...]:
         known = tuple(before.parameters)[12:]
         out.append(Suspect(name, statistic, dof, test.p_values[name], fits_the_run(refit, test), refit, known))
     return tuple(out)
-
-
-def next_orientation(found: Diagnosis) -> tuple[Advice, str] | None:
-    """The orientation to visit next and the reason in words, or None where no orientation would help.
-
-    Look-alikes are to be told apart; a single suspect is to be measured best; with no suspect, as many invisible
-    effects as possible are to be made visible.
-    """
-    fitted, test = (found.judged or found.before).fit, found.test
-    named = [name for name in found.ambiguity if name in test.best]
-    if named and not found.unknown:
-        first = test.candidate(named[0])
-        rivals = [test.candidate(name).effect for name in named[1:5]] if len(found.missing) == 1 else []
-        advice = advise.to_tell_apart(fitted, first.effect, test.scan.coefficients(first), rivals)
-        if advice is None:
-            return None
-        words = f"tells {named[0]} from {', '.join(advice.told)}" if advice.told else f"shows {named[0]} best"
-        stay = "" if advice.stay_s is None else f" in {advice.stay_s / 60.0:.0f} min there"
-        return advice, f"{words}: separation {advice.before:.1f} -> {advice.after:.1f} sigma{stay}"
-    hidden = [test.candidate(name).effect for name in test.invisible if name in test.best]
-    shown = advise.to_show(fitted, hidden)
-    if shown is None or not shown[1]:
-        return None
-    return shown[0], f"would show {shown[1]} of {len(hidden)} effects that these orientations cannot"

@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 
-from kf_calib.diagnosis.candidate_tests import EQUAL, LEVEL, SHARE, CandidateTests, assess_candidates, run_level
+from kf_calib.diagnosis.candidate_tests import EQUAL, LEVEL, SHARE, CandidateTests, assess_candidates
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.fit import loss_within_range
 from kf_calib.estimation.results import Calibration
+from kf_calib.support.tail_probabilities import sidak
 
 _REFUSED = 0.002  # probability that the effect that is missing is rejected because of noise in the rest of the misfit
 _NEARLY = 2.71  # rise of chi-squared that is not significant for one constant (10 %)
@@ -61,7 +62,7 @@ def _no_walk(refit: Calibration) -> bool:
 
     steps = np.array([visit.innovation_mps2 / visit.innovation_sigma_mps2 for visit in refit.visits])
     steps = np.abs(steps[np.isfinite(steps)])
-    leaps = bool(steps.size and run_level(2.0 * float(ndtr(-steps.max())), steps.size) < LEVEL)
+    leaps = bool(steps.size and sidak(2.0 * float(ndtr(-steps.max())), steps.size) < LEVEL)
     return leaps or 2.0 * refit.fit.back_gain[0] > EQUAL
 
 

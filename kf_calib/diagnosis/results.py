@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.design import next_orientation as advise
+from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import CandidateTests
+from kf_calib.diagnosis.detectability import Detectable, detectable
+from kf_calib.diagnosis.unknown_effect import Description, describe
 from kf_calib.estimation.calibration import refitted
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration, Parameter
@@ -76,12 +81,45 @@ class Diagnosis:
     def __str__(self) -> str:
         return printed(self)
 
-    @property
+    @cached_property
     def residual_ratios(self) -> Floats:
         """Residuals of the dwell means (D, 3), over their sigma."""
         carried = self.before.carried
         spread = mean_covariances(self.before.noise.judging, carried.means, carried.state)
         return self.before.residuals_mps2 / np.sqrt(np.einsum("dii->di", spread))
+
+    @cached_property
+    def description(self) -> Description | None:
+        """What an unknown misfit looks like; None where the misfit is known (one dwell, too), or there is none."""
+        if not self.unknown or self.before.outlying:
+            return None
+        return describe(self.before.fit, self.before.residuals_mps2, self.test.trend)
+
+    @cached_property
+    def detectable(self) -> list[Detectable]:
+        """The smallest size of every visible effect that such a run would find."""
+        return detectable(self.test)
+
+    @cached_property
+    def next_orientation(self) -> tuple[Advice, str] | None:
+        """Where to go next, and why: to tell equal suspects apart, to size the one there is, or to show what is
+        hidden."""
+        fitted, test = (self.judged or self.before).fit, self.test
+        named = [name for name in self.ambiguity if name in test.best]
+        if named and not self.unknown:
+            first = test.candidate(named[0])
+            rivals = [test.candidate(name).effect for name in named[1:5]] if len(self.missing) == 1 else []
+            advice = advise.to_tell_apart(fitted, first.effect, test.scan.coefficients(first), rivals)
+            if advice is None:
+                return None
+            words = f"tells {named[0]} from {', '.join(advice.told)}" if advice.told else f"shows {named[0]} best"
+            stay = "" if advice.stay_s is None else f" in {advice.stay_s / 60.0:.0f} min there"
+            return advice, f"{words}: separation {advice.before:.1f} -> {advice.after:.1f} sigma{stay}"
+        hidden = [test.candidate(name).effect for name in test.invisible if name in test.best]
+        shown = advise.to_show(fitted, hidden)
+        if shown is None or not shown[1]:
+            return None
+        return shown[0], f"would show {shown[1]} of {len(hidden)} effects that these orientations cannot"
 
     def refit_with(self, name: str) -> Calibration:
         """The calibration with this effect added; that of a suspect is not computed again."""

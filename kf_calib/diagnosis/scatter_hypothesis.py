@@ -18,7 +18,6 @@ from kf_calib.diagnosis.candidate_tests import (
     CandidateTests,
     evidence_as_fall,
     joint_evidence_as_fall,
-    run_level,
     threshold,
     values_of,
 )
@@ -26,6 +25,7 @@ from kf_calib.estimation.calibration import refitted
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.reml import FEWEST
 from kf_calib.estimation.results import Calibration
+from kf_calib.support.tail_probabilities import sidak
 
 
 def explains_more_than_scatter(
@@ -123,7 +123,7 @@ def passes_f_test(before: Calibration, test: CandidateTests, names: Sequence[str
     if freedom <= 0:
         return False
     rest = max(misfit.statistic - fall, 1e-9 * misfit.statistic)
-    return run_level(float(fdtrc(dof, freedom, fall / dof / (rest / freedom))), test.effective_tests) < LEVEL
+    return sidak(float(fdtrc(dof, freedom, fall / dof / (rest / freedom))), test.effective_tests) < LEVEL
 
 
 def dwell_noise_is_stated(before: Calibration) -> bool:

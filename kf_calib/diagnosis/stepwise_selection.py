@@ -26,7 +26,7 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.effects import as_text, effect_named, merged, refuse_unknown
 from kf_calib.errors import InputError
 from kf_calib.estimation import square_root_information
-from kf_calib.estimation.calibration import refitted
+from kf_calib.estimation.calibration import evaluate_fit, refitted
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 
@@ -169,6 +169,14 @@ class Improvement:
     def removals(self) -> tuple[Removal, ...]:
         """The test of removing each effect of the current model."""
         return self.steps[-1].removals if self.steps else removals(self.result.fit)
+
+    @cached_property
+    def warnings(self) -> list[str]:
+        """What was said of the recording, and of the last model."""
+        first = self.start.before
+        of_models = evaluate_fit(first.fit, first.settings).warnings
+        said = [sentence for sentence in first.warnings if sentence not in of_models]
+        return [*said, *self.result.warnings]
 
     @property
     def because(self) -> Because:

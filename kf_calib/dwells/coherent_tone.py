@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.dwells.line_spectrum import Line, independent
+from kf_calib.support.tail_probabilities import sidak
 
 _CELL_S = 0.125  # largest length of a cell, unless readings are less frequent
 _LONGEST = 1 << 15  # cells of a dwell that are kept at most: more than an hour
@@ -169,7 +170,7 @@ def tone(traces: Sequence[Trace], level: float = 0.01) -> Line | None:
     tall = np.argsort(height)[-_TALL:]
     chances = fdtrc(freedom, freedom / variance[tall], height[tall])
     k, chance = int(tall[np.argmin(chances)]), float(chances.min())
-    p_value = float(-np.expm1(len(height) * np.log1p(-min(chance, 1.0 - 1e-16))))
+    p_value = sidak(chance, len(height))
     if p_value >= level or not _steady(seen, frequency_hz[k], levels[:, k] * kept[k], moving):
         return None
     held = kept[k] * np.sinc(frequency_hz[k] * cell_s) * sum(float(trace.counts.sum()) for trace in seen)

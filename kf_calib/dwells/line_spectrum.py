@@ -15,6 +15,7 @@ from functools import lru_cache, reduce
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.support.tail_probabilities import sidak
 
 _LENGTHS = np.array(sorted([4000, *(2**k for k in range(6, 12)), *(3 * 2**k for k in range(5, 11))]))
 _FIRST_BIN = 3  # in lower bins the parabola has removed the power
@@ -132,7 +133,7 @@ class _Search:
         bins = len(self.height) - _FIRST_BIN - 1
         while open_.any() and len(found) < _MOST:
             k = int(np.argmax(np.where(open_, self.height, 0.0)))
-            p_value = float(-np.expm1(bins * np.log1p(-min(self._chance(k), 1 - 1e-16))))
+            p_value = sidak(self._chance(k), bins)
             if p_value >= level:
                 break
             line, place = self._line(k, p_value)

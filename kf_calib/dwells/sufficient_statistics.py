@@ -17,13 +17,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.coherent_tone import Cells, Trace, tone
 from kf_calib.dwells.line_spectrum import Line, Spectrum, lines
+from kf_calib.dwells.orthonormal_parabola import orthonormal_parabola
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.rows import Nodes, Rows, basis, parabola
 from kf_calib.dwells.walk_path import WalkPath, walk_path_of
@@ -274,16 +275,10 @@ def fold(rows: Rows, carrier_hz: float = 0.0) -> tuple[Piece, ...]:
 def less_curve(innovation: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -> Floats:
     """Innovations (3, n) with their parabola removed and, on a carrier, also its oscillating basis functions."""
     count = innovation.shape[1]
-    curve = _parabola(count)
+    curve = orthonormal_parabola(count)
     if carrier_hz:
         curve = np.linalg.qr(basis(np.linspace(-1.0, 1.0, count), elapsed_s, carrier_hz).T)[0]
     return innovation - (innovation @ curve) @ curve.T
-
-
-@lru_cache(maxsize=4)
-def _parabola(count: int) -> Floats:
-    """Return an orthonormal basis (n, 3) of 1, u, u^2."""
-    return np.linalg.qr(basis(np.linspace(-1.0, 1.0, count)).T)[0]
 
 
 def _folded(stacked: Floats) -> Floats:

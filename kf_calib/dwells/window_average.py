@@ -18,6 +18,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.blocks import Block
 from kf_calib.dwells.line_spectrum import Line
+from kf_calib.dwells.orthonormal_parabola import orthonormal_parabola
 
 WINDOW_S = 1.0
 """Default length of a window, s."""
@@ -71,8 +72,7 @@ def averaged(block: Block, length_s: float = WINDOW_S) -> Block | None:
     def means(values: Floats) -> Floats:
         return np.asarray(sliding_window_view(values, length, axis=0)[::step] @ weights)
 
-    u = np.linspace(-1.0, 1.0, count)
-    curve = np.linalg.qr(np.column_stack([np.ones(count), u, u * u]))[0]
+    curve = orthonormal_parabola(count)
     level = block.accel_mps2.mean(axis=0)
     left = block.accel_mps2 - level
     shaking = left - curve @ (curve.T @ left)

@@ -124,7 +124,8 @@ def _sight(found: Scan, effect: Effect) -> Visibility:
         return Visibility(effect, None, why="is noise of the biases, not a column: fit it to see it")
     own = [each for each in found.candidates if str(each.effect) == str(effect)]
     tests = len({str(each.effect) for each in found.candidates if each.dof})
-    sized = [(smallest_size(each, tests), each) for each in own]
+    chance = 0.5 * LEVEL / max(tests, 1)  # half: the misfit as a whole is tested beside
+    sized = [(smallest_size(each, chance), each) for each in own]
     size, best = min(sized, key=lambda pair: np.inf if pair[0] is None else pair[0][1])
     if not best.dof:
         return Visibility(best.effect, 0.0)
@@ -138,16 +139,21 @@ def _sight(found: Scan, effect: Effect) -> Visibility:
     return Visibility(best.effect, min(best.visibility, 1.0), tuple(unseen), size, tuple(near))
 
 
-def smallest_size(candidate: Candidate, tests: int) -> tuple[Coefficient, float] | None:
-    """The coefficient that is hardest to detect among ``tests`` effects, and the size (SI) that is found in 9 of 10
-    runs; None if none is determined."""
+def smallest_size(candidate: Candidate, chance: float) -> tuple[Coefficient, float] | None:
+    """The coefficient that is hardest to detect, and the size (SI) that is found in 9 of 10 runs; None if none is
+    determined.
+
+    An effect is found where it lowers chi-squared by more than c, P(chi2(k) > c) = ``chance``, k its degrees of
+    freedom. A coefficient of size a, whose column g is in units of the noise, lowers it by a noncentral chi-squared;
+    so a = sqrt(l) / |g|, l being the noncentrality with P(chi2(k, l) > c) = 0.9.
+    """
     from scipy.special import chdtri, chndtrinc
 
     sizes: Floats = np.linalg.norm(candidate.columns, axis=0)
     seen = np.flatnonzero(~candidate.hidden & (sizes > 0))
     if not (candidate.dof and seen.size):
         return None
-    threshold = float(chdtri(candidate.dof, 0.5 * LEVEL / tests))  # half, since the misfit as a whole is tested, too
+    threshold = float(chdtri(candidate.dof, chance))
     worst = int(seen[np.argmin(sizes[seen])])
     needed = float(np.sqrt(chndtrinc(threshold, candidate.dof, 1.0 - POWER)))
     return candidate.effect.coefficients[worst], needed / float(sizes[worst])

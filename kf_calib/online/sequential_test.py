@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from kf_calib.bench.bench import Bench
-from kf_calib.diagnosis.candidate_tests import LEVEL, REST, SHARE, candidates, chance_fall, independent_tests, run_level
+from kf_calib.diagnosis.candidate_tests import LEVEL, REST, SHARE, candidates, chance_fall, independent_tests
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend_beside
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect
@@ -26,6 +26,7 @@ from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.running_filter import Running
+from kf_calib.support.tail_probabilities import sidak
 from kf_calib.support.threads import one_blas_thread
 
 _GROWN = 1.25
@@ -100,7 +101,7 @@ class Watch:
             return None
         scan = self.running.scan
         own = [float(chdtrc(c.dof, x)) for c, x in zip(scan.candidates, scan.statistics, strict=True) if c.dof]
-        found = [float(chdtrc(dof, statistic)), *([run_level(min(own), self.tests)] if own else [])]
+        found = [float(chdtrc(dof, statistic)), *([sidak(min(own), self.tests)] if own else [])]
         going = self.trend
         found += [going.p_value * SHARE / REST] if going else []
         return min(1.0, min(found) / SHARE)

@@ -20,7 +20,7 @@ from kf_calib.bench.streams import Source
 from kf_calib.design.gimbal_limits import wrapped
 from kf_calib.design.next_orientation import Advice, Course, course
 from kf_calib.diagnosis.candidate_tests import LEVEL, assess_candidates
-from kf_calib.diagnosis.missing_effect import diagnose, next_orientation
+from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.calibration import conclude, evaluate, with_remarks
@@ -61,11 +61,6 @@ class Look:
         """The diagnosis, or without an alarm a statement that nothing is significant so far."""
         return self.diagnosed or _not_judged(self.result, self.watch)
 
-    @cached_property
-    def going(self) -> tuple[Advice, str] | None:
-        """The orientation to visit next and the reason in words, or None."""
-        return next_orientation(self.found)
-
     @property
     def settled(self) -> bool:
         """Whether enough looks in a row agree, of enough dwells.
@@ -90,10 +85,11 @@ class Look:
 
     def _is_followed(self, result: Calibration) -> bool:
         """Tell whether the platform has visited the orientation that this look advised."""
-        if self.going is None:
+        going = self.found.next_orientation
+        if going is None:
             return False
         poses = np.array([visit.dwell.pose for visit in result.visits[len(self.result.visits) :]])
-        apart = np.abs(wrapped(poses - np.radians(self.going[0].gimbal_deg)))
+        apart = np.abs(wrapped(poses - np.radians(going[0].gimbal_deg)))
         return bool((apart.max(axis=1) < np.radians(SAME_POSE_DEG)).any()) if len(poses) else False
 
 
@@ -188,15 +184,19 @@ class Judgement:
             named = f"missing: {' and '.join(self.suspects)}"
         return f"orientation {dwell} disagrees: accelerometer {channel} by {ratio:+.1f} sigma; {named}"
 
+    @property
+    def advice(self) -> tuple[Advice, str] | None:
+        """Where to go next because of what is missing, and why; None while nothing is beyond chance."""
+        return self.found.next_orientation if self.final or self.alarm else None
+
     @cached_property
     def next_orientation(self) -> tuple[tuple[float, ...], str] | None:
         """Gimbal angles of the next orientation in deg, and the reason; None where there is no advice.
 
         With suspects it tells them apart, else it reduces the worst sigma.
         """
-        going = self.look.going if self.final or self.alarm else None
-        if going is not None:
-            return going[0].gimbal_deg, going[1]
+        if self.advice is not None:
+            return self.advice[0].gimbal_deg, self.advice[1]
         if self.course is None:
             return None
         symbol, fall = self.course.sharpened(self.worst)

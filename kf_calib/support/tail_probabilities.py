@@ -1,4 +1,5 @@
-"""The chance that an F or a chi-squared distribution exceeds a value: every run needs these two numbers.
+"""The chance that an F or a chi-squared distribution exceeds a value: every run needs these two numbers. And
+what it becomes where it is the smallest of many.
 
 ``scipy.special.fdtrc`` gives it too, but takes longer to import than a short recording to evaluate, and of its digits
 half are lost where the noise is known to 1e9 degrees of freedom.
@@ -7,6 +8,8 @@ half are lost where the noise is known to 1e9 degrees of freedom.
 from __future__ import annotations
 
 import math
+
+import numpy as np
 
 _ENOUGH = 4e-16
 _KNOWN = 1e18  # degrees of freedom of noise that is as good as known
@@ -37,6 +40,11 @@ def f_tail(freedom: float, noise_freedom: float, ratio: float) -> float:
 def chi_squared_tail(freedom: float, value: float) -> float:
     """Chance that chi-squared with so many degrees of freedom exceeds ``value``: F of noise that is known."""
     return f_tail(freedom, _KNOWN, value / freedom)
+
+
+def sidak(p_value: float, tests: float) -> float:
+    """The chance that any of ``tests`` independent tests shows a p-value as small: 1 - (1 - p)^n (Sidak 1967)."""
+    return float(-np.expm1(tests * np.log1p(-min(p_value, 1.0 - 1e-16))))
 
 
 def _fraction(a: float, b: float, x: float, away: float) -> float:

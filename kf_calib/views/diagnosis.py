@@ -10,10 +10,9 @@ from rich.text import Text
 
 from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import LEVEL
-from kf_calib.diagnosis.detectability import Detectable, detectable
-from kf_calib.diagnosis.missing_effect import next_orientation
+from kf_calib.diagnosis.detectability import Detectable
 from kf_calib.diagnosis.results import Diagnosis, Suspect
-from kf_calib.diagnosis.unknown_effect import Description, describe
+from kf_calib.diagnosis.unknown_effect import Description
 from kf_calib.diagnosis.within_dwell_trend import Trend
 from kf_calib.estimation.results import format_p
 from kf_calib.support.printing import printed
@@ -23,22 +22,14 @@ from kf_calib.views.tables import Table
 from kf_calib.views.terminal import note
 
 
-def description(found: Diagnosis) -> Description | None:
-    """Description of a misfit that no known effect explains; None for every other diagnosis."""
-    if not found.unknown or found.before.outlying:
-        return None
-    return describe(found.before.fit, found.before.residuals_mps2, found.test.trend)
-
-
 def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
     """The JSON object of ``diagnose``; its p-values are family-wise."""
-    going = next_orientation(found)
+    going = found.next_orientation
     return found_object(found) | {"next_orientation": None if going is None else orientation_object(*going)}
 
 
 def found_object(found: Diagnosis) -> dict[str, Any]:
     """The same without the next orientation."""
-    unknown = description(found)
     missing = "unknown" if found.unknown else found.missing[0] if found.missing else None
     return clean(
         {
@@ -57,9 +48,9 @@ def found_object(found: Diagnosis) -> dict[str, Any]:
             "vibration_hz": [line.frequency_hz for line in found.test.vibration],
             "trend": _trend_object(found.test.trend),
             "detectable": [
-                {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in detectable(found.test)
+                {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in found.detectable
             ],
-            "unknown": description_object(unknown),
+            "unknown": description_object(found.description),
             "held_out_rms_mps2": found.before.held_out_rms_mps2,
             "held_out_floor_mps2": found.before.held_out_floor_mps2,
             "readings": readings_object(found.before.readings),
@@ -140,7 +131,7 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
                 f"times its power (p {format_p(trend.p_value)}), most in dwell {dwell}, accelerometer {channel}."
             )
         )
-    unknown, going = description(found), next_orientation(found)
+    unknown, going = found.description, found.next_orientation
     if unknown is not None:
         to_try = " ".join(f"--with '{formula}'" for formula in unknown.formulas)
         parts.append(
@@ -158,7 +149,7 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
         parts.append(Text(f"Next orientation: gimbals at {angles} deg: {going[1]}."))
     if found.test.invisible:
         parts.append(Text(f"Not to be seen with this run: {', '.join(found.test.invisible)}."))
-    parts.append(_detectable_table(detectable(found.test)))
+    parts.append(_detectable_table(found.detectable))
     parts += map(note, _notes(found))
     return Group(*parts)
 

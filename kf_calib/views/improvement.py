@@ -11,16 +11,14 @@ from typing import Any
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib.diagnosis.missing_effect import next_orientation
 from kf_calib.diagnosis.nested_cross_validation import NestedCrossValidation
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, SelectionStep, Spread, extend, take_step, undone
 from kf_calib.errors import InputError
-from kf_calib.estimation.calibration import evaluate_fit
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.plain_text import sentence
 from kf_calib.views.console import effect_table, parameter_table, rounded, symbol
-from kf_calib.views.diagnosis import description, description_object, of_what_p_is, orientation_object
+from kf_calib.views.diagnosis import description_object, of_what_p_is, orientation_object
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Bar, Table
 from kf_calib.views.terminal import note
@@ -42,7 +40,7 @@ def improvement_object(
     state: the improvement. honest: its nested cross-validation (None: not made). replay_difference: largest relative
     difference from the figures of the journal that was replayed (None: no replay). files: paths written, by their keys.
     """
-    unknown, going = description(state.found), next_orientation(state.found)
+    unknown, going = state.found.description, state.found.next_orientation
     return clean(
         {
             "start": _figures(state.start),
@@ -84,7 +82,7 @@ def improvement_object(
             "honest": None if honest is None else vars(honest),
             "replay_difference": replay_difference,
             **{key: None if path is None else str(path) for key, path in files.items()},
-            "warnings": notes(state),
+            "warnings": state.warnings,
         }
     )
 
@@ -134,14 +132,6 @@ def _parameters(result: Calibration) -> list[dict[str, Any]]:
     return [{key: getattr(parameter, key) for key in keys} for parameter in result.parameters.values()]
 
 
-def notes(state: Improvement) -> list[str]:
-    """Warnings about the recording, from the first model, and all warnings of the last model."""
-    first = state.start.before
-    of_models = evaluate_fit(first.fit, first.settings).warnings
-    said = [sentence for sentence in first.warnings if sentence not in of_models]
-    return [*said, *state.result.warnings]
-
-
 def improvement_report(
     state: Improvement, honest: NestedCrossValidation | None, replay_difference: float | None
 ) -> RenderableType:
@@ -166,7 +156,7 @@ def improvement_report(
     if replay_difference is not None:
         same = "to the last bit" if replay_difference == 0 else f"but for {replay_difference:.1g} of a figure at most"
         parts.append(Text(f"The steps of the journal gave its figures again, {same}."))
-    parts += map(note, notes(state))
+    parts += map(note, state.warnings)
     return Group(*parts)
 
 
@@ -252,7 +242,7 @@ def _settling(state: Improvement) -> list[str]:
     """Return sentences on what would settle an inconsistent run: a formula to try, an orientation to visit."""
     if state.found.test.consistent is not False:
         return []
-    unknown, going, out = description(state.found), next_orientation(state.found), list[str]()
+    unknown, going, out = state.found.description, state.found.next_orientation, list[str]()
     if unknown is not None:
         out.append(
             f"It goes with {unknown.driver} (accelerometer {unknown.channel}; explains {unknown.share:.0%} of it). "

@@ -56,9 +56,8 @@ def live_object(judgement: Judgement, standing: Standing, status: Status | None)
 
 def _going(judgement: Judgement) -> dict[str, Any] | None:
     """Return the next orientation as a JSON object: as the diagnosis advises, or without an alarm, for the sigmas."""
-    advised = judgement.look.going if judgement.final or judgement.alarm else None
-    if advised is not None:
-        return orientation_object(*advised)
+    if judgement.advice is not None:
+        return orientation_object(*judgement.advice)
     going = None if judgement.final else judgement.next_orientation
     return None if going is None else {"gimbal_deg": list(going[0]), "stay_s": None, "why": going[1]}
 

@@ -15,10 +15,10 @@ from helpers.paths import SHARED
 from helpers.synthetic import Run, plan_of
 
 from kf_calib.cli import cli
-from kf_calib.diagnosis import candidate_tests
+from kf_calib.diagnosis import candidate_tests, results
 from kf_calib.diagnosis.candidate_tests import EQUAL, assess_candidates, chance_fall, independent_tests
 from kf_calib.diagnosis.detectability import detectable
-from kf_calib.diagnosis.missing_effect import diagnose, next_orientation
+from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.results import with_effects
 from kf_calib.effects import effect_named
 from kf_calib.estimation.calibration import calibrate
@@ -61,23 +61,34 @@ def test_nothing_is_found_in_noise(case: dict, runs: int) -> None:
     "name, driver", [("encoder-harmonic-3:z", "angle"), *slow(("triple-product", "specific force"))]
 )
 def test_what_is_in_no_catalogue_is_unknown(name: str, driver: str) -> None:
-    from kf_calib.views.diagnosis import description, diagnosis_object
+    from kf_calib.views.diagnosis import diagnosis_object
 
     found = diagnose(run(f"{name}=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
     assert found.unknown and not found.missing
-    shape = description(found)
+    shape = found.description
     assert shape is not None and driver in shape.driver
     shown = diagnosis_object(found)
     assert shown["missing"] == "unknown" and shown["unknown"]["formula"] == shape.formulas[0]
     assert assess_candidates(with_effects(found.before, shape.formulas).fit).consistent
 
 
+def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Object and report read what the diagnosis has worked out once: without its functions they say the same."""
+    from kf_calib.views.console import plain
+    from kf_calib.views.diagnosis import diagnosis_object, diagnosis_report
+
+    found = diagnose(run("encoder-harmonic-3:z=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
+    shown, printed = diagnosis_object(found), plain(diagnosis_report(found))
+    assert shown["unknown"] and shown["detectable"] and "To try:" in printed
+    for name in ("describe", "detectable", "advise", "mean_covariances"):
+        monkeypatch.delattr(results, name)
+    assert diagnosis_object(found) == shown and plain(diagnosis_report(found)) == printed
+
+
 def test_a_formula_that_explains_more_than_a_known_effect_speaks_against_it() -> None:
     """A fifth power looks like a third power to 0.96: named third-order, it would be a wrong name."""
-    from kf_calib.views.diagnosis import description
-
     found = diagnose(run("fifth-order=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
-    shape = description(found)
+    shape = found.description
     assert found.unknown and shape is not None and shape.formula == "mine = a**5"
 
 
@@ -91,7 +102,7 @@ def test_six_faces_say_what_they_cannot_see_and_where_to_go() -> None:
     found = diagnose(run(plan=six_faces(dwell_s=8)))
     assert {"gravity-error", "cross-talk"} <= set(found.test.invisible)
     assert not found.missing
-    advice = next_orientation(found)
+    advice = found.next_orientation
     assert advice is not None and "would show" in advice[1]
 
 

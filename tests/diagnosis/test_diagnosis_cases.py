@@ -20,7 +20,6 @@ from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import six_faces
-from kf_calib.views.diagnosis import description
 
 
 @cache
@@ -226,7 +225,7 @@ def test_a_jump_is_not_called_a_walk(seed: int) -> None:
     """A walk could take that path, and any other: at whatever moment it is, the jump is likelier."""
     found = diagnose(run("bias-jump=20sigma", seed=seed))
     assert found.unknown, found.verdict
-    said = description(found)
+    said = found.description
     assert said is not None and said.driver == JUMP
 
 
@@ -262,7 +261,7 @@ def test_scatter_of_more_than_is_stated_is_no_effect(
     named = [each for each in noticed if each.missing]
     assert len(noticed) > len(found) / 3 and len(named) < len(noticed)
     assert all("dwells that scatter by more than is stated" in each.verdict for each in named)
-    said = [description(each) for each in noticed if each.unknown]
+    said = [each.description for each in noticed if each.unknown]
     assert sum(each is not None and each.driver == IRREGULAR for each in said) > 0.5 * len(said)
 
 
@@ -302,7 +301,7 @@ def test_a_walk_rarely_looks_as_if_it_came_back(runs: int) -> None:
 
 @pytest.mark.slow
 def test_what_comes_back_is_described_as_such() -> None:
-    said = description(diagnose(run("telegraph=15sigma;tau=30", seed=6, dwells=24)))
+    said = diagnose(run("telegraph=15sigma;tau=30", seed=6, dwells=24)).description
     assert said is not None and "back within about" in said.driver and said.formula == "bias-walk"
 
 

@@ -22,7 +22,7 @@ from kf_calib.online.sequential_test import Watch
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.views.console import plain
-from kf_calib.views.diagnosis import description, diagnosis_object, diagnosis_report
+from kf_calib.views.diagnosis import diagnosis_object, diagnosis_report
 
 
 def found_in(result: Calibration) -> Trend:
@@ -89,7 +89,7 @@ def test_what_dwells_hide_shows_within_them() -> None:
     before = run("chirp=25sigma;frequency=0.02;chirp=2e-4", seed=4)
     found = diagnose(before)
     assert found.unknown and found.test.trend is not None and found.test.trend.p_value < 1e-6, found.verdict
-    told = description(found)
+    told = found.description
     assert told is not None and told.driver == WITHIN and told.formula == "bias-walk"
     dwell, channel = found.test.trend.most
     assert diagnosis_object(found)["trend"] == {

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import chdtrc, fdtrc
 
-from kf_calib.support.tail_probabilities import chi_squared_tail, f_tail
+from kf_calib.support.tail_probabilities import chi_squared_tail, f_tail, sidak
 
 
 @pytest.mark.parametrize("freedom", [1, 2, 7, 60, 1000])
@@ -54,3 +54,11 @@ def test_its_ends() -> None:
     assert f_tail(3.0, 5.0, 0.0) == f_tail(3.0, 5.0, -1.0) == f_tail(60.0, 4728.0, 1e-300) == 1.0
     assert f_tail(3.0, 5.0, math.inf) == f_tail(60.0, 4728.0, 1e300) == f_tail(1e4, 1e9, 1e3) == 0.0
     assert math.isnan(f_tail(3.0, 5.0, math.nan))
+
+
+@pytest.mark.parametrize("tests", [1, 3, 40, 10**6])
+@pytest.mark.parametrize("p_value", [1e-300, 1e-20, 1e-7, 0.01, 0.6, 1.0])
+def test_the_smallest_of_many_p_values(p_value: float, tests: int) -> None:
+    with localcontext(prec=400):
+        expected = float(1 - (1 - Decimal(p_value)) ** tests)
+    assert sidak(p_value, tests) == pytest.approx(expected, rel=1e-13)
