@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from consoles import consoles, not_printed
 from helpers.long_runs import slow
 from helpers.paths import ROOT
 
@@ -24,7 +25,6 @@ PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 WITH_COMMANDS = [page for page in PAGES if "```console" in page.read_text()]
 BLOCK = re.compile(r"^```(\S*)(?: \S+)?\n(.*?)^```", re.DOTALL | re.MULTILINE)
 FILE = re.compile(r"^:caption: (\S+)\n\n(.*)", re.DOTALL)
-GAP = "\n...\n"
 
 
 @pytest.mark.parametrize("page", [README, ROOT / "docs" / "python.md"], ids=lambda page: page.name)
@@ -133,13 +133,6 @@ def files(text: str) -> list[tuple[str, str]]:
     return [(each[1], each[2]) for each in found if each]
 
 
-def consoles(text: str) -> list[tuple[str, str]]:
-    """Every command of the console blocks, with what is shown below it; a backslash goes on in the next line."""
-    blocks = [block for kind, block in BLOCK.findall(text) if kind == "console"]
-    parts = [part for block in blocks for part in re.split(r"^\$ ", block.replace("\\\n", " "), flags=re.MULTILINE)[1:]]
-    return [(command, shown) for command, _, shown in (part.partition("\n") for part in parts)]
-
-
 def _said(command: str) -> str:
     """What a command line of a page prints in this folder; ours in this process, since many starts take long.
 
@@ -156,11 +149,8 @@ def _said(command: str) -> str:
 
 def _assert_shown(shown: str, printed: str, what: str) -> None:
     """Each part of what is shown, between gaps, is printed, in this order."""
-    place = 0
-    for part in map(_words, f"\n{shown}\n".split(GAP)):
-        found = printed.find(part, place)
-        assert found >= 0, f"{what} does not print, in this place:\n{part}\nbut:\n{printed}"
-        place = found + len(part)
+    part = not_printed(shown, printed)
+    assert not part, f"{what} does not print, in this place:\n{part}\nbut:\n{printed}"
 
 
 def _words(text: str) -> str:
