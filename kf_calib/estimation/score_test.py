@@ -136,7 +136,7 @@ class Frame:
 
     def __init__(self, carried: Carried, noise: Noise, effects: Sequence[Effect]) -> None:
         self.dwells, self.noise, self.state, self.effects = carried.dwells, noise, carried.state, list(effects)
-        self.parts = _parts(effects)
+        self.parts = _slices(_counts(effects))
         self._stimulus = stimulus_of(carried.dwells, carried.model.bench, carried.state)
         self.basis, self.coordinates = orthonormal(
             whitened_columns(carried, noise, effects, carried.state, self._stimulus)
@@ -153,7 +153,7 @@ class Frame:
         out.coordinates = np.concatenate(
             [self.coordinates[:, :0], *(self.coordinates[:, own[_key(each)]] for each in effects)], axis=1
         )
-        out.parts = _parts(effects)
+        out.parts = _slices(_counts(effects))
         return out
 
     def has(self, effect: Effect) -> bool:
@@ -190,7 +190,7 @@ class Frame:
             square_root_information.accumulate([small]),
             width,
             effects,
-            [len(effect.coefficients) for effect in effects],
+            _counts(effects),
         )
 
     def _model(self, carried: Carried) -> tuple[Floats, Floats, int]:
@@ -214,18 +214,20 @@ class Frame:
         """
         if self._periodogram is None:
             self._periodogram = Periodogram(carried, self.noise, effect, values_hz)
-        rows, width = _judged(carried.dwells, carried.columns, self.noise, self.state, STATE_COUNT)
-        own = np.concatenate(rows[len(rows) - len(self.dwells) :])
-        return self._periodogram.falls(_stacked(rows, self.dwells, self.noise), own[:, _inside(self.noise) :], width)
+        return self._periodogram.falls(*_with_and_without_walk(carried, self.noise, self.state, STATE_COUNT))
 
 
 _OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps2_per_sqrt_s")
 
 
-def _parts(effects: Sequence[Effect]) -> list[slice]:
-    """Return the slice of columns that belongs to each effect."""
-    ends = np.cumsum([0, *(len(effect.coefficients) for effect in effects)]).tolist()
-    return [slice(a, b) for a, b in itertools.pairwise(ends)]
+def _counts(effects: Sequence[Effect]) -> list[int]:
+    """Return the number of columns of each effect."""
+    return [len(effect.coefficients) for effect in effects]
+
+
+def _slices(counts: Sequence[int]) -> list[slice]:
+    """Return the slice of columns that belongs to each effect, for effects of so many columns."""
+    return [slice(a, b) for a, b in itertools.pairwise(itertools.accumulate(counts, initial=0))]
 
 
 def _key(effect: Effect) -> tuple[str, float]:
@@ -241,9 +243,7 @@ def _is(one: object, other: object) -> bool:
 def scan(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Scan:
     """Project ``effects`` off the model in ``carried`` without a frame."""
     rows, width = whiten_model(carried, noise, effects)
-    return project(
-        square_root_information.accumulate([rows]), width, effects, [len(effect.coefficients) for effect in effects]
-    )
+    return project(square_root_information.accumulate([rows]), width, effects, _counts(effects))
 
 
 def project(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
@@ -256,9 +256,8 @@ def project(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequen
     sizes, rest = np.linalg.norm(upper[:, width:-1], axis=0), _beside(upper, width)
     units = np.where(sizes > 0, sizes, 1.0)
     columns, residual = rest[:-1, :-1] / units, rest[:-1, -1]
-    ends = np.cumsum([0, *counts]).tolist()
-    parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
-    found = [_candidate(each, columns[:, part], units[part]) for each, part in zip(effects, parts, strict=True)]
+    parts = zip(effects, _slices(counts), strict=True)
+    found = [_candidate(each, columns[:, part], units[part]) for each, part in parts]
     return Scan(tuple(found), residual)
 
 
@@ -280,12 +279,10 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
     proportional to d times n instead of d times n^2.
     """
     if effects[0].oscillates and len(effects) > _MANY:
-        rows, width = _judged(carried.dwells, carried.columns, noise, carried.state, carried.model.count)
-        own = np.concatenate(rows[len(rows) - len(carried.dwells) :])[:, _inside(noise) :]
         many = Periodogram(carried, noise, effects[0], np.array([effect.value for effect in effects]))
-        return many.falls(_stacked(rows, carried.dwells, noise), own, width)
+        return many.falls(*_with_and_without_walk(carried, noise, carried.state, carried.model.count))
     out = list[Floats]()
-    for part in batches([len(effect.coefficients) for effect in effects], _OF_ONE_KIND):
+    for part in batches(_counts(effects), _OF_ONE_KIND):
         rows, width = whiten_model(carried, noise, [effects[k] for k in part])
         sizes, rest = np.linalg.norm(rows[:, width:-1], axis=0), _beside(rows, width)
         columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
@@ -321,7 +318,7 @@ def whitened_columns(
     carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats, stimulus: Stimulus
 ) -> Floats:
     """The columns G (m, q) of ``whiten_model``, computed for a few effects at a time, which saves memory."""
-    sizes, out, first = [len(effect.coefficients) for effect in effects], np.zeros((0, 0)), 0
+    sizes, out, first = _counts(effects), np.zeros((0, 0)), 0
     for part in batches(sizes, columns_at_once(carried)) or [[]]:
         own = _columns_of_some(carried, noise, [effects[k] for k in part], state, stimulus)
         out = out if len(out) else np.empty((len(own), sum(sizes)))
@@ -366,6 +363,14 @@ def _judged(
 def _stacked(rows: Sequence[Floats], dwells: Sequence[DwellFactor], noise: Noise) -> Floats:
     """Concatenate all rows; if the biases walk, whiten them with respect to the walk."""
     return random_walk.whiten_walk(rows, steps(dwells, noise)) if _inside(noise) else np.concatenate(rows)
+
+
+def _with_and_without_walk(carried: Carried, noise: Noise, state: Floats, width: int) -> tuple[Floats, Floats, int]:
+    """Rows of the model in ``carried`` as ``Periodogram.falls`` needs them: whitened, the walk of the biases taken out;
+    those of the dwells alone with the walk still in them; and how many columns the first ``width`` become with W."""
+    rows, count = _judged(carried.dwells, carried.columns, noise, state, width)
+    of_dwells = np.concatenate(rows[len(rows) - len(carried.dwells) :])
+    return _stacked(rows, carried.dwells, noise), of_dwells[:, _inside(noise) :], count
 
 
 def _inside(noise: Noise) -> int:
