@@ -11,9 +11,15 @@ from types import FrameType
 
 @contextmanager
 def answered(answer: Callable[[signal.Signals], None]) -> Iterator[None]:
-    """Have ``answer`` called for each of them; SIGHUP stays ignored where it was (nohup)."""
+    """Have ``answer`` called for each of them; SIGHUP stays ignored where it was (nohup).
+
+    After a SIGHUP further ones are ignored for good: terminal and shell both send one, and the second must not kill
+    the process while it writes its results and ends.
+    """
+    came: set[int] = set()
 
     def called(number: int, _: FrameType | None) -> None:
+        came.add(number)
         answer(signal.Signals(number))
 
     if threading.current_thread() is not threading.main_thread():
@@ -27,7 +33,8 @@ def answered(answer: Callable[[signal.Signals], None]) -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            hung_up = number in came and number not in (signal.SIGINT, signal.SIGTERM)
+            signal.signal(number, signal.SIG_IGN if hung_up else handler)
 
 
 def interrupt(_: signal.Signals) -> None:

@@ -1,0 +1,23 @@
+"""Signals that ask a run to end."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from kf_calib.cli.signals import answered
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
+def test_only_a_hang_up_is_ignored_after_it_was_answered(number: signal.Signals) -> None:
+    """Terminal and shell both send a SIGHUP; the second must not kill what is writing its results."""
+    before = signal.getsignal(number)
+    seen: list[signal.Signals] = []
+    try:
+        with answered(seen.append):
+            signal.raise_signal(number)
+        assert seen == [number]
+        assert signal.getsignal(number) is (signal.SIG_IGN if number == signal.SIGHUP else before)
+    finally:
+        signal.signal(number, before)
