@@ -20,6 +20,9 @@ from kf_calib.cli.numbers import NOT_NEGATIVE, NUMBER, POSITIVE, NumberInRange
 from kf_calib.errors import BenchError
 
 if TYPE_CHECKING:
+    from kf_calib.diagnosis.results import Diagnosis
+    from kf_calib.diagnosis.stepwise_selection import Improvement
+    from kf_calib.estimation.engine_comparison import Comparison
     from kf_calib.estimation.results import Calibration
     from kf_calib.estimation.settings import Settings
     from kf_calib.sources.files.recording import Recording
@@ -97,7 +100,6 @@ columns_option = click.option(
     help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.',
 )  # fmt: skip
 rrd_option = output_option("--rrd", metavar="FILE.rrd", help="Save the Rerun view here.", panel=OUTPUT)
-png_option = output_option("--png", metavar="FILE.png", help="Save a picture of the Rerun view here.", panel=OUTPUT)
 save_model_option = output_option(
     "--save-model", metavar="FILE.toml", help="Save the model here, for --model to read.", panel=OUTPUT
 )
@@ -244,8 +246,8 @@ def effects_of(options: Mapping[str, Any]) -> tuple[str, ...]:
     return merged(model.effects, options["effects"])
 
 
-def save_view(result: Calibration, path: Path) -> None:
-    """The Rerun view of a run; Rerun is imported when there is one to save."""
+def save_view(result: Calibration | Diagnosis | Improvement | Comparison, path: Path) -> None:
+    """The Rerun view of a result; Rerun is imported when there is one to save."""
     from kf_calib.views import rerun
 
     rerun.save(result, path)

@@ -21,13 +21,12 @@ from kf_calib.cli.options import (
     opened,
     overrides,
     overwrite_option,
-    png_option,
     print_json,
     progress,
     recording_options,
-    rrd_option,
     show,
 )
+from kf_calib.cli.pictures import Pictures, figures_of, picture_options
 from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
@@ -84,8 +83,7 @@ def _plan_options(command: F) -> F:
                      help="White noise of a reading, m/s^2, where no recording tells it."),
         output_option("--csv", "csv_file", metavar="FILE.csv", panel=OUTPUT,
                       help="Save the angles, for simulate --plan."),
-        rrd_option,
-        png_option,
+        picture_options,
         overwrite_option,
     ]  # fmt: skip
     for option in reversed(options):
@@ -105,7 +103,7 @@ def _plan_options(command: F) -> F:
 @filter_options
 @json_option
 def plan(
-    as_json: bool, csv_file: Path | None, rrd: Path | None, png: Path | None, overwrite: bool, **options: Any
+    as_json: bool, csv_file: Path | None, overwrite: bool, **options: Any
 ) -> None:  # fmt: skip
     """Orientations that determine the parameters best: which, in which order, and the sigmas to expect."""
     from kf_calib.design import orientation_plan
@@ -114,7 +112,7 @@ def plan(
     from kf_calib.views import plan as views
 
     _refuse_contradictions(options)
-    outputs = claimed(overwrite=overwrite)
+    outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     prospect = _prospect(options, as_json)
     reach = _reach(prospect.model.bench, options)
     scheme = Scheme.of(reach, options["repeats"], options["antipodal"])
@@ -132,7 +130,7 @@ def plan(
         show(views.plan_report(made, options["beside_paper"]))
     with delivery(outputs, as_json) as deliver:
         deliver.file(csv_file, lambda path: views.write_csv(made, path))
-        deliver.view(lambda path: _save_view(made, path), rrd, png)
+        pictures.save(deliver, lambda path: _save_view(made, path), figures_of(made))
 
 
 def _save_view(made: Plan, path: Path) -> None:
