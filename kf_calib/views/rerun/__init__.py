@@ -1,13 +1,13 @@
-"""The Rerun view of a replay: sigmas falling, axes and their uncertainty in the platform, innovations, correlations.
+"""The Rerun view of a run: sigmas by orientation, axes and their uncertainty in the platform, innovations, correlations.
 
 A thin bridge: every number comes from the ``Calibration``, is scaled to a unit an engineer reads, and is sent in
 columns. Two timelines: ``bench_time`` (since the first sample; points within the dwells too) and ``orientation``
 (the count of dwells from 1; 0 is a stated prior). Angles are in arcsec, scale factors in ppm, biases, innovations in
 um/s^2. Where the orientations so far do not determine a parameter there is no point.
 
-Entities: ``parameters/ACCELEROMETER/SYMBOL/{log10_sigma,deviation,band}``, ``platform/...``,
-``innovation/CHANNEL/{value,bound,in_sigma}``, ``nis/{value,above,band}``, ``correlation/{picture,matrix,...}``,
-``bench/{dwell,pose/...}``, ``summary``.
+Entities: ``parameters/ACCELEROMETER/SYMBOL/{sigma,deviation,band}``, ``parameters/effects/SYMBOL/...``, the charts
+``sigmas/KIND``, ``each/PARAMETER`` and ``residuals``, ``platform/...``, ``innovation/CHANNEL/{value,bound,in_sigma}``,
+``nis/{value,above,band}``, ``correlation/{picture,matrix,...}``, ``bench/pose/...``, ``summary``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ from kf_calib.views.rerun.file import rrd_file
 from kf_calib.views.rerun.layout import TABS, layout
 from kf_calib.views.rerun.names import BENCH_TIME, ORIENTATION
 from kf_calib.views.rerun.platform import log_platform
+from kf_calib.views.rerun.residuals import log_residuals
 from kf_calib.views.rerun.series import History, log_bench, log_innovations, log_nis, log_parameters
+from kf_calib.views.rerun.sigmas import Falling
 from kf_calib.views.rerun.summary import summary
 
 __all__ = ["BENCH_TIME", "ORIENTATION", "TABS", "grow", "layout", "log", "save"]
@@ -39,15 +41,17 @@ def save(result: Calibration, path: str | Path, timeline: str = BENCH_TIME, tab:
     """
     path = Path(path)
     history = History.of(result)
-    with _strict(), rrd_file(path, layout(result, history, timeline, tab)) as stream:
-        _log(result, history, stream)
+    falling = Falling.of(result, history)
+    with _strict(), rrd_file(path, layout(result, history, falling, timeline, tab)) as stream:
+        _log(result, history, falling, stream)
     return path
 
 
 def log(result: Calibration, stream: rr.RecordingStream) -> None:
     """Send everything a run showed to a recording stream: a file, or a viewer that is open."""
     with _strict():
-        _log(result, History.of(result), stream)
+        history = History.of(result)
+        _log(result, history, Falling.of(result, history), stream)
 
 
 def grow(result: Calibration, stream: rr.RecordingStream, shown: int, lay_out: bool) -> None:
@@ -57,19 +61,22 @@ def grow(result: Calibration, stream: rr.RecordingStream, shown: int, lay_out: b
     """
     with _strict():
         history = History.of(result)
-        _log(result, history, stream, shown)
+        falling = Falling.of(result, history)
+        _log(result, history, falling, stream, shown)
         if lay_out:
-            stream.send_blueprint(layout(result, history, BENCH_TIME, TABS[0]))
+            stream.send_blueprint(layout(result, history, falling, BENCH_TIME, TABS[0]))
 
 
-def _log(result: Calibration, history: History, stream: rr.RecordingStream, shown: int = 0) -> None:
+def _log(result: Calibration, history: History, falling: Falling, stream: rr.RecordingStream, shown: int = 0) -> None:
     fresh = result.visits[shown:]
     if fresh:
         log_parameters(history.after(result.visits[:shown]), stream)
+        falling.log(stream)
+        log_residuals(result, stream)
         log_platform(result, stream)
         log_innovations(fresh, stream, shown)
         log_nis(fresh, stream, shown)
-        log_correlation(fresh, stream)
+        log_correlation(fresh, history.shown, stream)
         log_bench(result, stream, shown)
     stream.log("summary", rr.TextDocument(printable(summary(result)), media_type=rr.MediaType.MARKDOWN), static=True)
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import rerun as rr
 
 from kf_calib.bench import paper_parameters
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.support.plain_text import printable
 
 BENCH_TIME = "bench_time"
 ORIENTATION = "orientation"
@@ -29,6 +32,8 @@ LABELS = {
     "theta3": "θ₃", "phi3": "φ₃", "K3": "K₃", "b3": "b₃",
 }  # fmt: skip
 MICRO = 1e6
+MAUVE: Colour = (214, 150, 235)
+"""Coefficients of effects."""
 
 
 @dataclass(frozen=True)
@@ -65,3 +70,30 @@ def colour_of(symbol: str) -> Colour:
 def path_of(symbol: str) -> str:
     """The parameter's entity; the accelerometer comes first, so that legends list one after the other."""
     return f"parameters/a{paper_parameters.SYMBOLS.index(symbol) // 4 + 1}/{symbol}"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What is estimated and drawn as one curve: the SI value times ``per_si`` is in ``unit``."""
+
+    label: str
+    unit: str
+    per_si: float
+    colour: Colour
+    path: str
+
+
+TWELVE = tuple(
+    Quantity(LABELS[symbol], GROUP_OF[symbol].unit, GROUP_OF[symbol].per_si, colour_of(symbol), path_of(symbol))
+    for symbol in paper_parameters.SYMBOLS
+)
+
+
+def quantities(model: Model) -> tuple[Quantity, ...]:
+    """The twelve parameters, then the coefficients of the effects in the model."""
+    coefficients = [
+        Quantity(printable(each.symbol), printable(each.shown_unit), each.per_si, MAUVE,
+                 rr.new_entity_path(["parameters", "effects", each.symbol]).lstrip("/"))
+        for each in model.coefficients
+    ]  # fmt: skip
+    return (*TWELVE, *coefficients)

@@ -1,0 +1,166 @@
+"""Sigma of all that is estimated against the number of the orientation, with the share of information of each.
+
+Entities: ``sigmas/KIND/...`` for the overview, a chart a kind of parameter; ``each/PARAMETER/...``, a chart each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.estimation.information_share import information_shares
+from kf_calib.estimation.results import Calibration
+from kf_calib.views.rerun.chart import LEFT, RIGHT, TOP, Axis, Chart, sheet, thin, write
+from kf_calib.views.rerun.names import GROUPS, PER_SI, WHITE, Colour, Quantity
+from kf_calib.views.rerun.series import Counts, History
+
+BARS: Colour = (92, 96, 110)
+_TALLEST = 0.45  # of the chart's height: the bar of the largest share
+
+
+@dataclass(frozen=True)
+class Falling:
+    """Sigmas (n, 12 + q) in shown units after each orientation (n,), and the shares (n, 12) of information.
+
+    wanted (12 + q,): targets, NaN where there are none. Orientation 0 is a stated prior.
+    """
+
+    shown: tuple[Quantity, ...]
+    orientation: Counts
+    sigma: Floats
+    shares: Floats
+    wanted: Floats
+
+    @classmethod
+    def of(cls, result: Calibration, history: History, wanted: Floats | None = None) -> Falling:
+        """Of a run; ``wanted`` (12,): targets in SI."""
+        ends, shares = history.by_orientation, np.vstack([np.zeros((1, 12)), information_shares(result)])
+        first = 0 if np.isfinite(ends.sigma[0]).any() else 1
+        aims = np.full(len(ends.shown), np.nan)
+        aims[:12] = np.nan if wanted is None else wanted * PER_SI
+        return cls(ends.shown, ends.orientation[first:], ends.sigma[first:], shares[first:], aims)
+
+    @cached_property
+    def kinds(self) -> list[tuple[str, str, list[int]]]:
+        """Name, unit and columns of each chart of the overview; coefficients differ in unit, and are in final sigmas."""
+        own = [(group.title, group.unit, [paper_parameters.SYMBOLS.index(symbol) for symbol in group.symbols])
+               for group in GROUPS]  # fmt: skip
+        rest = list(range(12, len(self.shown)))
+        return [*own, *([("coefficients of effects", "final σ", rest)] if rest else [])]
+
+    def values(self, columns: Sequence[int], alone: bool = False) -> Floats:
+        """Sigmas (n, k) of one chart, in its unit; ``alone``: in the unit of the one that it shows."""
+        own = self.sigma[:, columns]
+        return own / own[-1] if columns[0] >= 12 and not alone else own
+
+    def share(self, columns: Sequence[int]) -> Floats | None:
+        """Mean share (n,) of information about the parameters of one chart that are determined; None: of none."""
+        own = self.shares[:, [k for k in columns if k < 12]]
+        own = own[:, np.isfinite(own).all(axis=0)]
+        return own.mean(axis=1) if own.size else None
+
+    def _across(self, title: str) -> Axis:
+        return Axis.counted(int(self.orientation[0]), int(self.orientation[-1]), title)
+
+    def _chart(self, path: str, columns: Sequence[int], title: str, place: Chart, below: str,
+               alone: bool = False) -> Chart:  # fmt: skip
+        values = np.append(self.values(columns, alone).ravel(), self.wanted[list(columns)])
+        return Chart(path, self._across(below), Axis.around(values, log=True), title, place.corner, place.width,
+                     place.height, place.colour)  # fmt: skip
+
+    def overview(self) -> list[Chart]:
+        """A chart a kind, one below the other."""
+        out, tall = list[Chart](), 640.0 / len(self.kinds) - TOP - 22.0
+        for k, (name, unit, columns) in enumerate(self.kinds):
+            corner, last = (0.0, k * (tall + TOP + 22.0)), k == len(self.kinds) - 1
+            place = Chart("", self._across(""), self._across(""), "", corner, 520.0, tall)
+            path = f"sigmas/{name.replace(' ', '_')}"
+            out.append(self._chart(path, columns, self._title(name, unit, columns), place, "orientation" * last))
+        return out
+
+    def _title(self, name: str, unit: str, columns: Sequence[int]) -> str:
+        """Return which is worst in the end, and which is best."""
+        final, known = self.values(columns)[-1], np.isfinite(self.sigma[-1, columns])
+        if not known.any():
+            return f"σ of {name}: not determined"
+        if columns[0] >= 12:
+            return f"σ of {name} over their final σ"
+        worst, best = int(np.nanargmax(final)), int(np.nanargmin(final))
+        ends = [
+            f"{word} {self.shown[columns[k]].label} {final[k]:.3g}" for word, k in (("worst", worst), ("best", best))
+        ]
+        return f"σ of {name}, {unit}: {', '.join(ends[: 1 if worst == best else 2])}"
+
+    def single(self) -> list[Chart]:
+        """A chart for each parameter and coefficient, four a row."""
+        rows = -(-len(self.shown) // 4)
+        wide, tall = 300.0, max(90.0, 860.0 / rows - TOP - 26.0)
+        return [
+            self._chart(f"each/{shown.path}", [k], f"σ of {shown.label}, {shown.unit}: {_final(self.sigma[-1, k])}",
+                        Chart("", self._across(""), self._across(""), "",
+                              ((k % 4) * (wide + LEFT + RIGHT), (k // 4) * (tall + TOP + 26.0)), wide, tall, shown.colour),
+                        "orientation" * (k // 4 == rows - 1), alone=True)
+            for k, shown in enumerate(self.shown)
+        ]  # fmt: skip
+
+    def log(self, stream: rr.RecordingStream) -> None:
+        """Send all charts."""
+        for chart, (_, _, columns) in zip(self.overview(), self.kinds, strict=True):
+            self._log(chart, columns, stream)
+        for k, chart in enumerate(self.single()):
+            self._log(chart, [k], stream, alone=True)
+
+    def _log(self, chart: Chart, columns: Sequence[int], stream: rr.RecordingStream, alone: bool = False) -> None:
+        chart.frame(stream)
+        x, own = self.orientation.astype(float), self.values(columns, alone)
+        self._log_shares(chart, columns, stream)
+        strips, colours, radii = list[Floats](), list[Colour](), list[float]()
+        worst = int(np.nanargmax(own[-1])) if np.isfinite(own[-1]).any() else 0
+        for k, column in enumerate(columns):
+            parts = chart.strip(x, own[:, k])
+            strips += parts
+            colours += [self.shown[column].colour] * len(parts)
+            radii += [thin(1.6 if k == worst else 0.7)] * len(parts)
+        stream.log(f"{chart.path}/curves", rr.LineStrips2D(strips, colors=colours, radii=radii), static=True)
+        dots = chart.at(x, own[:, worst])[np.isfinite(own[:, worst])]
+        stream.log(f"{chart.path}/worst", rr.Points2D(dots, colors=self.shown[columns[worst]].colour,
+                                                      radii=thin(3.0 if len(x) < 60 else 1.5)), static=True)  # fmt: skip
+        wanted = np.unique(self.wanted[list(columns)][np.isfinite(self.wanted[list(columns)])])
+        stream.log(f"{chart.path}/targets", rr.LineStrips2D([chart.level(each) for each in wanted], colors=WHITE,
+                                                            radii=thin(0.8)), static=True)  # fmt: skip
+
+    def _log_shares(self, chart: Chart, columns: Sequence[int], stream: rr.RecordingStream) -> None:
+        """Send the share of information of each orientation as a bar from the bottom, and write the largest at it."""
+        share = self.share(columns)
+        if share is None or not share.max() > 0.0:
+            return
+        scale = Axis(0.0, float(share.max()) / _TALLEST)
+        bars = Chart(chart.path, chart.x, scale, corner=chart.corner, width=chart.width, height=chart.height)
+        x, radius = self.orientation.astype(float), min(6.0, 0.36 * chart.width / len(share))
+        strips = bars.bars(x, np.where(share > 0.0, share, np.nan), 0.0)
+        stream.log(f"{chart.path}/shares", rr.LineStrips2D(strips, colors=[BARS], radii=radius, draw_order=-5.0),
+                   static=True)  # fmt: skip
+        top = int(np.argmax(share))
+        write(stream, f"{chart.path}/share", [(bars.at(x[[top]], share[[top]])[0] - (0.0, 22.0), f"{share[top]:.0%}")],
+              BARS)  # fmt: skip
+
+
+def _final(value: float) -> str:
+    return f"{value:.3g}" if np.isfinite(value) else "not determined"
+
+
+def overview_sheet(falling: Falling) -> rrb.Spatial2DView:
+    """The charts of the overview in one view."""
+    return sheet("sigmas", "σ by orientation; bars: share of the information each brought", falling.overview())
+
+
+def single_sheet(falling: Falling, name: str) -> rrb.Spatial2DView:
+    """The charts of all parameters in one view."""
+    return sheet("each", name, falling.single())
