@@ -1,4 +1,4 @@
-"""The Rerun view of a run: sigmas by orientation, axes and their uncertainty in the platform, innovations, correlations.
+"""The Rerun view of a run: sigmas by orientation, the platform, innovations, correlations.
 
 A thin bridge: every number comes from the ``Calibration``, is scaled to a unit an engineer reads, and is sent in
 columns. Two timelines: ``bench_time`` (since the first sample; points within the dwells too) and ``orientation``

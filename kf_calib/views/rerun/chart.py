@@ -21,7 +21,7 @@ from kf_calib.views.rerun.names import GREY, WHITE, Colour
 GRID: Colour = (44, 46, 50)
 LABEL_HEIGHT = 19.0
 """Of a label, which hangs below its point."""
-LEFT, RIGHT, TOP, BOTTOM = 66.0, 16.0, 34.0, 34.0
+LEFT, RIGHT, TOP, BOTTOM = 66.0, 16.0, 38.0, 40.0
 """Room around a chart for its ticks and titles."""
 _STEPS = (1.0, 2.0, 5.0, 10.0)
 
@@ -92,7 +92,7 @@ class Axis:
 def number(value: float) -> str:
     """A value of a tick: plain digits where they are few, else a power of ten."""
     if value == 0.0 or 1e-3 <= abs(value) < 1e5:
-        return f"{value:.4g}".replace("-", "−")
+        return np.format_float_positional(float(f"{value:.3g}"), trim="-").replace("-", "−")
     return ("−" if value < 0.0 else "") + power(abs(value))
 
 
@@ -153,7 +153,7 @@ class Chart:
         lines = [self.upright(value) for value, _ in across] + [self.level(value) for value, _ in upward]
         grid = [*lines, np.array([[left, top], [left, bottom], [right, bottom]])]
         colours = [GRID] * len(lines) + [GREY]
-        stream.log(f"{self.path}/grid", rr.LineStrips2D(grid, colors=colours, radii=thin(0.6), draw_order=-10.0),
+        stream.log(f"{self.path}/grid", rr.LineStrips2D(grid, colors=colours, radii=thin(0.4), draw_order=-10.0),
                    static=True)  # fmt: skip
         texts = [((self.at(np.array([value]), np.array([self.y.low]))[0] + (0.0, 4.0)), text) for value, text in across]
         texts += [((self.at(np.array([self.x.low]), np.array([value]))[0] - (14.0 + 4.2 * len(text), LABEL_HEIGHT / 2)),
@@ -177,9 +177,7 @@ def thin(pixels: float) -> float:
     return -pixels
 
 
-def sheet(
-    origin: str, name: str, charts: Sequence[Chart], contents: Sequence[str] = ("$origin/**",)
-) -> rrb.Spatial2DView:
+def sheet(origin: str, name: str, charts: Sequence[Chart]) -> rrb.Spatial2DView:
     """The view of a sheet that holds all charts."""
     left = min(chart.corner[0] for chart in charts) - LEFT
     right = max(chart.corner[0] + chart.width for chart in charts) + RIGHT

@@ -17,7 +17,7 @@ from kf_calib.views.rerun.series import History, nis_band
 from kf_calib.views.rerun.sigmas import Falling, overview_sheet, single_sheet
 
 TIED = 0.3
-"""Largest correlation below which the matrix has nothing to show: its room goes to the text."""
+"""Largest correlation below which the matrix has nothing to show."""
 TABS = ("Overview", "Sigmas", "Parameters", "Innovations")
 _ENDLESS = rr.TimeRangeBoundary.infinite()
 WHOLE_RUN = rrb.TimeAxis(view_range=rr.TimeRange(start=_ENDLESS, end=_ENDLESS))
@@ -26,8 +26,9 @@ WHOLE_RUN = rrb.TimeAxis(view_range=rr.TimeRange(start=_ENDLESS, end=_ENDLESS))
 
 def layout(result: Calibration, history: History, falling: Falling, timeline: str, tab: str) -> rrb.Blueprint:
     """The blueprint for a window of about 1600 x 1000, ``tab`` (one of TABS) in front."""
-    tabs = [_overview(result, falling), single_sheet(falling, TABS[1]), _parameters(history),
-            *([_innovations(result)] if predicted(result) else [])]  # fmt: skip
+    tabs = [_overview(result, falling), single_sheet(falling, TABS[1]), _parameters(history)]
+    tabs += [_innovations(result)] if predicted(result) else []
+    tabs += [_correlation(len(falling.shown))] if largest_correlation(result.estimate) >= TIED else []
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=min(TABS.index(tab), len(tabs) - 1)),
         rrb.BlueprintPanel(state="hidden"),
@@ -38,12 +39,11 @@ def layout(result: Calibration, history: History, falling: Falling, timeline: st
 
 def _overview(result: Calibration, falling: Falling) -> rrb.Horizontal:
     judged = [_normalised(result), _nis(result)] if predicted(result) else [_residuals(result)]
-    tied = largest_correlation(result.estimate) >= TIED
     return rrb.Horizontal(
         rrb.Vertical(overview_sheet(falling), _pose(result), row_shares=[7, 2]),
         rrb.Vertical(_platform(result), *judged, row_shares=[6, 3, 3][: 1 + len(judged)]),
-        rrb.Vertical(_summary(), *([_correlation(len(falling.shown))] if tied else []), row_shares=[6, 5][: 1 + tied]),
-        column_shares=[5, 4.2, 3.8],
+        _summary(),
+        column_shares=[5, 4.4, 3.8],
         name=TABS[0],
     )
 
@@ -117,7 +117,7 @@ def _correlation(count: int) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(
         origin="correlation",
         contents=["correlation/picture", "correlation/rows", "correlation/columns"],
-        name="correlation: blue −1, orange +1; grey: unseen",
+        name="Correlation: blue −1, orange +1; grey: not determined",
         visual_bounds=rrb.VisualBounds2D(x_range=[-1.6, count + 0.1], y_range=[-2.4, count + 0.1]),
     )
 

@@ -1,7 +1,8 @@
 """The platform frame in 3-D: the sensitive axes stand still in it, gravity moves from dwell to dwell.
 
 Ellipsoids of 1 sigma sit at the tips of the axes, magnified by one factor for the whole run, with a bar that shows the
-scale; the first ones stay as wires, so that the others are seen to shrink: along the axis the scale factor's sigma, across it the two angles' (s_i = K_i E_i, all without unit).
+scale; the first ones stay as wires, so that the others are seen to shrink. Along the axis they have the scale factor's
+sigma, across it the two angles' (s_i = K_i E_i, all without unit).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from kf_calib.views.rerun.chart import number, power, thin
 from kf_calib.views.rerun.names import ACCELEROMETERS, GOLD, GREY, RED, WHITE
 from kf_calib.views.rerun.series import above, crowd, ends, nis_band, times
 
-FINAL_SIZE = 0.12  # of the largest final ellipsoid, as a part of the axis' length
+FINAL_SIZE = 0.16  # of the largest final ellipsoid, as a part of the axis' length
 THINNEST = 0.008  # thinner ones could not be seen
 LARGEST = 0.7  # larger ones would hide the scene
 BAR = 0.6  # at most so long is the bar that shows the scale
@@ -149,7 +150,10 @@ def _log_bar(stream: rr.RecordingStream, factor: float, words: str) -> None:
     half = 0.5 * factor * arcsec / _ARCSEC
     bar = rr.LineStrips3D([[(-half, FLOOR, 0.0), (half, FLOOR, 0.0)]], colors=WHITE, radii=0.012)
     stream.log("platform/scale", bar, static=True)
-    texts = [f"{number(arcsec)} arcsec, {number(arcsec / _ARCSEC * 1e6)} ppm", *([words] if words else [])]
+    texts = [
+        f"{number(arcsec)} arcsec, {number(float(f'{arcsec / _ARCSEC * 1e6:.2g}'))} ppm",
+        *([words] if words else []),
+    ]
     places = [(0.0, FLOOR - 0.04 - 0.17 * k, 0.0) for k in range(len(texts))]
     label = rr.Points3D(places, labels=texts, radii=0.0, colors=WHITE, show_labels=True)
     stream.log("platform/scale/label", label, static=True)

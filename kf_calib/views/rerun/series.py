@@ -34,10 +34,10 @@ Counts = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class History:
-    """What is estimated along the run, in shown units: deviation from nominal and sigma (n, 12 + q), NaN where not seen.
+    """What is estimated along the run, in shown units: deviation from nominal and sigma (n, 12 + q).
 
-    ``shown``: what the columns are, the q coefficients of effects last. ``orientation`` (n,) is the number of the dwell, the prior has 0; ``whole`` (n,) tells the rows at which a dwell is
-    complete.
+    NaN where not determined. ``shown``: what the columns are, the q coefficients of effects last. ``orientation`` (n,)
+    is the number of the dwell, the prior has 0; ``whole`` (n,) tells the rows at which a dwell is complete.
     """
 
     shown: tuple[Quantity, ...]

@@ -22,6 +22,8 @@ from kf_calib.views.rerun.names import GROUPS, PER_SI, WHITE, Colour, Quantity
 from kf_calib.views.rerun.series import Counts, History
 
 BARS: Colour = (92, 96, 110)
+ROOM = 32.0
+"""Between a chart and the title of the next."""
 _TALLEST = 0.45  # of the chart's height: the bar of the largest share
 
 
@@ -49,7 +51,7 @@ class Falling:
 
     @cached_property
     def kinds(self) -> list[tuple[str, str, list[int]]]:
-        """Name, unit and columns of each chart of the overview; coefficients differ in unit, and are in final sigmas."""
+        """Name, unit and columns of each chart of the overview; coefficients are in final sigmas."""
         own = [(group.title, group.unit, [paper_parameters.SYMBOLS.index(symbol) for symbol in group.symbols])
                for group in GROUPS]  # fmt: skip
         rest = list(range(12, len(self.shown)))
@@ -77,9 +79,9 @@ class Falling:
 
     def overview(self) -> list[Chart]:
         """A chart a kind, one below the other."""
-        out, tall = list[Chart](), 640.0 / len(self.kinds) - TOP - 22.0
+        out, tall = list[Chart](), 640.0 / len(self.kinds) - TOP - ROOM
         for k, (name, unit, columns) in enumerate(self.kinds):
-            corner, last = (0.0, k * (tall + TOP + 22.0)), k == len(self.kinds) - 1
+            corner, last = (0.0, k * (tall + TOP + ROOM)), k == len(self.kinds) - 1
             place = Chart("", self._across(""), self._across(""), "", corner, 520.0, tall)
             path = f"sigmas/{name.replace(' ', '_')}"
             out.append(self._chart(path, columns, self._title(name, unit, columns), place, "orientation" * last))
@@ -101,14 +103,16 @@ class Falling:
     def single(self) -> list[Chart]:
         """A chart for each parameter and coefficient, four a row."""
         rows = -(-len(self.shown) // 4)
-        wide, tall = 300.0, max(90.0, 860.0 / rows - TOP - 26.0)
-        return [
-            self._chart(f"each/{shown.path}", [k], f"σ of {shown.label}, {shown.unit}: {_final(self.sigma[-1, k])}",
-                        Chart("", self._across(""), self._across(""), "",
-                              ((k % 4) * (wide + LEFT + RIGHT), (k // 4) * (tall + TOP + 26.0)), wide, tall, shown.colour),
-                        "orientation" * (k // 4 == rows - 1), alone=True)
-            for k, shown in enumerate(self.shown)
-        ]  # fmt: skip
+        wide, tall = 300.0, max(90.0, 860.0 / rows - TOP - ROOM)
+        out = list[Chart]()
+        for k, shown in enumerate(self.shown):
+            row, column = divmod(k, 4)
+            corner = (column * (wide + LEFT + RIGHT), row * (tall + TOP + ROOM))
+            place = Chart("", self._across(""), self._across(""), "", corner, wide, tall, shown.colour)
+            final = f"{self.sigma[-1, k]:.3g} {shown.unit}" if np.isfinite(self.sigma[-1, k]) else "not determined"
+            below = "orientation" if row == rows - 1 else ""
+            out.append(self._chart(f"each/{shown.path}", [k], f"σ of {shown.label}: {final}", place, below, alone=True))
+        return out
 
     def log(self, stream: rr.RecordingStream) -> None:
         """Send all charts."""
@@ -129,9 +133,9 @@ class Falling:
             colours += [self.shown[column].colour] * len(parts)
             radii += [thin(1.6 if k == worst else 0.7)] * len(parts)
         stream.log(f"{chart.path}/curves", rr.LineStrips2D(strips, colors=colours, radii=radii), static=True)
-        dots = chart.at(x, own[:, worst])[np.isfinite(own[:, worst])]
-        stream.log(f"{chart.path}/worst", rr.Points2D(dots, colors=self.shown[columns[worst]].colour,
-                                                      radii=thin(3.0 if len(x) < 60 else 1.5)), static=True)  # fmt: skip
+        dots, radius = chart.at(x, own[:, worst])[np.isfinite(own[:, worst])], thin(3.0 if len(x) < 60 else 1.5)
+        colour = self.shown[columns[worst]].colour
+        stream.log(f"{chart.path}/worst", rr.Points2D(dots, colors=colour, radii=radius), static=True)
         wanted = np.unique(self.wanted[list(columns)][np.isfinite(self.wanted[list(columns)])])
         stream.log(f"{chart.path}/targets", rr.LineStrips2D([chart.level(each) for each in wanted], colors=WHITE,
                                                             radii=thin(0.8)), static=True)  # fmt: skip
@@ -152,13 +156,9 @@ class Falling:
               BARS)  # fmt: skip
 
 
-def _final(value: float) -> str:
-    return f"{value:.3g}" if np.isfinite(value) else "not determined"
-
-
 def overview_sheet(falling: Falling) -> rrb.Spatial2DView:
     """The charts of the overview in one view."""
-    return sheet("sigmas", "σ by orientation; bars: share of the information each brought", falling.overview())
+    return sheet("sigmas", "σ by orientation; bars: information", falling.overview())
 
 
 def single_sheet(falling: Falling, name: str) -> rrb.Spatial2DView:
