@@ -184,6 +184,6 @@ def sheet(origin: str, name: str, charts: Sequence[Chart]) -> rrb.Spatial2DView:
     top = min(chart.corner[1] for chart in charts) - TOP
     bottom = max(chart.corner[1] + chart.height for chart in charts) + BOTTOM + 8.0
     return rrb.Spatial2DView(
-        origin=origin, name=name, contents=list(contents),
+        origin=origin, name=name,
         visual_bounds=rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom]),
     )  # fmt: skip
