@@ -23,6 +23,11 @@ def information_shares(result: Calibration) -> Floats:
     brings they sum to 1. A share is negative where biases that walk were lost faster than a dwell found them; a
     parameter that the run does not determine, or that the prior holds exact, has none (NaN).
     """
-    sigmas = np.array([each.sigma for each in (prior_estimate(result), *(visit.estimate for visit in result.visits))])
-    sigmas[:, ~(sigmas[-1] > 0.0)] = np.nan
-    return np.diff(np.nan_to_num(sigmas**-2), axis=0) * sigmas[-1] ** 2
+    estimates = [prior_estimate(result), *(visit.estimate for visit in result.visits)]
+    return shares_of(np.array([estimate.sigma for estimate in estimates]))
+
+
+def shares_of(sigmas: Floats) -> Floats:
+    """The same (n, k) from sigmas (n + 1, k) before the first dwell and after each, NaN where not determined."""
+    known = np.where(sigmas[-1] > 0.0, sigmas, np.nan)
+    return np.diff(np.nan_to_num(known**-2), axis=0) * known[-1] ** 2

@@ -40,7 +40,9 @@ def layout(result: Calibration, history: History, falling: Falling, timeline: st
 def _overview(result: Calibration, falling: Falling) -> rrb.Horizontal:
     judged = [_normalised(result), _nis(result)] if predicted(result) else [_residuals(result)]
     return rrb.Horizontal(
-        rrb.Vertical(overview_sheet(falling), _pose(result), row_shares=[7, 2]),
+        rrb.Vertical(
+            overview_sheet(falling, "σ by orientation; bars: information brought"), _pose(result), row_shares=[7, 2]
+        ),
         rrb.Vertical(_platform(result), *judged, row_shares=[6, 3, 3][: 1 + len(judged)]),
         _summary(),
         column_shares=[5, 4.4, 3.8],

@@ -53,7 +53,7 @@ def ellipsoids(sensitivities: Floats) -> list[Ellipsoid]:
     return out
 
 
-def _ellipsoids(estimate: Estimate) -> list[Ellipsoid]:
+def ellipsoids_of(estimate: Estimate) -> list[Ellipsoid]:
     """Return those of the sensitivities that are determined."""
     own = np.full((3, 3, 3), np.nan)
     for i in range(3):
@@ -64,7 +64,7 @@ def _ellipsoids(estimate: Estimate) -> list[Ellipsoid]:
 
 def magnified(estimate: Estimate) -> str:
     """What the title of the view says of the ellipsoids."""
-    factor = magnification(_ellipsoids(estimate))
+    factor = magnification(ellipsoids_of(estimate))
     return f" with 1σ ×{power(factor)}" if factor else ""
 
 
@@ -78,7 +78,7 @@ def log_platform(result: Calibration, stream: rr.RecordingStream) -> None:
     log_frame(stream)
     _log_axes(result, stream)
     numbers = ends(result.visits)[1].tolist()
-    steps = [_ellipsoids(visit.estimate) for visit in result.visits]
+    steps = [ellipsoids_of(visit.estimate) for visit in result.visits]
     tips = [_axes(visit.estimate) for visit in result.visits]
     log_ellipsoids(stream, times(*ends(result.visits)), numbers, steps, tips)
     _log_directions(result, stream)
@@ -98,7 +98,7 @@ def log_frame(stream: rr.RecordingStream) -> None:
 
 def _log_axes(result: Calibration, stream: rr.RecordingStream) -> None:
     """Estimated sensitive axes after each dwell; those not yet determined are left out."""
-    seen = [[i for i, _, _ in _ellipsoids(visit.estimate)] for visit in result.visits]
+    seen = [[i for i, _, _ in ellipsoids_of(visit.estimate)] for visit in result.visits]
     vectors = [_axes(visit.estimate)[own] for visit, own in zip(result.visits, seen, strict=True)]
     which = [i for own in seen for i in own]
     columns = rr.Arrows3D.columns(

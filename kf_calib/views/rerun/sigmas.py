@@ -18,7 +18,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.information_share import information_shares
 from kf_calib.estimation.results import Calibration
 from kf_calib.views.rerun.chart import LEFT, RIGHT, TOP, Axis, Chart, sheet, thin, write
-from kf_calib.views.rerun.names import GROUPS, PER_SI, WHITE, Colour, Quantity
+from kf_calib.views.rerun.names import GREY, GROUPS, PER_SI, WHITE, Colour, Quantity
 from kf_calib.views.rerun.series import Counts, History
 
 BARS: Colour = (92, 96, 110)
@@ -31,7 +31,9 @@ _TALLEST = 0.45  # of the chart's height: the bar of the largest share
 class Falling:
     """Sigmas (n, 12 + q) in shown units after each orientation (n,), and the shares (n, 12) of information.
 
-    wanted (12 + q,): targets, NaN where there are none. Orientation 0 is a stated prior.
+    wanted (12 + q,): targets, NaN where there are none. Orientation 0 is a stated prior. path: entity of the overview.
+    across: what is counted. beside: other sigmas that are to be in the range of the axes. size: width of
+    the overview's charts, and height of all.
     """
 
     shown: tuple[Quantity, ...]
@@ -39,6 +41,10 @@ class Falling:
     sigma: Floats
     shares: Floats
     wanted: Floats
+    path: str = "sigmas"
+    across: str = "orientation"
+    beside: Floats | None = None
+    size: tuple[float, float] = (520.0, 640.0)
 
     @classmethod
     def of(cls, result: Calibration, history: History, wanted: Floats | None = None) -> Falling:
@@ -73,18 +79,21 @@ class Falling:
 
     def _chart(self, path: str, columns: Sequence[int], title: str, place: Chart, below: str,
                alone: bool = False) -> Chart:  # fmt: skip
-        values = np.append(self.values(columns, alone).ravel(), self.wanted[list(columns)])
+        others = self.sigma[:0] if self.beside is None else self.beside
+        values = np.concatenate([self.values(columns, alone).ravel(), self.wanted[list(columns)],
+                                 others[:, list(columns)].ravel()])  # fmt: skip
         return Chart(path, self._across(below), Axis.around(values, log=True), title, place.corner, place.width,
                      place.height, place.colour)  # fmt: skip
 
     def overview(self) -> list[Chart]:
         """A chart a kind, one below the other."""
-        out, tall = list[Chart](), 640.0 / len(self.kinds) - TOP - ROOM
+        out, (wide, high) = list[Chart](), self.size
+        tall = high / len(self.kinds) - TOP - ROOM
         for k, (name, unit, columns) in enumerate(self.kinds):
             corner, last = (0.0, k * (tall + TOP + ROOM)), k == len(self.kinds) - 1
-            place = Chart("", self._across(""), self._across(""), "", corner, 520.0, tall)
-            path = f"sigmas/{name.replace(' ', '_')}"
-            out.append(self._chart(path, columns, self._title(name, unit, columns), place, "orientation" * last))
+            place = Chart("", self._across(""), self._across(""), "", corner, wide, tall)
+            path = f"{self.path}/{name.replace(' ', '_')}"
+            out.append(self._chart(path, columns, self._title(name, unit, columns), place, self.across if last else ""))
         return out
 
     def _title(self, name: str, unit: str, columns: Sequence[int]) -> str:
@@ -95,10 +104,12 @@ class Falling:
         if columns[0] >= 12:
             return f"σ of {name} over their final σ"
         worst, best = int(np.nanargmax(final)), int(np.nanargmin(final))
-        ends = [
-            f"{word} {self.shown[columns[k]].label} {final[k]:.3g}" for word, k in (("worst", worst), ("best", best))
-        ]
-        return f"σ of {name}, {unit}: {', '.join(ends[: 1 if worst == best else 2])}"
+        ends = [f"{final[k]:.3g}" for k in (worst, best)]
+        told = f"all {ends[0]}" if ends[0] == ends[1] else f"worst {self.shown[columns[worst]].label} {ends[0]}"
+        if self.size[0] < 300.0:
+            return f"{name}, {unit}: {told}"
+        least = "" if ends[0] == ends[1] else f", best {self.shown[columns[best]].label} {ends[1]}"
+        return f"σ of {name}, {unit}: {told}{least}"
 
     def single(self) -> list[Chart]:
         """A chart for each parameter and coefficient, four a row."""
@@ -110,16 +121,20 @@ class Falling:
             corner = (column * (wide + LEFT + RIGHT), row * (tall + TOP + ROOM))
             place = Chart("", self._across(""), self._across(""), "", corner, wide, tall, shown.colour)
             final = f"{self.sigma[-1, k]:.3g} {shown.unit}" if np.isfinite(self.sigma[-1, k]) else "not determined"
-            below = "orientation" if row == rows - 1 else ""
+            below = self.across if row == rows - 1 else ""
             out.append(self._chart(f"each/{shown.path}", [k], f"σ of {shown.label}: {final}", place, below, alone=True))
         return out
 
     def log(self, stream: rr.RecordingStream) -> None:
         """Send all charts."""
-        for chart, (_, _, columns) in zip(self.overview(), self.kinds, strict=True):
-            self._log(chart, columns, stream)
+        self.log_overview(stream)
         for k, chart in enumerate(self.single()):
             self._log(chart, [k], stream, alone=True)
+
+    def log_overview(self, stream: rr.RecordingStream) -> None:
+        """Send the charts of the overview."""
+        for chart, (_, _, columns) in zip(self.overview(), self.kinds, strict=True):
+            self._log(chart, columns, stream)
 
     def _log(self, chart: Chart, columns: Sequence[int], stream: rr.RecordingStream, alone: bool = False) -> None:
         chart.frame(stream)
@@ -151,14 +166,13 @@ class Falling:
         strips = bars.bars(x, np.where(share > 0.0, share, np.nan), 0.0)
         stream.log(f"{chart.path}/shares", rr.LineStrips2D(strips, colors=[BARS], radii=radius, draw_order=-5.0),
                    static=True)  # fmt: skip
-        top = int(np.argmax(share))
-        write(stream, f"{chart.path}/share", [(bars.at(x[[top]], share[[top]])[0] - (0.0, 22.0), f"{share[top]:.0%}")],
-              BARS)  # fmt: skip
+        place = chart.corner[0] + chart.width - 62.0, chart.corner[1] + 2.0
+        write(stream, f"{chart.path}/share", [(place, f"highest bar {100 * share.max():.0f} %")], GREY)
 
 
-def overview_sheet(falling: Falling) -> rrb.Spatial2DView:
+def overview_sheet(falling: Falling, name: str) -> rrb.Spatial2DView:
     """The charts of the overview in one view."""
-    return sheet("sigmas", "σ by orientation; bars: information", falling.overview())
+    return sheet(falling.path, name, falling.overview())
 
 
 def single_sheet(falling: Falling, name: str) -> rrb.Spatial2DView:
