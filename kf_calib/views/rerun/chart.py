@@ -148,7 +148,7 @@ class Chart:
     def frame(self, stream: rr.RecordingStream) -> None:
         """Send the frame, grid, ticks and titles, which stand still."""
         (left, top), right, bottom = self.corner, self.corner[0] + self.width, self.corner[1] + self.height
-        across = self.x.ticks(max(2, int(self.width / 70)))
+        across = self.x.ticks(max(2, int(self.width / 52)))
         upward = self.y.ticks(max(2, int(self.height / 34)))
         lines = [self.upright(value) for value, _ in across] + [self.level(value) for value, _ in upward]
         grid = [*lines, np.array([[left, top], [left, bottom], [right, bottom]])]
@@ -177,12 +177,12 @@ def thin(pixels: float) -> float:
     return -pixels
 
 
-def sheet(origin: str, name: str, charts: Sequence[Chart]) -> rrb.Spatial2DView:
-    """The view of a sheet that holds all charts."""
+def sheet(origin: str, name: str, charts: Sequence[Chart], above: float = 0.0) -> rrb.Spatial2DView:
+    """The view of a sheet that holds all charts, with more room above them."""
     left = min(chart.corner[0] for chart in charts) - LEFT
     right = max(chart.corner[0] + chart.width for chart in charts) + RIGHT
-    top = min(chart.corner[1] for chart in charts) - TOP
-    bottom = max(chart.corner[1] + chart.height for chart in charts) + BOTTOM + 8.0
+    top = min(chart.corner[1] for chart in charts) - TOP - above
+    bottom = max(chart.corner[1] + chart.height for chart in charts) + BOTTOM + 18.0
     return rrb.Spatial2DView(
         origin=origin, name=name,
         visual_bounds=rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom]),

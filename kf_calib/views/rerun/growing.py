@@ -19,6 +19,7 @@ from typing import IO
 
 from kf_calib.errors import InputError
 from kf_calib.estimation.results import Calibration
+from kf_calib.online.status import Judgement
 from kf_calib.support.output_files import Growing
 from kf_calib.views.rerun import grow
 from kf_calib.views.rerun.file import new_stream
@@ -39,7 +40,7 @@ class GrowingView:
         self, rrd: Path | None = None, port: int | None = PORT, bind: str = "127.0.0.1", waiting: int = _WAITING
     ) -> None:
         self.dropped, self.trouble = 0, ""
-        self._results = queue.Queue[Calibration | None](waiting)
+        self._results = queue.Queue[tuple[Calibration, Judgement | None] | None](waiting)
         self._file = _GrowingFile(rrd) if rrd else None
         self._viewer, self._relays = None, False
         self._stream = new_stream()
@@ -57,10 +58,10 @@ class GrowingView:
         """Whether there is a file by now."""
         return self._file is not None and self._file.began
 
-    def offer(self, result: Calibration) -> None:
-        """Show a result when there is time; never waits."""
+    def offer(self, result: Calibration, judgement: Judgement | None = None) -> None:
+        """Show a result when there is time, with what was judged of it; never waits."""
         try:
-            self._results.put_nowait(result)
+            self._results.put_nowait((result, judgement))
         except queue.Full:
             self.dropped += 1
 
@@ -86,10 +87,11 @@ class GrowingView:
     def _show(self) -> None:
         shown, laid_out = 0, 0
         try:
-            while (result := self._results.get()) is not None:
+            while (offered := self._results.get()) is not None:
+                result, judgement = offered
                 count = len(result.visits)
                 lay_out = count >= 2 * laid_out or count < shown  # not each time: who looks on may have changed it
-                grow(result, self._stream, shown, lay_out)
+                grow(result, self._stream, shown, lay_out, judgement)
                 shown, laid_out = count, count if lay_out else laid_out
                 self._pass_on(self._encoded.read() or b"")
         except Exception as error:  # a view that fails is no reason for a run to

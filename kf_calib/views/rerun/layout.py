@@ -52,7 +52,7 @@ def _overview(result: Calibration, falling: Falling) -> rrb.Horizontal:
 
 def predicted(result: Calibration) -> bool:
     """Were most dwells predicted from those before? Panels of innovations and NIS would else stand nearly empty."""
-    known = [visit.dof > 0 and np.isfinite(visit.innovation_mps2).all() for visit in result.visits]
+    known = [visit.dof > 0 and bool(np.isfinite(visit.innovation_mps2).all()) for visit in result.visits]
     return 2 * sum(known) >= len(known)
 
 
