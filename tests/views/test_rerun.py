@@ -16,12 +16,11 @@ from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.correlation import correlation
-from kf_calib.estimation.information_share import information_shares
 from kf_calib.estimation.prior import PRIORS
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.views import rerun as view
-from kf_calib.views.rerun.chart import Axis, Chart, number, power
+from kf_calib.views.rerun.chart import power
 from kf_calib.views.rerun.correlation import picture
 from kf_calib.views.rerun.names import PER_SI, path_of
 from kf_calib.views.rerun.platform import FINAL_SIZE, ellipsoids_of, magnification

@@ -6,8 +6,9 @@ columns. Two timelines: ``bench_time`` (since the first sample; points within th
 um/s^2. Where the orientations so far do not determine a parameter there is no point.
 
 Entities: ``parameters/ACCELEROMETER/SYMBOL/{sigma,deviation,band}``, ``parameters/effects/SYMBOL/...``, the charts
-``sigmas/KIND``, ``each/PARAMETER`` and ``residuals``, ``platform/...``, ``innovation/CHANNEL/{value,bound,in_sigma}``,
-``nis/{value,above,band}``, ``correlation/{picture,matrix,...}``, ``bench/pose/...``, ``summary``.
+``sigmas``, ``each``, ``estimates``, ``fit`` and ``innovations``, ``platform/...``,
+``innovation/CHANNEL/{value,bound,in_sigma}``, ``nis/{value,above,band}``, ``correlation/{picture,matrix,...}``,
+``bench/pose/...``, ``summary``.
 """
 
 from __future__ import annotations
@@ -28,12 +29,13 @@ from kf_calib.views.rerun.ahead import log_next, words
 from kf_calib.views.rerun.comparison import save as save_comparison
 from kf_calib.views.rerun.correlation import log_correlation
 from kf_calib.views.rerun.diagnosis import save as save_diagnosis
+from kf_calib.views.rerun.estimates import log_estimates
 from kf_calib.views.rerun.file import rrd_file, strict
 from kf_calib.views.rerun.improvement import save as save_improvement
 from kf_calib.views.rerun.layout import TABS, layout
 from kf_calib.views.rerun.names import BENCH_TIME, ORIENTATION
 from kf_calib.views.rerun.platform import log_platform
-from kf_calib.views.rerun.residuals import log_residuals
+from kf_calib.views.rerun.residuals import log_fit
 from kf_calib.views.rerun.series import History, log_bench, log_innovations, log_nis, log_parameters
 from kf_calib.views.rerun.sigmas import Falling
 from kf_calib.views.rerun.summary import summary
@@ -107,9 +109,10 @@ def _log(
     """Send what a run shows beyond its first ``shown`` dwells; ``said``: what stands above its page of text."""
     fresh = result.visits[shown:]
     if fresh:
-        log_parameters(history.after(result.visits[:shown]), stream)
+        log_parameters(history.after(result.visits[:shown]), stream, shown > 0)
         falling.log(stream)
-        log_residuals(result, stream)
+        log_estimates(history, stream)
+        log_fit(result, stream)
         log_platform(result, stream)
         log_innovations(fresh, stream, shown)
         log_nis(fresh, stream, shown)

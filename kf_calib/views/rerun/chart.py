@@ -7,9 +7,10 @@ sheet is about a pixel of a window of 1600 x 1000.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import rerun as rr
@@ -18,6 +19,8 @@ import rerun.blueprint as rrb
 from kf_calib.bench.arrays import Floats
 from kf_calib.views.rerun.names import GREY, WHITE, Colour
 
+Rgba = tuple[int, ...]
+Place = tuple[float, float]
 GRID: Colour = (44, 46, 50)
 LABEL_HEIGHT = 19.0
 """Of a label, which hangs below its point."""
@@ -65,8 +68,11 @@ class Axis:
 
     def ticks(self, at_most: int) -> list[tuple[float, str]]:
         """Round values in the range, and how they are printed."""
-        values = self._decades(at_most) if self.log else self._multiples(at_most)
-        return [(value, number(value)) for value in values]
+        if self.log:
+            return [(value, number(value)) for value in self._decades(at_most)]
+        values = self._multiples(at_most)
+        step = min((b - a for a, b in itertools.pairwise(values)), default=1.0)
+        return [(value, number(value, step)) for value in values]
 
     def _multiples(self, at_most: int) -> list[float]:
         """Return the multiples of a round step in the range."""
@@ -75,7 +81,7 @@ class Axis:
         step = next(each * decade for each in _STEPS if each * decade >= least * (1 - 1e-9))
         step = max(step, 1.0) if self.whole else step
         first, last = math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
-        return [round(k * step, 12) for k in range(first, last + 1)]
+        return [float(f"{k * step:.12g}") for k in range(first, last + 1)]
 
     def _decades(self, at_most: int) -> list[float]:
         """Return powers of ten in the range, each so many where they are many; with 2 and 5 times them where few."""
@@ -89,8 +95,12 @@ class Axis:
         return [10.0**k for k in range(first, last + 1) if k % every == 0]
 
 
-def number(value: float) -> str:
-    """A value of a tick: plain digits where they are few, else a power of ten."""
+def number(value: float, step: float = 0.0) -> str:
+    """A value of a tick: plain digits where they are few, else a power of ten; ``step``: to the next tick."""
+    if step >= 1e-4 and abs(value) < 1e7:
+        return f"{value:.{max(0, -math.floor(math.log10(step) + 1e-9))}f}".replace("-", "−")
+    if step:
+        return f"{value:.12g}".replace("-", "−")
     if value == 0.0 or 1e-3 <= abs(value) < 1e5:
         return np.format_float_positional(float(f"{value:.3g}"), trim="-").replace("-", "−")
     return ("−" if value < 0.0 else "") + power(abs(value))
@@ -145,24 +155,70 @@ class Chart:
         low = self.at(x[known], np.full(int(known.sum()), foot))
         return [np.array(ends) for ends in zip(low, self.at(x[known], y[known]), strict=True)]
 
-    def frame(self, stream: rr.RecordingStream) -> None:
-        """Send the frame, grid, ticks and titles, which stand still."""
-        (left, top), right, bottom = self.corner, self.corner[0] + self.width, self.corner[1] + self.height
-        across = self.x.ticks(max(2, int(self.width / 52)))
-        upward = self.y.ticks(max(2, int(self.height / 34)))
-        lines = [self.upright(value) for value, _ in across] + [self.level(value) for value, _ in upward]
-        grid = [*lines, np.array([[left, top], [left, bottom], [right, bottom]])]
-        colours = [GRID] * len(lines) + [GREY]
-        stream.log(f"{self.path}/grid", rr.LineStrips2D(grid, colors=colours, radii=thin(0.4), draw_order=-10.0),
-                   static=True)  # fmt: skip
-        texts = [((self.at(np.array([value]), np.array([self.y.low]))[0] + (0.0, 4.0)), text) for value, text in across]
-        texts += [((self.at(np.array([self.x.low]), np.array([value]))[0] - (14.0 + 4.2 * len(text), LABEL_HEIGHT / 2)),
-                   text) for value, text in upward]  # fmt: skip
-        write(stream, f"{self.path}/ticks", texts, GREY)
-        titles = [((left + self.width / 2, top - LABEL_HEIGHT - 8.0), self.title)] if self.title else []
-        write(stream, f"{self.path}/title", titles, self.colour)
-        below = [((left + self.width / 2, bottom + LABEL_HEIGHT + 3.0), self.x.title)] if self.x.title else []
-        write(stream, f"{self.path}/below", below, GREY)
+
+@dataclass
+class Ink:
+    """What is drawn on the charts of a sheet, gathered so that it is sent as a few entities: each has a cost."""
+
+    strips: list[Floats] = field(default_factory=list[Floats])
+    of_strips: list[tuple[Rgba, float]] = field(default_factory=list[tuple[Rgba, float]])
+    places: list[Floats] = field(default_factory=list[Floats])
+    of_places: list[tuple[Rgba, float]] = field(default_factory=list[tuple[Rgba, float]])
+    texts: list[tuple[Place, str, Colour]] = field(default_factory=list[tuple[Place, str, Colour]])
+
+    def lines(self, strips: Sequence[Floats], colour: Rgba, radius: float) -> None:
+        """Draw lines through places (n, 2)."""
+        self.strips += strips
+        self.of_strips += [(colour, radius)] * len(strips)
+
+    def points(self, places: Floats, colour: Rgba, radius: float) -> None:
+        """Draw points at places (n, 2)."""
+        self.places.append(places)
+        self.of_places += [(colour, radius)] * len(places)
+
+    def write(self, place: Place, text: str, colour: Colour) -> None:
+        """Write a text, centred below a place."""
+        self.texts += [(place, text, colour)] if text else []
+
+    def frame(self, chart: Chart) -> None:
+        """Draw frame, grid, ticks and titles of a chart."""
+        (left, top), right, bottom = chart.corner, chart.corner[0] + chart.width, chart.corner[1] + chart.height
+        across = chart.x.ticks(max(2, int(chart.width / 52)))
+        upward = chart.y.ticks(max(2, int(chart.height / 34)))
+        self.lines([chart.upright(value) for value, _ in across] + [chart.level(value) for value, _ in upward], GRID,
+                   thin(0.4))  # fmt: skip
+        self.lines([np.array([[left, top], [left, bottom], [right, bottom]])], GREY, thin(0.4))
+        for value, text in across:
+            self.write((float(chart.upright(value)[0, 0]), bottom + 4.0), text, GREY)
+        for value, text in upward:
+            place = left - 14.0 - 4.2 * len(text), float(chart.level(value)[0, 1]) - LABEL_HEIGHT / 2
+            self.write(place, text, GREY)
+        middle = left + chart.width / 2
+        self.write((middle, top - LABEL_HEIGHT - 8.0), chart.title, chart.colour)
+        self.write((middle, bottom + LABEL_HEIGHT + 3.0), chart.x.title, GREY)
+
+    def send(self, stream: rr.RecordingStream, path: str, order: float = 0.0) -> None:
+        """Send all that was drawn, for all times."""
+        if self.strips:
+            colours, radii = zip(*self.of_strips, strict=True)
+            lines = rr.LineStrips2D(self.strips, colors=colours, radii=radii, draw_order=order)
+            stream.log(f"{path}/lines", lines, static=True)
+        if self.places:
+            colours, radii = zip(*self.of_places, strict=True) if self.of_places else ((), ())
+            points = rr.Points2D(np.concatenate(self.places), colors=colours, radii=radii, draw_order=order + 1.0)
+            stream.log(f"{path}/points", points, static=True)
+        if self.texts:
+            places, texts, own = zip(*self.texts, strict=True)
+            labels = rr.Points2D(places, labels=texts, colors=own, radii=0.0, show_labels=True)
+            stream.log(f"{path}/texts", labels, static=True)
+
+
+def frames(stream: rr.RecordingStream, path: str, charts: Sequence[Chart]) -> None:
+    """Send the frames of all charts of a sheet."""
+    ink = Ink()
+    for chart in charts:
+        ink.frame(chart)
+    ink.send(stream, f"{path}/frame", -10.0)
 
 
 def write(stream: rr.RecordingStream, path: str, texts: Sequence[tuple[object, str]], colour: Colour) -> None:

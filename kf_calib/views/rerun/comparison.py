@@ -15,7 +15,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.batch_by_dwell import batch_differences
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.support.plain_text import printable
-from kf_calib.views.rerun.chart import LABEL_HEIGHT, TOP, Axis, Chart, sheet, thin, write
+from kf_calib.views.rerun.chart import LABEL_HEIGHT, TOP, Axis, Chart, frames, sheet, thin, write
 from kf_calib.views.rerun.file import rrd_file
 from kf_calib.views.rerun.names import GOLD, GREY, Quantity, quantities
 from kf_calib.views.rerun.series import Counts, ends
@@ -31,6 +31,7 @@ def save(compared: Comparison, path: Path) -> Path:
     shown = quantities(compared.result.model)
     charts = _charts(compared, number, apart)
     with rrd_file(path, _layout(charts)) as stream:
+        frames(stream, "apart", charts)
         for i, chart in enumerate(charts):
             _log(chart, number, apart, shown, i, stream)
             _log_ends(chart, compared, float(number[-1]), stream)
@@ -56,7 +57,6 @@ def _log(
     chart: Chart, number: Counts, apart: Floats, shown: tuple[Quantity, ...], i: int, stream: rr.RecordingStream
 ) -> None:
     """One chart: a curve for each parameter, all dwells so far by least squares against the filter."""
-    chart.frame(stream)
     for k in range(4 * i, 4 * i + 4) if i < 3 else range(12, len(shown)):
         known = apart[:, k] > 0.0  # equal to the last bit: no point on a logarithmic axis
         x, y = number[known].astype(float), apart[known, k]

@@ -21,7 +21,7 @@ from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import format_p
 from kf_calib.support.plain_text import printable
 from kf_calib.views.diagnosis import verdict
-from kf_calib.views.rerun.chart import Axis, Chart, sheet, thin, write
+from kf_calib.views.rerun.chart import Axis, Chart, frames, sheet, thin, write
 from kf_calib.views.rerun.explorer import (
     Log,
     at_step,
@@ -106,8 +106,9 @@ def _log_explorer(view: View, stream: rr.RecordingStream) -> None:
         return say(stream, "explorer/none", "Nothing that was recorded varies in this run.")
     driver = view.drivers[0]
     charts, x, standing = view.charts(driver), shown(driver), forever(stream)
-    for chart in (each for column in charts.values() for each in column):
-        chart.frame(stream)
+    everything = [each for column in charts.values() for each in column]
+    frames(stream, "explorer", everything)
+    for chart in everything:
         bounds(chart, standing)
     for i, chart in enumerate(charts["before"]):
         points(chart, x[:, i], view.before[:, i], standing, i)
@@ -150,9 +151,9 @@ def _dashes(chart: Chart, name: str, x: Floats, y: Floats, log: Log, colour: tup
 def _log_drivers(view: View, stream: rr.RecordingStream) -> None:
     """Residuals of all accelerometers against everything that varies, and below what an explanation leaves."""
     drivers = view.drivers[:_DRIVERS]
+    frames(stream, "drivers", [chart for charts in _driver_charts(view) for chart in charts])
     for driver, charts in zip(drivers, _driver_charts(view), strict=True):
         for chart in charts:
-            chart.frame(stream)
             bounds(chart, forever(stream))
         points(charts[0], shown(driver), view.before, forever(stream))
         for rank, each in _ranked(view):

@@ -21,7 +21,7 @@ from kf_calib.diagnosis.stepwise_selection import Improvement, SelectionStep
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support.plain_text import printable
-from kf_calib.views.rerun.chart import LEFT, RIGHT, TOP, Axis, Chart, sheet, thin, write
+from kf_calib.views.rerun.chart import LEFT, RIGHT, TOP, Axis, Chart, frames, sheet, thin, write
 from kf_calib.views.rerun.explorer import (  # fmt: skip
     at_step,
     bounds,
@@ -103,6 +103,7 @@ def save(state: Improvement, path: Path) -> Path:
     with rrd_file(path, _layout(view)) as stream:
         _log_errors(view, stream)
         _log_chance(view, stream)
+        frames(stream, "coefficients", _coefficient_charts(view))
         for chart, (_, values) in zip(_coefficient_charts(view), view.coefficients, strict=True):
             _log_coefficient(chart, values, stream)
         _log_steps(view, stream)
@@ -128,7 +129,7 @@ def _chance_chart(view: View) -> Chart:
 def _log_errors(view: View, stream: rr.RecordingStream) -> None:
     """Held-out and in-sample error by step, and what noise alone would give."""
     chart, x = _error_chart(view), np.arange(float(len(view.found)))
-    chart.frame(stream)
+    frames(stream, "errors", [chart, _chance_chart(view)])
     for k, (name, (values, colour)) in enumerate(view.errors.items()):
         path = f"errors/{name.replace(' ', '_').replace(',', '')}"
         _curve(chart, path, x, values, colour, stream)
@@ -139,7 +140,6 @@ def _log_errors(view: View, stream: rr.RecordingStream) -> None:
 
 def _log_chance(view: View, stream: rr.RecordingStream) -> None:
     chart, x = _chance_chart(view), np.arange(float(len(view.found)))
-    chart.frame(stream)
     level = rr.LineStrips2D([chart.level(_LEVEL)], colors=RED, radii=thin(0.8))
     stream.log("errors/p/level", level, static=True)
     _curve(chart, "errors/p/value", x, view.p_values, GOLD, stream)
@@ -181,7 +181,6 @@ def _coefficient_charts(view: View) -> list[Chart]:
 
 
 def _log_coefficient(chart: Chart, values: list[Parameter | None], stream: rr.RecordingStream) -> None:
-    chart.frame(stream)
     stream.log(f"{chart.path}/zero", rr.LineStrips2D([chart.level(0.0)], colors=GREY, radii=thin(0.8)), static=True)
     rows = [(float(step), each.value * each.per_si, each.sigma * each.per_si) for step, each in enumerate(values)
             if each is not None and each.value is not None and each.sigma is not None]  # fmt: skip
@@ -203,8 +202,8 @@ def _explorer(view: View) -> list[Chart]:
 def _log_steps(view: View, stream: rr.RecordingStream) -> None:
     """Residuals, spheres and words of each step."""
     charts = _explorer(view) if view.drivers else []
+    frames(stream, "explorer", charts)
     for chart in charts:
-        chart.frame(stream)
         bounds(chart, forever(stream))
     for i, chart in enumerate(charts):
         first = chart.at(shown(view.drivers[0])[:, i], view.ratios[0][:, i])

@@ -21,7 +21,7 @@ from kf_calib.design.orientation_plan import Plan
 from kf_calib.estimation.information_share import shares_of
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.views.plan import gimbal_names, sentences
-from kf_calib.views.rerun.chart import LABEL_HEIGHT, Axis, Chart, power, sheet, thin, write
+from kf_calib.views.rerun.chart import LABEL_HEIGHT, Axis, Chart, frames, power, sheet, thin, write
 from kf_calib.views.rerun.file import rrd_file
 from kf_calib.views.rerun.names import (
     ACCELEROMETERS,
@@ -159,7 +159,7 @@ def _angles(made: Plan) -> Chart:
 
 def _log_angles(made: Plan, stream: rr.RecordingStream) -> None:
     chart, number = _angles(made), np.arange(1.0, len(made.poses) + 1.0)
-    chart.frame(stream)
+    frames(stream, "angles", [chart])
     for k, (name, angle) in enumerate(zip(gimbal_names(made), made.gimbal_deg.T, strict=True)):
         colour = GIMBALS[k % len(GIMBALS)]
         radius = thin(3.5 if len(number) < 60 else 1.6)

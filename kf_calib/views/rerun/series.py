@@ -95,14 +95,16 @@ def ends(visits: Sequence[Visit]) -> tuple[Floats, Counts]:
     return np.array([dwell.end_s for dwell in dwells]), np.array([dwell.number for dwell in dwells])
 
 
-def log_parameters(history: History, stream: rr.RecordingStream) -> None:
-    """Sigma, deviation from nominal, and the deviation less and plus one sigma."""
+def log_parameters(history: History, stream: rr.RecordingStream, styled: bool) -> None:
+    """Sigma, deviation from nominal, and the deviation less and plus one sigma; ``styled``: how they look was sent."""
     for k, shown in enumerate(history.shown):
         path, colour, label = shown.path, shown.colour, shown.label
         value, sigma = history.deviation[:, k], history.sigma[:, k]
         _log_curve(stream, f"{path}/sigma", history, sigma)
         _log_curve(stream, f"{path}/deviation", history, value)
         _log_curve(stream, f"{path}/band", history, np.column_stack([value - sigma, value + sigma]))
+        if styled:
+            continue
         _style(stream, f"{path}/sigma", rr.SeriesLines(names=label, colors=colour, widths=2.0))
         _style(stream, f"{path}/deviation", rr.SeriesLines(names=label, colors=colour, widths=2.0))
         _style(stream, f"{path}/band", rr.SeriesLines(names=["−σ", "+σ"], colors=[GREY] * 2, widths=[1.0] * 2))

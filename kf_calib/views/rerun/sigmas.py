@@ -17,7 +17,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.information_share import information_shares
 from kf_calib.estimation.results import Calibration
-from kf_calib.views.rerun.chart import LEFT, RIGHT, TOP, Axis, Chart, sheet, thin, write
+from kf_calib.views.rerun.chart import LABEL_HEIGHT, LEFT, RIGHT, TOP, Axis, Chart, Ink, sheet, thin
 from kf_calib.views.rerun.names import GREY, GROUPS, PER_SI, WHITE, Colour, Quantity
 from kf_calib.views.rerun.series import Counts, History
 
@@ -128,46 +128,52 @@ class Falling:
     def log(self, stream: rr.RecordingStream) -> None:
         """Send all charts."""
         self.log_overview(stream)
-        for k, chart in enumerate(self.single()):
-            self._log(chart, [k], stream, alone=True)
+        self._log(self.single(), [[k] for k in range(len(self.shown))], "each", stream, alone=True)
 
     def log_overview(self, stream: rr.RecordingStream) -> None:
         """Send the charts of the overview."""
-        for chart, (_, _, columns) in zip(self.overview(), self.kinds, strict=True):
-            self._log(chart, columns, stream)
+        self._log(self.overview(), [columns for _, _, columns in self.kinds], self.path, stream)
 
-    def _log(self, chart: Chart, columns: Sequence[int], stream: rr.RecordingStream, alone: bool = False) -> None:
-        chart.frame(stream)
+    def _log(
+        self, charts: Sequence[Chart], columns: Sequence[Sequence[int]], path: str, stream: rr.RecordingStream,
+        alone: bool = False,
+    ) -> None:  # fmt: skip
+        """Send charts, each of these columns: frames and bars as one entity, curves as another."""
+        behind, curves = Ink(), Ink()
+        for chart, own in zip(charts, columns, strict=True):
+            behind.frame(chart)
+            self._bars(chart, own, behind)
+            self._curves(chart, own, curves, alone)
+        behind.send(stream, f"{path}/frame", -10.0)
+        curves.send(stream, f"{path}/curves")
+
+    def _curves(self, chart: Chart, columns: Sequence[int], ink: Ink, alone: bool) -> None:
+        """Draw a curve for each column, that which is worst in the end with points, and the targets."""
         x, own = self.orientation.astype(float), self.values(columns, alone)
-        self._log_shares(chart, columns, stream)
-        strips, colours, radii = list[Floats](), list[Colour](), list[float]()
         worst = int(np.nanargmax(own[-1])) if np.isfinite(own[-1]).any() else 0
         for k, column in enumerate(columns):
-            parts = chart.strip(x, own[:, k])
-            strips += parts
-            colours += [self.shown[column].colour] * len(parts)
-            radii += [thin(1.6 if k == worst else 0.7)] * len(parts)
-        stream.log(f"{chart.path}/curves", rr.LineStrips2D(strips, colors=colours, radii=radii), static=True)
-        dots, radius = chart.at(x, own[:, worst])[np.isfinite(own[:, worst])], thin(3.0 if len(x) < 60 else 1.5)
-        colour = self.shown[columns[worst]].colour
-        stream.log(f"{chart.path}/worst", rr.Points2D(dots, colors=colour, radii=radius), static=True)
-        wanted = np.unique(self.wanted[list(columns)][np.isfinite(self.wanted[list(columns)])])
-        stream.log(f"{chart.path}/targets", rr.LineStrips2D([chart.level(each) for each in wanted], colors=WHITE,
-                                                            radii=thin(0.8)), static=True)  # fmt: skip
+            ink.lines(chart.strip(x, own[:, k]), self.shown[column].colour, thin(1.6 if k == worst else 0.7))
+        known = np.isfinite(own[:, worst])
+        colour, radius = self.shown[columns[worst]].colour, thin(3.0 if len(x) < 60 else 1.5)
+        ink.points(chart.at(x[known], own[known, worst]), colour, radius)
+        wanted = self.wanted[list(columns)]
+        for aim in np.unique(wanted[np.isfinite(wanted)]):
+            ink.lines([chart.level(float(aim))], WHITE, thin(0.8))
+            ink.write(
+                (chart.corner[0] + 40.0, float(chart.level(float(aim))[0, 1]) - LABEL_HEIGHT - 4.0), "target", WHITE
+            )
 
-    def _log_shares(self, chart: Chart, columns: Sequence[int], stream: rr.RecordingStream) -> None:
-        """Send the share of information of each orientation as a bar from the bottom, and write the largest at it."""
+    def _bars(self, chart: Chart, columns: Sequence[int], ink: Ink) -> None:
+        """Draw the share of information of each orientation as a bar from the bottom, and write the largest."""
         share = self.share(columns)
         if share is None or not share.max() > 0.0:
             return
         scale = Axis(0.0, float(share.max()) / _TALLEST)
         bars = Chart(chart.path, chart.x, scale, corner=chart.corner, width=chart.width, height=chart.height)
         x, radius = self.orientation.astype(float), min(6.0, 0.36 * chart.width / len(share))
-        strips = bars.bars(x, np.where(share > 0.0, share, np.nan), 0.0)
-        stream.log(f"{chart.path}/shares", rr.LineStrips2D(strips, colors=[BARS], radii=radius, draw_order=-5.0),
-                   static=True)  # fmt: skip
+        ink.lines(bars.bars(x, np.where(share > 0.0, share, np.nan), 0.0), BARS, radius)
         place = chart.corner[0] + chart.width - 62.0, chart.corner[1] + 2.0
-        write(stream, f"{chart.path}/share", [(place, f"highest bar {100 * share.max():.0f} %")], GREY)
+        ink.write(place, f"highest bar {100 * share.max():.0f} %", GREY)
 
 
 def overview_sheet(falling: Falling, name: str) -> rrb.Spatial2DView:
