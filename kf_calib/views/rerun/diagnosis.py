@@ -29,6 +29,7 @@ from kf_calib.views.rerun.explorer import (
     driver_charts,
     forever,
     log_spheres,
+    of_share,
     panel,
     points,
     reach_of,
@@ -166,9 +167,13 @@ def _driver_charts(view: View) -> list[list[Chart]]:
 
 
 def _summary(view: View) -> str:
-    """The verdict, the explanations by rank, and the quantities by what they explain."""
+    """The verdict, the next orientation, the explanations by rank, and the quantities by what they explain."""
     found = view.found
     blocks = [f"**{verdict(found)}**"]
+    if found.next_orientation is not None:
+        advice, why = found.next_orientation
+        angles = ", ".join(f"{angle:.4g}" for angle in advice.gimbal_deg)
+        blocks.append(f"**Next orientation**: gimbals at {angles} deg: {why}.")
     if view.explanations:
         rows = [
             f"| {rank} | {each.name} | {'yes' if each.fits else 'no'} | {_p(each)} |" for rank, each in _ranked(view)
@@ -176,12 +181,8 @@ def _summary(view: View) -> str:
         blocks.append("\n".join(["| explanation | adds | fits | p of the model with it |", "|:--|:--|:--|:--|", *rows]))
         blocks.append("Move the cursor of the timeline *explanation* to see what each leaves.")
     if view.drivers:
-        rows = [f"| {each.words} | {each.share:.0%} | p {format_p(each.p_value)} |" for each in view.drivers]
-        blocks.append("\n".join(["| quantity | share of the misfit | |", "|:--|--:|:--|", *rows]))
-    if found.next_orientation is not None:
-        advice, why = found.next_orientation
-        angles = ", ".join(f"{angle:.4g}" for angle in advice.gimbal_deg)
-        blocks.append(f"**Next orientation**: gimbals at {angles} deg: {why}.")
+        rows = [f"| {each.words} | {of_share(each)} | p {format_p(each.p_value)} |" for each in view.drivers]
+        blocks.append("\n".join(["| quantity | goes with | |", "|:--|:--|:--|", *rows]))
     return "\n\n".join(blocks) + "\n"
 
 

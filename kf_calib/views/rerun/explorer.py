@@ -128,15 +128,20 @@ def signed(ratios: Floats) -> NDArray[np.uint8]:
     return np.round(NONE + weight * (end - NONE)).astype(np.uint8)
 
 
+def of_share(driver: Driver) -> str:
+    """How much of the misfit goes with a driver, in a few words."""
+    if driver.p_value > 0.01 or driver.share < 0.005:
+        return "no more than noise"
+    return f"{100 * driver.share:.0f} % of the misfit"
+
+
 def driver_charts(drivers: Sequence[Driver], reach: float, rows: int) -> list[list[Chart]]:
     """For each driver ``rows`` charts, one below the other; four drivers a row."""
     size = (330.0, 330.0 / rows if rows > 1 else 330.0)
     out = list[list[Chart]]()
     for k, driver in enumerate(drivers):
         row, column = divmod(k, 4)
-        tells = driver.p_value < 0.01 and driver.share > 0.005
-        share = f"{100 * driver.share:.0f} % of the misfit" if tells else "no more than noise"
-        titles = [f"{driver.words}: {share}", *["what the explanation leaves"] * (rows - 1)]
+        titles = [f"{driver.words}: {of_share(driver)}", *["what the explanation leaves"] * (rows - 1)]
         units = [*[""] * (rows - 1), f"{driver.symbol}, {UNITS.get(driver.unit, (driver.unit, 1.0))[0]}"]
         out.append([
             panel(f"drivers/{driver.symbol}/{below}", shown(driver), units[below], reach, titles[below],
