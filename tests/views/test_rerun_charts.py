@@ -3,6 +3,7 @@ comparison hold the numbers of their results."""
 
 from __future__ import annotations
 
+import time
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
@@ -31,10 +32,11 @@ from kf_calib.views.rerun import comparison, diagnosis, improvement, residuals
 from kf_calib.views.rerun.chart import Axis, Chart, number
 from kf_calib.views.rerun.explorer import shown, signed
 from kf_calib.views.rerun.file import new_stream
+from kf_calib.views.rerun.growing import GrowingView
 from kf_calib.views.rerun.names import PER_SI
 from kf_calib.views.rerun.series import History
 from kf_calib.views.rerun.sigmas import Falling
-from kf_calib.views.screenshot import viewer
+from kf_calib.views.screenshot import screenshot, viewer
 
 RECORDINGS = ROOT / "recordings"
 
@@ -255,6 +257,27 @@ def test_a_live_run_shows_targets_and_where_to_go(tmp_path: Path) -> None:
     force = judgement.result.bench.specific_force(np.zeros(1), np.radians([going[0]]))[0]
     np.testing.assert_allclose(arrow, 1.25 * force / np.linalg.norm(force), atol=1e-6)
     assert judgement.verdict in content(path, "TextDocument:text")["/summary"][None][0]
+
+
+@pytest.mark.draws
+def test_the_file_of_a_run_that_goes_on_opens(tmp_path: Path) -> None:
+    """As it is where the program was killed."""
+    growing = GrowingView(tmp_path / "live.rrd", None)
+    for count in (8, 16):
+        growing.offer(run("hidden", left_out=tuple(range(count + 1, 25))))
+    deadline = time.monotonic() + 30.0
+    while time.monotonic() < deadline and (growing._results.qsize() or not growing.began):
+        time.sleep(0.05)
+    before = -1
+    while (size := (tmp_path / "live.rrd").stat().st_size) != before:
+        before = size
+        time.sleep(1.0)
+    copy = tmp_path / "killed.rrd"
+    copy.write_bytes((tmp_path / "live.rrd").read_bytes())
+    assert copy.read_bytes().count(b"RRF2") == 1
+    screenshot(copy, tmp_path / "x.png", (800, 600))
+    growing.close()
+    assert not growing.trouble
 
 
 @pytest.mark.draws

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import queue
 import socket
+import struct
 import subprocess
 import tempfile
 import threading
@@ -26,6 +27,7 @@ from kf_calib.views.rerun.file import new_stream
 from kf_calib.views.screenshot import binary, obituary
 
 PORT = 9876
+_HEADER = 12  # bytes before the first message of what Rerun encoded
 _WAITING = 4  # results; the next one that comes through shows what those left out would have
 
 
@@ -135,8 +137,10 @@ class _GrowingFile:
         if self._is_lost:
             return ""
         try:
-            self._file = self._file or self._place.open()
-            self._file.write(data)
+            if self._file is None:
+                self._file = self._place.open()
+                self._file.write(data[:_HEADER])
+            self._file.write(messages(data))
             self._file.flush()
             self._place.settle()
             self.began = True
@@ -154,6 +158,21 @@ class _GrowingFile:
                 self._file.close()
             if not self._place.settled:
                 self._place.discard()
+
+
+def messages(data: bytes) -> bytes:
+    """What Rerun encoded, without header and footer: the parts of a file can then follow one another.
+
+    A footer tells where the messages before it lie, counted from the beginning of the file; the viewer refuses a file
+    whose last footer does not agree. Of a message: kind and size, 8 bytes each, and as many bytes; kind 0 is the end.
+    """
+    at = _HEADER
+    while at < len(data):
+        kind, size = struct.unpack_from("<QQ", data, at)
+        if kind == 0:
+            break
+        at += 16 + size
+    return data[_HEADER:at]
 
 
 def _listens(port: int) -> bool:
