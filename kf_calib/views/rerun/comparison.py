@@ -48,7 +48,7 @@ def _charts(compared: Comparison, number: Counts, apart: Floats) -> list[Chart]:
     below = "orientation"
     return [
         Chart(f"apart/{i + 1}", Axis.counted(int(number[0]), int(number[-1]), below if i == len(titles) - 1 else ""), y,
-              f"{title}: difference of least squares from the filter, σ", (0.0, i * (_SIZE[1] + TOP + ROOM)), *_SIZE)
+              f"{title}: difference, σ", (0.0, i * (_SIZE[1] + TOP + ROOM)), *_SIZE)
         for i, title in enumerate(titles)
     ]  # fmt: skip
 
@@ -94,7 +94,7 @@ def _summary(compared: Comparison) -> str:
 def _layout(charts: list[Chart]) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Horizontal(
-            sheet("apart", "filter against least squares, by orientation", charts),
+            sheet("apart", "least squares less filter, by orientation", charts),
             rrb.TextDocumentView(origin="summary", name="three ways"),
             column_shares=[7, 4],
         ),

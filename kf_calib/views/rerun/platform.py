@@ -131,7 +131,7 @@ def log_ellipsoids(
     first = next((k for k, own in enumerate(shown) if len(own) == len(shown[-1])), len(shown) - 1)
     wires = rr.Ellipsoids3D(**fields[first], fill_mode=rr.components.FillMode.MajorWireframe, line_radii=thin(0.4))
     stream.log("platform/first", wires if first < len(shown) - 1 else rr.Clear(recursive=False), static=True)
-    _log_bar(stream, factor, f"wires: after orientation {numbers[first]}" if first < len(shown) - 1 else "")
+    _log_bar(stream, factor, f"; wires: orientation {numbers[first]}" if first < len(shown) - 1 else "")
 
 
 def _fields(own: list[Ellipsoid], tips: Floats, factor: float) -> dict[str, Any]:
@@ -155,7 +155,7 @@ def _log_bar(stream: rr.RecordingStream, factor: float, words: str) -> None:
         *([words] if words else []),
     ]
     places = [(0.0, FLOOR - 0.04 - 0.17 * k, 0.0) for k in range(len(texts))]
-    label = rr.Points3D(places, labels=texts, radii=0.0, colors=WHITE, show_labels=True)
+    label = rr.Points3D([place], labels=[text], radii=0.0, colors=WHITE, show_labels=True)
     stream.log("platform/scale/label", label, static=True)
 
 
