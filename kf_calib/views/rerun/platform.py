@@ -150,11 +150,8 @@ def _log_bar(stream: rr.RecordingStream, factor: float, words: str) -> None:
     half = 0.5 * factor * arcsec / _ARCSEC
     bar = rr.LineStrips3D([[(-half, FLOOR, 0.0), (half, FLOOR, 0.0)]], colors=WHITE, radii=0.012)
     stream.log("platform/scale", bar, static=True)
-    texts = [
-        f"{number(arcsec)} arcsec, {number(float(f'{arcsec / _ARCSEC * 1e6:.2g}'))} ppm",
-        *([words] if words else []),
-    ]
-    places = [(0.0, FLOOR - 0.04 - 0.17 * k, 0.0) for k in range(len(texts))]
+    ppm = number(float(f"{arcsec / _ARCSEC * 1e6:.2g}"))
+    text, place = f"{number(arcsec)} arcsec, {ppm} ppm{words}", (0.0, FLOOR - 0.04, 0.0)
     label = rr.Points3D([place], labels=[text], radii=0.0, colors=WHITE, show_labels=True)
     stream.log("platform/scale/label", label, static=True)
 
