@@ -13,6 +13,8 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch, Stream
+from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.correlation import correlation
@@ -209,6 +211,15 @@ def test_a_prior_is_orientation_zero_and_one_dwell_is_enough(tmp_path: Path) -> 
 def test_four_orientations_leave_nothing_to_judge(tmp_path: Path) -> None:
     path = view.save(calibrate(Dwells(4, GIMBALS)), tmp_path / "run.rrd")
     assert not any("/nis/" in entity for entity in rows_of(path))
+
+
+@pytest.mark.parametrize("dwells", [1, 4, 9])
+def test_diagnoses_and_improvements_of_odd_runs(tmp_path: Path, dwells: int) -> None:
+    """Nothing varies, nothing to judge by, attitude recorded."""
+    bench = GIMBALS if dwells < 9 else ATTITUDE
+    found = diagnose(calibrate(Dwells(dwells, bench), Settings(prior=PRIORS["navigation"])))
+    for made in (found, Improvement(found)):
+        assert view.save(made, tmp_path / "odd.rrd").stat().st_size > 10_000
 
 
 def test_strict_mode_of_the_caller_is_given_back(result: Calibration, tmp_path: Path) -> None:

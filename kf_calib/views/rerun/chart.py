@@ -150,7 +150,7 @@ class Chart:
         return self.at(np.array([x, x]), np.array([self.y.low, self.y.high]))
 
     def bars(self, x: Floats, y: Floats, foot: float) -> list[Floats]:
-        """Upright lines from ``foot`` to each value that is finite and within reach of the eye."""
+        """Upright lines from ``foot`` to each value that is finite."""
         known = np.isfinite(y)
         low = self.at(x[known], np.full(int(known.sum()), foot))
         return [np.array(ends) for ends in zip(low, self.at(x[known], y[known]), strict=True)]

@@ -97,7 +97,7 @@ def save(found: Diagnosis, path: Path) -> Path:
 
 
 def _ranked(view: View) -> list[tuple[int, Explanation]]:
-    """Return the explanations with their ranks, the best last: a viewer opens at what was sent for the last time."""
+    """Return the explanations with their ranks."""
     return list(enumerate(view.explanations, 1))
 
 

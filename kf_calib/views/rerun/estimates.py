@@ -16,7 +16,7 @@ from kf_calib.views.rerun.sigmas import ROOM
 
 _AT_MOST = 300  # points of a curve
 _MINUTES = 180.0
-"""Runs of up to so many seconds have an axis in seconds."""
+"""Runs of more seconds have an axis in minutes."""
 
 
 def _charts(history: History) -> list[Chart]:
