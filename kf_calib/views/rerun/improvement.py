@@ -22,7 +22,7 @@ from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support.plain_text import printable
 from kf_calib.views.rerun.chart import LEFT, RIGHT, TOP, Axis, Chart, frames, sheet, thin, write
-from kf_calib.views.rerun.explorer import (  # fmt: skip
+from kf_calib.views.rerun.explorer import (
     at_step,
     bounds,
     forever,
