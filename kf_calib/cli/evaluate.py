@@ -34,6 +34,7 @@ from kf_calib.cli.options import (
     settings_of,
     show,
     strict_option,
+    units_option,
 )
 from kf_calib.errors import InputError
 
@@ -56,6 +57,7 @@ STEPS = "Steps"
 @save_model_option
 @overwrite_option
 @strict_option
+@units_option
 @json_option
 @click.pass_context
 def replay(
@@ -127,6 +129,7 @@ def compare(recording: Path, as_json: bool, **options: Any) -> None:
 )
 @recording_options
 @filter_options
+@units_option
 @json_option
 def list_effects(names: tuple[str, ...], recording: Path | None, as_json: bool, **options: Any) -> None:
     """The effects a model may have: all of the catalogue and your own, or those NAMEd (formulas too) in detail.
@@ -178,6 +181,7 @@ def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, option
 @recording_options
 @filter_options
 @strict_option
+@units_option
 @json_option
 @click.pass_context
 def diagnose(ctx: click.Context, recording: Path, strict: bool, as_json: bool, **options: Any) -> None:
@@ -220,6 +224,7 @@ def diagnose(ctx: click.Context, recording: Path, strict: bool, as_json: bool, *
 @output_option("--journal", "journal_file", metavar="FILE", help="Keep a journal of the steps here.", panel=OUTPUT)
 @overwrite_option
 @strict_option
+@units_option
 @json_option
 @click.pass_context
 def improve(

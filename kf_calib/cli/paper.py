@@ -19,6 +19,7 @@ from kf_calib.cli.options import (
     progress,
     rrd_option,
     show,
+    units_option,
 )
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ inferred = partial(click.option, panel="Conditions that the paper does not print
 @rrd_option
 @png_option
 @overwrite_option
+@units_option
 @json_option
 def paper(
     repetitions: int, seed: int, period_s: float, latitude: float, azimuth: float, turns: str, sampled: str,

@@ -26,16 +26,16 @@ from kf_calib.estimation.signal_quality import Readings
 from kf_calib.support.printing import printed
 from kf_calib.support.tail_probabilities import f_tail
 from kf_calib.support.threads import one_blas_thread
+from kf_calib.support.units import field_unit
 
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # larger sigmas: not determined
-_SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
 
 
 @dataclass(frozen=True)
 class Parameter:
     """An estimated parameter and its sigma in SI units; both are None if the orientations do not determine it.
 
-    A deviation from nominal times ``per_si`` is in ``shown_unit``, the usual unit of the field.
+    A value times ``per_si`` is in ``shown_unit``, the unit of the field (``support.units``).
     """
 
     symbol: str
@@ -278,7 +278,7 @@ class Calibration:
             ),
             *((c.symbol, *own, 0.0, c.unit) for c, *own in zip(coefficients, effects, sigmas, strict=True)),
         ]
-        shown = [*(_SHOWN[unit] for unit in paper_parameters.UNITS), *((c.shown_unit, c.per_si) for c in coefficients)]
+        shown = [*map(field_unit, paper_parameters.UNITS), *((c.shown_unit, c.per_si) for c in coefficients)]
         if self.model.walks:
             intensity, spread = self.noise.walk_mps2_per_sqrt_s, self.noise.walk_spread
             found.append((WALK.symbol, intensity, intensity * spread if spread else math.nan, 0.0, WALK.unit))
