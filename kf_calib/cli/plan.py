@@ -201,7 +201,5 @@ def _aim(options: Mapping[str, Any], gravity_mps2: float) -> Aim:
     from kf_calib.design import optimality_criteria
 
     if options["targets"]:
-        return optimality_criteria.minimax(
-            optimality_criteria.tolerated(targets_of(options["targets"]), gravity_mps2)
-        )
+        return optimality_criteria.minimax(optimality_criteria.tolerated(targets_of(options["targets"]), gravity_mps2))
     return optimality_criteria.NAMED[options["criterion"]]

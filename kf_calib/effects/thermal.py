@@ -61,9 +61,7 @@ class ThermalMisalignment(Effect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(
-            Coefficient(f"gamma{axis}{i}", "rad/K", 1e-5) for i in (1, 2, 3) for axis in ("P", "O")
-        )
+        return tuple(Coefficient(f"gamma{axis}{i}", "rad/K", 1e-5) for i in (1, 2, 3) for axis in ("P", "O"))
 
     def columns(self, s: Stimulus) -> Floats:
         out = np.zeros((len(s), 3, 6))

@@ -136,8 +136,8 @@ def test_innovations_and_nis_are_those_of_the_visits(result: Calibration, record
         bound = by_orientation(scalars[f"/innovation/a{i + 1}/bound"])
         assert list(value) == list(bound) == list(judged)
         for k, visit in judged.items():
-            assert value[k][0] == pytest.approx(visit.innovation_mps2[i] * 1e6)
-            assert bound[k] == pytest.approx(np.array([-2e6, 2e6]) * visit.innovation_sigma_mps2[i])
+            assert value[k][0] == pytest.approx(visit.innovation_mps2[i] * 1e6 / 9.80665)
+            assert bound[k] == pytest.approx(np.array([-2e6, 2e6]) / 9.80665 * visit.innovation_sigma_mps2[i])
     nis = by_orientation(scalars["/nis/value"]) | by_orientation(scalars.get("/nis/above", []))
     assert {k: v[0] for k, v in nis.items()} == pytest.approx(
         {k: visit.nis for k, visit in enumerate(result.visits, 1) if visit.dof > 0}
@@ -201,7 +201,7 @@ def test_a_prior_is_orientation_zero_and_one_dwell_is_enough(tmp_path: Path) -> 
     path = view.save(result, tmp_path / "run.rrd", view.ORIENTATION, "Parameters")
     sigma = by_orientation(rows_of(path)["/parameters/a2/b2/log10_sigma"])
     assert list(sigma) == [0, 1]
-    assert sigma[0][0] == pytest.approx(np.log10(2e-2 * 1e6))
+    assert sigma[0][0] == pytest.approx(np.log10(2e-2 * 1e6 / 9.80665))
 
 
 def test_four_orientations_leave_nothing_to_judge(tmp_path: Path) -> None:
