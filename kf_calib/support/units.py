@@ -6,7 +6,7 @@
     with shown_in("si"): ...        # Unit("rad", 1.0) in here; ``--units si`` does this for a command
     quantity("3µg", "m/s^2")        # 2.94e-05: what a user wrote, in SI
 
-JSON is made of SI values and does not come here.
+Numbers in JSON are SI values and do not come here.
 """
 
 from __future__ import annotations
@@ -90,7 +90,11 @@ _system: ContextVar[System] = ContextVar("units", default="field")
 
 @contextmanager
 def shown_in(system: System) -> Iterator[None]:
-    """What is printed and drawn for people within is in units of the field, or in SI; JSON is in SI always."""
+    """A context in which what is printed and drawn for people is in units of the field or in SI; numbers in JSON are in
+    SI always.
+
+    system: "field" (arcsec, ppm, µg ..., as everywhere else) or "si" (rad, 1, m/s^2 ...).
+    """
     token = _system.set(system)
     try:
         yield
@@ -145,7 +149,7 @@ WORDS: dict[str, dict[str, float]] = {
 _POWERS = {"1": {}, "m/s^2": {"m": 1, "s": -2}, "Hz": {"s": -1}}
 _FACTORS = {word: factor for words in WORDS.values() for word, factor in words.items()}
 _MEASURED = {word: _POWERS.get(kind, {kind: 1}) for kind, words in WORDS.items() for word in words}
-_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
+_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^,]*?)\s*")
 _WORD = re.compile(r"([A-Za-z%]+)\^?(-?[1-9])")
 _TYPED = str.maketrans({"µ": "u", "μ": "u", "²": "^2", "³": "^3", "⁴": "^4"})
 
