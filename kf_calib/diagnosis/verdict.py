@@ -8,6 +8,7 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.scatter_hypothesis import dwell_noise_is_stated
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.estimation.fit import WALK
+from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
 from kf_calib.estimation.results import format_p
 
 
@@ -61,6 +62,19 @@ def verdict_in_words(found: Diagnosis) -> str:
     return (
         f"{start} Either dwells scatter by what was not stated or an effect {missing}: state {keys}, or visit an "
         "orientation again to tell."
+    )
+
+
+def second_pass_in_words(found: Diagnosis) -> str:
+    """A sentence on what only a second pass over the readings, which was not possible, could judge; "" where nothing."""
+    names = [suspect.name for suspect in found.suspects if not holds_its_oscillation(suspect.refit.fit)]
+    if found.test.vibration and not found.before.fit.dwells[0].averaged:
+        names.append("the lines in their spectrum")
+    if not names:
+        return ""
+    return (
+        f" A second pass over the readings is needed to judge {' and '.join(names)}: diagnose the recording, or give "
+        "its Refits to diagnose."
     )
 
 

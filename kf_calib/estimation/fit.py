@@ -13,7 +13,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -94,12 +93,6 @@ class Fit:
             standing = np.zeros((len(more), own.shape[1] - more.shape[1]))
             out.append(np.vstack([own, np.hstack([standing, more])]) if len(more) else own)
         return out
-
-    @cached_property
-    def families(self) -> dict[Any, Any]:
-        """Cache of the formulas that were tried on the residuals of this fit (``unknown_effect.families``), by the
-        other effects tried."""
-        return {}
 
     @cached_property
     def considered(self) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -20,7 +20,6 @@ from kf_calib.estimation.dwell_columns import Carried, columns_of, means_of
 from kf_calib.estimation.fit import WALK, Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import Noise, considered_information, steps
-from kf_calib.estimation.score_test import Frame
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings
 from kf_calib.support.printing import printed
@@ -215,19 +214,10 @@ class Calibration:
     residual_rms_mps2: float
     tally: Tally
     warnings: tuple[str, ...]
-    reread: Callable[..., Calibration] | None = field(default=None, repr=False, compare=False)
-    """Evaluates the same source again, for models that need the readings folded in another way."""
     readings: Readings = field(default_factory=Readings)
     """Defects of the readings, found independently of the model."""
     outlying: tuple[OutlyingDwell, ...] = ()
     """The dwell that alone does not fit, or several if any one of them could be the cause."""
-    frames: list[Frame] = field(default_factory=list[Frame], repr=False, compare=False)
-    """The candidates' whitened columns, shared by all models of the run."""
-
-    @cached_property
-    def refits(self) -> dict[tuple[str, ...], Calibration]:
-        """Cache of the models fitted by ``refitted``, by their effects."""
-        return {}
 
     @cached_property
     def held_out(self) -> HeldOut | None:

@@ -21,6 +21,7 @@ from kf_calib.design.gimbal_limits import wrapped
 from kf_calib.design.next_orientation import Advice, Course, course
 from kf_calib.diagnosis.candidate_tests import LEVEL, assess_candidates
 from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.calibration import conclude, evaluate, with_remarks
@@ -313,7 +314,7 @@ def _least(result: Calibration) -> int:
 
 def _not_judged(result: Calibration, watch: Watch | None) -> Diagnosis:
     """Return a diagnosis without an alarm: nothing is significant so far, and what the run could show."""
-    test = assess_candidates(result.fit, None if watch is None else watch.tests, frames=result.frames)
+    test = assess_candidates(result.fit, None if watch is None else watch.tests)
     said = "Nothing is beyond chance so far: no effect is missing that this run has shown."
     if watch is None:
         said = "Too few orientations so far to judge the model by: visit more."
@@ -328,7 +329,7 @@ def judge_whole_run(passed: Pass, wanted: Floats, watch: Watch | None, again: So
     """
     with one_blas_thread():
         result = conclude(passed, again)
-        look = Look(result, watch, diagnose(result))
+        look = Look(result, watch, diagnose(result, Refits(again)))
         return Judgement(result, look, watch, wanted, _course(result, wanted), final=True)
 
 

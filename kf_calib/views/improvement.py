@@ -12,6 +12,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.diagnosis.nested_cross_validation import NestedCrossValidation
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, SelectionStep, Spread, extend, take_step, undone
 from kf_calib.errors import InputError
@@ -269,6 +270,7 @@ HOW = "number: add it; a NAME, f FORMULA: add that; d NAME: drop; u: undo; q: fi
 
 def session(
     state: Improvement,
+    refits: Refits,
     ask: Callable[[str, str], str],
     show: Callable[[RenderableType], None],
     on_step: Callable[[Improvement], None],
@@ -276,9 +278,9 @@ def session(
 ) -> Improvement:
     """Ask the user what to do next until the user ends the improvement, and return it.
 
-    state: the improvement at first. ask: takes a question and the meaning of an empty answer, and returns the answer.
-    show: shows a renderable. on_step: called after each step. busy: context that is entered while an answer is
-    computed.
+    state: the improvement at first. refits: those of the run. ask: takes a question and the meaning of an empty answer,
+    and returns the answer. show: shows a renderable. on_step: called after each step. busy: context that is entered
+    while an answer is computed.
     """
     shown: Improvement | None = None
     while True:
@@ -292,13 +294,13 @@ def session(
             return replace(state, asked=True)
         try:
             with busy():
-                state = answered(state, answer, options)
+                state = answered(state, refits, answer, options)
             on_step(state)
         except InputError as error:
             show(Text(sentence(str(error)), style="red"))
 
 
-def answered(state: Improvement, answer: str, options: list[tuple[str, ...]]) -> Improvement:
+def answered(state: Improvement, refits: Refits, answer: str, options: list[tuple[str, ...]]) -> Improvement:
     """The improvement after an answer of the user; raises InputError where the answer cannot be understood or done.
 
     options: the effects that may be chosen by number.
@@ -306,15 +308,15 @@ def answered(state: Improvement, answer: str, options: list[tuple[str, ...]]) ->
     word, _, rest = answer.partition(" ")
     rest = rest.strip()
     if answer == "u":
-        return undone(state)
+        return undone(state, refits)
     if word == "d" and rest:
-        return take_step(state, None, (rest,), "user")
+        return take_step(state, refits, None, (rest,), "user")
     if word == "f" and rest:
-        return extend(state, (rest if "=" in rest else f"mine = {rest}",), "user")
+        return extend(state, refits, (rest if "=" in rest else f"mine = {rest}",), "user")
     if word == "a" and rest:
-        return extend(state, (rest,), "user")
+        return extend(state, refits, (rest,), "user")
     if answer.isdigit() and 1 <= int(answer) <= len(options):
-        return extend(state, options[int(answer) - 1], "user")
+        return extend(state, refits, options[int(answer) - 1], "user")
     raise InputError(f"{answer!r} is no answer: {HOW}.")
 
 
