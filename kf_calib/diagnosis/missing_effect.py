@@ -24,7 +24,6 @@ from kf_calib.diagnosis.candidate_tests import (
 )
 from kf_calib.diagnosis.effect_pairs import (
     MOST,
-    WALKS,
     Pair,
     Pairs,
     candidate_overlap,
@@ -226,7 +225,7 @@ def _one(refits: Refits, found: Diagnosis, first: Suspect | None, pairs: Pairs) 
         return replace(found, unknown=True)
     close = test.rivals(first.name)
     close += [name for name in test.holding(first.name) if name not in close]
-    numbers = {name: test.best.get(name, WALKS) for name in (first.name, *close)}  # walks and lines have no columns
+    numbers = {name: test.best.get(name, name) for name in (first.name, *close)}  # walks and lines have no columns
     overlaps = {
         name: candidate_overlap(test, numbers[first.name], numbers[name]) for name in close if name != first.name
     }
@@ -251,7 +250,7 @@ def _beside(found: Diagnosis, together: Sequence[tuple[str, str]]) -> Diagnosis:
 def _outdone(refits: Refits, found: Diagnosis, refit: Calibration, names: Sequence[str]) -> bool:
     """Tell whether a formula, other than a known effect, explains the misfit clearly better than these effects do."""
     fitted, tests = found.before.fit, found.test.effective_tests
-    effects = [effect for effect in refit.model.effects if str(effect) in names and not effect.walks]
+    effects = [effect for effect in refit.model.effects if str(effect) in names and effect.coefficients]
     scanned = scan(fitted.carried, fitted.noise.judging, effects)
     own, _ = scanned.explained(np.concatenate([each.basis for each in scanned.candidates], axis=1))
     own -= sum(chance_fall(each, tests) for each in scanned.candidates)
@@ -365,7 +364,7 @@ def _pairs_with_walk(refits: Refits, found: Diagnosis, pairs: Pairs, beyond: boo
         own = float(test.scan.statistics[k]) - chance_fall(candidates[k], tests)
         walk = 2.0 * refits.with_effects(before, (name, test.walking)).fit.walk_gain - threshold(1, tests)
         if walk > 0.0 and own + walk > least:
-            out[k, WALKS] = own + walk + walk_path_margin_beside(test, pairs, k)
+            out[k, test.walking] = own + walk + walk_path_margin_beside(test, pairs, k)
     return out
 
 

@@ -29,6 +29,7 @@ from kf_calib.errors import InputError
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.calibration import evaluate_fit
 from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 
 _NEEDED = 0.01  # an effect is needed where its removal raises chi-squared significantly at this level
@@ -359,7 +360,7 @@ def removals(fitted: Fit) -> tuple[Removal, ...]:
     upper = square_root_information.accumulate(fitted.all_rows(), fitted.steps)
     rank, least, out = square_root_information.rank(upper[:-1]), upper[-1, -1] ** 2, list[Removal]()
     for effect in carried.model.effects:
-        if effect.walks:
+        if not effect.coefficients:  # a random walk is noise, which is judged by its likelihood
             gain = 2.0 * fitted.walk_gain
             out.append(Removal(str(effect), gain, 1, 0.5 * float(chdtrc(1, max(gain, 0.0)))))
             continue
@@ -404,5 +405,5 @@ def _refuse(result: Calibration, text: str) -> None:
     effect = effect_named(text, result.bench)
     if len(merged(result.settings.effects, [text])) == len(result.settings.effects):
         raise InputError(f"{effect} is in the model already: choose another, or drop it first.")
-    if effect.dynamic and not result.carried.slews:
+    if Model(result.bench, (effect,)).dynamic and not result.carried.slews:
         raise InputError(f"{effect} shows in slews only, which were not read: start with --with '{as_text(effect)}'.")

@@ -7,7 +7,6 @@ import numpy as np
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.scatter_hypothesis import dwell_noise_is_stated
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
-from kf_calib.estimation.fit import WALK
 from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
 from kf_calib.estimation.results import format_p
 
@@ -66,7 +65,7 @@ def verdict_in_words(found: Diagnosis) -> str:
 
 
 def second_pass_in_words(found: Diagnosis) -> str:
-    """A sentence on what only a second pass over the readings, which was not possible, could judge; "" where nothing."""
+    """A sentence on what only a second pass over the readings could judge; "" where nothing is left to it."""
     names = [suspect.name for suspect in found.suspects if not holds_its_oscillation(suspect.refit.fit)]
     if found.test.vibration and not found.before.fit.dwells[0].averaged:
         names.append("the lines in their spectrum")
@@ -88,7 +87,7 @@ def _size(found: Diagnosis) -> str:
     assert found.after is not None
     parameters = found.after.parameters
     first = next(each for each in found.after.model.effects if str(each) == found.missing[0])
-    sized = [parameters[c.symbol] for c in ([WALK] if first.walks else first.coefficients)]
+    sized = [parameters[c.symbol] for c in first.parameters]
     shown = [max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or np.inf))]
     shown += [parameters[first.unknown.symbol]] if first.unknown else []
     return "".join(

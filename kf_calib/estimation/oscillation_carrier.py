@@ -83,4 +83,6 @@ def fitted_to(passed: Pass, dwells: list[DwellFactor]) -> Fit:
 
 def _oscillation_hz(fitted: Fit) -> float:
     """Return the frequency of the model's oscillation."""
-    return next(effect.value for effect in fitted.carried.model.effects if effect.oscillates)
+    effect = fitted.carried.model.oscillation
+    assert effect is not None
+    return effect.value

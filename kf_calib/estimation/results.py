@@ -17,7 +17,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.cross_validation import HeldOut, held_out
 from kf_calib.estimation.dwell_columns import Carried, columns_of, means_of
-from kf_calib.estimation.fit import WALK, Fit
+from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import Noise, considered_information, steps
 from kf_calib.estimation.settings import Settings
@@ -269,10 +269,10 @@ class Calibration:
             *((c.symbol, *own, 0.0, c.unit) for c, *own in zip(coefficients, effects, sigmas, strict=True)),
         ]
         shown = [*(_SHOWN[unit] for unit in paper_parameters.UNITS), *((c.shown_unit, c.per_si) for c in coefficients)]
-        if self.model.walks:
+        if (walk := self.model.intensity) is not None:
             intensity, spread = self.noise.walk_mps2_per_sqrt_s, self.noise.walk_spread
-            found.append((WALK.symbol, intensity, intensity * spread if spread else math.nan, 0.0, WALK.unit))
-            shown.append((WALK.shown_unit, WALK.per_si))
+            found.append((walk.symbol, intensity, intensity * spread if spread else math.nan, 0.0, walk.unit))
+            shown.append((walk.shown_unit, walk.per_si))
         for effect in self.model.stepped:
             assert effect.unknown is not None
             constant, spread = effect.unknown, self.fit.spreads[str(effect)]

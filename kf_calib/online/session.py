@@ -125,11 +125,10 @@ class Session:
                 "a live run is evaluated from folded dwells, as the block engine does: leave out --engine, and check "
                 "the recording with replay --engine filterpy."
             )
-        swinging = [str(effect) for effect in model.effects if effect.oscillates]
-        if swinging:
+        if model.oscillates:
             raise InputError(
-                f"{swinging[0]} needs a second pass over the readings: record the run, then "
-                f"replay the recording --with {swinging[0]}."
+                f"{model.oscillation} needs a second pass over the readings: record the run, then "
+                f"replay the recording --with {model.oscillation}."
             )
         moving = [str(effect) for effect in model.dynamic]
         if begun and moving and not self._segmenter.slews:

@@ -25,7 +25,7 @@ from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.engine_comparison import compare
-from kf_calib.estimation.fit import WALK, Fit, fit
+from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.noise_model import Noise as NoiseModel
 from kf_calib.estimation.noise_model import within_dwells
@@ -309,9 +309,9 @@ def estimated(fitted: Fit) -> dict[str, tuple[float, float]]:
     estimate = Estimate(*square_root_information.solve(factor, model.nominal_state()))
     found, gains = model.natural(estimate.state)
     out = {c.symbol: own for c, *own in zip(model.coefficients, found, estimate.effect_sigma * gains, strict=True)}
-    if model.walks:
+    if (walk := model.intensity) is not None:
         noise = fitted.noise
-        out[WALK.symbol] = [noise.walk_mps2_per_sqrt_s, noise.walk_mps2_per_sqrt_s * (noise.walk_spread or np.nan)]
+        out[walk.symbol] = [noise.walk_mps2_per_sqrt_s, noise.walk_mps2_per_sqrt_s * (noise.walk_spread or np.nan)]
     return {symbol: (float(value), float(sigma)) for symbol, (value, sigma) in out.items()}
 
 
