@@ -61,11 +61,11 @@ def calibrate(
     """
     source, settings = opened(source), settings or Settings()
     with one_blas_thread():
-        if Model.of(source.bench, settings.effects).averages and not settings.window_s:
-            stage.say("reading how it vibrates")
-            settings = replace(settings, window_s=_window_s(source, settings, on_progress))
-            stage.say("reading")
         passed = Pass(source, settings)
+        if passed.model.averages and not settings.window_s:
+            stage.say("reading how it vibrates")
+            passed = Pass(source, replace(settings, window_s=_window_s(source, settings, on_progress)))
+            stage.say("reading")
         if plain is None:
             passed.fold(on_progress)
         return conclude(passed, source, on_progress, plain)
@@ -95,7 +95,7 @@ def conclude(
         _refuse_absent(settings.left_out, passed.folder.dwells)
         refuse_unusable(dwells, passed.tally, bench)
     stage.say("estimating")
-    if again is not None and Model.of(bench, settings.effects).oscillates:
+    if again is not None and passed.model.oscillates:
         passed, fitted = on_carrier(replace(passed, source=again), dwells, plain, on_progress)
     else:
         fitted = fitted_to(passed, dwells)
