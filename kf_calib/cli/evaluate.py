@@ -239,6 +239,7 @@ def improve(
     **options: Any,
 ) -> None:  # fmt: skip
     """Add the effects that are missing, one after another, and see the error fall, until there is a reason to stop."""
+    from kf_calib.cli.improvement_dialogue import dialogue
     from kf_calib.diagnosis import nested_cross_validation, selection_journal, stepwise_selection
     from kf_calib.diagnosis.refits import Refits
     from kf_calib.estimation.calibration import calibrate
@@ -272,10 +273,7 @@ def improve(
             else:
                 state = stepwise_selection.improve(start, accept_first, keep, refits)
         if interactive:
-            state = views.session(
-                state, refits, lambda text, usual: click.prompt(text, default=usual or None), show, keep,
-                lambda: progress("improving"),
-            )  # fmt: skip
+            state = dialogue(state, refits, keep)
         with progress("holding out orientations", as_json or not honest) as tick:
             checked = nested_cross_validation.nested_cross_validation(start, on_fold=tick) if honest else None
         if as_json:

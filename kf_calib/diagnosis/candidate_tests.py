@@ -23,10 +23,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import consistency
 from kf_calib.estimation.score_test import Candidate, Frame, Scan
 from kf_calib.support import stage
-from kf_calib.support.tail_probabilities import sidak
-
-LEVEL = 0.01
-"""Probability of a false alarm in one run."""
+from kf_calib.support.tail_probabilities import LEVEL, sidak
 
 SHARE = 0.4
 """Share of the false-alarm probability that is given to the test of the misfit, and as much to the scan."""

@@ -78,7 +78,7 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
     if before.outlying:  # one wrong dwell is not an effect, but would make many effects significant
         test = refits.assess(before)
         verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {outlying_in_words(before.outlying)}"
-        return Diagnosis(before, test, (), (), test.consistent is False, (), {}, None, verdict)
+        return Diagnosis(before=before, test=test, verdict=verdict, unknown=test.consistent is False)
     test = _without_vibration(refits, before, refits.assess(before))
     found = _explained(refits, before, test)
     if found.unknown and test.without_lines:  # the lines keep their phase through the run, but not their amplitude
@@ -127,7 +127,7 @@ def _told_in_its_noise(refits: Refits, found: Diagnosis) -> Diagnosis:
 
 def _likeliest(refits: Refits, before: Calibration, test: CandidateTests) -> Diagnosis:
     """Return the diagnosis with the one effect or the two that explain the misfit, and their look-alikes."""
-    nothing = Diagnosis(before, test, (), (), False, (), {}, None, "")
+    nothing = Diagnosis(before=before, test=test)
     if test.consistent is not False:
         return nothing
     suspects = _suspects(refits, before, test)

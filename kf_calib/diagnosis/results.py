@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -41,7 +41,7 @@ class Suspect:
         return [p for p in list(self.refit.parameters.values())[12:] if p.symbol not in self.known]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Diagnosis:
     """What a diagnosis found.
 
@@ -60,13 +60,13 @@ class Diagnosis:
 
     before: Calibration
     test: CandidateTests
-    suspects: tuple[Suspect, ...]
-    missing: tuple[str, ...]
-    unknown: bool
-    ambiguity: tuple[str, ...]
-    overlaps: dict[str, float]
-    after: Calibration | None
-    verdict: str
+    verdict: str = ""
+    suspects: tuple[Suspect, ...] = ()
+    missing: tuple[str, ...] = ()
+    unknown: bool = False
+    ambiguity: tuple[str, ...] = ()
+    overlaps: dict[str, float] = field(default_factory=dict[str, float])
+    after: Calibration | None = None
     together: tuple[tuple[str, str], ...] = ()
     alone: str = ""
     as_scatter: bool = False

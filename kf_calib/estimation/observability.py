@@ -18,11 +18,11 @@ from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.score_test import Candidate, Scan, scan
+from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.threads import one_blas_thread
 
-LEVEL, POWER = 0.01, 0.9
-"""Significance level of a detection, and the share of runs in which an effect of the smallest detectable size is
-found."""
+POWER = 0.9
+"""Share of runs in which an effect of the smallest detectable size is found."""
 
 _CONFUSED, _TWINS, _NAMED = 0.5, 0.99, 3  # overlap worth naming, overlap of look-alikes, number of effects named
 

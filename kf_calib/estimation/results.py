@@ -23,7 +23,7 @@ from kf_calib.estimation.noise_model import Noise, considered_information, steps
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings
 from kf_calib.support.printing import printed
-from kf_calib.support.tail_probabilities import f_tail
+from kf_calib.support.tail_probabilities import LEVEL, f_tail
 from kf_calib.support.threads import one_blas_thread
 
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # larger sigmas: not determined
@@ -374,7 +374,7 @@ def consistency(fitted: Fit) -> Consistency:
         return Consistency(statistic, 0, None, None)
     noise_dof = float(sum(max(dwell.count - 4, 1) for dwell in dwells) / noise.inflation.mean())
     p_value = f_tail(dof, max(noise_dof, 1.0), statistic / dof)
-    return Consistency(statistic, dof, p_value, p_value >= 0.01)
+    return Consistency(statistic, dof, p_value, p_value >= LEVEL)
 
 
 def format_p(p_value: float | None) -> str:

@@ -319,7 +319,7 @@ def _not_judged(result: Calibration, watch: Watch | None) -> Diagnosis:
     said = "Nothing is beyond chance so far: no effect is missing that this run has shown."
     if watch is None:
         said = "Too few orientations so far to judge the model by: visit more."
-    return Diagnosis(result, test, (), (), False, (), {}, None, said)
+    return Diagnosis(before=result, test=test, verdict=said)
 
 
 def judge_whole_run(passed: Pass, wanted: Floats, watch: Watch | None, again: Source | None = None) -> Judgement:
