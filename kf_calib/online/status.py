@@ -173,7 +173,9 @@ class Judgement:
         """The verdict in a few words, for a screen."""
         if self.consistent is None:
             return (
-                f"not judged before {_least(self.result)} dwells" if self.watch is None else "nothing to judge by yet"
+                f"not judged before {_least(self.result)} dwells"
+                if self.watch is None
+                else "too few measurements to test the model"
             )
         looks = f", look {self.watch.looks}" if self.watch is not None and not self.final else ""
         if not self.alarm:
@@ -200,7 +202,7 @@ class Judgement:
         if self.course is None:
             return None
         symbol, fall = self.course.sharpened(self.worst)
-        return self.course.gimbal_deg, f"sharpens {symbol}, sigma x {fall:.2f}"
+        return self.course.gimbal_deg, f"lowers sigma of {symbol} to {fall:.2f} of its value"
 
     @cached_property
     def worst(self) -> Floats:

@@ -54,9 +54,7 @@ def test_equal_names_are_found_from_the_run(tmp_path: Path, monkeypatch: pytest.
     assert set(same) == {(name, other) for name in ["encoder-offset:z"] for other in [name, "axis-nonorthogonality:x"]}
 
 
-def test_effects_with_equal_readings_mean_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_effects_with_equal_readings_mean_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A magnetic sensitivity that all three accelerometers share is a tilt of the base; others are not."""
     monkeypatch.chdir(tmp_path)
     for sizes, others in (("4e-2,4e-2,4e-2", {"base-tilt"}), ("4e-2,-4e-2,4e-2", set[str]())):
