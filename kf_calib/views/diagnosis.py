@@ -87,7 +87,9 @@ def description_sentence(unknown: Description, formulas: Sequence[str]) -> str:
     """Sentences on what an unknown misfit depends on, with the formulas to try."""
     where = "all accelerometers" if unknown.channel == "all" else f"accelerometer {unknown.channel}"
     to_try = " ".join(f"--with '{formula}'" for formula in formulas)
-    return f"The misfit depends on {unknown.driver} ({where}), which explains {unknown.share:.0%} of it. To try: {to_try}"
+    return (
+        f"The misfit depends on {unknown.driver} ({where}), which explains {unknown.share:.0%} of it. To try: {to_try}"
+    )
 
 
 def _suspect_object(suspect: Suspect) -> dict[str, Any]:
