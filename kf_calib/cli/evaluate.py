@@ -23,18 +23,18 @@ from kf_calib.cli.options import (
     opened,
     overrides,
     overwrite_option,
-    png_option,
     print_json,
     progress,
     recording_of,
     recording_options,
-    rrd_option,
     save_model_option,
     save_view,
     settings_of,
     show,
     strict_option,
+    units_option,
 )
+from kf_calib.cli.pictures import Pictures, figures_of, picture_options
 from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
@@ -51,18 +51,16 @@ STEPS = "Steps"
 @click.argument("recording", type=click.Path(path_type=Path))
 @recording_options
 @filter_options
-@rrd_option
-@png_option
+@picture_options
 @save_model_option
 @overwrite_option
 @strict_option
+@units_option
 @json_option
 @click.pass_context
 def replay(
     ctx: click.Context,
     recording: Path,
-    rrd: Path | None,
-    png: Path | None,
     save_model: Path | None,
     overwrite: bool,
     strict: bool,
@@ -72,7 +70,7 @@ def replay(
     """Run a recording through the filter: twelve parameters, their sigma, and whether the model fits."""
     from kf_calib.estimation.calibration import calibrate
 
-    outputs = claimed(overwrite=overwrite)
+    outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     source, settings = opened(recording, options)
     with progress(f"replaying {recording.name}", as_json) as tick:
         result = calibrate(source, settings, tick)
@@ -86,7 +84,7 @@ def replay(
         show(summary(result))
     with delivery(outputs, as_json) as deliver:
         deliver.model(save_model, result)
-        deliver.view(lambda path: save_view(result, path), rrd, png)
+        pictures.save(deliver, lambda path: save_view(result, path), figures_of(result))
     if strict and result.consistency.consistent is False:
         ctx.exit(1)
 
@@ -95,11 +93,14 @@ def replay(
 @click.argument("recording", type=click.Path(path_type=Path))
 @recording_options
 @filter_options
+@picture_options
+@overwrite_option
 @json_option
-def compare(recording: Path, as_json: bool, **options: Any) -> None:
+def compare(recording: Path, overwrite: bool, as_json: bool, **options: Any) -> None:
     """Block engine, filterpy and batch least squares on the same recording: differences, time, memory."""
     from kf_calib.estimation.engine_comparison import compare as run
 
+    outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     source, settings = opened(recording, options)
     with progress(f"comparing on {recording.name}", as_json) as tick:
         compared = run(source, settings, tick)
@@ -111,6 +112,8 @@ def compare(recording: Path, as_json: bool, **options: Any) -> None:
         from kf_calib.views.console import comparison_table
 
         show(comparison_table(compared))
+    with delivery(outputs, as_json) as deliver:
+        pictures.save(deliver, lambda path: save_view(compared, path), figures_of(compared))
 
 
 @click.command(
@@ -127,6 +130,7 @@ def compare(recording: Path, as_json: bool, **options: Any) -> None:
 )
 @recording_options
 @filter_options
+@units_option
 @json_option
 def list_effects(names: tuple[str, ...], recording: Path | None, as_json: bool, **options: Any) -> None:
     """The effects a model may have: all of the catalogue and your own, or those NAMEd (formulas too) in detail.
@@ -177,15 +181,19 @@ def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, option
 @click.argument("recording", type=click.Path(path_type=Path))
 @recording_options
 @filter_options
+@picture_options
+@overwrite_option
 @strict_option
+@units_option
 @json_option
 @click.pass_context
-def diagnose(ctx: click.Context, recording: Path, strict: bool, as_json: bool, **options: Any) -> None:
+def diagnose(ctx: click.Context, recording: Path, overwrite: bool, strict: bool, as_json: bool, **options: Any) -> None:
     """Which physical effect is missing in the model: verdict, suspects, what this run cannot see, where to go next."""
     from kf_calib.diagnosis.missing_effect import diagnose as run
     from kf_calib.estimation.calibration import calibrate
     from kf_calib.views import diagnosis as views
 
+    outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     source, settings = opened(recording, options)
     with progress(f"diagnosing {recording.name}", as_json) as tick:
         found = run(calibrate(source, settings, tick))
@@ -193,6 +201,8 @@ def diagnose(ctx: click.Context, recording: Path, strict: bool, as_json: bool, *
         print_json(views.diagnosis_object(found))
     else:
         show(views.diagnosis_report(found))
+    with delivery(outputs, as_json) as deliver:
+        pictures.save(deliver, lambda path: save_view(found, path), figures_of(found))
     if strict and found.test.consistent is False:
         ctx.exit(1)
 
@@ -218,8 +228,10 @@ def diagnose(ctx: click.Context, recording: Path, strict: bool, as_json: bool, *
 @filter_options
 @output_option("--save-model", "--out-model", metavar="FILE.toml", help="Save the last model here.", panel=OUTPUT)
 @output_option("--journal", "journal_file", metavar="FILE", help="Keep a journal of the steps here.", panel=OUTPUT)
+@picture_options
 @overwrite_option
 @strict_option
+@units_option
 @json_option
 @click.pass_context
 def improve(
@@ -243,7 +255,7 @@ def improve(
     from kf_calib.views import improvement as views
 
     interactive = _asks(interactive, unattended, as_json)
-    outputs = claimed(overwrite=overwrite)
+    outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     earlier = selection_journal.read(from_journal) if from_journal else None
     origin = selection_journal.Origin.of(recording)
     if earlier is not None and from_journal is not None:
@@ -282,6 +294,7 @@ def improve(
             show(views.improvement_report(state, checked, difference))
         deliver.model(save_model, state.result)
         deliver.file(journal_file, lambda path: selection_journal.write(path, state, origin))
+        pictures.save(deliver, lambda path: save_view(state, path), figures_of(state))
     if strict and state.found.test.consistent is False:
         ctx.exit(1)
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
-from kf_calib.cli.echo import complain, echo
+from kf_calib.cli.echo import echo
 from kf_calib.cli.failures import tell
 from kf_calib.support.output_files import Outputs
 
@@ -86,29 +86,6 @@ class Delivery:
             from kf_calib.estimation import model_file
 
             self.file(path, lambda path: model_file.write(path, result))
-
-    def view(self, save: Callable[[Path], object], rrd: Path | None, png: Path | None) -> None:
-        """What ``save`` writes as a Rerun recording, and a picture of it; either may be left out."""
-        self.file(rrd, save)
-        if png:
-            self._picture(save, None if rrd in self.failures else rrd, png)
-
-    def _picture(self, save: Callable[[Path], object], rrd: Path | None, png: Path) -> None:
-        import tempfile
-
-        from kf_calib.views.screenshot import ScreenshotError, screenshot
-
-        def draw(path: Path) -> None:
-            with tempfile.TemporaryDirectory() as folder:
-                drawn = rrd or Path(folder) / "view.rrd"
-                if rrd is None:
-                    save(drawn)
-                screenshot(drawn, path)
-
-        self.file(png, draw)
-        if isinstance(error := self.failures.get(png), ScreenshotError):
-            complain(f"the picture could not be drawn: {error}")
-            del self.failures[png]
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
@@ -14,12 +14,12 @@ from kf_calib.cli.options import (
     examples,
     json_option,
     overwrite_option,
-    png_option,
     print_json,
     progress,
-    rrd_option,
     show,
+    units_option,
 )
+from kf_calib.cli.pictures import Pictures, figures_of, picture_options
 
 if TYPE_CHECKING:
     from kf_calib.reproduction.grebenkin2019 import Experiment
@@ -66,20 +66,20 @@ inferred = partial(click.option, panel="Conditions that the paper does not print
     metavar="WORD",
     help="Accelerometers read together, or in turn in each orientation: 123, 132 ... 321.",
 )
-@rrd_option
-@png_option
+@picture_options
 @overwrite_option
+@units_option
 @json_option
 def paper(
     repetitions: int, seed: int, period_s: float, latitude: float, azimuth: float, turns: str, sampled: str,
-    rrd: Path | None, png: Path | None, overwrite: bool, as_json: bool,
+    overwrite: bool, as_json: bool, **options: Any,
 ) -> None:  # fmt: skip
     """The seed paper's experiment again: its Table 2, by least squares and by the filter, beside the print."""
     from kf_calib.reproduction.grebenkin2019 import Conditions, repeat
     from kf_calib.reproduction.grebenkin2019_conditions import search
     from kf_calib.views import paper as views
 
-    outputs = claimed(overwrite=overwrite)
+    outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     conditions = Conditions(period_s, latitude, azimuth, turns, sampled)  # type: ignore[arg-type]  # click's choices
     with progress("repeating the experiment", as_json) as tick:
         found = repeat(conditions, repetitions, seed)
@@ -90,7 +90,8 @@ def paper(
     else:
         show(views.paper_report(found, searched))
     with delivery(outputs, as_json) as deliver:
-        deliver.view(lambda path: _save_view(found, views.markdown(found, searched), path), rrd, png)
+        words = views.markdown(found, searched)
+        pictures.save(deliver, lambda path: _save_view(found, words, path), figures_of(found))
 
 
 def _save_view(found: Experiment, words: str, path: Path) -> None:

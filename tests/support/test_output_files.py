@@ -124,11 +124,14 @@ def test_the_file_of_a_standard_stream_is_not_written(here: Path, words: str, st
     assert Path("lines.csv").read_bytes() == before
 
 
+PICTURES = ["--rrd", "--png", "--svg", "--pdf", "--screenshot"]
 WRITING = [
-    ("replay run.mcap", ["--rrd", "--png", "--save-model"]),
-    ("improve run.mcap", ["--save-model", "--journal"]),
-    ("plan", ["--csv", "--rrd", "--png"]),
-    ("paper --repetitions 1", ["--rrd", "--png"]),
+    ("replay run.mcap", [*PICTURES, "--save-model"]),
+    ("diagnose run.mcap", PICTURES),
+    ("compare run.mcap", PICTURES),
+    ("improve run.mcap", [*PICTURES, "--save-model", "--journal"]),
+    ("plan", ["--csv", *PICTURES]),
+    ("paper --repetitions 1", PICTURES),
     ("live sim://?speed=100", ["--record", "--rrd", "--save-model"]),
     ("record", [""]),
     ("simulate", [""]),
@@ -142,7 +145,7 @@ def test_every_output_is_among_them_and_can_be_replaced() -> None:
         command = cli.get_command(ctx, name)
         assert command is not None
         asked = [param for param in command.params if isinstance(param.type, OutputFile)]
-        if name in ("compare", "diagnose", "effects", "demo"):
+        if name in ("effects", "demo"):
             assert not asked
             continue
         listed = next(options for words, options in WRITING if words.split()[0] == name)
@@ -258,7 +261,7 @@ FAST = "live sim://?speed=500&orientations=6&dwell_s=5&sample_hz=50&slew_degps=1
 
 @pytest.mark.parametrize("words", [
     "replay run.mcap --rrd", "replay run.mcap --save-model", "plan --count 6 --rrd", f"{FAST} --rrd",
-    f"{FAST} --save-model", pytest.param("replay run.mcap --png", marks=pytest.mark.draws),
+    f"{FAST} --save-model", "replay run.mcap --png",
 ])  # fmt: skip
 def test_a_file_that_finds_no_room_is_told_after_the_result(run, here: Path, words: str) -> None:
     """It was waited for, for ever."""
@@ -305,9 +308,9 @@ def test_a_picture_that_cannot_be_drawn_is_a_warning(run, here: Path, monkeypatc
         raise ScreenshotError("no graphics driver.")
 
     monkeypatch.setattr("kf_calib.views.screenshot.screenshot", draw)
-    code, out, err = run("replay", "run.mcap", "--json", "--png", "x.png", "--rrd", "x.rrd")
+    code, out, err = run("replay", "run.mcap", "--json", "--screenshot", "x.png", "--rrd", "x.rrd")
     assert code == 0 and out.count("\n") == 1 and json.loads(out)["dwells"] == 12 and Path("x.rrd").exists()
-    assert err == "kf-calib: the picture could not be drawn: no graphics driver.\n"
+    assert err == "kf-calib: the screenshot could not be taken: no graphics driver.\n"
 
 
 def test_files_are_written_where_nobody_reads_the_result(here: Path) -> None:

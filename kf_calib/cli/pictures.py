@@ -1,0 +1,93 @@
+"""Pictures that commands save: the Rerun view, a screenshot of it, and figures for a report."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from kf_calib.cli.echo import complain
+from kf_calib.cli.files import Delivery, output_option
+from kf_calib.cli.options import OUTPUT, rrd_option
+
+if TYPE_CHECKING:
+    from kf_calib.views.figures import Figures
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """The files that a command is to save; None where it is not asked for."""
+
+    rrd: Path | None
+    screenshot: Path | None
+    png: Path | None
+    svg: Path | None
+    pdf: Path | None
+
+    @classmethod
+    def taken_from(cls, options: dict[str, Any]) -> Pictures:
+        """The pictures among a command's options, which have them no longer."""
+        return cls(**{each.name: options.pop(each.name) for each in fields(cls)})
+
+    def save(self, deliver: Delivery, view: Callable[[Path], object], figures: Callable[[], Figures]) -> None:
+        """Save what was asked for. view: writes an .rrd file; figures: those of the result, made when they are needed.
+
+        A viewer that finds no graphics driver is a complaint; all else that fails is told as for any other file.
+        """
+        deliver.file(self.rrd, view)
+        self._screenshot(deliver, view)
+        for kind, path in (("png", self.png), ("svg", self.svg), ("pdf", self.pdf)):
+            deliver.file(path, lambda path, kind=kind: _save(figures, path, kind))
+
+    def _screenshot(self, deliver: Delivery, view: Callable[[Path], object]) -> None:
+        from kf_calib.views.screenshot import ScreenshotError, screenshot
+
+        rrd = None if self.rrd in deliver.failures else self.rrd
+
+        def draw(path: Path) -> None:
+            with tempfile.TemporaryDirectory() as folder:
+                drawn = rrd or Path(folder) / "view.rrd"
+                if rrd is None:
+                    view(drawn)
+                screenshot(drawn, path)
+
+        deliver.file(self.screenshot, draw)
+        error = None if self.screenshot is None else deliver.failures.get(self.screenshot)
+        if isinstance(error, ScreenshotError) and self.screenshot is not None:
+            complain(f"the screenshot could not be taken: {error}")
+            del deliver.failures[self.screenshot]
+
+
+def _save(figures: Callable[[], Figures], path: Path, kind: str) -> None:
+    """Save figures as the kind that the option names, whatever the name of the file ends in."""
+    from kf_calib.views.figures import save
+
+    save(figures(), path, kind)
+
+
+def picture_options(command: F) -> F:
+    """``--rrd``, ``--screenshot``, and ``--png``, ``--svg``, ``--pdf`` for figures."""
+    options = [rrd_option]
+    for kind, what in (("png", "main figure"), ("svg", "main figure"), ("pdf", "figures, one a page,")):
+        text = f"Save the {what} here, drawn by matplotlib."
+        options.append(output_option(f"--{kind}", metavar=f"FILE.{kind}", help=text, panel=OUTPUT))
+    text = "Save a screenshot of the Rerun view here; needs a graphics driver."
+    options.append(output_option("--screenshot", metavar="FILE.png", help=text, panel=OUTPUT))
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def figures_of(result: object) -> Callable[[], Figures]:
+    """What makes the figures of a result; matplotlib is imported then."""
+
+    def made() -> Figures:
+        from kf_calib.views.figures import figures
+
+        return figures(result)
+
+    return made

@@ -1,0 +1,92 @@
+"""The residuals of a calibration as a table: a row for each dwell and accelerometer, with what the bench did there."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.effects.formula import quantities
+from kf_calib.estimation.dwell_columns import stimulus_of
+from kf_calib.estimation.noise_model import mean_covariances
+
+if TYPE_CHECKING:
+    from kf_calib.estimation.results import Calibration
+
+_SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0  # weights of begin, middle and end of a piece in its mean
+
+
+def mean_sigmas(result: Calibration) -> Floats:
+    """Sigma (D, 3) of the mean of each dwell under the noise model, as the misfit is judged, m/s^2."""
+    means = result.carried.means
+    return np.sqrt(np.einsum("dii->di", mean_covariances(result.noise.judging, means, result.carried.state)))
+
+
+def quantity_means(result: Calibration, names: list[str]) -> dict[str, Floats]:
+    """Means (D, 3) over each dwell of quantities that formulas may name, in SI units, for each accelerometer."""
+    dwells, known = result.carried.dwells, quantities(result.bench.axes)
+    stimulus, places = stimulus_of(dwells, result.bench, result.carried.state), _weights(dwells)
+    firsts = np.cumsum([0, *(3 * len(dwell.pieces) for dwell in dwells[:-1])])
+    out = dict[str, Floats]()
+    for name in names:
+        values = np.broadcast_to(known[name].of(stimulus), (len(stimulus), 3))
+        out[name] = np.add.reduceat(values * places[:, None], firsts)
+    return out
+
+
+def _weights(dwells: list[DwellFactor]) -> Floats:
+    """Return the weight of each node in the mean over its dwell."""
+    return np.concatenate([np.outer(dwell.counts / dwell.count, _SIMPSON).ravel() for dwell in dwells])
+
+
+def residual_table(result: Calibration) -> NDArray[np.void]:
+    """The table as a structured array (3 D,), dwell by dwell, accelerometers 1, 2, 3 in each.
+
+    Columns: ``dwell`` (from 1), ``accelerometer``, ``start_s``, ``end_s``, ``readings``; gimbal angles
+    ``gimbal1_deg``... as recorded; ``force_x_mps2``, ``force_y_mps2``, ``force_z_mps2``: specific force in the
+    platform; ``along_mps2``, ``pendulous_mps2``, ``output_mps2``: along the axes of the accelerometer; ``step_mps2``:
+    last change of the first of these; ``temperature_c`` and its rate ``temperature_rate_kps`` (NaN and 0 where it is
+    not measured); ``mean_mps2``: mean reading; ``residual_mps2``: less its prediction by the final estimate;
+    ``sigma_mps2``: of the mean; ``ratio``: residual over sigma; ``innovation_mps2``, ``innovation_sigma_mps2``: the
+    mean less its prediction from the dwells before, NaN while there is none; ``nis``, ``nis_dof``: of the dwell.
+    """
+    dwells, means = result.carried.dwells, result.carried.means
+    of = quantity_means(result, ["fx", "fy", "fz", "a", "p", "o", "da", "dT"])
+    sigmas, visits = mean_sigmas(result), result.visits
+
+    def each(values: Any) -> Floats:
+        """Repeat a number of a dwell for its accelerometers."""
+        return np.repeat(np.asarray(values), 3)
+
+    poses = np.degrees(np.array([dwell.recorded_pose for dwell in dwells]))
+    warmth = [float(np.mean(dwell.nodes.temperature_c)) for dwell in dwells]
+    columns: dict[str, NDArray[Any]] = {
+        "dwell": each([dwell.number for dwell in dwells]),
+        "accelerometer": np.tile([1, 2, 3], len(dwells)),
+        "start_s": each([dwell.start_s for dwell in dwells]),
+        "end_s": each([dwell.end_s for dwell in dwells]),
+        "readings": each([dwell.count for dwell in dwells]),
+        **{f"gimbal{k + 1}_deg": each(poses[:, k]) for k in range(len(result.bench.axes))},
+        **{f"force_{axis}_mps2": of[f"f{axis}"].ravel() for axis in "xyz"},
+        "along_mps2": of["a"].ravel(),
+        "pendulous_mps2": of["p"].ravel(),
+        "output_mps2": of["o"].ravel(),
+        "step_mps2": of["da"].ravel(),
+        "temperature_c": each(warmth),
+        "temperature_rate_kps": of["dT"].ravel(),
+        "mean_mps2": means.readings.ravel(),
+        "residual_mps2": result.residuals_mps2.ravel(),
+        "sigma_mps2": sigmas.ravel(),
+        "ratio": (result.residuals_mps2 / sigmas).ravel(),
+        "innovation_mps2": np.array([visit.innovation_mps2 for visit in visits]).ravel(),
+        "innovation_sigma_mps2": np.array([visit.innovation_sigma_mps2 for visit in visits]).ravel(),
+        "nis": each([visit.nis for visit in visits]),
+        "nis_dof": each([visit.dof for visit in visits]),
+    }
+    table = np.zeros(3 * len(dwells), dtype=[(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        table[name] = values
+    return table

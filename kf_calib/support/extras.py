@@ -1,0 +1,17 @@
+"""Packages that only some uses need: they come with extras of kf_calib, and a missing one is one sentence."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from kf_calib.errors import KfCalibError
+
+
+class MissingExtraError(KfCalibError):
+    """A package is not installed that this needs; the message has the command that brings it."""
+
+
+def need(package: str, extra: str, purpose: str) -> None:
+    """Raise MissingExtraError unless ``package`` can be imported; extra: of kf_calib, that brings it."""
+    if find_spec(package) is None:
+        raise MissingExtraError(f"{purpose} needs {package}, which is not installed: pip install 'kf_calib[{extra}]'.")

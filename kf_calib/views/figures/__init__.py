@@ -1,0 +1,20 @@
+"""Figures of results for reports, by matplotlib: ``kf_calib.plot``.
+
+    found = kf_calib.diagnose("run.mcap")
+    kf_calib.plot.residuals(found)                  # a matplotlib Figure, shown by a notebook
+    kf_calib.plot.save(kf_calib.plot.figures(found), "run.pdf")
+
+``figures`` gives all figures of a result, by title, the one that tells most first; each is drawn when it is asked for.
+A function of each figure has the same name here as in its module.
+"""
+
+from __future__ import annotations
+
+from kf_calib.support.extras import need
+
+need("matplotlib", "plot", "a figure")
+
+from kf_calib.views.figures.collection import Figures, figures, save  # noqa: E402  # after the check
+from kf_calib.views.figures.residuals import residuals, what_they_go_with  # noqa: E402
+
+__all__ = ["Figures", "figures", "residuals", "save", "what_they_go_with"]

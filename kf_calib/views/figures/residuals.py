@@ -1,0 +1,151 @@
+"""Where the model fails: residuals against what they go with, what explanations predict of them, and what is left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, FigureBase
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.residual_drivers import Driver, Explanation, drivers_of, explanations, is_function_of
+from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.estimation.residual_table import mean_sigmas
+from kf_calib.estimation.results import format_p
+from kf_calib.views.figures.style import (
+    ACCELEROMETERS,
+    BAND,
+    BEST,
+    GREY,
+    MARKERS,
+    RUNNER_UP,
+    blank,
+    say,
+    styled,
+)
+
+MICRO_G = 9.80665e-6  # m/s^2
+_UNITS = {"rad": ("deg", 180.0 / np.pi), "m/s^2": ("g", 1.0 / 9.80665), "s": ("min", 1.0 / 60.0),
+          "K": ("K", 1.0), "K/s": ("K/h", 3600.0)}  # fmt: skip
+_PANELS = 8  # drivers in small panels
+_MANY = 150  # dwells, above which markers are smaller and bars of sigma are left out
+
+
+def residuals(found: Diagnosis, driver: str | None = None) -> Figure:
+    """Residuals of each accelerometer against what they go with most, the best explanation, and what it leaves.
+
+    From the left: the residuals of the model, with what the best explanation and the runner-up predict of them; the
+    readings less all that the best explanation does not itself add, and the effect as a curve with its 1 sigma; what it
+    leaves. All are means of dwells, with 1 sigma, on the same axes. driver: another quantity to draw them against, by
+    its symbol, such as ``q1`` or ``T``.
+    """
+    with styled():
+        figure = blank(11.0, 7.0)
+        draw_residuals(figure, found, drivers_of(found.before), driver)
+    return figure
+
+
+def draw_residuals(figure: FigureBase, found: Diagnosis, drivers: Sequence[Driver], symbol: str | None = None) -> None:
+    """The same on a part of a figure; drivers: of the residuals, the first is taken where no symbol is given."""
+    chosen = [each for each in drivers if symbol in (None, each.symbol)]
+    if not chosen:
+        return say(figure, f"{symbol or 'Nothing that was recorded'} does not vary in this run.")
+    driver, others = chosen[0], explanations(found)
+    panels = figure.subplots(3, 3 if others else 1, sharex=True, sharey="row", squeeze=False)
+    unit, scale = _UNITS.get(driver.unit, (driver.unit, 1.0))
+    sigmas = mean_sigmas(found.before)
+    for i, row in enumerate(panels):
+        x = driver.values[:, i] * scale
+        _points(row[0], x, found.before.residuals_mps2[:, i], sigmas[:, i], i)
+        row[0].set_ylabel(f"accelerometer {i + 1}, µg")
+        if others:
+            best = others[0]
+            for explanation, colour, marker in zip(others[:2], (BEST, RUNNER_UP), "_x", strict=False):
+                _predictions(row[0], x, explanation, i, colour, marker)
+            _points(row[1], x, best.left_mps2[:, i] + best.contribution_mps2[:, i], sigmas[:, i], i)
+            _curve(row[1], x, best, i, is_function_of(best.contribution_mps2, driver))
+            _points(row[2], x, best.left_mps2[:, i], sigmas[:, i], i)
+    panels[0, 0].set_title(f"Residuals of the model: {found.before.model.sum}")
+    if others:
+        panels[0, 1].set_title(f"Readings less all but {others[0].name}")
+        panels[0, 2].set_title(f"What is left with {others[0].name} in the model")
+        figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower left", ncols=3)
+    for axes in panels[-1]:
+        axes.set_xlabel(f"{driver.words}, {unit}")
+
+
+def _points(axes: Axes, x: Floats, values_mps2: Floats, sigmas_mps2: Floats, i: int) -> None:
+    """Draw means of dwells with their sigma and the line at zero."""
+    many = len(x) > _MANY
+    axes.axhline(0.0, color=GREY, linewidth=0.8)
+    bars = None if many else sigmas_mps2 / MICRO_G
+    axes.errorbar(x, values_mps2 / MICRO_G, bars, fmt=MARKERS[i], color=ACCELEROMETERS[i], zorder=3, elinewidth=0.9,
+                  markersize=2.0 if many else 4.5, markeredgewidth=0.0)  # fmt: skip
+
+
+def _predictions(axes: Axes, x: Floats, explanation: Explanation, i: int, colour: str, marker: str) -> None:
+    """Draw what an explanation predicts of the residual of each dwell."""
+    axes.plot(x, explanation.predicted_mps2[:, i] / MICRO_G, marker=marker, markersize=9 if marker == "_" else 4,
+              linestyle="none", color=colour, label=f"what {explanation.name} predicts of it")  # fmt: skip
+
+
+def _curve(axes: Axes, x: Floats, explanation: Explanation, i: int, is_function: bool) -> None:
+    """Draw what an explanation adds to the readings, with its 1 sigma: a curve if it depends on this quantity alone."""
+    order = np.argsort(x)
+    middle = explanation.contribution_mps2[order, i] / MICRO_G
+    sigma = explanation.contribution_sigma_mps2[order, i] / MICRO_G
+    if is_function:
+        axes.plot(x[order], middle, color=BEST)
+        axes.fill_between(x[order], middle - sigma, middle + sigma, color=BAND, linewidth=0.0)
+    else:
+        axes.errorbar(x[order], middle, sigma, fmt="_", color=BEST, ecolor=BAND, elinewidth=6.0, markersize=9)
+
+
+def what_they_go_with(found: Diagnosis) -> Figure:
+    """Residuals over their sigma against everything that varies in the run, and what the best explanation leaves."""
+    with styled():
+        figure = blank(11.0, 7.0)
+        draw_drivers(figure, found, drivers_of(found.before))
+    return figure
+
+
+def draw_drivers(figure: FigureBase, found: Diagnosis, drivers: Sequence[Driver]) -> None:
+    """The same on a part of a figure: a column a driver, those that explain most first."""
+    shown, others = drivers[:_PANELS], explanations(found)[:1]
+    if not shown:
+        return say(figure, "Nothing that was recorded varies in this run.")
+    wide = min(4, len(shown))
+    high = -(-len(shown) // wide) * (1 + len(others))
+    panels = figure.subplots(high, wide, sharey=True, squeeze=False)
+    before = found.before.residuals_mps2 / mean_sigmas(found.before)
+    for k, driver in enumerate(shown):
+        row, column = divmod(k, wide)
+        unit, scale = _UNITS.get(driver.unit, (driver.unit, 1.0))
+        values = [before, *(each.left_ratios for each in others)]
+        for below, (ratios, axes) in enumerate(zip(values, panels[row * len(values) :, column], strict=False)):
+            _ratios(axes, driver.values * scale, ratios)
+            axes.set_xlabel("" if below < len(values) - 1 else f"{driver.symbol}, {unit}")
+            if not below:
+                axes.set_title(f"{driver.words}\n{_of_share(driver)}", fontsize=8.5)
+            if not column:
+                axes.set_ylabel("residual / σ" if not below else f"with {others[0].name}")
+    for axes in panels.flat[: panels.size]:
+        if not axes.has_data():
+            axes.set_axis_off()
+
+
+def _of_share(driver: Driver) -> str:
+    """Return in a few words how much of the misfit goes with a driver."""
+    if driver.p_value > 0.01 or driver.share < 0.005:
+        return "no more than noise"
+    return f"{driver.share:.0%} of the misfit, p {format_p(driver.p_value)}"
+
+
+def _ratios(axes: Axes, x: Floats, ratios: Floats) -> None:
+    """Draw ratios (D, 3) against a quantity (D, 3), with lines at +-2."""
+    for bound in (-2.0, 2.0):
+        axes.axhline(bound, color=GREY, linewidth=0.7, linestyle=":")
+    for i in range(3):
+        axes.plot(x[:, i], ratios[:, i], MARKERS[i], color=ACCELEROMETERS[i], markersize=3.0 if len(x) < _MANY else 1.5,
+                  markeredgewidth=0.0, alpha=0.85)  # fmt: skip
