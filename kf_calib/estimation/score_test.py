@@ -12,7 +12,6 @@ be whitened; the projection is then done on a small matrix.
 
 from __future__ import annotations
 
-import copy
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -84,12 +83,7 @@ class Candidate:
         The criterion is the cosine of the largest principal angle. If it holds, the other explains whatever this one
         explains, so that no readings can favour this candidate over the other.
         """
-        if not 0 < self.dof <= other.dof:
-            return False
-        cosines = self.basis.T @ other.basis
-        if np.vdot(cosines, cosines) <= self.dof * cosine**2:  # the smallest is no larger than their root mean square
-            return False
-        return float(np.linalg.svd(cosines, compute_uv=False)[-1]) > cosine
+        return is_within(self.basis.T @ other.basis, cosine)
 
     def overlap(self, other: Candidate) -> float:
         """Cosine of the smallest principal angle between the two spans; 1 if they share a direction, so that the run
@@ -125,6 +119,29 @@ class Scan:
         return candidate.inverse @ (candidate.basis.T @ self.residual)
 
 
+def is_within(cosines: Floats, cosine: float) -> bool:
+    """``Candidate.within`` from the products (k, l) of the two bases."""
+    dof, others = cosines.shape
+    if not 0 < dof <= others or np.vdot(cosines, cosines) <= dof * cosine**2:
+        return False  # the smallest cosine is no larger than their root mean square
+    return float(np.linalg.svd(cosines, compute_uv=False)[-1]) > cosine
+
+
+class Complement:
+    """The orthogonal complement of a model's columns H, the first ``width`` of whitened rows [H | ...] (m, c)."""
+
+    def __init__(self, rows: Floats, width: int) -> None:
+        scaled = square_root_information.scale_columns(rows[:, : width + 1])[0]
+        left, singular, _ = np.linalg.svd(scaled, full_matrices=False)
+        self._explained = left[:, singular > 1e-9]
+
+    def of(self, columns: Floats) -> Floats:
+        """Columns (m, ...) projected off H."""
+        for _ in range(2):  # projecting twice removes the rounding errors that large components leave in the remainder
+            columns = columns - self._explained @ (self._explained.T @ columns)
+        return columns
+
+
 class Frame:
     """The whitened columns of ``effects`` over all dwells, in an orthonormal basis of their own.
 
@@ -136,7 +153,7 @@ class Frame:
 
     def __init__(self, carried: Carried, noise: Noise, effects: Sequence[Effect]) -> None:
         self.dwells, self.noise, self.state, self.effects = carried.dwells, noise, carried.state, list(effects)
-        self.parts = _slices(_counts(effects))
+        self.parts = slices(counts_of(effects))
         self._stimulus = stimulus_of(carried.dwells, carried.model.bench, carried.state)
         self.basis, self.coordinates = orthonormal(
             whitened_columns(carried, noise, effects, carried.state, self._stimulus)
@@ -145,20 +162,17 @@ class Frame:
         self._lines: dict[float, tuple[Line, ...]] = {}
         self._last: tuple[Carried, Floats, Floats, int] | None = None
 
-    def only(self, effects: Sequence[Effect]) -> Frame:
-        """The same frame restricted to ``effects``, all of which it must contain."""
+    def held(self, effects: Sequence[Effect]) -> tuple[list[Effect], Floats]:
+        """Those of ``effects`` that the frame contains, with their unknown constants at these values, and their
+        whitened columns (m, q)."""
         own = dict(zip(map(_key, self.effects), self.parts, strict=True))
-        out = copy.copy(self)
-        out.effects = list(effects)
-        out.coordinates = np.concatenate(
-            [self.coordinates[:, :0], *(self.coordinates[:, own[_key(each)]] for each in effects)], axis=1
-        )
-        out.parts = _slices(_counts(effects))
-        return out
+        found = [effect for effect in effects if _key(effect) in own]
+        parts = [self.coordinates[:, own[_key(effect)]] for effect in found]
+        return found, self.basis @ np.concatenate([self.coordinates[:, :0], *parts], axis=1)
 
-    def has(self, effect: Effect) -> bool:
-        """Tell whether the frame contains this effect with its unknown constant at this value."""
-        return _key(effect) in map(_key, self.effects)
+    def whitened(self, carried: Carried, effects: Sequence[Effect]) -> Floats:
+        """Whitened columns (m, q) of effects that the frame does not contain."""
+        return whitened_columns(carried, self.noise, effects, self.state, self._stimulus)
 
     def lines(self, level: float) -> tuple[Line, ...]:
         """Oscillations found in the readings at the significance ``level`` (see ``sufficient_statistics.lines_of``);
@@ -177,7 +191,7 @@ class Frame:
         model in ``carried``."""
         kept = [k for k, effect in enumerate(self.effects) if str(effect) not in carried.model.parts]
         inside, outside, width = self._model(carried)
-        more_inside, more_outside = self._split(whitened_columns(carried, self.noise, more, self.state, self._stimulus))
+        more_inside, more_outside = self._split(self.whitened(carried, more))
         beside = square_root_information.accumulate([np.hstack([outside[:, :-1], more_outside, outside[:, -1:]])])
         own = [self.coordinates[:, self.parts[k]] for k in kept]
         count = sum(each.shape[1] for each in own)
@@ -190,16 +204,20 @@ class Frame:
             square_root_information.accumulate([small]),
             width,
             effects,
-            _counts(effects),
+            counts_of(effects),
         )
 
     def _model(self, carried: Carried) -> tuple[Floats, Floats, int]:
         """Return the columns [H | W | z] of a model, inside the frame and outside it, and the number of columns before
         z; the result is cached for the next scan of the same model."""
         if self._last is None or self._last[0] is not carried:
-            rows, width = whiten_model(carried, self.noise, [], self.state, self._stimulus)
+            rows, width = self.whitened_model(carried)
             self._last = carried, *self._split(rows), width
         return self._last[1:]
+
+    def whitened_model(self, carried: Carried) -> tuple[Floats, int]:
+        """Whitened rows [H | W | z] (m, c) of the model in ``carried``, and the number of columns before z."""
+        return whiten_model(carried, self.noise, [], self.state, self._stimulus)
 
     def _split(self, rows: Floats) -> tuple[Floats, Floats]:
         """Split columns (m, c) into their coordinates (r, c) in the frame and the remainder (m, c) orthogonal to it."""
@@ -220,12 +238,12 @@ class Frame:
 _OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps2_per_sqrt_s")
 
 
-def _counts(effects: Sequence[Effect]) -> list[int]:
+def counts_of(effects: Sequence[Effect]) -> list[int]:
     """Return the number of columns of each effect."""
     return [len(effect.coefficients) for effect in effects]
 
 
-def _slices(counts: Sequence[int]) -> list[slice]:
+def slices(counts: Sequence[int]) -> list[slice]:
     """Return the slice of columns that belongs to each effect, for effects of so many columns."""
     return [slice(a, b) for a, b in itertools.pairwise(itertools.accumulate(counts, initial=0))]
 
@@ -243,7 +261,7 @@ def _is(one: object, other: object) -> bool:
 def scan(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Scan:
     """Project ``effects`` off the model in ``carried`` without a frame."""
     rows, width = whiten_model(carried, noise, effects)
-    return project(square_root_information.accumulate([rows]), width, effects, _counts(effects))
+    return project(square_root_information.accumulate([rows]), width, effects, counts_of(effects))
 
 
 def project(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
@@ -253,23 +271,17 @@ def project(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequen
     - width: number of columns H of the model.
     - effects: the candidates; counts: number of columns of each in G.
     """
-    sizes, rest = np.linalg.norm(upper[:, width:-1], axis=0), _beside(upper, width)
+    rest = Complement(upper, width).of(upper[:, width:])
+    return scan_of(rest, np.linalg.norm(upper[:, width:-1], axis=0), effects, counts)
+
+
+def scan_of(rest: Floats, sizes: Floats, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
+    """Make the scan from what a model leaves of a triangular factor [G | z], and the norms of G before."""
     units = np.where(sizes > 0, sizes, 1.0)
     columns, residual = rest[:-1, :-1] / units, rest[:-1, -1]
-    parts = zip(effects, _slices(counts), strict=True)
+    parts = zip(effects, slices(counts), strict=True)
     found = [_candidate(each, columns[:, part], units[part]) for each, part in parts]
     return Scan(tuple(found), residual)
-
-
-def _beside(rows: Floats, width: int) -> Floats:
-    """Project the columns [G | z] of rows [H | G | z] off H, the first ``width`` columns."""
-    left, singular, _ = np.linalg.svd(
-        square_root_information.scale_columns(rows[:, : width + 1])[0], full_matrices=False
-    )
-    explained, rest = left[:, singular > 1e-9], rows[:, width:]
-    for _ in range(2):  # projecting twice removes the rounding errors that large components leave in the remainder
-        rest = rest - explained @ (explained.T @ rest)
-    return rest
 
 
 def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
@@ -282,9 +294,9 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
         many = Periodogram(carried, noise, effects[0], np.array([effect.value for effect in effects]))
         return many.falls(*_with_and_without_walk(carried, noise, carried.state, carried.model.count))
     out = list[Floats]()
-    for part in batches(_counts(effects), _OF_ONE_KIND):
+    for part in batches(counts_of(effects), _OF_ONE_KIND):
         rows, width = whiten_model(carried, noise, [effects[k] for k in part])
-        sizes, rest = np.linalg.norm(rows[:, width:-1], axis=0), _beside(rows, width)
+        sizes, rest = np.linalg.norm(rows[:, width:-1], axis=0), Complement(rows, width).of(rows[:, width:])
         columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
         columns = columns.T.reshape(len(part), -1, len(rest))
         along, gram = columns @ rest[:, -1], columns @ columns.swapaxes(1, 2)
@@ -318,7 +330,7 @@ def whitened_columns(
     carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats, stimulus: Stimulus
 ) -> Floats:
     """The columns G (m, q) of ``whiten_model``, computed for a few effects at a time, which saves memory."""
-    sizes, out, first = _counts(effects), np.zeros((0, 0)), 0
+    sizes, out, first = counts_of(effects), np.zeros((0, 0)), 0
     for part in batches(sizes, columns_at_once(carried)) or [[]]:
         own = _columns_of_some(carried, noise, [effects[k] for k in part], state, stimulus)
         out = out if len(out) else np.empty((len(own), sum(sizes)))
