@@ -29,7 +29,8 @@ from kf_calib.estimation.noise_model import Noise, steps
 _SEEN = 1e-6  # a column of which the model leaves less than this share counts as explained
 _NEW = 1e-9  # a smaller share of a column beside those before it is rounding
 _SPARE = 18  # points beyond the phase, rad, that passes during a dwell; the error is then 1e-10 of a column
-_AT_ONCE = 64  # frequencies that are processed together that are processed together
+_AT_ONCE = 64  # frequencies that are processed together
+_SAME_RAD = 1e-10  # phases that differ by less are equal
 _LEAST_PAUSE = 1e-6  # of the largest variance of a step: the variance over a pause is at least this
 
 Waves = NDArray[np.complex128]
@@ -42,6 +43,7 @@ class Periodogram:
         self.values_hz, self.state, self.noise = values_hz, carried.state, noise
         dwells = carried.dwells
         self._middles_s = np.array([0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells])
+        self._same_hz = _SAME_RAD / (2.0 * np.pi * float(np.abs(self._middles_s).max(initial=1e-9)))
         points_hz, self._shares = _points(values_hz, max(dwell.end_s - dwell.start_s for dwell in dwells))
         waves = candidate_columns(dwells, [effect.at(hz) for hz in points_hz], carried.model.bench, carried.state)
         columns = [
@@ -141,9 +143,13 @@ class Periodogram:
 
     def _turning(self) -> Iterator[tuple[slice, Waves]]:
         """Yield slices of the frequencies and e^(2 pi i f t_d) (n, D) for each."""
+        turns_s, apart_hz, apart = 2j * np.pi * self._middles_s, np.zeros(0), np.zeros((0, 0))
         for first in range(0, len(self.values_hz), _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
-            yield part, np.exp(2j * np.pi * self.values_hz[part, None] * self._middles_s)
+            own_hz = self.values_hz[part] - self.values_hz[first]
+            if len(own_hz) > len(apart_hz) or np.abs(own_hz - apart_hz[: len(own_hz)]).max() > self._same_hz:
+                apart_hz, apart = own_hz, np.exp(own_hz[:, None] * turns_s)  # once, if the frequencies are equidistant
+            yield part, np.exp(self.values_hz[first] * turns_s) * apart[: len(own_hz)]
 
 
 @dataclass
