@@ -92,14 +92,24 @@ def candidate_columns(
     return _by_dwell(dwells, lambda s: effect_columns(effects, s), stimulus)
 
 
+def piece_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
+    """The same of all dwells in one array, (pieces, K nodes, 3 channels, p)."""
+    return _by_piece(lambda s: effect_columns(effects, s), stimulus)
+
+
 def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> list[Floats]:
-    """Split the columns of a stimulus (m, 3, p) by dwell; on a carrier the nodes of both envelopes follow those of the
-    plain part."""
+    """Split the columns of a stimulus (m, 3, p) by dwell."""
+    return np.split(_by_piece(columns, stimulus), np.cumsum([len(dwell.pieces) for dwell in dwells])[:-1])
+
+
+def _by_piece(columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> Floats:
+    """Arrange the columns of a stimulus (m, 3, p) by piece; on a carrier the nodes of both envelopes follow those of
+    the plain part."""
     parts = [columns(stimulus)]
     if stimulus.carrier_hz:
         parts += [columns(replace(stimulus, part=part)) for part in (1, 2)]
-    shaped = np.concatenate([part.reshape(len(part) // 3, 3, *part.shape[1:]) for part in parts], axis=1)
-    return np.split(shaped, np.cumsum([len(dwell.pieces) for dwell in dwells])[:-1])
+    shaped = [part.reshape(len(part) // 3, 3, *part.shape[1:]) for part in parts]
+    return np.concatenate(shaped, axis=1) if len(shaped) > 1 else shaped[0]
 
 
 @dataclass(frozen=True, repr=False)

@@ -25,10 +25,11 @@ from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect, Stimulus
 from kf_calib.estimation import random_walk, square_root_information
-from kf_calib.estimation.dwell_columns import Carried, candidate_columns, stimulus_of
+from kf_calib.estimation.dwell_columns import Carried, candidate_columns, piece_columns, stimulus_of
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise, steps
 from kf_calib.estimation.periodogram import Periodogram
+from kf_calib.estimation.square_root_information import MisfitColumns
 
 _SEEN = 1e-6
 """A candidate is invisible if the model leaves less than this share of its columns."""
@@ -155,9 +156,8 @@ class Frame:
         self.dwells, self.noise, self.state, self.effects = carried.dwells, noise, carried.state, list(effects)
         self.parts = slices(counts_of(effects))
         self._stimulus = stimulus_of(carried.dwells, carried.model.bench, carried.state)
-        self.basis, self.coordinates = orthonormal(
-            whitened_columns(carried, noise, effects, carried.state, self._stimulus)
-        )
+        self._whitening = None if _inside(noise) else MisfitColumns(carried.dwells, noise, carried.state)
+        self.basis, self.coordinates = orthonormal(self.whitened(carried, effects))
         self._periodogram: Periodogram | None = None
         self._lines: dict[float, tuple[Line, ...]] = {}
         self._last: tuple[Carried, Floats, Floats, int] | None = None
@@ -171,8 +171,25 @@ class Frame:
         return found, self.basis @ np.concatenate([self.coordinates[:, :0], *parts], axis=1)
 
     def whitened(self, carried: Carried, effects: Sequence[Effect]) -> Floats:
-        """Whitened columns (m, q) of effects that the frame does not contain."""
-        return whitened_columns(carried, self.noise, effects, self.state, self._stimulus)
+        """Whitened columns (m, q) of any effects, computed for a few at a time, which saves memory."""
+        sizes, out, first = counts_of(effects), np.zeros((0, 0)), 0
+        for part in batches(sizes, columns_at_once(carried)) or [[]]:
+            own = self._whitened(carried, [effects[k] for k in part])
+            out = out if len(out) else np.empty((len(own), sum(sizes)))
+            out[:, first : first + own.shape[1]], first = own, first + own.shape[1]
+        return out
+
+    def _whitened(self, carried: Carried, effects: Sequence[Effect]) -> Floats:
+        if self._whitening is not None:
+            return self._whitening.of(piece_columns(effects, self._stimulus))
+        # a walk is whitened by the columns of the biases, which are among the twelve
+        added = candidate_columns(carried.dwells, effects, carried.model.bench, self.state, self._stimulus)
+        both = [
+            np.concatenate([own[..., :STATE_COUNT], more], axis=3)
+            for own, more in zip(carried.columns, added, strict=True)
+        ]
+        rows, width = _judged(carried.dwells, both, self.noise, self.state, STATE_COUNT)
+        return _stacked(rows, carried.dwells, self.noise)[:, width:-1]
 
     def lines(self, level: float) -> tuple[Line, ...]:
         """Oscillations found in the readings at the significance ``level`` (see ``sufficient_statistics.lines_of``);
@@ -324,33 +341,6 @@ def whiten_model(
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
     rows, width = _judged(dwells, columns, noise, at, carried.model.count)
     return _stacked(rows, dwells, noise), width
-
-
-def whitened_columns(
-    carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats, stimulus: Stimulus
-) -> Floats:
-    """The columns G (m, q) of ``whiten_model``, computed for a few effects at a time, which saves memory."""
-    sizes, out, first = counts_of(effects), np.zeros((0, 0)), 0
-    for part in batches(sizes, columns_at_once(carried)) or [[]]:
-        own = _columns_of_some(carried, noise, [effects[k] for k in part], state, stimulus)
-        out = out if len(out) else np.empty((len(own), sum(sizes)))
-        out[:, first : first + own.shape[1]], first = own, first + own.shape[1]
-    return out
-
-
-def _columns_of_some(
-    carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats, stimulus: Stimulus
-) -> Floats:
-    dwells, bench = carried.dwells, carried.model.bench
-    added = candidate_columns(dwells, effects, bench, state, stimulus)
-    if not _inside(noise):
-        return square_root_information.misfit_columns(dwells, added, noise, state)
-    # a walk is whitened by the columns of the biases, which are among the twelve
-    both = [
-        np.concatenate([own[..., :STATE_COUNT], more], axis=3) for own, more in zip(carried.columns, added, strict=True)
-    ]
-    rows, width = _judged(dwells, both, noise, state, STATE_COUNT)
-    return _stacked(rows, dwells, noise)[:, width:-1]
 
 
 def columns_at_once(carried: Carried) -> int:
