@@ -74,7 +74,9 @@ class FurtherEffects:
     def _is_known(self, found: Scan, products: Floats) -> bool:
         """Tell whether each candidate lies within a known effect; products (k, q): of the bases of these with the
         columns."""
-        for each, own in zip(found.candidates, slices(counts_of([each.effect for each in found.candidates])), strict=True):
+        for each, own in zip(
+            found.candidates, slices(counts_of([each.effect for each in found.candidates])), strict=True
+        ):
             cosines = (products[:, own] @ each.inverse).T
             if not any(is_within(cosines[:, part], self._cosine) for part in self._parts):
                 return False

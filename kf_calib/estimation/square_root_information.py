@@ -189,14 +189,16 @@ class MisfitColumns:
         priors = int((noise.dwell_sigmas > 0).sum()) + (3 * len(_SLOW) if slow else 0)
         counts = np.array([len(dwell.pieces) for dwell in dwells])
         lengths = 3 * counts * [dwell.width for dwell in dwells] + priors
-        first_piece, first_row = np.cumsum(counts) - counts, slow + np.cumsum(lengths) - lengths
-        self._groups, self._count = list[_Alike](), slow + int(lengths.sum())
+        self._groups, self.ends = list[_Alike](), slow + np.cumsum([0, *lengths])
+        """The first row of each dwell, and at last the number of rows."""
+        first_piece, first_row = np.cumsum(counts) - counts, self.ends[:-1]
         for places in alike(dwells):
             some, pieces, width = [dwells[k] for k in places], int(counts[places[0]]), dwells[places[0]].width
             none = np.zeros((len(some), pieces, width, 3, 0))
             rows, count = _weighted(some, none, noise, state, None, flicker)
             group = _Alike(
-                first_piece[places, None] + np.arange(pieces), first_row[places, None] + np.arange(rows.shape[1]),
+                first_piece[places, None] + np.arange(pieces),
+                first_row[places, None] + np.arange(rows.shape[1]),
                 np.array([dwell.triangles[:, :width, :width] for dwell in some]),
                 np.linalg.qr(rows[..., :count])[0],
             )
@@ -204,7 +206,7 @@ class MisfitColumns:
 
     def of(self, columns: Floats) -> Floats:
         """G (m, q) of columns at the nodes of all pieces (pieces, K, 3, q)."""
-        out = np.zeros((self._count, columns.shape[3]))
+        out = np.zeros((self.ends[-1], columns.shape[3]))
         for each in self._groups:
             own = columns[each.pieces]  # (d, pieces, K, 3, q)
             many, pieces, width, _, count = own.shape
