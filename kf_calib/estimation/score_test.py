@@ -296,9 +296,21 @@ def scan_of(rest: Floats, sizes: Floats, effects: Sequence[Effect], counts: Sequ
     """Make the scan from what a model leaves of a triangular factor [G | z], and the norms of G before."""
     units = np.where(sizes > 0, sizes, 1.0)
     columns, residual = rest[:-1, :-1] / units, rest[:-1, -1]
-    parts = zip(effects, slices(counts), strict=True)
-    found = [_candidate(each, columns[:, part], units[part]) for each, part in parts]
+    found = list[Candidate]()
+    for effect, part, factors in zip(effects, slices(counts), _factors(columns, counts), strict=True):
+        found.append(_candidate(effect, columns[:, part], units[part], *factors))
     return Scan(tuple(found), residual)
+
+
+def _factors(columns: Floats, counts: Sequence[int]) -> list[tuple[Floats, Floats, Floats]]:
+    """Return the singular value decomposition of the columns of each effect, those of as many columns in one call."""
+    parts, out = slices(counts), [(columns, columns, columns)] * len(counts)
+    for count in dict.fromkeys(counts):
+        places = [k for k, own in enumerate(counts) if own == count]
+        stacked = np.array([columns[:, parts[k]] for k in places])
+        for k, *factors in zip(places, *np.linalg.svd(stacked, full_matrices=False), strict=True):
+            out[k] = factors[0], factors[1], factors[2]
+    return out
 
 
 def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
@@ -380,10 +392,11 @@ def _inside(noise: Noise) -> int:
     return 3 if noise.walk_mps2_per_sqrt_s else 0
 
 
-def _candidate(effect: Effect, columns: Floats, units: Floats) -> Candidate:
+def _candidate(
+    effect: Effect, columns: Floats, units: Floats, left: Floats, singular: Floats, right: Floats
+) -> Candidate:
     """Make a candidate from its projected ``columns`` (d, q), each divided by its norm before the projection, ``units``
-    (q,)."""
-    left, singular, right = np.linalg.svd(columns, full_matrices=False)
+    (q,), and the singular value decomposition of these."""
     seen = singular > _SEEN
     lost = np.eye(len(units)) - right[seen].T @ right[seen]
     inverse = (right[seen].T / singular[seen]) / units[:, None]
