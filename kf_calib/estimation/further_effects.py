@@ -44,15 +44,23 @@ class FurtherEffects:
 
     def _bases(self, known: Sequence[Effect]) -> tuple[Floats, list[slice]]:
         """Return orthonormal bases (m, k) of what the model leaves of each known effect, and the columns of each."""
-        held, columns = self._frame.held(known)
+        out, parts, last = np.empty((len(self._residual), sum(counts_of(known)))), list[slice](), 0
+        for some, columns in self._columns(known):
+            rest = self._beside.of(columns)
+            for effect, own in zip(some, slices(counts_of(some)), strict=True):
+                found = self._scan([effect], columns[:, own], rest[:, own]).candidates[0]
+                parts.append(slice(last, last + found.dof))
+                out[:, parts[-1]], last = rest[:, own] @ found.inverse, parts[-1].stop
+        return out[:, :last], parts
+
+    def _columns(self, known: Sequence[Effect]) -> Iterator[tuple[list[Effect], Floats]]:
+        """Yield a few of the known effects at a time with their whitened columns (m, q)."""
+        held = [effect for effect in known if self._frame.has(effect)]
+        for part in batches(counts_of(held), columns_at_once(self._carried)):
+            some = [held[k] for k in part]
+            yield some, self._frame.columns(some)
         others = [effect for effect in known if effect not in held]
-        columns = np.hstack([columns, self._frame.whitened(self._carried, others)])
-        effects, rest = [*held, *others], self._beside.of(columns)
-        bases = [np.zeros((len(rest), 0))]
-        for effect, own in zip(effects, slices(counts_of(effects)), strict=True):
-            found = self._scan([effect], columns[:, own], rest[:, own]).candidates[0]
-            bases.append(rest[:, own] @ found.inverse)
-        return np.concatenate(bases, axis=1), slices([each.shape[1] for each in bases[1:]])
+        yield others, self._frame.whitened(self._carried, others)
 
     def scans(self, groups: Sequence[Sequence[Effect]]) -> Iterator[tuple[Scan, bool]]:
         """Scan each group alone, and tell whether all of its effects are known."""

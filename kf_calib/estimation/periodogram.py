@@ -48,12 +48,13 @@ class Periodogram:
         points_hz, self._shares = _points(values_hz, max(dwell.end_s - dwell.start_s for dwell in dwells))
         kinds, self._path = [effect.at(hz) for hz in points_hz], None
         if noise.walk_mps2_per_sqrt_s:
-            parts, self._ends, stacked = _columns_beside_walk(carried, noise, kinds)
+            self._waves, self._ends, stacked = _waves_beside_walk(carried, noise, kinds)
             self._path = _Path(stacked, self._ends, steps(dwells, noise))
         else:
-            parts, self._ends = _columns(carried, noise, kinds)
-        turned = np.exp(-2j * np.pi * np.repeat(self._middles_s, np.diff(self._ends))[:, None] * points_hz)
-        self._waves: Waves = turned[..., None] * (parts[..., 1] + 1j * parts[..., 0])  # (m, points, 3)
+            self._waves, self._ends = _waves(carried, noise, kinds)
+        middles_s = np.repeat(self._middles_s, np.diff(self._ends))[:, None]
+        for k, hz in enumerate(points_hz):
+            self._waves[:, k] *= np.exp(-2j * np.pi * hz * middles_s)
         self._squares = self._products_of_waves()
         self._first: _Beside | None = None
 
@@ -247,17 +248,19 @@ class _Path:
         return bands.reshape(7, -1)
 
 
-def _columns(carried: Carried, noise: Noise, kinds: Sequence[Effect]) -> tuple[Floats, list[int]]:
-    """Return the whitened columns (m, points, 3, 2) of oscillations, and where the rows of each dwell begin and end."""
+def _waves(carried: Carried, noise: Noise, kinds: Sequence[Effect]) -> tuple[Waves, list[int]]:
+    """Return the whitened columns (m, points, 3) of oscillations, and where the rows of each dwell begin and end."""
     whitening = MisfitColumns(carried.dwells, noise, carried.state)
     stimulus = stimulus_of(carried.dwells, carried.model.bench, carried.state)
-    first, out = whitening.ends[0], np.empty((int(whitening.ends[-1] - whitening.ends[0]), len(kinds), 3, 2))
+    ends = whitening.ends - whitening.ends[0]
+    out = np.empty((int(ends[-1]), len(kinds), 3), np.complex128)
     for k, each in enumerate(kinds):  # one at a time, which saves memory
-        out[:, k] = whitening.of(piece_columns([each], stimulus))[first:].reshape(-1, 3, 2)
-    return out, (whitening.ends - first).tolist()
+        parts = whitening.of(piece_columns([each], stimulus))[whitening.ends[0] :].reshape(-1, 3, 2)
+        out[:, k] = parts[..., 1] + 1j * parts[..., 0]
+    return out, ends.tolist()
 
 
-def _columns_beside_walk(carried: Carried, noise: Noise, kinds: Sequence[Effect]) -> tuple[Floats, list[int], Floats]:
+def _waves_beside_walk(carried: Carried, noise: Noise, kinds: Sequence[Effect]) -> tuple[Waves, list[int], Floats]:
     """Return the same where the biases walk, and the rows [S | H | ...] that have the walk in them."""
     waves = candidate_columns(carried.dwells, kinds, carried.model.bench, carried.state)
     columns = [
@@ -269,7 +272,7 @@ def _columns_beside_walk(carried: Carried, noise: Noise, kinds: Sequence[Effect]
     rows = rows[len(rows) - len(carried.dwells) :]
     stacked = np.concatenate(rows)
     parts = stacked[:, 3 + width : -1].reshape(len(stacked), len(kinds), 3, 2)
-    return parts, np.cumsum([0, *map(len, rows)]).tolist(), stacked
+    return parts[..., 1] + 1j * parts[..., 0], np.cumsum([0, *map(len, rows)]).tolist(), stacked
 
 
 def _parts(ends: list[int]) -> list[slice]:

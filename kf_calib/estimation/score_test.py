@@ -162,13 +162,14 @@ class Frame:
         self._lines: dict[float, tuple[Line, ...]] = {}
         self._last: tuple[Carried, Floats, Floats, int] | None = None
 
-    def held(self, effects: Sequence[Effect]) -> tuple[list[Effect], Floats]:
-        """Those of ``effects`` that the frame contains, with their unknown constants at these values, and their
-        whitened columns (m, q)."""
+    def has(self, effect: Effect) -> bool:
+        """Tell whether the frame contains this effect with its unknown constant at this value."""
+        return _key(effect) in map(_key, self.effects)
+
+    def columns(self, effects: Sequence[Effect]) -> Floats:
+        """Whitened columns (m, q) of effects that the frame contains."""
         own = dict(zip(map(_key, self.effects), self.parts, strict=True))
-        found = [effect for effect in effects if _key(effect) in own]
-        parts = [self.coordinates[:, own[_key(effect)]] for effect in found]
-        return found, self.basis @ np.concatenate([self.coordinates[:, :0], *parts], axis=1)
+        return self.basis @ np.concatenate([self.coordinates[:, own[_key(each)]] for each in effects], axis=1)
 
     def whitened(self, carried: Carried, effects: Sequence[Effect]) -> Floats:
         """Whitened columns (m, q) of any effects, computed for a few at a time, which saves memory."""

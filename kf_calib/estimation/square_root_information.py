@@ -26,6 +26,7 @@ from kf_calib.estimation.prior import Prior
 
 _SLOW = np.arange(1, 5)
 _STILL = np.zeros(2)
+_USUAL = 24  # columns of candidates that are whitened together in a long run
 _AT_ONCE = 1 << 17  # numbers that are processed together, so that they stay in the cache
 
 
@@ -192,7 +193,7 @@ class MisfitColumns:
         self._groups, self.ends = list[_Alike](), slow + np.cumsum([0, *lengths])
         """The first row of each dwell, and at last the number of rows."""
         first_piece, first_row = np.cumsum(counts) - counts, self.ends[:-1]
-        for places in alike(dwells):
+        for places in _batches(dwells, _USUAL):
             some, pieces, width = [dwells[k] for k in places], int(counts[places[0]]), dwells[places[0]].width
             none = np.zeros((len(some), pieces, width, 3, 0))
             rows, count = _weighted(some, none, noise, state, None, flicker)
