@@ -15,9 +15,9 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.qr import triangle
 from kf_calib.effects import Effect
+from kf_calib.estimation.complement import Complement
 from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.score_test import (
-    Complement,
     Frame,
     Scan,
     batches,

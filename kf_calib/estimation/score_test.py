@@ -25,6 +25,7 @@ from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect, Stimulus
 from kf_calib.estimation import random_walk, square_root_information
+from kf_calib.estimation.complement import Complement
 from kf_calib.estimation.dwell_columns import Carried, candidate_columns, piece_columns, stimulus_of
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise, steps
@@ -126,21 +127,6 @@ def is_within(cosines: Floats, cosine: float) -> bool:
     if not 0 < dof <= others or np.vdot(cosines, cosines) <= dof * cosine**2:
         return False  # the smallest cosine is no larger than their root mean square
     return float(np.linalg.svd(cosines, compute_uv=False)[-1]) > cosine
-
-
-class Complement:
-    """The orthogonal complement of a model's columns H, the first ``width`` of whitened rows [H | ...] (m, c)."""
-
-    def __init__(self, rows: Floats, width: int) -> None:
-        scaled = square_root_information.scale_columns(rows[:, : width + 1])[0]
-        left, singular, _ = np.linalg.svd(scaled, full_matrices=False)
-        self._explained = left[:, singular > 1e-9]
-
-    def of(self, columns: Floats) -> Floats:
-        """Columns (m, ...) projected off H."""
-        for _ in range(2):  # projecting twice removes the rounding errors that large components leave in the remainder
-            columns = columns - self._explained @ (self._explained.T @ columns)
-        return columns
 
 
 class Frame:
