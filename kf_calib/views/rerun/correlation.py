@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.correlation import correlation
 from kf_calib.estimation.results import Visit
-from kf_calib.views.rerun.names import TWELVE, Quantity
+from kf_calib.views.rerun.names import Quantity
 from kf_calib.views.rerun.series import ends, times
 
 NEGATIVE, ZERO, POSITIVE = np.array([70, 140, 255]), np.array([18, 18, 22]), np.array([255, 110, 50])
@@ -40,7 +40,7 @@ def log_correlation(visits: Sequence[Visit], shown: Sequence[Quantity], stream: 
     numbers = rr.Scalars.columns(scalars=np.array(matrices).ravel()).partition([count**2] * len(visits))
     rr.send_columns("correlation/matrix", index, numbers, recording=stream)
     middle = np.arange(count) + 0.5
-    across = np.column_stack([middle, np.full(count, -0.6) - LIFT - 0.9 * (np.arange(count) >= len(TWELVE))])
+    across = np.column_stack([middle, np.full(count, -0.6) - LIFT - 0.9 * (np.arange(count) >= 12)])
     for side, places in (("rows", np.column_stack([np.full(count, -0.7), middle - LIFT])), ("columns", across)):
         points = rr.Points2D(places, labels=[each.label for each in shown], show_labels=True, radii=0.0,
                              colors=[each.colour for each in shown])  # fmt: skip

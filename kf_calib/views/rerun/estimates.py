@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from kf_calib.views.rerun.chart import LEFT, RIGHT, TOP, Axis, Chart, Ink, frames, sheet, thin
-from kf_calib.views.rerun.names import GREY, TWELVE
+from kf_calib.views.rerun.names import GREY
 from kf_calib.views.rerun.series import History
 from kf_calib.views.rerun.sigmas import ROOM
 
@@ -27,7 +27,7 @@ def _charts(history: History) -> list[Chart]:
     for k, shown in enumerate(history.shown):
         row, column = divmod(k, 4)
         seen = np.isfinite(history.sigma[:, k]).any()
-        named = f"{shown.label} − nominal ± σ, {shown.unit}" if k < len(TWELVE) else f"{shown.label} ± σ, {shown.unit}"
+        named = f"{shown.label} − nominal ± σ, {shown.unit}" if k < 12 else f"{shown.label} ± σ, {shown.unit}"
         x = Axis.around(history.elapsed_s / _per(history), _unit(history) if row == rows - 1 else "", room=0.02)
         corner = (column * (wide + LEFT + RIGHT), row * (tall + TOP + ROOM))
         title = named if seen else f"{shown.label}: not determined"

@@ -27,11 +27,11 @@ from kf_calib.views.rerun.names import (
     GREY,
     LABELS,
     ORIENTATION,
-    PER_SI,
-    TWELVE,
     WHITE,
     colour_of,
     path_of,
+    per_si,
+    twelve,
 )
 from kf_calib.views.rerun.sigmas import Falling, overview_sheet
 
@@ -67,7 +67,7 @@ def _sigmas(column: Column) -> Floats:
     jacobian = paper_parameters.jacobian(paper_parameters.state_of(nominal))
     covariances = shrinking(column.orientations, PRIORS["navigation"].covariance(nominal))
     variance = np.diagonal(jacobian @ covariances @ jacobian.T, axis1=1, axis2=2)
-    return np.sqrt(variance) * PER_SI
+    return np.sqrt(variance) * per_si()
 
 
 def _log_sigmas(stream: rr.RecordingStream, name: str, sigma: Floats) -> None:
@@ -166,4 +166,4 @@ def _falling(name: str, sigmas: dict[str, Floats]) -> Falling:
     own, none = sigmas[name], np.full(12, np.nan)
     shares = np.full_like(own, np.nan)  # of single readings they are too many to be drawn
     both = np.concatenate(list(sigmas.values()))
-    return Falling(TWELVE, np.arange(len(own)), own, shares, none, f"{name}/sigmas", READING, both, (230.0, 860.0))
+    return Falling(twelve(), np.arange(len(own)), own, shares, none, f"{name}/sigmas", READING, both, (230.0, 860.0))

@@ -20,6 +20,7 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, SelectionStep
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
+from kf_calib.support import units
 from kf_calib.support.plain_text import printable
 from kf_calib.views.rerun.chart import LEFT, RIGHT, TOP, Axis, Chart, frames, sheet, thin, write
 from kf_calib.views.rerun.explorer import (
@@ -36,7 +37,7 @@ from kf_calib.views.rerun.explorer import (
     title_of,
 )
 from kf_calib.views.rerun.file import rrd_file
-from kf_calib.views.rerun.names import CHANNELS, GOLD, GREY, MAUVE, MICRO, RED, WHITE, Colour
+from kf_calib.views.rerun.names import CHANNELS, GOLD, GREY, MAUVE, RED, WHITE, Colour
 from kf_calib.views.rerun.sigmas import ROOM
 
 STEP = "step"
@@ -94,7 +95,7 @@ class View:
 
 
 def _numbers(values_mps2: Sequence[float | None]) -> Floats:
-    return np.array([np.nan if value is None else value * MICRO for value in values_mps2])
+    return np.array([np.nan if value is None else value * units.shown("m/s^2").per_si for value in values_mps2])
 
 
 def save(state: Improvement, path: Path) -> Path:
@@ -117,7 +118,7 @@ def _place(path: str, y: Axis, title: str, row: int, x: Axis) -> Chart:
 
 def _error_chart(view: View) -> Chart:
     values = np.concatenate([own for own, _ in view.errors.values()])
-    return _place("errors", Axis.around(values, log=True), "rms error, µm/s²", 0, view.across)
+    return _place("errors", Axis.around(values, log=True), f"rms error, {units.shown('m/s^2').label}", 0, view.across)
 
 
 def _chance_chart(view: View) -> Chart:

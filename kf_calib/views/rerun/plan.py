@@ -29,9 +29,9 @@ from kf_calib.views.rerun.names import (
     GIMBALS,
     GOLD,
     GREY,
-    PER_SI,
-    TWELVE,
     WHITE,
+    per_si,
+    twelve,
 )
 from kf_calib.views.rerun.platform import ellipsoids, log_ellipsoids, log_frame, magnification
 from kf_calib.views.rerun.series import times
@@ -61,8 +61,8 @@ def _summary(made: Plan) -> str:
         f"| {k} | {begin:.0f} | " + " | ".join(f"{angle:.2f}" for angle in row) + " |"
         for k, (begin, row) in enumerate(zip(made.at_s - 0.5 * made.timing.dwell_s, made.gimbal_deg, strict=True), 1)
     ]
-    final = made.sigma[-1, :STATE_COUNT] * PER_SI
-    cells = [f"{each.label} {value:.3g} {each.unit}" for each, value in zip(TWELVE, final, strict=True)]
+    final = made.sigma[-1, :STATE_COUNT] * per_si()
+    cells = [f"{each.label} {value:.3g} {each.unit}" for each, value in zip(twelve(), final, strict=True)]
     sigmas = ["| σ after the plan | | | |", "|:--|:--|:--|:--|",
               *("| " + " | ".join(cells[4 * i : 4 * i + 4]) + " |" for i in range(3))]  # fmt: skip
     head = f"| | begins, s |{gimbals}\n|--:|--:|{'--:|' * made.poses.shape[1]}"
@@ -135,7 +135,8 @@ def _falling(made: Plan) -> Falling:
     sigma = made.sigma[:, :STATE_COUNT]
     first = 0 if np.isfinite(sigma[0]).any() else 1
     shares = np.vstack([np.zeros((1, STATE_COUNT)), shares_of(sigma)])[first:]
-    return Falling(TWELVE, np.arange(first, len(sigma)), sigma[first:] * PER_SI, shares, np.full(STATE_COUNT, np.nan))
+    aims, shown_sigma = np.full(STATE_COUNT, np.nan), sigma[first:] * per_si()
+    return Falling(twelve(), np.arange(first, len(sigma)), shown_sigma, shares, aims)
 
 
 def _log_uncertainty(made: Plan, stream: rr.RecordingStream) -> None:

@@ -11,8 +11,9 @@ import rerun as rr
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration
+from kf_calib.support import units
 from kf_calib.views.rerun.chart import TOP, Axis, Chart, Ink, frames, thin
-from kf_calib.views.rerun.names import ACCELEROMETERS, CHANNELS, GREY, MICRO, RED, WHITE
+from kf_calib.views.rerun.names import ACCELEROMETERS, CHANNELS, GREY, RED, WHITE
 from kf_calib.views.rerun.series import Counts, above, ends, nis_band
 from kf_calib.views.rerun.sigmas import ROOM
 
@@ -75,11 +76,12 @@ def innovation_charts(result: Calibration) -> list[Chart]:
     number = ends(result.visits)[1]
     late = [visit for visit in result.visits if visit.dwell.number >= number[-1] / 3]
     bounds = np.array([BOUND * visit.innovation_sigma_mps2 for visit in late])
-    reach = 1.08 * MICRO * float(np.nanmax([np.abs([visit.innovation_mps2 for visit in late]), bounds]))
+    largest = float(np.nanmax([np.abs([visit.innovation_mps2 for visit in late]), bounds]))
+    reach = 1.08 * units.shown("m/s^2").per_si * largest
     return [
         Chart(f"innovations/{channel}",
               Axis.counted(int(number[0]), int(number[-1]), "orientation" if i == 2 else ""), Axis(-reach, reach),
-              f"accelerometer {i + 1}: mean of a dwell less its prediction ± 2σ, µm/s²",
+              f"accelerometer {i + 1}: mean of a dwell less its prediction ± 2σ, {units.shown('m/s^2').label}",
               (0.0, i * (240.0 + TOP + ROOM)), 1300.0, 240.0, ACCELEROMETERS[i])
         for i, channel in enumerate(CHANNELS)
     ]  # fmt: skip
@@ -89,8 +91,9 @@ def _log_innovations(result: Calibration, radius: float, stream: rr.RecordingStr
     charts, ink, x = innovation_charts(result), Ink(), ends(result.visits)[1].astype(float)
     frames(stream, "innovations", charts)
     for i, chart in enumerate(charts):
-        value = MICRO * np.array([visit.innovation_mps2[i] for visit in result.visits])
-        bound = MICRO * BOUND * np.array([visit.innovation_sigma_mps2[i] for visit in result.visits])
+        per_si = units.shown("m/s^2").per_si
+        value = per_si * np.array([visit.innovation_mps2[i] for visit in result.visits])
+        bound = per_si * BOUND * np.array([visit.innovation_sigma_mps2[i] for visit in result.visits])
         for side in (-bound, bound):
             ink.lines(chart.strip(x, side), GREY, thin(0.8))
         known = np.abs(value) <= chart.y.high

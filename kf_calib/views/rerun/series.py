@@ -14,13 +14,13 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.information_share import prior_estimate
 from kf_calib.estimation.results import Calibration, Visit
+from kf_calib.support import units
 from kf_calib.views.rerun.names import (
     ACCELEROMETERS,
     BENCH_TIME,
     CHANNELS,
     GIMBALS,
     GREY,
-    MICRO,
     ORIENTATION,
     RED,
     WHITE,
@@ -132,13 +132,14 @@ def _style(stream: rr.RecordingStream, path: str, style: rr.SeriesLines | rr.Ser
 
 
 def log_innovations(visits: Sequence[Visit], stream: rr.RecordingStream, before: int = 0) -> None:
-    """Innovation of each dwell and channel with its bounds of 2 sigma, um/s^2; and in units of its own sigma.
+    """Innovation of each dwell and channel with its bounds of 2 sigma, in µg or m/s^2; and in units of its own sigma.
 
     ``before``: how many dwells were sent before these.
     """
     (elapsed_s, number), count = ends(visits), before + len(visits)
-    innovation = np.array([visit.innovation_mps2 for visit in visits]) * MICRO
-    sigma = np.array([visit.innovation_sigma_mps2 for visit in visits]) * MICRO
+    unit = units.shown("m/s^2")
+    innovation = np.array([visit.innovation_mps2 for visit in visits]) * unit.per_si
+    sigma = np.array([visit.innovation_sigma_mps2 for visit in visits]) * unit.per_si
     for i, (channel, colour) in enumerate(zip(CHANNELS, ACCELEROMETERS, strict=True)):
         path, bound = f"innovation/{channel}", 2 * sigma[:, i]
         _send(stream, f"{path}/value", elapsed_s, number, innovation[:, i])

@@ -17,8 +17,9 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.information_share import information_shares
 from kf_calib.estimation.results import Calibration
+from kf_calib.support import units
 from kf_calib.views.rerun.chart import LABEL_HEIGHT, LEFT, RIGHT, TOP, Axis, Chart, Ink, sheet, thin
-from kf_calib.views.rerun.names import GREY, GROUPS, PER_SI, WHITE, Colour, Quantity
+from kf_calib.views.rerun.names import GREY, GROUPS, WHITE, Colour, Quantity, per_si
 from kf_calib.views.rerun.series import Counts, History
 
 BARS: Colour = (92, 96, 110)
@@ -52,14 +53,15 @@ class Falling:
         ends, shares = history.by_orientation, np.vstack([np.zeros((1, 12)), information_shares(result)])
         first = 0 if np.isfinite(ends.sigma[0]).any() else 1
         aims = np.full(len(ends.shown), np.nan)
-        aims[:12] = np.nan if wanted is None else wanted * PER_SI
+        aims[:12] = np.nan if wanted is None else wanted * per_si()
         return cls(ends.shown, ends.orientation[first:], ends.sigma[first:], shares[first:], aims)
 
     @cached_property
     def kinds(self) -> list[tuple[str, str, list[int]]]:
         """Name, unit and columns of each chart of the overview; coefficients are in final sigmas."""
-        own = [(group.title, group.unit, [paper_parameters.SYMBOLS.index(symbol) for symbol in group.symbols])
-               for group in GROUPS]  # fmt: skip
+        places = {symbol: k for k, symbol in enumerate(paper_parameters.SYMBOLS)}
+        own = [(each.title, units.shown(each.unit).label, [places[symbol] for symbol in each.symbols])
+               for each in GROUPS]  # fmt: skip
         rest = list(range(12, len(self.shown)))
         return [*own, *([("coefficients of effects", "final σ", rest)] if rest else [])]
 
