@@ -7,6 +7,7 @@ filter does not.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 
 import numpy as np
@@ -35,8 +36,24 @@ def least_squares(
     for piece in samples:
         by_dwell.setdefault((piece.dwell, piece.moving), []).append(piece)
     whitened = (_whitened(pieces, noise.of(pieces[0].moving), linearised_at) for pieces in by_dwell.values())
-    stacked = np.concatenate(list(whitened))
-    design, readings = stacked[:, :-1], stacked[:, -1]
+    return _solution(np.concatenate(list(whitened)), around)
+
+
+def running_states(samples: Iterable[Samples], noise: Noise, linearised_at: Floats, around: Floats) -> Floats:
+    """States (D, p) from the samples of the first dwell alone, the first two, ... all D; slews belong to the dwell
+    before. Each is the least-squares solution as in ``least_squares``; the rows so far are kept as a triangle."""
+    upper, states = np.zeros((0, len(around) + 1)), list[Floats]()
+    for (_, moving), pieces in itertools.groupby(samples, key=lambda piece: (piece.dwell, piece.moving)):
+        if not moving and len(upper):
+            states.append(_solution(upper, around)[0])
+        rows = _whitened(list(pieces), noise.of(moving), linearised_at)
+        upper = np.linalg.qr(np.vstack([upper, rows]), mode="r")
+    return np.array([*states, _solution(upper, around)[0]])
+
+
+def _solution(rows: Floats, around: Floats) -> tuple[Floats, Floats]:
+    """Return state (p,) and covariance (p, p) from whitened rows [H | z] (n, p + 1)."""
+    design, readings = rows[:, :-1], rows[:, -1]
     scale = np.linalg.norm(design, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     left, upper = np.linalg.qr(design / scale)
