@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 import tracemalloc
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import TypeVar
@@ -115,7 +115,7 @@ def compare(
     return Comparison(result, ways, tuple(_remarks(settings, result)), differences, longest.allan_deviation())
 
 
-def _along(states: Sequence[Floats], result: Calibration) -> Floats:
+def _along(states: Iterable[Floats], result: Calibration) -> Floats:
     """Return the differences (D, p) of the parameters and coefficients in ``states`` (D, p) from those of the block
     engine after each dwell, in their sigmas then."""
     out = list[Floats]()

@@ -12,10 +12,12 @@ from scipy.special import chdtri
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.estimation.autoregression import expected_products
+from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration
 
 _MIDDLE = (0.025, 0.975)  # probabilities between which 95 % of all values lie
 _BOUND = 2.0  # sigmas
+_ROUNDING = 1e-9
 _MOST_LAGS = 20  # dwells
 
 
@@ -25,7 +27,7 @@ class InnovationTests:
 
     - numbers (D,): of the dwells.
     - nis (D,), dof (D,): normalised innovation squared and its degrees of freedom, which may be 0.
-    - ratios (D, 3): innovation of each accelerometer over its sigma; NaN while there is no prediction.
+    - ratios (D, 3): innovation of each accelerometer over its sigma; NaN where the dwells before do not predict it.
     """
 
     numbers: NDArray[np.int64]
@@ -78,8 +80,22 @@ def innovation_tests(result: Calibration) -> InnovationTests:
         np.array([visit.dwell.number for visit in visits]),
         np.array([visit.nis for visit in visits]),
         np.array([visit.dof for visit in visits]),
-        np.array([visit.innovation_mps2 / visit.innovation_sigma_mps2 for visit in visits]),
+        _ratios(result),
     )
+
+
+def _ratios(result: Calibration) -> Floats:
+    """Return innovations over their sigma (D, 3), also of readings that are predicted while some states are not yet."""
+    out = np.array([visit.innovation_mps2 / visit.innovation_sigma_mps2 for visit in result.visits])
+    means, visits = result.carried.means, result.visits
+    own = mean_covariances(result.noise, means, result.carried.state)
+    for k in np.flatnonzero(np.isnan(out).any(axis=1) & (np.arange(len(out)) > 0)):
+        before, rows = visits[k - 1].estimate, means.design[k]
+        lost = before.undetermined / np.linalg.norm(before.undetermined, axis=0)
+        seen = np.linalg.norm(rows @ lost, axis=1) < _ROUNDING * np.linalg.norm(rows, axis=1)
+        sigma = np.sqrt(np.diag(rows @ before.covariance @ rows.T) + np.diag(own[k]))
+        out[k] = np.where(seen, (means.readings[k] - rows @ before.state) / sigma, np.nan)
+    return out
 
 
 @dataclass(frozen=True)

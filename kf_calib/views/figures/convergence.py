@@ -29,8 +29,8 @@ def convergence(result: Calibration) -> Figure:
     units = {each.unit for each in shown(history.parameters)[STATE_COUNT:]}
     with styled():
         figure = blank(11.0, 7.0 + 1.3 * -(-len(units) // 3))
-        left, right = figure.subfigures(1, 2, width_ratios=[2.1, 1.0])
-        draw_sigmas(left, history.numbers, history.sigmas, shown(history.parameters))
+        left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.1, 1.0])[0]
+        draw_sigmas(left, history.numbers.astype(float), history.sigmas, shown(history.parameters))
         draw_innovations(right, innovation_tests(result))
     return figure
 
@@ -53,12 +53,12 @@ def draw_nis(axes: Axes, tests: InnovationTests) -> None:
         axes.text(0.5, 0.5, "nothing is left over\nto judge the model by", transform=axes.transAxes, ha="center",
                   va="center", color=GREY)  # fmt: skip
         return
-    numbers, band = tests.numbers[judged], tests.band[judged]
-    axes.fill_between(numbers, band[:, 0], band[:, 1], step="mid", color=PALE, alpha=0.6, linewidth=0.0,
+    band, ends = tests.band[judged], (tests.numbers[:, None] + [-0.5, 0.5]).ravel()  # a step a dwell
+    axes.fill_between(ends, *np.repeat(tests.band, 2, axis=0).T, color=PALE, alpha=0.6, linewidth=0.0,
                       label="95 % of noise alone")  # fmt: skip
-    axes.plot(tests.numbers, np.where(judged, tests.dof, np.nan), color=GREY, linewidth=0.9, drawstyle="steps-mid",
+    axes.plot(ends, np.repeat(np.where(judged, tests.dof, np.nan), 2), color=GREY, linewidth=0.9,
               label="degrees of freedom")  # fmt: skip
-    size = 4.0 if len(numbers) <= MANY else 2.2
+    size = 4.0 if len(tests.numbers) <= MANY else 2.2
     for place, marker, colour, name in ((~tests.high, "o", "#222222", ""), (tests.high, "D", ALARM, "above it")):
         chosen = judged & place
         if chosen.any():
@@ -87,7 +87,8 @@ def draw_ratios(axes: Axes, tests: InnovationTests) -> None:
     if np.isfinite(tests.ratios).any():
         axes.legend(loc="upper right", fontsize=7.5, ncols=3, title="accelerometer", columnspacing=1.0)
     else:
-        axes.text(0.5, 0.25, "no dwell is predicted by those before it", transform=axes.transAxes, ha="center",
+        axes.set_yticks([])
+        axes.text(0.5, 0.25, "the dwells before determine\nno prediction", transform=axes.transAxes, ha="center",
                   va="center", color=GREY)  # fmt: skip
 
 

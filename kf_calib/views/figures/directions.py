@@ -12,9 +12,9 @@ from kf_calib.estimation.residual_table import residual_table
 from kf_calib.estimation.results import Calibration
 from kf_calib.views.figures.style import ACCELEROMETERS, GREY, blank, styled
 
-_AXES = {"+x": (0.0, 0.0), "+z": (-90.0, 0.0), "−z": (90.0, 0.0), "−x": (180.0, 0.0), "+y": (0.0, 84.0),
-         "−y": (0.0, -84.0)}  # fmt: skip
-"""Where the axes of the platform are written: longitude and latitude, deg."""
+_AXES = {"+x": (0.0, 0.0, -9.0, -9.0), "+z": (-90.0, 0.0, -9.0, -9.0), "−z": (90.0, 0.0, -9.0, -9.0),
+         "−x": (180.0, 0.0, 10.0, 0.0), "+y": (0.0, 90.0, -16.0, 6.0), "−y": (0.0, -90.0, -16.0, -7.0)}  # fmt: skip
+"""Where the axes of the platform are written: longitude and latitude, deg, and how far beside it, points."""
 _NUMBERED = 40  # dwells, above which they are not numbered
 _LEAST = 3.0  # sigmas at the ends of the colours, at least
 
@@ -24,10 +24,9 @@ def sphere_map(figure: FigureBase, place: tuple[int, int, int]) -> Axes:
     axes = figure.add_subplot(*place, projection="mollweide")
     axes.set_xticks(np.radians([-150, -90, -30, 30, 90, 150]), [""] * 6)
     axes.set_yticks(np.radians([-60, -30, 0, 30, 60]), [""] * 5)
-    for name, (longitude, latitude) in _AXES.items():
-        beyond = 8.0 if longitude == 180.0 else 0.0  # beside the map, whose edge is that direction
-        axes.annotate(name, np.radians([longitude, latitude]), (beyond, 0.0), textcoords="offset points", color=GREY,
-                      ha="center", va="center", fontsize=8.0, zorder=1)  # fmt: skip
+    for name, (longitude, latitude, right, up) in _AXES.items():
+        axes.annotate(name, (np.radians(longitude), np.radians(latitude)), (right, up), textcoords="offset points",
+                      color=GREY, ha="center", va="center", fontsize=8.0, zorder=1)  # fmt: skip
     return axes
 
 
@@ -40,7 +39,7 @@ def on_map(directions: Floats) -> tuple[Floats, Floats]:
 def directions(result: Calibration) -> Figure:
     """Where specific force pointed in the platform in each dwell, coloured by the residual of each accelerometer."""
     with styled():
-        figure = blank(11.0, 6.6)
+        figure = blank(11.0, 6.2)
         draw_directions(figure, result)
     return figure
 
@@ -58,9 +57,9 @@ def draw_directions(figure: FigureBase, result: Calibration) -> None:
         for marker, chosen in (("^", ratios[:, i] >= 0.0), ("v", ratios[:, i] < 0.0)):
             marks = axes.scatter(
                 longitude[chosen], latitude[chosen], size, c=ratios[chosen, i], marker=marker, cmap="PuOr_r",
-                norm=Normalize(-limit, limit), edgecolors="#444444", linewidths=0.5, zorder=3,
+                norm=Normalize(-limit, limit), edgecolors="#444444", linewidths=0.5, zorder=3, clip_on=False,
             )  # fmt: skip
-        axes.set_title(f"accelerometer {i + 1}", color=ACCELEROMETERS[i], loc="center")
+        axes.set_title(f"accelerometer {i + 1}", color=ACCELEROMETERS[i], loc="center", pad=12.0)
         maps.append(axes)
     if marks is not None:
         figure.colorbar(marks, ax=maps, label="residual / σ (▲ above 0, ▼ below)", shrink=0.6, extend="both",
@@ -72,17 +71,20 @@ def _draw_order(figure: FigureBase, result: Calibration, longitude: Floats, lati
     """Draw the same directions in the order of the dwells: numbers, or colours where there are many."""
     axes = sphere_map(figure, (2, 2, 4))
     numbers = [dwell.number for dwell in result.fit.dwells]
-    axes.set_title("numbers of the dwells" if len(numbers) <= _NUMBERED else "order of the dwells", loc="center")
-    if len(numbers) <= _NUMBERED:
+    few = len(numbers) <= _NUMBERED
+    axes.set_title("numbers of the dwells" if few else "order of the dwells", loc="center", pad=12.0)
+    if few:
         number_points(axes, longitude, latitude, [str(number) for number in numbers])
         return
-    marks = axes.scatter(longitude, latitude, 300.0 / len(numbers) ** 0.5, c=numbers, cmap="viridis", zorder=3)
+    marks = axes.scatter(
+        longitude, latitude, 300.0 / len(numbers) ** 0.5, c=numbers, cmap="viridis", zorder=3, clip_on=False
+    )
     figure.colorbar(marks, ax=axes, label="dwell", shrink=0.6, pad=0.02)
 
 
 def number_points(axes: Axes, longitude: Floats, latitude: Floats, names: list[str]) -> None:
     """Draw points with their numbers beside them; those of one direction share a text."""
-    axes.plot(longitude, latitude, "o", color="#222222", markersize=3.0, zorder=3)
+    axes.plot(longitude, latitude, "o", color="#222222", markersize=3.0, zorder=3, clip_on=False)
     places = dict[tuple[float, float], list[str]]()
     for x, y, name in zip(longitude.tolist(), latitude.tolist(), names, strict=True):
         pole = abs(y) > 1.55  # all longitudes are one point there

@@ -30,8 +30,8 @@ def three_ways(compared: Comparison) -> Figure:
     memory of the three; cumulative NIS beside chi-squared."""
     with styled():
         figure = blank(11.0, 7.0)
-        above, below = figure.subfigures(2, 1)
-        left, right = above.subfigures(1, 2, width_ratios=[1.6, 1.0])
+        above, below = figure.subfigures(2, 1, squeeze=False)[:, 0]
+        left, right = above.subfigures(1, 2, squeeze=False, width_ratios=[1.6, 1.0])[0]
         draw_differences(left.subplots(), compared)
         draw_costs(right, compared)
         tests = innovation_tests(compared.result)
@@ -134,6 +134,7 @@ def draw_whiteness(figure: FigureBase, result: Calibration) -> None:
 def _autocorrelation(axes: Axes, values: Floats, white: Floats, bound: Floats, i: int) -> None:
     """Draw an autocorrelation as stems, with the band that white noise keeps within in 95 % of all lags."""
     if not len(values) or not np.isfinite(values).any():
+        axes.set_xticks([])
         axes.text(0.5, 0.5, "too few to tell", transform=axes.transAxes, ha="center", va="center", color=GREY)
         return
     lags = np.arange(1, len(values) + 1)
@@ -146,8 +147,8 @@ def _autocorrelation(axes: Axes, values: Floats, white: Floats, bound: Floats, i
 
 def _reach(axes: Axes, values: Floats, bound: Floats) -> None:
     """Let an axis reach as far below zero as above, over all that is drawn in its row."""
-    reach = 1.1 * max(float(np.nanmax(np.abs(values), initial=0.0)), float(bound.max(initial=0.1)))
-    axes.set_ylim(-reach, reach)
+    reach = 1.1 * max(float(np.nanmax(np.abs(values), initial=0.0)), float(bound.max(initial=0.0)))
+    axes.set_ylim(-(reach or 1.0), reach or 1.0)
 
 
 def allan_deviation(compared: Comparison) -> Figure:

@@ -48,6 +48,7 @@ def draw_table2(figure: FigureBase, found: Experiment) -> None:
     log_scale(axes, every)
     for edge in (3.5, 7.5):
         axes.axvline(edge, color=GREY, linewidth=0.8)
+    axes.set_xlim(-0.6, STATE_COUNT - 0.4)
     axes.set_xticks(place, [each.label for each in TWELVE])
     axes.grid(visible=False, axis="x")
     axes.set_ylabel("mean of |error|, % of the deviation that was to be found")
@@ -79,7 +80,8 @@ def draw_falling(figure: FigureBase, found: Experiment) -> None:
         axes.set_xticks(range(0, len(both[0]), READINGS))
         axes.set_xlim(0, 1.16 * len(both[0]))
     for k in range(4):
-        log_scale(panels[k], [sigmas[:, [k, k + 4, k + 8]] * TWELVE[k].per_si for sigmas in both])
+        shown = np.array(both)[:, :, k::4] * TWELVE[k].per_si
+        log_scale(panels[k], [0.7 * shown, shown])
     for axes in panels[3::4]:
         axes.set_xlabel(f"readings ({READINGS} in each orientation)")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)

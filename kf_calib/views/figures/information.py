@@ -35,13 +35,16 @@ def draw_information(figure: FigureBase, history: ParameterHistory) -> None:
     numbers, names = history.numbers, shown(history.parameters)
     above.axhline(100.0 / len(numbers), color=GREY, linewidth=1.0, linestyle="--",
                   label=f"if all {len(numbers)} brought as much")  # fmt: skip
-    for i, width in enumerate((4.5, 2.8, 1.2)):  # balanced orientations bring all three as much: none is hidden
-        marker = MARKERS[i] if len(numbers) <= MANY else ""
+    few = len(numbers) <= MANY
+    for i, width in enumerate((3.6, 2.4, 1.2) if few else (2.4, 1.5, 0.7)):  # where all three are alike, none is hidden
+        marker = MARKERS[i] if few else ""
         above.plot(numbers, 100.0 * history.shares_of_accelerometers[:, i], marker=marker, color=ACCELEROMETERS[i],
                    linewidth=width, markersize=2.0 + 1.6 * width, label=f"accelerometer {i + 1}")  # fmt: skip
     above.set_ylabel("share, %")
     above.set_title("Share of the final information 1/σ² that each orientation brought: mean of four parameters")
-    above.legend(loc="upper right", ncols=2)
+    top = 100.0 * np.nanmax(history.shares_of_accelerometers, initial=0.0)
+    above.set_ylim(-0.04 * top, 1.4 * top)  # room for the legend
+    above.legend(loc="upper center", ncols=4)
     known = 100.0 * np.where(np.isfinite(history.shares), history.shares, 0.0)
     edges = np.append(numbers - 0.5, numbers[-1] + 0.5)
     mesh = below.pcolormesh(edges, np.arange(len(names) + 1), known.T, cmap="YlGnBu", vmin=0.0,

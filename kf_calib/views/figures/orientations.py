@@ -12,11 +12,13 @@ from kf_calib.design.orientation_plan import Plan
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.views.figures.directions import number_points, on_map, sphere_map
 from kf_calib.views.figures.parameter_panels import draw_sigmas
-from kf_calib.views.figures.scales import log_scale, written
+from kf_calib.views.figures.scales import log_scale, whole_numbers, written
 from kf_calib.views.figures.style import ACCELEROMETERS, ALARM, GREY, PALE, blank, styled
 from kf_calib.views.figures.symbols import KINDS, TWELVE, Shown, label, plain
+from kf_calib.views.plan import gimbal_names
 
 _HATCHES = ("", "///", "...")
+_GIMBALS = ("#222222", "#cc79a7", "#56b4e9", "#e69f00")
 _ARC = 33  # points of the way between two directions
 
 
@@ -24,8 +26,10 @@ def plan(made: Plan) -> Figure:
     """The orientations on the sphere in their order, and the predicted sigma of each parameter, with targets if any."""
     with styled():
         figure = blank(11.0, 6.6)
-        left, right = figure.subfigures(1, 2, width_ratios=[1.25, 1.0])
-        draw_tour(left, made)
+        left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.25, 1.0])[0]
+        above, below = left.subfigures(2, 1, squeeze=False, height_ratios=[1.5, 1.0])[:, 0]
+        draw_tour(above, made)
+        draw_angles(below.subplots(), made)
         draw_predicted(right, made)
     return figure
 
@@ -39,7 +43,24 @@ def draw_tour(figure: FigureBase, made: Plan) -> None:
         axes.plot(np.insert(longitude, seam, np.nan), np.insert(latitude, seam, np.nan), color=PALE, linewidth=1.0,
                   zorder=2)  # fmt: skip
     number_points(axes, *on_map(made.directions), [str(k + 1) for k in range(len(made.poses))])
-    axes.set_title(f"{len(made.poses)} orientations in order: specific force in the platform, y up", loc="center")
+    axes.set_title(
+        f"{len(made.poses)} orientations in order: specific force in the platform, y up", loc="center", pad=14.0
+    )
+
+
+def draw_angles(axes: Axes, made: Plan) -> None:
+    """Draw the angles of the gimbals in the order of the visits."""
+    numbers = np.arange(1, len(made.poses) + 1)
+    for angles, name, colour, marker in zip(made.gimbal_deg.T, gimbal_names(made), _GIMBALS, "osDv", strict=False):
+        axes.plot(numbers, angles, f":{marker}", color=colour, markersize=4.0, linewidth=0.9,
+                  label=f"gimbal {name.replace('_', ' ')}")  # fmt: skip
+    reach = float(np.abs(made.gimbal_deg).max(initial=90.0))
+    axes.set_ylim(-1.15 * reach, 1.6 * reach)  # room for the legend
+    axes.set_yticks(np.arange(-180, 181, 90))
+    axes.set_ylabel("angle, deg")
+    axes.set_title("Angles to set")
+    axes.legend(loc="upper center", ncols=4, fontsize=8.0)
+    whole_numbers(axes, 1, max(len(made.poses), 2))
 
 
 def _arc(start: Floats, end: Floats) -> Floats:

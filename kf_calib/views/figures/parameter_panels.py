@@ -17,6 +17,7 @@ from kf_calib.views.figures.symbols import KINDS, TWELVE, Shown
 
 MANY = 60
 """Dwells, above which curves have no markers."""
+_ROOM = 0.28  # of a panel, for its text
 _STYLES = ("-", "--", ":")
 _ROWS = [KINDS[unit] for unit in paper_parameters.UNITS[:4]]
 
@@ -61,13 +62,13 @@ def draw_sigmas(
         row = [sigmas[:, k::4][:, :3] * names[k].per_si]
         if targets is not None:
             row.append(targets[k:STATE_COUNT:4] * names[k].per_si)
-        log_scale(twelve[k], row)
+        log_scale(twelve[k], row, room=_ROOM)
     for axes, group in zip(others, groups, strict=True):
         for place, k in enumerate(group):
             values = sigmas[:, k] * names[k].per_si
             _curve(axes, numbers, values, place % 3, place // 3, f"{names[k].label}  {_final(values[-1], '')}")
-        axes.set_ylabel(f"σ of effect\n{names[group[0]].unit}")
-        log_scale(axes, [sigmas[:, k] * names[k].per_si for k in group])
+        axes.set_ylabel(f"σ of effect,\n{names[group[0]].unit}")
+        log_scale(axes, [sigmas[:, k] * names[k].per_si for k in group], room=_ROOM)
         axes.legend(loc="upper right", fontsize=7.0, handlelength=1.2, labelspacing=0.2, ncols=1 + (len(group) > 3))
     for axes in (*twelve, *others):
         whole_numbers(axes, numbers[0], numbers[-1], "")

@@ -26,18 +26,22 @@ def written(value: float) -> str:
     return power if abs(mantissa - 1.0) < 1e-6 else f"{mantissa:.3g}·{power}"
 
 
-def log_scale(axes: Axes, values: Any, which: Literal["x", "y"] = "y") -> None:
-    """Make an axis logarithmic over all positive ``values``, and write numbers at its ticks."""
+def log_scale(axes: Axes, values: Any, which: Literal["x", "y"] = "y", room: float = 0.0) -> None:
+    """Make an axis logarithmic over all positive ``values``, and write numbers at its ticks; none without a value.
+
+    room: share of the axis that is left free above them, for text.
+    """
     flat = np.concatenate([np.asarray(own, float).ravel() for own in values] or [np.zeros(0)])
     flat = flat[np.isfinite(flat) & (flat > 0.0)]
     low, high = (float(flat.min()) / 1.15, float(flat.max()) * 1.15) if flat.size else (0.5, 20.0)
     if high < _LEAST_RANGE * low:
         middle = math.sqrt(low * high)
         low, high = middle / math.sqrt(_LEAST_RANGE), middle * math.sqrt(_LEAST_RANGE)
+    high *= (high / low) ** (room / (1.0 - room))
     axis = axes.yaxis if which == "y" else axes.xaxis
     (axes.set_yscale if which == "y" else axes.set_xscale)("log")
     (axes.set_ylim if which == "y" else axes.set_xlim)(low, high)
-    axis.set_major_locator(FixedLocator(ticks(low, high)))
+    axis.set_major_locator(FixedLocator(ticks(low, high) if flat.size else []))
     axis.set_major_formatter(FuncFormatter(lambda value, _: written(value)))
     axis.set_minor_locator(NullLocator())
     axis.set_minor_formatter(NullFormatter())
@@ -55,7 +59,7 @@ def ticks(low: float, high: float) -> list[float]:
 
 def whole_numbers(axes: Axes, first: float, last: float, words: str = "orientation") -> None:
     """Let the x axis count orientations from ``first`` to ``last``."""
-    room = 0.03 * max(last - first, 1.0)
+    room = max(0.03 * (last - first), 0.5)
     axes.set_xlim(first - room, last + room)
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=2))
     axes.set_xlabel(words)

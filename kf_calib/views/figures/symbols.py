@@ -28,7 +28,7 @@ def label(symbol: str) -> str:
     latin = next((each for each in _GREEK if symbol.startswith(each)), "")
     name = _GREEK.get(latin, "") + symbol[len(latin) :]
     stem = name.rstrip("0123456789")
-    return plain(stem + name[len(stem) :].translate(_SUBSCRIPTS))
+    return plain(stem.removesuffix("_") + name[len(stem) :].translate(_SUBSCRIPTS))
 
 
 def plain(text: str) -> str:
