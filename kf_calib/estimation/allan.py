@@ -45,11 +45,6 @@ class AllanDeviation:
     flicker_mps2: Floats
     walk_mps2: Floats
 
-    @property
-    def together_mps2(self) -> Floats:
-        """The noise model's Allan deviation (m, 3), all its parts."""
-        return np.sqrt(self.white_mps2**2 + self.flicker_mps2**2 + self.walk_mps2[:, None] ** 2)
-
 
 def deviations(series: Sequence[Floats], sizes: Sequence[int]) -> tuple[Floats, Floats]:
     """Overlapping Allan deviation (m, 3) of several series (n, 3) at once for clusters of these sizes, and the number

@@ -118,10 +118,9 @@ def draw_estimates(figure: FigureBase, history: ParameterHistory) -> None:
                   marker=MARKERS[i] if len(history.numbers) <= MANY else "")  # fmt: skip
         axes.set_ylim(-limit, limit)
         axes.set_ylabel("estimate less final,\nin final σ" if k < 4 or (k >= STATE_COUNT and k % 3 == 0) else "")
-        whole_numbers(axes, history.numbers[0], history.numbers[-1], "")
+        last = axes in (others[-3:] or twelve[3::4])
+        whole_numbers(axes, history.numbers[0], history.numbers[-1], "orientation" if last else "")
         corner(axes, _ending(history, k, names[k]))
-    for axes in others[-3:] if others else twelve[3::4]:
-        axes.set_xlabel("orientation")
 
 
 def _ending(history: ParameterHistory, k: int, name: Shown) -> str:

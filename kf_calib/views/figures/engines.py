@@ -191,6 +191,3 @@ def _lines(axes: Axes, allan: AllanDeviation, i: int) -> None:
                   linewidth=1.2, label="1/f, were it the scatter of dwells")  # fmt: skip
     if allan.walk_mps2.any():
         axes.plot(allan.tau_s, allan.walk_mps2 * MICRO_G, ":", color="#222222", linewidth=1.4, label="walk, q √(τ/3)")
-    if allan.flicker_mps2[i] or allan.walk_mps2.any():
-        axes.plot(allan.tau_s, allan.together_mps2[:, i] * MICRO_G, color=GREY, linewidth=2.5, alpha=0.5,
-                  label="together")  # fmt: skip

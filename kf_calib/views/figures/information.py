@@ -33,8 +33,8 @@ def draw_information(figure: FigureBase, history: ParameterHistory) -> None:
     """The same on a part of a figure."""
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1.0, 1.7])
     numbers, names = history.numbers, shown(history.parameters)
-    above.axhline(100.0 / len(numbers), color=GREY, linewidth=1.0, linestyle="--",
-                  label=f"if all {len(numbers)} brought as much")  # fmt: skip
+    count = int((numbers > 0).sum())
+    above.axhline(100.0 / count, color=GREY, linewidth=1.0, linestyle="--", label=f"if all {count} brought as much")
     few = len(numbers) <= MANY
     for i, width in enumerate((3.6, 2.4, 1.2) if few else (2.4, 1.5, 0.7)):  # where all three are alike, none is hidden
         marker = MARKERS[i] if few else ""

@@ -71,9 +71,8 @@ def draw_sigmas(
         log_scale(axes, [sigmas[:, k] * names[k].per_si for k in group], room=_ROOM)
         axes.legend(loc="upper right", fontsize=7.0, handlelength=1.2, labelspacing=0.2, ncols=1 + (len(group) > 3))
     for axes in (*twelve, *others):
-        whole_numbers(axes, numbers[0], numbers[-1], "")
-    for axes in [*others[-3:]] if others else twelve[3::4]:
-        axes.set_xlabel("orientation")
+        last = axes in (others[-3:] or twelve[3::4])
+        whole_numbers(axes, numbers[0], numbers[-1], "orientation" if last else "")
 
 
 def _by_unit(names: Sequence[Shown]) -> list[list[int]]:

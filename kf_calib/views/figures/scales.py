@@ -58,8 +58,8 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def whole_numbers(axes: Axes, first: float, last: float, words: str = "orientation") -> None:
-    """Let the x axis count orientations from ``first`` to ``last``."""
+    """Let the x axis count orientations from ``first`` to ``last``; 0 is what was known before them."""
     room = max(0.03 * (last - first), 0.5)
     axes.set_xlim(first - room, last + room)
-    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=2))
-    axes.set_xlabel(words)
+    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
+    axes.set_xlabel(f"{words} (0: before)" if words and first == 0 else words)
