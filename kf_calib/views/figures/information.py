@@ -65,19 +65,21 @@ def correlations(result: Calibration) -> Figure:
     """Correlations of the parameters and of the effects' coefficients at the end of a run, if any is notable."""
     with styled():
         figure = blank(8.0, 7.0)
-        draw_correlations(figure, result)
+        if not draw_correlations(figure, result):
+            figure.set_size_inches(8.0, 1.5)
     return figure
 
 
-def draw_correlations(figure: FigureBase, result: Calibration) -> None:
-    """The same on a part of a figure; a sentence where no correlation is notable."""
+def draw_correlations(figure: FigureBase, result: Calibration) -> bool:
+    """The same on a part of a figure; a sentence where no correlation is notable. Whether there is a matrix."""
     matrix, names = correlation(result.estimate), shown(history_of(result).parameters)
     beside = np.where(np.eye(len(matrix), dtype=bool) | ~np.isfinite(matrix), 0.0, matrix)
     one, other = np.unravel_index(np.argmax(np.abs(beside)), beside.shape)
     if abs(beside[one, other]) < NOTABLE:
         largest = f"the largest, of {names[one].label} and {names[other].label}, is {beside[one, other]:.2g}"
-        return say(figure, f"All correlations of parameters are smaller than {NOTABLE}: {largest.replace('-', '−')}.",
-                   "#222222")  # fmt: skip
+        said = f"All correlations of parameters are smaller than {NOTABLE}: {largest.replace('-', '−')}."
+        say(figure, said, "#222222")
+        return False
     axes = figure.subplots()
     image = axes.imshow(np.ma.masked_invalid(matrix), cmap="PuOr_r", vmin=-1.0, vmax=1.0)
     axes.set_facecolor("#d9d9d9")
@@ -94,6 +96,7 @@ def draw_correlations(figure: FigureBase, result: Calibration) -> None:
     lost = bool(np.isnan(np.diag(matrix)).any())
     axes.set_title(f"Correlations; written from {NOTABLE} on{'; grey: not determined' if lost else ''}", pad=12.0)
     figure.colorbar(image, ax=axes, label="correlation (no unit)", shrink=0.8)
+    return True
 
 
 def _number(axes: Axes, row: int, column: int, value: float, count: int) -> None:

@@ -80,6 +80,7 @@ def draw_predicted(figure: FigureBase, made: Plan) -> None:
         per_si, unit = TWELVE[group[0]].per_si, TWELVE[group[0]].unit
         _sigma_bars(axes, group, made.sigma[-1] * per_si, made.targets * per_si)
         _before(axes, group, made.sigma[0] * per_si)
+        _values(axes, group, made.sigma[[0, -1]] * per_si)
         axes.set_xlabel(f"predicted σ of {kind}, {unit}")
     panels[0].set_title("Predicted σ after the last orientation")
     marked = [axes for axes in panels if axes.get_legend_handles_labels()[1]]
@@ -98,8 +99,6 @@ def _sigma_bars(axes: Axes, group: list[int], sigma: Floats, targets: Floats) ->
             continue
         axes.barh(row, sigma[k] - left, left=left, height=0.7, color=ACCELEROMETERS[k // 4], hatch=_HATCHES[k // 4],
                   edgecolor="white", linewidth=0.0)  # fmt: skip
-        axes.annotate(written(float(f"{sigma[k]:.3g}")), (sigma[k], row), xytext=(4, 0), textcoords="offset points",
-                      va="center", fontsize=8.0)  # fmt: skip
         if np.isfinite(targets[k]):
             axes.plot([targets[k]] * 2, [row - 0.45, row + 0.45], color=ALARM, linewidth=2.0,
                       label="" if "target" in axes.get_legend_handles_labels()[1] else "target")  # fmt: skip
@@ -114,6 +113,15 @@ def _before(axes: Axes, group: list[int], sigma: Floats) -> None:
     if seen:
         before = [sigma[group[row]] for row in seen]
         axes.plot(before, seen, "D", color="#222222", markersize=4.0, label="before the plan")
+
+
+def _values(axes: Axes, group: list[int], sigmas: Floats) -> None:
+    """Write the last of some sigmas (n, p) to the right of all that are on the axis."""
+    for row, k in enumerate(group):
+        seen = sigmas[:, k][sigmas[:, k] < axes.get_xlim()[1]]
+        if np.isfinite(sigmas[-1, k]):
+            axes.annotate(written(float(f"{sigmas[-1, k]:.3g}")), (seen.max(initial=sigmas[-1, k]), row), (6, 0),
+                          textcoords="offset points", va="center", fontsize=8.0)  # fmt: skip
 
 
 def predicted_sigmas(made: Plan) -> Figure:
