@@ -34,9 +34,10 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.reproduction.grebenkin2019 import OPTIMAL_PRINTED, Experiment, printed, repeat
 from kf_calib.views.figures.scales import ticks, written
 from kf_calib.views.figures.style import content_of
-from kf_calib.views.figures.symbols import MICRO_G, label
+from kf_calib.views.figures.symbols import label
 
 HIDDEN = ROOT / "recordings" / "hidden.mcap"
+MICRO_G = 1.0 / 9.80665e-6
 ARCSEC = np.degrees(3600.0)
 ONE_AXIS = np.radians([[0.0, 0.0, angle] for angle in (0, 30, 70, 110, 200, 300)])
 ODD: dict[str, Callable[[], Calibration]] = {

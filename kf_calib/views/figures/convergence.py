@@ -10,11 +10,11 @@ from kf_calib.estimation.innovation_tests import InnovationTests, innovation_tes
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.parameter_history import ParameterHistory, history_of
 from kf_calib.estimation.results import Calibration
-from kf_calib.views.console import rounded
+from kf_calib.support.units import rounded
 from kf_calib.views.figures.parameter_panels import MANY, corner, draw_sigmas, parameter_panels
 from kf_calib.views.figures.scales import log_scale, whole_numbers
 from kf_calib.views.figures.style import ACCELEROMETERS, ALARM, BAND, GREY, MARKERS, PALE, blank, styled
-from kf_calib.views.figures.symbols import Shown, shown
+from kf_calib.views.figures.symbols import Shown, with_coefficients
 
 _LOG_FROM = 12.0  # times the upper end of the band; a larger NIS is drawn on a logarithmic axis
 _CUT = 12.0  # final sigmas beyond which an estimate on its way is not drawn
@@ -26,11 +26,13 @@ def convergence(result: Calibration) -> Figure:
     NIS of each dwell has the middle 95 % of chi-squared behind it, innovations are over their sigma with lines at 2.
     """
     history = history_of(result)
-    units = {each.unit for each in shown(history.parameters)[STATE_COUNT:]}
+    units = {each.unit for each in with_coefficients(history.parameters[STATE_COUNT:])[STATE_COUNT:]}
     with styled():
         figure = blank(11.0, 7.0 + 1.3 * -(-len(units) // 3))
         left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.1, 1.0])[0]
-        draw_sigmas(left, history.numbers.astype(float), history.sigmas, shown(history.parameters))
+        draw_sigmas(
+            left, history.numbers.astype(float), history.sigmas, with_coefficients(history.parameters[STATE_COUNT:])
+        )
         draw_innovations(right, innovation_tests(result))
     return figure
 
@@ -104,7 +106,7 @@ def estimates(result: Calibration) -> Figure:
 
 def draw_estimates(figure: FigureBase, history: ParameterHistory) -> None:
     """The same on a part of a figure."""
-    names = shown(history.parameters)
+    names = with_coefficients(history.parameters[STATE_COUNT:])
     twelve, others = parameter_panels(figure, "", [[k] for k in range(STATE_COUNT, len(names))])
     around = history.sigmas / history.sigmas[-1]
     reach = np.abs(history.deviations) + around

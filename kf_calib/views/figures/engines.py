@@ -13,11 +13,11 @@ from kf_calib.estimation.allan import AllanDeviation
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.innovation_tests import InnovationTests, innovation_tests, reading_correlation
 from kf_calib.estimation.results import Calibration
+from kf_calib.support.units import shown
 from kf_calib.views.figures.convergence import draw_nis
 from kf_calib.views.figures.parameter_panels import MANY
 from kf_calib.views.figures.scales import log_scale, whole_numbers, written
 from kf_calib.views.figures.style import ACCELEROMETERS, ALARM, GREY, MARKERS, PALE, blank, say, styled
-from kf_calib.views.figures.symbols import MICRO_G
 
 _WAYS = {"block": "block engine", "filterpy": "filterpy", "batch": "batch least squares"}
 _COLOURS = {"block": "#222222", "filterpy": "#cc79a7", "batch": "#56b4e9"}
@@ -165,7 +165,7 @@ def allan_deviation(compared: Comparison) -> Figure:
 def draw_allan(figure: FigureBase, allan: AllanDeviation) -> None:
     """The same on a part of a figure: a panel an accelerometer."""
     panels: Sequence[Axes] = figure.subplots(1, 3, sharex=True, sharey=True)
-    scaled = allan.deviation_mps2 * MICRO_G
+    scaled = allan.deviation_mps2 * shown("m/s^2").per_si
     for i, axes in enumerate(panels):
         _lines(axes, allan, i)
         axes.errorbar(allan.tau_s, scaled[:, i], scaled[:, i] * np.minimum(allan.spread, _LOWEST), fmt=MARKERS[i],
@@ -173,11 +173,11 @@ def draw_allan(figure: FigureBase, allan: AllanDeviation) -> None:
         axes.set_xlabel("length of a cluster τ, s")
         axes.set_title(f"accelerometer {i + 1}")
     ends = np.outer(np.minimum(allan.spread, _LOWEST), [-1.0, 1.0])[:, None] + 1.0
-    log_scale(panels[0], [scaled[..., None] * ends, allan.white_mps2 * MICRO_G])
+    log_scale(panels[0], [scaled[..., None] * ends, allan.white_mps2 * shown("m/s^2").per_si])
     log_scale(panels[0], [allan.tau_s], "x")
     for axes in panels[1:]:
         axes.tick_params(labelleft=False)
-    panels[0].set_ylabel("Allan deviation, µg")
+    panels[0].set_ylabel(f"Allan deviation, {shown('m/s^2').label}")
     numbers = ", ".join(map(str, allan.dwells))
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5,
                   title=f"Readings of {'dwell' if len(allan.dwells) == 1 else 'dwells'} {numbers}")  # fmt: skip
@@ -185,9 +185,23 @@ def draw_allan(figure: FigureBase, allan: AllanDeviation) -> None:
 
 def _lines(axes: Axes, allan: AllanDeviation, i: int) -> None:
     """Draw what the parts of the noise model give."""
-    axes.plot(allan.tau_s, allan.white_mps2[:, i] * MICRO_G, color="#222222", linewidth=1.2, label="white, σ √(κ/m)")
+    per_si = shown("m/s^2").per_si
+    axes.plot(
+        allan.tau_s,
+        allan.white_mps2[:, i] * per_si,
+        color="#222222",
+        linewidth=1.2,
+        label="white, σ √(κ/m)",
+    )
     if allan.flicker_mps2[i]:
-        axes.plot(allan.tau_s, np.full(len(allan.tau_s), allan.flicker_mps2[i] * MICRO_G), "--", color="#222222",
+        axes.plot(allan.tau_s, np.full(len(allan.tau_s), allan.flicker_mps2[i] * per_si), "--", color="#222222",
                   linewidth=1.2, label="1/f, were it the scatter of dwells")  # fmt: skip
     if allan.walk_mps2.any():
-        axes.plot(allan.tau_s, allan.walk_mps2 * MICRO_G, ":", color="#222222", linewidth=1.4, label="walk, q √(τ/3)")
+        axes.plot(
+            allan.tau_s,
+            allan.walk_mps2 * per_si,
+            ":",
+            color="#222222",
+            linewidth=1.4,
+            label="walk, q √(τ/3)",
+        )

@@ -18,7 +18,7 @@ from kf_calib.reproduction.grebenkin2019 import (
 from kf_calib.views.figures.parameter_panels import parameter_panels
 from kf_calib.views.figures.scales import log_scale, written
 from kf_calib.views.figures.style import GREY, blank, styled
-from kf_calib.views.figures.symbols import TWELVE
+from kf_calib.views.figures.symbols import twelve
 
 _SETS = {"optimal": ("#0072b2", "-"), "non-optimal": ("#d55e00", "--")}
 
@@ -49,7 +49,7 @@ def draw_table2(figure: FigureBase, found: Experiment) -> None:
     for edge in (3.5, 7.5):
         axes.axvline(edge, color=GREY, linewidth=0.8)
     axes.set_xlim(-0.6, STATE_COUNT - 0.4)
-    axes.set_xticks(place, [each.label for each in TWELVE])
+    axes.set_xticks(place, [each.label for each in twelve()])
     axes.grid(visible=False, axis="x")
     axes.set_ylabel("mean of |error|, % of the deviation that was to be found")
     axes.set_title(f"Table 2 of the paper and {written(found.repetitions)} repetitions: optimal orientations below, "
@@ -71,16 +71,16 @@ def draw_falling(figure: FigureBase, found: Experiment) -> None:
     both = [falling_sigma(column.orientations) for column, _ in _tables(found)]
     for k, axes in enumerate(panels):
         for (name, (colour, style)), sigmas in zip(_SETS.items(), both, strict=True):
-            values = sigmas[:, k] * TWELVE[k].per_si
+            values = sigmas[:, k] * twelve()[k].per_si
             last = written(float(f"{values[-1]:.2g}"))
             axes.plot(values, style, color=colour, label=f"{name}" if k else f"{name} set")
             axes.annotate(last, (len(values) - 1, values[-1]), xytext=(3, 0), textcoords="offset points", fontsize=7.5,
                           color=colour, va="center", annotation_clip=False)  # fmt: skip
-        axes.text(0.985, 0.97, TWELVE[k].label, transform=axes.transAxes, ha="right", va="top", fontweight="bold")
+        axes.text(0.985, 0.97, twelve()[k].label, transform=axes.transAxes, ha="right", va="top", fontweight="bold")
         axes.set_xticks(range(0, len(both[0]), READINGS))
         axes.set_xlim(0, 1.16 * len(both[0]))
     for k in range(4):
-        shown = np.array(both)[:, :, k::4] * TWELVE[k].per_si
+        shown = np.array(both)[:, :, k::4] * twelve()[k].per_si
         log_scale(panels[k], [0.7 * shown, shown])
     for axes in panels[3::4]:
         axes.set_xlabel(f"readings ({READINGS} in each orientation)")

@@ -12,7 +12,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.views.figures.parameter_panels import MANY
 from kf_calib.views.figures.scales import whole_numbers
 from kf_calib.views.figures.style import ACCELEROMETERS, GREY, MARKERS, blank, say, styled
-from kf_calib.views.figures.symbols import shown
+from kf_calib.views.figures.symbols import with_coefficients
 
 NOTABLE = 0.3
 """A correlation below this is not worth a place in a figure."""
@@ -32,7 +32,7 @@ def information(result: Calibration) -> Figure:
 def draw_information(figure: FigureBase, history: ParameterHistory) -> None:
     """The same on a part of a figure."""
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1.0, 1.7])
-    numbers, names = history.numbers, shown(history.parameters)
+    numbers, names = history.numbers, with_coefficients(history.parameters[STATE_COUNT:])
     count = int((numbers > 0).sum())
     above.axhline(100.0 / count, color=GREY, linewidth=1.0, linestyle="--", label=f"if all {count} brought as much")
     few = len(numbers) <= MANY
@@ -72,7 +72,7 @@ def correlations(result: Calibration) -> Figure:
 
 def draw_correlations(figure: FigureBase, result: Calibration) -> bool:
     """The same on a part of a figure; a sentence where no correlation is notable. Whether there is a matrix."""
-    matrix, names = correlation(result.estimate), shown(history_of(result).parameters)
+    matrix, names = correlation(result.estimate), with_coefficients(result.model.coefficients)
     beside = np.where(np.eye(len(matrix), dtype=bool) | ~np.isfinite(matrix), 0.0, matrix)
     one, other = np.unravel_index(np.argmax(np.abs(beside)), beside.shape)
     if abs(beside[one, other]) < NOTABLE:

@@ -14,7 +14,7 @@ from kf_calib.views.figures.directions import number_points, on_map, sphere_map
 from kf_calib.views.figures.parameter_panels import draw_sigmas
 from kf_calib.views.figures.scales import log_scale, whole_numbers, written
 from kf_calib.views.figures.style import ACCELEROMETERS, ALARM, GREY, PALE, blank, styled
-from kf_calib.views.figures.symbols import KINDS, TWELVE, Shown, label, plain
+from kf_calib.views.figures.symbols import KINDS, twelve, with_coefficients
 from kf_calib.views.plan import gimbal_names
 
 _HATCHES = ("", "///", "...")
@@ -77,7 +77,7 @@ def draw_predicted(figure: FigureBase, made: Plan) -> None:
     groups = [[k for k in range(STATE_COUNT) if paper_parameters.UNITS[k] == unit] for unit in KINDS]
     panels = figure.subplots(len(groups), 1, height_ratios=[len(group) for group in groups])
     for axes, group, kind in zip(panels, groups, KINDS.values(), strict=True):
-        per_si, unit = TWELVE[group[0]].per_si, TWELVE[group[0]].unit
+        per_si, unit = twelve()[group[0]].per_si, twelve()[group[0]].unit
         _sigma_bars(axes, group, made.sigma[-1] * per_si, made.targets * per_si)
         _before(axes, group, made.sigma[0] * per_si)
         _values(axes, group, made.sigma[[0, -1]] * per_si)
@@ -102,7 +102,7 @@ def _sigma_bars(axes: Axes, group: list[int], sigma: Floats, targets: Floats) ->
         if np.isfinite(targets[k]):
             axes.plot([targets[k]] * 2, [row - 0.45, row + 0.45], color=ALARM, linewidth=2.0,
                       label="" if "target" in axes.get_legend_handles_labels()[1] else "target")  # fmt: skip
-    axes.set_yticks(range(len(group)), [TWELVE[k].label for k in group])
+    axes.set_yticks(range(len(group)), [twelve()[k].label for k in group])
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
 
@@ -126,8 +126,7 @@ def _values(axes: Axes, group: list[int], sigmas: Floats) -> None:
 
 def predicted_sigmas(made: Plan) -> Figure:
     """Predicted sigma of every parameter against the number of orientations, with targets if any."""
-    coefficients = made.prospect.model.coefficients
-    names = (*TWELVE, *(Shown(label(each.symbol), plain(each.shown_unit), each.per_si) for each in coefficients))
+    names = with_coefficients(made.prospect.model.coefficients)
     with styled():
         figure = blank(11.0, 7.0)
         draw_sigmas(figure, np.arange(len(made.sigma), dtype=float), made.sigma, names, made.targets)

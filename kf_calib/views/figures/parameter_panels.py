@@ -13,7 +13,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.views.figures.scales import log_scale, whole_numbers, written
 from kf_calib.views.figures.style import ACCELEROMETERS, ALARM, MARKERS
-from kf_calib.views.figures.symbols import KINDS, TWELVE, Shown
+from kf_calib.views.figures.symbols import KINDS, Shown, twelve
 
 MANY = 60
 """Dwells, above which curves have no markers."""
@@ -29,19 +29,19 @@ def parameter_panels(figure: FigureBase, quantity: str, more: Sequence[Sequence[
     """
     rows = 4 + -(-len(more) // 3)
     panels = figure.subplots(rows, 3, sharex=True, squeeze=False)
-    twelve = [panels[row, column] for column in range(3) for row in range(4)]
-    for k, axes in enumerate(twelve):
+    own = [panels[row, column] for column in range(3) for row in range(4)]
+    for k, axes in enumerate(own):
         if k >= 4:
-            axes.sharey(twelve[k % 4])
+            axes.sharey(own[k % 4])
             axes.tick_params(labelleft=False)
         else:
-            axes.set_ylabel(f"{quantity} of {_ROWS[k]},\n{TWELVE[k].unit}" if TWELVE[k].unit else quantity)
+            axes.set_ylabel(f"{quantity} of {_ROWS[k]},\n{twelve()[k].unit}" if twelve()[k].unit else quantity)
         if k % 4 == 0:
             axes.set_title(f"accelerometer {k // 4 + 1}")
     others = list(panels[4:].flat)
     for axes in others[len(more) :]:
         axes.set_axis_off()
-    return twelve, others[: len(more)]
+    return own, others[: len(more)]
 
 
 def draw_sigmas(
@@ -49,9 +49,9 @@ def draw_sigmas(
 ) -> None:
     """Sigmas (n, p) in SI after dwells of these numbers, the largest of a kind named; targets (p,): those asked for."""
     groups = _by_unit(names)
-    twelve, others = parameter_panels(figure, "σ", groups)
+    panels, others = parameter_panels(figure, "σ", groups)
     largest = _largest(sigmas[-1, :STATE_COUNT])
-    for k, axes in enumerate(twelve):
+    for k, axes in enumerate(panels):
         own, values = names[k], sigmas[:, k] * names[k].per_si
         _curve(axes, numbers, values, k // 4)
         text = f"{own.label}  {_final(values[-1], own.unit)}"
@@ -62,7 +62,7 @@ def draw_sigmas(
         row = [sigmas[:, k::4][:, :3] * names[k].per_si]
         if targets is not None:
             row.append(targets[k:STATE_COUNT:4] * names[k].per_si)
-        log_scale(twelve[k], row, room=_ROOM)
+        log_scale(panels[k], row, room=_ROOM)
     for axes, group in zip(others, groups, strict=True):
         for place, k in enumerate(group):
             values = sigmas[:, k] * names[k].per_si
@@ -70,8 +70,8 @@ def draw_sigmas(
         axes.set_ylabel(f"σ of effect,\n{names[group[0]].unit}")
         log_scale(axes, [sigmas[:, k] * names[k].per_si for k in group], room=_ROOM)
         axes.legend(loc="upper right", fontsize=7.0, handlelength=1.2, labelspacing=0.2, ncols=1 + (len(group) > 3))
-    for axes in (*twelve, *others):
-        last = axes in (others[-3:] or twelve[3::4])
+    for axes in (*panels, *others):
+        last = axes in (others[-3:] or panels[3::4])
         whole_numbers(axes, numbers[0], numbers[-1], "orientation" if last else "")
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from kf_calib.bench import paper_parameters
-from kf_calib.estimation.measurement_model import STATE_COUNT
+from kf_calib.effects import Coefficient
 from kf_calib.estimation.results import Parameter
+from kf_calib.support import units
 
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν", "alpha": "α", "beta": "β", "kappa": "κ", "gamma": "γ", "delta": "δ",
           "omega": "ω", "eps": "ε", "tau": "τ"}  # fmt: skip
-_UNITS = {"rad": ("arcsec", 206264.80624709636), "1": ("ppm", 1e6), "m/s^2": ("µg", 1e6 / 9.80665)}
 KINDS = {"rad": "angle", "1": "scale factor", "m/s^2": "bias"}
 
 
@@ -36,15 +37,13 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-TWELVE = tuple(
-    Shown(label(symbol), *_UNITS[unit])
-    for symbol, unit in zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True)
-)
-MICRO_G = _UNITS["m/s^2"][1]
-"""µg in one m/s^2."""
+def twelve() -> tuple[Shown, ...]:
+    """How the twelve parameters are written, in the units that are asked for."""
+    pairs = zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True)
+    return tuple(Shown(label(symbol), *units.shown(unit)) for symbol, unit in pairs)
 
 
-def shown(parameters: tuple[Parameter, ...]) -> tuple[Shown, ...]:
-    """How the twelve parameters are written, and the coefficients of effects that follow them."""
-    rest = (Shown(label(each.symbol), plain(each.shown_unit), each.per_si) for each in parameters[STATE_COUNT:])
-    return (*TWELVE, *rest)
+def with_coefficients(coefficients: Iterable[Parameter | Coefficient]) -> tuple[Shown, ...]:
+    """The same, followed by coefficients of effects."""
+    found = [(each.symbol, units.shown(each)) for each in coefficients]
+    return (*twelve(), *(Shown(label(symbol), plain(unit.label), unit.per_si) for symbol, unit in found))
