@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 
@@ -19,6 +19,27 @@ from kf_calib.bench.bench import Bench
 from kf_calib.effects.stimulus import Stimulus
 
 G = 9.80665
+MICRO_G, MILLI_G = 1e-6 * G, 1e-3 * G
+MICRO_PER_G, MILLI_PER_G = 1e-6 / G, 1e-3 / G
+"""ug/g^2 and mg/g^2 in s^2/m."""
+
+Grade = Literal["navigation", "mems"]
+
+
+@dataclass(frozen=True)
+class Typical:
+    """Sizes of a coefficient that are usual, from ... to, in SI; from 0 where only the greatest is known.
+
+    navigation, mems: in sensors of either grade, or, of what is the bench's, on a bench that such sensors are tested
+    on; None where it is not known.
+    """
+
+    navigation: tuple[float, float] | None = None
+    mems: tuple[float, float] | None = None
+
+    def of(self, grade: Grade) -> tuple[float, float] | None:
+        """The sizes of one grade."""
+        return self.mems if grade == "mems" else self.navigation
 
 
 @dataclass(frozen=True)
@@ -63,6 +84,7 @@ class Effect(ABC):
     ``columns`` gives the part that the stimulus asks for (``Stimulus.part``).
     averages: vibration goes with it, so readings are averaged over windows first, and their variance in these is known.
     step: of ln(value) in the differences of ``derivative``.
+    typical: usual sizes of its coefficients.
     """
 
     name: ClassVar[str]
@@ -76,6 +98,7 @@ class Effect(ABC):
     oscillates: ClassVar[bool] = False
     averages: ClassVar[bool] = False
     step: ClassVar[float] = 1e-4
+    typical: ClassVar[Typical] = Typical()
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""
     value: float = 0.0

@@ -10,7 +10,8 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.bench import paper_parameters
-from kf_calib.effects import Effect, as_text
+from kf_calib.effects import Coefficient, Effect, as_text
+from kf_calib.effects.effect import Grade
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.fit import WALK
@@ -24,6 +25,8 @@ from kf_calib.views.terminal import PlainConsole, note
 
 _NOT_ESTIMATED = "not estimated"
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
+GRADES: dict[Grade, str] = {"navigation": "navigation grade", "mems": "MEMS"}
+"""Grades of sensors, and what they are called."""
 
 
 def symbol(name: str) -> str:
@@ -130,6 +133,15 @@ def effect_rows(effect: Effect) -> list[tuple[str, str, str]]:
     if (u := effect.unknown) is not None:
         rows.append((symbol(u.symbol), u.unit, f"{u.low * u.per_si:.3g} to {u.high * u.per_si:.3g} {u.shown_unit}"))
     return rows
+
+
+def size_range(sizes: tuple[float, float], own: Coefficient) -> str:
+    """Sizes of a coefficient from ... to (SI) in its unit of the field: ``1 to 20 µg/g²``, or ``up to 100 µg/g²``."""
+    low, high = (f"{float(f'{size * own.per_si:.3g}'):g}" for size in sizes)
+    unit = own.shown_unit if own.shown_unit != "1" else ""
+    if sizes[0] == sizes[1]:
+        return f"{high} {unit}".strip()
+    return f"{'up to' if sizes[0] == 0.0 else f'{low} to'} {high} {unit}".strip()
 
 
 def noise_table(result: Calibration) -> Table:
