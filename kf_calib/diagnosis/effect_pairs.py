@@ -7,10 +7,11 @@ number; ``WALKS`` stands for it.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.candidate_tests import EQUAL, CandidateTests, chance_fall, margin_of, walk_path_margin
 
 WALKS = -1
@@ -109,3 +110,13 @@ def candidate_overlap(test: CandidateTests, one: int, other: int) -> float:
     """The overlap of two candidates; it is 1 with a random walk, which can take any path."""
     candidates = test.scan.candidates
     return 1.0 if WALKS in (one, other) else candidates[one].overlap(candidates[other])
+
+
+def overlap_matrix(test: CandidateTests, names: Sequence[str]) -> Floats:
+    """The overlaps (n, n) of effects with each other; NaN with one that has no columns in the scan and is no walk."""
+    numbers = [test.best.get(name, WALKS if name == test.walking else None) for name in names]
+    overlaps = [
+        [np.nan if one is None or other is None else candidate_overlap(test, one, other) for other in numbers]
+        for one in numbers
+    ]
+    return np.array(overlaps, float).reshape(len(names), len(names))

@@ -20,9 +20,10 @@ from kf_calib.effects.formula import formula, quantities
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.residual_table import mean_sigmas, quantity_means
-from kf_calib.estimation.results import Calibration, consistency
-from kf_calib.estimation.score_test import Frame
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.score_test import falls_together
 from kf_calib.support.tail_probabilities import chi_squared_tail
+from kf_calib.support.threads import one_blas_thread
 
 _OF_FORCE = ("{0}*{0}", "{0}**3", "{0}**4")
 _OF_STEP = ("{0}", "{0}*abs({0})", "sign({0})")
@@ -72,8 +73,7 @@ def drivers_of(result: Calibration) -> list[Driver]:
     words = _WORDS | {f"q{k}": f"angle of gimbal {k}" for k in gimbals}
     values = {name: each for name, each in quantity_means(result, list(functions)).items() if _varies(each)}
     falls = _falls(fitted, {name: [text.format(name) for text in functions[name]] for name in values})
-    misfit = consistency(fitted)
-    excess = misfit.statistic - misfit.dof if misfit.consistent is False else 0.0
+    excess = misfit_beyond_noise(result)
     found = [
         Driver(name, words[name], known[name].unit, each, *falls[name], _share(*falls[name], excess))
         for name, each in values.items()
@@ -86,6 +86,12 @@ def _varies(values: Floats) -> bool:
     return bool(np.ptp(values, axis=0).max() > _CONSTANT * max(np.abs(values).max(), 1e-3))
 
 
+def misfit_beyond_noise(result: Calibration) -> float:
+    """What chi-squared has more than its degrees of freedom; 0 if the model agrees with the run."""
+    misfit = result.consistency
+    return misfit.statistic - misfit.dof if misfit.consistent is False else 0.0
+
+
 def _share(fall: float, dof: int, excess: float) -> float:
     """Return the part of the misfit beyond noise that a fall of chi-squared beyond its degrees of freedom explains."""
     return float(np.clip((fall - dof) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0
@@ -94,16 +100,12 @@ def _share(fall: float, dof: int, excess: float) -> float:
 def _falls(fitted: Fit, texts: dict[str, list[str]]) -> dict[str, tuple[float, int]]:
     """Return for each driver the decrease of chi-squared by all its functions together, and their rank."""
     bench = fitted.carried.model.bench
-    effects = {
-        name: [formula(f"drv{k} = {text}", bench.axes, bench.gravity_mps2, checked=False)
-               for k, text in enumerate(own)] for name, own in texts.items()
-    }  # fmt: skip
-    frame = Frame(fitted.carried, fitted.noise.judging, [])
-    scanned = frame.scan(fitted.carried, [effect for own in effects.values() for effect in own])
-    left, out = iter(scanned.candidates), dict[str, tuple[float, int]]()
-    for name, own in effects.items():
-        out[name] = scanned.explained(np.concatenate([next(left).basis for _ in own], axis=1))
-    return out
+    groups = [
+        [formula(f"drv{k} = {text}", bench.axes, bench.gravity_mps2, checked=False) for k, text in enumerate(own)]
+        for own in texts.values()
+    ]
+    with one_blas_thread():
+        return dict(zip(texts, falls_together(fitted.carried, fitted.noise.judging, groups), strict=True))
 
 
 def is_function_of(values: Floats, driver: Driver) -> bool:
@@ -129,23 +131,32 @@ def is_function_of(values: Floats, driver: Driver) -> bool:
 class Explanation:
     """A model with more in it than the one whose residuals are looked at.
 
-    names: what it has in addition. before, after: the two calibrations. fits: whether it fits the run.
+    names: what it has in addition. before, after: the two calibrations. fits: whether it fits the run. p_value: the
+    family-wise p-value of a single effect of the catalogue; None of anything else.
     """
 
     names: tuple[str, ...]
     before: Calibration
     after: Calibration
     fits: bool
+    p_value: float | None = None
 
     @property
     def name(self) -> str:
         """The effects, as a sum."""
         return " + ".join(self.names)
 
+    @property
+    def share(self) -> float | None:
+        """Part of the misfit beyond noise that it explains, 0 to 1: the decrease of chi-squared from refit to refit,
+        less the degrees of freedom that it takes; None if the means of the dwells agree without it."""
+        excess, own, rest = misfit_beyond_noise(self.before), self.before.consistency, self.after.consistency
+        return _share(own.statistic - rest.statistic, own.dof - rest.dof, excess) if excess > 0.0 else None
+
     @cached_property
     def left_mps2(self) -> Floats:
         """What it leaves of the residuals (D, 3)."""
-        return self.after.residuals_mps2 - _walk_path(self.after)
+        return unexplained_mps2(self.after)
 
     @cached_property
     def left_ratios(self) -> Floats:
@@ -197,6 +208,11 @@ class Explanation:
         return np.sqrt(np.maximum(np.einsum("dip,pq,diq->di", left, covariance, left), 0.0))
 
 
+def unexplained_mps2(result: Calibration) -> Floats:
+    """Residuals (D, 3) less the path of the biases where these walk, m/s^2."""
+    return result.residuals_mps2 - _walk_path(result)
+
+
 def _walk_path(result: Calibration) -> Floats:
     """Return the path of the biases (D, 3), less where it ends, m/s^2; zeros if they do not walk.
 
@@ -224,11 +240,12 @@ def explanations(found: Diagnosis) -> list[Explanation]:
     misfit; then the other suspects."""
     out = list[Explanation]()
     if found.missing and found.after is not None:
-        out.append(Explanation(found.missing, found.before, found.after, True))
+        alone = found.test.p_values.get(found.missing[0]) if len(found.missing) == 1 else None
+        out.append(Explanation(found.missing, found.before, found.after, True, alone))
     elif found.description is not None:
         formulas = found.description.formulas
         names = tuple(text.partition("=")[2].strip() or text for text in formulas)
         out.append(Explanation(names, found.before, with_effects(found.before, formulas), False))
     rest = [each for each in found.suspects if (each.name,) != found.missing]
     rest.sort(key=lambda each: not each.fits)  # stable: those that fit, by significance, before those that do not
-    return [*out, *(Explanation((each.name,), found.before, each.refit, each.fits) for each in rest)]
+    return [*out, *(Explanation((each.name,), found.before, each.refit, each.fits, each.p_value) for each in rest)]
