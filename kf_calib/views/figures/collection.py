@@ -15,7 +15,9 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.errors import InputError
 from kf_calib.support.output_files import write_whole
 from kf_calib.views.figures import style
+from kf_calib.views.figures.detection_limits import detection_limits
 from kf_calib.views.figures.residuals import residuals, what_they_go_with
+from kf_calib.views.figures.suspects import suspects
 
 Figures = Mapping[str, Callable[[], Figure]]
 """Title of each figure, and what draws it."""
@@ -33,6 +35,8 @@ def _(found: Diagnosis) -> Figures:
     return {
         "Where the model fails": lambda: residuals(found),
         "What the residuals go with": lambda: what_they_go_with(found),
+        "Which effect is missing": lambda: suspects(found),
+        "What could hide here": lambda: detection_limits(found),
     }
 
 
