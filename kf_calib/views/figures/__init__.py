@@ -15,6 +15,23 @@ from kf_calib.support.extras import need
 need("matplotlib", "plot", "a figure")
 
 from kf_calib.views.figures.collection import Figures, figures, save  # noqa: E402  # after the check
+from kf_calib.views.figures.detection_limits import detection_limits  # noqa: E402
+from kf_calib.views.figures.dwell import dwell  # noqa: E402
+from kf_calib.views.figures.improvement import improvement, residuals_of_steps  # noqa: E402
 from kf_calib.views.figures.residuals import residuals, what_they_go_with  # noqa: E402
+from kf_calib.views.figures.sphere import on_the_sphere  # noqa: E402
+from kf_calib.views.figures.suspects import suspects  # noqa: E402
 
-__all__ = ["Figures", "figures", "residuals", "save", "what_they_go_with"]
+__all__ = [
+    "Figures",
+    "detection_limits",
+    "dwell",
+    "figures",
+    "improvement",
+    "on_the_sphere",
+    "residuals",
+    "residuals_of_steps",
+    "save",
+    "suspects",
+    "what_they_go_with",
+]

@@ -17,7 +17,7 @@ from kf_calib.views.figures.style import GREY, blank, styled
 
 _LOW, _HIGH = 0.01, 1000.0  # smallest detectable sizes that the axis spans
 _SEEN, _HIDDEN = "#0072b2", "#e69f00"  # of Okabe and Ito's palette
-_ROW_IN = 0.23
+_ROW_IN, _LINE_IN = 0.23, 0.14
 _LINE = 150  # letters of a line below the panels
 
 
@@ -28,25 +28,25 @@ def detection_limits(found: Diagnosis) -> Figure:
     sensors of the grade that the noise of the run is of.
     """
     half = (len(found.detectable) + 1) // 2
-    lines = sum(len(text.splitlines()) for text in _unseen_texts(found.unseen))
+    below_in = _LINE_IN * (2 + sum(len(text.splitlines()) for text in _unseen_texts(found.unseen)))
+    height_in = max(7.0, 1.2 + _ROW_IN * half + below_in)
     with styled():
-        figure = blank(11.0, max(7.0, 1.4 + _ROW_IN * half + 0.17 * (lines + 2)))
-        draw_detection_limits(figure, found)
+        figure = blank(11.0, height_in)
+        draw_detection_limits(figure, found, below_in / height_in)
     return figure
 
 
-def draw_detection_limits(figure: FigureBase, found: Diagnosis) -> None:
-    """The same on a part of a figure."""
+def draw_detection_limits(figure: FigureBase, found: Diagnosis, below: float) -> None:
+    """The same on a part of a figure; below: share of its height for what is not seen."""
     sizes, texts = _ordered(found.detectable, found.grade), _unseen_texts(found.unseen)
     half = (len(sizes) + 1) // 2
-    lines = sum(len(text.splitlines()) for text in texts)
-    grid = figure.add_gridspec(2, 2, height_ratios=(_ROW_IN * max(half, 3) + 0.7, 0.17 * (lines + 2)))
+    grid = figure.add_gridspec(2, 2, height_ratios=(1.0 - below, below))
     for column, own in enumerate((sizes[:half], sizes[half:])):
         _bars(figure.add_subplot(grid[0, column]), own, half, found.grade, bool(column))
-    below = figure.add_subplot(grid[1, :])
-    below.set_axis_off()
-    below.set_title("Not to be seen in this run at any size" if texts else "Every effect could be seen in this run")
-    below.text(0.0, 1.0, "\n".join(texts), transform=below.transAxes, va="top", color=GREY, fontsize=8.0)
+    words = figure.add_subplot(grid[1, :])
+    words.set_axis_off()
+    words.set_title("Not to be seen in this run at any size" if texts else "Every effect could be seen in this run")
+    words.text(0.0, 1.0, "\n".join(texts), transform=words.transAxes, va="top", color=GREY, fontsize=8.0)
 
 
 def _ordered(sizes: Sequence[Detectable], grade: Grade) -> list[Detectable]:
@@ -65,9 +65,9 @@ def _bars(axes: Axes, sizes: Sequence[Detectable], rows: int, grade: Grade, seco
     axes.set_xlim(_LOW, _HIGH)
     for k, each in enumerate(sizes):
         usual = each.typical.of(grade)
-        smallest = f"{each.shown_minimum:.3g} {each.shown_unit}"
+        smallest = f"{float(f'{each.shown_minimum:.3g}'):.12g} {each.shown_unit}"
         if usual is None:
-            axes.text(_LOW * 1.2, k, "no usual size is known", va="center", color=GREY, fontsize=7.5)
+            axes.text(1.4, k, "no usual size is known", va="center", color=GREY, fontsize=7.5)
         else:
             _bar(axes, k, usual[0] / each.minimum, usual[1] / each.minimum)
             smallest += f"  ({size_range(usual, each.coefficient)})"
@@ -78,14 +78,17 @@ def _bars(axes: Axes, sizes: Sequence[Detectable], rows: int, grade: Grade, seco
     axes.grid(visible=False, axis="y")
     label_axis(axes.xaxis, _LOW, _HIGH)
     axes.set_xlabel("usual size / smallest size that would be found")
-    right = f"right: smallest size found in 9 of 10 runs (usual, {GRADES[grade]})"
-    axes.set_title(right if second else "What could hide here: usual sizes left of 1 (orange)", fontsize=9.0)
+    numbers = f"Numbers: smallest size found in 9 of 10 runs (usual, {GRADES[grade]})"
+    axes.set_title(numbers if second else "Left of 1, dotted: sizes that could hide here", fontsize=9.0)
 
 
 def _bar(axes: Axes, k: int, low: float, high: float) -> None:
     """Draw the part of usual sizes that could hide and the part that would be found, held within the axis."""
-    low, high = min(max(low, _LOW), 0.9 * _HIGH), min(max(high, 1.15 * _LOW), _HIGH)
-    high = max(high, 1.15 * low)
+    if high <= _LOW or low >= _HIGH:
+        edge, arrow, side = (_LOW, "◂", "left") if high <= _LOW else (_HIGH, "▸", "right")
+        axes.text(edge, k, arrow, color=_HIDDEN if high <= _LOW else _SEEN, va="center", ha=side, fontsize=12.0)
+        return
+    low, high = max(low, _LOW), min(max(high, 1.1 * low), _HIGH)
     if low < 1.0:
         axes.barh(k, min(high, 1.0) - low, left=low, color=_HIDDEN, height=0.62, hatch="....", edgecolor="white",
                   linewidth=0.0)  # fmt: skip

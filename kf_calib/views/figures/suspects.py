@@ -84,6 +84,8 @@ def _alike(found: Diagnosis) -> list[str]:
 def _overlaps(axes: Axes, found: Diagnosis, names: Sequence[str]) -> None:
     """Draw the matrix of overlaps with a number in each cell."""
     values = overlap_matrix(found.test, names)
+    if np.isfinite(values).sum() <= 1:
+        return _words(axes, "No other effect explains as much:\nthere are no overlaps to show.")
     axes.imshow(np.nan_to_num(values), cmap="Greys", vmin=0.0, vmax=1.25, aspect="auto")
     for (row, column), overlap in np.ndenumerate(values):
         text = "–" if np.isnan(overlap) else f"{overlap:.2f}"
@@ -95,11 +97,15 @@ def _overlaps(axes: Axes, found: Diagnosis, names: Sequence[str]) -> None:
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
-    axes.set_title("Overlap of what they add; 1: this run cannot tell them apart")
+    if found.test.walking in names:
+        axes.set_xlabel("a random walk can take any path: it overlaps with all", fontsize=8.0, color=GREY)
+    axes.set_title("Overlap of what they add to the readings\n(1.00: this run cannot tell them apart)")
 
 
 def _drivers(axes: Axes, drivers: Sequence[Driver]) -> None:
     """Draw the share of the misfit that goes with each quantity of the bench."""
+    if not any(driver.share for driver in drivers):
+        return _words(axes, "The means of the dwells agree with the model:\nnothing of them goes with any quantity.")
     for k, driver in enumerate(drivers):
         axes.barh(k, 100.0 * driver.share, color=PALE, height=0.62)
         axes.text(103.0, k, f"p {format_p(driver.p_value)}", va="center", fontsize=8.5, color=GREY)
@@ -115,9 +121,7 @@ def _separation(axes: Axes, found: Diagnosis) -> None:
     """Draw how far the best explanation stands out now, and would after a dwell in the advised orientation."""
     going = found.next_orientation
     if going is None:
-        axes.set_axis_off()
-        axes.text(0.5, 0.5, "No next orientation would tell more.", ha="center", va="center", color=GREY)
-        return
+        return _words(axes, "There is no advice where to go next.")
     advice, why = going
     axes.barh([0, 1], [advice.before, advice.after], color=(PALE, BEST), height=0.5)
     for k, value in enumerate((advice.before, advice.after)):
@@ -137,3 +141,9 @@ def _separation(axes: Axes, found: Diagnosis) -> None:
 def _angles(advice: Advice) -> str:
     """Return the advised gimbal angles as text."""
     return ", ".join(f"{angle:g}" for angle in advice.gimbal_deg)
+
+
+def _words(axes: Axes, text: str) -> None:
+    """Write in the middle of a panel why there is nothing to draw."""
+    axes.set_axis_off()
+    axes.text(0.5, 0.5, text, ha="center", va="center", color=GREY, transform=axes.transAxes)
