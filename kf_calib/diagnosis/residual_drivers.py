@@ -213,6 +213,11 @@ def unexplained_mps2(result: Calibration) -> Floats:
     return result.residuals_mps2 - _walk_path(result)
 
 
+def channel_rms_mps2(residuals_mps2: Floats) -> Floats:
+    """The rms (3,) of residuals (D, 3) of each accelerometer, m/s^2."""
+    return np.sqrt(np.mean(residuals_mps2**2, axis=0))
+
+
 def unexplained_rms_mps2(result: Calibration) -> float:
     """The in-sample error without the path of the biases where these walk, m/s^2."""
     if not result.noise.walk_mps2_per_sqrt_s:

@@ -63,7 +63,7 @@ def _inside(source: Source, start_s: float, end_s: float, every: int) -> tuple[F
         if not len(stamps):
             continue
         first_ns = int(stamps[0]) if first_ns is None else first_ns
-        elapsed_s = (stamps - first_ns) * 1e-9
+        elapsed_s = np.asarray((stamps - first_ns) * 1e-9, dtype=np.float64)
         own = np.flatnonzero((elapsed_s >= start_s - 1e-9) & (elapsed_s <= end_s + 1e-9))
         kept = own[-seen % every :: every]
         seen += len(own)

@@ -42,7 +42,7 @@ def draw_detection_limits(figure: FigureBase, found: Diagnosis, below: float) ->
     half = (len(sizes) + 1) // 2
     grid = figure.add_gridspec(2, 2, height_ratios=(1.0 - below, below))
     for column, own in enumerate((sizes[:half], sizes[half:])):
-        _bars(figure.add_subplot(grid[0, column]), own, half, found.grade, bool(column))
+        _bars(figure.add_subplot(grid[0, column]), own, half, found.grade, not column)
     words = figure.add_subplot(grid[1, :])
     words.set_axis_off()
     words.set_title("Not to be seen in this run at any size" if texts else "Every effect could be seen in this run")
@@ -59,7 +59,7 @@ def _ordered(sizes: Sequence[Detectable], grade: Grade) -> list[Detectable]:
     return sorted(sizes, key=largest_hidden)
 
 
-def _bars(axes: Axes, sizes: Sequence[Detectable], rows: int, grade: Grade, second: bool) -> None:
+def _bars(axes: Axes, sizes: Sequence[Detectable], rows: int, grade: Grade, first: bool) -> None:
     """Draw a row for each effect: usual sizes over the smallest that would be found."""
     axes.set_xscale("log")
     axes.set_xlim(_LOW, _HIGH)
@@ -78,8 +78,9 @@ def _bars(axes: Axes, sizes: Sequence[Detectable], rows: int, grade: Grade, seco
     axes.grid(visible=False, axis="y")
     label_axis(axes.xaxis, _LOW, _HIGH)
     axes.set_xlabel("usual size / smallest size that would be found")
-    numbers = f"Numbers: smallest size found in 9 of 10 runs (usual, {GRADES[grade]})"
-    axes.set_title(numbers if second else "Left of 1, dotted: sizes that could hide here", fontsize=9.0)
+    if first:
+        numbers = f"beside: smallest size found in 9 of 10 such runs (usual sizes, {GRADES[grade]})"
+        axes.set_title(f"Left of 1, dotted: usual sizes that could hide in this run\n{numbers}", fontsize=9.0)
 
 
 def _bar(axes: Axes, k: int, low: float, high: float) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from textwrap import fill
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -67,13 +68,13 @@ def draw_improvement(figure: FigureBase, state: Improvement) -> None:
         return say(figure, "The parameters take up every mean reading of this run: there is no error to be seen.")
     floor, effects = state.result.held_out_floor_mps2, _effects(points)
     if effects:
-        above, below = figure.subfigures(2, 1, height_ratios=(1.25, 1.0))
-        _errors(above.subplots(), points, floor)
-        _coefficients(below, points, effects)
+        halves: Any = figure.subfigures(2, 1, height_ratios=(1.25, 1.0))
+        _errors(halves[0].subplots(), points, floor)
+        _coefficients(halves[1], points, effects)
     else:
         axes = figure.subplots()
         _errors(axes, points, floor)
-        letter(axes, fill(f"No effect was added. {state.reason}", 110))
+        axes.set_title(f"{axes.get_title('left')}\n{fill(f'No effect was added. {state.reason}', 130)}")
 
 
 def _effects(points: Sequence[_Point]) -> list[str]:

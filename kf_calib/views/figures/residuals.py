@@ -11,7 +11,14 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.ticker import MaxNLocator
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.residual_drivers import Driver, Explanation, drivers_of, explanations, is_function_of
+from kf_calib.diagnosis.residual_drivers import (
+    Driver,
+    Explanation,
+    channel_rms_mps2,
+    drivers_of,
+    explanations,
+    is_function_of,
+)
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import format_p
@@ -23,6 +30,7 @@ from kf_calib.views.figures.style import (
     MARKERS,
     RUNNER_UP,
     blank,
+    letter,
     say,
     styled,
 )
@@ -63,6 +71,7 @@ def draw_residuals(figure: FigureBase, found: Diagnosis, drivers: Sequence[Drive
     for i, row in enumerate(panels):
         x = driver.values[:, i] * scale
         _points(row[0], x, found.before.residuals_mps2[:, i], sigmas[:, i], i)
+        _rms(row[0], found.before.residuals_mps2, i)
         row[0].set_ylabel(f"accelerometer {i + 1}, µg")
         if others:
             best = others[0]
@@ -71,6 +80,7 @@ def draw_residuals(figure: FigureBase, found: Diagnosis, drivers: Sequence[Drive
             _points(row[1], x, best.left_mps2[:, i] + best.contribution_mps2[:, i], sigmas[:, i], i)
             _curve(row[1], x, best, i, is_function_of(best.contribution_mps2, driver))
             _points(row[2], x, best.left_mps2[:, i], sigmas[:, i], i)
+            _rms(row[2], best.left_mps2, i)
     titles = [f"Residuals of the model: {found.before.model.sum}"]
     if others:
         name = others[0].name
@@ -110,6 +120,11 @@ def _points(axes: Axes, x: Floats, values_mps2: Floats, sigmas_mps2: Floats, i: 
     bars = None if many else sigmas_mps2 / MICRO_G
     axes.errorbar(x, values_mps2 / MICRO_G, bars, fmt=MARKERS[i], color=ACCELEROMETERS[i], zorder=3, elinewidth=0.9,
                   markersize=2.0 if many else 4.5, markeredgewidth=0.0)  # fmt: skip
+
+
+def _rms(axes: Axes, residuals_mps2: Floats, i: int) -> None:
+    """Write the rms of the residuals of one accelerometer in the corner: on axes of large ones small ones have none."""
+    letter(axes, f"rms {channel_rms_mps2(residuals_mps2)[i] / MICRO_G:.2g} µg")
 
 
 def _predictions(axes: Axes, x: Floats, explanation: Explanation, i: int, colour: str, marker: str) -> None:

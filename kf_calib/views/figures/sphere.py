@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from textwrap import fill
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -20,32 +22,33 @@ _MANY = 150
 
 
 def on_the_sphere(found: Diagnosis) -> Figure:
-    """Residuals over their sigma by the direction of the specific force in the platform, a panel an accelerometer.
+    """Residuals over their sigma by the direction of the specific force in the platform, a row an accelerometer.
 
     The sphere is unrolled with all areas true (Mollweide): the platform's z axis points up, its x axis out of the
-    middle. Triangles up are positive, down negative. Below: what the best explanation leaves, in the same colours.
+    middle. Triangles up are positive, down negative. On the right: what the best explanation leaves, in the same
+    colours.
     """
     with styled():
-        figure = blank(11.0, 6.2 if explanations(found) else 3.6)
+        figure = blank(11.0, 7.5) if explanations(found) else blank(11.0, 2.8)
         draw_on_the_sphere(figure, found)
     return figure
 
 
 def draw_on_the_sphere(figure: FigureBase, found: Diagnosis) -> None:
-    """The same on a part of a figure."""
+    """The same on a part of a figure; the accelerometers stand side by side where there is no explanation."""
     force = quantity_means(found.before, ["fx", "fy", "fz"])
     directions = np.stack([force[f"f{axis}"][:, 0] for axis in "xyz"], axis=1)
-    rows = {f"the model: {found.before.model.sum}": found.before.residuals_mps2 / mean_sigmas(found.before)}
-    rows |= {f"with {each.name} in the model": each.left_ratios for each in explanations(found)[:1]}
-    most = max(_LEAST, *(float(np.percentile(np.abs(ratios), 99.0)) for ratios in rows.values()))
-    panels = figure.subplots(len(rows), 3, squeeze=False, subplot_kw={"projection": "mollweide"})
-    for own, (words, ratios) in zip(panels, rows.items(), strict=True):
+    columns = {found.before.model.sum: found.before.residuals_mps2 / mean_sigmas(found.before)}
+    columns |= {f"with {each.name}": each.left_ratios for each in explanations(found)[:1]}
+    most = max(_LEAST, *(float(np.percentile(np.abs(ratios), 99.0)) for ratios in columns.values()))
+    shape = (3, 2) if len(columns) > 1 else (1, 3)
+    panels = figure.subplots(*shape, squeeze=False, subplot_kw={"projection": "mollweide"})
+    for own, (words, ratios) in zip(panels.T if len(columns) > 1 else panels, columns.items(), strict=True):
         for i, axes in enumerate(own):
             _points(axes, directions, ratios[:, i], most)
-            axes.set_title(f"accelerometer {i + 1}", fontsize=9.0, loc="center")
-        own[0].text(-0.02, 1.13, words[:1].upper() + words[1:], transform=own[0].transAxes, fontsize=9.5)
+            axes.set_title(fill(f"accelerometer {i + 1}: {words}", 60), fontsize=9.0, loc="center")
     bar = ScalarMappable(Normalize(-most, most), _COLOURS)
-    figure.colorbar(bar, ax=panels, label="residual / σ", shrink=0.7, aspect=30, extend="both")
+    figure.colorbar(bar, ax=panels, label="residual / σ", shrink=0.8, aspect=30, extend="both")
 
 
 def _points(axes: Axes, directions: Floats, ratios: Floats, most: float) -> None:
@@ -56,8 +59,8 @@ def _points(axes: Axes, directions: Floats, ratios: Floats, most: float) -> None
     for marker, own in (("^", ratios >= 0.0), ("v", ratios < 0.0)):
         axes.scatter(longitude[own], latitude[own], size[own], ratios[own], marker=marker, cmap=_COLOURS, vmin=-most,
                      vmax=most, edgecolors="#444444", linewidths=0.4, zorder=3)  # fmt: skip
-    for text, x, y in (("x", 0.0, 0.0), ("y", np.pi / 2, 0.0), ("−y", -np.pi / 2, 0.0), ("z", 0.0, np.pi / 2),
-                       ("−z", 0.0, -np.pi / 2), ("−x", 0.97 * np.pi, 0.0)):  # fmt: skip
-        axes.text(x, y, text, ha="center", va="center", color=GREY, fontsize=8.0)
+    for text, x, y in (("x", 0.0, 0.0), ("y", 90.0, 0.0), ("−y", -90.0, 0.0), ("z", 0.0, 78.0), ("−z", 0.0, -78.0),
+                       ("−x", 172.0, 0.0)):  # fmt: skip
+        axes.text(np.radians(x), np.radians(y), text, ha="center", va="center", color=GREY, fontsize=8.0)
     axes.set_xticks(np.radians([-90.0, 0.0, 90.0]), [])
     axes.set_yticks(np.radians([-45.0, 0.0, 45.0]), [])

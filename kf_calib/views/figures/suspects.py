@@ -8,6 +8,7 @@ from textwrap import fill
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.ticker import MaxNLocator
 
 from kf_calib.design.next_orientation import ENOUGH, Advice
 from kf_calib.diagnosis.effect_pairs import overlap_matrix
@@ -132,10 +133,11 @@ def _separation(axes: Axes, found: Diagnosis) -> None:
     axes.set_xlim(0.0, 1.2 * max(advice.before, advice.after, 1.0))
     axes.grid(visible=False, axis="y")
     axes.set_xlabel("effects that become visible" if advice.shows else "separation, σ")
+    axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], integer=bool(advice.shows)))
     if not advice.shows and axes.get_xlim()[1] > ENOUGH:
         axes.axvline(ENOUGH, color=GREY, linestyle=":", linewidth=1.0)
         axes.text(ENOUGH, -0.55, " enough", color=GREY, fontsize=8.0, va="top")
-    axes.set_title(f"Next: gimbals at {_angles(advice)} deg\n{fill(why.partition(':')[0], 58)}")
+    axes.set_title(f"Next: gimbals at {_angles(advice)} deg\n{fill(why.partition(':')[0], 50)}")
 
 
 def _angles(advice: Advice) -> str:
