@@ -18,7 +18,7 @@ QUIET = 1e-4
 """Density of white noise below which sensors are of navigation grade, m/s^2/sqrt(Hz) (10 ug/sqrt(Hz))."""
 
 _CONDITIONS = {
-    "temperature_c": "the temperature does not change in this run",
+    "temperature_c": "the temperature does not change in this run, or is not recorded",
     "variance_mps2_2": "the strength of vibration does not change in this run, or is not looked at",
 }
 """Conditions, other than orientations, that effects may depend on, and what is said where they do not vary."""
@@ -70,7 +70,7 @@ def unseen(fitted: Fit, test: CandidateTests) -> list[Unseen]:
     out = [Unseen(name, _reason(test.candidate(name).effect, stimulus)) for name in still]
     out += [Unseen(name, "shows while the platform turns, and only dwells are tested") for name in test.in_slews_only]
     if test.between:
-        out.append(Unseen(test.between, "too fast for the means of dwells, too slow to be seen within a dwell"))
+        out.append(Unseen(test.between, "not among the frequencies that are searched in this run"))
     return out
 
 
@@ -78,7 +78,7 @@ def _reason(effect: Effect, stimulus: Stimulus) -> str:
     """Return why nothing of an effect is seen in dwells."""
     columns = effect_columns([effect], stimulus)
     for quantity, words in _CONDITIONS.items():
-        values = getattr(stimulus, quantity)
+        values = np.nan_to_num(getattr(stimulus, quantity))
         ramp = np.arange(len(values), dtype=float).reshape(-1, *[1] * (values.ndim - 1)) / len(values)
         if not np.ptp(values, axis=0).any():
             changed = effect_columns([effect], replace(stimulus, **{quantity: values + ramp}))

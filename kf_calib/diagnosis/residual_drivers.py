@@ -131,8 +131,9 @@ def is_function_of(values: Floats, driver: Driver) -> bool:
 class Explanation:
     """A model with more in it than the one whose residuals are looked at.
 
-    names: what it has in addition. before, after: the two calibrations. fits: whether it fits the run. p_value: the
-    family-wise p-value of a single effect of the catalogue; None of anything else.
+    names: what it has in addition, formulas without the name that they were given. before, after: the two
+    calibrations. fits: whether it fits the run. p_value: the family-wise p-value of a single effect of the catalogue;
+    None of anything else.
     """
 
     names: tuple[str, ...]
@@ -184,8 +185,10 @@ class Explanation:
 
     @cached_property
     def _own(self) -> NDArray[np.intp]:
-        """Return the places of its coefficients in the state."""
-        return np.array([p for name in self.names for p in _places(self.after, name)], int)
+        """Return the places of its coefficients in the state; a walk has none, its path is no coefficient."""
+        model, known = self.after.model, self.before.model.parts
+        added = (part for name, part in model.parts.items() if name not in known)
+        return np.array([place for part in added for place in range(*part.indices(model.count))], int)
 
     @cached_property
     def predicted_sigma_mps2(self) -> Floats:
@@ -241,12 +244,6 @@ def _walk_path(result: Calibration) -> Floats:
     return np.array(path).T
 
 
-def _places(result: Calibration, name: str) -> list[int]:
-    """Return the places of an effect's coefficients in the state; none for a walk, whose path is no coefficient."""
-    part = result.model.parts.get(name.partition("=")[0].strip())
-    return list(range(*part.indices(result.model.count))) if part is not None else []
-
-
 def explanations(found: Diagnosis) -> list[Explanation]:
     """The explanations of a diagnosis, the best first: what is missing, or the formula that describes an unknown
     misfit; then the other suspects."""
@@ -257,7 +254,8 @@ def explanations(found: Diagnosis) -> list[Explanation]:
     elif found.description is not None:
         formulas = found.description.formulas
         names = tuple(text.partition("=")[2].strip() or text for text in formulas)
-        out.append(Explanation(names, found.before, with_effects(found.before, formulas), False))
+        after = with_effects(found.before, formulas)
+        out.append(Explanation(names, found.before, after, after.consistency.consistent is not False))
     rest = [each for each in found.suspects if (each.name,) != found.missing]
     rest.sort(key=lambda each: not each.fits)  # stable: those that fit, by significance, before those that do not
     return [*out, *(Explanation((each.name,), found.before, each.refit, each.fits, each.p_value) for each in rest)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from textwrap import fill
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
@@ -14,6 +13,7 @@ from kf_calib.effects.effect import Grade
 from kf_calib.views.console import GRADES, size_range
 from kf_calib.views.figures.log_axis import label_axis
 from kf_calib.views.figures.style import GREY, blank, styled
+from kf_calib.views.figures.words import rounded_number, wrapped
 
 _LOW, _HIGH = 0.01, 1000.0  # smallest detectable sizes that the axis spans
 _SEEN, _HIDDEN = "#0072b2", "#e69f00"  # of Okabe and Ito's palette
@@ -65,7 +65,7 @@ def _bars(axes: Axes, sizes: Sequence[Detectable], rows: int, grade: Grade, firs
     axes.set_xlim(_LOW, _HIGH)
     for k, each in enumerate(sizes):
         usual = each.typical.of(grade)
-        smallest = f"{float(f'{each.shown_minimum:.3g}'):.12g} {each.shown_unit}"
+        smallest = f"{rounded_number(each.shown_minimum)} {each.shown_unit}"
         if usual is None:
             axes.text(1.4, k, "no usual size is known", va="center", color=GREY, fontsize=7.5)
         else:
@@ -102,4 +102,4 @@ def _unseen_texts(unseen: Sequence[Unseen]) -> list[str]:
     together = dict[str, list[str]]()
     for each in unseen:
         together.setdefault(each.why, []).append(each.name)
-    return [fill(f"{', '.join(names)}: {why}", _LINE, subsequent_indent="    ") for why, names in together.items()]
+    return [wrapped(f"{', '.join(names)}: {why}", _LINE) for why, names in together.items()]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -32,6 +31,7 @@ from kf_calib.views.figures.style import (
     say,
     styled,
 )
+from kf_calib.views.figures.words import wrapped
 
 _COLUMNS = 5  # models whose residuals are drawn
 _COEFFICIENTS = 6  # panels of coefficients
@@ -74,7 +74,7 @@ def draw_improvement(figure: FigureBase, state: Improvement) -> None:
     else:
         axes = figure.subplots()
         _errors(axes, points, floor)
-        axes.set_title(f"{axes.get_title('left')}\n{fill(f'No effect was added. {state.reason}', 130)}")
+        axes.set_title(f"{axes.get_title('left')}\n{wrapped(f'No effect was added. {state.reason}', 130)}")
 
 
 def _effects(points: Sequence[_Point]) -> list[str]:
@@ -126,7 +126,7 @@ def _errors(axes: Axes, points: Sequence[_Point], floor_mps2: float | None) -> N
 def _tick(point: _Point) -> str:
     """Return the words below a model."""
     p_value = "" if point.p_value is None else f"\np {format_p(point.p_value)}"
-    return f"{fill(point.label, _NAME)}{p_value}"
+    return f"{wrapped(point.label, _NAME)}{p_value}"
 
 
 def _micro_g(values: Sequence[float | None]) -> Floats:
@@ -176,7 +176,7 @@ def _of_effect(axes: Axes, name: str, points: Sequence[_Point]) -> None:
     axes.set_xlim(-0.5, len(points) - 0.5)
     axes.set_xticks(range(len(points)), [_short(each.label) for each in points], rotation=25, ha="right", fontsize=8.0)
     axes.set_ylabel(f"coefficient ± 1σ, {unit}")
-    axes.set_title(fill(name, 30))
+    axes.set_title(wrapped(name, 30))
     axes.legend(fontsize=8.0, handletextpad=0.2, borderpad=0.1)
 
 
@@ -220,7 +220,7 @@ def draw_residuals_of_steps(figure: FigureBase, state: Improvement, drivers: Seq
     for column, (words, found) in enumerate(shown):
         ratios = unexplained_mps2(found.before) / sigmas
         panels[0, column].set_title(
-            f"{fill(words, 28)}\n{_fate(found, state.result.held_out_floor_mps2)}", fontsize=8.5
+            f"{wrapped(words, 28)}\n{_fate(found, state.result.held_out_floor_mps2)}", fontsize=8.5
         )
         for i, axes in enumerate(panels[:, column]):
             for bound in (-2.0, 2.0):

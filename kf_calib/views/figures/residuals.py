@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,17 +29,17 @@ from kf_calib.views.figures.style import (
     MARKERS,
     RUNNER_UP,
     blank,
-    letter,
     say,
     styled,
 )
+from kf_calib.views.figures.words import rounded_number, wrapped
 
 MICRO_G = 9.80665e-6  # m/s^2
 _UNITS = {"rad": ("deg", 180.0 / np.pi), "m/s^2": ("g", 1.0 / 9.80665), "s": ("min", 1.0 / 60.0),
           "K": ("K", 1.0), "K/s": ("K/h", 3600.0)}  # fmt: skip
 _SMALLER = {"s": ("s", 1.0, 300.0), "K": ("mK", 1e3, 0.5)}  # units for values whose greatest is below the last, SI
 _SIGNIFICANT, _SOME = 0.01, 0.005  # p-value and share above and below which a driver explains nothing
-_TITLE = 44  # letters in a line of a title
+_TITLE = 34  # letters in a line of a title
 _PANELS = 8  # drivers in small panels
 _MANY = 150  # dwells, above which markers are smaller and bars of sigma are left out
 
@@ -87,7 +86,7 @@ def draw_residuals(figure: FigureBase, found: Diagnosis, drivers: Sequence[Drive
         titles += [f"Readings less all but {name}", f"What is left with {name} in the model"]
         figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower left", ncols=3)
     for axes, title in zip(panels[0], titles, strict=True):
-        axes.set_title(fill(title, _TITLE if others else 3 * _TITLE))
+        axes.set_title(wrapped(title, _TITLE if others else 3 * _TITLE))
     for axes in panels[-1]:
         axes.set_xlabel(f"{driver.words}, {label}")
         axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
@@ -123,8 +122,10 @@ def _points(axes: Axes, x: Floats, values_mps2: Floats, sigmas_mps2: Floats, i: 
 
 
 def _rms(axes: Axes, residuals_mps2: Floats, i: int) -> None:
-    """Write the rms of the residuals of one accelerometer in the corner: on axes of large ones small ones have none."""
-    letter(axes, f"rms {channel_rms_mps2(residuals_mps2)[i] / MICRO_G:.2g} µg")
+    """Write the rms of the residuals of one accelerometer above its panel: on axes of large ones small ones cannot be
+    read."""
+    rms = rounded_number(channel_rms_mps2(residuals_mps2)[i] / MICRO_G, 2)
+    axes.set_title(f"rms {rms} µg", loc="right", fontsize=8.0, color=GREY)
 
 
 def _predictions(axes: Axes, x: Floats, explanation: Explanation, i: int, colour: str, marker: str) -> None:
@@ -173,7 +174,7 @@ def draw_drivers(figure: FigureBase, found: Diagnosis, drivers: Sequence[Driver]
             if not below:
                 axes.set_title(f"{driver.words}\n{_of_share(driver)}", fontsize=8.5)
             if not column:
-                axes.set_ylabel("residual / σ" if not below else f"with\n{fill(others[0].name, 18)}")
+                axes.set_ylabel("residual / σ" if not below else f"with\n{wrapped(others[0].name, 18)}")
     for axes in panels.flat[: panels.size]:
         if not axes.has_data():
             axes.set_axis_off()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from textwrap import fill
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -15,6 +13,7 @@ from kf_calib.diagnosis.residual_drivers import explanations
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.residual_table import mean_sigmas, quantity_means
 from kf_calib.views.figures.style import GREY, blank, styled
+from kf_calib.views.figures.words import wrapped
 
 _COLOURS = "PuOr_r"  # colour-blind eyes tell its ends apart
 _LEAST = 3.0  # sigma at the ends of the colours, at least
@@ -46,7 +45,7 @@ def draw_on_the_sphere(figure: FigureBase, found: Diagnosis) -> None:
     for own, (words, ratios) in zip(panels.T if len(columns) > 1 else panels, columns.items(), strict=True):
         for i, axes in enumerate(own):
             _points(axes, directions, ratios[:, i], most)
-            axes.set_title(fill(f"accelerometer {i + 1}: {words}", 60), fontsize=9.0, loc="center")
+            axes.set_title(wrapped(f"accelerometer {i + 1}: {words}", 60), fontsize=9.0, loc="center")
     bar = ScalarMappable(Normalize(-most, most), _COLOURS)
     figure.colorbar(bar, ax=panels, label="residual / σ", shrink=0.8, aspect=30, extend="both")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,6 +15,7 @@ from kf_calib.diagnosis.residual_drivers import Driver, Explanation, drivers_of,
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.results import format_p
 from kf_calib.views.figures.style import BEST, GREY, PALE, RUNNER_UP, blank, say, styled
+from kf_calib.views.figures.words import wrapped
 
 _MOST, _ALIKE = 7, 8  # explanations that are drawn, effects in the matrix of overlaps
 _DRIVERS = 6
@@ -41,7 +41,7 @@ def draw_suspects(figure: FigureBase, found: Diagnosis, drivers: Sequence[Driver
     """The same on a part of a figure; drivers: of the residuals."""
     explained = explanations(found)[:_MOST]
     if not explained:
-        return say(figure, fill(found.verdict, 90))
+        return say(figure, wrapped(found.verdict, 90))
     rows, names = figure.add_gridspec(2, 1, height_ratios=(1.5, 1.0)), _alike(found)
     above = rows[0].subgridspec(1, 2, width_ratios=(1.15, 1.0))
     below = rows[1].subgridspec(1, 2, width_ratios=(1.15, 1.0))
@@ -61,7 +61,7 @@ def _bars(axes: Axes, explained: Sequence[Explanation]) -> None:
         else:
             axes.barh(k, share, facecolor="white", edgecolor=GREY, hatch="////", height=0.62, linewidth=0.8)
         axes.text(103.0, k, _said(each), va="center", fontsize=8.5, color="#222222" if each.fits else GREY)
-    axes.set_yticks(range(len(explained)), [fill(each.name, _NAME) for each in explained])
+    axes.set_yticks(range(len(explained)), [wrapped(each.name, _NAME) for each in explained])
     axes.set_ylim(len(explained) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
     axes.set_xlim(0.0, 100.0)
@@ -92,9 +92,9 @@ def _overlaps(axes: Axes, found: Diagnosis, names: Sequence[str]) -> None:
         text = "–" if np.isnan(overlap) else f"{overlap:.2f}"
         axes.text(column, row, text, ha="center", va="center", fontsize=8.0,
                   color="white" if overlap > _DARK else "#222222")  # fmt: skip
-    axes.set_xticks(range(len(names)), [fill(name, 16) for name in names], rotation=40, ha="right",
+    axes.set_xticks(range(len(names)), [wrapped(name, 16) for name in names], rotation=40, ha="right",
                     rotation_mode="anchor", fontsize=8.0)  # fmt: skip
-    axes.set_yticks(range(len(names)), [fill(name, 22) for name in names], fontsize=8.0)
+    axes.set_yticks(range(len(names)), [wrapped(name, 22) for name in names], fontsize=8.0)
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
@@ -110,7 +110,7 @@ def _drivers(axes: Axes, drivers: Sequence[Driver]) -> None:
     for k, driver in enumerate(drivers):
         axes.barh(k, 100.0 * driver.share, color=PALE, height=0.62)
         axes.text(103.0, k, f"p {format_p(driver.p_value)}", va="center", fontsize=8.5, color=GREY)
-    axes.set_yticks(range(len(drivers)), [fill(driver.words, _NAME) for driver in drivers])
+    axes.set_yticks(range(len(drivers)), [wrapped(driver.words, _NAME) for driver in drivers])
     axes.set_ylim(max(len(drivers), 1) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
     axes.set_xlim(0.0, 100.0)
@@ -128,7 +128,8 @@ def _separation(axes: Axes, found: Diagnosis) -> None:
     for k, value in enumerate((advice.before, advice.after)):
         text = f" {value:.0f}" if advice.shows else f" {value:.1f} σ"
         axes.text(value, k, text, va="center", fontsize=9.0)
-    axes.set_yticks([0, 1], ["now", "after a dwell there"])
+    stay = "a dwell" if advice.stay_s is None else f"{advice.stay_s / 60.0:.0f} min"
+    axes.set_yticks([0, 1], ["now", f"after {stay} there"])
     axes.set_ylim(1.6, -0.6)
     axes.set_xlim(0.0, 1.2 * max(advice.before, advice.after, 1.0))
     axes.grid(visible=False, axis="y")
@@ -137,7 +138,7 @@ def _separation(axes: Axes, found: Diagnosis) -> None:
     if not advice.shows and axes.get_xlim()[1] > ENOUGH:
         axes.axvline(ENOUGH, color=GREY, linestyle=":", linewidth=1.0)
         axes.text(ENOUGH, -0.55, " enough", color=GREY, fontsize=8.0, va="top")
-    axes.set_title(f"Next: gimbals at {_angles(advice)} deg\n{fill(why.partition(':')[0], 50)}")
+    axes.set_title(f"Next: gimbals at {_angles(advice)} deg\n{wrapped(why.partition(':')[0], 50)}")
 
 
 def _angles(advice: Advice) -> str:
