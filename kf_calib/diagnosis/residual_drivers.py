@@ -8,6 +8,7 @@ the difference between the two models' predictions.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,12 +23,12 @@ from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.residual_table import mean_sigmas, quantity_means
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import falls_together
-from kf_calib.support.tail_probabilities import chi_squared_tail
+from kf_calib.support.tail_probabilities import f_tail
 from kf_calib.support.threads import one_blas_thread
 
 _OF_FORCE = ("{0}*{0}", "{0}**3", "{0}**4")
 _OF_STEP = ("{0}", "{0}*abs({0})", "sign({0})")
-_OF_ANGLE = tuple(f"{wave}({turns}*{{0}})" for turns in (1, 2, 3) for wave in ("sin", "cos"))
+_WAVES = tuple(f"{wave}({turns}*{{0}})" for turns in (1, 2, 3) for wave in ("sin", "cos"))
 _OF_TIME = ("{0}", "{0}*{0}", "{0}**3")
 _FUNCTIONS = {"a": _OF_FORCE, "p": _OF_FORCE, "o": _OF_FORCE, "da": _OF_STEP, "t": _OF_TIME, "T": _OF_TIME,
               "dT": ("{0}", "{0}*{0}"), "tau": ("{0}",)}  # fmt: skip
@@ -48,7 +49,8 @@ class Driver:
 
     symbol: its name in formulas. words: what it is. unit: its SI unit. values (D, 3): its mean over each dwell, for
     each accelerometer. fall, dof: decrease of chi-squared by smooth functions of it, and their degrees of freedom.
-    share: part of the misfit beyond noise that they explain, 0 to 1; 0 if the model fits.
+    share: part of the misfit beyond noise that they explain beyond what as many arbitrary functions would, 0 to 1; 0 if
+    the model fits. p_value: the chance that as many arbitrary functions explain as much of this misfit.
     """
 
     symbol: str
@@ -58,24 +60,19 @@ class Driver:
     fall: float
     dof: int
     share: float
-
-    @property
-    def p_value(self) -> float:
-        """The chance that functions of this quantity explain so much by noise alone."""
-        return chi_squared_tail(self.dof, self.fall) if self.dof else 1.0
+    p_value: float
 
 
 def drivers_of(result: Calibration) -> list[Driver]:
     """The quantities that vary in a run, those that explain most of the misfit first."""
     fitted, known = result.fit, quantities(result.bench.axes)
     gimbals = range(1, len(result.bench.axes) + 1)
-    functions = _FUNCTIONS | {f"q{k}": _OF_ANGLE for k in gimbals}
+    functions = _FUNCTIONS | {f"q{k}": _WAVES for k in gimbals}
     words = _WORDS | {f"q{k}": f"angle of gimbal {k}" for k in gimbals}
     values = {name: each for name, each in quantity_means(result, list(functions)).items() if _varies(each)}
-    falls = _falls(fitted, {name: [text.format(name) for text in functions[name]] for name in values})
-    excess = misfit_beyond_noise(result)
+    falls = _falls(fitted, {name: _formulas(name, functions[name]) for name in values})
     found = [
-        Driver(name, words[name], known[name].unit, each, *falls[name], _share(*falls[name], excess))
+        Driver(name, words[name], known[name].unit, each, *falls[name], *_beyond_chance(*falls[name], result))
         for name, each in values.items()
     ]
     return sorted(found, key=lambda each: (-each.share, each.p_value))
@@ -97,13 +94,37 @@ def _share(fall: float, dof: int, excess: float) -> float:
     return float(np.clip((fall - dof) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0
 
 
+def _beyond_chance(fall: float, dof: int, result: Calibration) -> tuple[float, float]:
+    """Return the share of a driver and its p-value.
+
+    Of a misfit of n degrees of freedom, any k functions explain k / n on average, however large the misfit is. So chi-
+    squared per degree of freedom with the functions is compared with that without them (as R-squared is adjusted), and
+    their decrease per function with what they leave per degree of freedom (the F-test), which is noise at least.
+    """
+    misfit = result.consistency
+    rest = misfit.dof - dof
+    if not dof or rest <= 0:
+        return 0.0, 1.0
+    left = max(misfit.statistic - fall, 0.0) / rest
+    p_value = f_tail(dof, rest, fall / dof / max(left, 1.0))
+    excess = misfit_beyond_noise(result) / misfit.dof
+    return (float(np.clip(1.0 - (left - 1.0) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0), p_value
+
+
+def _formulas(symbol: str, functions: Sequence[str]) -> list[str]:
+    """Return what is added to readings in proportion to functions of a quantity; with a gimbal's angle, that gimbal
+    may also turn by such functions, as by errors of its encoder, and the waves of readings are those of one turn."""
+    texts = [text.format(symbol) for text in functions]
+    if not symbol.startswith("q"):
+        return [f"drv{k} = {text}" for k, text in enumerate(texts)]
+    return [*(f"drv{k}:{symbol[1:]} = {text}" for k, text in enumerate(texts)),
+            *(f"drr{k} = {text}" for k, text in enumerate(texts[:2]))]  # fmt: skip
+
+
 def _falls(fitted: Fit, texts: dict[str, list[str]]) -> dict[str, tuple[float, int]]:
     """Return for each driver the decrease of chi-squared by all its functions together, and their rank."""
     bench = fitted.carried.model.bench
-    groups = [
-        [formula(f"drv{k} = {text}", bench.axes, bench.gravity_mps2, checked=False) for k, text in enumerate(own)]
-        for own in texts.values()
-    ]
+    groups = [[formula(text, bench.axes, bench.gravity_mps2, checked=False) for text in own] for own in texts.values()]
     with one_blas_thread():
         return dict(zip(texts, falls_together(fitted.carried, fitted.noise.judging, groups), strict=True))
 

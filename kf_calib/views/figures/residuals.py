@@ -184,7 +184,7 @@ def draw_drivers(figure: FigureBase, found: Diagnosis, drivers: Sequence[Driver]
 def _of_share(driver: Driver) -> str:
     """Return in a few words how much of the misfit goes with a driver."""
     if not _explains(driver):
-        return "no more than noise"
+        return "no more than by chance"
     return f"{driver.share:.0%} of the misfit, p {format_p(driver.p_value)}"
 
 

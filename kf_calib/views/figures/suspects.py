@@ -115,7 +115,7 @@ def _drivers(axes: Axes, drivers: Sequence[Driver]) -> None:
     axes.grid(visible=False, axis="y")
     axes.set_xlim(0.0, 100.0)
     axes.set_xlabel("part of the misfit beyond noise, %")
-    axes.set_title("What goes with each quantity, by any smooth function of it")
+    axes.set_title("What goes with each quantity, beyond what any would by chance")
 
 
 def _separation(axes: Axes, found: Diagnosis) -> None:
