@@ -151,7 +151,7 @@ def test_errors_fall_in_the_figure_as_in_the_result() -> None:
     assert axes.get_yscale() == "log" and axes.get_ylabel() == "rms error, µg"
     assert sum(bool(label.get_text()) for label in axes.get_yticklabels()) >= 2
     ticks = [label.get_text() for label in axes.get_xticklabels()]
-    assert ticks[0].startswith("start\np ") and ticks[1].startswith("+ second-order\np = ")
+    assert ticks[0].startswith("0: start\np ") and ticks[1].startswith("1: + second-order\np = ")
     below = axes_of(figure, "second-order")
     middles = [container.lines[0].get_ydata()[0] for container in below.containers]  # type: ignore[union-attr]
     own = [state.result.parameters[f"K2_{i}"] for i in (1, 2, 3)]
@@ -164,8 +164,10 @@ def test_undone_steps_and_choices_left_open_are_drawn_beside_the_way() -> None:
     assert_ink(figure)
     axes = axes_of(figure, "The error of the model")
     ticks = [label.get_text() for label in axes.get_xticklabels()]
-    assert ticks[1].split("\n")[:2] == ["+ second-order", "(undone)"]
-    assert [tick for tick in ticks if tick.endswith("?")] == [f"+ {each.name}?" for each in state.alternatives]
+    assert ticks[1].split("\n")[:2] == ["1: + second-order", "(undone)"]
+    assert [tick for tick in ticks if tick.endswith("?")] == [
+        f"{k}: + {each.name}?" for k, each in enumerate(state.alternatives, start=2)
+    ]
     way = next(line for line in axes.lines if line.get_label() == "rms of orientations left out of the fit")
     assert list(np.asarray(way.get_xdata())) == [0]
     assert sum(line.get_marker() == "x" for line in axes.lines) == 2

@@ -34,7 +34,7 @@ from kf_calib.views.figures.style import (
 from kf_calib.views.figures.words import wrapped
 
 _COLUMNS = 5  # models whose residuals are drawn
-_COEFFICIENTS = 6  # panels of coefficients
+_COEFFICIENTS, _WIDE = 6, 3  # panels of coefficients, and in a row
 _NAME = 22
 _TWELVE = 12  # parameters that are no coefficients of effects
 
@@ -56,7 +56,8 @@ def improvement(state: Improvement) -> Figure:
     step. Below the errors stands the p-value of the run with each model.
     """
     with styled():
-        figure = blank(11.0, 7.0)
+        rows = -(-min(len(_effects(_points(state))), _COEFFICIENTS) // _WIDE)
+        figure = blank(11.0, 7.0 + 2.0 * max(rows - 1, 0))
         draw_improvement(figure, state)
     return figure
 
@@ -68,7 +69,8 @@ def draw_improvement(figure: FigureBase, state: Improvement) -> None:
         return say(figure, "The parameters take up every mean reading of this run: there is no error to be seen.")
     floor, effects = state.result.held_out_floor_mps2, _effects(points)
     if effects:
-        halves: Any = figure.subfigures(2, 1, height_ratios=(1.25, 1.0))
+        rows = -(-min(len(effects), _COEFFICIENTS) // _WIDE)
+        halves: Any = figure.subfigures(2, 1, height_ratios=(1.25, float(rows)))
         _errors(halves[0].subplots(), points, floor)
         _coefficients(halves[1], points, effects)
     else:
@@ -118,15 +120,15 @@ def _errors(axes: Axes, points: Sequence[_Point], floor_mps2: float | None) -> N
     label_axis(axes.yaxis, low, high)
     axes.set_ylabel("rms error, µg")
     axes.set_xlim(-0.5, len(points) - 0.5)
-    axes.set_xticks(places, [_tick(each) for each in points])
+    axes.set_xticks(places, [_tick(k, each) for k, each in enumerate(points)])
     axes.set_title("The error of the model over the steps; below each, the p-value of the run with it")
     axes.legend(loc="upper right", ncols=3)
 
 
-def _tick(point: _Point) -> str:
+def _tick(number: int, point: _Point) -> str:
     """Return the words below a model."""
     p_value = "" if point.p_value is None else f"\np {format_p(point.p_value)}"
-    return f"{wrapped(point.label, _NAME)}{p_value}"
+    return f"{wrapped(f'{number}: {point.label}', _NAME)}{p_value}"
 
 
 def _micro_g(values: Sequence[float | None]) -> Floats:
@@ -154,8 +156,12 @@ def _write_ratios(axes: Axes, errors: Floats, floor: float) -> None:
 def _coefficients(figure: SubFigure, points: Sequence[_Point], effects: Sequence[str]) -> None:
     """Draw the coefficients of each effect, with 1 sigma, at every model that has the effect."""
     shown = effects[:_COEFFICIENTS]
-    for axes, name in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
+    rows = -(-len(shown) // _WIDE)
+    panels = figure.subplots(rows, -(-len(shown) // rows), squeeze=False).ravel()
+    for axes, name in zip(panels, shown, strict=False):
         _of_effect(axes, name, points)
+    for axes in panels[len(shown) :]:
+        axes.set_axis_off()
 
 
 def _of_effect(axes: Axes, name: str, points: Sequence[_Point]) -> None:
@@ -174,15 +180,11 @@ def _of_effect(axes: Axes, name: str, points: Sequence[_Point]) -> None:
                           markersize=5.0 if k < 3 else 3.5, label=symbol(each))  # fmt: skip
     axes.axhline(0.0, color=GREY, linewidth=0.8)
     axes.set_xlim(-0.5, len(points) - 0.5)
-    axes.set_xticks(range(len(points)), [_short(each.label) for each in points], rotation=25, ha="right", fontsize=8.0)
+    axes.set_xticks(range(len(points)))
+    axes.set_xlabel("number of the model above", fontsize=8.0)
     axes.set_ylabel(f"coefficient ± 1σ, {unit}")
     axes.set_title(wrapped(name, 30))
     axes.legend(fontsize=8.0, handletextpad=0.2, borderpad=0.1)
-
-
-def _short(label: str) -> str:
-    """Return a label short enough for a small panel."""
-    return label if len(label) <= _NAME else f"{label[: _NAME - 1]}…"
 
 
 def _parameters(result: Calibration, name: str) -> list[Parameter]:

@@ -39,7 +39,7 @@ _UNITS = {"rad": ("deg", 180.0 / np.pi), "m/s^2": ("g", 1.0 / 9.80665), "s": ("m
           "K": ("K", 1.0), "K/s": ("K/h", 3600.0)}  # fmt: skip
 _SMALLER = {"s": ("s", 1.0, 300.0), "K": ("mK", 1e3, 0.5)}  # units for values whose greatest is below the last, SI
 _SIGNIFICANT, _SOME = 0.01, 0.005  # p-value and share above and below which a driver explains nothing
-_TITLE = 34  # letters in a line of a title
+_TITLE = 36  # letters in a line of a title
 _PANELS = 8  # drivers in small panels
 _MANY = 150  # dwells, above which markers are smaller and bars of sigma are left out
 
@@ -80,10 +80,10 @@ def draw_residuals(figure: FigureBase, found: Diagnosis, drivers: Sequence[Drive
             _curve(row[1], x, best, i, is_function_of(best.contribution_mps2, driver))
             _points(row[2], x, best.left_mps2[:, i], sigmas[:, i], i)
             _rms(row[2], best.left_mps2, i)
-    titles = [f"Residuals of the model: {found.before.model.sum}"]
+    titles = [f"Residuals of {found.before.model.sum}"]
     if others:
         name = others[0].name
-        titles += [f"Readings less all but {name}", f"What is left with {name} in the model"]
+        titles += [f"Readings less all but {name}", f"What {name} leaves of them"]
         figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower left", ncols=3)
     for axes, title in zip(panels[0], titles, strict=True):
         axes.set_title(wrapped(title, _TITLE if others else 3 * _TITLE))
