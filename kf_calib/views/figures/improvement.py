@@ -176,8 +176,10 @@ def _of_effect(axes: Axes, name: str, points: Sequence[_Point]) -> None:
                   if p.symbol == each and p.value is not None and p.sigma is not None]  # fmt: skip
         if values:
             places, middles, sigmas = zip(*values, strict=True)
-            axes.errorbar(places, middles, sigmas, fmt=MARKERS[k % 3], color=ACCELEROMETERS[k % 3], capsize=2.0,
-                          markersize=5.0 if k < 3 else 3.5, label=symbol(each))  # fmt: skip
+            own = _accelerometer(each, k)
+            again = own in [_accelerometer(other, j) for j, other in enumerate(symbols[:k])]
+            axes.errorbar(places, middles, sigmas, fmt=MARKERS[own], color=ACCELEROMETERS[own], capsize=2.0,
+                          markersize=5.0, markerfacecolor="white" if again else None, label=symbol(each))  # fmt: skip
     axes.axhline(0.0, color=GREY, linewidth=0.8)
     axes.set_xlim(-0.5, len(points) - 0.5)
     axes.set_xticks(range(len(points)))
@@ -185,6 +187,11 @@ def _of_effect(axes: Axes, name: str, points: Sequence[_Point]) -> None:
     axes.set_ylabel(f"coefficient ± 1σ, {unit}")
     axes.set_title(wrapped(name, 30))
     axes.legend(fontsize=8.0, handletextpad=0.2, borderpad=0.1)
+
+
+def _accelerometer(name: str, k: int) -> int:
+    """Return the accelerometer, from 0, of a coefficient by the digit at its end; of one without, its place."""
+    return int(name[-1]) - 1 if name[-1] in "123" else k % 3
 
 
 def _parameters(result: Calibration, name: str) -> list[Parameter]:
