@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from contextvars import copy_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ import rich_click as click
 from kf_calib.cli.acquire import pair
 from kf_calib.cli.echo import Printer, complain
 from kf_calib.cli.files import claimed, delivery, output_option
+from kf_calib.cli.live_keys import pressed_keys
 from kf_calib.cli.numbers import NOT_NEGATIVE, POSITIVE
 from kf_calib.cli.options import (
     INPUT,
@@ -34,6 +36,8 @@ from kf_calib.cli.options import (
     save_view,
     settings_of,
     strict_option,
+    target_option,
+    units_option,
 )
 from kf_calib.cli.signals import answered
 from kf_calib.errors import InputError, KfCalibError
@@ -46,8 +50,6 @@ if TYPE_CHECKING:
     from kf_calib.online.status import Judgement
     from kf_calib.sources.live import LiveSource
     from kf_calib.views.rerun.growing import GrowingView
-from kf_calib.cli.live_keys import pressed_keys
-from kf_calib.cli.live_targets import parsed_targets
 
 RUNNING = "While it runs"
 _REFRESH_S = 0.25
@@ -61,15 +63,7 @@ _REFRESH_S = 0.25
 )
 @click.argument("source", metavar="SOURCE")
 @output_option("--record", metavar="OUT.mcap", panel=RUNNING, help="Record the run here.")
-@click.option(
-    "--target",
-    "targets",
-    multiple=True,
-    metavar="SYMBOL=SIGMA",
-    panel=RUNNING,
-    help="The sigma wanted of a parameter (theta1) or of a kind (theta, phi, nu, K, b), with a unit: "
-    "theta1=2arcsec, K=5ppm, b=10ug; repeatable.",
-)
+@target_option(panel=RUNNING)
 @click.option(
     "--auto", is_flag=True, panel=RUNNING, help="Accept a missing effect when it can be told from all others."
 )
@@ -119,6 +113,7 @@ _REFRESH_S = 0.25
 @rrd_option
 @save_model_option
 @strict_option
+@units_option
 @json_option
 @click.pass_context
 def live(
@@ -146,11 +141,12 @@ def live(
     SOURCE: a serial port, socket://HOST:PORT, rfc2217://HOST:PORT, - (standard input), a file that grows, or sim://.
     Ctrl-C ends the run: the recording is finished and the summary printed.
     """
+    from kf_calib.bench.targets import targets_of
     from kf_calib.estimation import model_file
     from kf_calib.sources.live import files_of, open_live
 
     outputs = claimed(files_of(source), overwrite=overwrite)
-    settings, wanted = settings_of(options), parsed_targets(targets)
+    settings, wanted = settings_of(options), targets_of(targets)
     _refuse(settings)
     opening = open_live(
         source, overrides(options), record, overwrite, columns=dict(map(pair, columns)), header=header,
@@ -161,8 +157,8 @@ def live(
         view = _view(rrd, rerun_port if with_viewer else None, rerun_bind)
         if view is not None:
             run.listeners.append(lambda judgement: view.offer(judgement.result))
-        with answered(run.asked):  # until all is written: who closes a terminal sends several
-            _watched(run, source, record, as_json)
+        with answered(run.handle_signal):  # until all is written: who closes a terminal sends several
+            _follow(run, source, record, as_json)
             if view is not None:
                 view.close()
             opened.close()
@@ -203,7 +199,8 @@ class _Run:
         self.error: BaseException | None = None
         self.listeners: list[Callable[[Judgement], None]] = [self._keep]
         self.judgements = queue.Queue["Judgement"](256)
-        self._thread = threading.Thread(target=self._work, args=(settings, wanted, auto, record, every), daemon=True)
+        work = self._work, settings, wanted, auto, record, every
+        self._thread = threading.Thread(target=copy_context().run, args=work, daemon=True)  # in the units chosen
 
     def start(self) -> None:
         self._thread.start()
@@ -218,7 +215,7 @@ class _Run:
         if self.session is not None:
             self.session.hurry()
 
-    def asked(self, number: signal.Signals) -> None:
+    def handle_signal(self, number: signal.Signals) -> None:
         """To end, by a signal, as its end would; a second Ctrl-C does not wait for it."""
         if number == signal.SIGINT and (self.stopped or not self.going):
             raise KeyboardInterrupt
@@ -274,7 +271,7 @@ class _Run:
             self.unshown += 1
 
 
-def _watched(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
+def _follow(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
     """The run to its end, with a screen, lines or objects."""
     run.start()
     if not as_json and sys.stdout.isatty():
@@ -288,14 +285,14 @@ def _watched(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
             judgement = run.judgements.get(timeout=_REFRESH_S)
             _print(run, judgement, as_json)
         run.warn()
-        now = _said(run)
+        now = _urgent_messages(run)
         for about, said in now.items():
             if said and said != told.get(about) and not as_json:
                 _echo(run, sentence(said))
         told = now
 
 
-def _said(run: _Run) -> dict[str, str]:
+def _urgent_messages(run: _Run) -> dict[str, str]:
     """What a user must know at once, about what: said again where it changes."""
     standing, status = run.session.standing if run.session else None, run.source.status
     return {

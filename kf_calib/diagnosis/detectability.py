@@ -28,17 +28,19 @@ _CONDITIONS = {
 class Detectable:
     """The size of a coefficient at which an effect is found in 90 of 100 runs; of several, that of the least visible.
 
-    name: of the effect. minimum, unit: the size in SI. shown_minimum, shown_unit: the same in the unit of the field.
-    coefficient: the one that is meant. typical: usual sizes of such coefficients, in SI.
+    name: of the effect. minimum: the size in SI. coefficient: which of them it is the size of. typical: usual sizes of
+    such coefficients, in SI.
     """
 
     name: str
     minimum: float
-    unit: str
-    shown_minimum: float
-    shown_unit: str
     coefficient: Coefficient
     typical: Typical
+
+    @property
+    def unit(self) -> str:
+        """The SI unit of the coefficient."""
+        return self.coefficient.unit
 
 
 @dataclass(frozen=True)
@@ -56,9 +58,8 @@ def detectable(test: CandidateTests) -> list[Detectable]:
         candidate = test.scan.candidates[k]
         found = None if name in test.invisible else smallest_size(candidate, SHARE * LEVEL / test.effective_tests)
         if found is not None:
-            own, minimum = found
-            typical = candidate.effect.typical
-            out.append(Detectable(name, minimum, own.unit, minimum * own.per_si, own.shown_unit, own, typical))
+            coefficient, minimum = found
+            out.append(Detectable(name, minimum, coefficient, candidate.effect.typical))
     return out
 
 

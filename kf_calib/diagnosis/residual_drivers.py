@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.results import Diagnosis, with_effects
+from kf_calib.diagnosis.refits import Refits
+from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.effects.formula import formula, quantities
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.noise_model import mean_covariances
@@ -265,9 +266,12 @@ def _walk_path(result: Calibration) -> Floats:
     return np.array(path).T
 
 
-def explanations(found: Diagnosis) -> list[Explanation]:
+def explanations(found: Diagnosis, refits: Refits | None = None) -> list[Explanation]:
     """The explanations of a diagnosis, the best first: what is missing, or the formula that describes an unknown
-    misfit; then the other suspects."""
+    misfit; then the other suspects.
+
+    refits: of the run, if there are any.
+    """
     out = list[Explanation]()
     if found.missing and found.after is not None:
         alone = found.test.p_values.get(found.missing[0]) if len(found.missing) == 1 else None
@@ -275,7 +279,7 @@ def explanations(found: Diagnosis) -> list[Explanation]:
     elif found.description is not None:
         formulas = found.description.formulas
         names = tuple(text.partition("=")[2].strip() or text for text in formulas)
-        after = with_effects(found.before, formulas)
+        after = (refits or Refits()).with_effects(found.before, formulas)
         out.append(Explanation(names, found.before, after, after.consistency.consistent is not False))
     rest = [each for each in found.suspects if (each.name,) != found.missing]
     rest.sort(key=lambda each: not each.fits)  # stable: those that fit, by significance, before those that do not

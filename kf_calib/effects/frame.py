@@ -6,11 +6,10 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects.effect import Coefficient, Effect, FrameEffect, G, Typical
+from kf_calib.effects.effect import Coefficient, Effect, FrameEffect, Typical
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
-
-ARCSEC = ("arcsec", np.degrees(1.0) * 3600.0)
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 
 class BaseTilt(FrameEffect):
@@ -22,7 +21,7 @@ class BaseTilt(FrameEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"delta{axis}", "rad", 1e-3, *ARCSEC) for axis in "NE")
+        return tuple(Coefficient(f"delta{axis}", "rad", 1e-3) for axis in "NE")
 
     def rotations(self, s: Stimulus) -> Floats:
         return -np.stack([s.to_platform(axis) for axis in s.level_axes], axis=1)
@@ -40,7 +39,7 @@ class BaseTiltDrift(BaseTilt):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"deltaRate{axis}", "rad/s", 1e-8, "µrad/day", 86400e6) for axis in "NE")
+        return tuple(Coefficient(f"deltaRate{axis}", "rad/s", 1e-8) for axis in "NE")
 
     def rotations(self, s: Stimulus) -> Floats:
         return super().rotations(s) * s.elapsed_s[:, None, None]
@@ -86,12 +85,11 @@ class Flexure(FrameEffect):
 
     name, title, source = "flexure", "bending under the torque of gravity", "IEEE Std 836"
     confused_with = "encoder-harmonic-1, cross-coupling"
-    typical = Typical((5e-6 / G, 100e-6 / G))
+    typical = Typical((5e-6 / STANDARD_GRAVITY_MPS2, 100e-6 / STANDARD_GRAVITY_MPS2))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        per_si = np.degrees(1.0) * 3600.0 * G
-        return tuple(Coefficient(f"d{axis}", "rad s^2/m", 1e-4, "arcsec/g", per_si) for axis in "XYZ")
+        return tuple(Coefficient(f"d{axis}", "rad s^2/m", 1e-4) for axis in "XYZ")
 
     def rotations(self, s: Stimulus) -> Floats:
         return -np.cross(s.force_mps2[:, None, :], np.eye(3))
@@ -106,7 +104,7 @@ class CrossTalk(Effect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"X{i}{j}", "1", 1e-3, "ppm", 1e6) for i in (1, 2, 3) for j in (1, 2, 3) if i != j)
+        return tuple(Coefficient(f"X{i}{j}", "1", 1e-3) for i in (1, 2, 3) for j in (1, 2, 3) if i != j)
 
     def columns(self, s: Stimulus) -> Floats:
         readings, out = s.force_mps2 @ s.sensitivity.T, np.zeros((len(s), 3, 6))
@@ -144,7 +142,7 @@ class EncoderOffset(_GimbalEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient(f"eps_{self.variant}", "rad", 1e-2, *ARCSEC),)
+        return (Coefficient(f"eps_{self.variant}", "rad", 1e-2),)
 
     def rotations(self, s: Stimulus) -> Floats:
         return self._about_axis(s)[:, None, :]
@@ -162,7 +160,7 @@ class EncoderScale(_GimbalEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient(f"epsS_{self.variant}", "1", 1e-3, "ppm", 1e6),)
+        return (Coefficient(f"epsS_{self.variant}", "1", 1e-3),)
 
     def rotations(self, s: Stimulus) -> Floats:
         return (self._angle(s)[:, None] * self._about_axis(s))[:, None, :]
@@ -177,7 +175,7 @@ class EncoderHarmonic1(_GimbalEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"{part}{self.order}_{self.variant}", "rad", 1e-3, *ARCSEC) for part in "sc")
+        return tuple(Coefficient(f"{part}{self.order}_{self.variant}", "rad", 1e-3) for part in "sc")
 
     def rotations(self, s: Stimulus) -> Floats:
         angle = self.order * self._angle(s)
@@ -200,7 +198,7 @@ class AxisNonorthogonality(_GimbalEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"tau{part}_{self.variant}", "rad", 1e-3, *ARCSEC) for part in "AB")
+        return tuple(Coefficient(f"tau{part}_{self.variant}", "rad", 1e-3) for part in "AB")
 
     def rotations(self, s: Stimulus) -> Floats:
         from kf_calib.bench.bench import turn
@@ -219,7 +217,7 @@ class GravityError(Effect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("epsG", "1", 1e-3, "ppm", 1e6),)
+        return (Coefficient("epsG", "1", 1e-3),)
 
     def columns(self, s: Stimulus) -> Floats:
         return (s.force_mps2 @ s.sensitivity.T)[:, :, None]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import MICRO_G, MICRO_PER_G, MILLI_PER_G, G, SensorEffect, Typical, Unknown
+from kf_calib.effects.effect import MICRO_G, MICRO_PER_G, MILLI_PER_G, SensorEffect, Typical, Unknown
 from kf_calib.effects.stimulus import Stimulus
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 IEEE = "IEEE Std 1293, model equation"
 _EDGES = 500
@@ -17,7 +18,7 @@ class BiasAsymmetry(SensorEffect):
 
     name, title, source = "bias-asymmetry", "bias that changes sign with the input", IEEE
     confused_with = "odd-quadratic; invisible in six faces"
-    symbol, unit, scale, shown = "K0'", "m/s^2", 1e-3, ("µg", 1e6 / G)
+    symbol, unit, scale = "K0'", "m/s^2", 1e-3
     typical = Typical((1 * MICRO_G, 10 * MICRO_G))
 
     def terms(self, s: Stimulus) -> Floats:
@@ -29,7 +30,7 @@ class ScaleAsymmetry(SensorEffect):
 
     name, title, source = "scale-asymmetry", "scale factor that differs with the sign of the input", IEEE
     confused_with = "second-order"
-    symbol, unit, scale, shown = "K1'", "1", 1e-3, ("ppm", 1e6)
+    symbol, unit, scale = "K1'", "1", 1e-3
     typical = Typical((1e-6, 30e-6), (0.1e-3, 1e-3))
 
     def terms(self, s: Stimulus) -> Floats:
@@ -41,7 +42,7 @@ class SecondOrder(SensorEffect):
 
     name, title, source = "second-order", "second-order nonlinearity", IEEE
     confused_with = "scale-asymmetry"
-    symbol, unit, scale, shown = "K2_", "s^2/m", 1e-4, ("µg/g²", 1e6 * G)
+    symbol, unit, scale = "K2_", "s^2/m", 1e-4
     typical = Typical((1 * MICRO_PER_G, 20 * MICRO_PER_G), (0.1 * MILLI_PER_G, 3 * MILLI_PER_G))
 
     def terms(self, s: Stimulus) -> Floats:
@@ -53,8 +54,11 @@ class ThirdOrder(SensorEffect):
 
     name, title, source = "third-order", "third-order nonlinearity", IEEE
     confused_with = "odd-quadratic; invisible in six faces"
-    symbol, unit, scale, shown = "K3_", "s^4/m^2", 1e-5, ("µg/g³", 1e6 * G**2)
-    typical = Typical((0.1 * MICRO_PER_G / G, 10 * MICRO_PER_G / G), (0.0, 5 * MILLI_PER_G / G))
+    symbol, unit, scale = "K3_", "s^4/m^2", 1e-5
+    typical = Typical(
+        (0.1 * MICRO_PER_G / STANDARD_GRAVITY_MPS2, 10 * MICRO_PER_G / STANDARD_GRAVITY_MPS2),
+        (0.0, 5 * MILLI_PER_G / STANDARD_GRAVITY_MPS2),
+    )
 
     def terms(self, s: Stimulus) -> Floats:
         return s.along**3
@@ -65,7 +69,7 @@ class OddQuadratic(SensorEffect):
 
     name, title, source = "odd-quadratic", "odd quadratic nonlinearity", IEEE
     confused_with = "third-order; invisible in six faces"
-    symbol, unit, scale, shown = "Koq", "s^2/m", 1e-4, ("µg/g²", 1e6 * G)
+    symbol, unit, scale = "Koq", "s^2/m", 1e-4
     typical = Typical((1 * MICRO_PER_G, 10 * MICRO_PER_G), (0.0, MILLI_PER_G))
 
     def terms(self, s: Stimulus) -> Floats:
@@ -74,7 +78,7 @@ class OddQuadratic(SensorEffect):
 
 class _CrossCoupling(SensorEffect):
     source, confused_with = IEEE, "seen in poses between the faces only"
-    unit, scale, shown = "s^2/m", 1e-4, ("µg/g²", 1e6 * G)
+    unit, scale = "s^2/m", 1e-4
     typical = Typical((1 * MICRO_PER_G, 30 * MICRO_PER_G), (0.0, MILLI_PER_G))
 
 
@@ -122,7 +126,7 @@ class VibrationRectification(SensorEffect):
     name, title, source = "vibration-rectification", "shift of the bias under vibration", IEEE
     confused_with = "needs vibration that varies"
     averages = True
-    symbol, unit, scale, shown = "K2v", "s^2/m", 1e-4, ("µg/g²", 1e6 * G)
+    symbol, unit, scale = "K2v", "s^2/m", 1e-4
     typical = Typical((10 * MICRO_PER_G, 50 * MICRO_PER_G))
 
     def terms(self, s: Stimulus) -> Floats:
@@ -135,7 +139,7 @@ class DeadZone(SensorEffect):
     name, title, source = "dead-zone", "no response to small inputs", IEEE
     confused_with = "needs poses that sweep through zero"
     symbol, unit, scale, shown = "Dz", "1", 1.0, ("of the input", 1.0)
-    unknown = Unknown("dZone", "m/s^2", 1e-6, 1e-2, "µg", 1e6 / G)
+    unknown = Unknown("dZone", "m/s^2", 1e-6, 1e-2)
     smooth = False
 
     def __init__(self) -> None:

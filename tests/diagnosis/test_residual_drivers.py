@@ -13,6 +13,7 @@ from scipy.stats import binom, chi2, f
 from kf_calib.diagnosis.detectability import QUIET, sensor_grade
 from kf_calib.diagnosis.effect_pairs import overlap_matrix
 from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.residual_drivers import (
     Explanation,
     drivers_of,
@@ -21,7 +22,6 @@ from kf_calib.diagnosis.residual_drivers import (
     unexplained_mps2,
     unexplained_rms_mps2,
 )
-from kf_calib.diagnosis.results import with_effects
 from kf_calib.effects import effect_named, names
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.residual_table import mean_sigmas
@@ -99,7 +99,7 @@ def test_the_band_of_an_effect_covers_as_often_as_it_says() -> None:
     offsets, predicted, sigmas = list[float](), list[np.ndarray](), list[np.ndarray]()
     for seed in range(runs):
         before = noisy_run("second-order=2ug/g^2,2ug/g^2,2ug/g^2", seed=300 + seed, plan=PLAN)
-        after = with_effects(before, ("second-order",))
+        after = Refits().with_effects(before, ("second-order",))
         best = Explanation(("second-order",), before, after, True)
         size, own = best.contribution_mps2, best.contribution_sigma_mps2
         force = before.carried.means.force_mps2
@@ -122,7 +122,7 @@ def test_the_band_of_an_effect_covers_as_often_as_it_says() -> None:
 
 def test_the_path_of_a_walk_is_no_residual() -> None:
     before = noisy_run(dwells=16, walk_mps2_per_sqrt_s=3e-6, seed=4)
-    after = with_effects(before, ("bias-walk",))
+    after = Refits().with_effects(before, ("bias-walk",))
     assert after.noise.walk_mps2_per_sqrt_s > 0.0
     ratios = unexplained_mps2(after) / mean_sigmas(before)
     assert unexplained_rms_mps2(after) < 0.5 * before.residual_rms_mps2

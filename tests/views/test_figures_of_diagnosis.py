@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 import kf_calib
 from kf_calib import plot
 from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.residual_drivers import explanations
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, begin, extend, improve, undone
@@ -159,7 +160,9 @@ def test_errors_fall_in_the_figure_as_in_the_result() -> None:
 
 
 def test_undone_steps_and_choices_left_open_are_drawn_beside_the_way() -> None:
-    state = undone(extend(begin(run("bias-drift=15sigma")), ("second-order",), "user"))
+    refits = Refits()
+    state = extend(begin(run("bias-drift=15sigma"), refits), refits, ("second-order",), "user")
+    state = undone(state, refits)
     figure = plot.improvement(state)
     assert_ink(figure)
     axes = axes_of(figure, "The error of the model")
@@ -175,7 +178,7 @@ def test_undone_steps_and_choices_left_open_are_drawn_beside_the_way() -> None:
 
 
 @pytest.mark.parametrize("made", [
-    lambda: begin(run()), lambda: begin(calibrate(Run(seed=1, dwells=4, count=100))),
+    lambda: begin(run(), Refits()), lambda: begin(calibrate(Run(seed=1, dwells=4, count=100)), Refits()),
     lambda: improve(noisy_run(walk_mps2_per_sqrt_s=3e-6, seed=4)),
 ])  # fmt: skip
 def test_odd_improvements_are_drawn(made: object) -> None:

@@ -10,10 +10,11 @@ from matplotlib.figure import Figure, FigureBase
 from kf_calib.diagnosis.detectability import Detectable, Unseen
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.effects.effect import Grade
+from kf_calib.support.units import shown
 from kf_calib.views.console import GRADES, size_range
 from kf_calib.views.figures.log_axis import label_axis
 from kf_calib.views.figures.style import GREY, blank, styled
-from kf_calib.views.figures.words import rounded_number, wrapped
+from kf_calib.views.figures.words import wrapped
 
 _LOW, _HIGH = 0.01, 1000.0  # smallest detectable sizes that the axis spans
 _SEEN, _HIDDEN = "#0072b2", "#e69f00"  # of Okabe and Ito's palette
@@ -65,7 +66,7 @@ def _bars(axes: Axes, sizes: Sequence[Detectable], rows: int, grade: Grade, firs
     axes.set_xlim(_LOW, _HIGH)
     for k, each in enumerate(sizes):
         usual = each.typical.of(grade)
-        smallest = f"{rounded_number(each.shown_minimum)} {each.shown_unit}"
+        smallest = shown(each.coefficient).text(each.minimum)
         if usual is None:
             axes.text(1.4, k, "no usual size is known", va="center", color=GREY, fontsize=7.5)
         else:

@@ -14,7 +14,6 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of, unexplained_mps2, unexplained_rms_mps2
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, SelectionStep
-from kf_calib.estimation.fit import WALK
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.views.console import symbol
@@ -36,7 +35,6 @@ from kf_calib.views.figures.words import wrapped
 _COLUMNS = 5  # models whose residuals are drawn
 _COEFFICIENTS, _WIDE = 6, 3  # panels of coefficients, and in a row
 _NAME = 22
-_TWELVE = 12  # parameters that are no coefficients of effects
 
 
 @dataclass(frozen=True)
@@ -197,13 +195,8 @@ def _accelerometer(name: str, k: int) -> int:
 def _parameters(result: Calibration, name: str) -> list[Parameter]:
     """Return the coefficients of an effect in the unit of the first of them; a constant of another unit is left out."""
     effect = next((each for each in result.model.effects if str(each) == name), None)
-    if effect is None:
-        return []
-    names = {each.symbol for each in effect.coefficients}
-    rest = list(result.parameters.values())[_TWELVE:]
-    own = [p for p in rest if p.symbol in names] or (
-        [p for p in rest if p.symbol == WALK.symbol] if effect.walks else []
-    )
+    sizes = [] if effect is None else [each.symbol for each in effect.parameters]
+    own = [result.parameters[each] for each in sizes if each in result.parameters]
     return [p for p in own if p.shown_unit == own[0].shown_unit]
 
 
