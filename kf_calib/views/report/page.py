@@ -1,0 +1,107 @@
+"""The page itself: its parts, and how they become one file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from base64 import b64encode
+from dataclasses import dataclass
+from functools import cache
+from importlib import metadata, resources
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from kf_calib.support.output_files import write_whole
+from kf_calib.views.report.explorer import Explorer
+from kf_calib.views.report.parts import Paragraph, Table
+
+Standing = Literal["agrees", "disagrees", "open"]
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure as an ``svg`` element, with the title that says what is to be seen."""
+
+    kind: ClassVar[str] = "drawing"
+    title: str
+    svg: str
+
+
+Part = Paragraph | Table | Drawing | Explorer
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of a page; one without parts is left out."""
+
+    title: str
+    parts: tuple[Part, ...]
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What was measured: a heading and words each; title: of which recording, where there are two."""
+
+    title: str
+    rows: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page. standing: whether model and measurements agree. verdict: what is found, in words, a paragraph each."""
+
+    title: str
+    what: str
+    standing: Standing
+    verdict: tuple[str, ...]
+    facts: tuple[Facts, ...]
+    sections: tuple[Section, ...]
+    commands: tuple[str, ...]
+
+    @property
+    def html(self) -> str:
+        """The whole page; what comes from recordings is escaped, and no script runs but the page's own."""
+        scripts = [own_text("uPlot.iife.min.js"), own_text("explorer.js")]
+        return environment().get_template("page.html").render(
+            page=self,
+            sections=[each for each in self.sections if each.parts],
+            version=metadata.version("kf_calib"),
+            styles=[Markup(own_text(name)) for name in ("uPlot.min.css", "style.css")],
+            scripts=[Markup(each) for each in scripts],
+            allowed=Markup(" ".join(f"'sha256-{_digest(each)}'" for each in scripts)),
+        )
+
+
+def save(page: Page, path: Path) -> None:
+    """Write a page as one file; the same page is the same file. Raises InputError where it cannot be written."""
+    write_whole(path, page.html.encode())
+
+
+@cache
+def environment() -> Environment:
+    """What fills in the templates of this package; everything is escaped that is not ``Markup``."""
+    made = Environment(
+        loader=PackageLoader("kf_calib.views.report", ""), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    made.filters["json"] = _json
+    made.filters["markup"] = Markup
+    return made
+
+
+def own_text(name: str) -> str:
+    """A text file of this package."""
+    return resources.files("kf_calib.views.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _json(value: Any) -> Markup:
+    """Return JSON for a script element: no text in it can end the element."""
+    text = json.dumps(value, allow_nan=False, separators=(",", ":"))
+    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
+
+
+def _digest(script: str) -> str:
+    return b64encode(hashlib.sha256(script.encode()).digest()).decode()
