@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import rich_click as click
+from click import get_current_context  # rich_click declares that there may be none
 from click.core import ParameterSource
 
 from kf_calib.cli.files import Delivery, claimed, delivery, output_option
@@ -30,7 +31,7 @@ from kf_calib.cli.options import (
 
 if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Diagnosis
-    from kf_calib.views.report import Measured
+    from kf_calib.views.report.measured import Measured
 
 report_option = output_option(
     "--report", metavar="FILE.html", panel=OUTPUT, help="Save a page with figures and tables here; it needs no network."
@@ -70,8 +71,10 @@ def report(
 ) -> None:
     """A page for the engineer: verdict, figures, residuals to explore, tables, commands to get the numbers again."""
     from kf_calib.diagnosis.side_by_side import SideBySide
-    from kf_calib.views import diagnosis, report, side_by_side
+    from kf_calib.views import diagnosis, side_by_side
     from kf_calib.views.json import clean
+    from kf_calib.views.report.contents import page_of
+    from kf_calib.views.report.page import save
 
     outputs = claimed(overwrite=overwrite)
     has_other_model = against is not None and against.suffix == ".toml"
@@ -95,26 +98,28 @@ def report(
         show(said)
     with delivery(outputs, as_json) as deliver, progress("drawing the page", as_json):
         result = found if pair is None else pair
-        deliver.file(out, lambda path: report.save(report.page_of(result, sources, commands_of(ctx)), path))
+        deliver.file(out, lambda path: save(page_of(result, sources, commands_of(ctx)), path))
     if strict and found.test.consistent is False:
         ctx.exit(1)
 
 
 def save_report(
-    deliver: Delivery, path: Path | None, result: object, measured: Measured, remarks: Sequence[str] = ()
+    deliver: Delivery, path: Path | None, result: object, measured: Measured | None, remarks: Sequence[str] = ()
 ) -> None:
     """Save the page of a command's result, if ``--report`` asks for one."""
-    if path is not None:
-        from kf_calib.views import report
+    if path is not None and measured is not None:
+        from kf_calib.views.report.contents import page_of
+        from kf_calib.views.report.page import save
 
-        commands = commands_of(click.get_current_context())
-        deliver.file(path, lambda path: report.save(report.page_of(result, [measured], commands, remarks), path))
+        commands = commands_of(get_current_context())
+        deliver.file(path, lambda path: save(page_of(result, [measured], commands, remarks), path))
 
 
 def measured_of(recording: Path, options: dict[str, Any]) -> Measured:
     """What a page says of a recording's file; raises MissingExtraError, before the work, where no page can be made."""
+    import kf_calib.views.figures  # noqa: F401  # which a page needs
     from kf_calib.diagnosis.selection_journal import Origin
-    from kf_calib.views.report import Measured
+    from kf_calib.views.report.measured import Measured
 
     return Measured(recording.name, Origin.of(recording).sha256, recording_of(recording, options).begin_ns())
 
@@ -135,11 +140,15 @@ def _programs_of(model: Path | None) -> list[Path]:
     return [] if model is None else [each.path for each in model_file.read(model).programs]
 
 
+_HOW_IT_ENDS = ("overwrite", "strict", "as_json")
+"""Options that change no number and no page."""
+
+
 def commands_of(ctx: click.Context) -> list[str]:
     """The command that runs, as it could be typed again, and what prints its tables alone."""
-    own = [f"kf-calib {ctx.info_name} {_typed(ctx, ())}"]
+    own = [f"kf-calib {ctx.info_name} {_typed(ctx, _HOW_IT_ENDS)}"]
     if ctx.info_name == "report" and ctx.params.get("against") is None:
-        shared = _typed(ctx, ("out", "overwrite", "strict", "as_json"))
+        shared = _typed(ctx, ("out", *_HOW_IT_ENDS))
         own += [f"kf-calib {name} {shared}" for name in ("replay", "diagnose")]
     return [*own, *(f"sha256sum {shlex.quote(str(path))}" for path in _recordings(ctx))]
 

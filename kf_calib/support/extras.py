@@ -12,7 +12,7 @@ class MissingExtraError(KfCalibError):
 
 
 def need(package: str, extra: str | None, purpose: str) -> None:
-    """Raise MissingExtraError unless ``package`` can be imported; extra: of kf_calib, that brings it, if there is one."""
+    """Raise MissingExtraError unless ``package`` can be imported; extra: of kf_calib, that brings it, if one does."""
     if find_spec(package) is None:
         wanted = package if extra is None else f"'kf_calib[{extra}]'"
         raise MissingExtraError(f"{purpose} needs {package}, which is not installed: pip install {wanted}.")

@@ -43,9 +43,9 @@ def _(found: Diagnosis, measured: Sequence[Measured], commands: Sequence[str], r
         measured[0].name, "Calibration report", _standing(found.test.consistent),
         (diagnosis.verdict(found), *remarks), (Facts("", tuple(facts(measured[0], found.before))),),
         (
-            _drawn(_where(found), found, "found"),
+            _drawn("Residuals", found, "found"),
             Section("Explore the residuals", (_explorer_of(found),)),
-            Section("Parameters", (*_in_text(console.summary(found.before)), *_with_what_is_missing(found))),
+            Section("Parameters", (*_calibrated(found.before), *_with_what_is_missing(found))),
             _drawn("The calibration", found.before, "run"),
             Section("Suspects, and what this run could show", _evidence(found)),
             _warnings(found.before.warnings),
@@ -85,7 +85,7 @@ def _(compared: Comparison, measured: Sequence[Measured], commands: Sequence[str
         (
             Section("Time, memory and difference", _in_text(console.comparison_table(compared), with_notes=True)),
             _drawn("Figures of the comparison", compared, "compared"),
-            Section("Parameters", _in_text(console.summary(result))),
+            Section("Parameters", _calibrated(result)),
             Section("Explore the residuals", (explorer(result, {}),)),
             _drawn("The calibration", result, "run"),
             _warnings(result.warnings),
@@ -105,7 +105,7 @@ def _(pair: SideBySide, measured: Sequence[Measured], commands: Sequence[str], r
         section
         for k, (name, each) in enumerate(zip(names, both, strict=True))
         for section in (
-            _drawn(f"{name}: {_where(each).lower()}", each, f"found{k}"),
+            _drawn(f"{name}: residuals", each, f"found{k}"),
             Section(f"{name}: explore the residuals", (_explorer_of(each),)),
             Section(f"{name}: suspects, and what this run could show", _evidence(each)),
             _warnings(each.before.warnings, f"{name}: warnings"),
@@ -122,10 +122,6 @@ def _(pair: SideBySide, measured: Sequence[Measured], commands: Sequence[str], r
 
 def _standing(consistent: bool | None) -> Standing:
     return "open" if consistent is None else "agrees" if consistent else "disagrees"
-
-
-def _where(found: Diagnosis) -> str:
-    return "Where the model fails" if found.test.consistent is False else "Residuals of the model"
 
 
 def _drawn(title: str, result: object, prefix: str) -> Section:
@@ -147,6 +143,11 @@ def _in_text(drawn: RenderableType, with_notes: bool = False) -> tuple[Part, ...
     return tuple(each for each in parts_of(drawn) if with_notes or each.kind != "note")
 
 
+def _calibrated(result: Calibration) -> tuple[Part, ...]:
+    """Return the tables of a calibration, less the counts of readings, which are among what was measured."""
+    return _in_text(console.summary(result))[1:]
+
+
 def _evidence(found: Diagnosis) -> tuple[Part, ...]:
     """Return what the console says for a diagnosis, less the verdict, which comes first there as on the page."""
     return _in_text(diagnosis.diagnosis_report(found))[1:]
@@ -156,9 +157,8 @@ def _with_what_is_missing(found: Diagnosis) -> tuple[Part, ...]:
     """Return the parameters with the missing effects beside those without; nothing where none is missing."""
     if found.after is None:
         return ()
-    table = side_by_side.difference_table(
-        differences(found.before, found.after, same_recording=True), "as it is", f"with {' + '.join(found.missing)}"
-    )
+    both = differences(found.before, found.after, same_recording=True)
+    table = side_by_side.difference_table(both, "model as it is", f"with {' + '.join(found.missing)}")
     return (*parts_of(table), *parts_of(console.effect_table(found.after)))
 
 

@@ -14,7 +14,8 @@ _OF_PANEL = 60
 _PICTURE_DPI = 220
 _COLOUR = re.compile(r"(fill|stroke|stop-color): (#[0-9a-f]{6})")
 _NAME = re.compile(r'(\bid="|href="#|url\(#)')
-_PAPER = re.compile(r'<g id="patch_1">.*?</g>', re.DOTALL)
+_PLACES = re.compile(r' (?:d|x|y)="[^"]*"')
+_DECIMALS = re.compile(r"(\d\.\d\d)\d+")  # more than a screen or printer shows; not of scales, which multiply
 
 
 def inline_svg(figure: Figure, prefix: str) -> str:
@@ -32,7 +33,7 @@ def inline_svg(figure: Figure, prefix: str) -> str:
     text = _NAME.sub(rf"\g<1>{prefix}-", _COLOUR.sub(_mixed, text))
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = re.sub(r' (width|height)="[\d.]+pt"', "", text, count=2)
-    return re.sub(r"(\d\.\d\d)\d+", r"\1", text)
+    return _PLACES.sub(lambda found: _DECIMALS.sub(r"\1", found[0]), text)
 
 
 def _draw_many_points_as_picture(figure: Figure) -> None:

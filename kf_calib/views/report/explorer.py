@@ -40,9 +40,7 @@ def explorer(first: Calibration, others: Mapping[str, Floats]) -> Explorer:
                 "gimbals_deg": np.degrees([dwell.recorded_pose for dwell in dwells]) if first.bench.axes else None,
                 "sigma_ug": mean_sigmas(first) / MICRO_G,
                 "drivers": [_driver(each) for each in drivers_of(first)],
-                "models": [
-                    {"name": name, "residual_ug": left_mps2 / MICRO_G} for name, left_mps2 in models.items()
-                ],
+                "models": [{"name": name, "residual_ug": left_mps2 / MICRO_G} for name, left_mps2 in models.items()],
             }
         )
     )

@@ -42,7 +42,8 @@ def _facts(measured: Measured, result: Calibration) -> Iterator[tuple[str, str]]
     yield "Begun", measured.date
     for key, words in _NOTES.items():
         yield words, bench.notes.get(key, "")
-    yield "Readings", f"{tally.used - tally.gated} of {tally.read} used; {tally.moving} moving, {tally.settling} settling"
+    used = tally.used - tally.gated
+    yield "Readings", f"{used} of {tally.read} used; {tally.moving} moving, {tally.settling} settling"
     last = dwells[-1].end_s
     yield "Dwells", f"{len(dwells)} in {len(orientations(dwells))} orientations, over {_duration(last)}"
     yield "Gimbals", _gimbals(result)

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from base64 import b64encode
 from dataclasses import dataclass
-from functools import cache
-from importlib import metadata, resources
+from importlib import metadata
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from kf_calib.support.output_files import write_whole
 from kf_calib.views.report.explorer import Explorer
 from kf_calib.views.report.parts import Paragraph, Table
+from kf_calib.views.report.templates import filled_in, own_text
 
 Standing = Literal["agrees", "disagrees", "open"]
 
@@ -65,7 +63,8 @@ class Page:
     def html(self) -> str:
         """The whole page; what comes from recordings is escaped, and no script runs but the page's own."""
         scripts = [own_text("uPlot.iife.min.js"), own_text("explorer.js")]
-        return environment().get_template("page.html").render(
+        return filled_in(
+            "page.html",
             page=self,
             sections=[each for each in self.sections if each.parts],
             version=metadata.version("kf_calib"),
@@ -78,29 +77,6 @@ class Page:
 def save(page: Page, path: Path) -> None:
     """Write a page as one file; the same page is the same file. Raises InputError where it cannot be written."""
     write_whole(path, page.html.encode())
-
-
-@cache
-def environment() -> Environment:
-    """What fills in the templates of this package; everything is escaped that is not ``Markup``."""
-    made = Environment(
-        loader=PackageLoader("kf_calib.views.report", ""), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    made.filters["json"] = _json
-    made.filters["markup"] = Markup
-    return made
-
-
-def own_text(name: str) -> str:
-    """A text file of this package."""
-    return resources.files("kf_calib.views.report").joinpath(name).read_text(encoding="utf-8")
-
-
-def _json(value: Any) -> Markup:
-    """Return JSON for a script element: no text in it can end the element."""
-    text = json.dumps(value, allow_nan=False, separators=(",", ":"))
-    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
 
 
 def _digest(script: str) -> str:

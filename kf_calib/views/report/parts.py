@@ -1,4 +1,4 @@
-"""What the console prints, part by part, for a page: paragraphs and tables with numbers aligned at the decimal point."""
+"""What the console prints, part by part, for a page: paragraphs, and tables with decimal points in line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from kf_calib.views.tables import Bar
 from kf_calib.views.tables import Table as ConsoleTable
 from kf_calib.views.terminal import Note
 
-_NUMBER = re.compile(r"(?P<whole>.*?\d)(?P<fraction>\.\d+)?(?P<rest>\D.*)?", re.DOTALL)
+_NUMBER = re.compile(r"(?P<whole>.*?\d)(?P<fraction>\.\d+)?(?P<power>e[-+]\d+)?(?P<rest>[^\d.].*)?", re.DOTALL)
+
+_MINUS = re.compile(r"(?<![\w.])-(?=\d)")  # a hyphen that is a minus, which is as wide as a plus
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ def _column(cells: Iterable[RenderableType], is_number: bool) -> list[Cell]:
     """Return the cells of a column; those of numbers with the room that keeps their decimal points in line."""
     if not is_number:
         return [Cell(_said(each), is_bar=isinstance(each, Bar)) for each in cells]
-    split = [_split(_said(each)) for each in cells]
+    split = [_split(_MINUS.sub("−", _said(each))) for each in cells]
     fraction = max((each[1] for each in split), key=len, default="")
     rest = max((each[2] for each in split), key=len, default="")
     return [Cell(own[0], own[1], fraction[len(own[1]) :], own[2], rest[len(own[2]) :]) if own[0] else Cell("")
@@ -103,8 +105,7 @@ def _split(text: str) -> tuple[str, str, str]:
     found = _NUMBER.fullmatch(text)
     if found is None:  # words, such as "not seen"
         return text, "", ""
-    whole, fraction, rest = found["whole"], found["fraction"] or "", found["rest"] or ""
-    return (whole + rest, "", "") if rest.startswith("e") and not fraction else (whole, fraction, rest)
+    return found["whole"], (found["fraction"] or "") + (found["power"] or ""), found["rest"] or ""
 
 
 def _said(cell: RenderableType) -> str:
