@@ -40,7 +40,7 @@ def page_of(result: Any, measured: Sequence[Measured], commands: Sequence[str], 
 @page_of.register
 def _(found: Diagnosis, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
     return Page(
-        measured[0].name, "Calibration report", _standing(found.test.consistent),
+        measured[0].name, "Calibration report", *_standing(found.test.consistent),
         (diagnosis.verdict(found), *remarks), (Facts("", tuple(facts(measured[0], found.before))),),
         (
             _drawn("Residuals", found, "found"),
@@ -61,7 +61,7 @@ def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str],
     start, last = state.start.before, state.result
     explained = {f"{last.model.sum}": Explanation(state.effects, start, last, True).left_mps2} if state.steps else {}
     return Page(
-        measured[0].name, "Improvement of the model", _standing(state.found.test.consistent),
+        measured[0].name, "Improvement of the model", *_standing(state.found.test.consistent),
         (stopped.text, *remarks), (Facts("", tuple(facts(measured[0], last))),),
         (
             Section("The error, step by step", tuple(steps)),
@@ -80,7 +80,7 @@ def _(compared: Comparison, measured: Sequence[Measured], commands: Sequence[str
     result = compared.result
     said = f"Filter, filterpy and batch least squares differ by at most {compared.max_difference_sigma:.1e} σ."
     return Page(
-        measured[0].name, "Filter against batch", _standing(result.consistency.consistent),
+        measured[0].name, "Filter against batch", *_standing(result.consistency.consistent),
         (said, console.verdict(result), *remarks), (Facts("", tuple(facts(measured[0], result))),),
         (
             Section("Time, memory and difference", _in_text(console.comparison_table(compared), with_notes=True)),
@@ -101,27 +101,35 @@ def _(pair: SideBySide, measured: Sequence[Measured], commands: Sequence[str], r
              for each, own in zip(both, recordings, strict=True)]  # fmt: skip
     told = [f"{name}: {diagnosis.verdict(each)}" for name, each in zip(names, both, strict=True)]
     table = side_by_side.difference_table(pair.differences, names[0], names[1])
-    each_run = [
-        section
-        for k, (name, each) in enumerate(zip(names, both, strict=True))
-        for section in (
-            _drawn(f"{name}: residuals", each, f"found{k}"),
-            Section(f"{name}: explore the residuals", (_explorer_of(each),)),
-            Section(f"{name}: suspects, and what this run could show", _evidence(each)),
-            _warnings(each.before.warnings, f"{name}: warnings"),
-        )
-    ]
+    standing, headline = _standing(pair.second.test.consistent)
+    measurements = [Facts("" if pair.same_recording else name, tuple(facts(own, each.before)))
+                    for name, own, each in zip(names, recordings, both, strict=True)]  # fmt: skip
     return Page(
         measured[0].name if pair.same_recording else f"{names[1]} beside {names[0]}", "Side by side",
-        _standing(pair.second.test.consistent), (side_by_side.verdict(pair), *told, *remarks),
-        tuple(Facts(name, tuple(facts(own, each.before)))
-              for name, own, each in zip(names, recordings, both, strict=True)),
-        (Section("Parameters", tuple(parts_of(table))), *each_run), tuple(commands),
+        standing, f"{names[1]}: {headline[0].lower()}{headline[1:]}", (side_by_side.verdict(pair), *told, *remarks),
+        tuple(measurements[1:] if pair.same_recording else measurements),
+        (
+            Section("Difference of the parameters", tuple(parts_of(table))),
+            *(_run(name, each, f"found{k}-") for k, (name, each) in enumerate(zip(names, both, strict=True))),
+        ), tuple(commands),
     )  # fmt: skip
 
 
-def _standing(consistent: bool | None) -> Standing:
-    return "open" if consistent is None else "agrees" if consistent else "disagrees"
+def _run(name: str, found: Diagnosis, prefix: str) -> Section:
+    """Return all of one diagnosis as a section."""
+    parts = (*_drawn("", found, prefix).parts, _explorer_of(found), *_evidence(found))
+    return Section(name, (*parts, *_warnings(found.before.warnings).parts))
+
+
+_HEADLINES: dict[bool | None, tuple[Standing, str]] = {
+    True: ("agrees", "Model and measurements agree"),
+    False: ("disagrees", "Model and measurements disagree"),
+    None: ("open", "There is nothing to judge the model by"),
+}
+
+
+def _standing(consistent: bool | None) -> tuple[Standing, str]:
+    return _HEADLINES[consistent]
 
 
 def _drawn(title: str, result: object, prefix: str) -> Section:

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import io
 import re
+from base64 import b64decode, b64encode
 
-from matplotlib.collections import LineCollection
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.collections import Collection
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from PIL import Image
 
 from kf_calib.views.figures.style import content_of
 
-_MANY = 3000  # points of a figure, above which those of larger panels are drawn as a picture: the file stays small
-_OF_PANEL = 60
-_PICTURE_DPI = 220
-_COLOUR = re.compile(r"(fill|stroke|stop-color): (#[0-9a-f]{6})")
+_LARGE = 350_000  # characters of an SVG, above which its points are drawn as a picture
+_MANY = 60  # points of one kind in a panel that are
+_PICTURE_DPI = 150
+_COLOUR = re.compile(r"\b(fill|stroke|stop-color): #([0-9a-f]{6})\b")
+_PICTURE = re.compile(r"(?<=data:image/png;base64,)[\w+/=\s]+")
+_SHADES = 64  # of a picture of points, which are few colours and their edges
 _NAME = re.compile(r'(\bid="|href="#|url\(#)')
 _PLACES = re.compile(r' (?:d|x|y)="[^"]*"')
 _DECIMALS = re.compile(r"(\d\.\d\d)\d+")  # more than a screen or printer shows; not of scales, which multiply
@@ -27,33 +36,54 @@ def inline_svg(figure: Figure, prefix: str) -> str:
     figure.patch.set_visible(False)
     for axes in figure.axes:
         axes.patch.set_visible(False)
-    _draw_many_points_as_picture(figure)
+    text = _element(figure, prefix)
+    if len(text) > _LARGE:
+        for axes in figure.axes:
+            for artist in axes.get_children():
+                artist.set_rasterized(_is_of_many_points(artist))
+        text = _element(figure, prefix)
+    return text
+
+
+def _element(figure: Figure, prefix: str) -> str:
+    """Return the ``svg`` element, as wide as its place, with the colours that it uses defined in its style."""
     text = content_of(figure, "svg", _PICTURE_DPI).decode()
-    text = text[text.index("<svg") :].strip()
-    text = _NAME.sub(rf"\g<1>{prefix}-", _COLOUR.sub(_mixed, text))
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = re.sub(r' (width|height)="[\d.]+pt"', "", text, count=2)
-    return _PLACES.sub(lambda found: _DECIMALS.sub(r"\1", found[0]), text)
+    text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :].strip(), flags=re.DOTALL)
+    text = re.sub(r' (width|height)="[\d.]+pt"', "", text, count=2).replace("xlink:href", "href")
+    colours = sorted({colour for _, colour in _COLOUR.findall(text)})
+    mixed = "; ".join(f"--c{colour}: {_mixture(colour)}" for colour in colours)
+    text = _NAME.sub(rf"\g<1>{prefix}-", _COLOUR.sub(r"\1: var(--c\2)", text))
+    text = _PICTURE.sub(_smaller, _PLACES.sub(lambda found: _DECIMALS.sub(r"\1", found[0]), text))
+    return text.replace("<svg", f'<svg style="{mixed}"', 1)
 
 
-def _draw_many_points_as_picture(figure: Figure) -> None:
-    lines = [line for axes in figure.axes for line in axes.lines]
-    if sum(len(line.get_xdata()) for line in lines) <= _MANY:  # type: ignore[arg-type]  # arrays, as they were given
-        return
-    for line in lines:
-        line.set_rasterized(len(line.get_xdata()) > _OF_PANEL)  # type: ignore[arg-type]
-    for axes in figure.axes:
-        for bars in axes.collections:
-            if isinstance(bars, LineCollection):
-                bars.set_rasterized(len(bars.get_segments()) > _OF_PANEL)
+def _smaller(found: re.Match[str]) -> str:
+    """Return a PNG in base64 with no more shades than points need."""
+    memory = io.BytesIO()
+    picture = Image.open(io.BytesIO(b64decode(found[0]))).convert("RGBA")
+    picture.quantize(_SHADES, Image.Quantize.FASTOCTREE).save(memory, "PNG", optimize=True)
+    return b64encode(memory.getvalue()).decode()
 
 
-def _mixed(found: re.Match[str]) -> str:
-    """Return a colour as itself, for old browsers, and then as a mixture of the page's colours."""
-    what, colour = found.groups()
-    parts = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
-    if max(parts) - min(parts) <= 8:
-        mixture = f"var(--ink) {100 - sum(parts) / 7.65:.0f}%, var(--paper)"
-    else:
-        mixture = f"{colour} var(--keep), #ffffff"
-    return f"{what}: {colour}; {what}: color-mix(in srgb, {mixture})"
+def _is_of_many_points(artist: Artist) -> bool:
+    """Tell whether an artist is of many points in a colour: greys must follow the page, and a curve is small."""
+    if isinstance(artist, Line2D):
+        has_marks = artist.get_marker() not in ("None", "none", "", " ", None)
+        return has_marks and np.size(artist.get_xdata()) > _MANY and not _is_grey(artist.get_color())
+    if isinstance(artist, Collection):
+        colours = [*artist.get_edgecolor(), *artist.get_facecolor()]
+        count = max(len(artist.get_paths()), len(artist.get_offsets()))
+        return count > _MANY and not all(map(_is_grey, colours))
+    return False
+
+
+def _is_grey(colour: object) -> bool:
+    return bool(np.ptp(to_rgb(colour)) < 0.04)  # type: ignore[arg-type]  # whatever an artist has for a colour
+
+
+def _mixture(colour: str) -> str:
+    """Return a colour as a mixture of the page's colours."""
+    parts = [int(colour[k : k + 2], 16) for k in (0, 2, 4)]
+    if _is_grey(f"#{colour}"):
+        return f"color-mix(in srgb, var(--ink) {100 - sum(parts) / 7.65:.0f}%, var(--paper))"
+    return f"color-mix(in srgb, #{colour} var(--keep), #ffffff)"

@@ -31,7 +31,7 @@ function explore(root) {
     const driver = run.drivers[form.driver.value], model = run.models[form.model.value];
     const inSigma = form.unit.value === "sigma", found = [];
     for (let i = 0; i < 3; i++) if (form["a" + (i + 1)].checked) run.dwells.forEach((number, d) => {
-      const sigma = run.sigma_ug[d][i], left = model.residual_ug[d][i], x = driver.values[d][i];
+      const sigma = run.sigma_ug[d][i], left = model.residual_ug[d][i], x = Array.isArray(driver.values[d]) ? driver.values[d][i] : driver.values[d];
       if (left === null || x === null || !(sigma > 0)) return;
       found.push({x, y: inSigma ? left / sigma : left, bar: inSigma ? 1 : sigma, left, sigma, d, i});
     });

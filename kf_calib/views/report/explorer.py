@@ -17,7 +17,7 @@ from kf_calib.views.json import clean
 MICRO_G = 9.80665e-6  # m/s^2
 _UNITS = {"rad": ("deg", 180.0 / np.pi), "m/s^2": ("g", 1.0 / 9.80665), "s": ("min", 1.0 / 60.0),
           "K/s": ("K/h", 3600.0)}  # fmt: skip
-_DIGITS = 6  # significant ones, which a page needs
+_DIGITS = 5  # significant ones, which a page needs
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,8 @@ def _driver(each: Driver) -> dict[str, Any]:
     """Return a driver with its values in the unit in which people read them."""
     unit, scale = _UNITS.get(each.unit, (each.unit, 1.0))
     explains = f"explains {each.share:.0%}" if each.share >= 0.005 and each.p_value <= 0.01 else ""
-    return {"name": each.words, "unit": unit, "explains": explains, "values": each.values * scale}
+    of_all = each.values[:, 0] if np.ptp(each.values, axis=1).max() == 0.0 else each.values  # such as an angle
+    return {"name": each.words, "unit": unit, "explains": explains, "values": of_all * scale}
 
 
 def _short(value: Any) -> Any:

@@ -49,11 +49,13 @@ class Facts:
 
 @dataclass(frozen=True)
 class Page:
-    """A page. standing: whether model and measurements agree. verdict: what is found, in words, a paragraph each."""
+    """A page. standing: whether model and measurements agree, which the headline says in words. verdict: what is found,
+    a paragraph each."""
 
     title: str
     what: str
     standing: Standing
+    headline: str
     verdict: tuple[str, ...]
     facts: tuple[Facts, ...]
     sections: tuple[Section, ...]

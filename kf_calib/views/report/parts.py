@@ -40,7 +40,8 @@ class Cell:
     fraction_room: str = ""
     rest: str = ""
     rest_room: str = ""
-    is_bar: bool = False
+    bar: float = 0.0
+    """Length of a bar, in characters, in place of text."""
 
     def __str__(self) -> str:
         return self.whole + self.fraction + self.rest
@@ -92,7 +93,7 @@ def _table(drawn: ConsoleTable) -> Table:
 def _column(cells: Iterable[RenderableType], is_number: bool) -> list[Cell]:
     """Return the cells of a column; those of numbers with the room that keeps their decimal points in line."""
     if not is_number:
-        return [Cell(_said(each), is_bar=isinstance(each, Bar)) for each in cells]
+        return [Cell("", bar=each.length) if isinstance(each, Bar) else Cell(_said(each)) for each in cells]
     split = [_split(_MINUS.sub("−", _said(each))) for each in cells]
     fraction = max((each[1] for each in split), key=len, default="")
     rest = max((each[2] for each in split), key=len, default="")
