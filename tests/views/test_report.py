@@ -103,7 +103,11 @@ def test_nothing_is_wider_than_the_page(shown: Any) -> None:
 def test_the_explorer_shows_what_is_chosen(shown: Any, found: kf_calib.Diagnosis, told: list[str]) -> None:
     place, canvas = shown.locator(".plot").first, shown.locator(".plot canvas").first
     pictures = [canvas.screenshot()]
-    for name, choice in (("driver", {"index": 3}), ("model", {"label": "with hysteresis"}), ("unit", {"value": "sigma"})):
+    for name, choice in (
+        ("driver", {"index": 3}),
+        ("model", {"label": "with hysteresis"}),
+        ("unit", {"value": "sigma"}),
+    ):
         shown.locator(f"select[name={name}]").select_option(**choice)
         pictures.append(place.locator("canvas").screenshot())
     shown.locator("input[name=a2]").uncheck()

@@ -71,6 +71,7 @@ class Page:
             sections=[each for each in self.sections if each.parts],
             version=metadata.version("kf_calib"),
             styles=[Markup(own_text(name)) for name in ("uPlot.min.css", "style.css")],
+            licence=Markup(own_text("uPlot.LICENSE")),
             scripts=[Markup(each) for each in scripts],
             allowed=Markup(" ".join(f"'sha256-{_digest(each)}'" for each in scripts)),
         )
