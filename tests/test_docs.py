@@ -78,7 +78,8 @@ def test_commands_effects_and_public_names_are_all_there(pages: dict[Path, Page]
     assert {f"kf_calib.{name}" for name in kf_calib.__all__} <= anchors["api.html"]
     listed = json.loads(_printed("effects", "--json"))["effects"]
     assert {each["effect"].partition(":")[0] for each in listed} <= anchors["effects.html"]
-    commands = {"demo", "simulate", "record", "live", "replay", "compare", "diagnose", "improve", "report", "plan", "paper"}
+    commands = {"demo", "simulate", "record", "live", "replay", "compare", "diagnose", "improve", "report", "plan",
+                "paper"}  # fmt: skip
     assert {f"kf-calib-{name}" for name in commands} <= anchors["command_line.html"]
 
 
