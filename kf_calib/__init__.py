@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from kf_calib.bench.bench import Bench
     from kf_calib.diagnosis.missing_effect import diagnose
+    from kf_calib.diagnosis.refits import Refits
     from kf_calib.diagnosis.results import Diagnosis
     from kf_calib.diagnosis.stepwise_selection import Improvement, improve
     from kf_calib.errors import InputError, KfCalibError, UnobservableError
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from kf_calib.online.session import Session
     from kf_calib.sources.files.recorder import Recorder
     from kf_calib.sources.files.recording import Recording as open_recording
+    from kf_calib.support.units import shown_in
     from kf_calib.views import figures as plot
     from kf_calib.views.rerun import save as save_view
 
@@ -53,6 +55,7 @@ _HOMES = {
     "diagnose": ("diagnosis.missing_effect", "diagnose"),
     "Improvement": ("diagnosis.stepwise_selection", "Improvement"),
     "improve": ("diagnosis.stepwise_selection", "improve"),
+    "Refits": ("diagnosis.refits", "Refits"),
     "InputError": ("errors", "InputError"),
     "KfCalibError": ("errors", "KfCalibError"),
     "UnobservableError": ("errors", "UnobservableError"),
@@ -61,6 +64,7 @@ _HOMES = {
     "Recorder": ("sources.files.recorder", "Recorder"),
     "open_recording": ("sources.files.recording", "Recording"),
     "save_view": ("views.rerun", "save"),
+    "shown_in": ("support.units", "shown_in"),
     "Watch": ("online.sequential_test", "Watch"),
 }
 
@@ -69,8 +73,8 @@ _SHOWING = ("views.notebook",)
 
 __all__ = [
     "Bench", "Calibration", "Diagnosis", "Improvement", "InputError", "KfCalibError", "Parameter", "Recorder",
-    "Running", "Session", "Settings", "UnobservableError", "Watch", "calibrate", "compare", "diagnose", "improve",
-    "open_recording", "plot", "save_view",
+    "Refits", "Running", "Session", "Settings", "UnobservableError", "Watch", "calibrate", "compare", "diagnose",
+    "improve", "open_recording", "plot", "save_view", "shown_in",
 ]  # fmt: skip
 
 

@@ -32,6 +32,7 @@ from kf_calib.cli.options import (
     settings_of,
     show,
     strict_option,
+    units_option,
 )
 from kf_calib.cli.pictures import Pictures, figures_of, picture_options
 from kf_calib.cli.report import measured_of, report_option, save_report
@@ -55,6 +56,7 @@ STEPS = "Steps"
 @save_model_option
 @overwrite_option
 @strict_option
+@units_option
 @json_option
 @click.pass_context
 def replay(
@@ -95,6 +97,7 @@ def replay(
 @picture_options
 @report_option
 @overwrite_option
+@units_option
 @json_option
 def compare(recording: Path, report: Path | None, overwrite: bool, as_json: bool, **options: Any) -> None:
     """Block engine, filterpy and batch least squares on the same recording: differences, time, memory."""
@@ -132,6 +135,7 @@ def compare(recording: Path, report: Path | None, overwrite: bool, as_json: bool
 )
 @recording_options
 @filter_options
+@units_option
 @json_option
 def list_effects(names: tuple[str, ...], recording: Path | None, as_json: bool, **options: Any) -> None:
     """The effects a model may have: all of the catalogue and your own, or those NAMEd (formulas too) in detail.
@@ -185,18 +189,20 @@ def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, option
 @picture_options
 @overwrite_option
 @strict_option
+@units_option
 @json_option
 @click.pass_context
 def diagnose(ctx: click.Context, recording: Path, overwrite: bool, strict: bool, as_json: bool, **options: Any) -> None:
     """Which physical effect is missing in the model: verdict, suspects, what this run cannot see, where to go next."""
     from kf_calib.diagnosis.missing_effect import diagnose as run
+    from kf_calib.diagnosis.refits import Refits
     from kf_calib.estimation.calibration import calibrate
     from kf_calib.views import diagnosis as views
 
     outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     source, settings = opened(recording, options)
     with progress(f"diagnosing {recording.name}", as_json) as tick:
-        found = run(calibrate(source, settings, tick))
+        found = run(calibrate(source, settings, tick), Refits(source))
     if as_json:
         print_json(views.diagnosis_object(found))
     else:
@@ -232,6 +238,7 @@ def diagnose(ctx: click.Context, recording: Path, overwrite: bool, strict: bool,
 @report_option
 @overwrite_option
 @strict_option
+@units_option
 @json_option
 @click.pass_context
 def improve(
@@ -251,7 +258,9 @@ def improve(
     **options: Any,
 ) -> None:  # fmt: skip
     """Add the effects that are missing, one after another, and see the error fall, until there is a reason to stop."""
+    from kf_calib.cli.improvement_dialogue import dialogue
     from kf_calib.diagnosis import nested_cross_validation, selection_journal, stepwise_selection
+    from kf_calib.diagnosis.refits import Refits
     from kf_calib.estimation.calibration import calibrate
     from kf_calib.views import improvement as views
 
@@ -275,18 +284,16 @@ def improve(
 
         difference = None
         with progress(f"improving on {recording.name}", as_json) as tick:
-            start = calibrate(recording_of(recording, options), settings, tick)
+            source = recording_of(recording, options)
+            start, refits = calibrate(source, settings, tick), Refits(source)
             if earlier is not None:
-                state, difference = selection_journal.replayed(earlier, start)
+                state, difference = selection_journal.replayed(earlier, start, refits)
             elif interactive:
-                state = stepwise_selection.begin(start)
+                state = stepwise_selection.begin(start, refits)
             else:
-                state = stepwise_selection.improve(start, accept_first, keep)
+                state = stepwise_selection.improve(start, accept_first, keep, refits)
         if interactive:
-            state = views.session(
-                state, lambda text, usual: click.prompt(text, default=usual or None), show, keep,
-                lambda: progress("improving"),
-            )  # fmt: skip
+            state = dialogue(state, refits, keep)
         with progress("holding out orientations", as_json or not honest) as tick:
             checked = nested_cross_validation.nested_cross_validation(start, on_fold=tick) if honest else None
         if as_json:

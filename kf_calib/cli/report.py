@@ -19,14 +19,15 @@ from kf_calib.cli.options import (
     examples,
     filter_options,
     json_option,
+    opened,
     overwrite_option,
     print_json,
     progress,
     recording_of,
     recording_options,
-    settings_of,
     show,
     strict_option,
+    units_option,
 )
 
 if TYPE_CHECKING:
@@ -56,6 +57,7 @@ report_option = output_option(
     help="Where the page is saved.",
 )  # fmt: skip
 @overwrite_option
+@units_option
 @strict_option
 @json_option
 @click.pass_context
@@ -127,11 +129,12 @@ def measured_of(recording: Path, options: dict[str, Any]) -> Measured:
 def _diagnosed(recording: Path, options: dict[str, Any], quiet: bool) -> tuple[Diagnosis, Measured]:
     """Return the diagnosis of a recording, and what a page says of its file."""
     from kf_calib.diagnosis.missing_effect import diagnose
+    from kf_calib.diagnosis.refits import Refits
     from kf_calib.estimation.calibration import calibrate
 
-    measured, settings = measured_of(recording, options), settings_of(options)
+    measured, (source, settings) = measured_of(recording, options), opened(recording, options)
     with progress(f"diagnosing {recording.name}", quiet) as tick:
-        return diagnose(calibrate(recording_of(recording, options), settings, tick)), measured
+        return diagnose(calibrate(source, settings, tick), Refits(source)), measured
 
 
 def _programs_of(model: Path | None) -> list[Path]:

@@ -156,18 +156,13 @@ def _trend_beside(fitted: Fit, family: Family) -> Trend | None:
 def families(fitted: Fit, known: Sequence[Effect] = (), frame: Frame | None = None) -> list[Family]:
     """All families of formulas, each tested on what the model leaves.
 
-    The result is kept with the fit, so that it is computed once.
-
     fitted: the fit. known: effects with which the formulas are compared. frame: with the columns of most of these
     effects.
     """
-    key = tuple((str(effect), effect.value) for effect in known)
-    if key not in fitted.families:
-        frame = frame or Frame(fitted.carried, fitted.noise.judging, known)
-        had = [effect for effect in known if frame.has(effect)]
-        others = [effect for effect in known if not frame.has(effect)]
-        fitted.families[key] = _tried(fitted, frame.only(had), others)
-    return fitted.families[key]
+    frame = frame or Frame(fitted.carried, fitted.noise.judging, known)
+    had = [effect for effect in known if frame.has(effect)]
+    others = [effect for effect in known if not frame.has(effect)]
+    return _tried(fitted, frame.only(had), others)
 
 
 def _tried(fitted: Fit, frame: Frame, others: Sequence[Effect]) -> list[Family]:

@@ -7,8 +7,9 @@ import numpy as np
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.scatter_hypothesis import dwell_noise_is_stated
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
-from kf_calib.estimation.fit import WALK
+from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
 from kf_calib.estimation.results import format_p
+from kf_calib.support.units import shown
 
 
 def verdict_in_words(found: Diagnosis) -> str:
@@ -64,6 +65,19 @@ def verdict_in_words(found: Diagnosis) -> str:
     )
 
 
+def second_pass_in_words(found: Diagnosis) -> str:
+    """A sentence on what only a second pass over the readings could judge; "" where nothing is left to it."""
+    names = [suspect.name for suspect in found.suspects if not holds_its_oscillation(suspect.refit.fit)]
+    if found.test.vibration and not found.before.fit.dwells[0].averaged:
+        names.append("the lines in their spectrum")
+    if not names:
+        return ""
+    return (
+        f" A second pass over the readings is needed to judge {' and '.join(names)}: diagnose the recording, or give "
+        "its Refits to diagnose."
+    )
+
+
 def _scattering(found: Diagnosis) -> str:
     """Return the words for scatter from dwell to dwell as an explanation."""
     return f"dwells that scatter by more than is {'stated' if dwell_noise_is_stated(found.before) else 'estimated'}"
@@ -74,12 +88,12 @@ def _size(found: Diagnosis) -> str:
     assert found.after is not None
     parameters = found.after.parameters
     first = next(each for each in found.after.model.effects if str(each) == found.missing[0])
-    sized = [parameters[c.symbol] for c in ([WALK] if first.walks else first.coefficients)]
-    shown = [max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or np.inf))]
-    shown += [parameters[first.unknown.symbol]] if first.unknown else []
+    sized = [parameters[c.symbol] for c in first.parameters]
+    told = [max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or np.inf))]
+    told += [parameters[first.unknown.symbol]] if first.unknown else []
     return "".join(
-        f", {p.symbol} = {p.value * p.per_si:.3g} ± {p.sigma * p.per_si:.2g} {p.shown_unit}"
-        for p in shown
+        f", {p.symbol} = {shown(p).number(p.value)} ± {shown(p).text(p.sigma, 2)}"
+        for p in told
         if p.value is not None and p.sigma
     )
 

@@ -17,19 +17,25 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.effects.stimulus import Stimulus
-
-G = 9.80665
+from kf_calib.support.units import field_unit
 
 
 @dataclass(frozen=True)
 class Coefficient:
-    """symbol, SI unit; scale: a size a user would call large, for a prior; shown_unit, per_si: a unit of the field."""
+    """symbol, SI unit; scale: a size a user would call large, for a prior.
+
+    shown_unit, per_si: a unit of the field, and how many of it make one SI unit; left out, they are those of the table
+    in ``support.units``.
+    """
 
     symbol: str
     unit: str
     scale: float
-    shown_unit: str
-    per_si: float
+    shown_unit: str = ""
+    per_si: float = 1.0
+
+    def __post_init__(self) -> None:
+        _complete(self)
 
 
 @dataclass(frozen=True)
@@ -43,8 +49,11 @@ class Unknown:
     unit: str
     low: float
     high: float
-    shown_unit: str
-    per_si: float
+    shown_unit: str = ""
+    per_si: float = 1.0
+
+    def __post_init__(self) -> None:
+        _complete(self)
 
     def grid(self, ratio: float = 1.5) -> Floats:
         """Values from low to high in equal steps of the logarithm, each at most ``ratio`` times the one before."""
@@ -52,12 +61,20 @@ class Unknown:
         return np.geomspace(self.low, self.high, count)
 
 
+def _complete(own: Coefficient | Unknown) -> None:
+    """Fill in the unit of the field where none was given."""
+    if not own.shown_unit:
+        unit = field_unit(own.unit)
+        object.__setattr__(own, "shown_unit", unit.label)  # the way for a frozen dataclass
+        object.__setattr__(own, "per_si", unit.per_si)
+
+
 class Effect(ABC):
     """A physical effect the readings may contain besides the twelve parameters.
 
     unknown: a constant inside the columns; ``value`` is where it stands, and ``at(value)`` the effect with another.
     smooth: the columns change smoothly with it; where not it is no state, and is averaged over its likelihood.
-    walks: the biases take a random walk (process noise), its intensity is estimated by likelihood.
+    intensity: of the random walk (process noise) that the biases take, estimated by likelihood; None: they take none.
     dynamic: it shows in slews only, so these are evaluated too.
     oscillates: its columns may be faster than a piece of a dwell, so the dwells are folded on a carrier, and
     ``columns`` gives the part that the stimulus asks for (``Stimulus.part``).
@@ -71,7 +88,7 @@ class Effect(ABC):
     confused_with: ClassVar[str] = ""
     unknown: ClassVar[Unknown | None] = None
     smooth: ClassVar[bool] = True
-    walks: ClassVar[bool] = False
+    intensity: ClassVar[Coefficient | None] = None
     dynamic: ClassVar[bool] = False
     oscillates: ClassVar[bool] = False
     averages: ClassVar[bool] = False
@@ -97,6 +114,40 @@ class Effect(ABC):
     @abstractmethod
     def columns(self, s: Stimulus) -> Floats:
         """What each accelerometer reads more per unit of each coefficient: (m, 3, q), m/s^2."""
+
+    @property
+    def parameters(self) -> tuple[Coefficient, ...]:
+        """The parameters that state its size: its coefficients, or the intensity of a random walk."""
+        return self.coefficients if self.intensity is None else (self.intensity,)
+
+    @property
+    def states(self) -> tuple[Coefficient, ...]:
+        """The coefficients that are states: its own and, where its columns have a derivative by it, its unknown."""
+        own = self.unknown
+        if own is None or not self.smooth:
+            return self.coefficients
+        return *self.coefficients, Coefficient(own.symbol, own.unit, 1.0, own.shown_unit, own.per_si)
+
+    @property
+    def walks(self) -> bool:
+        """Whether the biases take a random walk."""
+        return self.intensity is not None
+
+    @property
+    def no_columns(self) -> str:
+        """Why dwells show no columns of it, in words; empty where they do."""
+        if self.dynamic:
+            return "shows in slews only, which are not looked at here"
+        return "is noise of the biases, not a column: fit it to see it" if self.walks else ""
+
+    @property
+    def scannable(self) -> bool:
+        """Whether it shows in dwells at a coarse grid of its unknown: an oscillation needs its frequency, or a line."""
+        return not (self.no_columns or self.oscillates)
+
+    def shows_in(self, s: Stimulus) -> bool:
+        """Whether it has columns in the part of a carrier that the stimulus asks for."""
+        return not s.part or self.oscillates
 
     def grid(self, s: Stimulus) -> Floats:
         """Values of the unknown among which it is looked for first."""
@@ -132,16 +183,20 @@ class Effect(ABC):
 
 
 class SensorEffect(Effect):
-    """One coefficient for each accelerometer; ``terms`` (m, 3) is what each reads more per unit of its own."""
+    """One coefficient for each accelerometer; ``terms`` (m, 3) is what each reads more per unit of its own.
+
+    shown: a unit of the field and how many of it make one SI unit, where it is not that of ``support.units``.
+    """
 
     symbol: ClassVar[str]
     unit: ClassVar[str]
     scale: ClassVar[float]
-    shown: ClassVar[tuple[str, float]]
+    shown: ClassVar[tuple[str, float] | None] = None
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"{self.symbol}{i}", self.unit, self.scale, *self.shown) for i in (1, 2, 3))
+        shown = self.shown or field_unit(self.unit)
+        return tuple(Coefficient(f"{self.symbol}{i}", self.unit, self.scale, *shown) for i in (1, 2, 3))
 
     @abstractmethod
     def terms(self, s: Stimulus) -> Floats: ...

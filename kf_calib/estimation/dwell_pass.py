@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from kf_calib.estimation import setup_blunders
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import ReadingsMonitor
+from kf_calib.support.units import WORDS
 
 
 @dataclass
@@ -32,10 +34,14 @@ class Pass:
     folder: Folder = field(default_factory=Folder)
     watch: ReadingsMonitor = field(default_factory=ReadingsMonitor)
 
+    @cached_property
+    def model(self) -> Model:
+        """The model with the effects that the settings name."""
+        return Model.of(self.source.bench, self.settings.effects)
+
     def segmenter(self) -> Segmenter:
         """The segmenter for this source, which also returns slews if the model has effects that show in slews only."""
-        slews = bool(Model.of(self.source.bench, self.settings.effects).dynamic)
-        return Segmenter(self.source.bench, self.settings.stillness, self.tally, slews)
+        return Segmenter(self.source.bench, self.settings.stillness, self.tally, bool(self.model.dynamic))
 
     def rows(self) -> Iterator[Rows]:
         """Rows of all blocks of the source."""
@@ -43,9 +49,8 @@ class Pass:
 
     def rows_of(self, blocks: Iterable[Block]) -> Iterator[Rows]:
         """Rows of the given blocks, averaged over windows if the settings or the model's effects require it."""
-        model = Model.of(self.source.bench, self.settings.effects)
-        usual_s = window_average.WINDOW_S if model.averages else 0.0
-        window_s = 0.0 if model.oscillates else self.settings.window_s or usual_s
+        usual_s = window_average.WINDOW_S if self.model.averages else 0.0
+        window_s = 0.0 if self.model.oscillates else self.settings.window_s or usual_s
         return model_rows(blocks, self.source.bench, self.tally, self.settings.gate_sigma, window_s)
 
     def add(self, rows: Rows) -> None:
@@ -100,10 +105,9 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
     if 0.5 <= level <= 2.0:
         setup_blunders.refuse(dwells, bench)
         return
-    units = {"g": 1 / 9.80665, "mg": 1e3 / 9.80665, "ug": 1e6 / 9.80665}
     measured = level * bench.gravity_mps2
-    for unit, per_mps2 in units.items():
-        if 0.8 <= measured / (bench.gravity_mps2 * per_mps2) <= 1.25:
+    for unit in ("g", "mg", "ug"):
+        if 0.8 <= measured * WORDS["m/s^2"][unit] / bench.gravity_mps2 <= 1.25:
             raise InputError(
                 f"the readings have a norm of {measured:.4g} at rest, which is gravity in {unit}, not in m/s^2: "
                 f"state it with --accel-unit {unit}."

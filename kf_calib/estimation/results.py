@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
@@ -18,26 +18,25 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.cross_validation import HeldOut, held_out
 from kf_calib.estimation.dwell_columns import Carried, columns_of, means_of
-from kf_calib.estimation.fit import WALK, Fit
+from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import Noise, considered_information, steps
 from kf_calib.estimation.residual_table import residual_table, table_as
-from kf_calib.estimation.score_test import Frame
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings
 from kf_calib.support.printing import as_html, printed
-from kf_calib.support.tail_probabilities import f_tail
+from kf_calib.support.tail_probabilities import LEVEL, f_tail
 from kf_calib.support.threads import one_blas_thread
+from kf_calib.support.units import field_unit, shown
 
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # larger sigmas: not determined
-_SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
 
 
 @dataclass(frozen=True)
 class Parameter:
     """An estimated parameter and its sigma in SI units; both are None if the orientations do not determine it.
 
-    A deviation from nominal times ``per_si`` is in ``shown_unit``, the usual unit of the field.
+    A value times ``per_si`` is in ``shown_unit``, the unit of the field (``support.units``).
     """
 
     symbol: str
@@ -193,8 +192,8 @@ class OutlyingDwell:
         pose = self.dwell.recorded_pose
         axes = self.without.bench.axes
         at = f" (recorded at {', '.join(f'{angle:.4g}' for angle in np.degrees(pose))} deg)" if axes else ""
-        size = float(np.linalg.norm(self.error_mps2))
-        told = f"dwell {self.number}{at} alone does not fit: it is off by {size:.2g} m/s^2"
+        size = shown("m/s^2").text(float(np.linalg.norm(self.error_mps2)), 2)
+        told = f"dwell {self.number}{at} alone does not fit: it is off by {size}"
         if self.turns:
             told += f", as if {' or '.join(map(str, self.turns))}"
         elif axes:
@@ -217,19 +216,10 @@ class Calibration:
     residual_rms_mps2: float
     tally: Tally
     warnings: tuple[str, ...]
-    reread: Callable[..., Calibration] | None = field(default=None, repr=False, compare=False)
-    """Evaluates the same source again, for models that need the readings folded in another way."""
     readings: Readings = field(default_factory=Readings)
     """Defects of the readings, found independently of the model."""
     outlying: tuple[OutlyingDwell, ...] = ()
     """The dwell that alone does not fit, or several if any one of them could be the cause."""
-    frames: list[Frame] = field(default_factory=list[Frame], repr=False, compare=False)
-    """The candidates' whitened columns, shared by all models of the run."""
-
-    @cached_property
-    def refits(self) -> dict[tuple[str, ...], Calibration]:
-        """Cache of the models fitted by ``refitted``, by their effects."""
-        return {}
 
     @cached_property
     def held_out(self) -> HeldOut | None:
@@ -280,17 +270,17 @@ class Calibration:
             ),
             *((c.symbol, *own, 0.0, c.unit) for c, *own in zip(coefficients, effects, sigmas, strict=True)),
         ]
-        shown = [*(_SHOWN[unit] for unit in paper_parameters.UNITS), *((c.shown_unit, c.per_si) for c in coefficients)]
-        if self.model.walks:
+        units = [*map(field_unit, paper_parameters.UNITS), *((c.shown_unit, c.per_si) for c in coefficients)]
+        if (walk := self.model.intensity) is not None:
             intensity, spread = self.noise.walk_mps2_per_sqrt_s, self.noise.walk_spread
-            found.append((WALK.symbol, intensity, intensity * spread if spread else math.nan, 0.0, WALK.unit))
-            shown.append((WALK.shown_unit, WALK.per_si))
+            found.append((walk.symbol, intensity, intensity * spread if spread else math.nan, 0.0, walk.unit))
+            units.append((walk.shown_unit, walk.per_si))
         for effect in self.model.stepped:
             assert effect.unknown is not None
             constant, spread = effect.unknown, self.fit.spreads[str(effect)]
             sigma = effect.value * spread if spread < 1.0 else math.nan  # sigma over value
             found.append((constant.symbol, effect.value, sigma, 0.0, constant.unit))
-            shown.append((constant.shown_unit, constant.per_si))
+            units.append((constant.shown_unit, constant.per_si))
         return {
             symbol: Parameter(
                 symbol,
@@ -300,7 +290,7 @@ class Calibration:
                 float(expected),
                 *own,
             )
-            for (symbol, value, sigma, expected, unit), own in zip(found, shown, strict=True)
+            for (symbol, value, sigma, expected, unit), own in zip(found, units, strict=True)
         }
 
     def residuals(self, kind: Literal["numpy", "pandas", "polars"] = "numpy") -> Any:
@@ -397,7 +387,7 @@ def consistency(fitted: Fit) -> Consistency:
         return Consistency(statistic, 0, None, None)
     noise_dof = float(sum(max(dwell.count - 4, 1) for dwell in dwells) / noise.inflation.mean())
     p_value = f_tail(dof, max(noise_dof, 1.0), statistic / dof)
-    return Consistency(statistic, dof, p_value, p_value >= 0.01)
+    return Consistency(statistic, dof, p_value, p_value >= LEVEL)
 
 
 def format_p(p_value: float | None) -> str:

@@ -1,14 +1,13 @@
-"""A Kalman filter that adds and removes effects in the course of a run without a restart.
+"""A Kalman filter that tests effects in the course of a run without a restart.
 
-Its square-root information factor [R | z] carries the columns of more effects than its model has. The estimate of any
-choice of these effects is one small QR (``square_root_information.restrict``), and equals that of a filter that had
-run with this choice from the start. A dwell that closes is one update of the factor. An effect whose columns were not
-carried is added by building the factor again from the dwell factors.
+Its square-root information factor [R | z] carries the columns of more effects than its model has. The estimate of the
+model is one small QR (``square_root_information.restrict``), and equals that of a filter without the other columns. So
+is the test of every effect that is carried but not in the model. A dwell that closes is one update of the factor.
 
     running = Running.over(dwells, model, noise, state, candidates)
     running = running.after(dwell)               # as each dwell closes
-    running = running.with_effect("mine = a*T")  # added or removed at any time
     state, covariance, undetermined = running.solved()
+    running.scan.statistics                      # fall of chi-squared by each candidate
 
 The noise and the linearisation are those given. A constant inside the columns of an effect keeps its value, and
 effects that show in slews only are not supported. ``calibrate`` iterates or estimates all of these.
@@ -26,8 +25,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.effects import Effect, effect_named
-from kf_calib.errors import InputError
+from kf_calib.effects import Effect
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
@@ -107,26 +105,6 @@ class Running:
             carried = self.carried.followed_by(dwell)
         more = replace(self, carried=carried)
         return more._updated(more._rows([-1])[0], steps(carried.dwells[-2:], self.noise)[-1])
-
-    def with_effect(self, text: str) -> Running:
-        """The filter with an effect (a name or a formula) in its model; raises InputError where it cannot be added."""
-        effect = effect_named(text, self.carried.model.bench)
-        _ = self.model + effect  # raises where the model has the effect already
-        inside = (*self.inside, str(effect))
-        if str(effect) in self.carried.model.parts:
-            return replace(self, inside=inside)
-        every = self.carried.model + effect
-        at = np.concatenate([self.about, np.zeros(every.count - len(self.about))])
-        return replace(self, inside=inside, carried=Carried(self.dwells, every, at))._folded()
-
-    def without(self, name: str) -> Running:
-        """The filter with an effect removed from its model, whose columns are still carried.
-
-        Raises InputError where the effect is not in the model.
-        """
-        if name not in self.inside:
-            raise InputError(f"{name} is not in the model: it has {', '.join(self.inside) or 'no effects'}.")
-        return replace(self, inside=tuple(each for each in self.inside if each != name))
 
     def solved(self) -> tuple[Floats, Floats, Floats]:
         """State (p,) of the model, its covariance (p, p), and a basis (p, q) of the combinations not determined."""

@@ -15,12 +15,12 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextvars import copy_context
 from dataclasses import dataclass, replace
 
 from kf_calib.bench.streams import Batch, Source
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.sufficient_statistics import Folder
-from kf_calib.effects import effect_named
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.measurement_model import Model
@@ -62,8 +62,8 @@ class Session:
         self.every, self.auto, self.again = every, auto, again
         self.listeners = list[Callable[[Judgement], None]]()
         self.standing = Standing(model=self.settings.effects)
-        self._refuse(Model.of(source.bench, self.settings.effects))
         self._passed = Pass(source, self.settings)
+        self._refuse(self._passed.model)
         self._segmenter = self._passed.segmenter()
         self._closed, self._looked_s = 0, 0.0
         self._lock = threading.Condition()
@@ -77,7 +77,7 @@ class Session:
         """
         failure: Exception | None = None
         with one_blas_thread():  # for both threads: setting it in one would change the other's
-            judge = threading.Thread(target=self._judge, name="judge", daemon=True)
+            judge = threading.Thread(target=copy_context().run, args=(self._judge,), name="judge", daemon=True)
             judge.start()
             try:
                 for batch in self.source:  # read to its end even after a failure, as the source may be recording
@@ -101,11 +101,9 @@ class Session:
     def accept(self, *names: str) -> None:
         """Add effects (names or formulas) to the model from now on; raises InputError where one cannot be added."""
         with self._lock:
-            model = Model.of(self.source.bench, self.settings.effects)
-            for name in names:
-                model += effect_named(name, self.source.bench)
-            self._refuse(model, begun=True)
-            self.settings = replace(self.settings, effects=(*self.settings.effects, *names))
+            settings = replace(self.settings, effects=(*self.settings.effects, *names))
+            self._refuse(Model.of(self.source.bench, settings.effects), begun=True)
+            self.settings = settings
             self._publish(notice=f"{' and '.join(names)} accepted", model=self.settings.effects)
             if self._last is not None and not self._waiting:
                 self._waiting.append(self._last)
@@ -125,11 +123,10 @@ class Session:
                 "a live run is evaluated from folded dwells, as the block engine does: leave out --engine, and check "
                 "the recording with replay --engine filterpy."
             )
-        swinging = [str(effect) for effect in model.effects if effect.oscillates]
-        if swinging:
+        if model.oscillates:
             raise InputError(
-                f"{swinging[0]} needs a second pass over the readings: record the run, then "
-                f"replay the recording --with {swinging[0]}."
+                f"{model.oscillation} needs a second pass over the readings: record the run, then "
+                f"replay the recording --with {model.oscillation}."
             )
         moving = [str(effect) for effect in model.dynamic]
         if begun and moving and not self._segmenter.slews:

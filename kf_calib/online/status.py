@@ -21,12 +21,14 @@ from kf_calib.design.gimbal_limits import wrapped
 from kf_calib.design.next_orientation import Advice, Course, course
 from kf_calib.diagnosis.candidate_tests import LEVEL, assess_candidates
 from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation.calibration import conclude, evaluate, with_remarks
+from kf_calib.estimation.calibration import conclude, evaluate_fit, with_remarks
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.noise_model import mean_covariances
+from kf_calib.estimation.oscillation_carrier import fitted_to
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.online.sequential_test import Watch
 from kf_calib.support.threads import one_blas_thread
@@ -284,10 +286,10 @@ def judged(passed: Pass, wanted: Floats, before: Judgement | None = None) -> Jud
     passed: the pass over the readings. wanted (12,): targets of the sigmas. before: the judgement after fewer dwells.
     Raises InputError where the readings cannot be used as they are.
     """
-    settings, bench, dwells = passed.settings, passed.source.bench, passed.dwells
+    dwells = passed.dwells
     with one_blas_thread():
-        refuse_unusable(dwells, passed.tally, bench)
-        result = with_remarks(evaluate(dwells, bench, settings, passed.folder.slews), passed)
+        refuse_unusable(dwells, passed.tally, passed.source.bench)
+        result = with_remarks(evaluate_fit(fitted_to(passed, dwells), passed.settings), passed)
         watch = _watched(dwells, result, None if before is None else before.watch)
         look = _look(result, watch) if before is None else before.look.again(result, watch)
         return Judgement(result, look, watch, wanted, _course(result, wanted))
@@ -313,11 +315,11 @@ def _least(result: Calibration) -> int:
 
 def _not_judged(result: Calibration, watch: Watch | None) -> Diagnosis:
     """Return a diagnosis without an alarm: nothing is significant so far, and what the run could show."""
-    test = assess_candidates(result.fit, None if watch is None else watch.tests, frames=result.frames)
+    test = assess_candidates(result.fit, None if watch is None else watch.tests)
     said = "Nothing is beyond chance so far: no effect is missing that this run has shown."
     if watch is None:
         said = "Too few orientations so far to judge the model by: visit more."
-    return Diagnosis(result, test, (), (), False, (), {}, None, said)
+    return Diagnosis(before=result, test=test, verdict=said)
 
 
 def judge_whole_run(passed: Pass, wanted: Floats, watch: Watch | None, again: Source | None = None) -> Judgement:
@@ -328,7 +330,7 @@ def judge_whole_run(passed: Pass, wanted: Floats, watch: Watch | None, again: So
     """
     with one_blas_thread():
         result = conclude(passed, again)
-        look = Look(result, watch, diagnose(result))
+        look = Look(result, watch, diagnose(result, Refits(again)))
         return Judgement(result, look, watch, wanted, _course(result, wanted), final=True)
 
 

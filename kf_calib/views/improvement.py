@@ -1,10 +1,8 @@
-"""Stepwise improvement as a report and as a JSON object, and the dialogue with the user."""
+"""Stepwise improvement as a report, as a JSON object and as a table to choose from."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +11,10 @@ from rich.text import Text
 
 from kf_calib.diagnosis.nested_cross_validation import NestedCrossValidation
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, SelectionStep, Spread, extend, take_step, undone
-from kf_calib.errors import InputError
+from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, SelectionStep, Spread
 from kf_calib.estimation.results import Calibration, format_p
-from kf_calib.support.plain_text import sentence
-from kf_calib.views.console import effect_table, parameter_table, rounded, symbol
+from kf_calib.support.units import shown
+from kf_calib.views.console import effect_table, parameter_table, symbol
 from kf_calib.views.diagnosis import description_object, of_what_p_is, orientation_object
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Bar, Table
@@ -170,7 +167,8 @@ def progress(state: Improvement) -> RenderableType:
     rows += [(f"({word} {each.name})", each.result, None) for each in others]
     errors = [_errors(result, floor) for _, result, _ in rows]
     longest = max(error for both in errors for error in both if error is not None)
-    head = "over the noise floor" if floor else "m/s^2 (without any one orientation the model is not determined)"
+    unit, alone = shown("m/s^2"), "without any one orientation the model is not determined"
+    head = "over the noise floor" if floor else f"{unit.label} ({alone})"
     table = Table(title=f"Rms error, {head}", title_justify="left", box=None, pad_edge=False)
     for heading in ("step", "p of the run", "", "", ""):
         table.add_column(heading, no_wrap=True)
@@ -179,7 +177,7 @@ def progress(state: Improvement) -> RenderableType:
         if held_out is not None:
             table.add_row(label, p_text, "held out", f"{held_out:.2f}", Bar(bar(held_out, longest), style="cyan"))
             label = p_text = ""
-        number = f"{fitted:.2f}" if floor else f"{fitted:.2g}"
+        number = f"{fitted:.2f}" if floor else unit.number(fitted, 2)
         table.add_row(label, p_text, "fitted", number, Bar(bar(fitted, longest), style="dim"))
     said = [Text(line) for step in state.steps for line in (*map(_out, step.dropped), *step.remarks)]
     tests = [Text(f"Tested: {_test(each)}.") for each in state.removals]
@@ -231,11 +229,9 @@ def _spread_table(state: Improvement) -> Table:
 def _spread_row(each: Spread) -> tuple[str, ...]:
     """Return the row of one parameter in that table."""
     own = each.parameter
-    low, high = (
-        rounded((value - own.nominal) * own.per_si, (own.sigma or 0.0) * own.per_si)
-        for value in (each.lowest, each.highest)
-    )
-    return symbol(own.symbol), low[0], high[0], f"± {low[1]}", own.shown_unit, f"{each.sigmas:.1f}"
+    unit = shown(own)
+    low, high = (unit.rounded(value - own.nominal, own.sigma or 0.0) for value in (each.lowest, each.highest))
+    return symbol(own.symbol), low[0], high[0], f"± {low[1]}", unit.label, f"{each.sigmas:.1f}"
 
 
 def _settling(state: Improvement) -> list[str]:
@@ -257,83 +253,28 @@ def _settling(state: Improvement) -> list[str]:
 def honest_sentence(honest: NestedCrossValidation) -> str:
     """The result of nested cross-validation in a sentence."""
     times = ", ".join(f"{name} in {count}" for name, count in honest.chosen.items()) or "no effect in any"
+    rms = shown("m/s^2").text(honest.rms_mps2)
     return (
         f"With the choice of effects repeated without what is held out ({honest.folds} folds): "
-        f"{honest.rms_mps2:.3g} m/s^2 rms, {honest.rms_mps2 / honest.expected_mps2:.2f} of what noise gives; "
+        f"{rms} rms, {honest.rms_mps2 / honest.expected_mps2:.2f} of what noise gives; "
         f"chosen: {times}."
     )
 
 
-HOW = "number: add it; a NAME, f FORMULA: add that; d NAME: drop; u: undo; q: finish"
+def choices_table(state: Improvement, choices: Sequence[tuple[str, ...]]) -> RenderableType:
+    """The steps so far, the verdict, and the effects that a user may choose by number."""
+    return Group(progress(state), Text(state.found.verdict, style="bold"), *_numbered(state.found, choices))
 
 
-def session(
-    state: Improvement,
-    ask: Callable[[str, str], str],
-    show: Callable[[RenderableType], None],
-    on_step: Callable[[Improvement], None],
-    busy: Callable[[], AbstractContextManager[object]] = nullcontext,
-) -> Improvement:
-    """Ask the user what to do next until the user ends the improvement, and return it.
-
-    state: the improvement at first. ask: takes a question and the meaning of an empty answer, and returns the answer.
-    show: shows a renderable. on_step: called after each step. busy: context that is entered while an answer is
-    computed.
-    """
-    shown: Improvement | None = None
-    while True:
-        options = _options(state.found)
-        if shown is not state:
-            show(Group(progress(state), Text(state.found.verdict, style="bold"), *_numbered(state.found, options)))
-            shown = state
-        usual = "q" if not options else "1" if state.found.missing else ""
-        answer = ask(HOW, usual).strip()
-        if answer == "q":
-            return replace(state, asked=True)
-        try:
-            with busy():
-                state = answered(state, answer, options)
-            on_step(state)
-        except InputError as error:
-            show(Text(sentence(str(error)), style="red"))
-
-
-def answered(state: Improvement, answer: str, options: list[tuple[str, ...]]) -> Improvement:
-    """The improvement after an answer of the user; raises InputError where the answer cannot be understood or done.
-
-    options: the effects that may be chosen by number.
-    """
-    word, _, rest = answer.partition(" ")
-    rest = rest.strip()
-    if answer == "u":
-        return undone(state)
-    if word == "d" and rest:
-        return take_step(state, None, (rest,), "user")
-    if word == "f" and rest:
-        return extend(state, (rest if "=" in rest else f"mine = {rest}",), "user")
-    if word == "a" and rest:
-        return extend(state, (rest,), "user")
-    if answer.isdigit() and 1 <= int(answer) <= len(options):
-        return extend(state, options[int(answer) - 1], "user")
-    raise InputError(f"{answer!r} is no answer: {HOW}.")
-
-
-def _options(found: Diagnosis) -> list[tuple[str, ...]]:
-    """Return the choices by number: the missing effects together, then each suspect."""
-    out = [found.missing] if found.missing else []
-    out += [(suspect.name,) for suspect in found.suspects if (suspect.name,) != found.missing]
-    return out
-
-
-def _numbered(found: Diagnosis, options: list[tuple[str, ...]]) -> list[RenderableType]:
+def _numbered(found: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[RenderableType]:
     """Return the table of the choices, or nothing where there are none."""
-    if not options:
+    if not choices:
         return []
     refits = {suspect.name: suspect for suspect in found.suspects}
     table = Table(box=None, pad_edge=False)
     for heading in ("", "suspect", "p of the run", "fits", "held out"):
         table.add_column(heading, justify="right" if heading in ("", "held out") else "left")
-    for number, names in enumerate(options, start=1):
+    for number, names in enumerate(choices, start=1):
         suspect = refits.get(names[0]) if len(names) == 1 else None
         result = suspect.refit if suspect is not None else found.after
         p_value = "" if suspect is None else format_p(suspect.p_value).removeprefix("= ")

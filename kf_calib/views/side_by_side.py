@@ -7,7 +7,9 @@ from typing import Any
 
 from kf_calib.diagnosis.side_by_side import Difference, SideBySide
 from kf_calib.estimation.results import Parameter, format_p
-from kf_calib.views.console import rounded, symbol
+from kf_calib.support.tail_probabilities import LEVEL
+from kf_calib.support.units import shown
+from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Table
 
@@ -20,7 +22,7 @@ def verdict(pair: SideBySide) -> str:
     most = f"{symbol(far.symbol)} differs most, by {abs(far.sigmas or 0.0):.1f} σ"
     if pair.p_value is None:
         return f"Between the two models, {most}."
-    word = "agree" if pair.p_value >= 0.01 else "DIFFER"
+    word = "agree" if pair.p_value >= LEVEL else "DIFFER"
     chance = f"noise alone gives differences as large with probability p {format_p(pair.p_value)}"
     return f"The parameters of the two recordings {word}: {chance}; {most}."
 
@@ -39,16 +41,15 @@ def _row(each: Difference) -> tuple[str, ...]:
     """Return the row of one parameter."""
     both, moved = (*_cells(each.first), *_cells(each.second)), ("", "")
     if each.value is not None and each.sigma is not None and each.sigmas is not None:
-        per_si = each.first.per_si
-        moved = rounded(each.value * per_si, each.sigma * per_si)[0], f"{each.sigmas:+.1f}"
-    return symbol(each.symbol), *both, each.first.shown_unit, *moved
+        moved = shown(each.first).rounded(each.value, each.sigma)[0], f"{each.sigmas:+.1f}"
+    return symbol(each.symbol), *both, shown(each.first).label, *moved
 
 
 def _cells(own: Parameter) -> tuple[str, str]:
     """Return a parameter less its nominal value, and its sigma."""
     if own.value is None or own.sigma is None:
         return "not seen", ""
-    value, sigma = rounded((own.value - own.nominal) * own.per_si, own.sigma * own.per_si)
+    value, sigma = shown(own).rounded(own.value - own.nominal, own.sigma)
     return value, f"± {sigma}"
 
 

@@ -15,6 +15,7 @@ function explore(root) {
   }
   run.drivers.forEach((each, k) => form.driver.add(
     new Option(each.name + (each.explains ? " (" + each.explains + ")" : ""), k)));
+  form.unit.options[0].text = run.unit;
   run.models.forEach((each, k) => form.model.add(new Option(each.name, k)));
   for (let i = 0; i < 3; i++) {
     const box = Object.assign(document.createElement("input"), {type: "checkbox", checked: true, name: "a" + (i + 1)});
@@ -31,7 +32,7 @@ function explore(root) {
     const driver = run.drivers[form.driver.value], model = run.models[form.model.value];
     const inSigma = form.unit.value === "sigma", found = [];
     for (let i = 0; i < 3; i++) if (form["a" + (i + 1)].checked) run.dwells.forEach((number, d) => {
-      const sigma = run.sigma_ug[d][i], left = model.residual_ug[d][i], x = Array.isArray(driver.values[d]) ? driver.values[d][i] : driver.values[d];
+      const sigma = run.sigma[d][i], left = model.residual[d][i], x = Array.isArray(driver.values[d]) ? driver.values[d][i] : driver.values[d];
       if (left === null || x === null || !(sigma > 0)) return;
       found.push({x, y: inSigma ? left / sigma : left, bar: inSigma ? 1 : sigma, left, sigma, d, i});
     });
@@ -58,7 +59,7 @@ function explore(root) {
       scales: {x: {time: false, range: (u, low, high) => low === xs[0] && high === xs.at(-1) ? across : [low, high]}, y: {range: () => along}},
       legend: {show: false}, cursor: {points: {show: false}, drag: {x: true, y: false}},
       axes: [{...axis, label: driver.name + ", " + driver.unit, size: 46},
-             {...axis, label: inSigma ? "residual / σ" : "residual, µg", size: 66}],
+             {...axis, label: inSigma ? "residual / σ" : "residual, " + run.unit, size: 66}],
       series: [{}, {paths: () => null, points: {show: false}}],
       hooks: {draw: [paint], setCursor: [point]},
     }, [xs, ys], place);
@@ -117,7 +118,7 @@ function explore(root) {
     const said = ["begun at " + number(run.begin_s[each.d]) + " s"];
     if (run.gimbals_deg) said.push("gimbals at " + run.gimbals_deg[each.d].map(a => number(a)).join(", ") + " deg");
     said.push(driver.name + " " + number(each.x) + " " + driver.unit);
-    said.push("residual " + number(each.left) + " ± " + number(each.sigma) + " µg (" + (each.left / each.sigma).toFixed(1) + " σ)");
+    said.push("residual " + number(each.left) + " ± " + number(each.sigma) + " " + run.unit + " (" + (each.left / each.sigma).toFixed(1) + " σ)");
     const head = document.createElement("strong");
     head.textContent = "Dwell " + run.dwells[each.d] + ", accelerometer " + (each.i + 1);
     readout.replaceChildren(head, ": " + said.join("; "));

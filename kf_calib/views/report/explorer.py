@@ -12,9 +12,9 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration
+from kf_calib.support.units import shown
 from kf_calib.views.json import clean
 
-MICRO_G = 9.80665e-6  # m/s^2
 _UNITS = {"rad": ("deg", 180.0 / np.pi), "m/s^2": ("g", 1.0 / 9.80665), "s": ("min", 1.0 / 60.0),
           "K/s": ("K/h", 3600.0)}  # fmt: skip
 _DIGITS = 5  # significant ones, which a page needs
@@ -31,16 +31,17 @@ class Explorer:
 def explorer(first: Calibration, others: Mapping[str, Floats]) -> Explorer:
     """The explorer of a run; others: residuals (D, 3) that other models leave, m/s^2, by what each is called."""
     dwells = first.carried.dwells
-    models = {f"{first.model.sum}": first.residuals_mps2, **others}
+    models, unit = {f"{first.model.sum}": first.residuals_mps2, **others}, shown("m/s^2")
     return Explorer(
         _short(
             {
                 "dwells": [dwell.number for dwell in dwells],
                 "begin_s": [dwell.start_s for dwell in dwells],
                 "gimbals_deg": np.degrees([dwell.recorded_pose for dwell in dwells]) if first.bench.axes else None,
-                "sigma_ug": mean_sigmas(first) / MICRO_G,
+                "unit": unit.label,
+                "sigma": mean_sigmas(first) * unit.per_si,
                 "drivers": [_driver(each) for each in drivers_of(first)],
-                "models": [{"name": name, "residual_ug": left_mps2 / MICRO_G} for name, left_mps2 in models.items()],
+                "models": [{"name": name, "residual": left_mps2 * unit.per_si} for name, left_mps2 in models.items()],
             }
         )
     )
