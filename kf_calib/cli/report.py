@@ -167,7 +167,8 @@ def _typed(ctx: click.Context, less: Sequence[str]) -> str:
     words = list[str]()
     for param in ctx.command.params:
         name = param.name or ""
-        if name in less or ctx.get_parameter_source(name) is not ParameterSource.COMMANDLINE:
+        given = ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE
+        if name in less or not given or name not in ctx.params:  # of --units, no value is left
             continue
         value = ctx.params[name]
         if isinstance(param, click.Argument):

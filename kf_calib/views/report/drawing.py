@@ -72,7 +72,7 @@ def _is_of_many_points(artist: Artist) -> bool:
         return has_marks and np.size(artist.get_xdata()) > _MANY and not _is_grey(artist.get_color())
     if isinstance(artist, Collection):
         colours = [*artist.get_edgecolor(), *artist.get_facecolor()]
-        count = max(len(artist.get_paths()), len(artist.get_offsets()))
+        count = max(len(artist.get_paths()), np.shape(artist.get_offsets())[0])
         return count > _MANY and not all(map(_is_grey, colours))
     return False
 

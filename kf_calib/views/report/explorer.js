@@ -49,7 +49,7 @@ function explore(root) {
     const ink = colour("--quiet"), line = colour("--line");
     points = collect(); chosen = null; readout.textContent = welcome;
     if (plot) plot.destroy();
-    const axis = {stroke: ink, grid: {stroke: line, width: 1}, ticks: {stroke: line}, font: "13px system-ui, sans-serif",
+    const axis = {values: (u, marks) => marks.map(each => each === null ? "" : number(each)), stroke: ink, grid: {stroke: line, width: 1}, ticks: {stroke: line}, font: "13px system-ui, sans-serif",
                   labelFont: "13px system-ui, sans-serif"};
     const xs = points.map(each => each.x), ys = points.map(each => each.y);
     const across = points.length ? reach(xs) : [0, 1];

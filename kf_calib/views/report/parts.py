@@ -32,7 +32,7 @@ class Paragraph:
 class Cell:
     """The text of a cell; of a number, its parts before the decimal point, behind it, and after the last digit.
 
-    Each of the latter is followed by what its column's longest has more, which a page leaves room for.
+    A page leaves room for what the longest fraction of the column has more, and for the longest text after a number.
     """
 
     whole: str
@@ -97,7 +97,7 @@ def _column(cells: Iterable[RenderableType], is_number: bool) -> list[Cell]:
     split = [_split(_MINUS.sub("−", _said(each))) for each in cells]
     fraction = max((each[1] for each in split), key=len, default="")
     rest = max((each[2] for each in split), key=len, default="")
-    return [Cell(own[0], own[1], fraction[len(own[1]) :], own[2], rest[len(own[2]) :]) if own[0] else Cell("")
+    return [Cell(own[0], own[1], fraction[len(own[1]) :], own[2], rest) if own[0] else Cell("")
             for own in split]  # fmt: skip
 
 
