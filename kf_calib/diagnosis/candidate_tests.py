@@ -335,7 +335,9 @@ def _smallest_p(found: Scan, seen: NDArray[np.intp], seed: int) -> Floats:
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     draws = np.random.default_rng(seed).standard_normal((_DRAWS, len(root)))
     squares = np.add.reduceat((draws @ root) ** 2, starts, axis=1)
-    return chdtrc(np.array([found.candidates[k].dof for k in seen], float), squares).min(axis=1)
+    dofs = np.array([found.candidates[k].dof for k in seen])
+    tallest = {dof: squares[:, dofs == dof].max(axis=1) for dof in np.unique(dofs).tolist()}  # has the smallest p-value
+    return np.min([chdtrc(dof, square) for dof, square in tallest.items()], axis=0)
 
 
 def _walking(fitted: Fit) -> str:

@@ -104,7 +104,7 @@ class Effect(ABC):
         """The same effect with its unknown at ``value``, held within its range."""
         other = copy.copy(self)
         if self.unknown is not None:
-            other.value = float(np.clip(value, self.unknown.low, self.unknown.high))
+            other.value = float(min(max(value, self.unknown.low), self.unknown.high))
         return other
 
     @property

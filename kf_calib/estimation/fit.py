@@ -155,9 +155,14 @@ class Fit:
 
     def rows(self, noise: Noise | None = None) -> list[Floats]:
         """Whitened rows [H | z] of each dwell, with the weights of the fit or with another noise."""
-        return square_root_information.whiten(
-            self.dwells, self.carried.columns, noise or self.noise.weights, self.carried.state
-        )
+        return self._weighted if noise is None else self._whitened(noise)
+
+    @cached_property
+    def _weighted(self) -> list[Floats]:
+        return self._whitened(self.noise.weights)
+
+    def _whitened(self, noise: Noise) -> list[Floats]:
+        return square_root_information.whiten(self.dwells, self.carried.columns, noise, self.carried.state)
 
 
 def fit(

@@ -170,14 +170,14 @@ class Model:
 
 def effect_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
     """The change (m, 3, q) of each accelerometer's reading per unit of each coefficient of the effects."""
-    own = [
-        each.columns(stimulus) if each.shows_in(stimulus) else np.zeros((len(stimulus), 3, len(each.coefficients)))
-        for each in effects
-    ]
-    columns = np.concatenate([np.zeros((len(stimulus), 3, 0)), *own], axis=2)
-    scales = np.array([coefficient.scale for each in effects for coefficient in each.coefficients])
-    # set to zero what even a large coefficient would not raise above rounding, as for the tilt of a vertical axis
-    columns[np.abs(columns) * scales < _ROUNDING_MPS2] = 0.0
+    counts = [len(each.coefficients) for each in effects]
+    columns, last = np.zeros((len(stimulus), 3, sum(counts))), np.cumsum(counts).tolist()
+    for effect, end, count in zip(effects, last, counts, strict=True):
+        if not effect.shows_in(stimulus):
+            continue
+        own, scales = effect.columns(stimulus), np.array([coefficient.scale for coefficient in effect.coefficients])
+        # set to zero what even a large coefficient would not raise above rounding, as for the tilt of a vertical axis
+        columns[:, :, end - count : end] = np.where(np.abs(own) * scales < _ROUNDING_MPS2, 0.0, own)
     return columns
 
 

@@ -55,11 +55,11 @@ def outlying_dwells(
     ratios = (statistics / statistics.max()).round(9)  # rounded, so that the first of equal dwells comes first
     order = np.argsort(-ratios, kind="stable")[:_TRIED]
     tried = [k for k in order.tolist() if ratios[k] > _NEARLY]
-    found = [_judged(result, k, evaluate(dwells_without(dwells, (k,)))) for k in tried]
+    found = [_test_dwell(result, k, evaluate(dwells_without(dwells, (k,)))) for k in tried]
     return tuple(each for each in found if each is not None)
 
 
-def _judged(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell | None:
+def _test_dwell(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell | None:
     """Judge dwell ``k`` against the calibration from all others; None if those disagree or if it is within chance."""
     if rest.consistency.consistent is not True:
         return None

@@ -73,7 +73,7 @@ class Running:
         at = np.concatenate([state[:STATE_COUNT], np.zeros(every.count - STATE_COUNT)])
         inside = tuple(str(effect) for effect in model.effects)
         empty = np.zeros((every.count, every.count + 1))
-        return cls(Carried(dwells, every, at), inside, noise, prior or Prior(), empty)._folded()
+        return cls(Carried(dwells, every, at), inside, noise, prior or Prior(), empty)._rebuild()
 
     @property
     def dwells(self) -> list[DwellFactor]:
@@ -100,15 +100,15 @@ class Running:
         if exact:
             carried = Carried([*self.dwells, dwell], self.carried.model, self.about)
             if not all(map(np.array_equal, self.carried.columns, carried.columns[:-1])):
-                return replace(self, carried=carried)._folded()
+                return replace(self, carried=carried)._rebuild()
         else:
             carried = self.carried.followed_by(dwell)
         more = replace(self, carried=carried)
-        return more._updated(more._rows([-1])[0], steps(carried.dwells[-2:], self.noise)[-1])
+        return more._update(more._rows([-1])[0], steps(carried.dwells[-2:], self.noise)[-1])
 
     def solved(self) -> tuple[Floats, Floats, Floats]:
         """State (p,) of the model, its covariance (p, p), and a basis (p, q) of the combinations not determined."""
-        kept = self._kept
+        kept = self._model_columns
         around = self.model.nominal_state() - self.about[kept]
         moved, covariance, undetermined = square_root_information.solve(
             square_root_information.restrict(self.factor, kept), around
@@ -119,13 +119,13 @@ class Running:
     def state(self) -> Floats:
         """The state (P,) of all columns: the estimate for those of the model, zero for those that are only carried."""
         out = np.zeros(len(self.about))
-        out[self._kept] = self.solved()[0]
+        out[self._model_columns] = self.solved()[0]
         return out
 
     @cached_property
     def scan(self) -> Scan:
         """The score tests of all effects that are carried but not in the model."""
-        kept, parts = self._kept, self.carried.model.parts
+        kept, parts = self._model_columns, self.carried.model.parts
         outside = [effect for effect in self.carried.model.effects if str(effect) not in self.inside]
         theirs = [range(*parts[str(effect)].indices(len(self.about))) for effect in outside]
         order = [*kept, *itertools.chain(*theirs), len(self.about)]
@@ -135,31 +135,31 @@ class Running:
     @property
     def misfit(self) -> tuple[float, int]:
         """The sum of squares that the current model leaves, and its degrees of freedom."""
-        restricted = square_root_information.restrict(self.factor, self._kept)
+        restricted = square_root_information.restrict(self.factor, self._model_columns)
         squares = self.left + float(np.sum(self.factor[:, -1] ** 2) - np.sum(restricted[:, -1] ** 2))
         return squares, self.rows - square_root_information.rank(restricted)
 
     @cached_property
-    def _kept(self) -> list[int]:
+    def _model_columns(self) -> list[int]:
         """Numbers of the columns of the current model among all."""
         parts, count = self.carried.model.parts, len(self.about)
         return [*range(STATE_COUNT), *(k for name in self.inside for k in range(*parts[name].indices(count)))]
 
-    def _updated(self, rows: Floats, walked: Floats) -> Running:
+    def _update(self, rows: Floats, walked: Floats) -> Running:
         """Return the filter after an update with whitened rows and the variances of a random walk before them."""
         factor, left = square_root_information.update(self.factor, rows, walked)
         return replace(self, factor=factor, left=self.left + left, rows=self.rows + len(rows))
 
-    def _folded(self) -> Running:
+    def _rebuild(self) -> Running:
         """Return the same filter with its factor built again from all dwells."""
         factor = square_root_information.start(self.prior, self.carried.model)
         factor[:, -1] -= factor[:, :-1] @ self.about
         variances = steps(self.dwells, self.noise)
         out = replace(self, factor=factor, left=0.0, rows=0)
         if not variances.any():
-            return out._updated(np.concatenate(self._rows()), variances[0])
+            return out._update(np.concatenate(self._rows()), variances[0])
         for own, variance in zip(self._rows(), variances, strict=True):
-            out = out._updated(own, variance)
+            out = out._update(own, variance)
         return out
 
     def _rows(self, chosen: Sequence[int] | None = None) -> list[Floats]:

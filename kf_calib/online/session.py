@@ -25,7 +25,7 @@ from kf_calib.errors import InputError, KfCalibError
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
-from kf_calib.online.status import Judgement, Standing, current, judge_whole_run, judged, targets
+from kf_calib.online.status import Judgement, Standing, current, judge_so_far, judge_whole_run, targets
 from kf_calib.support.threads import one_blas_thread
 
 _FIRST_LOOK_S = 1.0
@@ -206,7 +206,7 @@ class Session:
             with self._lock:
                 settings = self.settings
             try:
-                judgement = judged(replace(closed.passed, settings=settings), self.wanted, before)
+                judgement = judge_so_far(replace(closed.passed, settings=settings), self.wanted, before)
             except KfCalibError as error:
                 with self._lock:
                     self._publish(problem=str(error))
@@ -215,7 +215,7 @@ class Session:
                 self.say(f"a dwell could not be judged: {error!r}")
                 continue
             before = judgement
-            self._told(judgement, closed.elapsed_s)
+            self._publish_judgement(judgement, closed.elapsed_s)
             self._automatic(judgement)
 
     def _next(self) -> _Closed | None:
@@ -224,7 +224,7 @@ class Session:
             self._lock.wait_for(lambda: self._waiting or self._ended)
             return self._waiting.popleft() if self._waiting else None
 
-    def _told(self, judgement: Judgement, elapsed_s: float) -> None:
+    def _publish_judgement(self, judgement: Judgement, elapsed_s: float) -> None:
         """Publish a judgement and pass it to the listeners."""
         with self._lock:
             self._publish(judgement=judgement, judged_s=elapsed_s, problem="")
@@ -249,7 +249,7 @@ class Session:
         passed = replace(self._passed, settings=self.settings)
         again = None if self.again is None else self.again()
         final = judge_whole_run(passed, self.wanted, None if before is None else before.watch, again)
-        self._told(final, self.standing.elapsed_s)
+        self._publish_judgement(final, self.standing.elapsed_s)
         return final
 
     def say(self, notice: str) -> None:

@@ -15,7 +15,7 @@ from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, Selectio
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.units import shown
 from kf_calib.views.console import effect_table, parameter_table, symbol
-from kf_calib.views.diagnosis import description_object, of_what_p_is, orientation_object
+from kf_calib.views.diagnosis import description_object, description_sentence, of_what_p_is, orientation_object
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Bar, Table
 from kf_calib.views.terminal import note
@@ -151,8 +151,8 @@ def improvement_report(
     if honest is not None:
         parts.append(Text(honest_sentence(honest)))
     if replay_difference is not None:
-        same = "to the last bit" if replay_difference == 0 else f"but for {replay_difference:.1g} of a figure at most"
-        parts.append(Text(f"The steps of the journal gave its figures again, {same}."))
+        same = "to the last bit" if replay_difference == 0 else f"to within {replay_difference:.1g} of each figure"
+        parts.append(Text(f"The steps of the journal gave the same figures, {same}."))
     parts += map(note, state.warnings)
     return Group(*parts)
 
@@ -218,7 +218,7 @@ def _test(each: Removal) -> str:
 def _spread_table(state: Improvement) -> Table:
     """Return the table of the range of each parameter over the equally good explanations."""
     names = ", ".join(each.name for each in state.alternatives)
-    table = Table(title=f"Parameters less nominal, with either of {names}", title_justify="left")
+    table = Table(title=f"Parameters less nominal, over the explanations {names}", title_justify="left")
     for heading in ("parameter", "lowest", "highest", "sigma", "unit", "differ by, σ"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for k, each in enumerate(state.spreads):
@@ -240,10 +240,7 @@ def _settling(state: Improvement) -> list[str]:
         return []
     unknown, going, out = state.found.description, state.found.next_orientation, list[str]()
     if unknown is not None:
-        out.append(
-            f"It goes with {unknown.driver} (accelerometer {unknown.channel}; explains {unknown.share:.0%} of it). "
-            f"To try: --with '{unknown.formula}'"
-        )
+        out.append(description_sentence(unknown, [unknown.formula]))
     if going is not None:
         angles = ", ".join(f"{angle:g}" for angle in going[0].gimbal_deg)
         out.append(f"Next orientation: gimbals at {angles} deg: {going[1]}.")

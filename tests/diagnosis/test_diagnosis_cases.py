@@ -187,7 +187,7 @@ def test_poor_plans_give_no_wrong_name(name: str) -> None:
         found = diagnose(source(_large(name), plan=plan))
         not_wrong(found, name)
         assert name not in found.test.invisible or name not in found.missing
-        assert found.test.consistent is not True or found.verdict.count("cannot see") or not found.test.invisible
+        assert found.test.consistent is not True or found.verdict.count("cannot show") or not found.test.invisible
 
 
 def _large(name: str) -> str:
@@ -281,7 +281,7 @@ def test_scatter_of_more_than_is_stated_is_no_effect(
     noticed = [each for each in found if each.test.consistent is False]
     named = [each for each in noticed if each.missing]
     assert len(noticed) > len(found) / 3 and len(named) < len(noticed)
-    assert all("dwells that scatter by more than is stated" in each.verdict for each in named)
+    assert all("scatter from dwell to dwell larger than stated" in each.verdict for each in named)
     said = [each.description for each in noticed if each.unknown]
     assert sum(each is not None and each.driver == IRREGULAR for each in said) > 0.5 * len(said)
 
@@ -331,6 +331,6 @@ def test_a_walk_that_may_come_back_is_said_to() -> None:
     """Telegraph noise that is not unlikely enough for a walk to be none."""
     found = diagnose(source("telegraph=15sigma;tau=30", seed=21, dwells=24))
     assert found.missing == ("bias-walk",) and found.back_s is not None and 5.0 < found.back_s < 100.0
-    assert "Best: bias-walk" in found.verdict and "come back within about" in found.verdict
+    assert "Likeliest: bias-walk" in found.verdict and "return to their mean within about" in found.verdict
     walks = [walking(seed) for seed in range(1, 3)]
     assert not any(each.back_s for each in walks) and any("bias-walk" in each.missing for each in walks)
