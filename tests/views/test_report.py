@@ -21,7 +21,7 @@ import kf_calib
 from kf_calib.views import console
 from kf_calib.views.figures import style
 from kf_calib.views.report.contents import page_of
-from kf_calib.views.report.drawing import inline_svg
+from kf_calib.views.report.drawing import Drawing, fit
 from kf_calib.views.report.measured import Measured
 from kf_calib.views.report.page import save
 from kf_calib.views.report.parts import Table, parts_of
@@ -188,23 +188,32 @@ def test_a_number_is_split_at_its_decimal_point(text: str, parts: tuple[str, str
     assert (cell.whole, cell.fraction, cell.rest) == parts
 
 
-def test_a_figure_of_many_points_stays_small_and_has_greys_of_the_page() -> None:
+def many_points(seed: int) -> Figure:
     with style.styled():
         figure = style.blank()
-        values = np.random.default_rng(1).normal(size=(2, 20000))
-        for axes in figure.subplots(2, 2).flat:
+        values = np.random.default_rng(seed).normal(size=(2, 20000))
+        for axes in figure.subplots(1, 2).flat:
             axes.plot(*values, "o", color=style.ACCELEROMETERS[0], markersize=1.5)
             axes.axhline(0.0, color="#6b6b6b")
-    drawn = inline_svg(figure, "many")
-    assert len(drawn) < 400_000 and "data:image/png" in drawn
-    assert "var(--ink)" in drawn and "#6b6b6b;" not in drawn and 'id="many-' in drawn
+    return figure
 
 
-def test_a_figure_of_few_points_has_all_of_them_as_lines() -> None:
-    figure = Figure()
-    figure.subplots().plot([1, 2, 3], "o", color=style.ACCELEROMETERS[1])
-    drawn = inline_svg(figure, "few")
-    assert "data:image" not in drawn and drawn.count("<use") >= 3 and "#009e73 var(--keep)" in drawn
+def test_figures_of_many_points_stay_small_and_have_greys_of_the_page() -> None:
+    few = Figure()
+    few.subplots().plot([1, 2, 3], "o", color=style.ACCELEROMETERS[1])
+    drawings = [Drawing("many", many_points(1), "many"), Drawing("few", few, "few")]
+    fit(drawings)
+    many, small = (each.markup for each in drawings)
+    assert len(many) < 400_000 and "data:image/png" in many and many.startswith("<svg")
+    assert "var(--ink)" in many and "stroke: #6b6b6b" not in many and 'id="many-' in many
+    assert "data:image" not in small and small.count("<use") >= 3 and "#009e73 var(--keep)" in small
+
+
+def test_what_is_still_too_large_is_a_picture() -> None:
+    drawings = [Drawing(f"{k}", many_points(k), f"d{k}") for k in range(2)]
+    fit(drawings, 0)
+    for each in drawings:
+        assert each.is_picture and each.markup.startswith("<img") and len(each.markup) < 250_000
 
 
 def _ink(png: bytes) -> float:

@@ -16,10 +16,10 @@ from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.results import Calibration
 from kf_calib.views import console, diagnosis, improvement, side_by_side
 from kf_calib.views.figures import figures
-from kf_calib.views.report.drawing import inline_svg
+from kf_calib.views.report.drawing import Drawing
 from kf_calib.views.report.explorer import Explorer, explorer
 from kf_calib.views.report.measured import Measured, facts
-from kf_calib.views.report.page import Drawing, Facts, Page, Part, Section, Standing
+from kf_calib.views.report.page import Facts, Page, Part, Section, Standing
 from kf_calib.views.report.parts import Paragraph, parts_of
 
 _EXPLORED = 3
@@ -136,7 +136,7 @@ def _drawn(title: str, result: object, prefix: str) -> Section:
     """Return the section of a result's figures; it has no part where there is no figure of such a result."""
     known = figures.dispatch(type(result)) is not figures.dispatch(object)
     drawn = figures(result) if known else {}
-    return Section(title, tuple(Drawing(name, inline_svg(draw(), f"{prefix}{k}"))
+    return Section(title, tuple(Drawing(name, draw(), f"{prefix}{k}")
                                 for k, (name, draw) in enumerate(drawn.items())))  # fmt: skip
 
 

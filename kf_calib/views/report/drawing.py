@@ -5,6 +5,9 @@ from __future__ import annotations
 import io
 import re
 from base64 import b64decode, b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -16,7 +19,7 @@ from PIL import Image
 
 from kf_calib.views.figures.style import content_of
 
-_LARGE = 350_000  # characters of an SVG, above which its points are drawn as a picture
+_MOST = 1_200_000  # characters of all figures of a page
 _MANY = 60  # points of one kind in a panel that are
 _PICTURE_DPI = 150
 _COLOUR = re.compile(r"\b(fill|stroke|stop-color): #([0-9a-f]{6})\b")
@@ -27,22 +30,47 @@ _PLACES = re.compile(r' (?:d|x|y)="[^"]*"')
 _DECIMALS = re.compile(r"(\d\.\d\d)\d+")  # more than a screen or printer shows; not of scales, which multiply
 
 
-def inline_svg(figure: Figure, prefix: str) -> str:
-    """The figure as an ``svg`` element whose names begin with ``prefix``, so that several can be in one page.
+@dataclass(eq=False)
+class Drawing:
+    """A figure in a page, with the title that says what is to be seen; names in its SVG begin with ``prefix``.
 
     A grey of the figure is mixed of the page's ``--ink`` and ``--paper``, black being ink alone; of other colours
     ``--keep`` says how much is kept beside white. On white paper with black ink, colours are those of the figure.
     """
-    figure.patch.set_visible(False)
-    for axes in figure.axes:
-        axes.patch.set_visible(False)
-    text = _element(figure, prefix)
-    if len(text) > _LARGE:
-        for axes in figure.axes:
+
+    kind: ClassVar[str] = "drawing"
+    title: str
+    figure: Figure
+    prefix: str
+    is_picture: bool = False
+    markup: str = ""
+
+    def __post_init__(self) -> None:
+        for patch in (self.figure.patch, *(axes.patch for axes in self.figure.axes)):
+            patch.set_visible(False)
+        self.markup = _element(self.figure, self.prefix)
+
+    def with_points_as_picture(self) -> None:
+        """Draw again, the points of each kind as a picture where there are many."""
+        for axes in self.figure.axes:
             for artist in axes.get_children():
                 artist.set_rasterized(_is_of_many_points(artist))
-        text = _element(figure, prefix)
-    return text
+        self.markup = _element(self.figure, self.prefix)
+
+    def as_picture(self) -> None:
+        """Draw again, all of it as a picture, on white in the dark, too."""
+        self.figure.patch.set_visible(True)
+        content = b64encode(_of_few_shades(content_of(self.figure, "png", _PICTURE_DPI))).decode()
+        self.markup, self.is_picture = f'<img alt="" src="data:image/png;base64,{content}">', True
+
+
+def fit(drawings: Sequence[Drawing], most: int = _MOST) -> None:
+    """Make pictures of points, and then of whole figures, the largest first, until all have ``most`` characters."""
+    for smaller in (Drawing.with_points_as_picture, Drawing.as_picture):
+        for each in sorted(drawings, key=lambda each: -len(each.markup)):
+            if sum(len(drawing.markup) for drawing in drawings) <= most:
+                return
+            smaller(each)
 
 
 def _element(figure: Figure, prefix: str) -> str:
@@ -58,11 +86,15 @@ def _element(figure: Figure, prefix: str) -> str:
 
 
 def _smaller(found: re.Match[str]) -> str:
-    """Return a PNG in base64 with no more shades than points need."""
+    return b64encode(_of_few_shades(b64decode(found[0]))).decode()
+
+
+def _of_few_shades(png: bytes) -> bytes:
+    """Return a PNG with no more shades than a drawing needs."""
     memory = io.BytesIO()
-    picture = Image.open(io.BytesIO(b64decode(found[0]))).convert("RGBA")
+    picture = Image.open(io.BytesIO(png)).convert("RGBA")
     picture.quantize(_SHADES, Image.Quantize.FASTOCTREE).save(memory, "PNG", optimize=True)
-    return b64encode(memory.getvalue()).decode()
+    return memory.getvalue()
 
 
 def _is_of_many_points(artist: Artist) -> bool:

@@ -7,25 +7,17 @@ from base64 import b64encode
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 from markupsafe import Markup
 
 from kf_calib.support.output_files import write_whole
+from kf_calib.views.report.drawing import Drawing, fit
 from kf_calib.views.report.explorer import Explorer
 from kf_calib.views.report.parts import Paragraph, Table
 from kf_calib.views.report.templates import filled_in, own_text
 
 Standing = Literal["agrees", "disagrees", "open"]
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """A figure as an ``svg`` element, with the title that says what is to be seen."""
-
-    kind: ClassVar[str] = "drawing"
-    title: str
-    svg: str
 
 
 Part = Paragraph | Table | Drawing | Explorer
@@ -64,6 +56,7 @@ class Page:
     @property
     def html(self) -> str:
         """The whole page; what comes from recordings is escaped, and no script runs but the page's own."""
+        fit([part for section in self.sections for part in section.parts if isinstance(part, Drawing)])
         scripts = [own_text("uPlot.iife.min.js"), own_text("explorer.js")]
         return filled_in(
             "page.html",
