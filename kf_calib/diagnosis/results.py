@@ -16,7 +16,7 @@ from kf_calib.diagnosis.unknown_effect import Description, describe
 from kf_calib.effects.effect import Grade
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration, Parameter
-from kf_calib.support.printing import printed
+from kf_calib.support.printing import as_html, printed
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,9 @@ class Diagnosis:
 
     def __str__(self) -> str:
         return printed(self)
+
+    def _repr_html_(self) -> str | None:
+        return as_html(self)
 
     @cached_property
     def residual_ratios(self) -> Floats:
