@@ -199,9 +199,9 @@ def test_an_improvement_is_a_timeline_of_steps(improved: Improvement, tmp_path: 
     points = content(path, "Points2D:positions")
     chart = improvement._error_chart(made)
     held = values_at(chart, points["/errors/held_out/points"][None])[:, 1]
-    np.testing.assert_allclose(held, [each.held_out_rms_mps2 * 1e6 / 9.80665 for each in made.results], rtol=1e-3)  # type: ignore[operator]
+    np.testing.assert_allclose(held, [each.held_out_rms_mps2 * 1e6 / 9.80665 for each in made.results], rtol=1e-3)
     inside = values_at(chart, points["/errors/within_the_run/points"][None])[:, 1]
-    np.testing.assert_allclose(inside, [each.residual_rms_mps2 * 1e6 for each in made.results], rtol=1e-3)
+    np.testing.assert_allclose(inside, [each.residual_rms_mps2 * 1e6 / 9.80665 for each in made.results], rtol=1e-3)
     told = content(path, "Points2D:labels")["/errors/p/told"][None]
     assert told[0].startswith("p = ") and float(told[0][4:]) < 1e-20
     steps = content(path, "Points2D:positions", improvement.STEP)["/explorer/a2/residuals"]
