@@ -42,7 +42,8 @@ class Track:
     values (n,), sigmas (n,): as found and calibrated. level, level_sigma: what it is at the last calibration, by all of
     them. drift, drift_sigma: its change per day (None: fewer than three). walk: intensity q of its random walk, per
     square root of a day, rms over what is likely. repeatability: r, likewise. constant_p:
-    that a constant parameter shows such differences. predicted_sigma (n,): of the next calibration, by those before it; predicted (n,): its value; NaN for the first.
+    that a constant parameter shows such differences. predicted, predicted_sigma (n,): each calibration as those before
+    it predict it; NaN for the first.
     """
 
     symbol: str
