@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from kf_calib.online.session import Session
     from kf_calib.sources.files.recorder import Recorder
     from kf_calib.sources.files.recording import Recording as open_recording
+    from kf_calib.support.units import shown_in
     from kf_calib.views import figures as plot
     from kf_calib.views.rerun import save as save_view
 
@@ -61,6 +62,7 @@ _HOMES = {
     "Recorder": ("sources.files.recorder", "Recorder"),
     "open_recording": ("sources.files.recording", "Recording"),
     "save_view": ("views.rerun", "save"),
+    "shown_in": ("support.units", "shown_in"),
     "Watch": ("online.sequential_test", "Watch"),
 }
 
@@ -70,7 +72,7 @@ _PRINTING = ("views.console", "views.diagnosis")
 __all__ = [
     "Bench", "Calibration", "Diagnosis", "Improvement", "InputError", "KfCalibError", "Parameter", "Recorder",
     "Running", "Session", "Settings", "UnobservableError", "Watch", "calibrate", "compare", "diagnose", "improve",
-    "open_recording", "plot", "save_view",
+    "open_recording", "plot", "save_view", "shown_in",
 ]  # fmt: skip
 
 

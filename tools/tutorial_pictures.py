@@ -20,7 +20,8 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.views.rerun.names import ACCELEROMETERS, GOLD, GREY, GROUPS, LABELS, MICRO, ORIENTATION, PER_SI, colour_of
+from kf_calib.support.units import shown
+from kf_calib.views.rerun.names import ACCELEROMETERS, GOLD, GREY, GROUPS, LABELS, ORIENTATION, colour_of, per_si
 from kf_calib.views.screenshot import screenshot
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,17 +48,17 @@ def draw_readings(found: Diagnosis, png: Path) -> None:
     )
     elapsed_s = (np.concatenate(time_ns) - time_ns[0][0]) * 1e-9
     inside = (elapsed_s >= visit.dwell.start_s) & (elapsed_s <= visit.dwell.end_s)
-    readings = np.concatenate(values)[inside]
-    misfit = visit.residual_mps2[i] * MICRO
-    shown = (readings - readings.mean()) * MICRO + misfit
+    unit, readings = shown("m/s^2"), np.concatenate(values)[inside]
+    misfit = visit.residual_mps2[i] * unit.per_si
+    values = (readings - readings.mean()) * unit.per_si + misfit
     with tempfile.TemporaryDirectory() as folder, rr.RecordingStream("readings") as stream:
         points = rr.SeriesPoints(names="reading", colors=ACCELEROMETERS[i], markers="circle", marker_sizes=2.0)
-        send(stream, "readings/each", shown, points)
-        send(stream, "readings/model", np.zeros(len(shown)), rr.SeriesLines(names="model", colors=GREY, widths=1.5))
+        send(stream, "readings/each", values, points)
+        send(stream, "readings/model", np.zeros(len(values)), rr.SeriesLines(names="model", colors=GREY, widths=1.5))
         mean = rr.SeriesLines(names=f"their mean, {misfit:+.1f}", colors=GOLD, widths=2.5)
-        send(stream, "readings/mean", np.full(len(shown), misfit), mean)
-        name = f"E{i + 1}, dwell {number + 1}, reading by reading: reading − model of twelve parameters, µm/s²"
-        panels = rrb.Horizontal(panel("readings", name, len(shown), legend=True))
+        send(stream, "readings/mean", np.full(len(values), misfit), mean)
+        name = f"E{i + 1}, dwell {number + 1}, reading by reading: reading − model of twelve parameters, {unit.label}"
+        panels = rrb.Horizontal(panel("readings", name, len(values), legend=True))
         take(stream, panels, Path(folder, "readings.rrd"), png, (1200, 360))
 
 
@@ -83,7 +84,7 @@ def draw_residuals(found: Sequence[Diagnosis], png: Path) -> None:
 
 def draw_sigmas(result: kf_calib.Calibration, png: Path) -> None:
     """log10 of sigma after each orientation: the twelve parameters by kind, and the coefficients of the effect."""
-    twelve = np.array([visit.estimate.sigma[:12] for visit in result.visits]) * PER_SI
+    twelve = np.array([visit.estimate.sigma[:12] for visit in result.visits]) * per_si()
     others = list(result.parameters.values())[12:]
     added = np.array([visit.estimate.effect_sigma for visit in result.visits]) * [each.per_si for each in others]
     with tempfile.TemporaryDirectory() as folder, rr.RecordingStream("sigmas") as stream:
@@ -92,8 +93,9 @@ def draw_sigmas(result: kf_calib.Calibration, png: Path) -> None:
             for symbol in group.symbols:
                 style = rr.SeriesLines(names=LABELS[symbol], colors=colour_of(symbol), widths=2.0)
                 send(stream, f"{k}/{symbol}", np.log10(twelve[:, paper_parameters.SYMBOLS.index(symbol)]), style)
+            unit = shown(group.unit)
             panels.append(
-                panel(f"{k}", f"σ of {group.title} by orientation: log₁₀ of {group.unit}", len(twelve), legend=True)
+                panel(f"{k}", f"σ of {group.title} by orientation: log₁₀ of {unit.label}", len(twelve), legend=True)
             )
         for each, values, colour in zip(others, added.T, ACCELEROMETERS, strict=True):
             style = rr.SeriesLines(names=each.symbol, colors=colour, widths=2.0)

@@ -28,6 +28,7 @@ from kf_calib.cli.options import (
     progress,
     save_view,
     show,
+    units_option,
 )
 from kf_calib.cli.signals import answered, interrupt
 from kf_calib.errors import InputError
@@ -264,6 +265,7 @@ def _folder() -> str:
 @click.command(epilog=examples("demo", "demo somewhere", "demo --tutorial"))
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default=_folder)
 @click.option("--tutorial", is_flag=True, is_eager=True, help="Instead, copy the recordings of the tutorial to FOLDER.")
+@units_option
 @json_option
 def demo(folder: Path, tutorial: bool, as_json: bool) -> None:
     """The main job on a simulated run: record, replay, compare with least squares, save the view; files in FOLDER.

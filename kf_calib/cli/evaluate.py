@@ -32,6 +32,7 @@ from kf_calib.cli.options import (
     settings_of,
     show,
     strict_option,
+    units_option,
 )
 from kf_calib.cli.pictures import Pictures, figures_of, picture_options
 from kf_calib.errors import InputError
@@ -54,6 +55,7 @@ STEPS = "Steps"
 @save_model_option
 @overwrite_option
 @strict_option
+@units_option
 @json_option
 @click.pass_context
 def replay(
@@ -128,6 +130,7 @@ def compare(recording: Path, overwrite: bool, as_json: bool, **options: Any) -> 
 )
 @recording_options
 @filter_options
+@units_option
 @json_option
 def list_effects(names: tuple[str, ...], recording: Path | None, as_json: bool, **options: Any) -> None:
     """The effects a model may have: all of the catalogue and your own, or those NAMEd (formulas too) in detail.
@@ -181,6 +184,7 @@ def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, option
 @picture_options
 @overwrite_option
 @strict_option
+@units_option
 @json_option
 @click.pass_context
 def diagnose(ctx: click.Context, recording: Path, overwrite: bool, strict: bool, as_json: bool, **options: Any) -> None:
@@ -227,6 +231,7 @@ def diagnose(ctx: click.Context, recording: Path, overwrite: bool, strict: bool,
 @picture_options
 @overwrite_option
 @strict_option
+@units_option
 @json_option
 @click.pass_context
 def improve(

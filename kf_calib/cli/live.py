@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from contextvars import copy_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ import rich_click as click
 from kf_calib.cli.acquire import pair
 from kf_calib.cli.echo import Printer, complain
 from kf_calib.cli.files import claimed, delivery, output_option
+from kf_calib.cli.live_keys import pressed_keys
 from kf_calib.cli.numbers import NOT_NEGATIVE, POSITIVE
 from kf_calib.cli.options import (
     INPUT,
@@ -34,6 +36,8 @@ from kf_calib.cli.options import (
     save_view,
     settings_of,
     strict_option,
+    target_option,
+    units_option,
 )
 from kf_calib.cli.signals import answered
 from kf_calib.errors import InputError, KfCalibError
@@ -46,8 +50,6 @@ if TYPE_CHECKING:
     from kf_calib.online.status import Judgement
     from kf_calib.sources.live import LiveSource
     from kf_calib.views.rerun.growing import GrowingView
-from kf_calib.cli.live_keys import pressed_keys
-from kf_calib.cli.live_targets import parsed_targets
 
 RUNNING = "While it runs"
 _REFRESH_S = 0.25
@@ -61,15 +63,7 @@ _REFRESH_S = 0.25
 )
 @click.argument("source", metavar="SOURCE")
 @output_option("--record", metavar="OUT.mcap", panel=RUNNING, help="Record the run here.")
-@click.option(
-    "--target",
-    "targets",
-    multiple=True,
-    metavar="SYMBOL=SIGMA",
-    panel=RUNNING,
-    help="The sigma wanted of a parameter (theta1) or of a kind (theta, phi, nu, K, b), with a unit: "
-    "theta1=2arcsec, K=5ppm, b=10ug; repeatable.",
-)
+@target_option(panel=RUNNING)
 @click.option(
     "--auto", is_flag=True, panel=RUNNING, help="Accept a missing effect when it can be told from all others."
 )
@@ -119,6 +113,7 @@ _REFRESH_S = 0.25
 @rrd_option
 @save_model_option
 @strict_option
+@units_option
 @json_option
 @click.pass_context
 def live(
@@ -146,11 +141,12 @@ def live(
     SOURCE: a serial port, socket://HOST:PORT, rfc2217://HOST:PORT, - (standard input), a file that grows, or sim://.
     Ctrl-C ends the run: the recording is finished and the summary printed.
     """
+    from kf_calib.bench.targets import targets_of
     from kf_calib.estimation import model_file
     from kf_calib.sources.live import files_of, open_live
 
     outputs = claimed(files_of(source), overwrite=overwrite)
-    settings, wanted = settings_of(options), parsed_targets(targets)
+    settings, wanted = settings_of(options), targets_of(targets)
     _refuse(settings)
     opening = open_live(
         source, overrides(options), record, overwrite, columns=dict(map(pair, columns)), header=header,
@@ -203,7 +199,8 @@ class _Run:
         self.error: BaseException | None = None
         self.listeners: list[Callable[[Judgement], None]] = [self._keep]
         self.judgements = queue.Queue["Judgement"](256)
-        self._thread = threading.Thread(target=self._work, args=(settings, wanted, auto, record, every), daemon=True)
+        work = self._work, settings, wanted, auto, record, every
+        self._thread = threading.Thread(target=copy_context().run, args=work, daemon=True)  # in the units chosen
 
     def start(self) -> None:
         self._thread.start()

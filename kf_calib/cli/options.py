@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import rich_click as click
 
@@ -18,6 +18,7 @@ from kf_calib.cli.echo import complain, echo, echo_drawn
 from kf_calib.cli.files import output_option
 from kf_calib.cli.numbers import NOT_NEGATIVE, NUMBER, POSITIVE, NumberInRange
 from kf_calib.errors import BenchError
+from kf_calib.support.units import shown_in, si
 
 if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Diagnosis
@@ -60,8 +61,7 @@ BENCH_OPTIONS = {
     "azimuth_deg": ("--azimuth", NUMBER, "DEG", "Azimuth of the bench's x axis from North toward East, deg."),
     "nominal": ("--nominal", str, "JSON", "Nominal parameters that differ, for example '{\"theta1\": 0}'."),
 }  # fmt: skip
-_ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
-_ACCEL_UNITS = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "ug": 9.80665e-6}
+_ANGLE_UNITS, _ACCEL_UNITS = ("rad", "deg"), ("m/s2", "g", "mg", "ug")
 
 
 def bench_options(command: F) -> F:
@@ -77,11 +77,11 @@ def bench_options(command: F) -> F:
 def recording_options(command: F) -> F:
     """How to read a recording: the bench, unit of the readings, and topics."""
     options = [
-        click.option("--accel-unit", type=click.Choice(list(_ACCEL_UNITS)), default="m/s2", show_default=True,
+        click.option("--accel-unit", type=click.Choice(_ACCEL_UNITS), default="m/s2", show_default=True,
                      help="Unit of the readings.", panel=INPUT),
         click.option("--accel-scale", type=NUMBER, default=1.0, show_default=True,
                      help="Size of one count, in the unit of the readings.", panel=INPUT),
-        click.option("--angle-unit", type=click.Choice(list(_ANGLE_UNITS)), default="rad", show_default=True,
+        click.option("--angle-unit", type=click.Choice(_ANGLE_UNITS), default="rad", show_default=True,
                      help="Unit of the gimbal angles.", panel=INPUT),
         click.option("--accel-topic", metavar="TOPIC", help="Topic of the accelerometer, where there are several.",
                      panel=INPUT),
@@ -154,6 +154,22 @@ strict_option = click.option(
 )
 
 
+def _show_in(ctx: click.Context, param: click.Parameter, system: Literal["field", "si"]) -> None:
+    ctx.with_resource(shown_in(system))
+
+
+units_option = click.option(
+    "--units", type=click.Choice(["field", "si"]), default="field", show_default=True, expose_value=False,
+    callback=_show_in, panel=OUTPUT,
+    help="Units of what is printed and drawn: of the field (arcsec, ppm, µg ...) or SI. Numbers in JSON are in SI.",
+)  # fmt: skip
+target_option = partial(
+    click.option, "--target", "targets", multiple=True, metavar="NAME=SIGMA",
+    help="The sigma wanted of a parameter (theta1, K2), of a kind (theta, phi, nu, K, b) or of all angles, with a unit "
+    "(2ppm, 20ug, 0.1arcsec) or in SI; repeatable.",
+)  # fmt: skip
+
+
 def examples(*lines: str) -> str:
     """What follows the options in ``--help``, a line each."""
     return "\n\n".join(["Examples:", *(f"$ kf-calib {line}" for line in lines)])
@@ -191,8 +207,8 @@ def recording_of(path: Path, options: Mapping[str, Any]) -> Recording:
     return Recording(
         path,
         overrides(options),
-        _ACCEL_UNITS[options["accel_unit"]] * options["accel_scale"],
-        angle_scale=_ANGLE_UNITS[options["angle_unit"]],
+        si(f"1 {options['accel_unit']}") * options["accel_scale"],
+        angle_scale=si(f"1 {options['angle_unit']}"),
         accel_topic=options["accel_topic"],
         pose_topic=options["pose_topic"],
         temperature_topic=options["temperature_topic"],

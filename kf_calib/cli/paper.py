@@ -17,6 +17,7 @@ from kf_calib.cli.options import (
     print_json,
     progress,
     show,
+    units_option,
 )
 from kf_calib.cli.pictures import Pictures, figures_of, picture_options
 
@@ -67,6 +68,7 @@ inferred = partial(click.option, panel="Conditions that the paper does not print
 )
 @picture_options
 @overwrite_option
+@units_option
 @json_option
 def paper(
     repetitions: int, seed: int, period_s: float, latitude: float, azimuth: float, turns: str, sampled: str,

@@ -25,6 +25,8 @@ from kf_calib.cli.options import (
     progress,
     recording_options,
     show,
+    target_option,
+    units_option,
 )
 from kf_calib.cli.pictures import Pictures, figures_of, picture_options
 from kf_calib.errors import InputError
@@ -36,14 +38,14 @@ if TYPE_CHECKING:
     from kf_calib.design.orientation_plan import Plan
     from kf_calib.design.predicted_information import Prospect
 
+_AIM = "What to aim at"
 _CRITERIA = ("D", "A", "E", "minimax", "condition")
 
 
 def _plan_options(command: F) -> F:
     """What is aimed at, what the bench can do, and what a dwell tells."""
     aim_option, reach_option, dwell_option = (
-        partial(click.option, panel=panel)
-        for panel in ("What to aim at", "What the bench can do", "What a dwell tells")
+        partial(click.option, panel=panel) for panel in (_AIM, "What the bench can do", "What a dwell tells")
     )
     options = [
         aim_option("--count", type=click.IntRange(min=1), metavar="N",
@@ -51,9 +53,7 @@ def _plan_options(command: F) -> F:
         aim_option("--criterion", type=click.Choice(_CRITERIA), default="D", show_default=True,
                    help="Least generalised variance, mean variance, largest principal sigma, largest sigma (rad, 1, "
                    "g), or the paper's condition number."),
-        aim_option("--target", "targets", multiple=True, metavar="NAME=SIZE",
-                   help="Sigma wanted of a parameter or kind, as K=2ppm, b2=20ug, angles=0.1arcsec; repeatable: the "
-                   "worst relative to its target is made least."),
+        target_option(panel=_AIM),
         aim_option("--fewest", is_flag=True, help="The fewest dwells that reach all targets."),
         aim_option("--recording", type=click.Path(path_type=Path), metavar="REC",
                    help="A run so far: what comes next, from the filter's own covariance."),
@@ -101,6 +101,7 @@ def _plan_options(command: F) -> F:
 @_plan_options
 @recording_options
 @filter_options
+@units_option
 @json_option
 def plan(
     as_json: bool, csv_file: Path | None, overwrite: bool, **options: Any
@@ -194,8 +195,9 @@ def _reach(bench: Bench, options: Mapping[str, Any]) -> Reach:
 
 
 def _aim(options: Mapping[str, Any], gravity_mps2: float) -> Aim:
+    from kf_calib.bench.targets import targets_of
     from kf_calib.design import optimality_criteria
 
     if options["targets"]:
-        return optimality_criteria.minimax(optimality_criteria.tolerated(options["targets"], gravity_mps2))
+        return optimality_criteria.minimax(optimality_criteria.tolerated(targets_of(options["targets"]), gravity_mps2))
     return optimality_criteria.NAMED[options["criterion"]]

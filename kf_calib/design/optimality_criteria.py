@@ -14,22 +14,14 @@ are those of a ``Prospect``, of parameters in its units (rad, 1, g; effects: the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, Mask
-from kf_calib.errors import InputError, how_to_write
 
-G = 9.80665
-_KINDS = {"rad": ("theta", "phi", "nu"), "1": ("K",), "m/s^2": ("b",)}
-_UNITS = {
-    "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.radians(1), "arcsec": math.radians(1 / 3600)},
-    "1": {"": 1.0, "ppm": 1e-6, "%": 1e-2},
-    "m/s^2": {"m/s^2": 1.0, "m/s2": 1.0, "um/s2": 1e-6, "g": G, "mg": 1e-3 * G, "ug": 1e-6 * G},
-}
 _TINY = 1e-12
 _SOFT = (16.0, 400.0)
 
@@ -148,44 +140,8 @@ def slope(aim: Score, factor: Floats, power: float) -> Floats:
     return out + np.triu(out, 1).T
 
 
-def tolerated(texts: tuple[str, ...], gravity_mps2: float) -> Floats:
-    """Tolerated sigma of each parameter (12,), in rad, 1 and g, from texts such as ``K=2ppm``, ``b2=20ug``,
-    ``angles=0.1arcsec``; raises InputError."""
-    out = np.full(len(paper_parameters.SYMBOLS), np.inf)
-    for text in texts:
-        name, equals, size = text.replace(" ", "").partition("=")
-        chosen = [k for k, symbol in enumerate(paper_parameters.SYMBOLS) if name in _names_of(symbol)]
-        if not equals or not chosen:
-            raise InputError(
-                f"target {text!r} names no parameter: write for example K=2ppm, b2=20ug, theta1=0.1arcsec or "
-                "angles=0.1arcsec."
-            )
-        for k in chosen:
-            out[k] = _size(text, size, paper_parameters.UNITS[k]) / (
-                gravity_mps2 if paper_parameters.UNITS[k] == "m/s^2" else 1.0
-            )
-    return out
-
-
-def _names_of(symbol: str) -> set[str]:
-    """Return the names of a parameter: its symbol, its symbol without number, and ``angles`` for an angle."""
-    kind = symbol.rstrip("123")
-    return {symbol, kind, *(["angles"] if kind in _KINDS["rad"] else [])}
-
-
-def _size(text: str, size: str, kind: str) -> float:
-    """Return the size in SI of a number with a unit."""
-    unit = size.lstrip("+-.0123456789")
-    if unit[:1] in ("e", "E") and unit[1:2] and unit[1] in "+-0123456789":
-        unit = unit[1:].lstrip("+-0123456789")
-    number, units = size[: len(size) - len(unit)], _UNITS[kind]
-    try:
-        value = float(number) * units[unit]
-    except (ValueError, KeyError):
-        value = math.nan
-    if not 0.0 < value < math.inf:
-        known = ", ".join(filter(None, units))
-        raise InputError(
-            f"target {text!r} has no size above zero that fits: give a number in one of {known}{how_to_write(size)}."
-        )
-    return value
+def tolerated(wanted: Mapping[str, float], gravity_mps2: float) -> Floats:
+    """Tolerated sigma of each parameter (12,) in rad, 1 and g, from sigmas in SI by symbol; infinity for the others."""
+    sigma = np.array([wanted.get(symbol, math.inf) for symbol in paper_parameters.SYMBOLS])
+    sigma[paper_parameters.BIASES] /= gravity_mps2
+    return sigma

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kf_calib.diagnosis.candidate_tests import LEVEL, SHARE, CandidateTests
+from kf_calib.effects import Coefficient
 from kf_calib.estimation.observability import smallest_size
 
 
@@ -12,14 +13,17 @@ from kf_calib.estimation.observability import smallest_size
 class Detectable:
     """The size of a coefficient at which an effect is found in 90 of 100 runs; of several, that of the least visible.
 
-    name: of the effect. minimum, unit: the size in SI. shown_minimum, shown_unit: the same in the unit of the field.
+    name: of the effect. minimum: the size in SI. coefficient: which of them it is the size of.
     """
 
     name: str
     minimum: float
-    unit: str
-    shown_minimum: float
-    shown_unit: str
+    coefficient: Coefficient
+
+    @property
+    def unit(self) -> str:
+        """The SI unit of the coefficient."""
+        return self.coefficient.unit
 
 
 def detectable(test: CandidateTests) -> list[Detectable]:
@@ -29,6 +33,6 @@ def detectable(test: CandidateTests) -> list[Detectable]:
         candidate = test.scan.candidates[k]
         found = None if name in test.invisible else smallest_size(candidate, SHARE * LEVEL / test.effective_tests)
         if found is not None:
-            own, minimum = found
-            out.append(Detectable(name, minimum, own.unit, minimum * own.per_si, own.shown_unit))
+            coefficient, minimum = found
+            out.append(Detectable(name, minimum, coefficient))
     return out

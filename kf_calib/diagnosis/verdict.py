@@ -9,6 +9,7 @@ from kf_calib.diagnosis.scatter_hypothesis import dwell_noise_is_stated
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.estimation.fit import WALK
 from kf_calib.estimation.results import format_p
+from kf_calib.support.units import shown
 
 
 def verdict_in_words(found: Diagnosis) -> str:
@@ -75,11 +76,11 @@ def _size(found: Diagnosis) -> str:
     parameters = found.after.parameters
     first = next(each for each in found.after.model.effects if str(each) == found.missing[0])
     sized = [parameters[c.symbol] for c in ([WALK] if first.walks else first.coefficients)]
-    shown = [max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or np.inf))]
-    shown += [parameters[first.unknown.symbol]] if first.unknown else []
+    told = [max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or np.inf))]
+    told += [parameters[first.unknown.symbol]] if first.unknown else []
     return "".join(
-        f", {p.symbol} = {p.value * p.per_si:.3g} ± {p.sigma * p.per_si:.2g} {p.shown_unit}"
-        for p in shown
+        f", {p.symbol} = {shown(p).number(p.value)} ± {shown(p).text(p.sigma, 2)}"
+        for p in told
         if p.value is not None and p.sigma
     )
 

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import Coefficient, Effect, G, SensorEffect, Unknown
+from kf_calib.effects.effect import Coefficient, Effect, SensorEffect, Unknown
 from kf_calib.effects.stimulus import Stimulus
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _HELD = 2.5  # cycles in a piece, of which its parabola holds a fourteenth of the power
 
@@ -17,7 +18,7 @@ class BiasDrift(SensorEffect):
 
     name, title, source = "bias-drift", "bias that drifts with time", "IEEE Std 1293, drift"
     confused_with = "warm-up; a monotone order of poses mixes it with angle"
-    symbol, unit, scale, shown = "beta", "m/s^3", 1e-6, ("µg/h", 3600e6 / G)
+    symbol, unit, scale = "beta", "m/s^3", 1e-6
 
     def terms(self, s: Stimulus) -> Floats:
         return np.repeat(s.elapsed_s[:, None], 3, axis=1)
@@ -28,7 +29,7 @@ class ScaleDrift(SensorEffect):
 
     name, title, source = "scale-drift", "scale factor that drifts with time", "IEEE Std 1293, drift"
     confused_with = "base-tilt-drift"
-    symbol, unit, scale, shown = "kappa", "1/s", 1e-7, ("ppm/h", 3600e6)
+    symbol, unit, scale = "kappa", "1/s", 1e-7
 
     def terms(self, s: Stimulus) -> Floats:
         return s.elapsed_s[:, None] * s.along
@@ -39,10 +40,10 @@ class Hysteresis(SensorEffect):
 
     name, title, source = "hysteresis", "reading that depends on the side it was come from", "IEEE Std 1293, hysteresis"
     confused_with = "needs the same pose from two sides"
-    symbol, unit, scale, shown = "h", "m/s^2", 1e-3, ("µg", 1e6 / G)
+    symbol, unit, scale = "h", "m/s^2", 1e-3
 
     def terms(self, s: Stimulus) -> Floats:
-        return np.sign(np.where(np.abs(s.step) > 1e-6 * G, s.step, 0.0))
+        return np.sign(np.where(np.abs(s.step) > 1e-6 * STANDARD_GRAVITY_MPS2, s.step, 0.0))
 
 
 class _Decay(SensorEffect):
@@ -58,7 +59,7 @@ class WarmUp(_Decay):
 
     name, title, source = "warm-up", "bias that settles after switching on", "IEEE Std 1293, turn-on transient"
     confused_with = "bias-drift; needs an early long dwell"
-    symbol, unit, scale, shown = "B", "m/s^2", 1e-2, ("µg", 1e6 / G)
+    symbol, unit, scale = "B", "m/s^2", 1e-2
     unknown = Unknown("tauWarm", "s", 30.0, 10800.0, "min", 1.0 / 60.0)
 
     def terms(self, s: Stimulus) -> Floats:
@@ -70,7 +71,7 @@ class Settling(_Decay):
 
     name, title, source = "settling", "creep after a change of the input", "IEEE Std 1293, settling"
     confused_with = "shows in early against late samples of a dwell"
-    symbol, unit, scale, shown = "C", "1", 1e-3, ("ppm", 1e6)
+    symbol, unit, scale = "C", "1", 1e-3
     unknown = Unknown("tauSettle", "s", 3.0, 600.0, "s", 1.0)
 
     def terms(self, s: Stimulus) -> Floats:
@@ -95,7 +96,7 @@ class Sinusoid(Effect):
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         kinds = [f"{kind}{i}" for i in (1, 2, 3) for kind in ("As", "Ac")]
-        return tuple(Coefficient(symbol, "m/s^2", 1e-3, "µg", 1e6 / G) for symbol in kinds)
+        return tuple(Coefficient(symbol, "m/s^2", 1e-3) for symbol in kinds)
 
     def columns(self, s: Stimulus) -> Floats:
         at_s, shares = s.about

@@ -17,19 +17,25 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.effects.stimulus import Stimulus
-
-G = 9.80665
+from kf_calib.support.units import field_unit
 
 
 @dataclass(frozen=True)
 class Coefficient:
-    """symbol, SI unit; scale: a size a user would call large, for a prior; shown_unit, per_si: a unit of the field."""
+    """symbol, SI unit; scale: a size a user would call large, for a prior.
+
+    shown_unit, per_si: a unit of the field, and how many of it make one SI unit; left out, they are those of the table
+    in ``support.units``.
+    """
 
     symbol: str
     unit: str
     scale: float
-    shown_unit: str
-    per_si: float
+    shown_unit: str = ""
+    per_si: float = 1.0
+
+    def __post_init__(self) -> None:
+        _complete(self)
 
 
 @dataclass(frozen=True)
@@ -43,13 +49,24 @@ class Unknown:
     unit: str
     low: float
     high: float
-    shown_unit: str
-    per_si: float
+    shown_unit: str = ""
+    per_si: float = 1.0
+
+    def __post_init__(self) -> None:
+        _complete(self)
 
     def grid(self, ratio: float = 1.5) -> Floats:
         """Values from low to high in equal steps of the logarithm, each at most ``ratio`` times the one before."""
         count = int(np.ceil(np.log(self.high / self.low) / np.log(ratio))) + 1
         return np.geomspace(self.low, self.high, count)
+
+
+def _complete(own: Coefficient | Unknown) -> None:
+    """Fill in the unit of the field where none was given."""
+    if not own.shown_unit:
+        unit = field_unit(own.unit)
+        object.__setattr__(own, "shown_unit", unit.label)  # the way for a frozen dataclass
+        object.__setattr__(own, "per_si", unit.per_si)
 
 
 class Effect(ABC):
@@ -132,16 +149,20 @@ class Effect(ABC):
 
 
 class SensorEffect(Effect):
-    """One coefficient for each accelerometer; ``terms`` (m, 3) is what each reads more per unit of its own."""
+    """One coefficient for each accelerometer; ``terms`` (m, 3) is what each reads more per unit of its own.
+
+    shown: a unit of the field and how many of it make one SI unit, where it is not that of ``support.units``.
+    """
 
     symbol: ClassVar[str]
     unit: ClassVar[str]
     scale: ClassVar[float]
-    shown: ClassVar[tuple[str, float]]
+    shown: ClassVar[tuple[str, float] | None] = None
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"{self.symbol}{i}", self.unit, self.scale, *self.shown) for i in (1, 2, 3))
+        shown = self.shown or field_unit(self.unit)
+        return tuple(Coefficient(f"{self.symbol}{i}", self.unit, self.scale, *shown) for i in (1, 2, 3))
 
     @abstractmethod
     def terms(self, s: Stimulus) -> Floats: ...

@@ -5,17 +5,15 @@ A plain number stays a number, so that it can be an exponent; a plain 0 goes wit
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any
 
-from kf_calib.effects.effect import G
 from kf_calib.effects.expression import FUNCTIONS, OPERATORS, Expression
 from kf_calib.errors import InputError
+from kf_calib.support.units import RAISED, field_unit, per_power_of_g
 
 _ORDER = {"radian": "rad", "meter": "m", "second": "s", "kelvin": "K"}
-_RAISED = str.maketrans("0123456789.-", "⁰¹²³⁴⁵⁶⁷⁸⁹·⁻")
 _POWER_LIMIT = 12.0
 Unit = Any
 """pint.Unit; pint is imported where a formula is used only."""
@@ -49,14 +47,14 @@ def coefficient_units(unit: Unit) -> tuple[str, tuple[str, float]]:
     power = _exponents(unit).get("meter", 0.0)
     if power not in (0.0, 1.0, 2.0, 3.0, 4.0):
         return own, (own, 1.0)
-    head = {0.0: "µg", 1.0: "ppm"}.get(power, f"µg/g{f'{power:g}'.translate(_RAISED)}")
-    return own, (text(acceleration**power / unit, head, raised=True), 1e6 * G ** (power - 1.0))
+    shown = per_power_of_g(power)
+    return own, (text(acceleration**power / unit, shown.label, raised=True), shown.per_si)
 
 
 def turning_units(unit: Unit) -> tuple[str, tuple[str, float]]:
     """The same of the coefficient of an expression that is an angle per unit of the coefficient; told in arcsec."""
-    own = _registry().Unit("rad") / unit
-    return text(own), (text(1 / unit, "arcsec"), math.degrees(3600.0))
+    own, shown = _registry().Unit("rad") / unit, field_unit("rad")
+    return text(own), (text(1 / unit, shown.label), shown.per_si)
 
 
 def text(unit: Unit, head: str = "", raised: bool = False) -> str:
@@ -65,7 +63,7 @@ def text(unit: Unit, head: str = "", raised: bool = False) -> str:
     def power(name: str, exponent: float) -> str:
         if exponent == 1.0:
             return name
-        return name + (f"{exponent:.4g}".translate(_RAISED) if raised else f"^{exponent:.4g}")
+        return name + (f"{exponent:.4g}".translate(RAISED) if raised else f"^{exponent:.4g}")
 
     found = _exponents(unit)
     powers = [(short, found[name]) for name, short in _ORDER.items() if found.get(name)]

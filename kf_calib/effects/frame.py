@@ -6,11 +6,9 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects.effect import Coefficient, Effect, FrameEffect, G
+from kf_calib.effects.effect import Coefficient, Effect, FrameEffect
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
-
-ARCSEC = ("arcsec", np.degrees(1.0) * 3600.0)
 
 
 class BaseTilt(FrameEffect):
@@ -21,7 +19,7 @@ class BaseTilt(FrameEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"delta{axis}", "rad", 1e-3, *ARCSEC) for axis in "NE")
+        return tuple(Coefficient(f"delta{axis}", "rad", 1e-3) for axis in "NE")
 
     def rotations(self, s: Stimulus) -> Floats:
         return -np.stack([s.to_platform(axis) for axis in s.level_axes], axis=1)
@@ -38,7 +36,7 @@ class BaseTiltDrift(BaseTilt):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"deltaRate{axis}", "rad/s", 1e-8, "µrad/day", 86400e6) for axis in "NE")
+        return tuple(Coefficient(f"deltaRate{axis}", "rad/s", 1e-8) for axis in "NE")
 
     def rotations(self, s: Stimulus) -> Floats:
         return super().rotations(s) * s.elapsed_s[:, None, None]
@@ -85,8 +83,7 @@ class Flexure(FrameEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        per_si = np.degrees(1.0) * 3600.0 * G
-        return tuple(Coefficient(f"d{axis}", "rad s^2/m", 1e-4, "arcsec/g", per_si) for axis in "XYZ")
+        return tuple(Coefficient(f"d{axis}", "rad s^2/m", 1e-4) for axis in "XYZ")
 
     def rotations(self, s: Stimulus) -> Floats:
         return -np.cross(s.force_mps2[:, None, :], np.eye(3))
@@ -100,7 +97,7 @@ class CrossTalk(Effect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"X{i}{j}", "1", 1e-3, "ppm", 1e6) for i in (1, 2, 3) for j in (1, 2, 3) if i != j)
+        return tuple(Coefficient(f"X{i}{j}", "1", 1e-3) for i in (1, 2, 3) for j in (1, 2, 3) if i != j)
 
     def columns(self, s: Stimulus) -> Floats:
         readings, out = s.force_mps2 @ s.sensitivity.T, np.zeros((len(s), 3, 6))
@@ -138,7 +135,7 @@ class EncoderOffset(_GimbalEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient(f"eps_{self.variant}", "rad", 1e-2, *ARCSEC),)
+        return (Coefficient(f"eps_{self.variant}", "rad", 1e-2),)
 
     def rotations(self, s: Stimulus) -> Floats:
         return self._about_axis(s)[:, None, :]
@@ -156,7 +153,7 @@ class EncoderScale(_GimbalEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient(f"epsS_{self.variant}", "1", 1e-3, "ppm", 1e6),)
+        return (Coefficient(f"epsS_{self.variant}", "1", 1e-3),)
 
     def rotations(self, s: Stimulus) -> Floats:
         return (self._angle(s)[:, None] * self._about_axis(s))[:, None, :]
@@ -170,7 +167,7 @@ class EncoderHarmonic1(_GimbalEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"{part}{self.order}_{self.variant}", "rad", 1e-3, *ARCSEC) for part in "sc")
+        return tuple(Coefficient(f"{part}{self.order}_{self.variant}", "rad", 1e-3) for part in "sc")
 
     def rotations(self, s: Stimulus) -> Floats:
         angle = self.order * self._angle(s)
@@ -192,7 +189,7 @@ class AxisNonorthogonality(_GimbalEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"tau{part}_{self.variant}", "rad", 1e-3, *ARCSEC) for part in "AB")
+        return tuple(Coefficient(f"tau{part}_{self.variant}", "rad", 1e-3) for part in "AB")
 
     def rotations(self, s: Stimulus) -> Floats:
         from kf_calib.bench.bench import turn
@@ -210,7 +207,7 @@ class GravityError(Effect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("epsG", "1", 1e-3, "ppm", 1e6),)
+        return (Coefficient("epsG", "1", 1e-3),)
 
     def columns(self, s: Stimulus) -> Floats:
         return (s.force_mps2 @ s.sensitivity.T)[:, :, None]

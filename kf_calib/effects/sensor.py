@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import G, SensorEffect, Unknown
+from kf_calib.effects.effect import SensorEffect, Unknown
 from kf_calib.effects.stimulus import Stimulus
 
 IEEE = "IEEE Std 1293, model equation"
@@ -17,7 +17,7 @@ class BiasAsymmetry(SensorEffect):
 
     name, title, source = "bias-asymmetry", "bias that changes sign with the input", IEEE
     confused_with = "odd-quadratic; invisible in six faces"
-    symbol, unit, scale, shown = "K0'", "m/s^2", 1e-3, ("µg", 1e6 / G)
+    symbol, unit, scale = "K0'", "m/s^2", 1e-3
 
     def terms(self, s: Stimulus) -> Floats:
         return 0.5 * np.sign(s.along)
@@ -28,7 +28,7 @@ class ScaleAsymmetry(SensorEffect):
 
     name, title, source = "scale-asymmetry", "scale factor that differs with the sign of the input", IEEE
     confused_with = "second-order"
-    symbol, unit, scale, shown = "K1'", "1", 1e-3, ("ppm", 1e6)
+    symbol, unit, scale = "K1'", "1", 1e-3
 
     def terms(self, s: Stimulus) -> Floats:
         return 0.5 * np.abs(s.along)
@@ -39,7 +39,7 @@ class SecondOrder(SensorEffect):
 
     name, title, source = "second-order", "second-order nonlinearity", IEEE
     confused_with = "scale-asymmetry"
-    symbol, unit, scale, shown = "K2_", "s^2/m", 1e-4, ("µg/g²", 1e6 * G)
+    symbol, unit, scale = "K2_", "s^2/m", 1e-4
 
     def terms(self, s: Stimulus) -> Floats:
         return s.along**2
@@ -50,7 +50,7 @@ class ThirdOrder(SensorEffect):
 
     name, title, source = "third-order", "third-order nonlinearity", IEEE
     confused_with = "odd-quadratic; invisible in six faces"
-    symbol, unit, scale, shown = "K3_", "s^4/m^2", 1e-5, ("µg/g³", 1e6 * G**2)
+    symbol, unit, scale = "K3_", "s^4/m^2", 1e-5
 
     def terms(self, s: Stimulus) -> Floats:
         return s.along**3
@@ -61,7 +61,7 @@ class OddQuadratic(SensorEffect):
 
     name, title, source = "odd-quadratic", "odd quadratic nonlinearity", IEEE
     confused_with = "third-order; invisible in six faces"
-    symbol, unit, scale, shown = "Koq", "s^2/m", 1e-4, ("µg/g²", 1e6 * G)
+    symbol, unit, scale = "Koq", "s^2/m", 1e-4
 
     def terms(self, s: Stimulus) -> Floats:
         return s.along * np.abs(s.along)
@@ -69,7 +69,7 @@ class OddQuadratic(SensorEffect):
 
 class _CrossCoupling(SensorEffect):
     source, confused_with = IEEE, "seen in poses between the faces only"
-    unit, scale, shown = "s^2/m", 1e-4, ("µg/g²", 1e6 * G)
+    unit, scale = "s^2/m", 1e-4
 
 
 class CrossCouplingIP(_CrossCoupling):
@@ -115,7 +115,7 @@ class VibrationRectification(SensorEffect):
     name, title, source = "vibration-rectification", "shift of the bias under vibration", IEEE
     confused_with = "needs vibration that varies"
     averages = True
-    symbol, unit, scale, shown = "K2v", "s^2/m", 1e-4, ("µg/g²", 1e6 * G)
+    symbol, unit, scale = "K2v", "s^2/m", 1e-4
 
     def terms(self, s: Stimulus) -> Floats:
         return np.broadcast_to(s.variance_mps2_2, (len(s), 3))
@@ -127,7 +127,7 @@ class DeadZone(SensorEffect):
     name, title, source = "dead-zone", "no response to small inputs", IEEE
     confused_with = "needs poses that sweep through zero"
     symbol, unit, scale, shown = "Dz", "1", 1.0, ("of the input", 1.0)
-    unknown = Unknown("dZone", "m/s^2", 1e-6, 1e-2, "µg", 1e6 / G)
+    unknown = Unknown("dZone", "m/s^2", 1e-6, 1e-2)
     smooth = False
 
     def __init__(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import Coefficient, Effect, G
+from kf_calib.effects.effect import Coefficient, Effect
 from kf_calib.effects.stimulus import Stimulus
 
 
@@ -20,7 +20,7 @@ class Magnetic(Effect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"mB{part}{i}", "m/s^2", 1e-3, "µg", 1e6 / G) for i in (1, 2, 3) for part in "NE")
+        return tuple(Coefficient(f"mB{part}{i}", "m/s^2", 1e-3) for i in (1, 2, 3) for part in "NE")
 
     def columns(self, s: Stimulus) -> Floats:
         out = np.zeros((len(s), 3, 6))

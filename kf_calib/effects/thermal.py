@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import Coefficient, Effect, G, SensorEffect, Unknown
+from kf_calib.effects.effect import Coefficient, Effect, SensorEffect, Unknown
 from kf_calib.effects.stimulus import Stimulus
 
 IEEE = "IEEE Std 1293, environmental sensitivities"
@@ -16,7 +16,7 @@ class ThermalBias(SensorEffect):
 
     name, title, source = "thermal-bias", "bias that follows the temperature", IEEE
     confused_with = "needs a temperature swing"
-    symbol, unit, scale, shown = "alpha", "m/s^2/K", 1e-3, ("µg/K", 1e6 / G)
+    symbol, unit, scale = "alpha", "m/s^2/K", 1e-3
 
     def terms(self, s: Stimulus) -> Floats:
         return np.repeat(s.warmth[:, None], 3, axis=1)
@@ -26,7 +26,7 @@ class ThermalBias2(SensorEffect):
     """alpha_2 T^2."""
 
     name, title, source = "thermal-bias-2", "bias that follows the square of the temperature", IEEE
-    symbol, unit, scale, shown = "alpha2_", "m/s^2/K^2", 1e-4, ("µg/K²", 1e6 / G)
+    symbol, unit, scale = "alpha2_", "m/s^2/K^2", 1e-4
 
     def terms(self, s: Stimulus) -> Floats:
         return np.repeat(s.warmth[:, None] ** 2, 3, axis=1)
@@ -37,7 +37,7 @@ class ThermalScale(SensorEffect):
 
     name, title, source = "thermal-scale", "scale factor that follows the temperature", IEEE
     confused_with = "needs both signs of the input at two temperatures"
-    symbol, unit, scale, shown = "alphaS", "1/K", 1e-4, ("ppm/K", 1e6)
+    symbol, unit, scale = "alphaS", "1/K", 1e-4
 
     def terms(self, s: Stimulus) -> Floats:
         return s.warmth[:, None] * s.along
@@ -48,7 +48,7 @@ class ThermalRate(SensorEffect):
 
     name, title, source = "thermal-rate", "bias that follows the rate of the temperature", IEEE
     confused_with = "warm-up"
-    symbol, unit, scale, shown = "kappaT", "m s^-1/K", 1e-1, ("µg per K/min", 1e6 / G / 60)
+    symbol, unit, scale = "kappaT", "m s^-1/K", 1e-1
 
     def terms(self, s: Stimulus) -> Floats:
         return np.repeat(s.warming[:, None], 3, axis=1)
@@ -61,9 +61,7 @@ class ThermalMisalignment(Effect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(
-            Coefficient(f"gamma{axis}{i}", "rad/K", 1e-5, "µrad/K", 1e6) for i in (1, 2, 3) for axis in ("P", "O")
-        )
+        return tuple(Coefficient(f"gamma{axis}{i}", "rad/K", 1e-5) for i in (1, 2, 3) for axis in ("P", "O"))
 
     def columns(self, s: Stimulus) -> Floats:
         out = np.zeros((len(s), 3, 6))
@@ -78,7 +76,7 @@ class ThermalLag(SensorEffect):
 
     name, title, source = "thermal-lag", "bias that follows the temperature late", IEEE
     confused_with = "thermal-bias and thermal-rate together"
-    symbol, unit, scale, shown = "alphaL", "m/s^2/K", 1e-3, ("µg/K", 1e6 / G)
+    symbol, unit, scale = "alphaL", "m/s^2/K", 1e-3
     unknown = Unknown("tauLag", "s", 30.0, 7200.0, "min", 1.0 / 60.0)
 
     def __init__(self) -> None:

@@ -11,8 +11,8 @@ A file needs no more than this (ten lines at most)::
             return s.along**2 * s.warmth[:, None]
 
 What a class leaves out is filled in: name ``mine``, title, source ``user``, symbols ``mine1 mine2 mine3``, scale 1, and
-the unit itself as the unit shown. A package announces a class, or a module of classes, as an entry point of the group
-``kf_calib.effects``. Reading such a file runs it, as Python runs any module.
+the unit of the field that it is shown in (``support.units``). A package announces a class, or a module of classes, as
+an entry point of the group ``kf_calib.effects``. Reading such a file runs it, as Python runs any module.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def completed(kind: type[Effect], origin: str) -> type[Effect]:
     defaults: dict[str, object] = {"name": name, "title": name, "source": "user"}
     if issubclass(kind, SensorEffect):
         unit = getattr(kind, "unit", "SI")
-        defaults |= {"symbol": symbol_stem(name), "unit": unit, "scale": 1.0, "shown": (unit, 1.0)}
+        defaults |= {"symbol": symbol_stem(name), "unit": unit, "scale": 1.0}
     for key, value in defaults.items():
         if not hasattr(kind, key):
             setattr(kind, key, value)

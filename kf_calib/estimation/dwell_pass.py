@@ -20,6 +20,7 @@ from kf_calib.estimation import setup_blunders
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import ReadingsMonitor
+from kf_calib.support.units import WORDS
 
 
 @dataclass
@@ -100,10 +101,9 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
     if 0.5 <= level <= 2.0:
         setup_blunders.refuse(dwells, bench)
         return
-    units = {"g": 1 / 9.80665, "mg": 1e3 / 9.80665, "ug": 1e6 / 9.80665}
     measured = level * bench.gravity_mps2
-    for unit, per_mps2 in units.items():
-        if 0.8 <= measured / (bench.gravity_mps2 * per_mps2) <= 1.25:
+    for unit in ("g", "mg", "ug"):
+        if 0.8 <= measured * WORDS["m/s^2"][unit] / bench.gravity_mps2 <= 1.25:
             raise InputError(
                 f"the readings have a norm of {measured:.4g} at rest, which is gravity in {unit}, not in m/s^2: "
                 f"state it with --accel-unit {unit}."

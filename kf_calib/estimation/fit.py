@@ -29,7 +29,7 @@ from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, steps, within_dwe
 from kf_calib.estimation.reml import Part, gain_of, misfit, restoring_gain, with_dwell_parts, with_slow_scatter
 from kf_calib.estimation.score_test import falls
 
-WALK = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5, "µg/√s", 1e6 / 9.80665)
+WALK = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5)
 """The intensity of the random walk of the biases, as a parameter in the results."""
 
 _PASSES = 3

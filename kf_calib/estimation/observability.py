@@ -19,6 +19,7 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.score_test import Candidate, Scan, scan
 from kf_calib.support.threads import one_blas_thread
+from kf_calib.support.units import shown
 
 LEVEL, POWER = 0.01, 0.9
 """Significance level of a detection, and the share of runs in which an effect of the smallest detectable size is
@@ -62,7 +63,7 @@ class Visibility:
             parts.append(f"not determined: {' '.join(self.unseen)}")
         if self.smallest is not None:
             own, size = self.smallest
-            parts.append(f"smallest size {size * own.per_si:.3g} {own.shown_unit}{self.at}")
+            parts.append(f"smallest size {shown(own).text(size)}{self.at}")
         for words, twins in (("cannot be told from", True), ("overlaps with", False)):
             named = [f"{name} ({overlap:.2f})" for name, overlap in self.rivals if (overlap > _TWINS) == twins]
             parts += [f"{words} {', '.join(named)}"] if named else []
@@ -79,7 +80,7 @@ class Visibility:
         unknown = self.effect.unknown
         if unknown is None:
             return ""
-        return f" with {unknown.symbol} at {self.effect.value * unknown.per_si:.3g} {unknown.shown_unit}"
+        return f" with {unknown.symbol} at {shown(unknown).text(self.effect.value)}"
 
 
 def visibility_of(fitted: Fit, effects: Sequence[Effect]) -> list[Visibility]:

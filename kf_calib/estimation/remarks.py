@@ -16,6 +16,7 @@ from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.noise_model import TOO_SHORT, Noise
 from kf_calib.estimation.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, directions
 from kf_calib.estimation.results import Consistency, Estimate
+from kf_calib.support.units import shown
 
 
 def misfit_remark(judged: Consistency, residuals: Floats, bench: Bench, noise: Noise) -> str:
@@ -23,8 +24,8 @@ def misfit_remark(judged: Consistency, residuals: Floats, bench: Bench, noise: N
     rms = float(np.sqrt(np.mean(residuals**2)))
     if rms > 0.03 * bench.gravity_mps2:
         return (
-            f"the angles do not explain the readings (residual {rms:.2g} m/s^2 rms between dwells): check the order "
-            "and sign of the axes, the unit of the angles, and which channel is which."
+            f"the angles do not explain the readings (residual {shown('m/s^2').text(rms, 2)} rms between dwells): "
+            "check the order and sign of the axes, the unit of the angles, and which channel is which."
         )
     if judged.consistent is False:
         return (
@@ -96,8 +97,8 @@ def remarks_on(
         yield (
             f"these orientations have gravity in {known} different direction{'s' * (known != 1)}, which cannot tell a "
             "setting error of the angles from scatter of the sensors: dwells are weighted alike and their whole misfit "
-            f"({noise.scatter_mps2[0]:.2g} m/s^2) counts in every sigma; {ENOUGH_DIRECTIONS} directions, spread, would "
-            "tell."
+            f"({shown('m/s^2').text(noise.scatter_mps2[0], 2)}) counts in every sigma; {ENOUGH_DIRECTIONS} directions, "
+            "spread, would tell."
         )
     if unstated(noise) and degrees_of_freedom(carried.means) < FEWEST:
         yield (

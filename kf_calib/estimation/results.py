@@ -26,16 +26,16 @@ from kf_calib.estimation.signal_quality import Readings
 from kf_calib.support.printing import printed
 from kf_calib.support.tail_probabilities import f_tail
 from kf_calib.support.threads import one_blas_thread
+from kf_calib.support.units import field_unit, shown
 
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # larger sigmas: not determined
-_SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("m/s^2", 1.0)}
 
 
 @dataclass(frozen=True)
 class Parameter:
     """An estimated parameter and its sigma in SI units; both are None if the orientations do not determine it.
 
-    A deviation from nominal times ``per_si`` is in ``shown_unit``, the usual unit of the field.
+    A value times ``per_si`` is in ``shown_unit``, the unit of the field (``support.units``).
     """
 
     symbol: str
@@ -191,8 +191,8 @@ class OutlyingDwell:
         pose = self.dwell.recorded_pose
         axes = self.without.bench.axes
         at = f" (recorded at {', '.join(f'{angle:.4g}' for angle in np.degrees(pose))} deg)" if axes else ""
-        size = float(np.linalg.norm(self.error_mps2))
-        told = f"dwell {self.number}{at} alone does not fit: it is off by {size:.2g} m/s^2"
+        size = shown("m/s^2").text(float(np.linalg.norm(self.error_mps2)), 2)
+        told = f"dwell {self.number}{at} alone does not fit: it is off by {size}"
         if self.turns:
             told += f", as if {' or '.join(map(str, self.turns))}"
         elif axes:
@@ -278,17 +278,17 @@ class Calibration:
             ),
             *((c.symbol, *own, 0.0, c.unit) for c, *own in zip(coefficients, effects, sigmas, strict=True)),
         ]
-        shown = [*(_SHOWN[unit] for unit in paper_parameters.UNITS), *((c.shown_unit, c.per_si) for c in coefficients)]
+        units = [*map(field_unit, paper_parameters.UNITS), *((c.shown_unit, c.per_si) for c in coefficients)]
         if self.model.walks:
             intensity, spread = self.noise.walk_mps2_per_sqrt_s, self.noise.walk_spread
             found.append((WALK.symbol, intensity, intensity * spread if spread else math.nan, 0.0, WALK.unit))
-            shown.append((WALK.shown_unit, WALK.per_si))
+            units.append((WALK.shown_unit, WALK.per_si))
         for effect in self.model.stepped:
             assert effect.unknown is not None
             constant, spread = effect.unknown, self.fit.spreads[str(effect)]
             sigma = effect.value * spread if spread < 1.0 else math.nan  # sigma over value
             found.append((constant.symbol, effect.value, sigma, 0.0, constant.unit))
-            shown.append((constant.shown_unit, constant.per_si))
+            units.append((constant.shown_unit, constant.per_si))
         return {
             symbol: Parameter(
                 symbol,
@@ -298,7 +298,7 @@ class Calibration:
                 float(expected),
                 *own,
             )
-            for (symbol, value, sigma, expected, unit), own in zip(found, shown, strict=True)
+            for (symbol, value, sigma, expected, unit), own in zip(found, units, strict=True)
         }
 
     @property

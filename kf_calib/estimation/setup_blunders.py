@@ -27,8 +27,8 @@ from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.bench import CHANNELS, Bench
 from kf_calib.bench.mountings import Mounting, mountings
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.effects.effect import G
 from kf_calib.errors import BlunderError
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _FARTHEST = math.cos(math.radians(45.0))  # largest angle of an axis from nominal
 _GAIN = (0.5, 2.0)  # range of a scale factor over nominal; outside it is another unit or no accelerometer
@@ -370,11 +370,11 @@ def common_scale(scales: Floats, sigmas: Floats, bench: Bench) -> str:
     if not (same and abs(level) > max(5.0 * float(sigmas.max()), _LITTLE)):
         return ""
     said = f"the three scale factors are off by the same {1e6 * level:+.0f} ppm, as they are where"
-    factor = bench.gravity_mps2 / G
+    factor = bench.gravity_mps2 / STANDARD_GRAVITY_MPS2
     if abs(level - (1.0 / factor - 1.0)) < max(5.0 * float(sigmas.max()), _ALIKE * abs(level)):
         return (
             f"{said} readings in units of local gravity ({bench.gravity_mps2:.6g} m/s^2) are taken for such of "
-            f"standard gravity ({G}): if they are, state --accel-scale {factor:.7f}."
+            f"standard gravity ({STANDARD_GRAVITY_MPS2}): if they are, state --accel-scale {factor:.7f}."
         )
     seen_mps2 = bench.gravity_mps2 * (1.0 + level)
     return f"{said} gravity is not {bench.gravity_mps2:.6g} m/s^2 as stated, but {seen_mps2:.6g}."

@@ -26,6 +26,7 @@ from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.dwells.rows import Rows
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.noise_model import Noise
+from kf_calib.support.units import shown
 
 _SAMPLE = 256  # readings of a dwell whose values are compared; a step below a twentieth of the noise is not noticed
 _VALUES = 32  # largest number of distinct values of a dwell that are kept
@@ -52,12 +53,14 @@ class Quantisation:
         return self.step_mps2 / math.sqrt(12.0)
 
     def __str__(self) -> str:
-        told = f"readings of accelerometer {self.channel} are whole multiples of {self.step_mps2:.3g} m/s^2"
+        unit = shown("m/s^2")
+        told = f"readings of accelerometer {self.channel} are whole multiples of {unit.text(self.step_mps2)}"
+        rms, noise, error = (unit.text(x, 2) for x in (self.rms_mps2, self.sigma_mps2, self.mean_error_mps2))
         if not self.matters:
-            return f"{told} (rms {self.rms_mps2:.2g}, within a noise of {self.sigma_mps2:.2g}): harmless."
+            return f"{told} (rms {rms}, within a noise of {noise}): harmless."
         return (
-            f"{told}, too coarse for their noise of {self.sigma_mps2:.2g}: the mean of a dwell can be off by "
-            f"{self.mean_error_mps2:.2g} m/s^2, and averaging does not help; record with a finer step."
+            f"{told}, too coarse for their noise of {noise}: the mean of a dwell can be off by {error}, and averaging "
+            "does not help; record with a finer step."
         )
 
 
@@ -133,6 +136,7 @@ class Readings:
     def findings(self) -> list[str]:
         """All findings, harmless or not, in a few words each."""
         out = self.outliers
+        unit = shown("m/s^2")
         crowded = f", crowded in {_dwells(out.dwells)}" if out.clustered else ""
         return [
             *(
@@ -140,8 +144,9 @@ class Readings:
                 for each in self.saturation
             ),
             *(
-                f"quantisation of accelerometer {each.channel} in steps of {each.step_mps2:.3g} m/s^2 (rms "
-                f"{each.rms_mps2:.2g}, noise {each.sigma_mps2:.2g}: {'too coarse' if each.matters else 'harmless'})"
+                f"quantisation of accelerometer {each.channel} in steps of {unit.text(each.step_mps2)} (rms "
+                f"{unit.number(each.rms_mps2, 2)}, noise {unit.number(each.sigma_mps2, 2)}: "
+                f"{'too coarse' if each.matters else 'harmless'})"
                 for each in self.quantisation
             ),
             *([f"outliers, {out.count} ({out.share:.2%}){crowded}"] if out.count else []),

@@ -15,6 +15,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextvars import copy_context
 from dataclasses import dataclass, replace
 
 from kf_calib.bench.streams import Batch, Source
@@ -77,7 +78,7 @@ class Session:
         """
         failure: Exception | None = None
         with one_blas_thread():  # for both threads: setting it in one would change the other's
-            judge = threading.Thread(target=self._judge, name="judge", daemon=True)
+            judge = threading.Thread(target=copy_context().run, args=(self._judge,), name="judge", daemon=True)
             judge.start()
             try:
                 for batch in self.source:  # read to its end even after a failure, as the source may be recording

@@ -12,6 +12,7 @@ from rich.text import Text
 
 from kf_calib.effects import Effect, as_text, remarks_of
 from kf_calib.estimation.observability import Visibility
+from kf_calib.support.units import shown
 from kf_calib.views.console import effect_rows, symbol
 from kf_calib.views.tables import Table
 
@@ -98,7 +99,7 @@ def _sight_cells(sight: Visibility) -> list[str]:
         cells.append("")
     else:
         own, size = sight.smallest
-        cells.append(f"{size * own.per_si:.3g} {own.shown_unit}{sight.at}")
+        cells.append(f"{shown(own).text(size)}{sight.at}")
     return [*cells, ", ".join(f"{name} ({overlap:.2f})" for name, overlap in sight.rivals)]
 
 

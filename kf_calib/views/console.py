@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 
 import numpy as np
 from rich.console import Group, RenderableType
@@ -19,6 +18,7 @@ from kf_calib.estimation.remarks import beyond_stated
 from kf_calib.estimation.reml import FEWEST, degrees_of_freedom
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Parameter, format_p
 from kf_calib.support.printing import printed
+from kf_calib.support.units import rounded, shown, shown_angle
 from kf_calib.views.tables import Table
 from kf_calib.views.terminal import PlainConsole, note
 
@@ -33,26 +33,24 @@ def symbol(name: str) -> str:
     return name
 
 
-def rounded(value: float, sigma: float) -> tuple[str, str]:
-    """A value and its sigma as text, rounded to two significant digits of sigma (GUM 7.2.6)."""
-    if not (math.isfinite(sigma) and sigma > 0):
-        return f"{value:.6g}", f"{sigma:.2g}"
-    decimals = max(0, 1 - math.floor(math.log10(sigma)))
-    return f"{value:.{decimals}f}", f"{sigma:.{decimals}f}"
+def whole_value(parameter: Parameter) -> str:
+    """The value of one of the twelve parameters to two digits of its sigma: angles in deg, scale factors as they are,
+    biases in the unit of their sigmas."""
+    assert parameter.value is not None and parameter.sigma is not None
+    if parameter.unit == "1":
+        return rounded(parameter.value, parameter.sigma)[0]
+    unit = shown_angle() if parameter.unit == "rad" else shown(parameter)
+    return f"{unit.rounded(parameter.value, parameter.sigma)[0]} {unit.label}"
 
 
 def _row(parameter: Parameter) -> tuple[str, str, str, str, str]:
-    """Return symbol, value, deviation from nominal, sigma and unit of a parameter; angles have values in deg."""
+    """Return symbol, value, deviation from nominal, sigma and unit of a parameter."""
     if parameter.value is None or parameter.sigma is None:
         return symbol(parameter.symbol), "not seen", "", "", ""
-    factor = parameter.per_si
-    deviation, sigma = rounded((parameter.value - parameter.nominal) * factor, parameter.sigma * factor)
-    if parameter.unit == "rad":
-        value = f"{rounded(math.degrees(parameter.value), math.degrees(parameter.sigma))[0]} deg"
-    else:
-        value = rounded(parameter.value, parameter.sigma)[0]
+    unit = shown(parameter)
+    deviation, sigma = unit.rounded(parameter.value - parameter.nominal, parameter.sigma)
     sign = "" if deviation.startswith("-") else "+"
-    return symbol(parameter.symbol), value, f"{sign}{deviation}", f"± {sigma}", parameter.shown_unit
+    return symbol(parameter.symbol), whole_value(parameter), f"{sign}{deviation}", f"± {sigma}", unit.label
 
 
 def parameter_table(result: Calibration) -> Table:
@@ -75,7 +73,8 @@ def without_table(result: Calibration, found: OutlyingDwell) -> Table:
     for k, (before, parameter) in enumerate(pairs):
         name, value, _, sigma, unit = _row(parameter)
         known = parameter.value is not None and before.value is not None
-        moved = f"{(parameter.value - before.value) * parameter.per_si:+.3g}" if known else ""  # type: ignore[operator]
+        moved = shown(parameter).number(parameter.value - before.value) if known else ""  # type: ignore[operator]
+        moved = moved if not moved or moved.startswith("-") else f"+{moved}"
         table.add_row(name, value, sigma, unit, moved, end_section=k % 4 == 3)
     return table
 
@@ -93,9 +92,9 @@ def effect_table(result: Calibration) -> Table:
             if parameter.value is None or parameter.sigma is None:
                 table.add_row(name, symbol(parameter.symbol), "not seen")
                 continue
-            value, sigma = rounded(parameter.value * parameter.per_si, parameter.sigma * parameter.per_si)
-            ratio = f"{parameter.value / parameter.sigma:.1f}"
-            table.add_row(name, symbol(parameter.symbol), value, f"± {sigma}", parameter.shown_unit, ratio)
+            unit, ratio = shown(parameter), f"{parameter.value / parameter.sigma:.1f}"
+            value, sigma = unit.rounded(parameter.value, parameter.sigma)
+            table.add_row(name, symbol(parameter.symbol), value, f"± {sigma}", unit.label, ratio)
     return table
 
 
@@ -119,16 +118,9 @@ def model_table(model: Model) -> Table:
 
 def effect_rows(effect: Effect) -> list[tuple[str, str, str]]:
     """Symbol, SI unit and prior scale of each coefficient of an effect; its constant has a range and no scale."""
-    rows = [
-        (
-            symbol(c.symbol),
-            c.unit,
-            f"{c.scale * c.per_si:.3g} {c.shown_unit}" if c.shown_unit != "1" else f"{c.scale:.3g}",
-        )
-        for c in effect.coefficients
-    ]
+    rows = [(symbol(c.symbol), c.unit, shown(c).text(c.scale).removesuffix(" 1")) for c in effect.coefficients]
     if (u := effect.unknown) is not None:
-        rows.append((symbol(u.symbol), u.unit, f"{u.low * u.per_si:.3g} to {u.high * u.per_si:.3g} {u.shown_unit}"))
+        rows.append((symbol(u.symbol), u.unit, f"{shown(u).number(u.low)} to {shown(u).text(u.high)}"))
     return rows
 
 
@@ -137,15 +129,16 @@ def noise_table(result: Calibration) -> Table:
     noise, table = result.noise, Table(title="Noise (1σ)", title_justify="left")
     for heading in ("", "accelerometer 1", "accelerometer 2", "accelerometer 3", "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
-    table.add_row("within a dwell", *(f"{value:.3g}" for value in noise.sigma_mps2), "m/s^2")
+    reading, angle = shown("m/s^2"), shown("rad")
+    table.add_row("within a dwell", *map(reading.number, noise.sigma_mps2), reading.label)
     table.add_row("inflation by correlation", *(f"{value:.3g}" for value in noise.inflation), "of variance")
     scatter, setting = noise_origins(result)
-    scatters, settings = noise.scatter_mps2, np.full(3, np.degrees(noise.setting_rad))
     for name, origin, values, unit in (
-        ("dwell to dwell", scatter, scatters, "m/s^2"), ("setting of angles", setting, settings, "deg"),
-    ):  # fmt: skip
-        cells = ["-"] * 3 if origin == _NOT_ESTIMATED else [f"{value:.3g}" for value in values]
-        table.add_row(f"{name}, {origin}", *cells, unit)
+        ("dwell to dwell", scatter, noise.scatter_mps2, reading),
+        ("setting of angles", setting, np.full(3, noise.setting_rad), angle),
+    ):
+        cells = ["-"] * 3 if origin == _NOT_ESTIMATED else [unit.number(value) for value in values]
+        table.add_row(f"{name}, {origin}", *cells, unit.label)
     return table
 
 
@@ -170,9 +163,10 @@ def verdict(result: Calibration) -> str:
             f"p {format_p(judged.p_value)} (NIS/dof = {judged.nis_per_dof:.3g})."
         )
     if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2 is not None:
+        unit = shown("m/s^2")
         text += (
-            f" Orientations left out are predicted to {result.held_out_rms_mps2:.2g} m/s^2 rms; "
-            f"noise alone gives {result.held_out_floor_mps2:.2g}."
+            f" Orientations left out are predicted to {unit.text(result.held_out_rms_mps2, 2)} rms; "
+            f"noise alone gives {unit.number(result.held_out_floor_mps2, 2)}."
         )
     return text
 

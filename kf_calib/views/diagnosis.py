@@ -16,7 +16,8 @@ from kf_calib.diagnosis.unknown_effect import Description
 from kf_calib.diagnosis.within_dwell_trend import Trend
 from kf_calib.estimation.results import format_p
 from kf_calib.support.printing import printed
-from kf_calib.views.console import plain, rounded, symbol
+from kf_calib.support.units import shown
+from kf_calib.views.console import plain, symbol
 from kf_calib.views.json import clean, outlying_object, readings_object
 from kf_calib.views.tables import Table
 from kf_calib.views.terminal import note
@@ -192,8 +193,9 @@ def _suspect_table(found: Diagnosis) -> Table:
             if p.value is None or p.sigma is None:
                 table.add_row(*own, symbol(p.symbol), "not seen", "", "", ratio if k == 0 else "")
                 continue
-            value, sigma = rounded(p.value * p.per_si, p.sigma * p.per_si)
-            table.add_row(*own, symbol(p.symbol), value, f"± {sigma}", p.shown_unit, ratio if k == 0 else "")
+            unit = shown(p)
+            value, sigma = unit.rounded(p.value, p.sigma)
+            table.add_row(*own, symbol(p.symbol), value, f"± {sigma}", unit.label, ratio if k == 0 else "")
         table.add_section()
     return table
 
@@ -217,7 +219,8 @@ def _detectable_table(sizes: list[Detectable]) -> Table:
     for heading in ("effect", "size", "unit", "effect", "size", "unit"):
         table.add_column(heading, justify="right" if heading == "size" else "left")
     half = (len(sizes) + 1) // 2
-    cells = [(each.name, f"{each.shown_minimum:.3g}", each.shown_unit) for each in sizes]
+    units = [shown(each.coefficient) for each in sizes]
+    cells = [(each.name, unit.number(each.minimum), unit.label) for each, unit in zip(sizes, units, strict=True)]
     cells += [("", "", "")] * (2 * half - len(cells))
     for left, right in zip(cells[:half], cells[half:], strict=True):
         table.add_row(*left, *right)

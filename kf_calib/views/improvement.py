@@ -17,7 +17,8 @@ from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, Selectio
 from kf_calib.errors import InputError
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.plain_text import sentence
-from kf_calib.views.console import effect_table, parameter_table, rounded, symbol
+from kf_calib.support.units import shown
+from kf_calib.views.console import effect_table, parameter_table, symbol
 from kf_calib.views.diagnosis import description_object, of_what_p_is, orientation_object
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Bar, Table
@@ -170,7 +171,8 @@ def progress(state: Improvement) -> RenderableType:
     rows += [(f"({word} {each.name})", each.result, None) for each in others]
     errors = [_errors(result, floor) for _, result, _ in rows]
     longest = max(error for both in errors for error in both if error is not None)
-    head = "over the noise floor" if floor else "m/s^2 (without any one orientation the model is not determined)"
+    unit, alone = shown("m/s^2"), "without any one orientation the model is not determined"
+    head = "over the noise floor" if floor else f"{unit.label} ({alone})"
     table = Table(title=f"Rms error, {head}", title_justify="left", box=None, pad_edge=False)
     for heading in ("step", "p of the run", "", "", ""):
         table.add_column(heading, no_wrap=True)
@@ -179,7 +181,7 @@ def progress(state: Improvement) -> RenderableType:
         if held_out is not None:
             table.add_row(label, p_text, "held out", f"{held_out:.2f}", Bar(bar(held_out, longest), style="cyan"))
             label = p_text = ""
-        number = f"{fitted:.2f}" if floor else f"{fitted:.2g}"
+        number = f"{fitted:.2f}" if floor else unit.number(fitted, 2)
         table.add_row(label, p_text, "fitted", number, Bar(bar(fitted, longest), style="dim"))
     said = [Text(line) for step in state.steps for line in (*map(_out, step.dropped), *step.remarks)]
     tests = [Text(f"Tested: {_test(each)}.") for each in state.removals]
@@ -231,11 +233,9 @@ def _spread_table(state: Improvement) -> Table:
 def _spread_row(each: Spread) -> tuple[str, ...]:
     """Return the row of one parameter in that table."""
     own = each.parameter
-    low, high = (
-        rounded((value - own.nominal) * own.per_si, (own.sigma or 0.0) * own.per_si)
-        for value in (each.lowest, each.highest)
-    )
-    return symbol(own.symbol), low[0], high[0], f"± {low[1]}", own.shown_unit, f"{each.sigmas:.1f}"
+    unit = shown(own)
+    low, high = (unit.rounded(value - own.nominal, own.sigma or 0.0) for value in (each.lowest, each.highest))
+    return symbol(own.symbol), low[0], high[0], f"± {low[1]}", unit.label, f"{each.sigmas:.1f}"
 
 
 def _settling(state: Improvement) -> list[str]:
@@ -257,9 +257,10 @@ def _settling(state: Improvement) -> list[str]:
 def honest_sentence(honest: NestedCrossValidation) -> str:
     """The result of nested cross-validation in a sentence."""
     times = ", ".join(f"{name} in {count}" for name, count in honest.chosen.items()) or "no effect in any"
+    rms = shown("m/s^2").text(honest.rms_mps2)
     return (
         f"With the choice of effects repeated without what is held out ({honest.folds} folds): "
-        f"{honest.rms_mps2:.3g} m/s^2 rms, {honest.rms_mps2 / honest.expected_mps2:.2f} of what noise gives; "
+        f"{rms} rms, {honest.rms_mps2 / honest.expected_mps2:.2f} of what noise gives; "
         f"chosen: {times}."
     )
 

@@ -14,6 +14,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.online.status import Judgement, Standing
 from kf_calib.support.plain_text import sentence
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2, shown
 from kf_calib.views.console import symbol
 from kf_calib.views.diagnosis import found_object, orientation_object
 from kf_calib.views.json import clean, replay_object
@@ -26,7 +27,6 @@ _BAR, _NAME = 18, 30
 _TARGET_DECADES = 3.0  # decades above the target at which the bar of a sigma is full
 # Without a target: the sigma of a full bar in rad, 1 or g, and the decades below it at which the bar is empty.
 _COARSE, _DECADES = 1e-3, 5.0
-_SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("µg", 1e6 / 9.80665)}
 
 
 def live_object(judgement: Judgement, standing: Standing, status: Status | None) -> dict[str, Any]:
@@ -74,9 +74,8 @@ def line(judgement: Judgement) -> str:
     seen = "sigmas not determined yet"
     if np.isfinite(sigma).any():
         k = int(np.nanargmax(sigma / np.where(np.isfinite(judgement.worst), judgement.worst, np.inf)))
-        unit, per_si = _SHOWN[paper_parameters.UNITS[k]]
         left = f", {span(judgement.left_s[k])} to its target" if np.isfinite(judgement.wanted[k]) else ""
-        seen = f"worst sigma {paper_parameters.SYMBOLS[k]} {sigma[k] * per_si:.3g} {unit}{left}"
+        seen = f"worst sigma {paper_parameters.SYMBOLS[k]} {shown(paper_parameters.UNITS[k]).text(sigma[k])}{left}"
     going = judgement.next_orientation
     following = f"; next {_angles(going[0])} deg ({going[1]})" if going else ""
     per_dof = result.consistency.nis_per_dof
@@ -164,16 +163,16 @@ def _sigmas(standing: Standing) -> RenderableType:
         table.add_column(justify=justify, no_wrap=True)
     table.add_row("", "σ", "", "target", "left", "", style="dim")
     for k, name in enumerate(paper_parameters.SYMBOLS):
-        unit, per_si = _SHOWN[paper_parameters.UNITS[k]]
+        unit = shown(paper_parameters.UNITS[k])
         sigma, left = standing.sigma[k], standing.left_s[k]
         if not math.isfinite(sigma):
-            table.add_row(symbol(name), "-", unit, "", "", "")
+            table.add_row(symbol(name), "-", unit.label, "", "", "")
             continue
-        target = f"{wanted[k] * per_si:.3g}" if math.isfinite(wanted[k]) else "half"
+        target = unit.number(wanted[k]) if math.isfinite(wanted[k]) else "half"
         table.add_row(
             symbol(name),
-            f"{sigma * per_si:.3g}",
-            unit,
+            unit.number(sigma),
+            unit.label,
             target,
             span(left) if left else "",
             _bar(float(sigma), float(wanted[k]), k),
@@ -186,7 +185,7 @@ def _bar(sigma: float, wanted: float, k: int) -> Bar:
     if math.isfinite(wanted):
         share = math.log10(max(sigma / wanted, 1e-9)) / _TARGET_DECADES
     else:
-        size = _COARSE * (9.80665 if paper_parameters.UNITS[k] == "m/s^2" else 1.0)
+        size = _COARSE * (STANDARD_GRAVITY_MPS2 if paper_parameters.UNITS[k] == "m/s^2" else 1.0)
         share = 1.0 + math.log10(max(sigma / size, 1e-30)) / _DECADES
     if math.isfinite(wanted) and share <= 0:
         return Bar("reached", style="green")
@@ -201,7 +200,8 @@ def _fit(judgement: Judgement) -> Text:
     text = f"12 parameters{''.join(f' + {effect}' for effect in result.model.effects)}; "
     text += "NIS: nothing to judge by" if judged.nis_per_dof is None else f"NIS/dof {judged.nis_per_dof:.3g}"
     if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2:
-        text += f"; held out {result.held_out_rms_mps2:.2g} m/s² rms, noise alone {result.held_out_floor_mps2:.2g}"
+        rms, floor, unit = result.held_out_rms_mps2, result.held_out_floor_mps2, shown("m/s^2")
+        text += f"; held out {unit.text(rms, 2)} rms, noise alone {unit.number(floor, 2)}"
     return Text(text)
 
 

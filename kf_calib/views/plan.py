@@ -16,12 +16,11 @@ from kf_calib.design.orientation_plan import Plan, papers_sigma
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.reproduction.grebenkin2019 import DEVIATIONS
 from kf_calib.support.output_files import write_whole
+from kf_calib.support.units import Unit, shown
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Table
 from kf_calib.views.terminal import note
-
-_SHOWN = {"rad": ("arcsec", math.degrees(3600.0)), "1": ("ppm", 1e6), "m/s^2": ("µm/s²", 1e6)}
 
 
 def gimbal_names(made: Plan) -> list[str]:
@@ -114,11 +113,10 @@ def _sigmas(made: Plan, beside_paper: bool) -> Table:
     columns = _columns(made, beside_paper)
     for heading in ("parameter", *columns, "unit"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    units = [_SHOWN[unit] for unit in paper_parameters.UNITS]
-    units += [(c.shown_unit, c.per_si) for c in made.prospect.model.coefficients]
-    for k, (name, (unit, per_si)) in enumerate(zip(made.prospect.symbols, units, strict=True)):
-        values = [_figure(values[k], percent, per_si) for values, percent in columns.values()]
-        table.add_row(symbol(name), *values, unit, end_section=k % 4 == 3)
+    units = [*map(shown, paper_parameters.UNITS), *map(shown, made.prospect.model.coefficients)]
+    for k, (name, unit) in enumerate(zip(made.prospect.symbols, units, strict=True)):
+        values = [_figure(values[k], percent, unit) for values, percent in columns.values()]
+        table.add_row(symbol(name), *values, unit.label, end_section=k % 4 == 3)
     return table
 
 
@@ -138,11 +136,11 @@ def _columns(made: Plan, beside_paper: bool) -> dict[str, tuple[Floats, bool]]:
     return out
 
 
-def _figure(value: float, percent: bool, per_si: float) -> str:
+def _figure(value: float, percent: bool, unit: Unit) -> str:
     """Return a number as text; "not seen" where it is not finite."""
     if not math.isfinite(value):
         return "not seen"
-    return f"{value:.3g} %" if percent else f"{value * per_si:.3g}"
+    return f"{value:.3g} %" if percent else unit.number(value)
 
 
 def sentences(made: Plan, beside_paper: bool = False) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -51,6 +52,20 @@ def test_replay_prints_the_agreed_keys(run, recording: Path) -> None:
     truth = json.loads(recording.with_suffix(".truth.json").read_text())["parameters"]
     ratios = [(p["value"] - truth[p["symbol"]]) / p["sigma"] for p in result["parameters"]]
     assert np.abs(ratios).max() < 4.5
+
+
+def test_people_read_units_of_the_field_or_si_and_programs_si(run, recording: Path) -> None:
+    (bias,) = (p for p in json.loads(run("replay", recording, "--json")[1])["parameters"] if p["symbol"] == "b1")
+    field, si = run("replay", recording)[1], run("replay", recording, "--units", "si")[1]
+    for text, unit, size in ((field, "µg", 9.80665e-6), (si, "m/s^2", 1.0)):
+        (row,) = re.findall(rf"│ b1 +│ +(\S+) {re.escape(unit)} +│ +(\S+) │ ± (\S+) │ {re.escape(unit)} ", text)
+        value, deviation, sigma = (float(figure) * size for figure in row)
+        assert [value, deviation] == pytest.approx([bias["value"]] * 2, abs=0.05 * bias["sigma"])
+        assert sigma == pytest.approx(bias["sigma"], rel=0.05)
+    assert "m/s^2" not in field
+    assert not any(word in si for word in ("µg", "arcsec", "ppm", " deg"))
+    assert run("replay", recording, "--units", "si", "--json")[1] == run("replay", recording, "--json")[1]
+    assert run("replay", recording)[1] == field
 
 
 def test_truth_is_not_in_the_recording(recording: Path) -> None:

@@ -251,7 +251,7 @@ def test_a_class_of_ten_lines_is_completed(tmp_path: Path) -> None:
     effect = effect_named("bend", BENCH)
     assert (effect.title, effect.source) == ("bend", "user") and names(BENCH)[-1] == "bend"
     first = effect.coefficients[0]
-    assert (first.symbol, first.unit, first.scale, first.shown_unit, first.per_si) == ("bend1", "s^2/m", 1, "s^2/m", 1)
+    assert (first.symbol, first.unit, first.scale, first.shown_unit) == ("bend1", "s^2/m", 1, "µg/g²")
     assert load_file(tmp_path / "own.py") == ["bend"]  # again: replaces
     assert not list(tmp_path.glob("__pycache__"))
 

@@ -13,6 +13,7 @@ from operator import mul
 from kf_calib.errors import InputError
 from kf_calib.sources.files.line_parts import (
     ACCEL_UNITS,
+    ANGLE_UNITS,
     TIME_DECIMALS,
     Account,
     LineError,
@@ -22,7 +23,6 @@ from kf_calib.sources.files.line_parts import (
     stamp_ns,
 )
 
-_ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
 _USUAL_GIMBALS = ("outer", "middle", "inner")
 _TEMPERATURE = "temperature_c"
 _EXAMPLE = "time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c"
@@ -115,7 +115,7 @@ class CsvLines(LineReader):
         matches = [re.fullmatch(r"(.+)_(deg|rad)", name) for name in self._names]
         angles = {match[1]: match for match in matches if match}
         chosen = [angles[name] for name in _USUAL_GIMBALS if name in angles] or list(angles.values())
-        return self._found([match[0] for match in chosen], [_ANGLE_UNITS[match[2]] for match in chosen])
+        return self._found([match[0] for match in chosen], [ANGLE_UNITS[match[2]] for match in chosen])
 
     def _quaternion_columns(self) -> _Columns:
         names = ["qx", "qy", "qz", "qw"]

@@ -12,9 +12,10 @@ from typing import ClassVar
 import numpy as np
 
 from kf_calib.bench.streams import Batch, Stream
+from kf_calib.support.units import WORDS
 
-STANDARD_GRAVITY_MPS2 = 9.80665
-ACCEL_UNITS = {"mps2": 1.0, "g": STANDARD_GRAVITY_MPS2, "mg": STANDARD_GRAVITY_MPS2 / 1e3}
+ACCEL_UNITS = {unit: WORDS["m/s^2"][unit] for unit in ("mps2", "g", "mg")}
+ANGLE_UNITS = {unit: WORDS["rad"][unit] for unit in ("rad", "deg")}
 TIME_DECIMALS = {"time_ns": 0, "time_us": 3, "time_ms": 6, "time_s": 9}
 """Names of the stamp, and how many decimals its unit has in nanoseconds."""
 

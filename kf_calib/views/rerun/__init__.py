@@ -2,8 +2,9 @@
 
 A thin bridge: every number comes from the ``Calibration``, is scaled to a unit an engineer reads, and is sent in
 columns. Two timelines: ``bench_time`` (since the first sample; points within the dwells too) and ``orientation``
-(the count of dwells from 1; 0 is a stated prior). Angles are in arcsec, scale factors in ppm, biases, innovations in
-um/s^2. Where the orientations so far do not determine a parameter there is no point.
+(the count of dwells from 1; 0 is a stated prior). Angles are in arcsec, scale factors in ppm, biases and innovations
+in µg, or all in SI (``support.units.shown_in``). Where the orientations so far do not determine a parameter there is no
+point.
 
 Entities: ``parameters/ACCELEROMETER/SYMBOL/{log10_sigma,deviation,band}``, ``platform/...``,
 ``innovation/CHANNEL/{value,bound,in_sigma}``, ``nis/{value,above,band}``, ``correlation/{picture,matrix,...}``,

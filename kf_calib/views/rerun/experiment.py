@@ -20,6 +20,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.prior import PRIORS
 from kf_calib.reproduction.grebenkin2019 import GRAVITY_MPS2, READINGS, Column, Experiment, shrinking
+from kf_calib.support.units import shown
 from kf_calib.views.rerun.correlation import LIFT, picture
 from kf_calib.views.rerun.file import rrd_file
 from kf_calib.views.rerun.names import (
@@ -29,10 +30,10 @@ from kf_calib.views.rerun.names import (
     GROUPS,
     LABELS,
     ORIENTATION,
-    PER_SI,
     WHITE,
     colour_of,
     path_of,
+    per_si,
 )
 
 READING = "reading"
@@ -64,7 +65,7 @@ def _sigmas(column: Column) -> Floats:
     jacobian = paper_parameters.jacobian(paper_parameters.state_of(nominal))
     covariances = shrinking(column.orientations, PRIORS["navigation"].covariance(nominal))
     variance = np.diagonal(jacobian @ covariances @ jacobian.T, axis1=1, axis2=2)
-    return np.log10(np.sqrt(variance) * PER_SI)
+    return np.log10(np.sqrt(variance) * per_si())
 
 
 def _log_sigmas(stream: rr.RecordingStream, name: str, logs: Floats) -> None:
@@ -130,7 +131,7 @@ def _blank(width: int) -> NDArray[np.uint8]:
 
 def _layout(sigmas: dict[str, Floats]) -> rrb.Blueprint:
     curves = [
-        rrb.Vertical(*(_curves(name, group.unit, group.symbols, sigmas) for group in GROUPS),
+        rrb.Vertical(*(_curves(name, shown(group.unit).label, group.symbols, sigmas) for group in GROUPS),
                      row_shares=[5, 4, 4]) for name in SETS
     ]  # fmt: skip
     spheres = [

@@ -14,6 +14,7 @@ import subprocess
 import tempfile
 import threading
 from contextlib import suppress
+from contextvars import copy_context
 from pathlib import Path
 from typing import IO
 
@@ -49,7 +50,7 @@ class GrowingView:
         if port is not None:
             self._relays = _listens(port)
             self._viewer = _viewer(port, bind, self._log)
-        self._thread = threading.Thread(target=self._show, name="rerun", daemon=True)
+        self._thread = threading.Thread(target=copy_context().run, args=(self._show,), name="rerun", daemon=True)
         self._thread.start()
 
     @property

@@ -9,7 +9,8 @@ import rerun.blueprint as rrb
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.estimation.results import Calibration
-from kf_calib.views.rerun.names import BENCH_TIME, CHANNELS, GROUP_OF, GROUPS, LABELS, MICRO, ORIENTATION, path_of
+from kf_calib.support.units import shown
+from kf_calib.views.rerun.names import BENCH_TIME, CHANNELS, GROUPS, LABELS, ORIENTATION, UNIT_OF, path_of
 from kf_calib.views.rerun.platform import magnification
 from kf_calib.views.rerun.series import History, nis_band
 
@@ -54,7 +55,7 @@ def _sigmas(result: Calibration) -> list[rrb.TimeSeriesView]:
     return [
         _series(
             [f"{path_of(symbol)}/log10_sigma" for symbol in group.symbols],
-            f"σ of {group.title}: log₁₀ of {group.unit}",
+            f"σ of {group.title}: log₁₀ of {shown(group.unit).label}",
             corner,
         )
         for group in GROUPS
@@ -144,7 +145,8 @@ def _parameters(history: History) -> rrb.Grid:
 def _parameter(history: History, k: int) -> rrb.TimeSeriesView:
     symbol, sigma = paper_parameters.SYMBOLS[k], history.sigma[:, k]
     path, label = path_of(symbol), LABELS[symbol]
-    name = f"{label} − nominal ± σ, {GROUP_OF[symbol].unit}" if np.isfinite(sigma).any() else f"{label}: not determined"
+    unit, seen = shown(UNIT_OF[symbol]), np.isfinite(sigma).any()
+    name = f"{label} − nominal ± σ, {unit.label}" if seen else f"{label}: not determined"
     around = _readable(history.deviation[:, k], sigma, history.orientation)
     return _series([f"{path}/band", f"{path}/deviation"], name, around=around)
 
@@ -162,11 +164,12 @@ def _readable(deviation: np.ndarray, sigma: np.ndarray, orientation: np.ndarray)
 def _innovations(result: Calibration) -> rrb.Vertical:
     values = np.array([np.abs(visit.innovation_mps2) for visit in result.visits])
     bounds = np.array([2 * visit.innovation_sigma_mps2 for visit in result.visits])
-    reach = 1.1 * MICRO * float(np.nan_to_num(np.maximum(values, bounds)).max())
+    unit = shown("m/s^2")
+    reach = 1.1 * unit.per_si * float(np.nan_to_num(np.maximum(values, bounds)).max())
     panels = [
         _series(
             [f"innovation/{channel}/value", f"innovation/{channel}/bound"],
-            f"innovation of accelerometer {i}: mean of a dwell less its prediction, with ±2σ, µm/s²",
+            f"innovation of accelerometer {i}: mean of a dwell less its prediction, with ±2σ, {unit.label}",
             around=(-reach, reach),
         )
         for i, channel in enumerate(CHANNELS, 1)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.support.units import shown
 
 BENCH_TIME = "bench_time"
 ORIENTATION = "orientation"
@@ -28,32 +30,28 @@ LABELS = {
     "nu1": "ν₁", "nu2": "ν₂", "K2": "K₂", "b2": "b₂",
     "theta3": "θ₃", "phi3": "φ₃", "K3": "K₃", "b3": "b₃",
 }  # fmt: skip
-MICRO = 1e6
+UNIT_OF = dict(zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True))
+"""SI unit of each parameter."""
 
 
 @dataclass(frozen=True)
 class EntityGroup:
-    """Parameters of one kind: what is shown is the SI value times ``per_si``, in ``unit``."""
+    """Parameters of one kind, which have the same SI ``unit``."""
 
     title: str
     unit: str
-    per_si: float
-    symbols: tuple[str, ...]
+
+    @property
+    def symbols(self) -> tuple[str, ...]:
+        return tuple(symbol for symbol, unit in UNIT_OF.items() if unit == self.unit)
 
 
-def _of_unit(unit: str) -> tuple[str, ...]:
-    return tuple(
-        symbol for symbol, own in zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True) if own == unit
-    )
+GROUPS = EntityGroup("angles", "rad"), EntityGroup("scale factors", "1"), EntityGroup("biases", "m/s^2")
 
 
-GROUPS = (
-    EntityGroup("angles", "arcsec", float(np.degrees(3600.0)), _of_unit("rad")),
-    EntityGroup("scale factors", "ppm", MICRO, _of_unit("1")),
-    EntityGroup("biases", "µm/s²", MICRO, _of_unit("m/s^2")),
-)
-GROUP_OF = {symbol: group for group in GROUPS for symbol in group.symbols}
-PER_SI = np.array([GROUP_OF[symbol].per_si for symbol in paper_parameters.SYMBOLS])
+def per_si() -> Floats:
+    """Factors (12,) from SI to the units in which the parameters are shown."""
+    return np.array([shown(unit).per_si for unit in paper_parameters.UNITS])
 
 
 def colour_of(symbol: str) -> Colour:

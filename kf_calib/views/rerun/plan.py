@@ -20,6 +20,7 @@ from kf_calib.bench.bench import slerp
 from kf_calib.design import optimality_criteria
 from kf_calib.design.orientation_plan import Plan
 from kf_calib.estimation.measurement_model import STATE_COUNT
+from kf_calib.support.units import shown
 from kf_calib.views.plan import gimbal_names, sentences
 from kf_calib.views.rerun.file import rrd_file
 from kf_calib.views.rerun.layout import WHOLE_RUN, power
@@ -29,13 +30,13 @@ from kf_calib.views.rerun.names import (
     GIMBALS,
     GOLD,
     GREY,
-    GROUP_OF,
     GROUPS,
     LABELS,
-    PER_SI,
+    UNIT_OF,
     WHITE,
     colour_of,
     path_of,
+    per_si,
 )
 from kf_calib.views.rerun.platform import FINAL_SIZE, LARGEST, THINNEST, log_frame
 from kf_calib.views.rerun.series import times
@@ -65,8 +66,8 @@ def _summary(made: Plan) -> str:
         for k, (begin, row) in enumerate(zip(made.at_s - 0.5 * made.timing.dwell_s, made.gimbal_deg, strict=True), 1)
     ]
     sigmas = [
-        f"| {LABELS[symbol]} | {made.sigma[-1, k] * PER_SI[k]:.3g} | {GROUP_OF[symbol].unit} |"
-        for k, symbol in enumerate(paper_parameters.SYMBOLS)
+        f"| {LABELS[symbol]} | {shown(unit).number(made.sigma[-1, k])} | {shown(unit).label} |"
+        for k, (symbol, unit) in enumerate(UNIT_OF.items())
     ]
     head = f"| | begins, s |{gimbals}\n|--:|--:|{'--:|' * made.poses.shape[1]}"
     told = "\n\n".join([*sentences(made), *(f"**Note**: {remark}" for remark in made.remarks)])
@@ -166,7 +167,7 @@ def _log_uncertainty(made: Plan, stream: rr.RecordingStream) -> None:
 
 
 def _log_sigmas(made: Plan, stream: rr.RecordingStream) -> None:
-    logs = np.log10(made.sigma[:, :STATE_COUNT] * PER_SI)
+    logs = np.log10(made.sigma[:, :STATE_COUNT] * per_si())
     for k, symbol in enumerate(paper_parameters.SYMBOLS):
         seen = np.isfinite(logs[:, k])
         path = f"{path_of(symbol)}/log10_sigma"
@@ -210,7 +211,8 @@ def _layout(made: Plan) -> rrb.Blueprint:
     )
     sigmas = [
         _series(
-            [f"{path_of(symbol)}/log10_sigma" for symbol in group.symbols], f"σ of {group.title}: log₁₀ of {group.unit}"
+            [f"{path_of(symbol)}/log10_sigma" for symbol in group.symbols],
+            f"σ of {group.title}: log₁₀ of {shown(group.unit).label}",
         )
         for group in GROUPS
     ]

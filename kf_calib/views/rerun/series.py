@@ -14,6 +14,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.results import Calibration, Estimate, Visit
+from kf_calib.support.units import shown
 from kf_calib.views.rerun.names import (
     ACCELEROMETERS,
     BENCH_TIME,
@@ -21,14 +22,13 @@ from kf_calib.views.rerun.names import (
     GIMBALS,
     GREY,
     LABELS,
-    MICRO,
     ORIENTATION,
-    PER_SI,
     RED,
     WHITE,
     Colour,
     colour_of,
     path_of,
+    per_si,
 )
 
 EDGE = 0.015
@@ -68,8 +68,8 @@ class History:
             elapsed_s=np.array([elapsed_s for elapsed_s, _, _ in steps]),
             orientation=orientation,
             whole=np.append(np.diff(orientation) > 0, True),
-            deviation=np.where(np.isfinite(sigma), deviation, np.nan) * PER_SI,
-            sigma=sigma * PER_SI,
+            deviation=np.where(np.isfinite(sigma), deviation, np.nan) * per_si(),
+            sigma=sigma * per_si(),
         )
 
 
@@ -128,13 +128,14 @@ def _style(stream: rr.RecordingStream, path: str, style: rr.SeriesLines | rr.Ser
 
 
 def log_innovations(visits: Sequence[Visit], stream: rr.RecordingStream, before: int = 0) -> None:
-    """Innovation of each dwell and channel with its bounds of 2 sigma, um/s^2; and in units of its own sigma.
+    """Innovation of each dwell and channel with its bounds of 2 sigma, in µg or m/s^2; and in units of its own sigma.
 
     ``before``: how many dwells were sent before these.
     """
     (elapsed_s, number), count = ends(visits), before + len(visits)
-    innovation = np.array([visit.innovation_mps2 for visit in visits]) * MICRO
-    sigma = np.array([visit.innovation_sigma_mps2 for visit in visits]) * MICRO
+    unit = shown("m/s^2")
+    innovation = np.array([visit.innovation_mps2 for visit in visits]) * unit.per_si
+    sigma = np.array([visit.innovation_sigma_mps2 for visit in visits]) * unit.per_si
     for i, (channel, colour) in enumerate(zip(CHANNELS, ACCELEROMETERS, strict=True)):
         path, bound = f"innovation/{channel}", 2 * sigma[:, i]
         _send(stream, f"{path}/value", elapsed_s, number, innovation[:, i])

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from itertools import combinations
 
 import numpy as np
 
+from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.results import Calibration, Parameter
-from kf_calib.views.console import noise_origins
+from kf_calib.support.units import Unit, shown, significant
+from kf_calib.views.console import noise_origins, whole_value
 from kf_calib.views.rerun.correlation import correlation
-from kf_calib.views.rerun.names import GROUP_OF, LABELS, MICRO
+from kf_calib.views.rerun.names import LABELS
 
 
 def summary(result: Calibration) -> str:
-    """Markdown; deviations and sigmas in arcsec, ppm, um/s^2."""
+    """The page in Markdown, in the units that people are shown."""
     blocks = [_head(result), _table(result), _verdict(result), *_warnings(result), _noise(result), *_ties(result)]
     return "\n\n".join(blocks) + "\n"
 
@@ -34,29 +35,16 @@ def _table(result: Calibration) -> str:
 
 
 def _row(parameter: Parameter) -> str:
-    label, group = LABELS.get(parameter.symbol, parameter.symbol), GROUP_OF.get(parameter.symbol)
+    label, unit = LABELS.get(parameter.symbol, parameter.symbol), shown(parameter)
     if parameter.value is None or parameter.sigma is None:
         return f"| {label} | not determined | | | |"
-    per_si, unit = (parameter.per_si, parameter.shown_unit) if group is None else (group.per_si, group.unit)
-    deviation = fixed((parameter.value - parameter.nominal) * per_si, parameter.sigma * per_si)
-    value = "" if group is None else _absolute(parameter.value, parameter.sigma, parameter.unit)
-    return f"| {label} | {value} | {deviation} | {_two(parameter.sigma * per_si)} | {unit} |"
+    deviation, sigma = map(_minus, unit.rounded(parameter.value - parameter.nominal, parameter.sigma))
+    value = _minus(whole_value(parameter)) if parameter.symbol in LABELS else ""
+    return f"| {label} | {value} | {deviation} | {sigma} | {unit.label} |"
 
 
-def _absolute(value: float, sigma: float, unit: str) -> str:
-    if unit == "rad":
-        return fixed(math.degrees(value), math.degrees(sigma)) + "°"
-    return fixed(value, sigma)
-
-
-def fixed(value: float, sigma: float) -> str:
-    """A value to the second digit of its sigma."""
-    digits = 1 - math.floor(math.log10(sigma)) if sigma > 0 else 9
-    return f"{value:.{min(max(digits, 0), 12)}f}".replace("-", "−")
-
-
-def _two(sigma: float) -> str:
-    return fixed(sigma, sigma)
+def _minus(text: str) -> str:
+    return text.replace("-", "−")
 
 
 def _verdict(result: Calibration) -> str:
@@ -65,25 +53,26 @@ def _verdict(result: Calibration) -> str:
         words = "nothing left over to judge the model by"
     else:
         yes = "agree with the model" if judged.consistent else "**disagree with the model**"
-        per_dof = _digits(judged.statistic / judged.dof)
+        per_dof = significant(judged.statistic / judged.dof)
         words = f"the dwells {yes}: p = {judged.p_value:.2g}, NIS/dof = {per_dof}, dof = {judged.dof}"
-    held = ""
+    held, unit = "", shown("m/s^2")
     if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2 is not None:
-        held = f"; held out {_micro(result.held_out_rms_mps2)} (noise alone {_micro(result.held_out_floor_mps2)})"
-    return f"**Misfit**: {words}. Residual rms {_micro(result.residual_rms_mps2)}{held} µm/s²"
+        rms, floor = map(unit.number, (result.held_out_rms_mps2, result.held_out_floor_mps2))
+        held = f"; held out {rms} (noise alone {floor})"
+    return f"**Misfit**: {words}. Residual rms {unit.number(result.residual_rms_mps2)}{held} {unit.label}"
 
 
 def _noise(result: Calibration) -> str:
-    noise = result.noise
-    parts = [f"{_three(noise.sigma_mps2 * MICRO)} µm/s² a reading"]
+    noise, unit = result.noise, shown("m/s^2")
+    parts = [f"{_three(unit, noise.sigma_mps2)} {unit.label} a reading"]
     if noise.inflation.max() > 1.05:
-        parts.append(f"correlated: variance of means × {_three(noise.inflation)}")
+        parts.append(f"correlated: variance of means × {_three(Unit('', 1.0), noise.inflation)}")
     if noise.setting_rad > 0:
         origin = noise_origins(result)[1]
-        parts.append(f"setting error {math.degrees(noise.setting_rad) * 3600:.3g} arcsec ({origin})")
+        parts.append(f"setting error {shown('rad').text(noise.setting_rad)} ({origin})")
     if noise.scatter_mps2.max() > 0:
         origin = noise_origins(result)[0]
-        parts.append(f"scatter {_three(noise.scatter_mps2 * MICRO)} µm/s² ({origin})")
+        parts.append(f"scatter {_three(unit, noise.scatter_mps2)} {unit.label} ({origin})")
     return f"**Noise** (1σ): {'; '.join(parts)}"
 
 
@@ -96,20 +85,9 @@ def _ties(result: Calibration) -> list[str]:
     return [f"**Correlated**: {', '.join(strong)}".replace("-", "−")] if strong else []
 
 
-def _three(values: np.ndarray) -> str:
-    return ", ".join(_digits(value) for value in values)
-
-
-def _micro(value_mps2: float) -> str:
-    return _digits(value_mps2 * MICRO)
+def _three(unit: Unit, values: Floats) -> str:
+    return ", ".join(map(unit.number, values))
 
 
 def _warnings(result: Calibration) -> list[str]:
     return ["**Warnings**\n\n" + "\n".join(f"- {text}" for text in result.warnings)] if result.warnings else []
-
-
-def _digits(value: float) -> str:
-    """Three significant digits, no exponent."""
-    if 0 < value < 1e-3:
-        return "< 0.001"
-    return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim="-")

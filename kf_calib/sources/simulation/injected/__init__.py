@@ -8,7 +8,7 @@ Conventions, the same for every effect:
 * SI throughout: contributions and accelerations in m/s^2, time in s since the first sample, temperature in K from the
   ``reference`` (25 degC unless told otherwise), angles in rad, magnetic flux density in T. A coefficient is what
   multiplies these: the K2 of ``second-order`` is in 1/(m/s^2), and K2 a_i^2 adds to the reading in m/s^2. A unit
-  may be written after a number, ``second-order=4ug/g^2``, and is converted (``units.si``); g is 9.80665 m/s^2.
+  may be written after a number, ``second-order=4ug/g^2``, and is converted (``support.units.si``); g is 9.80665 m/s^2.
 * a_i is the true specific force along the true input axis of accelerometer i, E_i . f; a_p and a_o are its parts along
   the platform axes of the nominal triads, (x, y, z), (y, z, x), (z, x, y). Contributions add to the reading as they
   are, not multiplied by the scale factor.
@@ -33,7 +33,7 @@ from kf_calib.sources.simulation.injected import drift, history, outside, electr
 # isort: on
 from kf_calib.sources.simulation.injected.kinds import INNER, Hidden, Kind, NoSizeError, Rig, Stage, catalogue, steps_of
 from kf_calib.sources.simulation.injected.text import parse
-from kf_calib.sources.simulation.injected.units import si
+from kf_calib.support.units import si
 
 FAMILIES = (surroundings, gimbal, sensor, thermal, drift, history, outside, electronics)
 

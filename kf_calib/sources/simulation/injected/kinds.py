@@ -14,10 +14,10 @@ from kf_calib.bench.bench import Bench, Vector
 from kf_calib.errors import InputError
 from kf_calib.sources.simulation.gimbal_motion import Motion
 from kf_calib.sources.simulation.injected.terms import adding
-from kf_calib.sources.simulation.injected.units import si
 from kf_calib.sources.simulation.noise_processes import generator
 from kf_calib.sources.simulation.physics import Step
 from kf_calib.sources.simulation.sensors import Sensors
+from kf_calib.support.units import si
 
 Stage = Literal["angles", "attitude", "force", "input", "reading", "record"]
 """Where in the chain a step stands: it changes the true gimbal angles and axes, the attitude, the specific force in the

@@ -13,8 +13,8 @@ import numpy as np
 from kf_calib.bench.bench import Vector
 from kf_calib.errors import InputError, how_to_write
 from kf_calib.sources.simulation.injected.kinds import INNER, Hidden, Kind, NoSizeError, catalogue
-from kf_calib.sources.simulation.injected.units import si
 from kf_calib.sources.simulation.noise_processes import generator
+from kf_calib.support.units import si
 
 RANDOM = {"random": (True, False), "random-known": (True,), "random-unknown": (False,)}
 """What may be drawn: effects that are in the catalogue of the diagnosis (True), and those that are not."""
