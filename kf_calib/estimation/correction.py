@@ -91,6 +91,13 @@ class Correction:
         return self.state[:STATE_COUNT].reshape(3, 4)[:, 3]
 
     @cached_property
+    def worst_sigma_mps2(self) -> Floats:
+        """Sigma (3,) of corrected specific force by the calibration alone, the largest over directions of gravity."""
+        directions = np.vstack([np.eye(3), -np.eye(3)]) * self.bench.gravity_mps2
+        temperature = REFERENCE_TEMPERATURE_C if self.needs_temperature else None
+        return self.sigma_of(directions, temperature).max(axis=0)
+
+    @cached_property
     def matrix(self) -> Floats:
         """S^-1 (3, 3), which turns readings without bias into specific force."""
         return np.asarray(np.linalg.inv(self.sensitivity), float)

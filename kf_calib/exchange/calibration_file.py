@@ -9,6 +9,7 @@ effects whose classes are in a user's Python file: reading runs none, ``model`` 
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -27,12 +28,14 @@ from kf_calib import effects
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Source
 from kf_calib.effects.programs import Program, allowed
 from kf_calib.errors import BenchError, InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.results import Calibration
+from kf_calib.sources.files.bags import files_of
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.plain_text import COMMANDS, LONGEST, cut
 
@@ -257,10 +260,31 @@ def saved(
     )  # fmt: skip
 
 
+def of_source(result: Calibration, source: Source) -> SavedCalibration:
+    """The calibration of a source: of a recording with its name, checksum and the date of its first sample."""
+    path = getattr(source, "path", None)
+    first_ns = next((int(b.accel.time_ns[0]) for b in source if len(b.accel)), None) if path else None
+    name, sha256 = ("", None) if path is None else (path.name, fingerprint(path))
+    return saved(result, name, sha256, first_ns)
+
+
+def fingerprint(path: Path) -> str:
+    """SHA-256 of a recording, all files of a bag one after the other; raises InputError if it cannot be read."""
+    digest = hashlib.sha256()
+    try:
+        for each in files_of(path):
+            with each.open("rb") as file:
+                hashlib.file_digest(file, lambda: digest)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}): name a recording.") from None
+    return digest.hexdigest()
+
+
 def _not_seen(result: Calibration) -> list[str]:
     """Return the names of effects of the catalogue that the orientations cannot show."""
-    others = [name for name in effects.names(result.bench) if name not in result.model.parts]
-    seen = visibility_of(result.fit, [effects.effect_named(name, result.bench) for name in others])
+    every = [effects.effect_named(name, result.bench) for name in effects.names(result.bench)]
+    others = [each for each in every if str(each) not in result.model.parts and not each.walks]
+    seen = visibility_of(result.fit, others)
     return [str(each.effect) for each in seen if not each.visible]
 
 

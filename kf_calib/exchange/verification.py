@@ -12,7 +12,7 @@ or to the platform may differ: their coefficients are free.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -87,11 +87,17 @@ class Verification:
         return tuple(move for move in self.moves if move.p_value < 0.5 * LEVEL)
 
 
-def verify(saved: SavedCalibration, model: Model, source: Source, settings: Settings | None = None) -> Verification:
+def verify(
+    saved: SavedCalibration,
+    model: Model,
+    source: Source,
+    settings: Settings | None = None,
+    on_progress: Callable[[float], None] | None = None,
+) -> Verification:
     """Compare a calibration with a new recording; model: that of the calibration (``saved.model()``)."""
     settings = replace(settings or Settings(), effects=())
     passed = Pass(source, settings)
-    dwells = passed.fold()
+    dwells = passed.fold(on_progress)
     refuse_unusable(dwells, passed.tally, source.bench)
     with one_blas_thread():
         fitted = fit(dwells, Model(source.bench, model.effects))
