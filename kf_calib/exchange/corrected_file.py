@@ -44,9 +44,8 @@ def apply_to_file(
     count = bad = 0
     source = source_file(recording.path)
     with out.open("wb") as file:
-        appender = TopicAppender(
-            source, file, CALIBRATED_TOPIC, cdr.IMU, _template(correction), _half(on_progress, 0.0)
-        )
+        copied = _half(on_progress, 0.0)
+        appender = TopicAppender(source, file, CALIBRATED_TOPIC, cdr.IMU, _template(correction), copied)
         told = _half(on_progress, 0.5)
         for batch in recording:
             for readings, temperature_c in thermometer.pairs(batch):

@@ -29,7 +29,7 @@ from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import Noise, mean_covariances
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
-from kf_calib.exchange.calibration_file import SavedCalibration
+from kf_calib.exchange.calibration_file import SavedCalibration, fingerprint
 from kf_calib.support.tail_probabilities import chi_squared_tail, sidak
 from kf_calib.support.threads import one_blas_thread
 
@@ -113,7 +113,7 @@ def verify(
     both = min(1.0, 2.0 * min(p_value, clearest))  # two tests, of which either may say so
     return Verification(
         both >= LEVEL, both, statistic, dof, moves, seen, len(dwells), rms, *worst, free,
-        (*source.warnings, *passed.tally.sentences(), *_warnings(saved, new)),
+        (*source.warnings, *passed.tally.sentences(), *_warnings(saved, source, new)),
     )  # fmt: skip
 
 
@@ -203,9 +203,12 @@ def _sphere(count: int) -> Floats:
     return np.column_stack([across * np.cos(turn), height, across * np.sin(turn)])
 
 
-def _warnings(saved: SavedCalibration, new: Calibration) -> list[str]:
+def _warnings(saved: SavedCalibration, source: Source, new: Calibration) -> list[str]:
     """Return what may make the two runs differ besides the sensors."""
     out, conditions = list[str](), saved.conditions
+    path = getattr(source, "path", None)
+    if path is not None and saved.provenance.sha256 == fingerprint(path):
+        out.append("this is the recording that it was calibrated from, so that it cannot but agree: verify with another.")
     warmth = np.concatenate([visit.dwell.nodes.temperature_c for visit in new.visits])
     if (
         conditions.temperature_min_c is not None

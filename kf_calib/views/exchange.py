@@ -89,11 +89,8 @@ def verification_report(found: Verification) -> RenderableType:
     head = "The calibration still holds" if found.holds else "The calibration does NOT hold any more"
     style = "bold green" if found.holds else "bold yellow"
     dwells = f"{found.dwells} dwell{'s' * (found.dwells != 1)}"
-    parts: list[RenderableType] = [
-        Text(
-            f"{head} (p {format_p(found.p_value)}; {dwells}, χ² {found.statistic:.1f} of {found.dof} dof).", style=style
-        )
-    ]
+    test = f"p {format_p(found.p_value)}; {dwells}, χ² {found.statistic:.1f} of {found.dof} dof"
+    parts: list[RenderableType] = [Text(f"{head} ({test}).", style=style)]
     unit = shown("m/s^2")
     parts.append(Text(f"It predicts the means of the dwells to {unit.text(found.residual_rms_mps2)} rms."))
     if found.worst_mps2 is not None and found.worst_sigma_mps2 is not None:
@@ -163,9 +160,8 @@ def history_report(found: History) -> RenderableType:
     parts.append(table)
     if found.due is not None:
         where = "now" if found.due <= found.dates[-1] else f"by {found.due.date()}"
-        parts.append(
-            Text(f"Calibrate again {where}: {symbol(found.due_by)} may leave its tolerance then (2σ).", style="bold")
-        )
+        why = f"{symbol(found.due_by)} may leave its tolerance then (2σ)"
+        parts.append(Text(f"Calibrate again {where}: {why}.", style="bold"))
     elif found.tolerances:
         parts.append(Text("No tolerance is left within twenty years, as far as these calibrations can tell."))
     if any(track.drift is None for track in found.tracks):
