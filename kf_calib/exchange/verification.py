@@ -208,7 +208,7 @@ def _warnings(saved: SavedCalibration, source: Source, new: Calibration) -> list
     out, conditions = list[str](), saved.conditions
     path = getattr(source, "path", None)
     if path is not None and saved.provenance.sha256 == fingerprint(path):
-        out.append("this is the recording that it was calibrated from, so that it cannot but agree: verify with another.")
+        out.append("this is the recording that it was calibrated from, so it must agree: verify with another.")
     warmth = np.concatenate([visit.dwell.nodes.temperature_c for visit in new.visits])
     if (
         conditions.temperature_min_c is not None
