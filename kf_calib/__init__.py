@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from kf_calib.bench.bench import Bench
     from kf_calib.diagnosis.missing_effect import diagnose
+    from kf_calib.diagnosis.refits import Refits
     from kf_calib.diagnosis.results import Diagnosis
     from kf_calib.diagnosis.stepwise_selection import Improvement, improve
     from kf_calib.errors import InputError, KfCalibError, UnobservableError
@@ -54,6 +55,7 @@ _HOMES = {
     "diagnose": ("diagnosis.missing_effect", "diagnose"),
     "Improvement": ("diagnosis.stepwise_selection", "Improvement"),
     "improve": ("diagnosis.stepwise_selection", "improve"),
+    "Refits": ("diagnosis.refits", "Refits"),
     "InputError": ("errors", "InputError"),
     "KfCalibError": ("errors", "KfCalibError"),
     "UnobservableError": ("errors", "UnobservableError"),
@@ -71,8 +73,8 @@ _PRINTING = ("views.console", "views.diagnosis")
 
 __all__ = [
     "Bench", "Calibration", "Diagnosis", "Improvement", "InputError", "KfCalibError", "Parameter", "Recorder",
-    "Running", "Session", "Settings", "UnobservableError", "Watch", "calibrate", "compare", "diagnose", "improve",
-    "open_recording", "plot", "save_view", "shown_in",
+    "Refits", "Running", "Session", "Settings", "UnobservableError", "Watch", "calibrate", "compare", "diagnose",
+    "improve", "open_recording", "plot", "save_view", "shown_in",
 ]  # fmt: skip
 
 

@@ -15,6 +15,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: a process a 
 os.environ["COLUMNS"] = ""
 del os.environ["COLUMNS"]  # readline sets it behind Python's back, and a child would print tables that narrow
 
+import kf_calib.views.diagnosis  # noqa: F401 (with it results print themselves, as with the public names)
 from kf_calib.cli import main
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "recordings"

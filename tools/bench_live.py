@@ -32,7 +32,7 @@ from kf_calib.dwells.sufficient_statistics import Folder
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.session import Session
-from kf_calib.online.status import judged, targets
+from kf_calib.online.status import judge_so_far, targets
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import LiveSource, frames, open_live
 from kf_calib.sources.live.links import Link
@@ -290,7 +290,7 @@ def judging(hidden: str, count: int) -> dict[str, Any]:
         folder = Folder()
         folder.dwells = dwells[:number]
         began_s = time.process_time()
-        before = judged(replace(passed, folder=folder), targets({}), before)
+        before = judge_so_far(replace(passed, folder=folder), targets({}), before)
         _ = line(before)
         taken[number] = 1e3 * (time.process_time() - began_s)
     out = dict[str, Any]()

@@ -194,13 +194,14 @@ def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, option
 def diagnose(ctx: click.Context, recording: Path, overwrite: bool, strict: bool, as_json: bool, **options: Any) -> None:
     """Which physical effect is missing in the model: verdict, suspects, what this run cannot see, where to go next."""
     from kf_calib.diagnosis.missing_effect import diagnose as run
+    from kf_calib.diagnosis.refits import Refits
     from kf_calib.estimation.calibration import calibrate
     from kf_calib.views import diagnosis as views
 
     outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     source, settings = opened(recording, options)
     with progress(f"diagnosing {recording.name}", as_json) as tick:
-        found = run(calibrate(source, settings, tick))
+        found = run(calibrate(source, settings, tick), Refits(source))
     if as_json:
         print_json(views.diagnosis_object(found))
     else:
@@ -254,7 +255,9 @@ def improve(
     **options: Any,
 ) -> None:  # fmt: skip
     """Add the effects that are missing, one after another, and see the error fall, until there is a reason to stop."""
+    from kf_calib.cli.improvement_dialogue import dialogue
     from kf_calib.diagnosis import nested_cross_validation, selection_journal, stepwise_selection
+    from kf_calib.diagnosis.refits import Refits
     from kf_calib.estimation.calibration import calibrate
     from kf_calib.views import improvement as views
 
@@ -277,18 +280,16 @@ def improve(
 
         difference = None
         with progress(f"improving on {recording.name}", as_json) as tick:
-            start = calibrate(recording_of(recording, options), settings, tick)
+            source = recording_of(recording, options)
+            start, refits = calibrate(source, settings, tick), Refits(source)
             if earlier is not None:
-                state, difference = selection_journal.replayed(earlier, start)
+                state, difference = selection_journal.replayed(earlier, start, refits)
             elif interactive:
-                state = stepwise_selection.begin(start)
+                state = stepwise_selection.begin(start, refits)
             else:
-                state = stepwise_selection.improve(start, accept_first, keep)
+                state = stepwise_selection.improve(start, accept_first, keep, refits)
         if interactive:
-            state = views.session(
-                state, lambda text, usual: click.prompt(text, default=usual or None), show, keep,
-                lambda: progress("improving"),
-            )  # fmt: skip
+            state = dialogue(state, refits, keep)
         with progress("holding out orientations", as_json or not honest) as tick:
             checked = nested_cross_validation.nested_cross_validation(start, on_fold=tick) if honest else None
         if as_json:

@@ -34,18 +34,18 @@ def sentence(error: BaseException) -> str:
         case KfCalibError():
             return str(error)
         case MemoryError():
-            return f"there is not memory enough ({_said(error)}): give it fewer readings, or more memory."
+            return f"there is not memory enough ({_type_and_text(error)}): give it fewer readings, or more memory."
         case OSError() if error.strerror:
             where = "" if error.filename is None else f"{error.filename}: "
             return f"{where}{error.strerror} ({_place(error)}): mend that, and run it again."
         case _:
             return (
-                f"{_said(error)}, which was not foreseen, in {_place(error)}: please report it, with the traceback "
-                f"that {TRACEBACK}=1 in the environment shows."
+                f"{_type_and_text(error)}, which was not foreseen, in {_place(error)}: please report it, with the "
+                f"traceback that {TRACEBACK}=1 in the environment shows."
             )
 
 
-def _said(error: BaseException) -> str:
+def _type_and_text(error: BaseException) -> str:
     """Type and text, in one line."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -157,8 +157,8 @@ def live(
         view = _view(rrd, rerun_port if with_viewer else None, rerun_bind)
         if view is not None:
             run.listeners.append(lambda judgement: view.offer(judgement.result))
-        with answered(run.asked):  # until all is written: who closes a terminal sends several
-            _watched(run, source, record, as_json)
+        with answered(run.handle_signal):  # until all is written: who closes a terminal sends several
+            _follow(run, source, record, as_json)
             if view is not None:
                 view.close()
             opened.close()
@@ -215,7 +215,7 @@ class _Run:
         if self.session is not None:
             self.session.hurry()
 
-    def asked(self, number: signal.Signals) -> None:
+    def handle_signal(self, number: signal.Signals) -> None:
         """To end, by a signal, as its end would; a second Ctrl-C does not wait for it."""
         if number == signal.SIGINT and (self.stopped or not self.going):
             raise KeyboardInterrupt
@@ -271,7 +271,7 @@ class _Run:
             self.unshown += 1
 
 
-def _watched(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
+def _follow(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
     """The run to its end, with a screen, lines or objects."""
     run.start()
     if not as_json and sys.stdout.isatty():
@@ -285,14 +285,14 @@ def _watched(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
             judgement = run.judgements.get(timeout=_REFRESH_S)
             _print(run, judgement, as_json)
         run.warn()
-        now = _said(run)
+        now = _urgent_messages(run)
         for about, said in now.items():
             if said and said != told.get(about) and not as_json:
                 _echo(run, sentence(said))
         told = now
 
 
-def _said(run: _Run) -> dict[str, str]:
+def _urgent_messages(run: _Run) -> dict[str, str]:
     """What a user must know at once, about what: said again where it changes."""
     standing, status = run.session.standing if run.session else None, run.source.status
     return {

@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 
 from kf_calib.bench.arrays import Floats, Ints, Mask
 from kf_calib.design import optimality_criteria
-from kf_calib.design.gimbal_limits import Reach, wrapped
+from kf_calib.design.gimbal_limits import Reach, wrap
 from kf_calib.design.optimality_criteria import Aim, Score
 from kf_calib.design.predicted_information import Prospect
 from kf_calib.dwells.qr import triangle
@@ -70,7 +70,7 @@ class Scheme:
         """Poses (n, k) at which gravity is reversed."""
         other = poses * np.array(self.signs)
         other[:, self.turned] += np.pi
-        return wrapped(other)
+        return wrap(other)
 
     @classmethod
     def of(cls, reach: Reach, repeats: int, antipodal: bool) -> Scheme:
@@ -144,12 +144,12 @@ class Search:
 
     def best(self, count: int) -> Floats:
         """The best ``count`` orientations found, (count, k)."""
-        chosen = self.exchanged(count)
+        chosen = self.exchange(count)
         poses = self.candidates[chosen]
         if not self.reach.continuous:
             return poses
-        starts = [poses, *(self._scattered(count, seed) for seed in range(2 if count <= _FEW else 0))]
-        polished = [self.polished(start) for start in starts]
+        starts = [poses, *(self._random_candidates(count, seed) for seed in range(2 if count <= _FEW else 0))]
+        polished = [self.polish(start) for start in starts]
         return min([poses, *polished], key=self.cost)
 
     def measure(self, poses: Floats) -> float:
@@ -164,11 +164,11 @@ class Search:
         """Return the aim plus a small share of D, which decides between designs of equal aim."""
         return self.aim(factors, power) + _TIE * optimality_criteria.D(factors)
 
-    def _scattered(self, count: int, seed: int) -> Floats:
+    def _random_candidates(self, count: int, seed: int) -> Floats:
         """Choose random candidates to start from."""
         return np.random.default_rng(seed).choice(self.candidates, count)
 
-    def exchanged(self, count: int) -> list[int]:
+    def exchange(self, count: int) -> list[int]:
         """Indices of the best candidates, found by greedy choice followed by exchange.
 
         If the candidates are the only possible orientations, random starts are tried as well. The greedy choice uses D,
@@ -179,10 +179,10 @@ class Search:
             greedy.append(self._choice(optimality_criteria.D, rows[greedy])[0])
         rng = np.random.default_rng(0)
         others = [] if self.reach.continuous else [rng.choice(len(rows), count).tolist() for _ in range(_OTHERS)]
-        found = [self._exchanged(start) for start in (greedy, *others)]
+        found = [self._exchange_from(start) for start in (greedy, *others)]
         return min(found, key=lambda each: float(self._score(self.factor(rows[each]))))
 
-    def _exchanged(self, start: list[int]) -> list[int]:
+    def _exchange_from(self, start: list[int]) -> list[int]:
         """Exchange each dwell for the best candidate until none changes."""
         rows, chosen = self.candidate_rows, list(start)
         for _ in range(_SWEEPS):
@@ -221,7 +221,7 @@ class Search:
         promise = np.einsum("nri,ij,nrj->n", white, optimality_criteria.slope(score, spread, self.aim.powers[0]), white)
         return np.argsort(promise)[:_FIRST]
 
-    def polished(self, poses: Floats) -> Floats:
+    def polish(self, poses: Floats) -> Floats:
         """The orientations moved within their bounds to a local minimum of the cost."""
         shape, rooms = poses.shape, self._rooms(poses)
         for power in self.aim.powers:
@@ -230,7 +230,7 @@ class Search:
                 options=_UNTIL,
             )  # fmt: skip
             poses = found.x.reshape(shape)
-        return np.where(np.isfinite(rooms).any(axis=2), poses, wrapped(poses))
+        return np.where(np.isfinite(rooms).any(axis=2), poses, wrap(poses))
 
     def _rooms(self, poses: Floats) -> Floats:
         """Return the bounds (n, k, 2) of each orientation within which it and its antipode are allowed."""
@@ -281,14 +281,14 @@ class Search:
         the candidates, and from balanced directions.
         """
         bounds, balanced = list[float](), self.prospect.balanced(len(rows) * self.scheme.copies)
-        for design in (rows, self._weighted(len(rows)), *([] if balanced is None else [balanced])):
+        for design in (rows, self._weighted_rows(len(rows)), *([] if balanced is None else [balanced])):
             known, largest = self.variance_function(design, self.candidates)
             width = design.shape[2]
             ratio = (known + len(rows) * largest) / width
             bounds.append(-float(optimality_criteria.D(self.factor(design))) * 2.0 + math.log(ratio))
         return min(bounds)
 
-    def _weighted(self, count: int) -> Floats:
+    def _weighted_rows(self, count: int) -> Floats:
         """Return the rows (c, r, p) of the candidates times the roots of their D-optimal weights, found by
         multiplicative updates."""
         rows = self.candidate_rows
@@ -309,15 +309,15 @@ class Search:
             return self._first_of(self.candidates)
         rng, (low, high) = np.random.default_rng(0), self.reach.bounds.T
         scattered = rng.uniform(low, high, (_SCATTERED, len(low)))
-        best = self._first_of(np.vstack([scattered[self._allowed(scattered)], self.reach.candidates[:1]]))
+        best = self._first_of(np.vstack([scattered[self._is_allowed(scattered)], self.reach.candidates[:1]]))
         for reach_deg in (24.0, 8.0, 2.5, 0.8):
             about = best + np.radians(rng.uniform(-reach_deg, reach_deg, (_ABOUT, len(best))))
-            best = self._first_of(np.vstack([best, about[self._allowed(about)]]))
-        return wrapped(best)
+            best = self._first_of(np.vstack([best, about[self._is_allowed(about)]]))
+        return wrap(best)
 
-    def _allowed(self, poses: Floats) -> Mask:
+    def _is_allowed(self, poses: Floats) -> Mask:
         """Return a mask of the poses that are allowed together with their antipodes."""
-        inside = self.reach.allowed(wrapped(poses))
+        inside = self.reach.allowed(wrap(poses))
         return inside if self.scheme.turned is None else inside & self.reach.allowed(self.scheme.antipodes(poses))
 
     def _first_of(self, poses: Floats) -> Floats:

@@ -141,7 +141,7 @@ def _aside(angle: float, zone: Floats) -> tuple[float, float]:
     return (-1.0, -1.0) if inside else (float(below), float(above))
 
 
-def wrapped(poses: Floats) -> Floats:
+def wrap(poses: Floats) -> Floats:
     """Angles wrapped to the range from -180 to 180 deg, rad."""
     return np.pi - (np.pi - poses) % (2.0 * np.pi)
 

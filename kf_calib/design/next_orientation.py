@@ -11,7 +11,7 @@ import numpy as np
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
-from kf_calib.design.gimbal_limits import wrapped
+from kf_calib.design.gimbal_limits import wrap
 from kf_calib.design.predicted_information import Prospect
 from kf_calib.dwells.qr import triangle
 from kf_calib.effects import Effect
@@ -127,7 +127,7 @@ class Course:
     dwells: int
     each_s: float
 
-    def sharpened(self, sizes: Floats) -> tuple[str, float]:
+    def next_reduction(self, sizes: Floats) -> tuple[str, float]:
         """The parameter whose sigma is largest relative to ``sizes`` (12,), and the factor by which the next dwell
         reduces it."""
         worst = int(np.argmax(self.sigma[0] / sizes))
@@ -162,7 +162,7 @@ def course(fitted: Fit, sizes: Floats, count: int = _STEPS) -> Course | None:
     root = np.asarray(np.linalg.inv(triangle(np.vstack([factor, at_least]))), float)
     sigmas, first = [_sigmas(root, jacobian)], 0
     for number in range(count):
-        after = _narrowed(root, rows)
+        after = _root_after(root, rows)
         reached = _sigmas(after, jacobian)
         best = int(np.argmin(((reached / sizes) ** 2).sum(axis=1)))
         first = first if number else best
@@ -184,7 +184,7 @@ def _sigmas(roots: Floats, jacobian: Floats) -> Floats:
     return np.asarray(np.linalg.norm(jacobian @ roots[..., :STATE_COUNT, :], axis=-1))
 
 
-def _narrowed(root: Floats, rows: Floats) -> Floats:
+def _root_after(root: Floats, rows: Floats) -> Floats:
     """Return roots S (m, p, p) of the covariance S S^T after each of m sets of whitened rows (m, r, p), from the root
     before.
 
@@ -210,7 +210,7 @@ def _poses(fitted: Fit) -> Floats | None:
     coarse = rng.integers(-4, 4, (_POSES // 2, count)) * 45.0
     fine = np.round(rng.uniform(-180.0, 180.0, (_POSES // 2, count)) / _STEP_DEG) * _STEP_DEG
     poses = np.radians(np.concatenate([coarse, fine]))
-    turn = np.abs(wrapped(poses - fitted.dwells[-1].pose)).max(axis=1)
+    turn = np.abs(wrap(poses - fitted.dwells[-1].pose)).max(axis=1)
     return poses[turn > np.radians(SAME_POSE_DEG)]
 
 

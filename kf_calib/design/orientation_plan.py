@@ -222,7 +222,7 @@ def plan(search: Search, count: int, timing: Timing, seed: int = 0) -> Plan:
         made = Plan(search, _ordered(search, poses, timing, seed), timing)
         if search.reach.continuous and search.prospect.model.bench.reference == "inertial" and copies == 1:
             sequence = replace(search, at_s=made.at_s)  # gravity turns with the Earth during the plan
-            made = Plan(search, _rounded(search, sequence.polished(made.poses)), timing)
+            made = Plan(search, _rounded(search, sequence.polish(made.poses)), timing)
         _refuse_unseen(made)
         return made
 
@@ -238,7 +238,7 @@ def fewest(search: Search, timing: Timing, seed: int = 0, on_try: Callable[[int]
         """Return the aim of the best ``count`` orientations; infinite if they leave parameters undetermined."""
         if count not in tried:
             on_try(count * copies)
-            enough = not optimality_criteria.unseen(search.factor(search.candidate_rows[search.exchanged(count)])).any()
+            enough = not optimality_criteria.unseen(search.factor(search.candidate_rows[search.exchange(count)])).any()
             tried[count] = math.exp(search.measure(search.best(count))) if enough else math.inf
         return tried[count]
 

@@ -154,7 +154,7 @@ class Prospect:
         ``at_s`` (n,) are the middles of consecutive dwells; without it, each pose is that of the next dwell.
         """
         stimulus = self.stimulus(poses, at_s)
-        return self.whitened(self.model.columns(stimulus, self.state), stimulus) @ self.transform
+        return self.whiten(self.model.columns(stimulus, self.state), stimulus) @ self.transform
 
     def balanced(self, count: int) -> Floats | None:
         """Whitened rows (12, 3, p) equivalent to ``count`` dwells in directions spread as the vertices of an
@@ -166,7 +166,7 @@ class Prospect:
             return None
         stimulus = self.stimulus(np.zeros((len(_ICOSAHEDRON), len(self.model.bench.axes))))
         stimulus = replace(stimulus, force_mps2=self.model.bench.gravity_mps2 * _ICOSAHEDRON)
-        rows = self.whitened(self.model.columns(stimulus, self.state), stimulus) @ self.transform
+        rows = self.whiten(self.model.columns(stimulus, self.state), stimulus) @ self.transform
         return math.sqrt(count / len(_ICOSAHEDRON)) * rows
 
     def columns(self, effects: Sequence[Effect], poses: Floats, wait_s: float = 0.0) -> Floats:
@@ -178,9 +178,9 @@ class Prospect:
         since_arrival_s = stimulus.since_arrival_s + wait_s
         stimulus = replace(stimulus, elapsed_s=stimulus.elapsed_s + wait_s, since_arrival_s=since_arrival_s)
         own = self.model.columns(stimulus, self.state), effect_columns(effects, stimulus)
-        return self.whitened(np.concatenate(own, axis=2), stimulus)
+        return self.whiten(np.concatenate(own, axis=2), stimulus)
 
-    def whitened(self, design: Floats, stimulus: Stimulus) -> Floats:
+    def whiten(self, design: Floats, stimulus: Stimulus) -> Floats:
         """The design (n, 3, p) of dwells' means, whitened by their noise."""
         count = len(stimulus)
         means = Means(design, np.zeros((count, 3)), stimulus.force_mps2, np.full(count, self.readings),

@@ -97,13 +97,13 @@ def order(poses: Floats, columns: Floats, timing: Timing, reach: Reach, start: F
 
     best, least = np.arange(count), np.inf
     for _ in range(_STARTS):
-        tour, own = _improved(rng.permutation(count), cost, rng)
+        tour, own = _improve(rng.permutation(count), cost, rng)
         if own < least:
             best, least = tour, own
     return best
 
 
-def _improved(tour: Ints, cost: Callable[[Ints], Floats], rng: np.random.Generator) -> tuple[Ints, float]:
+def _improve(tour: Ints, cost: Callable[[Ints], Floats], rng: np.random.Generator) -> tuple[Ints, float]:
     """Improve an order by random moves until a number of them in sequence brings no gain."""
     least, fruitless = float(cost(tour[None])[0]), 0
     while fruitless < _FRUITLESS:

@@ -16,17 +16,14 @@ from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.dwells.coherent_tone import band_hz
 from kf_calib.dwells.line_spectrum import Line, lowest_hz
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.effects import Effect, effect_named, names, walk_named
+from kf_calib.effects import Effect, effect_named, names, oscillation_of, slew_effects, walk_named
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import consistency
 from kf_calib.estimation.score_test import Candidate, Frame, Scan
 from kf_calib.support import stage
-from kf_calib.support.tail_probabilities import sidak
-
-LEVEL = 0.01
-"""Probability of a false alarm in one run."""
+from kf_calib.support.tail_probabilities import LEVEL, sidak
 
 SHARE = 0.4
 """Share of the false-alarm probability that is given to the test of the misfit, and as much to the scan."""
@@ -179,7 +176,7 @@ def candidates(model: Model) -> list[Effect]:
     inside, out = {str(effect) for effect in model.effects}, list[Effect]()
     for name in names(model.bench):
         effect = effect_named(name, model.bench)
-        if name in inside or effect.dynamic or effect.walks or effect.oscillates:
+        if name in inside or not effect.scannable:
             continue
         out += [effect] if effect.unknown is None else [effect.at(value) for value in effect.unknown.grid(2.0)]
     return out
@@ -221,7 +218,7 @@ def assess_candidates(
         beyond = fall - threshold(1, tests)
         paths = _beside_best(found, scores, tests) if beyond > 0.0 else 0.0
         scores[name] = beyond + paths
-    slewing = tuple(name for name in names(model.bench) if effect_named(name, model.bench).dynamic)
+    slewing = slew_effects(model.bench)
     test = CandidateTests(found, best, scores, p_values, agreed.p_value, name, tests, slewing, (), paths=paths)
     return _with_lines(test, fitted, frame)
 
@@ -240,7 +237,7 @@ def candidate_frame(fitted: Fit, frames: list[Frame]) -> Frame:
 
 def _scanned(fitted: Fit, frame: Frame) -> Scan:
     """Return the scan of all candidates and of slow oscillations, of which the best frequency is kept."""
-    carried, effect = fitted.carried, _oscillation(fitted.carried.model)
+    carried, effect = fitted.carried, oscillation_of(fitted.carried.model.bench)
     values = np.zeros(0) if effect is None or carried.model.oscillates else slow_hz(fitted, effect)
     if effect is None or not len(values):
         return frame.scan(carried)
@@ -250,12 +247,6 @@ def _scanned(fitted: Fit, frame: Frame) -> Scan:
     others, swinging = found.candidates[: -len(near)], found.candidates[-len(near) :]
     last = swinging[int(np.argmax(found.statistics[-len(near) :]))]
     return replace(found, candidates=(*others, replace(last, tried=len(values))))
-
-
-def _oscillation(model: Model) -> Effect | None:
-    """Return the effect of the catalogue that oscillates, or None."""
-    every = (effect_named(name, model.bench) for name in names(model.bench))
-    return next((effect for effect in every if effect.oscillates), None)
 
 
 def slow_hz(fitted: Fit, effect: Effect) -> Floats:
@@ -275,7 +266,7 @@ def _with_lines(test: CandidateTests, fitted: Fit, frame: Frame) -> CandidateTes
     """Return the tests with the lines of the spectrum, which count for an oscillation in place of slow frequencies."""
     from scipy.special import chdtri
 
-    effect = _oscillation(fitted.carried.model)
+    effect = oscillation_of(fitted.carried.model.bench)
     if effect is None or fitted.carried.model.oscillates:
         return replace(test, trend=trend(fitted))
     name, slow, (low, high, first) = str(effect), slow_hz(fitted, effect), _searched_hz(fitted.dwells)
@@ -344,7 +335,9 @@ def _smallest_p(found: Scan, seen: NDArray[np.intp], seed: int) -> Floats:
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     draws = np.random.default_rng(seed).standard_normal((_DRAWS, len(root)))
     squares = np.add.reduceat((draws @ root) ** 2, starts, axis=1)
-    return chdtrc(np.array([found.candidates[k].dof for k in seen], float), squares).min(axis=1)
+    dofs = np.array([found.candidates[k].dof for k in seen])
+    tallest = {dof: squares[:, dofs == dof].max(axis=1) for dof in np.unique(dofs).tolist()}  # has the smallest p-value
+    return np.min([chdtrc(dof, square) for dof, square in tallest.items()], axis=0)
 
 
 def _walking(fitted: Fit) -> str:

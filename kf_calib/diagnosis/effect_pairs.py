@@ -1,7 +1,7 @@
 """Pairs of effects, which may mask each other, or explain together what neither of them explains alone.
 
-A pair holds the numbers of two candidates of a test. A random walk of the biases has no columns and therefore no
-number; ``WALKS`` stands for it.
+A pair holds the numbers of two candidates of a test. An effect without columns, as the random walk of the biases, is no
+candidate, and a pair holds its name instead.
 """
 
 from __future__ import annotations
@@ -13,15 +13,13 @@ import numpy as np
 
 from kf_calib.diagnosis.candidate_tests import EQUAL, CandidateTests, chance_fall, margin_of, walk_path_margin
 
-WALKS = -1
-"""Stands for the random walk of the biases where a pair holds the number of a candidate."""
-
 _EQUAL_PAIR = 9.21  # as EQUAL, for two pairs that have no effect in common: 1 %, 2 degrees of freedom
 
 MOST = 3
 """Number of pairs that are refitted, and that are named in a verdict."""
 
-Pair = tuple[int, int]
+Member = int | str
+Pair = tuple[Member, Member]
 Pairs = Mapping[Pair, float]
 """The score of each pair: the fall of chi-squared less the thresholds (``chance_fall``) of both effects."""
 
@@ -50,8 +48,8 @@ def walk_path_margin_beside(test: CandidateTests, pairs: Pairs, k: int) -> float
     scores = {j if i == k else i: score for (i, j), score in pairs.items() if k in (i, j)}
     if not scores:
         return 0.0
-    best = str(candidates[max(scores, key=lambda j: scores[j])].effect)
-    beside = [j for j in scores if str(candidates[j].effect) == best]
+    best = name_of(test, max(scores, key=lambda j: scores[j]))
+    beside = [j for j in scores if isinstance(j, int) and name_of(test, j) == best]
     own = float(test.scan.statistics[k]) - chance_fall(candidates[k], tests)
     falls = np.array([scores[j] - own + chance_fall(candidates[j], tests) for j in beside])
     return walk_path_margin(test.scan, beside, falls, max(scores[j] for j in beside) - own, tests)
@@ -87,7 +85,7 @@ def exchangeable_effects(test: CandidateTests, pairs: Pairs, pair: Pair, least: 
         if len(shared) != 1:
             continue
         (lost,), (new,) = set(pair) - shared, set(other) - shared
-        if pairs[other] > pairs[pair] - margin_of(None if lost == WALKS else test.scan.candidates[lost]):
+        if pairs[other] > pairs[pair] - margin_of(None if isinstance(lost, str) else test.scan.candidates[lost]):
             name, overlap = name_of(test, new), candidate_overlap(test, lost, new)
             if overlap > max(least, out.get(name, 0.0)) and name not in both:
                 out[name] = overlap
@@ -100,12 +98,13 @@ def names_of(test: CandidateTests, pair: Pair) -> tuple[str, str]:
     return one, two
 
 
-def name_of(test: CandidateTests, k: int) -> str:
-    """Name of the effect of candidate number ``k``, or of the random walk."""
-    return test.walking if k == WALKS else str(test.scan.candidates[k].effect)
+def name_of(test: CandidateTests, member: Member) -> str:
+    """Name of one of the effects of a pair."""
+    return member if isinstance(member, str) else str(test.scan.candidates[member].effect)
 
 
-def candidate_overlap(test: CandidateTests, one: int, other: int) -> float:
-    """The overlap of two candidates; it is 1 with a random walk, which can take any path."""
-    candidates = test.scan.candidates
-    return 1.0 if WALKS in (one, other) else candidates[one].overlap(candidates[other])
+def candidate_overlap(test: CandidateTests, one: Member, other: Member) -> float:
+    """The overlap of two effects; it is 1 with one without columns, as a random walk, which can take any path."""
+    if isinstance(one, str) or isinstance(other, str):
+        return 1.0
+    return test.scan.candidates[one].overlap(test.scan.candidates[other])

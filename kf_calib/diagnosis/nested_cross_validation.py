@@ -53,7 +53,7 @@ def nested_cross_validation(
         with one_blas_thread():
             kept = evaluate(dwells_without(start.fit.dwells, left), start.bench, start.settings, start.carried.slews)
         result = improve(kept, accept_first=True).result
-        squares, variances = _predicted(start, result, left)
+        squares, variances = _prediction_errors(start, result, left)
         errors.append(squares)
         expected.append(variances)
         for effect in result.model.effects:
@@ -64,7 +64,7 @@ def nested_cross_validation(
     return NestedCrossValidation(rms, floor, folds, counts)
 
 
-def _predicted(start: Calibration, result: Calibration, left: list[int]) -> tuple[Floats, Floats]:
+def _prediction_errors(start: Calibration, result: Calibration, left: list[int]) -> tuple[Floats, Floats]:
     """Return the squared errors of the held-out dwell means and the variances that noise gives; (3 len(left),) each."""
     if result.estimate.undetermined.size:
         raise UnobservableError(

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from kf_calib.diagnosis.candidate_tests import EQUAL, LEVEL, SHARE, CandidateTests, assess_candidates
+from kf_calib.diagnosis.candidate_tests import EQUAL, LEVEL, SHARE, CandidateTests
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.fit import loss_within_range
 from kf_calib.estimation.results import Calibration
@@ -16,20 +17,21 @@ _REFUSED = 0.002  # probability that the effect that is missing is rejected beca
 _NEARLY = 2.71  # rise of chi-squared that is not significant for one constant (10 %)
 
 
-def fits_the_run(refit: Calibration, before: CandidateTests, added: int = 1) -> bool:
+def fits_the_run(refits: Refits, refit: Calibration, before: CandidateTests, added: int = 1) -> bool:
     """Whether the refit leaves only noise, judged by its misfit, all remaining candidates, and trends within dwells.
 
     A random walk has to move like one, and a constant must not end at a limit of its range. A random walk, or several
     effects added at once, can absorb much of a misfit that they do not cause, so that stricter levels are used for
     them.
 
-    refit: the run with the effect. before: the tests without it. added: number of effects that were added at once.
+    refits: those of the run. refit: the run with the effect. before: the tests without it. added: number of effects
+    that were added at once.
     """
     misfit, walks = refit.consistency.p_value, bool(refit.noise.walk_mps2_per_sqrt_s)
     least = LEVEL if walks else _REFUSED
     if (misfit is not None and misfit < SHARE * least) or (walks and _no_walk(refit)) or _at_an_end(refit):
         return False
-    left = assess_candidates(refit.fit, before.effective_tests, frames=refit.frames)
+    left = refits.assess(refit, before.effective_tests)
     if left.trend and misfit is not None:
         free = walks or added > 1
         if _together(misfit, left.trend.p_value) < SHARE * (LEVEL if free else _REFUSED):

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.results import Diagnosis, with_effects
+from kf_calib.diagnosis.refits import Refits
+from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.effects.formula import formula, quantities
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.noise_model import mean_covariances
@@ -219,16 +220,19 @@ def _places(result: Calibration, name: str) -> list[int]:
     return list(range(*part.indices(result.model.count))) if part is not None else []
 
 
-def explanations(found: Diagnosis) -> list[Explanation]:
+def explanations(found: Diagnosis, refits: Refits | None = None) -> list[Explanation]:
     """The explanations of a diagnosis, the best first: what is missing, or the formula that describes an unknown
-    misfit; then the other suspects."""
+    misfit; then the other suspects.
+
+    refits: of the run, if there are any.
+    """
     out = list[Explanation]()
     if found.missing and found.after is not None:
         out.append(Explanation(found.missing, found.before, found.after, True))
     elif found.description is not None:
         formulas = found.description.formulas
         names = tuple(text.partition("=")[2].strip() or text for text in formulas)
-        out.append(Explanation(names, found.before, with_effects(found.before, formulas), False))
+        out.append(Explanation(names, found.before, (refits or Refits()).with_effects(found.before, formulas), False))
     rest = [each for each in found.suspects if (each.name,) != found.missing]
     rest.sort(key=lambda each: not each.fits)  # stable: those that fit, by significance, before those that do not
     return [*out, *(Explanation((each.name,), found.before, each.refit, each.fits) for each in rest)]

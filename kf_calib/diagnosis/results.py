@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +13,6 @@ from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.detectability import Detectable, detectable
 from kf_calib.diagnosis.unknown_effect import Description, describe
-from kf_calib.estimation.calibration import refitted
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration, Parameter
 from kf_calib.support.printing import printed
@@ -43,7 +41,7 @@ class Suspect:
         return [p for p in list(self.refit.parameters.values())[12:] if p.symbol not in self.known]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Diagnosis:
     """What a diagnosis found.
 
@@ -62,13 +60,13 @@ class Diagnosis:
 
     before: Calibration
     test: CandidateTests
-    suspects: tuple[Suspect, ...]
-    missing: tuple[str, ...]
-    unknown: bool
-    ambiguity: tuple[str, ...]
-    overlaps: dict[str, float]
-    after: Calibration | None
-    verdict: str
+    verdict: str = ""
+    suspects: tuple[Suspect, ...] = ()
+    missing: tuple[str, ...] = ()
+    unknown: bool = False
+    ambiguity: tuple[str, ...] = ()
+    overlaps: dict[str, float] = field(default_factory=dict[str, float])
+    after: Calibration | None = None
     together: tuple[tuple[str, str], ...] = ()
     alone: str = ""
     as_scatter: bool = False
@@ -120,13 +118,3 @@ class Diagnosis:
         if shown is None or not shown[1]:
             return None
         return shown[0], f"would show {shown[1]} of {len(hidden)} effects that these orientations cannot"
-
-    def refit_with(self, name: str) -> Calibration:
-        """The calibration with this effect added; that of a suspect is not computed again."""
-        own = (suspect.refit for suspect in self.suspects if suspect.name == name)
-        return next(own, None) or with_effects(self.before, (name,))
-
-
-def with_effects(before: Calibration, added: Sequence[str]) -> Calibration:
-    """The same run calibrated with further effects in the model."""
-    return refitted(before, (*before.settings.effects, *added))

@@ -21,7 +21,7 @@ from kf_calib.diagnosis.candidate_tests import (
     threshold,
     values_of,
 )
-from kf_calib.estimation.calibration import refitted
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.reml import FEWEST
 from kf_calib.estimation.results import Calibration
@@ -131,7 +131,7 @@ def dwell_noise_is_stated(before: Calibration) -> bool:
     return before.noise.scatter_stated and before.noise.setting_stated
 
 
-def with_noise_as_stated(before: Calibration, refit: Calibration) -> Calibration:
+def with_noise_as_stated(refits: Refits, before: Calibration, refit: Calibration) -> Calibration:
     """The run without the added effects, with the noise from dwell to dwell as it was estimated in their refit.
 
     Estimated without the effects, the noise would be too large, as it would contain what they explain.
@@ -141,7 +141,7 @@ def with_noise_as_stated(before: Calibration, refit: Calibration) -> Calibration
         bench = replace(bench, angle_sigma_deg=float(np.degrees(noise.setting_rad)))
     if not noise.scatter_stated:
         bench = replace(bench, scatter_sigma_mps2=float(np.sqrt(np.mean(noise.scatter_mps2**2))))
-    return refitted(replace(before, bench=bench), before.settings.effects)
+    return refits.of(replace(before, bench=bench), before.settings.effects)
 
 
 def least_noisy(refits: Iterable[Calibration]) -> Calibration | None:

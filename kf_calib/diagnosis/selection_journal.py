@@ -37,6 +37,7 @@ from typing import Any, NotRequired
 
 from typing_extensions import TypedDict
 
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import By, Improvement, SelectionStep, begin, take_step
 from kf_calib.effects import refuse_unfit
@@ -204,16 +205,16 @@ def _choice(step: _Step) -> Choice:
 
 
 def replayed(
-    journal: Journal, start: Calibration, on_step: Callable[[Improvement], None] | None = None
+    journal: Journal, start: Calibration, refits: Refits, on_step: Callable[[Improvement], None] | None = None
 ) -> tuple[Improvement, float]:
     """The steps of a journal repeated, and the largest relative difference from its figures (0: equal to the last bit).
 
-    start: the calibration with the first model. on_step: called after each step.
+    start: the calibration with the first model. refits: those of the run. on_step: called after each step.
     """
-    state = begin(start)
+    state = begin(start, refits)
     differences = [_difference(journal.start, figures(state.found))]
     for choice in journal.choices:
-        state = take_step(state, choice.added, choice.dropped, choice.by)
+        state = take_step(state, refits, choice.added, choice.dropped, choice.by)
         differences.append(_difference(choice.figures, figures(state.found)))
         if on_step is not None:
             on_step(state)

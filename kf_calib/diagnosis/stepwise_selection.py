@@ -22,12 +22,14 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.effects import as_text, effect_named, merged, refuse_unknown
 from kf_calib.errors import InputError
 from kf_calib.estimation import square_root_information
-from kf_calib.estimation.calibration import evaluate_fit, refitted
+from kf_calib.estimation.calibration import evaluate_fit
 from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 
 _NEEDED = 0.01  # an effect is needed where its removal raises chi-squared significantly at this level
@@ -128,12 +130,14 @@ class Improvement:
     """The steps from a first model to the current one.
 
     start: the diagnosis of the first model. history: all steps, those that were undone included. asked: whether the
-    user ended the improvement.
+    user ended the improvement. alternatives: the effects among which this run cannot decide, each with its refit; if
+    one of them was added already: the current model, then one with each of the others in its place.
     """
 
     start: Diagnosis
     history: tuple[SelectionStep, ...] = ()
     asked: bool = False
+    alternatives: tuple[Alternative, ...] = ()
 
     def __repr__(self) -> str:
         return f"<Improvement: {self.result.model.sum}, {self.because}>"
@@ -211,30 +215,6 @@ class Improvement:
         return f"{verdict}{equals}"
 
     @cached_property
-    def alternatives(self) -> tuple[Alternative, ...]:
-        """The effects among which this run cannot decide, each with its refit.
-
-        If one of them was added already: the current model, then one with each of the others in its place.
-        """
-        if _rivals(self.found):
-            return tuple(Alternative(name, self.found.refit_with(name)) for name in self.found.ambiguity)
-        out, inside = list[Alternative](), {str(effect): k for k, effect in enumerate(self.result.model.effects)}
-        for before, step in zip([self.start, *(step.found for step in self.steps)], self.steps, strict=False):
-            if step.name not in inside or step.name not in before.ambiguity:
-                continue
-            others = [name for name in before.ambiguity if name not in inside]
-            own = [Alternative(name, self._with_instead(inside[step.name], name)) for name in others]
-            own = [each for each in own if each.result.consistency.consistent is not False]
-            out += [Alternative(step.name, self.result), *own] if own else []
-        return tuple(out)
-
-    def _with_instead(self, place: int, name: str) -> Calibration:
-        """Return the calibration with another effect in one place of the list."""
-        effects = list(self.effects)
-        effects[place] = name
-        return refitted(self.result, tuple(effects))
-
-    @cached_property
     def spreads(self) -> tuple[Spread, ...]:
         """The range over all alternatives of each of the twelve parameters that all of them determine."""
         out = list[Spread]()
@@ -250,26 +230,57 @@ def improve(
     run: Calibration | Source | str | PathLike[str],
     accept_first: bool = False,
     on_step: Callable[[Improvement], None] | None = None,
+    refits: Refits | None = None,
 ) -> Improvement:
     """Stepwise selection: add the effects that the diagnosis names until none is missing or none can be chosen.
 
     run: a calibration, or a recording or source, which is calibrated first. accept_first: take the first of effects
-    that explain the misfit equally well instead of stopping. on_step: called after each step.
+    that explain the misfit equally well instead of stopping. on_step: called after each step. refits: those of the run,
+    with its source, as for ``diagnose``.
     """
-    state = begin(run)
-    while (name := next_effect(state.found, accept_first)) is not None:
-        state = take_step(state, name, None, "diagnosis")
+    start, refits = calibration_of(run, refits)
+    state = begin(start, refits)
+    while (name := next_effect(state.found, refits, accept_first)) is not None:
+        state = take_step(state, refits, name, None, "diagnosis")
         if on_step is not None:
             on_step(state)
     return state
 
 
-def begin(run: Calibration | Source | str | PathLike[str]) -> Improvement:
-    """An improvement without steps, from the diagnosis of a run."""
-    return Improvement(diagnose(run))
+def begin(start: Calibration, refits: Refits) -> Improvement:
+    """An improvement without steps, from the diagnosis of a calibration."""
+    return _with_alternatives(Improvement(diagnose(start, refits)), refits)
 
 
-def next_effect(found: Diagnosis, accept_first: bool = False) -> str | None:
+def _with_alternatives(state: Improvement, refits: Refits) -> Improvement:
+    """Return the improvement with the effects among which its run cannot decide."""
+    return replace(state, alternatives=_alternatives(state, refits))
+
+
+def _alternatives(state: Improvement, refits: Refits) -> tuple[Alternative, ...]:
+    """Return the effects among which a run cannot decide: those of its diagnosis, or those of an earlier one."""
+    found, result = state.found, state.result
+    if _rivals(found):
+        return tuple(Alternative(name, refits.with_effects(result, (name,))) for name in found.ambiguity)
+    out, inside = list[Alternative](), {str(effect): k for k, effect in enumerate(result.model.effects)}
+    for before, step in zip([state.start, *(step.found for step in state.steps)], state.steps, strict=False):
+        if step.name not in inside or step.name not in before.ambiguity:
+            continue
+        others = [name for name in before.ambiguity if name not in inside]
+        own = [Alternative(name, _with_instead(result, refits, inside[step.name], name)) for name in others]
+        own = [each for each in own if each.result.consistency.consistent is not False]
+        out += [Alternative(step.name, result), *own] if own else []
+    return tuple(out)
+
+
+def _with_instead(result: Calibration, refits: Refits, place: int, name: str) -> Calibration:
+    """Return the calibration with another effect in one place of the list."""
+    effects = list(result.settings.effects)
+    effects[place] = name
+    return refits.of(result, effects)
+
+
+def next_effect(found: Diagnosis, refits: Refits, accept_first: bool = False) -> str | None:
     """The effect to add next; None where nothing is missing, or where the choice is left to a person."""
     if found.test.consistent is not False or not found.missing:
         return None
@@ -277,15 +288,15 @@ def next_effect(found: Diagnosis, accept_first: bool = False) -> str | None:
         return found.missing[0]
     if _rivals(found) or (found.as_scatter and found.test.walking not in found.missing):
         return None  # a random walk is excepted: the noise is as large whether it is a walk or scatter
-    return found.missing[0] if len(found.missing) == 1 else _only_choice(found)
+    return found.missing[0] if len(found.missing) == 1 else _only_choice(found, refits)
 
 
-def _only_choice(found: Diagnosis) -> str | None:
+def _only_choice(found: Diagnosis, refits: Refits) -> str | None:
     """Return the first of several effects needed together that has no look-alike beside the others, or None."""
     before = found.before
     for name in found.missing:
         rest = [other for other in found.missing if other != name]
-        beside = diagnose(refitted(before, (*before.settings.effects, *rest)))
+        beside = diagnose(refits.with_effects(before, rest), refits)
         if beside.missing == (name,) and not _rivals(beside):
             return name
     return None
@@ -296,32 +307,35 @@ def _rivals(found: Diagnosis) -> list[str]:
     return [name for name in found.ambiguity if found.missing and name not in found.missing]
 
 
-def extend(state: Improvement, names: Sequence[str], by: By) -> Improvement:
+def extend(state: Improvement, refits: Refits, names: Sequence[str], by: By) -> Improvement:
     """The improvement after adding several effects, one step each; after the last, those not needed are removed."""
     for name in names[:-1]:
-        state = take_step(state, name, (), by)
-    return take_step(state, names[-1], None, by)
+        state = take_step(state, refits, name, (), by)
+    return take_step(state, refits, names[-1], None, by)
 
 
-def take_step(state: Improvement, added: str | None, dropped: Sequence[str] | None, by: By) -> Improvement:
+def take_step(
+    state: Improvement, refits: Refits, added: str | None, dropped: Sequence[str] | None, by: By
+) -> Improvement:
     """The improvement after one step: ``added`` goes into the model, then effects are taken out.
 
-    state: the improvement before. added: name or formula of an effect (None: no effect). dropped: names of effects to
-    take out (None: each that is not needed). by: who chose the step. Raises InputError where the effect cannot be
-    added, or where one to be dropped is not in the model.
+    state: the improvement before. refits: those of the run. added: name or formula of an effect (None: no effect).
+    dropped: names of effects to take out (None: each that is not needed). by: who chose the step. Raises InputError
+    where the effect cannot be added, or where one to be dropped is not in the model.
     """
     if added is not None:
         _refuse(state.result, added)
-    result = state.result if added is None else refitted(state.result, (*state.effects, added))
+    result = state.result if added is None else refits.with_effects(state.result, (added,))
     kept = state.kept | ({_name(added, result)} if added is not None else set[str]())
     out = list[Removal]()
     while (weak := _next_out(result, kept, dropped, len(out))) is not None:
-        result = refitted(result, _less(result, weak.name))
+        result = refits.of(result, _less(result, weak.name))
         out.append(weak)
-    return replace(state, history=(*state.history, SelectionStep(added, tuple(out), by, diagnose(result))))
+    step = SelectionStep(added, tuple(out), by, diagnose(result, refits))
+    return _with_alternatives(replace(state, history=(*state.history, step)), refits)
 
 
-def undone(state: Improvement) -> Improvement:
+def undone(state: Improvement, refits: Refits) -> Improvement:
     """The improvement with its last step undone, which stays in the history.
 
     Raises InputError where there is no step to undo.
@@ -331,7 +345,7 @@ def undone(state: Improvement) -> Improvement:
         raise InputError("there is no step to undo.")
     history = list(state.history)
     history[last] = replace(history[last], undone=True)
-    return replace(state, history=tuple(history))
+    return _with_alternatives(replace(state, history=tuple(history)), refits)
 
 
 def removals(fitted: Fit) -> tuple[Removal, ...]:
@@ -346,7 +360,7 @@ def removals(fitted: Fit) -> tuple[Removal, ...]:
     upper = square_root_information.accumulate(fitted.all_rows(), fitted.steps)
     rank, least, out = square_root_information.rank(upper[:-1]), upper[-1, -1] ** 2, list[Removal]()
     for effect in carried.model.effects:
-        if effect.walks:
+        if not effect.coefficients:  # a random walk is noise, which is judged by its likelihood
             gain = 2.0 * fitted.walk_gain
             out.append(Removal(str(effect), gain, 1, 0.5 * float(chdtrc(1, max(gain, 0.0)))))
             continue
@@ -391,5 +405,5 @@ def _refuse(result: Calibration, text: str) -> None:
     effect = effect_named(text, result.bench)
     if len(merged(result.settings.effects, [text])) == len(result.settings.effects):
         raise InputError(f"{effect} is in the model already: choose another, or drop it first.")
-    if effect.dynamic and not result.carried.slews:
+    if Model(result.bench, (effect,)).dynamic and not result.carried.slews:
         raise InputError(f"{effect} shows in slews only, which were not read: start with --with '{as_text(effect)}'.")

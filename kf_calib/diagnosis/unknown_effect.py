@@ -18,8 +18,9 @@ from kf_calib.effects import Effect, effect_named, walk_named
 from kf_calib.effects.formula import formula
 from kf_calib.errors import InputError
 from kf_calib.estimation.fit import Fit, fit
+from kf_calib.estimation.further_effects import FurtherEffects
 from kf_calib.estimation.results import consistency
-from kf_calib.estimation.score_test import Frame, batches, columns_at_once
+from kf_calib.estimation.score_test import Frame
 from kf_calib.support import stage
 
 _CHANCE = 1e-4  # significance level of one family, of which there are about a hundred
@@ -156,41 +157,25 @@ def _trend_beside(fitted: Fit, family: Family) -> Trend | None:
 def families(fitted: Fit, known: Sequence[Effect] = (), frame: Frame | None = None) -> list[Family]:
     """All families of formulas, each tested on what the model leaves.
 
-    The result is kept with the fit, so that it is computed once.
-
     fitted: the fit. known: effects with which the formulas are compared. frame: with the columns of most of these
     effects.
     """
-    key = tuple((str(effect), effect.value) for effect in known)
-    if key not in fitted.families:
-        frame = frame or Frame(fitted.carried, fitted.noise.judging, known)
-        had = [effect for effect in known if frame.has(effect)]
-        others = [effect for effect in known if not frame.has(effect)]
-        fitted.families[key] = _tried(fitted, frame.only(had), others)
-    return fitted.families[key]
+    frame = frame or Frame(fitted.carried, fitted.noise.judging, known)
+    return _tried(fitted, FurtherEffects(frame, fitted.carried, known, _SAME))
 
 
-def _tried(fitted: Fit, frame: Frame, others: Sequence[Effect]) -> list[Family]:
-    """Return the families with their falls of chi-squared, tested together with the known effects."""
+def _tried(fitted: Fit, tests: FurtherEffects) -> list[Family]:
+    """Return the families with their falls of chi-squared."""
     bench, tried = fitted.carried.model.bench, list[tuple[str, list[str], list[Effect]]]()
     for driver, texts in _families(bench, fitted.dwells):
         with contextlib.suppress(InputError):  # a very late jump or fast decay does not show when a formula is checked
             own = [formula(_named(text), bench.axes, bench.gravity_mps2, checked=False) for text in texts]
             tried.append((driver, texts, [*own]))
     stage.say(f"trying {sum(len(texts) for _, texts, _ in tried)} formulas")
-    out, known = list[Family](), len(frame.effects) + len(others)
-    for part in batches(
-        [sum(len(each.coefficients) for each in effects) for _, _, effects in tried], columns_at_once(fitted.carried)
-    ):
-        some = [tried[k] for k in part]
-        scanned = frame.scan(fitted.carried, [*others, *(effect for _, _, effects in some for effect in effects)])
-        beside, left = scanned.candidates[:known], iter(scanned.candidates[known:])
-        falls = iter(scanned.statistics[known:].tolist())
-        for driver, texts, effects in some:
-            parts = [next(left) for _ in effects]
-            same = all(any(own.within(each, _SAME) for each in beside) for own in parts)
-            fall, rank = scanned.explained(np.concatenate([own.basis for own in parts], axis=1))
-            out.append(Family(driver, tuple(texts), fall, rank, tuple(next(falls) for _ in effects), same))
+    out, scans = list[Family](), tests.scans([effects for _, _, effects in tried])
+    for (driver, texts, _), (scan, known) in zip(tried, scans, strict=True):
+        fall, rank = scan.explained(np.concatenate([each.basis for each in scan.candidates], axis=1))
+        out.append(Family(driver, tuple(texts), fall, rank, tuple(scan.statistics.tolist()), known))
     return out
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.scatter_hypothesis import dwell_noise_is_stated
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
-from kf_calib.estimation.fit import WALK
+from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
 from kf_calib.estimation.results import format_p
 from kf_calib.support.units import shown
 
@@ -16,58 +16,83 @@ def verdict_in_words(found: Diagnosis) -> str:
     """The verdict of a diagnosis in one sentence, with what else it could be."""
     test = found.test
     if test.consistent is None:
-        return "Nothing is left over to judge the model by: visit more orientations."
+        return "The model cannot be tested: there are no more measurements than parameters. Visit more orientations."
     if test.consistent:
-        blind = f" It cannot see {len(test.unseen)} of {test.count} effects." if test.unseen else ""
+        blind = f" This run cannot show {len(test.unseen)} of {test.count} effects." if test.unseen else ""
         agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
         return f"{agreed}: no effect is missing that this run could show.{blind}"
     start = f"Residuals fail (p {format_p(test.p_value)})."
     if found.missing and found.after is not None:
-        first = found.missing[0]
-        if len(found.missing) > 1:
-            named = f"{' and '.join(found.missing)} together explain it; no single known effect does as well"
-        else:
-            named = f"Missing: {first}{_size(found)}"
-            if len(found.ambiguity) > 1 or found.as_scatter or found.back_s:
-                named = f"Best: {first}{_size(found)}"
-        instead = "" if len(found.missing) == 1 else "in the place of one of them, "
-        told = [
-            f"{name} alone" if name == found.alone else f"{name} ({instead}overlap {overlap:.2f})"
-            for name, overlap in found.overlaps.items()
-        ]
-        told = [
-            *told,
-            *(f"{' and '.join(pair)} together" for pair in found.together),
-            *([_scattering(found)] if found.as_scatter else []),
-            *([f"biases that come back within about {one_digit_seconds(found.back_s)}"] if found.back_s else []),
-        ]
-        if told:
-            named += f". Cannot yet be told from {', '.join(told)}"
-        return f"{start} {named}.{_held_out(found)}"
+        return f"{start} {_explanation(found)}.{_held_out(found)}"
     if found.unknown:
-        nearest = next((each.name for each in found.suspects if each.fits), None)
-        if nearest and found.as_scatter:
-            return (
-                f"{start} {nearest} would fit, but {_scattering(found)} are likelier: unknown. "
-                "Visit an orientation again to tell."
-            )
-        if nearest:
-            return f"{start} {nearest} would fit, but what no known effect is explains it better: unknown."
-        return f"{start} No known effect explains it, alone or in pairs: unknown."
-    nearest = next((each.name for each in found.suspects if each.fits), None)
-    noise = found.before.noise
+        return f"{start} {_why_unknown(found)}"
+    noise, nearest = found.before.noise, _nearest(found)
     stated = ("angle_sigma_deg", noise.setting_stated), ("scatter_sigma_mps2", noise.scatter_stated)
     keys = " and ".join(key for key, known in stated if not known)
-    missing = f"is missing ({nearest} would fit)" if nearest else "is missing that is none of the known ones"
+    effect = f"an effect is missing ({nearest} would fit)" if nearest else "an unknown effect is missing"
     return (
-        f"{start} Either dwells scatter by what was not stated or an effect {missing}: state {keys}, or visit an "
-        "orientation again to tell."
+        f"{start} Either the dwells scatter by an amount that was not stated, or {effect}. "
+        f"To find out, state {keys} or repeat an orientation."
     )
+
+
+def second_pass_in_words(found: Diagnosis) -> str:
+    """A sentence on what only a second pass over the readings could judge; "" where nothing is left to it."""
+    names = [suspect.name for suspect in found.suspects if not holds_its_oscillation(suspect.refit.fit)]
+    if found.test.vibration and not found.before.fit.dwells[0].averaged:
+        names.append("the lines in their spectrum")
+    if not names:
+        return ""
+    return (
+        f" A second pass over the readings is needed to judge {' and '.join(names)}: diagnose the recording, or give "
+        "its Refits to diagnose."
+    )
+
+
+def _explanation(found: Diagnosis) -> str:
+    """Return the missing effects, and the explanations from which they cannot be distinguished."""
+    rivals, (first, *more) = _rivals(found), found.missing
+    if more:
+        named = f"{' and '.join(found.missing)} together explain it; no single known effect does as well"
+    else:
+        sure = len(found.ambiguity) <= 1 and not found.as_scatter and not found.back_s
+        named = f"{'Missing' if sure else 'Likeliest'}: {first}{_size(found)}"
+    return f"{named}. Cannot yet be distinguished from {', '.join(rivals)}" if rivals else named
+
+
+def _rivals(found: Diagnosis) -> list[str]:
+    """Return in words the explanations from which the missing effects cannot be distinguished."""
+    instead = "" if len(found.missing) == 1 else "in place of one of them, "
+    out = [
+        f"{name} alone" if name == found.alone else f"{name} ({instead}overlap {overlap:.2f})"
+        for name, overlap in found.overlaps.items()
+    ]
+    out += [f"{' and '.join(pair)} together" for pair in found.together]
+    if found.as_scatter:
+        out.append(_scattering(found))
+    if found.back_s:
+        out.append(f"biases that return to their mean within about {one_digit_seconds(found.back_s)}")
+    return out
+
+
+def _why_unknown(found: Diagnosis) -> str:
+    """Return a sentence on why the cause is unknown."""
+    nearest = _nearest(found)
+    if nearest and found.as_scatter:
+        return f"{nearest} would fit, but {_scattering(found)} is likelier: unknown. Repeat an orientation to find out."
+    if nearest:
+        return f"{nearest} would fit, but a formula that is no known effect explains it better: unknown."
+    return "No known effect explains it, alone or in pairs: unknown."
+
+
+def _nearest(found: Diagnosis) -> str | None:
+    """Return the likeliest suspect that fits."""
+    return next((each.name for each in found.suspects if each.fits), None)
 
 
 def _scattering(found: Diagnosis) -> str:
     """Return the words for scatter from dwell to dwell as an explanation."""
-    return f"dwells that scatter by more than is {'stated' if dwell_noise_is_stated(found.before) else 'estimated'}"
+    return f"scatter from dwell to dwell larger than {'stated' if dwell_noise_is_stated(found.before) else 'estimated'}"
 
 
 def _size(found: Diagnosis) -> str:
@@ -75,7 +100,7 @@ def _size(found: Diagnosis) -> str:
     assert found.after is not None
     parameters = found.after.parameters
     first = next(each for each in found.after.model.effects if str(each) == found.missing[0])
-    sized = [parameters[c.symbol] for c in ([WALK] if first.walks else first.coefficients)]
+    sized = [parameters[c.symbol] for c in first.parameters]
     told = [max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or np.inf))]
     told += [parameters[first.unknown.symbol]] if first.unknown else []
     return "".join(

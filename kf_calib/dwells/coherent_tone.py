@@ -162,7 +162,7 @@ def tone(traces: Sequence[Trace], level: float = 0.01) -> Line | None:
     frequency_hz = step_hz * np.arange(part.start, part.stop, dtype=float)
     wave = np.fft.rfft(grid, size, axis=1)[:, part]
     knots = np.geomspace(frequency_hz[0], frequency_hz[-1], _KNOTS)
-    kept = np.interp(frequency_hz, knots, _kept(np.pi * knots * _usual_s(seen)))
+    kept = np.interp(frequency_hz, knots, _share_beside_parabola(np.pi * knots * _usual_s(seen)))
     power = (wave.real**2 + wave.imag**2)[moving] / kept
     levels, variance = _levels(power, frequency_hz, size / (end - first))
     heights = power / levels
@@ -196,7 +196,7 @@ def _steady(traces: Sequence[Trace], frequency_hz: float, noise: Floats, moving:
     return bool(together > 0.5 * apart)
 
 
-def _kept(half_phase: Floats) -> Floats:
+def _share_beside_parabola(half_phase: Floats) -> Floats:
     """Return the share of a sinusoid's power that remains after a parabola over a dwell is removed.
 
     If the phase advances by 2 x over the dwell, the share is 1 - sum over l = 0, 1, 2 of (2 l + 1) j_l(x)^2, where j_l

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, Mask
 
 _PART = 1024  # rows that are decomposed at once, so that they and their copies stay in the cache
 
@@ -22,7 +23,16 @@ def triangle(rows: NDArray[np.floating[Any]]) -> Floats:
     if rows.ndim == 2 and count >= 4 * part:
         whole = count // part * part
         rows = np.vstack([*(triangle(rows[k : k + part]) for k in range(0, whole, part)), rows[whole:]])
-    return cast("Floats", np.linalg.qr(rows, mode="r"))
+    # numpy's mode "r" makes the mask anew at each call, which for a small matrix takes as long as its decomposition
+    least = min(count, width)
+    folded = np.swapaxes(np.linalg.qr(rows, mode="raw")[0], -1, -2)[..., :least, :]
+    return cast("Floats", np.where(_upper(least, width), folded, 0.0))
+
+
+@lru_cache(maxsize=256)
+def _upper(count: int, width: int) -> Mask:
+    """Return the mask (m, n) of an upper triangle."""
+    return np.arange(count)[:, None] <= np.arange(width)
 
 
 def orthonormal(rows: Floats) -> tuple[Floats, Floats]:

@@ -14,7 +14,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.dwells import innovation_gate
 from kf_calib.dwells.blocks import Block, Tally
 from kf_calib.dwells.slew_kinematics import Curve
-from kf_calib.dwells.window_average import averaged
+from kf_calib.dwells.window_average import average
 
 REGRESSORS = ("1", "f_x", "f_y", "f_z")
 
@@ -119,7 +119,7 @@ def model_rows(
             standing = block.pose, bench.specific_force(np.zeros(1), block.pose)
         force = standing[1] if static and standing else None
         raw = _rows(block, bench, force)
-        means = averaged(block, window_s) if window_s else block
+        means = average(block, window_s) if window_s else block
         if means is None:
             continue
         block, rows = means, _rows(means, bench, force) if window_s else raw
@@ -128,13 +128,13 @@ def model_rows(
             if keep is not None:
                 tally.gated += int((~keep).sum())
                 out = rows.innovation[:, ~keep]
-                block = _kept(block, keep)
+                block = _select(block, keep)
                 rows = _rows(block, bench, force)
                 rows = replace(rows, gated=innovation_gate.channels(out, rows.innovation, gate_sigma))
         yield replace(rows, raw=raw, taken=block.taken) if window_s else rows
 
 
-def _kept(block: Block, keep: Mask) -> Block:
+def _select(block: Block, keep: Mask) -> Block:
     """Return the block with only the readings in ``keep``."""
     pose = block.pose if len(block.pose) == 1 else block.pose[keep]
     return replace(

@@ -146,9 +146,9 @@ class Stillness:
         times, own = pose.time_ns, pose.values - pose.values[0]
         ends = np.minimum(np.searchsorted(times, times - self.window_ns), np.maximum(np.arange(len(times)) - 1, 0))
         starts = np.minimum(np.searchsorted(times, times - 4 * self.window_ns), np.maximum(ends - _BEFORE, 0))
-        sums, counts = _summed(own), (ends - starts)[:, None]
+        sums, counts = _cumulative_sums(own), (ends - starts)[:, None]
         means = (sums[ends] - sums[starts]) / np.maximum(counts, 1)
-        bent, bends = _summed(np.diff(own, 2, axis=0) ** 2), np.maximum(ends - starts - 2, 0)[:, None]
+        bent, bends = _cumulative_sums(np.diff(own, 2, axis=0) ** 2), np.maximum(ends - starts - 2, 0)[:, None]
         variance = (bent[starts + bends[:, 0]] - bent[starts]) / (6.0 * np.maximum(bends, 1))
         allowed = np.maximum(self.rest_rad, 4.0 * np.sqrt(np.maximum(variance, 0.0).max(axis=1)))
         apart = pose_distance(pose.values, means + pose.values[0], is_quaternion)
@@ -241,7 +241,7 @@ def encoder_sigma(poses: Floats) -> Floats:
     )
 
 
-def _summed(values: Floats) -> Floats:
+def _cumulative_sums(values: Floats) -> Floats:
     """Return the cumulative sums (n + 1, k) of values (n, k), beginning with zero."""
     return np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
 

@@ -213,7 +213,7 @@ class DwellFactor:
     @cached_property
     def factor(self) -> Floats:
         """Triangular factor (7, 7) of [1 f_x f_y f_z | z1 z2 z3] over the whole dwell."""
-        return _folded(self.rows([piece.nodes.regressors for piece in self.pieces]))
+        return _square_factor(self.rows([piece.nodes.regressors for piece in self.pieces]))
 
     @cached_property
     def means(self) -> Floats:
@@ -229,7 +229,7 @@ class DwellFactor:
         out[:, :, width:] = self.triangles[:, :, self.width :]
         return out.reshape(-1, width + 3)
 
-    def merged(self, others: Sequence[DwellFactor]) -> DwellFactor:
+    def merge(self, others: Sequence[DwellFactor]) -> DwellFactor:
         """This dwell merged with further blocks of its samples."""
         pieces = (piece for each in (self, *others) for piece in each.pieces)
         return replace(
@@ -240,7 +240,7 @@ class DwellFactor:
             trace=sum((each.trace for each in others), self.trace),
         )
 
-    def repeated(self, times: float) -> DwellFactor:
+    def repeat(self, times: float) -> DwellFactor:
         """This dwell as if each of its readings had been taken ``times`` times."""
         pieces = (
             replace(own, triangle=own.triangle * times**0.5, count=round(own.count * times)) for own in self.pieces
@@ -266,7 +266,7 @@ def fold(rows: Rows, carrier_hz: float = 0.0) -> tuple[Piece, ...]:
     for part, u, nodes in rows.pieces:
         stacked = np.empty((width + 3, len(u)))  # contiguous rows are what LAPACK needs and are faster to fill
         stacked[:width], stacked[width:] = basis(u, rows.elapsed_s[part], carrier_hz), channels[:, part]
-        folded = _folded(stacked.T)
+        folded = _square_factor(stacked.T)
         folded[0, width:] += folded[0, 0] * level
         pieces.append(Piece(folded, nodes, len(u), carrier_hz, len(u) * rows.taken))
     return tuple(pieces)
@@ -281,7 +281,7 @@ def less_curve(innovation: Floats, elapsed_s: Floats | None = None, carrier_hz: 
     return innovation - (innovation @ curve) @ curve.T
 
 
-def _folded(stacked: Floats) -> Floats:
+def _square_factor(stacked: Floats) -> Floats:
     """Return the square triangular factor of rows (n, c), padded with zeros if there are fewer rows than columns."""
     width = stacked.shape[1]
     if len(stacked) < width:
@@ -343,12 +343,12 @@ class _Growing:
         """Add a block of the last dwell or of a new one."""
         if self._last(block.number) is None:
             self.folded.append(block)
-        elif block.autocovariance.count:  # merged now, since ``correlated`` reads the count from the dwell
-            self._folded[-1] = self._folded[-1].merged([block])
+        elif block.autocovariance.count:  # merged now, since ``autocovariance_count`` reads the count from the dwell
+            self._folded[-1] = self._folded[-1].merge([block])
         else:
             self._blocks.append(block)
 
-    def correlated(self, number: int) -> int:
+    def autocovariance_count(self, number: int) -> int:
         """Number of readings in the autocovariance of the dwell of this number, which is either the last or a new
         one."""
         last = self._last(number)
@@ -358,7 +358,7 @@ class _Growing:
     def folded(self) -> list[DwellFactor]:
         """All dwells, each with all its blocks."""
         if self._blocks:
-            self._folded[-1] = self._folded[-1].merged(self._blocks)
+            self._folded[-1] = self._folded[-1].merge(self._blocks)
             self._blocks = []
         return self._folded
 
@@ -400,7 +400,7 @@ class Folder:
             rows.dwell, fold(rows, self.carrier_hz), moving=rows.moving, pose_sigma_rad=rows.pose_sigma_rad,
             turns=rows.turns,
         )  # fmt: skip
-        if not rows.moving and growing.correlated(rows.dwell) < _CORRELATED_SAMPLES:
+        if not rows.moving and growing.autocovariance_count(rows.dwell) < _CORRELATED_SAMPLES:
             left = less_curve(rows.innovation, rows.elapsed_s, self.carrier_hz)
             own, spectrum = Autocovariance.of(left), Spectrum.of(left, rows.elapsed_s)
             block = replace(block, autocovariance=own, spectrum=spectrum)

@@ -98,7 +98,7 @@ def _moments(count: int) -> tuple[Floats, float]:
     return covariance, max(0.5 * count * (count - 1) - inside, 0.0)
 
 
-def lagged(period_s: float, size: int, pairs: Floats) -> Floats:
+def lagged_products(period_s: float, size: int, pairs: Floats) -> Floats:
     """Contribution of a walk of intensity q = 1 to the sums of lagged products (L + 1,) about the parabolas of blocks
     of ``size`` readings.
 

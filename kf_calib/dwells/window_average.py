@@ -54,7 +54,7 @@ def inflation() -> float:
     return float(2.0 * correlations().sum() - 1.0)
 
 
-def averaged(block: Block, length_s: float = WINDOW_S) -> Block | None:
+def average(block: Block, length_s: float = WINDOW_S) -> Block | None:
     """The block averaged over cos^4 windows, with the variance of the readings in each; None if the block is too short.
 
     The side lobes of the window fall as the fifth power of the frequency; with 30 cycles in a window, 1e-7 of an

@@ -23,8 +23,8 @@ from kf_calib.errors import InputError
 
 __all__ = [
     "Coefficient", "Effect", "FrameEffect", "SensorEffect", "Stimulus", "Unknown", "as_text", "effect_named",
-    "load_file", "loaded", "merged", "names", "of_the_users", "programs_of", "refuse_unfit", "refuse_unknown",
-    "register", "remarks_of",
+    "load_file", "loaded", "merged", "names", "of_the_users", "oscillation_of", "programs_of", "refuse_unfit",
+    "refuse_unknown", "register", "remarks_of", "slew_effects", "walk_named",
 ]  # fmt: skip
 
 _PLAIN: dict[str, type[Effect]] = {
@@ -77,6 +77,16 @@ def walk_named(bench: Bench) -> str:
     """The name of the effect that lets the biases walk."""
     kinds = (effect_named(name, bench) for name in names(bench) if ":" not in name)
     return next((str(effect) for effect in kinds if effect.walks), "")
+
+
+def oscillation_of(bench: Bench) -> Effect | None:
+    """The effect that oscillates, or None."""
+    return next((each for each in (effect_named(name, bench) for name in names(bench)) if each.oscillates), None)
+
+
+def slew_effects(bench: Bench) -> tuple[str, ...]:
+    """Names of the effects that show in slews only."""
+    return tuple(name for name in names(bench) if effect_named(name, bench).dynamic)
 
 
 def effect_named(text: str, bench: Bench) -> Effect:

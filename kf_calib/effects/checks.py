@@ -79,7 +79,7 @@ def check(effect: Effect, s: Stimulus | None = None) -> tuple[str, ...]:
     before = {name: values.copy() for name, values in before.items()}
     if isinstance(effect, FrameEffect):
         _rotations(effect, s, count)
-    columns = np.asarray(_called(effect, "columns", effect.columns, s))
+    columns = np.asarray(_call(effect, "columns", effect.columns, s))
     _refuse_shape(effect, columns, (len(s), 3, count))
     refuse_not_finite(effect, columns.reshape(len(s), -1), s)
     for name, values in _arrays(s).items():
@@ -102,7 +102,7 @@ def guard(kind: type[Effect]) -> None:
 
     @functools.wraps(own)
     def columns(self: Effect, s: Stimulus) -> Floats:
-        found = np.asarray(_called(self, "columns", own, self, s))
+        found = np.asarray(_call(self, "columns", own, self, s))
         _refuse_shape(self, found, (len(s), 3, len(self.coefficients)))
         refuse_not_finite(self, found.reshape(len(s), -1), s)
         return found
@@ -126,7 +126,7 @@ def refuse_not_finite(effect: Effect, values: Floats, s: Stimulus) -> None:
 
 
 def _coefficients(effect: Effect) -> int:
-    found = _called(effect, "coefficients", lambda: tuple(effect.coefficients))
+    found = _call(effect, "coefficients", lambda: tuple(effect.coefficients))
     symbols = [coefficient.symbol for coefficient in found]
     if len(set(symbols)) < len(symbols):
         raise InputError(f"{effect} gives two coefficients the same symbol ({' '.join(symbols)}): tell them apart.")
@@ -140,7 +140,7 @@ def _arrays(s: Stimulus) -> dict[str, Floats]:
     return {name: value for name in names if isinstance(value := getattr(s, name), np.ndarray)}
 
 
-def _called(effect: Effect, what: str, call: Callable[..., Any], *arguments: Any) -> Any:
+def _call(effect: Effect, what: str, call: Callable[..., Any], *arguments: Any) -> Any:
     try:
         with np.errstate(all="ignore"):
             return call(*arguments)
@@ -173,7 +173,7 @@ def _refuse_shape(effect: Effect, columns: Floats, shape: tuple[int, int, int]) 
 
 
 def _rotations(effect: FrameEffect, s: Stimulus, count: int) -> Floats:
-    rotations = np.asarray(_called(effect, "rotations", effect.rotations, s))
+    rotations = np.asarray(_call(effect, "rotations", effect.rotations, s))
     shape = (len(s), count, 3)
     if rotations.shape != shape:
         raise InputError(
@@ -188,7 +188,7 @@ def _refuse_wrong_derivative(effect: FrameEffect, columns: Floats, s: Stimulus) 
     for k, own in enumerate(np.moveaxis(rotations, 1, 0)):
         largest = max(float(np.linalg.norm(own, axis=1).max()), 1e-300)
         step = _LARGEST_TURN_RAD / largest
-        turned = (_turned(s.force_mps2, step * own) - _turned(s.force_mps2, -step * own)) / (2.0 * step)
+        turned = (_rotate(s.force_mps2, step * own) - _rotate(s.force_mps2, -step * own)) / (2.0 * step)
         expected = turned @ s.sensitivity.T
         off = np.abs(columns[:, :, k] - expected)
         if off.max() > _DERIVATIVE_LIMIT * largest * s.bench.gravity_mps2:
@@ -202,8 +202,8 @@ def _refuse_wrong_derivative(effect: FrameEffect, columns: Floats, s: Stimulus) 
 
 def _refuse_wrong_slope(effect: Effect, s: Stimulus, count: int) -> None:
     """A class's own derivative for its unknown, against central differences of its columns."""
-    given = np.asarray(_called(effect, "derivative", effect.derivative, s, np.ones(count)))
-    expected = _called(effect, "columns", Effect.derivative, effect, s, np.ones(count))
+    given = np.asarray(_call(effect, "derivative", effect.derivative, s, np.ones(count)))
+    expected = _call(effect, "columns", Effect.derivative, effect, s, np.ones(count))
     if given.shape != expected.shape:
         raise InputError(f"{effect}: its derivative has the shape {given.shape}, not {expected.shape}.")
     off, limit = np.abs(given - expected), 10.0 * _DERIVATIVE_LIMIT * np.abs(expected).max()
@@ -215,7 +215,7 @@ def _refuse_wrong_slope(effect: Effect, s: Stimulus, count: int) -> None:
         )
 
 
-def _turned(vector: Floats, rotation: Floats) -> Floats:
+def _rotate(vector: Floats, rotation: Floats) -> Floats:
     """Rows (m, 3) turned by rotation vectors (m, 3), rad (Rodrigues)."""
     angle = np.linalg.norm(rotation, axis=1, keepdims=True)
     axis = rotation / np.maximum(angle, 1e-300)
@@ -232,7 +232,7 @@ def _remarks(effect: Effect, columns: Floats, s: Stimulus) -> tuple[str, ...]:
     }
     some = dataclasses.replace(s, **own)
     vars(some)["warming"] = s.warming[keep]  # a rate is of an instant, though it is made of the readings about it
-    fewer = np.asarray(_called(effect, "columns", effect.columns, some))
+    fewer = np.asarray(_call(effect, "columns", effect.columns, some))
     if fewer.shape == columns[keep].shape and np.allclose(
         fewer, columns[keep], rtol=1e-9, atol=1e-12 * np.abs(columns).max(initial=0.0)
     ):

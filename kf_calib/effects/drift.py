@@ -143,7 +143,7 @@ class BiasWalk(Effect):
 
     name, title, source = "bias-walk", "bias that walks at random", "IEEE Std 1293, annex on Allan variance"
     confused_with = "bias-drift; scatter from dwell to dwell"
-    walks = True
+    intensity = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5)
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:

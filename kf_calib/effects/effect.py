@@ -74,7 +74,7 @@ class Effect(ABC):
 
     unknown: a constant inside the columns; ``value`` is where it stands, and ``at(value)`` the effect with another.
     smooth: the columns change smoothly with it; where not it is no state, and is averaged over its likelihood.
-    walks: the biases take a random walk (process noise), its intensity is estimated by likelihood.
+    intensity: of the random walk (process noise) that the biases take, estimated by likelihood; None: they take none.
     dynamic: it shows in slews only, so these are evaluated too.
     oscillates: its columns may be faster than a piece of a dwell, so the dwells are folded on a carrier, and
     ``columns`` gives the part that the stimulus asks for (``Stimulus.part``).
@@ -88,7 +88,7 @@ class Effect(ABC):
     confused_with: ClassVar[str] = ""
     unknown: ClassVar[Unknown | None] = None
     smooth: ClassVar[bool] = True
-    walks: ClassVar[bool] = False
+    intensity: ClassVar[Coefficient | None] = None
     dynamic: ClassVar[bool] = False
     oscillates: ClassVar[bool] = False
     averages: ClassVar[bool] = False
@@ -104,7 +104,7 @@ class Effect(ABC):
         """The same effect with its unknown at ``value``, held within its range."""
         other = copy.copy(self)
         if self.unknown is not None:
-            other.value = float(np.clip(value, self.unknown.low, self.unknown.high))
+            other.value = float(min(max(value, self.unknown.low), self.unknown.high))
         return other
 
     @property
@@ -114,6 +114,40 @@ class Effect(ABC):
     @abstractmethod
     def columns(self, s: Stimulus) -> Floats:
         """What each accelerometer reads more per unit of each coefficient: (m, 3, q), m/s^2."""
+
+    @property
+    def parameters(self) -> tuple[Coefficient, ...]:
+        """The parameters that state its size: its coefficients, or the intensity of a random walk."""
+        return self.coefficients if self.intensity is None else (self.intensity,)
+
+    @property
+    def states(self) -> tuple[Coefficient, ...]:
+        """The coefficients that are states: its own and, where its columns have a derivative by it, its unknown."""
+        own = self.unknown
+        if own is None or not self.smooth:
+            return self.coefficients
+        return *self.coefficients, Coefficient(own.symbol, own.unit, 1.0, own.shown_unit, own.per_si)
+
+    @property
+    def walks(self) -> bool:
+        """Whether the biases take a random walk."""
+        return self.intensity is not None
+
+    @property
+    def no_columns(self) -> str:
+        """Why dwells show no columns of it, in words; empty where they do."""
+        if self.dynamic:
+            return "shows in slews only, which are not looked at here"
+        return "is noise of the biases, not a column: fit it to see it" if self.walks else ""
+
+    @property
+    def scannable(self) -> bool:
+        """Whether it shows in dwells at a coarse grid of its unknown: an oscillation needs its frequency, or a line."""
+        return not (self.no_columns or self.oscillates)
+
+    def shows_in(self, s: Stimulus) -> bool:
+        """Whether it has columns in the part of a carrier that the stimulus asks for."""
+        return not s.part or self.oscillates
 
     def grid(self, s: Stimulus) -> Floats:
         """Values of the unknown among which it is looked for first."""

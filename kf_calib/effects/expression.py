@@ -96,7 +96,7 @@ def _look(tree: ast.expr, meanings: Mapping[str, str]) -> Iterable[str]:
         if isinstance(node, ast.Constant):
             node.value = _number(node.value)
         elif isinstance(node, ast.Name):
-            yield _known(node.id, meanings)
+            yield _symbol_of(node.id, meanings)
         elif isinstance(node, ast.Compare) and len(node.ops) > 1:
             raise InputError(f"{_words(node)} compares more than two values: multiply two comparisons instead.")
         elif isinstance(node, ast.Call):
@@ -121,7 +121,7 @@ def _number(value: object) -> float:
         raise InputError("a number in the formula is too large: write it as 1e30, up to 1e308.") from None
 
 
-def _known(name: str, meanings: Mapping[str, str]) -> str:
+def _symbol_of(name: str, meanings: Mapping[str, str]) -> str:
     if name in meanings:
         return name
     if name in FUNCTIONS:

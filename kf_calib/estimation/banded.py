@@ -30,7 +30,7 @@ def root(columns: Floats) -> Floats:
     return cast("Floats", lower)
 
 
-def solved(lower: Floats, rows: Floats, transposed: bool = False) -> Floats:
+def solve(lower: Floats, rows: Floats, transposed: bool = False) -> Floats:
     """The inverse of the Cholesky factor, or of its transpose, times rows (3 D, c)."""
     if not rows.size:
         return rows  # scipy's wrapper would write beyond empty arrays

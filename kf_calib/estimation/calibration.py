@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from os import PathLike
 from typing import Literal
 
@@ -32,7 +31,7 @@ from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import considered_information, mean_covariances
 from kf_calib.estimation.observability import visibility_of
-from kf_calib.estimation.oscillation_carrier import fitted_to, holds_its_oscillation, on_carrier
+from kf_calib.estimation.oscillation_carrier import fitted_to, on_carrier
 from kf_calib.estimation.outlying_dwell import outlying_dwells, outlying_in_words
 from kf_calib.estimation.random_walk import predict, to_mean
 from kf_calib.estimation.remarks import misfit_remark, remarks_on
@@ -62,11 +61,11 @@ def calibrate(
     """
     source, settings = opened(source), settings or Settings()
     with one_blas_thread():
-        if Model.of(source.bench, settings.effects).averages and not settings.window_s:
-            stage.say("reading how it vibrates")
-            settings = replace(settings, window_s=_window_s(source, settings, on_progress))
-            stage.say("reading")
         passed = Pass(source, settings)
+        if passed.model.averages and not settings.window_s:
+            stage.say("reading how it vibrates")
+            passed = Pass(source, replace(settings, window_s=_window_s(source, settings, on_progress)))
+            stage.say("reading")
         if plain is None:
             passed.fold(on_progress)
         return conclude(passed, source, on_progress, plain)
@@ -96,7 +95,7 @@ def conclude(
         _refuse_absent(settings.left_out, passed.folder.dwells)
         refuse_unusable(dwells, passed.tally, bench)
     stage.say("estimating")
-    if again is not None and Model.of(bench, settings.effects).oscillates:
+    if again is not None and passed.model.oscillates:
         passed, fitted = on_carrier(replace(passed, source=again), dwells, plain, on_progress)
     else:
         fitted = fitted_to(passed, dwells)
@@ -105,8 +104,7 @@ def conclude(
     if again is not None and settings.engine == "filterpy":
         stage.say("filterpy, reading by reading")
         result = replace(result, estimate=filterpy_estimate(again, result, on_progress=on_progress))
-    reread = None if again is None else partial(calibrate, again)
-    return replace(with_remarks(result, passed), reread=reread)
+    return with_remarks(result, passed)
 
 
 def with_remarks(result: Calibration, passed: Pass) -> Calibration:
@@ -126,33 +124,6 @@ def with_remarks(result: Calibration, passed: Pass) -> Calibration:
 def _fit_again(result: Calibration, dwells: list[DwellFactor]) -> Fit:
     """Fit the same model to other dwells."""
     return fit(dwells, result.model, result.settings.walk_mps2_per_sqrt_s, result.carried.slews)
-
-
-def refitted(before: Calibration, effects: Sequence[str]) -> Calibration:
-    """The same run with these effects in the model instead of those it had, computed from the sufficient statistics.
-
-    Another pass over the source is needed only by effects that require other statistics: a carrier, slews or averages.
-    """
-    key = tuple(effects)
-    if key not in before.refits:
-        before.refits[key] = replace(_refitted(before, key), frames=before.frames)
-    return before.refits[key]
-
-
-def _refitted(before: Calibration, effects: tuple[str, ...]) -> Calibration:
-    """Fit the model with these effects, and read the source again if its statistics do not suffice."""
-    settings = replace(before.settings, effects=effects)
-    model = Model.of(before.bench, settings.effects)
-    stage.say(f"refitting with {' + '.join(map(str, model.effects))}" if model.effects else "refitting the twelve")
-    other = model.averages and not all(dwell.averaged for dwell in before.fit.dwells)
-    if before.reread is not None and (other or (model.dynamic and not before.carried.slews)):
-        return before.reread(settings)
-    with one_blas_thread():
-        fitted = fit(before.fit.dwells, model, settings.walk_mps2_per_sqrt_s, before.carried.slews)
-        if before.reread is not None and not holds_its_oscillation(fitted):
-            return before.reread(settings, None, None if fitted.dwells[0].averaged else fitted)
-        again = evaluate_fit(fitted, settings)
-        return replace(again, tally=before.tally, readings=before.readings, reread=before.reread)
 
 
 def evaluate(

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -22,26 +23,30 @@ _VIBRATING = 15.0  # mean squared deviation of the variances in units of sigma; 
 def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> Stimulus:
     """The conditions at the nodes of all pieces of all dwells and slews, in order; rotations are linearised at
     ``state``."""
+    return Stimulus(bench=bench, sensitivity=state[:12].reshape(3, 4)[:, :3], **_conditions(tuple(dwells)))
+
+
+@lru_cache(maxsize=2)
+def _conditions(dwells: tuple[DwellFactor, ...]) -> dict[str, Any]:
+    """What the stimulus of a run always is; every fit asks for it several times."""
     nodes = [dwell.nodes for dwell in dwells]
     before = [last for dwell, last in zip(dwells, dwells_before(dwells), strict=True) for _ in dwell.pieces]
     elapsed_s = np.concatenate([each.elapsed_s for each in nodes])
-    return Stimulus(
-        bench=bench,
-        elapsed_s=elapsed_s,
-        since_arrival_s=np.concatenate([each.since_arrival_s for each in nodes]),
-        force_mps2=np.concatenate([each.force_mps2 for each in nodes]),
-        previous_force_mps2=np.repeat([each.means[1:4] for each in before], 3, axis=0),
-        pose=np.concatenate([each.pose for each in nodes]),
-        previous_pose=np.repeat([each.pose for each in before], 3, axis=0),
-        temperature_c=_signal_only(dwells, np.concatenate([each.temperature_c for each in nodes])),
-        sensitivity=state[:12].reshape(3, 4)[:, :3],
-        variance_mps2_2=_varying(dwells).reshape(-1, 3),
-        rate_radps=np.concatenate([rate_or_zero(each.rate_radps) for each in nodes]),
-        rate_change_radps2=np.concatenate([rate_or_zero(each.rate_change_radps2) for each in nodes]),
-        half_s=np.repeat(0.5 * (elapsed_s[2::3] - elapsed_s[::3]), 3),
-        within=np.tile([-1.0, 0.0, 1.0], len(before)),
-        carrier_hz=dwells[0].carrier_hz,
-    )
+    return {
+        "elapsed_s": elapsed_s,
+        "since_arrival_s": np.concatenate([each.since_arrival_s for each in nodes]),
+        "force_mps2": np.concatenate([each.force_mps2 for each in nodes]),
+        "previous_force_mps2": np.repeat([each.means[1:4] for each in before], 3, axis=0),
+        "pose": np.concatenate([each.pose for each in nodes]),
+        "previous_pose": np.repeat([each.pose for each in before], 3, axis=0),
+        "temperature_c": _signal_only(dwells, np.concatenate([each.temperature_c for each in nodes])),
+        "variance_mps2_2": _varying(dwells).reshape(-1, 3),
+        "rate_radps": np.concatenate([rate_or_zero(each.rate_radps) for each in nodes]),
+        "rate_change_radps2": np.concatenate([rate_or_zero(each.rate_change_radps2) for each in nodes]),
+        "half_s": np.repeat(0.5 * (elapsed_s[2::3] - elapsed_s[::3]), 3),
+        "within": np.tile([-1.0, 0.0, 1.0], len(before)),
+        "carrier_hz": dwells[0].carrier_hz,
+    }
 
 
 def _signal_only(dwells: Sequence[DwellFactor], temperature_c: Floats) -> Floats:
@@ -92,14 +97,24 @@ def candidate_columns(
     return _by_dwell(dwells, lambda s: effect_columns(effects, s), stimulus)
 
 
+def piece_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
+    """The same of all dwells in one array, (pieces, K nodes, 3 channels, p)."""
+    return _by_piece(lambda s: effect_columns(effects, s), stimulus)
+
+
 def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> list[Floats]:
-    """Split the columns of a stimulus (m, 3, p) by dwell; on a carrier the nodes of both envelopes follow those of the
-    plain part."""
+    """Split the columns of a stimulus (m, 3, p) by dwell."""
+    return np.split(_by_piece(columns, stimulus), np.cumsum([len(dwell.pieces) for dwell in dwells])[:-1])
+
+
+def _by_piece(columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> Floats:
+    """Arrange the columns of a stimulus (m, 3, p) by piece; on a carrier the nodes of both envelopes follow those of
+    the plain part."""
     parts = [columns(stimulus)]
     if stimulus.carrier_hz:
         parts += [columns(replace(stimulus, part=part)) for part in (1, 2)]
-    shaped = np.concatenate([part.reshape(len(part) // 3, 3, *part.shape[1:]) for part in parts], axis=1)
-    return np.split(shaped, np.cumsum([len(dwell.pieces) for dwell in dwells])[:-1])
+    shaped = [part.reshape(len(part) // 3, 3, *part.shape[1:]) for part in parts]
+    return np.concatenate(shaped, axis=1) if len(shaped) > 1 else shaped[0]
 
 
 @dataclass(frozen=True, repr=False)

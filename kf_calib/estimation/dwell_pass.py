@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -33,10 +34,14 @@ class Pass:
     folder: Folder = field(default_factory=Folder)
     watch: ReadingsMonitor = field(default_factory=ReadingsMonitor)
 
+    @cached_property
+    def model(self) -> Model:
+        """The model with the effects that the settings name."""
+        return Model.of(self.source.bench, self.settings.effects)
+
     def segmenter(self) -> Segmenter:
         """The segmenter for this source, which also returns slews if the model has effects that show in slews only."""
-        slews = bool(Model.of(self.source.bench, self.settings.effects).dynamic)
-        return Segmenter(self.source.bench, self.settings.stillness, self.tally, slews)
+        return Segmenter(self.source.bench, self.settings.stillness, self.tally, bool(self.model.dynamic))
 
     def rows(self) -> Iterator[Rows]:
         """Rows of all blocks of the source."""
@@ -44,9 +49,8 @@ class Pass:
 
     def rows_of(self, blocks: Iterable[Block]) -> Iterator[Rows]:
         """Rows of the given blocks, averaged over windows if the settings or the model's effects require it."""
-        model = Model.of(self.source.bench, self.settings.effects)
-        usual_s = window_average.WINDOW_S if model.averages else 0.0
-        window_s = 0.0 if model.oscillates else self.settings.window_s or usual_s
+        usual_s = window_average.WINDOW_S if self.model.averages else 0.0
+        window_s = 0.0 if self.model.oscillates else self.settings.window_s or usual_s
         return model_rows(blocks, self.source.bench, self.tally, self.settings.gate_sigma, window_s)
 
     def add(self, rows: Rows) -> None:

@@ -13,7 +13,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -21,16 +20,13 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.effects import Coefficient, Effect
+from kf_calib.effects import Effect
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.dwell_columns import Carried, Means, candidate_columns, stimulus_of
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, steps, within_dwells
 from kf_calib.estimation.reml import Part, gain_of, misfit, restoring_gain, with_dwell_parts, with_slow_scatter
 from kf_calib.estimation.score_test import falls
-
-WALK = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5)
-"""The intensity of the random walk of the biases, as a parameter in the results."""
 
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
@@ -96,12 +92,6 @@ class Fit:
         return out
 
     @cached_property
-    def families(self) -> dict[Any, Any]:
-        """Cache of the formulas that were tried on the residuals of this fit (``unknown_effect.families``), by the
-        other effects tried."""
-        return {}
-
-    @cached_property
     def considered(self) -> Floats:
         """Contribution B (p, p) of the constants without a derivative to the covariance, which becomes P + P B P.
 
@@ -165,9 +155,14 @@ class Fit:
 
     def rows(self, noise: Noise | None = None) -> list[Floats]:
         """Whitened rows [H | z] of each dwell, with the weights of the fit or with another noise."""
-        return square_root_information.whiten(
-            self.dwells, self.carried.columns, noise or self.noise.weights, self.carried.state
-        )
+        return self._weighted if noise is None else self._whitened(noise)
+
+    @cached_property
+    def _weighted(self) -> list[Floats]:
+        return self._whitened(self.noise.weights)
+
+    def _whitened(self, noise: Noise) -> list[Floats]:
+        return square_root_information.whiten(self.dwells, self.carried.columns, noise, self.carried.state)
 
 
 def fit(

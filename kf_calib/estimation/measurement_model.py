@@ -46,10 +46,10 @@ class Model:
     def __add__(self, effect: Effect) -> Model:
         """The model with one effect more; raises InputError if it, or one of its coefficients, is in the model
         already."""
-        taken = {c.symbol: each for each in self.effects for c in _states_of(each)}
+        taken = {c.symbol: each for each in self.effects for c in each.states}
         if any(str(each) == str(effect) for each in self.effects):
             raise InputError(f"{effect} is in the model already: name it once, or take it out first.")
-        for coefficient in _states_of(effect):
+        for coefficient in effect.states:
             if coefficient.symbol in taken:
                 raise InputError(
                     f"{effect} cannot be added: {taken[coefficient.symbol]} in the model already has the coefficient "
@@ -74,18 +74,23 @@ class Model:
     def coefficients(self) -> tuple[Coefficient, ...]:
         """The coefficients of all effects, in the order of the state after the twelve; an effect's unknown constant
         follows its coefficients."""
-        return tuple(coefficient for effect in self.effects for coefficient in _states_of(effect))
+        return tuple(coefficient for effect in self.effects for coefficient in effect.states)
 
     @cached_property
     def parts(self) -> dict[str, slice]:
         """The slice of the state that belongs to each effect, by name."""
-        ends = np.cumsum([STATE_COUNT, *(len(_states_of(effect)) for effect in self.effects)]).tolist()
+        ends = np.cumsum([STATE_COUNT, *(len(effect.states) for effect in self.effects)]).tolist()
         return {str(effect): slice(a, b) for effect, (a, b) in zip(self.effects, itertools.pairwise(ends), strict=True)}
+
+    @property
+    def intensity(self) -> Coefficient | None:
+        """The intensity of the random walk that the biases follow, or None if they follow none."""
+        return next((effect.intensity for effect in self.effects if effect.intensity is not None), None)
 
     @property
     def walks(self) -> bool:
         """Whether an effect makes the biases follow a random walk."""
-        return any(effect.walks for effect in self.effects)
+        return self.intensity is not None
 
     @property
     def dynamic(self) -> tuple[Effect, ...]:
@@ -93,10 +98,14 @@ class Model:
         return tuple(effect for effect in self.effects if effect.dynamic)
 
     @property
+    def oscillation(self) -> Effect | None:
+        """The effect that may oscillate within a piece of a dwell, so that dwells are folded on a carrier, or None."""
+        return next((effect for effect in self.effects if effect.oscillates), None)
+
+    @property
     def oscillates(self) -> bool:
-        """Whether an effect may oscillate within a piece of a dwell, so that the dwells have to be folded on a
-        carrier."""
-        return any(effect.oscillates for effect in self.effects)
+        """Whether an effect may oscillate within a piece of a dwell."""
+        return self.oscillation is not None
 
     @property
     def averages(self) -> bool:
@@ -149,7 +158,7 @@ class Model:
             out[:, i, 4 * i : 4 * i + 3] = stimulus.force_mps2
             out[:, i, 4 * i + 3] = 1.0
         for effect in self.effects:
-            if stimulus.part and not effect.oscillates:
+            if not effect.shows_in(stimulus):
                 continue
             part = self.parts[str(effect)]
             own = slice(part.start, part.start + len(effect.coefficients))
@@ -161,26 +170,15 @@ class Model:
 
 def effect_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
     """The change (m, 3, q) of each accelerometer's reading per unit of each coefficient of the effects."""
-    own = [
-        np.zeros((len(stimulus), 3, len(each.coefficients)))
-        if stimulus.part and not each.oscillates
-        else each.columns(stimulus)
-        for each in effects
-    ]
-    columns = np.concatenate([np.zeros((len(stimulus), 3, 0)), *own], axis=2)
-    scales = np.array([coefficient.scale for each in effects for coefficient in each.coefficients])
-    # set to zero what even a large coefficient would not raise above rounding, as for the tilt of a vertical axis
-    columns[np.abs(columns) * scales < _ROUNDING_MPS2] = 0.0
+    counts = [len(each.coefficients) for each in effects]
+    columns, last = np.zeros((len(stimulus), 3, sum(counts))), np.cumsum(counts).tolist()
+    for effect, end, count in zip(effects, last, counts, strict=True):
+        if not effect.shows_in(stimulus):
+            continue
+        own, scales = effect.columns(stimulus), np.array([coefficient.scale for coefficient in effect.coefficients])
+        # set to zero what even a large coefficient would not raise above rounding, as for the tilt of a vertical axis
+        columns[:, :, end - count : end] = np.where(np.abs(own) * scales < _ROUNDING_MPS2, 0.0, own)
     return columns
-
-
-def _states_of(effect: Effect) -> tuple[Coefficient, ...]:
-    """Return the coefficients that are states: those of the effect and, if it has a derivative, its unknown
-    constant."""
-    unknown = effect.unknown
-    if unknown is None or not effect.smooth:
-        return effect.coefficients
-    return *effect.coefficients, Coefficient(unknown.symbol, unknown.unit, 1.0, unknown.shown_unit, unknown.per_si)
 
 
 def dwell_map(state: Floats) -> Floats:

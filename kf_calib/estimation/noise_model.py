@@ -114,7 +114,7 @@ def within_dwells(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float = 0
     for dwell in dwells[1:]:
         total += dwell.autocovariance
     if walk_mps2_per_sqrt_s:
-        total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _lagged(dwells))
+        total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(dwells))
     known = _of_averages if dwells[0].averaged else _inflation
     inflation, variance = np.array([known(total, i) for i in range(3)]).T
     if not dwells[0].averaged and total.count < _SHORT * inflation.max() * total.blocks:
@@ -130,14 +130,14 @@ def within_dwells(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float = 0
     return Noise(np.sqrt(np.where(long.any(axis=0), pooled, variance)), inflation)
 
 
-def _lagged(dwells: Sequence[DwellFactor]) -> Floats:
+def _walk_products(dwells: Sequence[DwellFactor]) -> Floats:
     """Return what a random walk of intensity q = 1 contributes to the sums of lagged products (L + 1, 1) of all
     dwells."""
     out = 0.0 * dwells[0].autocovariance.pairs
     for dwell in dwells:
         known, period_s = dwell.autocovariance, (dwell.end_s - dwell.start_s) / max(dwell.count - 1, 1)
         if known.blocks:
-            out += walk_path.lagged(period_s, max(round(known.count / known.blocks), 1), known.pairs)
+            out += walk_path.lagged_products(period_s, max(round(known.count / known.blocks), 1), known.pairs)
     return out[:, None]
 
 

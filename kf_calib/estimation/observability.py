@@ -18,12 +18,12 @@ from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.score_test import Candidate, Scan, scan
+from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.threads import one_blas_thread
 from kf_calib.support.units import shown
 
-LEVEL, POWER = 0.01, 0.9
-"""Significance level of a detection, and the share of runs in which an effect of the smallest detectable size is
-found."""
+POWER = 0.9
+"""Share of runs in which an effect of the smallest detectable size is found."""
 
 _CONFUSED, _TWINS, _NAMED = 0.5, 0.99, 3  # overlap worth naming, overlap of look-alikes, number of effects named
 
@@ -100,16 +100,11 @@ def _beside(fitted: Fit, model: Model, effects: Sequence[Effect]) -> list[Visibi
     catalogue."""
     bench, named = model.bench, {str(each) for each in effects}
     others = [effect_named(name, bench) for name in names(bench) if name not in named | set(model.parts)]
-    tried = [at for each in (*effects, *others) if _has_columns(each) for at in _values(each)]
+    tried = [at for each in (*effects, *others) if not each.no_columns for at in _values(each)]
     state = np.concatenate([fitted.carried.state[:STATE_COUNT], np.zeros(model.count - STATE_COUNT)])
     carried = Carried(fitted.dwells, model, state)
     found = scan(carried, fitted.noise.judging, tried)
     return [replace(_sight(found, each), degeneracy=each.degeneracy(bench)) for each in effects]
-
-
-def _has_columns(effect: Effect) -> bool:
-    """Tell whether an effect has columns in dwells."""
-    return not (effect.dynamic or effect.walks)
 
 
 def _values(effect: Effect) -> list[Effect]:
@@ -119,10 +114,8 @@ def _values(effect: Effect) -> list[Effect]:
 
 def _sight(found: Scan, effect: Effect) -> Visibility:
     """Return the visibility of one effect from the scan of all."""
-    if effect.dynamic:
-        return Visibility(effect, None, why="shows in slews only, which are not looked at here")
-    if effect.walks:
-        return Visibility(effect, None, why="is noise of the biases, not a column: fit it to see it")
+    if effect.no_columns:
+        return Visibility(effect, None, why=effect.no_columns)
     own = [each for each in found.candidates if str(each.effect) == str(effect)]
     tests = len({str(each.effect) for each in found.candidates if each.dof})
     chance = 0.5 * LEVEL / max(tests, 1)  # half: the misfit as a whole is tested beside

@@ -9,7 +9,6 @@ import numpy as np
 from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder, lines_of
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.fit import Fit, fit
-from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import consistency
 from kf_calib.support import stage
 
@@ -76,11 +75,11 @@ def _nearer(passed: Pass, carrier: float | Fit, on_progress: Callable[[float], N
 
 def fitted_to(passed: Pass, dwells: list[DwellFactor]) -> Fit:
     """The fit of the settings' model to these dwells."""
-    settings = passed.settings
-    model = Model.of(passed.source.bench, settings.effects)
-    return fit(dwells, model, settings.walk_mps2_per_sqrt_s, passed.folder.slews)
+    return fit(dwells, passed.model, passed.settings.walk_mps2_per_sqrt_s, passed.folder.slews)
 
 
 def _oscillation_hz(fitted: Fit) -> float:
     """Return the frequency of the model's oscillation."""
-    return next(effect.value for effect in fitted.carried.model.effects if effect.oscillates)
+    effect = fitted.carried.model.oscillation
+    assert effect is not None
+    return effect.value

@@ -23,7 +23,7 @@ from kf_calib.estimation.noise_model import lift_rounding, mean_covariances
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Turn
 from kf_calib.support.tail_probabilities import f_tail
 
-LEVEL = 1e-6  # significance over the whole run; a dwell must be wrong beyond doubt
+_BEYOND_DOUBT = 1e-6  # significance over the whole run; a dwell must be wrong beyond doubt
 _MOST_LEFT = -2.0 * math.log(1e-4)  # limit of chi-squared after a rotation; three channels less one angle leave 2 dof
 _GROSS = 0.02  # g; larger than any known effect in one dwell
 _NEARLY = 0.3  # relative to the largest statistic; dwells above it are tried, too
@@ -55,11 +55,11 @@ def outlying_dwells(
     ratios = (statistics / statistics.max()).round(9)  # rounded, so that the first of equal dwells comes first
     order = np.argsort(-ratios, kind="stable")[:_TRIED]
     tried = [k for k in order.tolist() if ratios[k] > _NEARLY]
-    found = [_judged(result, k, evaluate(dwells_without(dwells, (k,)))) for k in tried]
+    found = [_test_dwell(result, k, evaluate(dwells_without(dwells, (k,)))) for k in tried]
     return tuple(each for each in found if each is not None)
 
 
-def _judged(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell | None:
+def _test_dwell(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell | None:
     """Judge dwell ``k`` against the calibration from all others; None if those disagree or if it is within chance."""
     if rest.consistency.consistent is not True:
         return None
@@ -69,7 +69,7 @@ def _judged(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell | N
     freedom = 1e9 if noise.setting_stated and noise.scatter_stated else max(rest.consistency.dof, 1)
     statistic = float(error @ np.linalg.solve(covariance, error))
     p_value = min(len(dwells) * f_tail(3.0, freedom, statistic / 3.0), 1.0)
-    if p_value > LEVEL:
+    if p_value > _BEYOND_DOUBT:
         return None
     turns = tuple(_turns(dwells[k], means, rest))
     if not turns and np.linalg.norm(error) < _GROSS * result.bench.gravity_mps2:

@@ -11,7 +11,7 @@ by means of its banded precision matrix.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,14 +22,16 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import BIASES
 from kf_calib.effects import Effect
 from kf_calib.estimation import square_root_information
-from kf_calib.estimation.dwell_columns import Carried, candidate_columns
+from kf_calib.estimation.dwell_columns import Carried, candidate_columns, piece_columns, stimulus_of
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise, steps
+from kf_calib.estimation.square_root_information import MisfitColumns
 
 _SEEN = 1e-6  # a column of which the model leaves less than this share counts as explained
 _NEW = 1e-9  # a smaller share of a column beside those before it is rounding
 _SPARE = 18  # points beyond the phase, rad, that passes during a dwell; the error is then 1e-10 of a column
-_AT_ONCE = 64  # frequencies that are processed together that are processed together
+_AT_ONCE = 64  # frequencies that are processed together
+_SAME_RAD = 1e-10  # phases that differ by less are equal
 _LEAST_PAUSE = 1e-6  # of the largest variance of a step: the variance over a pause is at least this
 
 Waves = NDArray[np.complex128]
@@ -42,22 +44,17 @@ class Periodogram:
         self.values_hz, self.state, self.noise = values_hz, carried.state, noise
         dwells = carried.dwells
         self._middles_s = np.array([0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells])
+        self._same_hz = _SAME_RAD / (2.0 * np.pi * float(np.abs(self._middles_s).max(initial=1e-9)))
         points_hz, self._shares = _points(values_hz, max(dwell.end_s - dwell.start_s for dwell in dwells))
-        waves = candidate_columns(dwells, [effect.at(hz) for hz in points_hz], carried.model.bench, carried.state)
-        columns = [
-            np.concatenate([own[..., :STATE_COUNT], more], axis=3)
-            for own, more in zip(carried.columns, waves, strict=True)
-        ]
-        rows, width = square_root_information.misfit_rows(
-            dwells, columns, noise, carried.state, STATE_COUNT, reduced=False
-        )
-        rows = rows[len(rows) - len(dwells) :]
-        self._ends = np.cumsum([0, *map(len, rows)]).tolist()
-        stacked, inside = np.concatenate(rows), 3 if noise.walk_mps2_per_sqrt_s else 0
-        parts = stacked[:, inside + width : -1].reshape(len(stacked), len(points_hz), 3, 2)
-        turned = np.exp(-2j * np.pi * np.repeat(self._middles_s, np.diff(self._ends))[:, None] * points_hz)
-        self._waves: Waves = turned[..., None] * (parts[..., 1] + 1j * parts[..., 0])  # (m, points, 3)
-        self._path = _Path(stacked, self._ends, steps(dwells, noise)) if inside else None
+        kinds, self._path = [effect.at(hz) for hz in points_hz], None
+        if noise.walk_mps2_per_sqrt_s:
+            self._waves, self._ends, stacked = _waves_beside_walk(carried, noise, kinds)
+            self._path = _Path(stacked, self._ends, steps(dwells, noise))
+        else:
+            self._waves, self._ends = _waves(carried, noise, kinds)
+        middles_s = np.repeat(self._middles_s, np.diff(self._ends))[:, None]
+        for k, hz in enumerate(points_hz):
+            self._waves[:, k] *= np.exp(-2j * np.pi * hz * middles_s)
         self._squares = self._products_of_waves()
         self._first: _Beside | None = None
 
@@ -141,9 +138,13 @@ class Periodogram:
 
     def _turning(self) -> Iterator[tuple[slice, Waves]]:
         """Yield slices of the frequencies and e^(2 pi i f t_d) (n, D) for each."""
+        turns_s, apart_hz, apart = 2j * np.pi * self._middles_s, np.zeros(0), np.zeros((0, 0))
         for first in range(0, len(self.values_hz), _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
-            yield part, np.exp(2j * np.pi * self.values_hz[part, None] * self._middles_s)
+            own_hz = self.values_hz[part] - self.values_hz[first]
+            if len(own_hz) > len(apart_hz) or np.abs(own_hz - apart_hz[: len(own_hz)]).max() > self._same_hz:
+                apart_hz, apart = own_hz, np.exp(own_hz[:, None] * turns_s)  # once, if the frequencies are equidistant
+            yield part, np.exp(self.values_hz[first] * turns_s) * apart[: len(own_hz)]
 
 
 @dataclass
@@ -245,6 +246,33 @@ class _Path:
         bands[3, :-1, 3:] -= pauses[:, None]  # s and the next a
         bands[6, 1:-1, :3] -= pauses[1:, None]  # a and the next a
         return bands.reshape(7, -1)
+
+
+def _waves(carried: Carried, noise: Noise, kinds: Sequence[Effect]) -> tuple[Waves, list[int]]:
+    """Return the whitened columns (m, points, 3) of oscillations, and where the rows of each dwell begin and end."""
+    whitening = MisfitColumns(carried.dwells, noise, carried.state)
+    stimulus = stimulus_of(carried.dwells, carried.model.bench, carried.state)
+    ends = whitening.ends - whitening.ends[0]
+    out = np.empty((int(ends[-1]), len(kinds), 3), np.complex128)
+    for k, each in enumerate(kinds):  # one at a time, which saves memory
+        parts = whitening.of(piece_columns([each], stimulus))[whitening.ends[0] :].reshape(-1, 3, 2)
+        out[:, k] = parts[..., 1] + 1j * parts[..., 0]
+    return out, ends.tolist()
+
+
+def _waves_beside_walk(carried: Carried, noise: Noise, kinds: Sequence[Effect]) -> tuple[Waves, list[int], Floats]:
+    """Return the same where the biases walk, and the rows [S | H | ...] that have the walk in them."""
+    waves = candidate_columns(carried.dwells, kinds, carried.model.bench, carried.state)
+    columns = [
+        np.concatenate([own[..., :STATE_COUNT], more], axis=3) for own, more in zip(carried.columns, waves, strict=True)
+    ]
+    rows, width = square_root_information.misfit_rows(
+        carried.dwells, columns, noise, carried.state, STATE_COUNT, reduced=False
+    )
+    rows = rows[len(rows) - len(carried.dwells) :]
+    stacked = np.concatenate(rows)
+    parts = stacked[:, 3 + width : -1].reshape(len(stacked), len(kinds), 3, 2)
+    return parts[..., 1] + 1j * parts[..., 0], np.cumsum([0, *map(len, rows)]).tolist(), stacked
 
 
 def _parts(ends: list[int]) -> list[slice]:

@@ -75,7 +75,7 @@ def remarks_on(
             yield f"{exact}."
     if judged.dof == 0:
         yield (
-            f"{len(dwells)} dwell{'s leave' if len(dwells) > 1 else ' leaves'} nothing over to judge the model by: "
+            f"{len(dwells)} dwell{'s are' if len(dwells) > 1 else ' is'} too few to test the model: "
             "visit at least five spread orientations."
         )
     if misfit := misfit_remark(judged, residuals, model.bench, noise):
@@ -95,21 +95,21 @@ def remarks_on(
     if not noise.checked and noise.scatter_mps2.any() and not noise.scatter_stated:
         known = directions(carried.means.force_mps2)
         yield (
-            f"these orientations have gravity in {known} different direction{'s' * (known != 1)}, which cannot tell a "
-            "setting error of the angles from scatter of the sensors: dwells are weighted alike and their whole misfit "
-            f"({shown('m/s^2').text(noise.scatter_mps2[0], 2)}) counts in every sigma; {ENOUGH_DIRECTIONS} directions, "
-            "spread, would tell."
+            f"these orientations have gravity in {known} different direction{'s' * (known != 1)}, too few to "
+            "distinguish a setting error of the angles from scatter of the sensors: all dwells have the same weight, "
+            f"and their whole misfit ({shown('m/s^2').text(noise.scatter_mps2[0], 2)}) enters every sigma. Visit "
+            f"{ENOUGH_DIRECTIONS} spread directions to distinguish them."
         )
     if unstated(noise) and degrees_of_freedom(carried.means) < FEWEST:
         yield (
             f"{len(dwells)} dwell{'s are' if len(dwells) > 1 else ' is'} too few to estimate what was not stated "
-            f"({' and '.join(unstated(noise))}): it is taken as zero, and where it is not, sigmas are too small."
+            f"({' and '.join(unstated(noise))}): it is taken as zero; if it is not zero, the sigmas are too small."
         )
     stated_deg = model.bench.angle_sigma_deg
     if stated_deg is not None and beyond_stated(noise, model.bench):
         yield (
-            f"the angles' own noise leaves {np.degrees(noise.setting_rad):.2g} deg uncertain of a pose, with the "
-            f"{stated_deg:g} deg stated for its setting: that is what dwells are weighted by."
+            f"the angles are noisy themselves: together with the stated setting error of {stated_deg:g} deg, each "
+            f"pose is uncertain by {np.degrees(noise.setting_rad):.2g} deg, which is used to weight the dwells."
         )
     if not noise.setting_stated and noise.setting_rad > 0:
         yield (

@@ -100,7 +100,7 @@ def with_dwell_parts(
     )
     if stated.setting_stated and stated.scatter_stated and not walks:
         return stated, {}
-    means, _ = _reduced(means)
+    means, _ = _reduce(means)
     free = means.readings.size - means.design.shape[2]
     if free < FEWEST:
         return stated, {}
@@ -178,7 +178,7 @@ def directions(force_mps2: Floats) -> int:
 
 def degrees_of_freedom(means: Means) -> int:
     """Degrees of freedom of the dwells' means beside the model's coefficients."""
-    return means.readings.size - _reduced(means)[0].design.shape[2]
+    return means.readings.size - _reduce(means)[0].design.shape[2]
 
 
 def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats) -> float:
@@ -186,7 +186,7 @@ def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats
 
     ``means`` and ``prior`` are those that ``with_slow_scatter`` returns.
     """
-    means, prior = _reduced(means, prior)
+    means, prior = _reduce(means, prior)
     likelihood = _likelihood(noise, {part}, means, state, prior)
     _, point = likelihood.of((part,)).most_likely()
     return max(likelihood.without().cost - point.cost, 0.0)
@@ -198,7 +198,7 @@ def restoring_gain(noise: Noise, means: Means, state: Floats, prior: Floats) -> 
     The mean-reverting walk is a Gauss-Markov process of any variance; with an infinite time constant it is the random
     walk. ``means`` and ``prior`` are those that ``with_slow_scatter`` returns.
     """
-    means, prior = _reduced(means, prior)
+    means, prior = _reduce(means, prior)
     free, still = _likelihood(noise, (), means, state, prior).without(), replace(noise, walk_mps2_per_sqrt_s=0.0)
     spans_s, run_s = means.ends_s[:, 1] - means.ends_s[:, 0], float(means.ends_s[-1, 1] - means.ends_s[0, 0])
     times_s = np.geomspace(max(float(np.median(spans_s)) / 4.0, run_s * 1e-4), 2.0 * run_s, _HELD).tolist()
@@ -225,7 +225,7 @@ def misfit(noise: Noise, means: Means, state: Floats, prior: Floats | None = Non
 
     ``prior`` (q, p + 1) are whitened rows of prior knowledge about the coefficients.
     """
-    means, prior = _reduced(means, prior)
+    means, prior = _reduce(means, prior)
     return _likelihood(noise, (), means, state, prior).without().misfit
 
 
@@ -237,11 +237,11 @@ def restricted_log_likelihood(
     ``prior`` is as in ``misfit``; ``held_s`` is the time constant with which a walk of the biases reverts to its mean,
     infinite for a random walk.
     """
-    means, prior = _reduced(means, prior)
+    means, prior = _reduce(means, prior)
     return -_likelihood(noise, (), means, state, prior, held_s).without().cost
 
 
-def _reduced(means: Means, prior: Floats | None = None) -> tuple[Means, Floats]:
+def _reduce(means: Means, prior: Floats | None = None) -> tuple[Means, Floats]:
     """Return the means with an orthonormal basis (D, 3, r) in place of the columns without a prior, and the prior's
     rows.
 
@@ -269,7 +269,7 @@ def _likelihood(
     prior: Floats | None = None,
     held_s: float = math.inf,
 ) -> Likelihood:
-    """Return the likelihood of means from ``_reduced``, with the parts that may be added."""
+    """Return the likelihood of means from ``_reduce``, with the parts that may be added."""
     count, units = len(means.counts), _units(means)
     standing = "walk" not in parts and not noise.walk_mps2_per_sqrt_s
     path = Links(*(np.zeros(count - k) for k in (1, 0, 1))) if standing else mean_links(means.ends_s, held_s)
@@ -281,19 +281,21 @@ def _likelihood(
     walk[0, :, :3] = path.alone[:, None, None] * np.eye(3)
     walk[0, :-1, 3:] = path.beside[:, None, None] * np.eye(3)
     shapes: dict[Part, Floats] = {
-        "setting": _linked(setting_covariances(means, state)[None], path),
-        "common": _linked(each.sum(axis=0, keepdims=True), path),
-        "scatter": _linked(each, path),
+        "setting": _conditional_covariances(setting_covariances(means, state)[None], path),
+        "common": _conditional_covariances(each.sum(axis=0, keepdims=True), path),
+        "scatter": _conditional_covariances(each, path),
         "walk": walk,
     }
-    fixed = _linked(mean_covariances(noise, means, state), path) + noise.walk_mps2_per_sqrt_s**2 * walk[0]
+    fixed = (
+        _conditional_covariances(mean_covariances(noise, means, state), path) + noise.walk_mps2_per_sqrt_s**2 * walk[0]
+    )
     alone = Restricted(
         rows.reshape(3 * count, -1), np.zeros((0, rows.shape[2])) if prior is None else prior, fixed, walk[:0]
     )
     return Likelihood(alone, {part: units[part][:, None, None, None] ** 2 * shapes[part] for part in parts}, units)
 
 
-def _linked(own: Floats, path: Links) -> Floats:
+def _conditional_covariances(own: Floats, path: Links) -> Floats:
     """Return the covariances (..., D, 6, 3), in the layout of ``banded``, of means less their share of the mean before.
 
     ``own`` (..., D, 3, 3) are the covariances of the means themselves, which are independent of each other.

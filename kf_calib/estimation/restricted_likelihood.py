@@ -63,14 +63,14 @@ class Restricted:
         covariance = self.fixed + wider.reshape(self.fixed.shape)
         covariance[:, :3] = lift_rounding(covariance[:, :3])
         lower, known = banded.root(covariance), len(self.prior)
-        whitened = np.concatenate([self.prior, banded.solved(lower, self.rows)])
+        whitened = np.concatenate([self.prior, banded.solve(lower, self.rows)])
         basis, upper = np.linalg.qr(whitened[:, :-1])
         rest = whitened[:, -1] - basis @ (basis.T @ whitened[:, -1])
         cost = np.log(lower[0]).sum() + np.log(np.abs(np.diag(upper))).sum() + 0.5 * rest @ rest
         basis, misfit = basis[known:], float(rest @ rest)
-        back = banded.solved(lower, np.column_stack([basis, rest[known:]]), transposed=True)
+        back = banded.solve(lower, np.column_stack([basis, rest[known:]]), transposed=True)
         inner = banded.inverse(covariance, lower) - banded.outer(back)
-        moved = banded.solved(lower, banded.products(self.shapes, back[:, -1]))
+        moved = banded.solve(lower, banded.products(self.shapes, back[:, -1]))
         within = basis.T @ moved
         information = 0.5 * (moved.T @ moved - within.T @ within)
         return Point(float(cost), misfit, 0.5 * banded.traces(inner, self.shapes), information)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -17,14 +17,13 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.cross_validation import HeldOut, held_out
 from kf_calib.estimation.dwell_columns import Carried, columns_of, means_of
-from kf_calib.estimation.fit import WALK, Fit
+from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import Noise, considered_information, steps
-from kf_calib.estimation.score_test import Frame
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings
 from kf_calib.support.printing import printed
-from kf_calib.support.tail_probabilities import f_tail
+from kf_calib.support.tail_probabilities import LEVEL, f_tail
 from kf_calib.support.threads import one_blas_thread
 from kf_calib.support.units import field_unit, shown
 
@@ -215,19 +214,10 @@ class Calibration:
     residual_rms_mps2: float
     tally: Tally
     warnings: tuple[str, ...]
-    reread: Callable[..., Calibration] | None = field(default=None, repr=False, compare=False)
-    """Evaluates the same source again, for models that need the readings folded in another way."""
     readings: Readings = field(default_factory=Readings)
     """Defects of the readings, found independently of the model."""
     outlying: tuple[OutlyingDwell, ...] = ()
     """The dwell that alone does not fit, or several if any one of them could be the cause."""
-    frames: list[Frame] = field(default_factory=list[Frame], repr=False, compare=False)
-    """The candidates' whitened columns, shared by all models of the run."""
-
-    @cached_property
-    def refits(self) -> dict[tuple[str, ...], Calibration]:
-        """Cache of the models fitted by ``refitted``, by their effects."""
-        return {}
 
     @cached_property
     def held_out(self) -> HeldOut | None:
@@ -279,10 +269,10 @@ class Calibration:
             *((c.symbol, *own, 0.0, c.unit) for c, *own in zip(coefficients, effects, sigmas, strict=True)),
         ]
         units = [*map(field_unit, paper_parameters.UNITS), *((c.shown_unit, c.per_si) for c in coefficients)]
-        if self.model.walks:
+        if (walk := self.model.intensity) is not None:
             intensity, spread = self.noise.walk_mps2_per_sqrt_s, self.noise.walk_spread
-            found.append((WALK.symbol, intensity, intensity * spread if spread else math.nan, 0.0, WALK.unit))
-            units.append((WALK.shown_unit, WALK.per_si))
+            found.append((walk.symbol, intensity, intensity * spread if spread else math.nan, 0.0, walk.unit))
+            units.append((walk.shown_unit, walk.per_si))
         for effect in self.model.stepped:
             assert effect.unknown is not None
             constant, spread = effect.unknown, self.fit.spreads[str(effect)]
@@ -384,7 +374,7 @@ def consistency(fitted: Fit) -> Consistency:
         return Consistency(statistic, 0, None, None)
     noise_dof = float(sum(max(dwell.count - 4, 1) for dwell in dwells) / noise.inflation.mean())
     p_value = f_tail(dof, max(noise_dof, 1.0), statistic / dof)
-    return Consistency(statistic, dof, p_value, p_value >= 0.01)
+    return Consistency(statistic, dof, p_value, p_value >= LEVEL)
 
 
 def format_p(p_value: float | None) -> str:

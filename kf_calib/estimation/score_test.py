@@ -12,7 +12,6 @@ be whitened; the projection is then done on a small matrix.
 
 from __future__ import annotations
 
-import copy
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,10 +25,12 @@ from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect, Stimulus
 from kf_calib.estimation import random_walk, square_root_information
-from kf_calib.estimation.dwell_columns import Carried, candidate_columns, stimulus_of
+from kf_calib.estimation.complement import Complement
+from kf_calib.estimation.dwell_columns import Carried, candidate_columns, piece_columns, stimulus_of
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise, steps
 from kf_calib.estimation.periodogram import Periodogram
+from kf_calib.estimation.square_root_information import MisfitColumns
 
 _SEEN = 1e-6
 """A candidate is invisible if the model leaves less than this share of its columns."""
@@ -84,12 +85,7 @@ class Candidate:
         The criterion is the cosine of the largest principal angle. If it holds, the other explains whatever this one
         explains, so that no readings can favour this candidate over the other.
         """
-        if not 0 < self.dof <= other.dof:
-            return False
-        cosines = self.basis.T @ other.basis
-        if np.vdot(cosines, cosines) <= self.dof * cosine**2:  # the smallest is no larger than their root mean square
-            return False
-        return float(np.linalg.svd(cosines, compute_uv=False)[-1]) > cosine
+        return is_within(self.basis.T @ other.basis, cosine)
 
     def overlap(self, other: Candidate) -> float:
         """Cosine of the smallest principal angle between the two spans; 1 if they share a direction, so that the run
@@ -125,6 +121,14 @@ class Scan:
         return candidate.inverse @ (candidate.basis.T @ self.residual)
 
 
+def is_within(cosines: Floats, cosine: float) -> bool:
+    """``Candidate.within`` from the products (k, l) of the two bases."""
+    dof, others = cosines.shape
+    if not 0 < dof <= others or np.vdot(cosines, cosines) <= dof * cosine**2:
+        return False  # the smallest cosine is no larger than their root mean square
+    return float(np.linalg.svd(cosines, compute_uv=False)[-1]) > cosine
+
+
 class Frame:
     """The whitened columns of ``effects`` over all dwells, in an orthonormal basis of their own.
 
@@ -136,29 +140,43 @@ class Frame:
 
     def __init__(self, carried: Carried, noise: Noise, effects: Sequence[Effect]) -> None:
         self.dwells, self.noise, self.state, self.effects = carried.dwells, noise, carried.state, list(effects)
-        self.parts = _slices(_counts(effects))
+        self.parts = slices(counts_of(effects))
         self._stimulus = stimulus_of(carried.dwells, carried.model.bench, carried.state)
-        self.basis, self.coordinates = orthonormal(
-            whitened_columns(carried, noise, effects, carried.state, self._stimulus)
-        )
+        self._whitening = None if _inside(noise) else MisfitColumns(carried.dwells, noise, carried.state)
+        self.basis, self.coordinates = orthonormal(self.whitened(carried, effects))
         self._periodogram: Periodogram | None = None
         self._lines: dict[float, tuple[Line, ...]] = {}
         self._last: tuple[Carried, Floats, Floats, int] | None = None
 
-    def only(self, effects: Sequence[Effect]) -> Frame:
-        """The same frame restricted to ``effects``, all of which it must contain."""
-        own = dict(zip(map(_key, self.effects), self.parts, strict=True))
-        out = copy.copy(self)
-        out.effects = list(effects)
-        out.coordinates = np.concatenate(
-            [self.coordinates[:, :0], *(self.coordinates[:, own[_key(each)]] for each in effects)], axis=1
-        )
-        out.parts = _slices(_counts(effects))
-        return out
-
     def has(self, effect: Effect) -> bool:
         """Tell whether the frame contains this effect with its unknown constant at this value."""
         return _key(effect) in map(_key, self.effects)
+
+    def columns(self, effects: Sequence[Effect]) -> Floats:
+        """Whitened columns (m, q) of effects that the frame contains."""
+        own = dict(zip(map(_key, self.effects), self.parts, strict=True))
+        return self.basis @ np.concatenate([self.coordinates[:, own[_key(each)]] for each in effects], axis=1)
+
+    def whitened(self, carried: Carried, effects: Sequence[Effect]) -> Floats:
+        """Whitened columns (m, q) of any effects, computed for a few at a time, which saves memory."""
+        sizes, out, first = counts_of(effects), np.zeros((0, 0)), 0
+        for part in batches(sizes, columns_at_once(carried)) or [[]]:
+            own = self._whitened(carried, [effects[k] for k in part])
+            out = out if len(out) else np.empty((len(own), sum(sizes)))
+            out[:, first : first + own.shape[1]], first = own, first + own.shape[1]
+        return out
+
+    def _whitened(self, carried: Carried, effects: Sequence[Effect]) -> Floats:
+        if self._whitening is not None:
+            return self._whitening.of(piece_columns(effects, self._stimulus))
+        # a walk is whitened by the columns of the biases, which are among the twelve
+        added = candidate_columns(carried.dwells, effects, carried.model.bench, self.state, self._stimulus)
+        both = [
+            np.concatenate([own[..., :STATE_COUNT], more], axis=3)
+            for own, more in zip(carried.columns, added, strict=True)
+        ]
+        rows, width = _judged(carried.dwells, both, self.noise, self.state, STATE_COUNT)
+        return _stacked(rows, carried.dwells, self.noise)[:, width:-1]
 
     def lines(self, level: float) -> tuple[Line, ...]:
         """Oscillations found in the readings at the significance ``level`` (see ``sufficient_statistics.lines_of``);
@@ -177,7 +195,7 @@ class Frame:
         model in ``carried``."""
         kept = [k for k, effect in enumerate(self.effects) if str(effect) not in carried.model.parts]
         inside, outside, width = self._model(carried)
-        more_inside, more_outside = self._split(whitened_columns(carried, self.noise, more, self.state, self._stimulus))
+        more_inside, more_outside = self._split(self.whitened(carried, more))
         beside = square_root_information.accumulate([np.hstack([outside[:, :-1], more_outside, outside[:, -1:]])])
         own = [self.coordinates[:, self.parts[k]] for k in kept]
         count = sum(each.shape[1] for each in own)
@@ -190,16 +208,20 @@ class Frame:
             square_root_information.accumulate([small]),
             width,
             effects,
-            _counts(effects),
+            counts_of(effects),
         )
 
     def _model(self, carried: Carried) -> tuple[Floats, Floats, int]:
         """Return the columns [H | W | z] of a model, inside the frame and outside it, and the number of columns before
         z; the result is cached for the next scan of the same model."""
         if self._last is None or self._last[0] is not carried:
-            rows, width = whiten_model(carried, self.noise, [], self.state, self._stimulus)
+            rows, width = self.whitened_model(carried)
             self._last = carried, *self._split(rows), width
         return self._last[1:]
+
+    def whitened_model(self, carried: Carried) -> tuple[Floats, int]:
+        """Whitened rows [H | W | z] (m, c) of the model in ``carried``, and the number of columns before z."""
+        return whiten_model(carried, self.noise, [], self.state, self._stimulus)
 
     def _split(self, rows: Floats) -> tuple[Floats, Floats]:
         """Split columns (m, c) into their coordinates (r, c) in the frame and the remainder (m, c) orthogonal to it."""
@@ -220,12 +242,12 @@ class Frame:
 _OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps2_per_sqrt_s")
 
 
-def _counts(effects: Sequence[Effect]) -> list[int]:
+def counts_of(effects: Sequence[Effect]) -> list[int]:
     """Return the number of columns of each effect."""
     return [len(effect.coefficients) for effect in effects]
 
 
-def _slices(counts: Sequence[int]) -> list[slice]:
+def slices(counts: Sequence[int]) -> list[slice]:
     """Return the slice of columns that belongs to each effect, for effects of so many columns."""
     return [slice(a, b) for a, b in itertools.pairwise(itertools.accumulate(counts, initial=0))]
 
@@ -243,7 +265,7 @@ def _is(one: object, other: object) -> bool:
 def scan(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Scan:
     """Project ``effects`` off the model in ``carried`` without a frame."""
     rows, width = whiten_model(carried, noise, effects)
-    return project(square_root_information.accumulate([rows]), width, effects, _counts(effects))
+    return project(square_root_information.accumulate([rows]), width, effects, counts_of(effects))
 
 
 def project(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
@@ -253,23 +275,29 @@ def project(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequen
     - width: number of columns H of the model.
     - effects: the candidates; counts: number of columns of each in G.
     """
-    sizes, rest = np.linalg.norm(upper[:, width:-1], axis=0), _beside(upper, width)
+    rest = Complement(upper, width).of(upper[:, width:])
+    return scan_of(rest, np.linalg.norm(upper[:, width:-1], axis=0), effects, counts)
+
+
+def scan_of(rest: Floats, sizes: Floats, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
+    """Make the scan from what a model leaves of a triangular factor [G | z], and the norms of G before."""
     units = np.where(sizes > 0, sizes, 1.0)
     columns, residual = rest[:-1, :-1] / units, rest[:-1, -1]
-    parts = zip(effects, _slices(counts), strict=True)
-    found = [_candidate(each, columns[:, part], units[part]) for each, part in parts]
+    found = list[Candidate]()
+    for effect, part, factors in zip(effects, slices(counts), _factors(columns, counts), strict=True):
+        found.append(_candidate(effect, columns[:, part], units[part], *factors))
     return Scan(tuple(found), residual)
 
 
-def _beside(rows: Floats, width: int) -> Floats:
-    """Project the columns [G | z] of rows [H | G | z] off H, the first ``width`` columns."""
-    left, singular, _ = np.linalg.svd(
-        square_root_information.scale_columns(rows[:, : width + 1])[0], full_matrices=False
-    )
-    explained, rest = left[:, singular > 1e-9], rows[:, width:]
-    for _ in range(2):  # projecting twice removes the rounding errors that large components leave in the remainder
-        rest = rest - explained @ (explained.T @ rest)
-    return rest
+def _factors(columns: Floats, counts: Sequence[int]) -> list[tuple[Floats, Floats, Floats]]:
+    """Return the singular value decomposition of the columns of each effect, those of as many columns in one call."""
+    parts, out = slices(counts), [(columns, columns, columns)] * len(counts)
+    for count in dict.fromkeys(counts):
+        places = [k for k, own in enumerate(counts) if own == count]
+        stacked = np.array([columns[:, parts[k]] for k in places])
+        for k, *factors in zip(places, *np.linalg.svd(stacked, full_matrices=False), strict=True):
+            out[k] = factors[0], factors[1], factors[2]
+    return out
 
 
 def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
@@ -282,9 +310,9 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
         many = Periodogram(carried, noise, effects[0], np.array([effect.value for effect in effects]))
         return many.falls(*_with_and_without_walk(carried, noise, carried.state, carried.model.count))
     out = list[Floats]()
-    for part in batches(_counts(effects), _OF_ONE_KIND):
+    for part in batches(counts_of(effects), _OF_ONE_KIND):
         rows, width = whiten_model(carried, noise, [effects[k] for k in part])
-        sizes, rest = np.linalg.norm(rows[:, width:-1], axis=0), _beside(rows, width)
+        sizes, rest = np.linalg.norm(rows[:, width:-1], axis=0), Complement(rows, width).of(rows[:, width:])
         columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
         columns = columns.T.reshape(len(part), -1, len(rest))
         along, gram = columns @ rest[:, -1], columns @ columns.swapaxes(1, 2)
@@ -312,33 +340,6 @@ def whiten_model(
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
     rows, width = _judged(dwells, columns, noise, at, carried.model.count)
     return _stacked(rows, dwells, noise), width
-
-
-def whitened_columns(
-    carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats, stimulus: Stimulus
-) -> Floats:
-    """The columns G (m, q) of ``whiten_model``, computed for a few effects at a time, which saves memory."""
-    sizes, out, first = _counts(effects), np.zeros((0, 0)), 0
-    for part in batches(sizes, columns_at_once(carried)) or [[]]:
-        own = _columns_of_some(carried, noise, [effects[k] for k in part], state, stimulus)
-        out = out if len(out) else np.empty((len(own), sum(sizes)))
-        out[:, first : first + own.shape[1]], first = own, first + own.shape[1]
-    return out
-
-
-def _columns_of_some(
-    carried: Carried, noise: Noise, effects: Sequence[Effect], state: Floats, stimulus: Stimulus
-) -> Floats:
-    dwells, bench = carried.dwells, carried.model.bench
-    added = candidate_columns(dwells, effects, bench, state, stimulus)
-    if not _inside(noise):
-        return square_root_information.misfit_columns(dwells, added, noise, state)
-    # a walk is whitened by the columns of the biases, which are among the twelve
-    both = [
-        np.concatenate([own[..., :STATE_COUNT], more], axis=3) for own, more in zip(carried.columns, added, strict=True)
-    ]
-    rows, width = _judged(dwells, both, noise, state, STATE_COUNT)
-    return _stacked(rows, dwells, noise)[:, width:-1]
 
 
 def columns_at_once(carried: Carried) -> int:
@@ -378,10 +379,11 @@ def _inside(noise: Noise) -> int:
     return 3 if noise.walk_mps2_per_sqrt_s else 0
 
 
-def _candidate(effect: Effect, columns: Floats, units: Floats) -> Candidate:
+def _candidate(
+    effect: Effect, columns: Floats, units: Floats, left: Floats, singular: Floats, right: Floats
+) -> Candidate:
     """Make a candidate from its projected ``columns`` (d, q), each divided by its norm before the projection, ``units``
-    (q,)."""
-    left, singular, right = np.linalg.svd(columns, full_matrices=False)
+    (q,), and the singular value decomposition of these."""
     seen = singular > _SEEN
     lost = np.eye(len(units)) - right[seen].T @ right[seen]
     inverse = (right[seen].T / singular[seen]) / units[:, None]

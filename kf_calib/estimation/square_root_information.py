@@ -26,6 +26,7 @@ from kf_calib.estimation.prior import Prior
 
 _SLOW = np.arange(1, 5)
 _STILL = np.zeros(2)
+_USUAL = 24  # columns of candidates that are whitened together in a long run
 _AT_ONCE = 1 << 17  # numbers that are processed together, so that they stay in the cache
 
 
@@ -163,12 +164,60 @@ def misfit_rows(
     return [prior, *whiten(dwells, both, noise, state, flicker_mps2=flicker, reduced=reduced)], width + len(sigma)
 
 
-def misfit_columns(dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats) -> Floats:
-    """G (m, q) alone of ``misfit_rows``, all its rows, for a noise in which the biases do not walk."""
-    count = len(slow_scatter(dwells, noise)[1])
-    flicker = flicker_sigma(noise, len(dwells)) if count else None
-    rows = whiten(dwells, columns, noise, state, flicker_mps2=flicker, reduced=False)
-    return np.concatenate([np.zeros((count, columns[0].shape[3])), *(own[:, :-1] for own in rows)])
+@dataclass(frozen=True)
+class _Alike:
+    """Dwells of one shape in ``MisfitColumns``.
+
+    - pieces (d, pieces), rows (d, r): which of all pieces and rows are theirs.
+    - triangles (d, pieces, K, K): of the basis functions. nuisances (d, r, n): orthonormal basis of nuisance states.
+    """
+
+    pieces: NDArray[np.intp]
+    rows: NDArray[np.intp]
+    triangles: Floats
+    nuisances: Floats
+
+
+class MisfitColumns:
+    """The columns G alone of ``misfit_rows``, all their rows, for a noise in which the biases do not walk.
+
+    Whatever does not depend on the columns is computed once.
+    """
+
+    def __init__(self, dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> None:
+        self._sigma, slow = noise.effective_sigma_mps2, len(slow_scatter(dwells, noise)[1])
+        flicker = flicker_sigma(noise, len(dwells)) if slow else None
+        priors = int((noise.dwell_sigmas > 0).sum()) + (3 * len(_SLOW) if slow else 0)
+        counts = np.array([len(dwell.pieces) for dwell in dwells])
+        lengths = 3 * counts * [dwell.width for dwell in dwells] + priors
+        self._groups, self.ends = list[_Alike](), slow + np.cumsum([0, *lengths])
+        """The first row of each dwell, and at last the number of rows."""
+        first_piece, first_row = np.cumsum(counts) - counts, self.ends[:-1]
+        for places in _batches(dwells, _USUAL):
+            some, pieces, width = [dwells[k] for k in places], int(counts[places[0]]), dwells[places[0]].width
+            none = np.zeros((len(some), pieces, width, 3, 0))
+            rows, count = _weighted(some, none, noise, state, None, flicker)
+            group = _Alike(
+                first_piece[places, None] + np.arange(pieces),
+                first_row[places, None] + np.arange(rows.shape[1]),
+                np.array([dwell.triangles[:, :width, :width] for dwell in some]),
+                np.linalg.qr(rows[..., :count])[0],
+            )
+            self._groups.append(group)
+
+    def of(self, columns: Floats) -> Floats:
+        """G (m, q) of columns at the nodes of all pieces (pieces, K, 3, q)."""
+        out = np.zeros((self.ends[-1], columns.shape[3]))
+        for each in self._groups:
+            own = columns[each.pieces]  # (d, pieces, K, 3, q)
+            many, pieces, width, _, count = own.shape
+            found = each.triangles @ on_basis(own.reshape(many, pieces, width, 3 * count))
+            found = found.reshape(own.shape) / self._sigma[:, None]
+            rows = np.zeros((many, each.rows.shape[1], count))
+            size = 3 * pieces * width
+            rows[:, :size] = np.moveaxis(found, 3, 1).reshape(many, size, count)
+            out[each.rows] = rows - each.nuisances @ (np.swapaxes(each.nuisances[:, :size], 1, 2) @ rows[:, :size])
+        return out
 
 
 def _waves(dwell: DwellFactor) -> Floats:

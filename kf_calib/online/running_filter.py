@@ -1,14 +1,13 @@
-"""A Kalman filter that adds and removes effects in the course of a run without a restart.
+"""A Kalman filter that tests effects in the course of a run without a restart.
 
-Its square-root information factor [R | z] carries the columns of more effects than its model has. The estimate of any
-choice of these effects is one small QR (``square_root_information.restrict``), and equals that of a filter that had
-run with this choice from the start. A dwell that closes is one update of the factor. An effect whose columns were not
-carried is added by building the factor again from the dwell factors.
+Its square-root information factor [R | z] carries the columns of more effects than its model has. The estimate of the
+model is one small QR (``square_root_information.restrict``), and equals that of a filter without the other columns. So
+is the test of every effect that is carried but not in the model. A dwell that closes is one update of the factor.
 
     running = Running.over(dwells, model, noise, state, candidates)
     running = running.after(dwell)               # as each dwell closes
-    running = running.with_effect("mine = a*T")  # added or removed at any time
     state, covariance, undetermined = running.solved()
+    running.scan.statistics                      # fall of chi-squared by each candidate
 
 The noise and the linearisation are those given. A constant inside the columns of an effect keeps its value, and
 effects that show in slews only are not supported. ``calibrate`` iterates or estimates all of these.
@@ -26,8 +25,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.effects import Effect, effect_named
-from kf_calib.errors import InputError
+from kf_calib.effects import Effect
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
@@ -75,7 +73,7 @@ class Running:
         at = np.concatenate([state[:STATE_COUNT], np.zeros(every.count - STATE_COUNT)])
         inside = tuple(str(effect) for effect in model.effects)
         empty = np.zeros((every.count, every.count + 1))
-        return cls(Carried(dwells, every, at), inside, noise, prior or Prior(), empty)._folded()
+        return cls(Carried(dwells, every, at), inside, noise, prior or Prior(), empty)._rebuild()
 
     @property
     def dwells(self) -> list[DwellFactor]:
@@ -102,35 +100,15 @@ class Running:
         if exact:
             carried = Carried([*self.dwells, dwell], self.carried.model, self.about)
             if not all(map(np.array_equal, self.carried.columns, carried.columns[:-1])):
-                return replace(self, carried=carried)._folded()
+                return replace(self, carried=carried)._rebuild()
         else:
             carried = self.carried.followed_by(dwell)
         more = replace(self, carried=carried)
-        return more._updated(more._rows([-1])[0], steps(carried.dwells[-2:], self.noise)[-1])
-
-    def with_effect(self, text: str) -> Running:
-        """The filter with an effect (a name or a formula) in its model; raises InputError where it cannot be added."""
-        effect = effect_named(text, self.carried.model.bench)
-        _ = self.model + effect  # raises where the model has the effect already
-        inside = (*self.inside, str(effect))
-        if str(effect) in self.carried.model.parts:
-            return replace(self, inside=inside)
-        every = self.carried.model + effect
-        at = np.concatenate([self.about, np.zeros(every.count - len(self.about))])
-        return replace(self, inside=inside, carried=Carried(self.dwells, every, at))._folded()
-
-    def without(self, name: str) -> Running:
-        """The filter with an effect removed from its model, whose columns are still carried.
-
-        Raises InputError where the effect is not in the model.
-        """
-        if name not in self.inside:
-            raise InputError(f"{name} is not in the model: it has {', '.join(self.inside) or 'no effects'}.")
-        return replace(self, inside=tuple(each for each in self.inside if each != name))
+        return more._update(more._rows([-1])[0], steps(carried.dwells[-2:], self.noise)[-1])
 
     def solved(self) -> tuple[Floats, Floats, Floats]:
         """State (p,) of the model, its covariance (p, p), and a basis (p, q) of the combinations not determined."""
-        kept = self._kept
+        kept = self._model_columns
         around = self.model.nominal_state() - self.about[kept]
         moved, covariance, undetermined = square_root_information.solve(
             square_root_information.restrict(self.factor, kept), around
@@ -141,13 +119,13 @@ class Running:
     def state(self) -> Floats:
         """The state (P,) of all columns: the estimate for those of the model, zero for those that are only carried."""
         out = np.zeros(len(self.about))
-        out[self._kept] = self.solved()[0]
+        out[self._model_columns] = self.solved()[0]
         return out
 
     @cached_property
     def scan(self) -> Scan:
         """The score tests of all effects that are carried but not in the model."""
-        kept, parts = self._kept, self.carried.model.parts
+        kept, parts = self._model_columns, self.carried.model.parts
         outside = [effect for effect in self.carried.model.effects if str(effect) not in self.inside]
         theirs = [range(*parts[str(effect)].indices(len(self.about))) for effect in outside]
         order = [*kept, *itertools.chain(*theirs), len(self.about)]
@@ -157,31 +135,31 @@ class Running:
     @property
     def misfit(self) -> tuple[float, int]:
         """The sum of squares that the current model leaves, and its degrees of freedom."""
-        restricted = square_root_information.restrict(self.factor, self._kept)
+        restricted = square_root_information.restrict(self.factor, self._model_columns)
         squares = self.left + float(np.sum(self.factor[:, -1] ** 2) - np.sum(restricted[:, -1] ** 2))
         return squares, self.rows - square_root_information.rank(restricted)
 
     @cached_property
-    def _kept(self) -> list[int]:
+    def _model_columns(self) -> list[int]:
         """Numbers of the columns of the current model among all."""
         parts, count = self.carried.model.parts, len(self.about)
         return [*range(STATE_COUNT), *(k for name in self.inside for k in range(*parts[name].indices(count)))]
 
-    def _updated(self, rows: Floats, walked: Floats) -> Running:
+    def _update(self, rows: Floats, walked: Floats) -> Running:
         """Return the filter after an update with whitened rows and the variances of a random walk before them."""
         factor, left = square_root_information.update(self.factor, rows, walked)
         return replace(self, factor=factor, left=self.left + left, rows=self.rows + len(rows))
 
-    def _folded(self) -> Running:
+    def _rebuild(self) -> Running:
         """Return the same filter with its factor built again from all dwells."""
         factor = square_root_information.start(self.prior, self.carried.model)
         factor[:, -1] -= factor[:, :-1] @ self.about
         variances = steps(self.dwells, self.noise)
         out = replace(self, factor=factor, left=0.0, rows=0)
         if not variances.any():
-            return out._updated(np.concatenate(self._rows()), variances[0])
+            return out._update(np.concatenate(self._rows()), variances[0])
         for own, variance in zip(self._rows(), variances, strict=True):
-            out = out._updated(own, variance)
+            out = out._update(own, variance)
         return out
 
     def _rows(self, chosen: Sequence[int] | None = None) -> list[Floats]:

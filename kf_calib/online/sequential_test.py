@@ -69,7 +69,7 @@ class Watch:
         if len(dwells) < _FEWEST:
             raise ValueError(f"a watch begins with {_FEWEST} dwells, not {len(dwells)}")
         with one_blas_thread():
-            return cls(bench, settings, *_begun(dwells, bench, settings, fitted), looks)._looked()
+            return cls(bench, settings, *_begun(dwells, bench, settings, fitted), looks)._look()
 
     def after(self, dwell: DwellFactor, fitted: Fit | None = None) -> Watch:
         """The sequential test after one more dwell.
@@ -79,9 +79,9 @@ class Watch:
         with one_blas_thread():
             running = self.running.after(dwell, exact=False)  # it is built again when the run has grown by a quarter
             if len(running.dwells) < _GROWN * self.fitted_at:
-                return replace(self, running=running)._looked()
+                return replace(self, running=running)._look()
             running, fitted_at, tests = _begun(running.dwells, self.bench, self.settings, fitted)
-            return replace(self, running=running, fitted_at=fitted_at, tests=tests)._looked()
+            return replace(self, running=running, fitted_at=fitted_at, tests=tests)._look()
 
     @property
     def dwells(self) -> list[DwellFactor]:
@@ -124,7 +124,7 @@ class Watch:
         }
         return sorted((name for name, score in scores.items() if score > 0), key=lambda name: -scores[name])
 
-    def _looked(self) -> Watch:
+    def _look(self) -> Watch:
         """Return the watch after a test, at the level that is spent on it."""
         if self.p_value is None:
             return self
@@ -141,11 +141,11 @@ def _begun(
     if fitted is None or fitted.carried.slews or len(fitted.dwells) != len(dwells):
         fitted = fit(list(dwells), Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s)
     noise = replace(fitted.noise.judging, checked=True)  # a test of the misfit has to allow for all of a setting error
-    running = Running.over(dwells, fitted.carried.model, noise, fitted.carried.state, _watched(fitted))
+    running = Running.over(dwells, fitted.carried.model, noise, fitted.carried.state, _effects_to_watch(fitted))
     return running, len(dwells), independent_tests(running.scan)
 
 
-def _watched(fitted: Fit) -> list[Effect]:
+def _effects_to_watch(fitted: Fit) -> list[Effect]:
     """Return one candidate of each effect; an unknown constant has the middle value of its grid."""
     first = dict[str, list[Effect]]()
     for effect in candidates(fitted.carried.model):

@@ -21,12 +21,11 @@ from dataclasses import dataclass, replace
 from kf_calib.bench.streams import Batch, Source
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.sufficient_statistics import Folder
-from kf_calib.effects import effect_named
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
-from kf_calib.online.status import Judgement, Standing, current, judge_whole_run, judged, targets
+from kf_calib.online.status import Judgement, Standing, current, judge_so_far, judge_whole_run, targets
 from kf_calib.support.threads import one_blas_thread
 
 _FIRST_LOOK_S = 1.0
@@ -63,8 +62,8 @@ class Session:
         self.every, self.auto, self.again = every, auto, again
         self.listeners = list[Callable[[Judgement], None]]()
         self.standing = Standing(model=self.settings.effects)
-        self._refuse(Model.of(source.bench, self.settings.effects))
         self._passed = Pass(source, self.settings)
+        self._refuse(self._passed.model)
         self._segmenter = self._passed.segmenter()
         self._closed, self._looked_s = 0, 0.0
         self._lock = threading.Condition()
@@ -102,11 +101,9 @@ class Session:
     def accept(self, *names: str) -> None:
         """Add effects (names or formulas) to the model from now on; raises InputError where one cannot be added."""
         with self._lock:
-            model = Model.of(self.source.bench, self.settings.effects)
-            for name in names:
-                model += effect_named(name, self.source.bench)
-            self._refuse(model, begun=True)
-            self.settings = replace(self.settings, effects=(*self.settings.effects, *names))
+            settings = replace(self.settings, effects=(*self.settings.effects, *names))
+            self._refuse(Model.of(self.source.bench, settings.effects), begun=True)
+            self.settings = settings
             self._publish(notice=f"{' and '.join(names)} accepted", model=self.settings.effects)
             if self._last is not None and not self._waiting:
                 self._waiting.append(self._last)
@@ -126,11 +123,10 @@ class Session:
                 "a live run is evaluated from folded dwells, as the block engine does: leave out --engine, and check "
                 "the recording with replay --engine filterpy."
             )
-        swinging = [str(effect) for effect in model.effects if effect.oscillates]
-        if swinging:
+        if model.oscillates:
             raise InputError(
-                f"{swinging[0]} needs a second pass over the readings: record the run, then "
-                f"replay the recording --with {swinging[0]}."
+                f"{model.oscillation} needs a second pass over the readings: record the run, then "
+                f"replay the recording --with {model.oscillation}."
             )
         moving = [str(effect) for effect in model.dynamic]
         if begun and moving and not self._segmenter.slews:
@@ -210,7 +206,7 @@ class Session:
             with self._lock:
                 settings = self.settings
             try:
-                judgement = judged(replace(closed.passed, settings=settings), self.wanted, before)
+                judgement = judge_so_far(replace(closed.passed, settings=settings), self.wanted, before)
             except KfCalibError as error:
                 with self._lock:
                     self._publish(problem=str(error))
@@ -219,7 +215,7 @@ class Session:
                 self.say(f"a dwell could not be judged: {error!r}")
                 continue
             before = judgement
-            self._told(judgement, closed.elapsed_s)
+            self._publish_judgement(judgement, closed.elapsed_s)
             self._automatic(judgement)
 
     def _next(self) -> _Closed | None:
@@ -228,7 +224,7 @@ class Session:
             self._lock.wait_for(lambda: self._waiting or self._ended)
             return self._waiting.popleft() if self._waiting else None
 
-    def _told(self, judgement: Judgement, elapsed_s: float) -> None:
+    def _publish_judgement(self, judgement: Judgement, elapsed_s: float) -> None:
         """Publish a judgement and pass it to the listeners."""
         with self._lock:
             self._publish(judgement=judgement, judged_s=elapsed_s, problem="")
@@ -253,7 +249,7 @@ class Session:
         passed = replace(self._passed, settings=self.settings)
         again = None if self.again is None else self.again()
         final = judge_whole_run(passed, self.wanted, None if before is None else before.watch, again)
-        self._told(final, self.standing.elapsed_s)
+        self._publish_judgement(final, self.standing.elapsed_s)
         return final
 
     def say(self, notice: str) -> None:

@@ -17,16 +17,18 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
-from kf_calib.design.gimbal_limits import wrapped
+from kf_calib.design.gimbal_limits import wrap
 from kf_calib.design.next_orientation import Advice, Course, course
 from kf_calib.diagnosis.candidate_tests import LEVEL, assess_candidates
 from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation.calibration import conclude, evaluate, with_remarks
+from kf_calib.estimation.calibration import conclude, evaluate_fit, with_remarks
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.noise_model import mean_covariances
+from kf_calib.estimation.oscillation_carrier import fitted_to
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.online.sequential_test import Watch
 from kf_calib.support.threads import one_blas_thread
@@ -89,7 +91,7 @@ class Look:
         if going is None:
             return False
         poses = np.array([visit.dwell.pose for visit in result.visits[len(self.result.visits) :]])
-        apart = np.abs(wrapped(poses - np.radians(going[0].gimbal_deg)))
+        apart = np.abs(wrap(poses - np.radians(going[0].gimbal_deg)))
         return bool((apart.max(axis=1) < np.radians(SAME_POSE_DEG)).any()) if len(poses) else False
 
 
@@ -98,11 +100,11 @@ def _look(result: Calibration, watch: Watch | None, before: Look | None = None) 
     if not _alarmed(watch):
         return Look(result, watch)
     found = diagnose(result)
-    same = before is not None and before.diagnosed is not None and _said(found) == _said(before.diagnosed)
+    same = before is not None and before.diagnosed is not None and _conclusion(found) == _conclusion(before.diagnosed)
     return Look(result, watch, found, before.agreed + 1 if before and same else 1)
 
 
-def _said(found: Diagnosis) -> tuple[object, ...]:
+def _conclusion(found: Diagnosis) -> tuple[object, ...]:
     """Return the parts of a diagnosis that have to be equal for two diagnoses to agree."""
     enough = found.after is not None and found.after.consistency.dof >= _FREEDOM
     return found.test.consistent, frozenset(found.missing), frozenset(found.ambiguity), enough
@@ -173,7 +175,9 @@ class Judgement:
         """The verdict in a few words, for a screen."""
         if self.consistent is None:
             return (
-                f"not judged before {_least(self.result)} dwells" if self.watch is None else "nothing to judge by yet"
+                f"not judged before {_least(self.result)} dwells"
+                if self.watch is None
+                else "too few measurements to test the model"
             )
         looks = f", look {self.watch.looks}" if self.watch is not None and not self.final else ""
         if not self.alarm:
@@ -199,8 +203,8 @@ class Judgement:
             return self.advice[0].gimbal_deg, self.advice[1]
         if self.course is None:
             return None
-        symbol, fall = self.course.sharpened(self.worst)
-        return self.course.gimbal_deg, f"sharpens {symbol}, sigma x {fall:.2f}"
+        symbol, fall = self.course.next_reduction(self.worst)
+        return self.course.gimbal_deg, f"lowers sigma of {symbol} to {fall:.2f} of its value"
 
     @cached_property
     def worst(self) -> Floats:
@@ -278,22 +282,22 @@ def targets(texts: Mapping[str, float]) -> Floats:
     return np.array([texts.get(symbol, np.nan) for symbol in paper_parameters.SYMBOLS])
 
 
-def judged(passed: Pass, wanted: Floats, before: Judgement | None = None) -> Judgement:
+def judge_so_far(passed: Pass, wanted: Floats, before: Judgement | None = None) -> Judgement:
     """The judgement of the run after the dwells folded so far.
 
     passed: the pass over the readings. wanted (12,): targets of the sigmas. before: the judgement after fewer dwells.
     Raises InputError where the readings cannot be used as they are.
     """
-    settings, bench, dwells = passed.settings, passed.source.bench, passed.dwells
+    dwells = passed.dwells
     with one_blas_thread():
-        refuse_unusable(dwells, passed.tally, bench)
-        result = with_remarks(evaluate(dwells, bench, settings, passed.folder.slews), passed)
-        watch = _watched(dwells, result, None if before is None else before.watch)
+        refuse_unusable(dwells, passed.tally, passed.source.bench)
+        result = with_remarks(evaluate_fit(fitted_to(passed, dwells), passed.settings), passed)
+        watch = _sequential_test(dwells, result, None if before is None else before.watch)
         look = _look(result, watch) if before is None else before.look.again(result, watch)
         return Judgement(result, look, watch, wanted, _course(result, wanted))
 
 
-def _watched(dwells: list[DwellFactor], result: Calibration, watch: Watch | None) -> Watch | None:
+def _sequential_test(dwells: list[DwellFactor], result: Calibration, watch: Watch | None) -> Watch | None:
     """Return the sequential test with all dwells so far, begun again if the model has changed; None if too few."""
     bench, settings = result.bench, result.settings
     if len(dwells) < _least(result):
@@ -313,11 +317,11 @@ def _least(result: Calibration) -> int:
 
 def _not_judged(result: Calibration, watch: Watch | None) -> Diagnosis:
     """Return a diagnosis without an alarm: nothing is significant so far, and what the run could show."""
-    test = assess_candidates(result.fit, None if watch is None else watch.tests, frames=result.frames)
+    test = assess_candidates(result.fit, None if watch is None else watch.tests)
     said = "Nothing is beyond chance so far: no effect is missing that this run has shown."
     if watch is None:
         said = "Too few orientations so far to judge the model by: visit more."
-    return Diagnosis(result, test, (), (), False, (), {}, None, said)
+    return Diagnosis(before=result, test=test, verdict=said)
 
 
 def judge_whole_run(passed: Pass, wanted: Floats, watch: Watch | None, again: Source | None = None) -> Judgement:
@@ -328,7 +332,7 @@ def judge_whole_run(passed: Pass, wanted: Floats, watch: Watch | None, again: So
     """
     with one_blas_thread():
         result = conclude(passed, again)
-        look = Look(result, watch, diagnose(result))
+        look = Look(result, watch, diagnose(result, Refits(again)))
         return Judgement(result, look, watch, wanted, _course(result, wanted), final=True)
 
 
@@ -354,7 +358,7 @@ def current(dwell: DwellFactor, judgement: Judgement | None) -> Current:
     if judgement is None:
         return here
     result, wanted = judgement.result, judgement.wanted
-    sigma, longer = result.during(dwell).sigma, {k: result.during(dwell.repeated(k)).sigma for k in _STAYING}
+    sigma, longer = result.during(dwell).sigma, {k: result.during(dwell.repeat(k)).sigma for k in _STAYING}
     stay_s = np.full(12, np.inf)
     for k in reversed(_STAYING):
         stay_s[longer[k] <= wanted] = (k - 1.0) * seconds
@@ -381,4 +385,4 @@ def _saturated(before: Floats, now: Floats, doubled: Floats) -> bool | None:
     return bool(further.max() < _LITTLE * gained.max())
 
 
-__all__ = ["LEVEL", "Current", "Judgement", "Standing", "current", "judge_whole_run", "judged", "targets"]
+__all__ = ["LEVEL", "Current", "Judgement", "Standing", "current", "judge_so_far", "judge_whole_run", "targets"]

@@ -57,7 +57,9 @@ class ConditionSearch:
 
 def search(latitude_deg: float = Conditions.latitude_deg) -> ConditionSearch:
     """Every reading of the turns, order of sampling, azimuth in steps of 15 deg, and 48 periods from 2 to 60 s."""
-    found = [each for azimuth in AZIMUTHS_DEG.tolist() for each in _tried(Conditions(1.0, latitude_deg, azimuth))]
+    found = [
+        each for azimuth in AZIMUTHS_DEG.tolist() for each in _nearest_periods(Conditions(1.0, latitude_deg, azimuth))
+    ]
     together, in_turn = (
         min((f for f in found if (f.conditions.sampled == TOGETHER) is kind), key=lambda f: f.log_ratio)
         for kind in (True, False)
@@ -69,7 +71,7 @@ def search(latitude_deg: float = Conditions.latitude_deg) -> ConditionSearch:
     )
 
 
-def _tried(base: Conditions) -> Iterator[Found]:
+def _nearest_periods(base: Conditions) -> Iterator[Found]:
     """The nearest period for every reading of the turns and order of sampling, by the closed form."""
     column, vertical = grebenkin2019.printed(grebenkin2019.NONOPTIMAL_PRINTED), _vertical(base)
     attitudes = {turns: base.bench.attitude(grebenkin2019.attitudes(turns)) for turns in TURNS}

@@ -29,7 +29,7 @@ else:
         """Who has taken a file, for a message; empty where nobody has."""
         try:
             with path.open("rb") as file:
-                return "" if _is_free(file, fcntl.LOCK_SH) else _named(os.fstat(file.fileno()).st_ino)
+                return "" if _is_free(file, fcntl.LOCK_SH) else _holder(os.fstat(file.fileno()).st_ino)
         except OSError:
             return ""
 
@@ -42,7 +42,7 @@ else:
             return True
         return True
 
-    def _named(inode: int) -> str:
+    def _holder(inode: int) -> str:
         """The process that has the file of this number, as far as Linux tells it."""
         pids = set[int]()
         with suppress(OSError, ValueError, IndexError):

@@ -11,6 +11,9 @@ import math
 
 import numpy as np
 
+LEVEL = 0.01
+"""Probability of a false alarm in one run."""
+
 _ENOUGH = 4e-16
 _KNOWN = 1e18  # degrees of freedom of noise that is as good as known
 

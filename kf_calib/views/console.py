@@ -12,7 +12,6 @@ from kf_calib.bench import paper_parameters
 from kf_calib.effects import Effect, as_text
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.engine_comparison import Comparison
-from kf_calib.estimation.fit import WALK
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.remarks import beyond_stated
 from kf_calib.estimation.reml import FEWEST, degrees_of_freedom
@@ -85,8 +84,7 @@ def effect_table(result: Calibration) -> Table:
     for heading in ("effect", "coefficient", "value", "sigma", "unit", "value / sigma"):
         table.add_column(heading, justify="left" if heading in ("effect", "coefficient", "unit") else "right")
     for effect in result.model.effects:
-        symbols = [each.symbol for each in (*effect.coefficients, effect.unknown) if each is not None]
-        symbols += [WALK.symbol] if effect.walks else []
+        symbols = [each.symbol for each in (*effect.parameters, effect.unknown) if each is not None]
         for k, own in enumerate(symbols):
             parameter, name = result.parameters[own], as_text(effect) if k == 0 else ""
             if parameter.value is None or parameter.sigma is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -83,6 +84,15 @@ def description_object(unknown: Description | None) -> dict[str, Any] | None:
     return None if unknown is None else {**vars(unknown), "formula": unknown.formula}
 
 
+def description_sentence(unknown: Description, formulas: Sequence[str]) -> str:
+    """Sentences on what an unknown misfit depends on, with the formulas to try."""
+    where = "all accelerometers" if unknown.channel == "all" else f"accelerometer {unknown.channel}"
+    to_try = " ".join(f"--with '{formula}'" for formula in formulas)
+    return (
+        f"The misfit depends on {unknown.driver} ({where}), which explains {unknown.share:.0%} of it. To try: {to_try}"
+    )
+
+
 def _suspect_object(suspect: Suspect) -> dict[str, Any]:
     """Return one suspect as a JSON object."""
     return {
@@ -128,45 +138,40 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
         dwell, channel = trend.most
         parts.append(
             Text(
-                f"Within dwells, too, the readings go where noise does not: slopes and bends of {trend.ratio:.2f} "
-                f"times its power (p {format_p(trend.p_value)}), most in dwell {dwell}, accelerometer {channel}."
+                f"The readings also drift within dwells: their slopes and curvatures have {trend.ratio:.2f} times the "
+                f"power of noise (p {format_p(trend.p_value)}), most in dwell {dwell}, accelerometer {channel}."
             )
         )
     unknown, going = found.description, found.next_orientation
     if unknown is not None:
-        to_try = " ".join(f"--with '{formula}'" for formula in unknown.formulas)
-        parts.append(
-            Text(
-                f"It goes with {unknown.driver} (accelerometer {unknown.channel}; explains {unknown.share:.0%} of it). "
-                f"To try: {to_try}"
-            )
-        )
+        parts.append(Text(description_sentence(unknown, unknown.formulas)))
     if found.test.vibration:
         seen = ", ".join(f"{line.frequency_hz:.4g}" for line in found.test.vibration)
-        treated = "the test is of averages free of it" if found.before.fit.dwells[0].averaged else "it counts as noise"
-        parts.append(Text(f"Vibration at {seen} Hz: not of one amplitude all along, so {treated}."))
+        averaged = found.before.fit.dwells[0].averaged
+        treated = "the tests use averages that suppress it" if averaged else "it counts as noise"
+        parts.append(Text(f"Vibration at {seen} Hz changes its amplitude during the run, so {treated}."))
     if going is not None:
         angles = ", ".join(f"{angle:g}" for angle in going[0].gimbal_deg)
         parts.append(Text(f"Next orientation: gimbals at {angles} deg: {going[1]}."))
     if found.test.invisible:
-        parts.append(Text(f"Not to be seen with this run: {', '.join(found.test.invisible)}."))
+        parts.append(Text(f"Effects that this run cannot show: {', '.join(found.test.invisible)}."))
     parts.append(_detectable_table(found.detectable))
     parts += map(note, _notes(found))
     return Group(*parts)
 
 
 def of_what_p_is(found: Diagnosis) -> list[str]:
-    """A sentence on what the p-value of a run means, beside that of the misfit alone, which ``replay`` prints.
+    """Sentences on what the p-value of a run means, and on that of the misfit as a whole, which ``replay`` prints.
 
     Empty where nothing could be tested.
     """
     if found.test.p_value is None:
         return []
     alone = found.before.consistency.p_value
-    beside = "" if alone is None else f"; of the misfit as a whole alone, which replay prints, p {format_p(alone)}"
+    overall = "" if alone is None else f" For the misfit as a whole, which replay prints, p {format_p(alone)}."
     return [
-        "p of the run is the probability that noise alone shows as much in any of the effects, in the misfit as a "
-        f"whole, or within dwells{beside}."
+        "p of the run is the probability that noise alone looks as significant in any tested effect, in the misfit as "
+        f"a whole, or within dwells.{overall}"
     ]
 
 
@@ -178,7 +183,7 @@ def plain_report(found: Diagnosis) -> str:
 
 def _suspect_table(found: Diagnosis) -> Table:
     """Return the table of the suspects with their coefficients."""
-    title = "Suspects (1σ; p: that noise alone lets any effect explain as much; held-out rms over its floor)"
+    title = "Suspects (1σ; p: noise alone lets some effect explain as much; held out: rms over noise floor)"
     table = Table(title=title, title_justify="left")
     for heading in ("effect", "p", "χ² / dof", "fits", "symbol", "value", "sigma", "unit", "held out"):
         left = heading in ("effect", "fits", "symbol", "unit")

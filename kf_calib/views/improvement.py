@@ -1,10 +1,8 @@
-"""Stepwise improvement as a report and as a JSON object, and the dialogue with the user."""
+"""Stepwise improvement as a report, as a JSON object and as a table to choose from."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +11,11 @@ from rich.text import Text
 
 from kf_calib.diagnosis.nested_cross_validation import NestedCrossValidation
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, SelectionStep, Spread, extend, take_step, undone
-from kf_calib.errors import InputError
+from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, SelectionStep, Spread
 from kf_calib.estimation.results import Calibration, format_p
-from kf_calib.support.plain_text import sentence
 from kf_calib.support.units import shown
 from kf_calib.views.console import effect_table, parameter_table, symbol
-from kf_calib.views.diagnosis import description_object, of_what_p_is, orientation_object
+from kf_calib.views.diagnosis import description_object, description_sentence, of_what_p_is, orientation_object
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Bar, Table
 from kf_calib.views.terminal import note
@@ -155,8 +151,8 @@ def improvement_report(
     if honest is not None:
         parts.append(Text(honest_sentence(honest)))
     if replay_difference is not None:
-        same = "to the last bit" if replay_difference == 0 else f"but for {replay_difference:.1g} of a figure at most"
-        parts.append(Text(f"The steps of the journal gave its figures again, {same}."))
+        same = "to the last bit" if replay_difference == 0 else f"to within {replay_difference:.1g} of each figure"
+        parts.append(Text(f"The steps of the journal gave the same figures, {same}."))
     parts += map(note, state.warnings)
     return Group(*parts)
 
@@ -222,7 +218,7 @@ def _test(each: Removal) -> str:
 def _spread_table(state: Improvement) -> Table:
     """Return the table of the range of each parameter over the equally good explanations."""
     names = ", ".join(each.name for each in state.alternatives)
-    table = Table(title=f"Parameters less nominal, with either of {names}", title_justify="left")
+    table = Table(title=f"Parameters less nominal, over the explanations {names}", title_justify="left")
     for heading in ("parameter", "lowest", "highest", "sigma", "unit", "differ by, σ"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for k, each in enumerate(state.spreads):
@@ -244,10 +240,7 @@ def _settling(state: Improvement) -> list[str]:
         return []
     unknown, going, out = state.found.description, state.found.next_orientation, list[str]()
     if unknown is not None:
-        out.append(
-            f"It goes with {unknown.driver} (accelerometer {unknown.channel}; explains {unknown.share:.0%} of it). "
-            f"To try: --with '{unknown.formula}'"
-        )
+        out.append(description_sentence(unknown, [unknown.formula]))
     if going is not None:
         angles = ", ".join(f"{angle:g}" for angle in going[0].gimbal_deg)
         out.append(f"Next orientation: gimbals at {angles} deg: {going[1]}.")
@@ -265,76 +258,20 @@ def honest_sentence(honest: NestedCrossValidation) -> str:
     )
 
 
-HOW = "number: add it; a NAME, f FORMULA: add that; d NAME: drop; u: undo; q: finish"
+def choices_table(state: Improvement, choices: Sequence[tuple[str, ...]]) -> RenderableType:
+    """The steps so far, the verdict, and the effects that a user may choose by number."""
+    return Group(progress(state), Text(state.found.verdict, style="bold"), *_numbered(state.found, choices))
 
 
-def session(
-    state: Improvement,
-    ask: Callable[[str, str], str],
-    show: Callable[[RenderableType], None],
-    on_step: Callable[[Improvement], None],
-    busy: Callable[[], AbstractContextManager[object]] = nullcontext,
-) -> Improvement:
-    """Ask the user what to do next until the user ends the improvement, and return it.
-
-    state: the improvement at first. ask: takes a question and the meaning of an empty answer, and returns the answer.
-    show: shows a renderable. on_step: called after each step. busy: context that is entered while an answer is
-    computed.
-    """
-    shown: Improvement | None = None
-    while True:
-        options = _options(state.found)
-        if shown is not state:
-            show(Group(progress(state), Text(state.found.verdict, style="bold"), *_numbered(state.found, options)))
-            shown = state
-        usual = "q" if not options else "1" if state.found.missing else ""
-        answer = ask(HOW, usual).strip()
-        if answer == "q":
-            return replace(state, asked=True)
-        try:
-            with busy():
-                state = answered(state, answer, options)
-            on_step(state)
-        except InputError as error:
-            show(Text(sentence(str(error)), style="red"))
-
-
-def answered(state: Improvement, answer: str, options: list[tuple[str, ...]]) -> Improvement:
-    """The improvement after an answer of the user; raises InputError where the answer cannot be understood or done.
-
-    options: the effects that may be chosen by number.
-    """
-    word, _, rest = answer.partition(" ")
-    rest = rest.strip()
-    if answer == "u":
-        return undone(state)
-    if word == "d" and rest:
-        return take_step(state, None, (rest,), "user")
-    if word == "f" and rest:
-        return extend(state, (rest if "=" in rest else f"mine = {rest}",), "user")
-    if word == "a" and rest:
-        return extend(state, (rest,), "user")
-    if answer.isdigit() and 1 <= int(answer) <= len(options):
-        return extend(state, options[int(answer) - 1], "user")
-    raise InputError(f"{answer!r} is no answer: {HOW}.")
-
-
-def _options(found: Diagnosis) -> list[tuple[str, ...]]:
-    """Return the choices by number: the missing effects together, then each suspect."""
-    out = [found.missing] if found.missing else []
-    out += [(suspect.name,) for suspect in found.suspects if (suspect.name,) != found.missing]
-    return out
-
-
-def _numbered(found: Diagnosis, options: list[tuple[str, ...]]) -> list[RenderableType]:
+def _numbered(found: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[RenderableType]:
     """Return the table of the choices, or nothing where there are none."""
-    if not options:
+    if not choices:
         return []
     refits = {suspect.name: suspect for suspect in found.suspects}
     table = Table(box=None, pad_edge=False)
     for heading in ("", "suspect", "p of the run", "fits", "held out"):
         table.add_column(heading, justify="right" if heading in ("", "held out") else "left")
-    for number, names in enumerate(options, start=1):
+    for number, names in enumerate(choices, start=1):
         suspect = refits.get(names[0]) if len(names) == 1 else None
         result = suspect.refit if suspect is not None else found.after
         p_value = "" if suspect is None else format_p(suspect.p_value).removeprefix("= ")

@@ -151,7 +151,7 @@ def _here(standing: Standing) -> Text:
     if here.enough:
         out.append(": enough, go on", "bold green")
     elif here.enough is False:
-        out.append(": stay, it still sharpens")
+        out.append(": stay, its sigmas still fall")
     return out
 
 

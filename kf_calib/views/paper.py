@@ -37,8 +37,10 @@ def paper_object(found: Experiment, searched: ConditionSearch) -> dict[str, Any]
             "scatter": grebenkin2019.scatter(found.repetitions),
             **{
                 name: {
-                    "log_ratio": float(grebenkin2019.log_ratio(column.least_squares, _printed(name))),
-                    "expected_log_ratio": float(grebenkin2019.log_ratio(column.orientations.expected, _printed(name))),
+                    "log_ratio": float(grebenkin2019.log_ratio(column.least_squares, _paper_column(name))),
+                    "expected_log_ratio": float(
+                        grebenkin2019.log_ratio(column.orientations.expected, _paper_column(name))
+                    ),
                     "condition_numbers": column.orientations.condition_numbers,
                     "condition_numbers_in_g": column.orientations.condition_numbers_in_g,
                     "rank": column.orientations.rank,
@@ -66,7 +68,7 @@ def paper_object(found: Experiment, searched: ConditionSearch) -> dict[str, Any]
     )
 
 
-def _printed(name: str) -> Floats:
+def _paper_column(name: str) -> Floats:
     """Return the column (12,) that the paper prints for a set of orientations, in per cent."""
     return grebenkin2019.printed(OPTIMAL_PRINTED if name == "optimal" else NONOPTIMAL_PRINTED)
 
@@ -77,7 +79,7 @@ def _row_object(found: Experiment, name: str) -> dict[str, Any]:
     for key, column in (("optimal", found.optimal), ("nonoptimal", found.nonoptimal)):
         row |= {
             key: column.least_squares[k],
-            f"{key}_printed": _printed(key)[k],
+            f"{key}_printed": _paper_column(key)[k],
             f"{key}_expected": column.orientations.expected[k],
             f"{key}_kalman": column.kalman[k],
         }
@@ -99,7 +101,7 @@ def _turning(found: Experiment) -> tuple[float, float]:
 
     The first is with each orientation set by gravity on arrival, the second by gravity at the start.
     """
-    column = _printed("optimal")
+    column = _paper_column("optimal")
     figures = [grebenkin2019.optimal(found.conditions, each).expected for each in (True, False)]
     return float(grebenkin2019.log_ratio(figures[0], column)), float(grebenkin2019.log_ratio(figures[1], column))
 
@@ -144,19 +146,21 @@ def _both(found: Experiment, name: str) -> list[str]:
     k, cells = paper_parameters.SYMBOLS.index(name), list[str]()
     for key, column in (("optimal", found.optimal), ("nonoptimal", found.nonoptimal)):
         figures = (column.orientations.expected[k], column.least_squares[k], column.kalman[k])
-        cells += [f"{_printed(key)[k]:.4f}", *(f"{figure:#.4g}" for figure in figures)]
+        cells += [f"{_paper_column(key)[k]:.4f}", *(f"{figure:#.4g}" for figure in figures)]
     return cells
 
 
 def sentences(found: Experiment, searched: ConditionSearch) -> list[str]:
     """What the figures show, on which conditions they rest, and which of these were inferred; in sentences."""
-    return [_scatter(found), rank_sentence(found), _inferred(found), *_searched(searched), _earth(found),
-            _conditioning(found), _filter(found)]  # fmt: skip
+    return [
+        _scatter(found), rank_sentence(found), _conditions_sentence(found), *_search_sentences(searched),
+        _earth(found), _conditioning(found), _filter(found),
+    ]  # fmt: skip
 
 
 def _scatter(found: Experiment) -> str:
     """Return a sentence on the scatter of a mean of so many repetitions."""
-    column = _printed("optimal")
+    column = _paper_column("optimal")
     expected = np.abs(column / found.optimal.orientations.expected - 1).max()
     off = np.abs(found.optimal.least_squares / column - 1).max()
     return (
@@ -176,20 +180,20 @@ def rank_sentence(found: Experiment) -> str:
     )
 
 
-def _inferred(found: Experiment) -> str:
+def _conditions_sentence(found: Experiment) -> str:
     """Return sentences on the conditions that were inferred from the paper's table."""
-    column, hours = _printed("nonoptimal"), found.conditions.duration_s / 3600
+    column, hours = _paper_column("nonoptimal"), found.conditions.duration_s / 3600
     closed = grebenkin2019.log_ratio(found.nonoptimal.orientations.expected, column)
     ran = grebenkin2019.log_ratio(found.nonoptimal.least_squares, column)
     return (
         "They are finite where the platform is held in inertial space and the Earth turns gravity in it. Under which "
-        f"conditions the paper does not say; INFERRED from its table: {_described(found.conditions)} ({hours:.1f} h in "
-        f"all), latitude {found.conditions.latitude_deg:g}°. Rms log-ratio to the print: {closed:.2f} expected, "
-        f"{ran:.2f} in these runs."
+        f"conditions the paper does not say; INFERRED from its table: {_conditions_in_words(found.conditions)} "
+        f"({hours:.1f} h in all), latitude {found.conditions.latitude_deg:g}°. "
+        f"Rms log-ratio to the print: {closed:.2f} expected, {ran:.2f} in these runs."
     )
 
 
-def _described(conditions: Conditions) -> str:
+def _conditions_in_words(conditions: Conditions) -> str:
     """Return the conditions of an experiment in words."""
     order = " ".join(conditions.sampled)
     sampled = "together" if conditions.sampled == TOGETHER else f"one after another ({order}) in each orientation"
@@ -199,15 +203,15 @@ def _described(conditions: Conditions) -> str:
     )
 
 
-def _searched(searched: ConditionSearch) -> list[str]:
+def _search_sentences(searched: ConditionSearch) -> list[str]:
     """Return sentences on the search for conditions that give the paper's figures."""
     together, in_turn, worst = searched.together, searched.in_turn, int(searched.bias_excess.argmax())
     return [
         f"Of {searched.tried} conditions tried ({len(AZIMUTHS_DEG)} azimuths, {len(PERIODS_S)} periods, "
         f"{len(grebenkin2019.TURNS)} readings of the turns, {len(grebenkin2019.SAMPLED)} orders of sampling) the "
         "nearest are "
-        f"{together.log_ratio:.3f}: {_described(together.conditions)}; and {in_turn.log_ratio:.3f}: "
-        f"{_described(in_turn.conditions)}.",
+        f"{together.log_ratio:.3f}: {_conditions_in_words(together.conditions)}; and {in_turn.log_ratio:.3f}: "
+        f"{_conditions_in_words(in_turn.conditions)}.",
         f"Read together, nothing can come below {searched.floor:.3f}, because θ1 and θ3, φ1 and ν2, ν1 and φ3 then "
         f"have equal errors. The print's own scatter would leave {searched.scatter:.3f}: neither is shown to be the "
         "paper's, and of so many some come near by chance. "

@@ -55,7 +55,7 @@ def screenshot(
         client.run_command("ui.toggle_top_panel")
         if timeline is not None:
             _seek(client, timeline, time)
-        picture = _settled(client)
+        picture = _steady_picture(client)
     _write(picture, png)
     return png
 
@@ -73,7 +73,7 @@ def viewer(rrd: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
         with log.open("wb") as sink:
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, env=quiet)
         try:
-            yield _loaded(process, port, log)
+            yield _viewer_with_file(process, port, log)
         finally:
             process.kill()
             process.wait()
@@ -93,7 +93,7 @@ def binary() -> str:
     return str(Path(rerun_cli.__file__).with_name("rerun.exe" if sys.platform == "win32" else "rerun"))
 
 
-def _loaded(process: subprocess.Popen[bytes], port: int, log: Path) -> ViewerClient:
+def _viewer_with_file(process: subprocess.Popen[bytes], port: int, log: Path) -> ViewerClient:
     """Return the viewer once it has loaded the file; raise ScreenshotError if it ends or takes too long."""
     from rerun.experimental import ViewerClient
 
@@ -147,7 +147,7 @@ def _seek(client: ViewerClient, timeline: str, time: float | None) -> None:
         client.set_time(timeline, duration=float(time), play_state="paused")
 
 
-def _settled(client: ViewerClient) -> bytes:
+def _steady_picture(client: ViewerClient) -> bytes:
     """Return the picture (PNG) once it no longer changes, as layouts and axes take a few frames."""
     picture, equal, deadline = b"", 0, clock.monotonic() + _PATIENCE_S
     while equal < _SETTLED and clock.monotonic() < deadline:

@@ -71,10 +71,10 @@ class Table(rich.table.Table):
 
     def _records(self, width: int) -> str:
         """Return the rows as records of text."""
-        headings, cells = [_said(column.header) for column in self.columns], [list(c.cells) for c in self.columns]
-        lines = [*textwrap.wrap(_said(self.title or ""), width)]
+        headings, cells = [_one_line(column.header) for column in self.columns], [list(c.cells) for c in self.columns]
+        lines = [*textwrap.wrap(_one_line(self.title or ""), width)]
         for number, row in enumerate(self.rows):
-            label, *said = [_said(column[number]) for column in cells]
+            label, *said = [_one_line(column[number]) for column in cells]
             named = [f"{heading} {cell}".strip() for heading, cell in zip(headings[1:], said, strict=True) if cell]
             glued = [part.replace(" ", _GLUE) if cell_len(part) <= width // 2 else part for part in named]
             text = f"{label}: {', '.join(glued)}".removeprefix(": ")
@@ -88,7 +88,7 @@ class Table(rich.table.Table):
         return "\n".join(lines)
 
 
-def _said(cell: RenderableType | None) -> str:
+def _one_line(cell: RenderableType | None) -> str:
     """Return the text of a cell on one line."""
     return " ".join(str(cell or "").split())
 

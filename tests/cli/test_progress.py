@@ -15,6 +15,7 @@ from helpers.synthetic import Run
 from kf_calib.cli import cli
 from kf_calib.cli.options import progress
 from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.stepwise_selection import improve
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.engine_comparison import compare
@@ -46,11 +47,11 @@ def test_a_comparison_says_which_way_it_is_at_and_how_far_filterpy_is() -> None:
 
 def test_a_diagnosis_and_an_improvement_say_what_they_try() -> None:
     run = calibrate(Run(dwells=8, count=100))
-    said = heard(lambda: diagnose(run))
+    refits = Refits()
+    said = heard(lambda: diagnose(run, refits))
     assert re.fullmatch(r"scanning [3-9]\d effects", said[0])
-    other = calibrate(Run(dwells=8, count=100))
-    assert heard(lambda: improve(other)) == said  # nothing is missing
-    assert not heard(lambda: improve(run))  # its columns are known
+    assert heard(lambda: improve(run)) == said  # nothing is missing
+    assert not heard(lambda: improve(run, refits=refits))  # its columns are known
 
 
 def test_whoever_does_not_listen_any_more_hears_nothing() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from helpers.hidden_effects import BENCH, run
+from helpers.hidden_effects import BENCH, run, source
 from helpers.long_runs import slow
 from helpers.paths import SHARED
 from helpers.synthetic import Run, plan_of
@@ -19,7 +19,7 @@ from kf_calib.diagnosis import candidate_tests, results
 from kf_calib.diagnosis.candidate_tests import EQUAL, assess_candidates, chance_fall, independent_tests
 from kf_calib.diagnosis.detectability import detectable
 from kf_calib.diagnosis.missing_effect import diagnose
-from kf_calib.diagnosis.results import with_effects
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.effects import effect_named
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.score_test import Candidate, Scan, scan
@@ -37,7 +37,7 @@ HAND = SHARED / "ferraris_hand.mcap"
 )  # fmt: skip
 def test_a_hidden_effect_is_named(name: str) -> None:
     """Made by the nonlinear truth at 15 sigma: first name, and the error falls to its floor on what was held out."""
-    found = diagnose(run(f"{name}=15sigma"))
+    found = diagnose(source(f"{name}=15sigma"))
     assert found.missing == (name,) and name == found.ambiguity[0] and not found.unknown
     assert found.after is not None and found.after.held_out_floor_mps2 is not None
     assert found.after.held_out_rms_mps2 <= 1.3 * found.after.held_out_floor_mps2
@@ -63,13 +63,13 @@ def test_nothing_is_found_in_noise(case: dict, runs: int) -> None:
 def test_what_is_in_no_catalogue_is_unknown(name: str, driver: str) -> None:
     from kf_calib.views.diagnosis import diagnosis_object
 
-    found = diagnose(run(f"{name}=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
+    found = diagnose(source(f"{name}=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
     assert found.unknown and not found.missing
     shape = found.description
     assert shape is not None and driver in shape.driver
     shown = diagnosis_object(found)
     assert shown["missing"] == "unknown" and shown["unknown"]["formula"] == shape.formulas[0]
-    assert assess_candidates(with_effects(found.before, shape.formulas).fit).consistent
+    assert assess_candidates(Refits().with_effects(found.before, shape.formulas).fit).consistent
 
 
 def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,7 +77,7 @@ def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
     from kf_calib.views.console import plain
     from kf_calib.views.diagnosis import diagnosis_object, diagnosis_report
 
-    found = diagnose(run("encoder-harmonic-3:z=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
+    found = diagnose(source("encoder-harmonic-3:z=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
     shown, printed = diagnosis_object(found), plain(diagnosis_report(found))
     assert shown["unknown"] and shown["detectable"] and "To try:" in printed
     for name in ("describe", "detectable", "advise", "mean_covariances"):
@@ -87,19 +87,19 @@ def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_formula_that_explains_more_than_a_known_effect_speaks_against_it() -> None:
     """A fifth power looks like a third power to 0.96: named third-order, it would be a wrong name."""
-    found = diagnose(run("fifth-order=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
+    found = diagnose(source("fifth-order=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
     shape = found.description
     assert found.unknown and shape is not None and shape.formula == "mine = a**5"
 
 
 @pytest.mark.slow  # test_improvement.py adds the same two
 def test_two_effects_at_once_are_both_found() -> None:
-    found = diagnose(run("hysteresis=15sigma", "thermal-scale=15sigma"))
+    found = diagnose(source("hysteresis=15sigma", "thermal-scale=15sigma"))
     assert set(found.missing) == {"hysteresis", "thermal-scale"}
 
 
 def test_six_faces_say_what_they_cannot_see_and_where_to_go() -> None:
-    found = diagnose(run(plan=six_faces(dwell_s=8)))
+    found = diagnose(source(plan=six_faces(dwell_s=8)))
     assert {"gravity-error", "cross-talk"} <= set(found.test.invisible)
     assert not found.missing
     advice = found.next_orientation
@@ -171,7 +171,7 @@ def test_command_line(tmp_path: Path) -> None:
 def test_a_hand_placed_run_claims_nothing() -> None:
     from kf_calib.sources.files.recording import Recording
 
-    found = diagnose(calibrate(Recording(HAND)))
+    found = diagnose(Recording(HAND))
     assert not found.missing and not found.unknown and "third-order" in found.test.invisible
 
 

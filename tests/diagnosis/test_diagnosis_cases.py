@@ -8,12 +8,14 @@ from functools import cache
 import pytest
 from helpers.hidden_effects import BENCH, WHITE
 from helpers.hidden_effects import noisy_run as run
+from helpers.hidden_effects import noisy_source as source
 from helpers.long_runs import slow
 from helpers.synthetic import Run, plan_of
 
 from kf_calib.diagnosis.candidate_tests import EQUAL, assess_candidates
 from kf_calib.diagnosis.missing_effect import diagnose
-from kf_calib.diagnosis.results import Diagnosis, with_effects
+from kf_calib.diagnosis.refits import Refits
+from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.unknown_effect import IRREGULAR, JUMP
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.sources.simulation.noise_processes import TrueNoise
@@ -25,7 +27,7 @@ from kf_calib.sources.simulation.visit_plans import six_faces
 @cache
 def walking(seed: int) -> Diagnosis:
     """Of a walk of the biases; several tests look at the same ones."""
-    return diagnose(run("bias-walk=15sigma", seed=seed, dwells=24))
+    return diagnose(source("bias-walk=15sigma", seed=seed, dwells=24))
 
 
 def not_wrong(found: Diagnosis, *truth: str) -> None:
@@ -49,7 +51,7 @@ def not_wrong(found: Diagnosis, *truth: str) -> None:
     ids=lambda noise: "+".join(noise),
 )
 def test_an_effect_is_named_in_noise_of_other_kinds(noise: dict[str, float]) -> None:
-    found = diagnose(run("hysteresis=15sigma", **noise))
+    found = diagnose(source("hysteresis=15sigma", **noise))
     assert found.missing == ("hysteresis",), found.verdict
 
 
@@ -61,7 +63,7 @@ def test_stated_scatter_and_flicker_name_nothing(noise: dict[str, float], runs: 
 
 
 def test_two_accelerometers_with_different_effects() -> None:
-    found = diagnose(run("second-order=3e-7,0,0", "hysteresis=0,0,3e-5"))
+    found = diagnose(source("second-order=3e-7,0,0", "hysteresis=0,0,3e-5"))
     assert set(found.missing) == {"second-order", "hysteresis"}
     assert found.after is not None
     sigmas = {p.symbol: abs(p.value or 0.0) / (p.sigma or 1.0) for p in list(found.after.parameters.values())[12:]}
@@ -76,17 +78,34 @@ def test_a_walk_is_not_taken_for_a_drift(seed: int) -> None:
 
 
 def test_a_line_is_named_with_its_frequency() -> None:
-    found = diagnose(run("sinusoid=6ug;frequency=7.3"))
+    found = diagnose(source("sinusoid=6ug;frequency=7.3"))
     assert found.missing == ("sinusoid",) and found.after is not None
     frequency = found.after.parameters["fSin"]
     assert frequency.value is not None and frequency.sigma is not None
     assert abs(frequency.value - 7.3) < 5.0 * frequency.sigma < 0.01
 
 
+def test_without_its_source_a_line_is_judged_by_one_pass_and_that_is_said() -> None:
+    """A calibration does not reach back to its readings: whoever holds them gives their refits."""
+    recorded = source("sinusoid=6ug;frequency=7.3")
+    before = calibrate(recorded)
+    alone, whole = diagnose(before), diagnose(before, Refits(recorded))
+    assert "A second pass over the readings is needed to judge the lines in their spectrum" in alone.verdict
+    assert whole.missing == ("sinusoid",) and whole.verdict == diagnose(recorded).verdict
+    assert "second pass" not in whole.verdict
+
+
+def test_without_its_source_a_slow_oscillation_is_fitted_by_one_pass_and_that_is_said() -> None:
+    recorded = source("sinusoid=15sigma;frequency=0.1")
+    before = calibrate(recorded)
+    assert "is needed to judge sinusoid" in diagnose(before).verdict
+    assert "second pass" not in diagnose(before, Refits(recorded)).verdict
+
+
 @pytest.mark.parametrize("frequency_hz", [0.01, *slow(0.1, 0.3, 1.5)])
 def test_a_slow_oscillation_is_named_with_its_frequency(frequency_hz: float) -> None:
     """Too slow or too weak for a line in the spectrum: three cycles a run, one and two cycles a dwell, ten."""
-    found = diagnose(run(f"sinusoid=15sigma;frequency={frequency_hz}"))
+    found = diagnose(source(f"sinusoid=15sigma;frequency={frequency_hz}"))
     assert found.missing == ("sinusoid",) and found.after is not None
     frequency = found.after.parameters["fSin"]
     assert frequency.value is not None and frequency.sigma is not None
@@ -96,11 +115,11 @@ def test_a_slow_oscillation_is_named_with_its_frequency(frequency_hz: float) -> 
 @pytest.mark.slow
 def test_one_cycle_a_run_is_not_told_from_what_the_temperature_does() -> None:
     """The temperature of these runs swings once, too."""
-    not_wrong(diagnose(run("sinusoid=15sigma;frequency=0.0045", dwells=24)), "sinusoid")
+    not_wrong(diagnose(source("sinusoid=15sigma;frequency=0.0045", dwells=24)), "sinusoid")
 
 
 def test_pairs_that_explain_as_much_as_a_single_effect_are_said() -> None:
-    both = diagnose(run("thermal-bias=12sigma", "thermal-rate=12sigma"))
+    both = diagnose(source("thermal-bias=12sigma", "thermal-rate=12sigma"))
     assert {"thermal-bias", "thermal-rate"} <= set(both.ambiguity), both.verdict
     assert ("thermal-bias", "thermal-rate") in both.together and "thermal-rate together" in both.verdict
 
@@ -117,13 +136,13 @@ def test_what_the_run_has_no_sight_of_is_said() -> None:
 def test_other_pairs_that_explain_as_much_are_said(seed: int) -> None:
     """Here two others happen to explain it a little better than the two that were hidden."""
     truth = {"cross-coupling-io", "scale-asymmetry"}
-    found = diagnose(run(*(f"{name}=15sigma" for name in sorted(truth)), seed=seed, dwells=24))
+    found = diagnose(source(*(f"{name}=15sigma" for name in sorted(truth)), seed=seed, dwells=24))
     assert not found.unknown and truth <= set(found.ambiguity), found.verdict
 
 
 @pytest.mark.slow
 def test_two_effects_with_a_constant_each_are_both_found() -> None:
-    found = diagnose(run("warm-up=25sigma;tau=60", "settling=25sigma;tau=4"))
+    found = diagnose(source("warm-up=25sigma;tau=60", "settling=25sigma;tau=4"))
     assert set(found.missing) == {"warm-up", "settling"}, found.verdict
     assert found.after is not None
     for symbol, truth in (("tauWarm", 60.0), ("tauSettle", 4.0)):
@@ -134,7 +153,7 @@ def test_two_effects_with_a_constant_each_are_both_found() -> None:
 @pytest.mark.slow
 def test_an_oscillation_and_another_effect_are_both_found() -> None:
     """The one shows within dwells, the other between them: neither alone explains it, and the one is no column."""
-    found = diagnose(run("base-tilt=12sigma", "sinusoid=12sigma;frequency=0.9"))
+    found = diagnose(source("base-tilt=12sigma", "sinusoid=12sigma;frequency=0.9"))
     assert set(found.missing) == {"base-tilt", "sinusoid"}, found.verdict
     assert found.after is not None and found.after.consistency.consistent
     assert found.after.parameters["fSin"].value == pytest.approx(0.9, abs=1e-3)
@@ -142,14 +161,16 @@ def test_an_oscillation_and_another_effect_are_both_found() -> None:
 
 def test_vibration_is_no_oscillation_of_one_amplitude_and_what_it_rectifies_is_named() -> None:
     """With a line of 3 m/s^2 in the readings."""
-    found = diagnose(run("vibration-rectification=15sigma", dwells=14))
+    found = diagnose(source("vibration-rectification=15sigma", dwells=14))
     assert found.missing == ("vibration-rectification",) and found.test.vibration, found.verdict
+    alone = diagnose(run("vibration-rectification=15sigma", dwells=14))
+    assert alone.test.vibration and "needed to judge the lines in their spectrum" in alone.verdict
 
 
 @pytest.mark.parametrize("seeds, dwells", [(range(1), 12), *slow((range(44), 24))])
 def test_of_vibration_alone_nothing_is_said_but_that_it_is_there(seeds: range, dwells: int) -> None:
     """Averages are few in short dwells: their noise is that of white readings in windows that overlap."""
-    quiet = [diagnose(run("vibration-rectification=1e-12", seed=seed, dwells=dwells)) for seed in seeds]
+    quiet = [diagnose(source("vibration-rectification=1e-12", seed=seed, dwells=dwells)) for seed in seeds]
     assert all(found.test.vibration for found in quiet)
     assert sum(not found.test.consistent for found in quiet) <= 0.05 * len(quiet)
 
@@ -163,10 +184,10 @@ def test_poor_plans_give_no_wrong_name(name: str) -> None:
     short = plan_of(6, dwell_s=8.0, seed=3)
     ordered = sorted(plan_of(18, dwell_s=8.0, seed=4), key=lambda visit: tuple(visit.gimbal_deg))
     for plan in (six_faces(dwell_s=8.0), short, ordered):
-        found = diagnose(run(_large(name), plan=plan))
+        found = diagnose(source(_large(name), plan=plan))
         not_wrong(found, name)
         assert name not in found.test.invisible or name not in found.missing
-        assert found.test.consistent is not True or found.verdict.count("cannot see") or not found.test.invisible
+        assert found.test.consistent is not True or found.verdict.count("cannot show") or not found.test.invisible
 
 
 def _large(name: str) -> str:
@@ -183,7 +204,7 @@ def test_scatter_that_is_not_stated_gets_no_name() -> None:
     noise = TrueNoise(white_mps2=WHITE, scatter_mps2=5e-5)
     source = Simulation(unstated, GRADES["navigation"].sensors(9), noise, visits, sample_hz=50.0, angle_hz=20.0,
                         slew_rate_degps=90.0, seed=9)  # fmt: skip
-    found = diagnose(calibrate(source))
+    found = diagnose(source)
     assert not found.missing, found.verdict
 
 
@@ -191,7 +212,7 @@ def test_scatter_that_is_not_stated_gets_no_name() -> None:
 @pytest.mark.parametrize("seed", [1, *slow(2)])
 def test_few_dwells_name_nothing_that_unstated_scatter_could_be(dwells: int, seed: int) -> None:
     """With as many coefficients as dwells leave over, an effect fits whatever the setting errors were."""
-    found = diagnose(calibrate(Run(seed=seed, dwells=dwells, setting_deg=0.002, stated=False)))
+    found = diagnose(Run(seed=seed, dwells=dwells, setting_deg=0.002, stated=False))
     assert not found.missing and not found.unknown, found.verdict
     assert "state angle_sigma_deg and scatter_sigma_mps2" in found.verdict
 
@@ -199,7 +220,7 @@ def test_few_dwells_name_nothing_that_unstated_scatter_could_be(dwells: int, see
 @pytest.mark.parametrize("name", ["hysteresis", *slow("second-order")])
 def test_a_walk_and_another_effect_are_both_found(name: str) -> None:
     """The walk is no column to be paired: it is judged by its likelihood beside the other."""
-    found = diagnose(run("bias-walk=15sigma", f"{name}=15sigma", seed=2, dwells=24))
+    found = diagnose(source("bias-walk=15sigma", f"{name}=15sigma", seed=2, dwells=24))
     assert set(found.missing) == {name, "bias-walk"}, found.verdict
     assert found.after is not None and found.after.consistency.consistent
 
@@ -214,16 +235,16 @@ def test_a_walk_that_explains_all_gets_no_companion_by_chance(seeds: range) -> N
 @pytest.mark.parametrize("seeds, dwells", [(range(1, 3), 24), *slow((range(36), 24))])
 def test_a_walk_is_named_before_what_its_path_happens_to_look_like(seeds: range, dwells: int) -> None:
     """By their odds: a line through a path is the best of many, and the likelihood of a walk is over all its paths."""
-    first = [diagnose(run("bias-walk=10sigma", seed=seed, dwells=dwells)).missing[:1] for seed in seeds]
+    first = [diagnose(source("bias-walk=10sigma", seed=seed, dwells=dwells)).missing[:1] for seed in seeds]
     assert sum(each == ("bias-walk",) for each in first) >= 0.75 * len(first)  # a half of them by chi-squared alone
-    drifts = [diagnose(run("bias-drift=10sigma", seed=seed, dwells=dwells)).missing for seed in seeds[::12]]
+    drifts = [diagnose(source("bias-drift=10sigma", seed=seed, dwells=dwells)).missing for seed in seeds[::12]]
     assert ("bias-walk",) not in drifts
 
 
 @pytest.mark.parametrize("seed", [0, *slow(1, 2)])
 def test_a_jump_is_not_called_a_walk(seed: int) -> None:
     """A walk could take that path, and any other: at whatever moment it is, the jump is likelier."""
-    found = diagnose(run("bias-jump=20sigma", seed=seed))
+    found = diagnose(source("bias-jump=20sigma", seed=seed))
     assert found.unknown, found.verdict
     said = found.description
     assert said is not None and said.driver == JUMP
@@ -232,11 +253,11 @@ def test_a_jump_is_not_called_a_walk(seed: int) -> None:
 @pytest.mark.parametrize("seeds", [range(6, 8), *slow(range(3, 8))])
 def test_in_a_few_dwells_a_walk_could_explain_what_an_effect_does(seeds: range) -> None:
     """Three coefficients of six degrees of freedom: what is left is no proof. In 16 dwells it is."""
-    few = [diagnose(run("hysteresis=12sigma", plan=plan_of(6, dwell_s=8.0, seed=seed))) for seed in seeds]
+    few = [diagnose(source("hysteresis=12sigma", plan=plan_of(6, dwell_s=8.0, seed=seed))) for seed in seeds]
     kept = [found for found in few if {"hysteresis", "bias-walk"} <= set(found.ambiguity)]
     assert len(kept) > 0.7 * len(few)  # now and then the effect fits so closely that it is a proof
     assert all(found.missing and "bias-walk" in found.verdict for found in kept)
-    assert "bias-walk" not in diagnose(run("hysteresis=12sigma")).ambiguity
+    assert "bias-walk" not in diagnose(source("hysteresis=12sigma")).ambiguity
 
 
 SCATTER = ({"scatter_mps2": 3e-6}, {"scatter_sigma_mps2": 0.0})
@@ -256,18 +277,18 @@ def test_scatter_of_more_than_is_stated_is_no_effect(
     noise: tuple[dict[str, float], dict[str, float | None]], seeds: range
 ) -> None:
     """Of some forty effects one comes near whatever dwells scatter by: it is never named without saying so."""
-    found = [diagnose(run(seed=seed, dwells=24, states=noise[1], **noise[0])) for seed in seeds]
+    found = [diagnose(source(seed=seed, dwells=24, states=noise[1], **noise[0])) for seed in seeds]
     noticed = [each for each in found if each.test.consistent is False]
     named = [each for each in noticed if each.missing]
     assert len(noticed) > len(found) / 3 and len(named) < len(noticed)
-    assert all("dwells that scatter by more than is stated" in each.verdict for each in named)
+    assert all("scatter from dwell to dwell larger than stated" in each.verdict for each in named)
     said = [each.description for each in noticed if each.unknown]
     assert sum(each is not None and each.driver == IRREGULAR for each in said) > 0.5 * len(said)
 
 
 @pytest.mark.parametrize("name", ["second-order", *slow("scale-drift", "thermal-bias", "bias-asymmetry")])
 def test_an_effect_of_some_size_is_no_scatter(name: str) -> None:
-    found = diagnose(run(f"{name}=8sigma", seed=6))
+    found = diagnose(source(f"{name}=8sigma", seed=6))
     assert name in found.ambiguity and not found.as_scatter, found.verdict
 
 
@@ -277,7 +298,7 @@ def test_an_effect_of_some_size_is_no_scatter(name: str) -> None:
 def test_a_large_effect_in_noise_that_is_not_stated_is_named_alone(name: str, dwells: int) -> None:
     """Scatter that is estimated without it is its own; where it is left out, what is little counts as much."""
     unstated = {"angle_sigma_deg": None, "scatter_sigma_mps2": None}
-    found = diagnose(run(f"{name}=40sigma", seed=7, dwells=dwells, states=unstated, setting_sigma_deg=2e-4))
+    found = diagnose(source(f"{name}=40sigma", seed=7, dwells=dwells, states=unstated, setting_sigma_deg=2e-4))
     assert found.missing == (name,) and found.before.noise.setting_stated is False, found.verdict
     assert found.after is not None and not found.after.noise.setting_stated
     assert found.after.consistency.consistent
@@ -286,7 +307,7 @@ def test_a_large_effect_in_noise_that_is_not_stated_is_named_alone(name: str, dw
 @pytest.mark.parametrize("seeds", [range(12, 13), *slow(range(12, 18))])
 def test_a_bias_that_goes_to_and_fro_is_no_walk(seeds: range) -> None:
     """Telegraph noise of many switches a run: what a walk explains of it comes back as no walk does."""
-    found = [diagnose(run("telegraph=15sigma;tau=30", seed=seed, dwells=24)) for seed in seeds]
+    found = [diagnose(source("telegraph=15sigma;tau=30", seed=seed, dwells=24)) for seed in seeds]
     walks = sum("bias-walk" in each.missing for each in found)
     assert walks <= len(found) // 6  # of six, four where nothing asks whether it comes back
 
@@ -294,22 +315,22 @@ def test_a_bias_that_goes_to_and_fro_is_no_walk(seeds: range) -> None:
 @pytest.mark.parametrize("runs", [6, *slow(24)])
 def test_a_walk_rarely_looks_as_if_it_came_back(runs: int) -> None:
     walks = [run("bias-walk=15sigma", seed=seed, dwells=24) for seed in range(runs)]
-    gains = [2.0 * with_effects(each, ("bias-walk",)).fit.back_gain[0] for each in walks]
+    gains = [2.0 * Refits().with_effects(each, ("bias-walk",)).fit.back_gain[0] for each in walks]
     assert sum(gain > EQUAL for gain in gains) <= runs // 24
     assert sum(gain > 0.5 for gain in gains) > runs // 12  # they do differ
 
 
 @pytest.mark.slow
 def test_what_comes_back_is_described_as_such() -> None:
-    said = diagnose(run("telegraph=15sigma;tau=30", seed=6, dwells=24)).description
+    said = diagnose(source("telegraph=15sigma;tau=30", seed=6, dwells=24)).description
     assert said is not None and "back within about" in said.driver and said.formula == "bias-walk"
 
 
 @pytest.mark.xdist_group("walking")
 def test_a_walk_that_may_come_back_is_said_to() -> None:
     """Telegraph noise that is not unlikely enough for a walk to be none."""
-    found = diagnose(run("telegraph=15sigma;tau=30", seed=21, dwells=24))
+    found = diagnose(source("telegraph=15sigma;tau=30", seed=21, dwells=24))
     assert found.missing == ("bias-walk",) and found.back_s is not None and 5.0 < found.back_s < 100.0
-    assert "Best: bias-walk" in found.verdict and "come back within about" in found.verdict
+    assert "Likeliest: bias-walk" in found.verdict and "return to their mean within about" in found.verdict
     walks = [walking(seed) for seed in range(1, 3)]
     assert not any(each.back_s for each in walks) and any("bias-walk" in each.missing for each in walks)

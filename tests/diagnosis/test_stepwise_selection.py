@@ -11,18 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from helpers.hidden_effects import BENCH, run
+from helpers.hidden_effects import BENCH, run, source
 from helpers.long_runs import slow
 from scipy.stats import chi2
 
 from kf_calib.cli import cli
 from kf_calib.diagnosis import selection_journal
 from kf_calib.diagnosis.nested_cross_validation import nested_cross_validation
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.selection_journal import figures
 from kf_calib.diagnosis.stepwise_selection import Improvement, SelectionStep, improve, removals, take_step, undone
 from kf_calib.dwells.sufficient_statistics import dwells_without
 from kf_calib.errors import InputError
-from kf_calib.estimation.calibration import calibrate, evaluate, refitted
+from kf_calib.estimation.calibration import evaluate
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.fit import fit
 from kf_calib.estimation.measurement_model import Model
@@ -67,13 +68,13 @@ def test_the_error_falls_to_the_noise(improved: Improvement) -> None:
 
 @pytest.mark.parametrize("name", ["axis-nonorthogonality:z", *slow("hysteresis", "encoder-harmonic-1:z")])
 def test_other_kinds_of_effects(name: str) -> None:
-    state = improve(run(f"{name}=15sigma"))
+    state = improve(source(f"{name}=15sigma"))
     assert [step.added for step in state.steps] == [name] and state.because == "consistent"
     assert ratio(state.result) < 1.3
 
 
 def test_two_effects_are_added_one_by_one() -> None:
-    state = improve(run("hysteresis=15sigma", "thermal-scale=15sigma"))
+    state = improve(source("hysteresis=15sigma", "thermal-scale=15sigma"))
     assert {step.added for step in state.steps} == {"hysteresis", "thermal-scale"} and len(state.steps) == 2
     assert state.because == "consistent" and ratio(state.result) < 1.3
     errors = [ratio(result) for result in (state.start.before, *(step.result for step in state.steps))]
@@ -86,7 +87,7 @@ def test_nothing_is_added_to_noise(quiet: Calibration) -> None:
 
 
 def test_the_unknown_stops_it() -> None:
-    state = improve(run("encoder-harmonic-3:z=20sigma"))
+    state = improve(source("encoder-harmonic-3:z=20sigma"))
     assert state.because == "unknown" and not state.steps and "unknown" in state.reason
 
 
@@ -105,28 +106,28 @@ def test_equal_explanations_are_left_to_a_person() -> None:
     assert [each.name for each in first.alternatives] == [each.name for each in state.alternatives]
     assert [each.sigmas for each in first.spreads] == pytest.approx([each.sigmas for each in state.spreads], rel=0.01)
     assert "second-order and scale-asymmetry" in first.reason and f"{widest.sigmas:.1f} sigma" in first.reason
-    other = take_step(state, "scale-asymmetry", None, "user")
+    other = take_step(state, Refits(), "scale-asymmetry", None, "user")
     assert other.alternatives[0].name == "scale-asymmetry" and other.alternatives[1].name == "second-order"
 
 
 def test_removals_are_the_rise_of_chi_squared(improved: Improvement) -> None:
     """Against refits; of effects that stand still in a dwell, so that all models have the same rows."""
     model = ("second-order", "cross-coupling-ip")
-    full = refitted(improved.start.before, model)
+    full = Refits().of(improved.start.before, model)
     for name, test in zip(model, removals(full.fit), strict=True):
-        less = refitted(full, [other for other in model if other != name])
+        less = Refits().of(full, [other for other in model if other != name])
         rises = less.consistency.statistic - full.consistency.statistic
         assert test.name == name and test.dof == 3 and test.statistic == pytest.approx(rises, rel=0.02, abs=0.05)
 
 
 def test_what_is_not_needed_goes_unless_it_was_asked_for(improved: Improvement) -> None:
     """A step that explained nothing is taken out when the true effect comes in; the user's own stays."""
-    useless, start = refitted(improved.start.before, ("hysteresis",)), Improvement(improved.start)
+    useless, start = Refits().of(improved.start.before, ("hysteresis",)), Improvement(improved.start)
     stands = replace(improved.start, before=useless)
-    asked = take_step(Improvement(stands), "second-order", None, "diagnosis")
+    asked = take_step(Improvement(stands), Refits(), "second-order", None, "diagnosis")
     assert asked.effects == ("hysteresis", "second-order") and not asked.steps[-1].dropped
     taken = replace(start, history=(SelectionStep("hysteresis", (), "diagnosis", stands),))
-    found = take_step(taken, "second-order", None, "diagnosis")
+    found = take_step(taken, Refits(), "second-order", None, "diagnosis")
     assert found.effects == ("second-order",)
     gone = found.steps[-1].dropped[0]
     assert gone.name == "hysteresis" and gone.p_value > 0.01 and not gone.needed
@@ -143,18 +144,18 @@ def test_a_result_shows_what_it_is_and_not_its_arrays(improved: Improvement) -> 
 
 def test_undo_and_drop(improved: Improvement) -> None:
     start = Improvement(improved.start)
-    taken = take_step(take_step(start, "mine = fx*fz", None, "user"), "second-order", None, "user")
+    taken = take_step(take_step(start, Refits(), "mine = fx*fz", None, "user"), Refits(), "second-order", None, "user")
     assert taken.effects == ("mine = fx*fz", "second-order")
-    back = undone(taken)
-    assert back.effects == ("mine = fx*fz",) and len(back.history) == 2 and undone(back).effects == ()
-    dropped = take_step(taken, None, ("mine",), "user")
+    back = undone(taken, Refits())
+    assert back.effects == ("mine = fx*fz",) and len(back.history) == 2 and undone(back, Refits()).effects == ()
+    dropped = take_step(taken, Refits(), None, ("mine",), "user")
     assert dropped.effects == ("second-order",) and figures(dropped.found) == figures(improved.found)
     for bad, says in [
-        (lambda: undone(start), "no step to undo"),
-        (lambda: take_step(taken, None, ("hysteresis",), "user"), "it has mine, second-order"),
-        (lambda: take_step(taken, "second-order", None, "user"), "in the model already"),
-        (lambda: take_step(start, "second-ordr", None, "user"), "did you mean second-order"),
-        (lambda: take_step(start, "latency", None, "user"), "start with --with"),
+        (lambda: undone(start, Refits()), "no step to undo"),
+        (lambda: take_step(taken, Refits(), None, ("hysteresis",), "user"), "it has mine, second-order"),
+        (lambda: take_step(taken, Refits(), "second-order", None, "user"), "in the model already"),
+        (lambda: take_step(start, Refits(), "second-ordr", None, "user"), "did you mean second-order"),
+        (lambda: take_step(start, Refits(), "latency", None, "user"), "start with --with"),
     ]:
         with pytest.raises(InputError, match=says):
             bad()
@@ -179,7 +180,7 @@ def test_the_honest_error_repeats_the_choice(second_order: Calibration, quiet: C
 def test_honest_errors_are_those_of_orientations_left_out() -> None:
     """As many folds as orientations and nothing to choose: leave-one-out of the fixed model, history and all."""
     before = run("hysteresis=15sigma", plan=spread_plan(12, dwell_s=8.0, seed=5))
-    cured = refitted(before, ("hysteresis",))
+    cured = Refits().of(before, ("hysteresis",))
     checked = nested_cross_validation(cured, folds=12)
     assert checked.chosen == {"hysteresis": 12}
     assert checked.rms_mps2 == pytest.approx(cured.held_out_rms_mps2, rel=0.02)
@@ -200,7 +201,7 @@ def test_sigmas_are_honest_after_improvement(runs: int) -> None:
         )  # fmt: skip
         source = source.hiding(parse(["second-order=15sigma"], BENCH.axes, seed=seed, sized=partial(sized, source)))
         truth = np.array(list(source.sensors.parameters.values()))
-        state = improve(calibrate(source))
+        state = improve(source)
         if state.because != "consistent":
             assert state.because == "unknown" or "second-order" in state.found.ambiguity
             continue
@@ -335,6 +336,6 @@ def test_a_figure_that_differs_is_told(improved: Improvement) -> None:
 def test_a_refit_is_a_replay(second_order: Calibration) -> None:
     settings = Settings(effects=("second-order",))
     anew = evaluate(second_order.fit.dwells, BENCH, settings)
-    refit = refitted(second_order, settings.effects)
+    refit = Refits().of(second_order, settings.effects)
     np.testing.assert_array_equal(anew.estimate.state, refit.estimate.state)
     assert fit(second_order.fit.dwells, Model.of(BENCH, settings.effects)).noise.sigma_mps2[0] > 0

@@ -6,14 +6,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers.hidden_effects import BENCH
+from helpers.hidden_effects import BENCH, noisy_source
 from helpers.hidden_effects import noisy_run as run
 from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 from scipy import stats
 
 from kf_calib.diagnosis.missing_effect import diagnose
-from kf_calib.diagnosis.results import with_effects
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.unknown_effect import WITHIN
 from kf_calib.diagnosis.within_dwell_trend import Trend, shapes, trend, variances
 from kf_calib.estimation.calibration import calibrate
@@ -81,13 +81,12 @@ def test_a_walk_in_the_model_is_expected_within_dwells_too() -> None:
     for seed in range(1, 4):
         before = run("bias-walk=60sigma", seed=seed, plan=plan)
         assert found_in(before).p_value < 1e-6
-        assert found_in(with_effects(before, ("bias-walk",))).p_value > 0.001
+        assert found_in(Refits().with_effects(before, ("bias-walk",))).p_value > 0.001
 
 
 def test_what_dwells_hide_shows_within_them() -> None:
     """A period that falls below a dwell's length: no column follows it, and it is no line."""
-    before = run("chirp=25sigma;frequency=0.02;chirp=2e-4", seed=4)
-    found = diagnose(before)
+    found = diagnose(noisy_source("chirp=25sigma;frequency=0.02;chirp=2e-4", seed=4))
     assert found.unknown and found.test.trend is not None and found.test.trend.p_value < 1e-6, found.verdict
     told = found.description
     assert told is not None and told.driver == WITHIN and told.formula == "bias-walk"

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.coherent_tone import Cells, Trace, _kept, band_hz, tone
+from kf_calib.dwells.coherent_tone import Cells, Trace, _share_beside_parabola, band_hz, tone
 
 RATE_HZ, DWELL_S = 6.0, 58.0
 
@@ -131,7 +131,9 @@ def test_what_a_parabola_leaves_of_a_sinusoid(cycles: float) -> None:
     waves = np.column_stack([np.sin(np.pi * cycles * u), np.cos(np.pi * cycles * u)])
     curve = np.linalg.qr(np.vander(u, 3))[0]
     left = waves - curve @ (curve.T @ waves)
-    assert float(_kept(np.array([np.pi * cycles]))[0]) == pytest.approx((left**2).sum() / len(u), abs=1e-3)
+    assert float(_share_beside_parabola(np.array([np.pi * cycles]))[0]) == pytest.approx(
+        (left**2).sum() / len(u), abs=1e-3
+    )
 
 
 def test_too_little_is_not_searched() -> None:

@@ -36,7 +36,7 @@ def test_a_real_imu_placed_by_hand(ferraris: Path) -> None:
     assert sigmas["theta1"] > np.radians(0.3) / 2
     assert result.noise.setting_stated and result.consistency.consistent
     assert result.parameters["theta1"].nominal == 0.0
-    assert any("cannot tell a setting error" in warning for warning in result.warnings)
+    assert any("too few to distinguish a setting error" in warning for warning in result.warnings)
 
 
 def test_an_effect_that_is_missing_shows_as_misfit() -> None:
@@ -91,7 +91,7 @@ def test_two_faces_name_the_unseen_and_give_the_rest() -> None:
 def test_four_orientations_leave_nothing_to_judge_by() -> None:
     result = calibrate(Run(seed=6, dwells=4))
     assert result.consistency.consistent is None
-    assert any("nothing over to judge" in warning for warning in result.warnings)
+    assert any("too few to test the model" in warning for warning in result.warnings)
 
 
 @pytest.mark.parametrize("unit, factor", [("g", 1 / 9.80665), ("mg", 1e3 / 9.80665)])

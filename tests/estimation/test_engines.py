@@ -122,7 +122,7 @@ def test_factors_merge_and_do_not_depend_on_batches() -> None:
     by_number = {dwell.number: dwell for dwell in left.dwells}
     for dwell in right.dwells:
         known = by_number.get(dwell.number)
-        by_number[dwell.number] = dwell if known is None else known.merged(dwell)
+        by_number[dwell.number] = dwell if known is None else known.merge(dwell)
     merged = evaluate([by_number[k] for k in sorted(by_number)], whole.bench, Settings())
     assert distance(merged.estimate, one.estimate)[0] < 1e-2  # the autocovariance sees other stretches
     np.testing.assert_allclose(merged.estimate.state, one.estimate.state, rtol=1e-12, atol=1e-14)

@@ -10,9 +10,9 @@ from helpers.synthetic import plan_of
 from scipy.interpolate import Akima1DInterpolator
 
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.diagnosis.candidate_tests import candidates
+from kf_calib.diagnosis.candidate_tests import candidate_frame, candidates
 from kf_calib.diagnosis.missing_effect import diagnose
-from kf_calib.diagnosis.results import with_effects
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import effect_named
 from kf_calib.effects.stimulus import smooth_between
@@ -42,7 +42,8 @@ def test_a_frame_gives_what_a_scan_of_one_model_gives(walk_mps2: float) -> None:
     noise = replace(before.noise.judging, walk_mps2_per_sqrt_s=walk_mps2)
     frame = Frame(before.carried, noise, candidates(Model(BENCH)))
     more = [effect_named("mine = a*p*o", BENCH)]
-    for result in (before, with_effects(before, ("second-order",)), with_effects(before, ("settling",))):
+    refits = Refits()
+    for result in (before, *(refits.with_effects(before, (name,)) for name in ("second-order", "settling"))):
         found = frame.scan(result.carried, more)
         alone = scan(result.carried, noise, [*candidates(result.model), *more])
         assert [str(each.effect) for each in found.candidates] == [str(each.effect) for each in alone.candidates]
@@ -64,10 +65,11 @@ def test_a_frame_serves_one_noise_and_one_run() -> None:
 
 def test_nothing_is_fitted_twice() -> None:
     before = run("second-order=40ug/g^2")
-    assert with_effects(before, ("second-order",)) is with_effects(before, ("second-order",))
-    found = diagnose(before)
-    assert found.after is with_effects(before, found.missing)
-    assert found.after is not None and found.after.frames is before.frames
+    refits = Refits()
+    assert refits.with_effects(before, ("second-order",)) is refits.with_effects(before, ("second-order",))
+    found, frame = diagnose(before, refits), candidate_frame(before.fit, refits.frames)
+    assert found.after is not None and found.after is refits.with_effects(before, found.missing)
+    assert candidate_frame(found.after.fit, refits.frames) is frame
 
 
 @pytest.mark.parametrize("count", [5, 40, 5000])

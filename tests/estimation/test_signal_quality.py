@@ -12,7 +12,8 @@ from helpers.long_runs import slow
 from helpers.synthetic import Run
 
 from kf_calib.bench.streams import Stream
-from kf_calib.estimation.calibration import calibrate, refitted
+from kf_calib.diagnosis.refits import Refits
+from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.signal_quality import Readings, clustering, common_step, missing_above
 from kf_calib.sources.files.recording import Recording
 
@@ -173,7 +174,7 @@ def test_a_refit_keeps_what_was_seen() -> None:
     run = Run(seed=1)
     run.accel = Stream(run.accel.time_ns, np.clip(run.accel.values, -9.0, 9.0))
     before = calibrate(run)
-    assert before.readings.saturation and refitted(before, ["second-order"]).readings == before.readings
+    assert before.readings.saturation and Refits().of(before, ["second-order"]).readings == before.readings
 
 
 @pytest.fixture

@@ -22,24 +22,34 @@ BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scat
 
 
 def run(*hidden: str, seed: int = 5, plan: list | None = None) -> Calibration:
-    """A calibration without the hidden effects in its model. A diagnosis takes as long as there are dwells."""
+    """A calibration without the hidden effects in its model."""
+    return calibrate(source(*hidden, seed=seed, plan=plan))
+
+
+def source(*hidden: str, seed: int = 5, plan: list | None = None) -> Simulation:
+    """A simulated run with hidden effects. A diagnosis takes as long as there are dwells."""
     base = Simulation(
         BENCH, GRADES["navigation"].sensors(seed), TrueNoise(white_mps2=5e-5),
         plan or plan_of(16, dwell_s=8.0, seed=seed),
         sample_hz=50.0, angle_hz=20.0, slew_rate_degps=90.0, seed=seed,
         ambient=Ambient(swing_c=5.0, period_s=300.0, sigma_c=0.0),
     )  # fmt: skip
-    return calibrate(base.hiding(parse(hidden, BENCH.axes, seed=seed, sized=partial(sized, base))))
+    return base.hiding(parse(hidden, BENCH.axes, seed=seed, sized=partial(sized, base)))
 
 
 WHITE = 5e-5
 
 
-def noisy_run(
+def noisy_run(*hidden: str, **options: Any) -> Calibration:
+    """A calibration of a ``noisy_source`` without the hidden effects in its model."""
+    return calibrate(noisy_source(*hidden, **options))
+
+
+def noisy_source(
     *hidden: str, seed: int = 5, dwells: int = 16, plan: list[Visit] | None = None,
     states: dict[str, float | None] | None = None, **noise: float,
-) -> Calibration:  # fmt: skip
-    """A calibration without the hidden effects in its model, on a bench that states its noise, or ``states``.
+) -> Simulation:  # fmt: skip
+    """A simulated run with hidden effects, on a bench that states its noise, or ``states``.
 
     A diagnosis takes as long as there are dwells; what goes with time rather than with gravity needs more of them.
     """
@@ -52,4 +62,4 @@ def noisy_run(
         bench, GRADES["navigation"].sensors(seed), made, visits, sample_hz=50.0, angle_hz=20.0, slew_rate_degps=90.0,
         seed=seed, ambient=Ambient(swing_c=5.0, period_s=300.0, sigma_c=0.0),
     )  # fmt: skip
-    return calibrate(base.hiding(parse(hidden, bench.axes, seed=seed, sized=partial(sized, base))))
+    return base.hiding(parse(hidden, bench.axes, seed=seed, sized=partial(sized, base)))

@@ -39,7 +39,7 @@ from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
 from kf_calib.online import status
 from kf_calib.online.session import Session
-from kf_calib.online.status import Judgement, current, judged, targets
+from kf_calib.online.status import Judgement, current, judge_so_far, targets
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import Status
 from kf_calib.sources.simulation.detectability import sized
@@ -136,10 +136,10 @@ def test_the_look_into_a_dwell_takes_nothing_from_it() -> None:
     here = current(last, before)
     np.testing.assert_allclose(here.sigma, judged_of(run.fit.dwells).result.estimate.sigma, rtol=0.05)
     assert (here.sigma < before.result.estimate.sigma).all()
-    longer = current(last.repeated(2.0), before)
+    longer = current(last.repeat(2.0), before)
     assert (longer.sigma < here.sigma).all() and longer.readings == 2 * here.readings
     assert here.enough is False, "white noise only, and no longer than the others"
-    assert current(last.repeated(400.0), before).enough is True
+    assert current(last.repeat(400.0), before).enough is True
     wanted = judged_of(run.fit.dwells[:8], longer.sigma * 1.0001)
     assert (current(last, wanted).stay_s == last.end_s - last.start_s).all()
 
@@ -166,7 +166,7 @@ def judged_one_by_one(source: Simulation) -> dict[int, Judgement]:
     for count in range(1, len(dwells) + 1):
         folder = Folder()
         folder.dwells = dwells[:count]
-        out[count] = before = judged(replace(passed, folder=folder), targets({}), before)
+        out[count] = before = judge_so_far(replace(passed, folder=folder), targets({}), before)
     return out
 
 
@@ -174,13 +174,13 @@ def judged_of(dwells: list, wanted: np.ndarray | None = None) -> Judgement:
     passed = Pass(Run(dwells=9, count=400, white_mps2=1e-3), Settings())
     passed.fold()
     passed.folder.dwells = list(dwells)
-    return judged(passed, targets({}) if wanted is None else wanted)
+    return judge_so_far(passed, targets({}) if wanted is None else wanted)
 
 
 def test_setting_error_makes_a_dwell_enough() -> None:
     source = Run(dwells=14, count=300, white_mps2=1e-4, setting_deg=0.01)
     run = calibrate(source)
-    found = judged(folded(source), targets({}))
+    found = judge_so_far(folded(source), targets({}))
     assert current(run.fit.dwells[-1], found).enough is True
 
 
@@ -195,7 +195,7 @@ def test_time_to_a_target_is_the_time_it_takes() -> None:
     source = Run(dwells=24, count=200, white_mps2=1e-3)
     whole, passed = calibrate(source), folded(source)
     passed.folder.dwells = passed.folder.dwells[:8]
-    first = judged(passed, whole.estimate.sigma)
+    first = judge_so_far(passed, whole.estimate.sigma)
     needed = whole.fit.dwells[-1].end_s - whole.fit.dwells[7].end_s
     left = first.left_s
     assert np.isfinite(left).all() and 0.25 * needed < np.median(left) <= 1.2 * needed

@@ -17,7 +17,7 @@ def files_of(path: Path) -> list[Path]:
     """The MCAP files at ``path``, in order of time. Raises InputError where a folder is not one bag of such files."""
     if not path.is_dir():
         return [path]
-    listed = _listed(path / "metadata.yaml")
+    listed = _files_in_metadata(path / "metadata.yaml")
     lost = [name for name in listed if not (path / name).is_file()]
     if lost:
         raise InputError(
@@ -41,7 +41,7 @@ def _place(file: Path) -> tuple[str, int]:
     return (numbered[1], int(numbered[2])) if numbered else (file.stem, 0)
 
 
-def _listed(metadata: Path) -> list[str]:
+def _files_in_metadata(metadata: Path) -> list[str]:
     """The files that a bag's metadata.yaml lists, in order; none where there is no such file."""
     try:
         found = _LISTED.search(metadata.read_text(encoding="utf-8", errors="replace"))

@@ -82,7 +82,7 @@ class MessageType:
     layout: Callable[[bytes], Layout]
 
 
-def _aligned(offset: int, to: int) -> int:
+def _align(offset: int, to: int) -> int:
     return offset + (4 - offset) % to
 
 
@@ -99,39 +99,39 @@ def _after_string(message: bytes, offset: int) -> int:
 
 def _imu_layout(message: bytes) -> Layout:
     """Orientation (4) and covariance (9), angular velocity (3) and covariance (9) come before the acceleration."""
-    values = _aligned(_after_string(message, _FRAME), 8) + (4 + 9 + 3 + 9) * 8
+    values = _align(_after_string(message, _FRAME), 8) + (4 + 9 + 3 + 9) * 8
     return Layout(size=values + (3 + 9) * 8, values=values, width=3, flagged=True)
 
 
 def _joint_state_layout(message: bytes) -> Layout:
-    start = _aligned(_after_string(message, _FRAME), 4)
+    start = _align(_after_string(message, _FRAME), 4)
     count, offset = _uint32(message, start), start + 4
     names: list[str] = []
     for _ in range(count):
-        begin = _aligned(offset, 4)
+        begin = _align(offset, 4)
         offset = _after_string(message, begin)
         names.append(message[begin + 4 : offset - 1].decode(errors="replace"))
-    offset = _aligned(offset, 4)
+    offset = _align(offset, 4)
     width, offset = _uint32(message, offset), offset + 4
-    values = _aligned(offset, 8) if width else offset
+    values = _align(offset, 8) if width else offset
     if count not in (0, width):
         raise CdrError(f"it names {count} joints but gives {width} positions")
     end = values + 8 * width
     for _ in ("velocity", "effort"):
-        offset = _aligned(end, 4)
+        offset = _align(end, 4)
         more = _uint32(message, offset)
-        end = _aligned(offset + 4, 8) + 8 * more if more else offset + 4
+        end = _align(offset + 4, 8) + 8 * more if more else offset + 4
     return Layout(size=end, values=values, width=width, names=tuple(names), names_at=(start, values))
 
 
 def _quaternion_layout(message: bytes) -> Layout:
-    values = _aligned(_after_string(message, _FRAME), 8)
+    values = _align(_after_string(message, _FRAME), 8)
     return Layout(size=values + 4 * 8, values=values, width=4)
 
 
 def _temperature_layout(message: bytes) -> Layout:
     """The variance follows the temperature."""
-    values = _aligned(_after_string(message, _FRAME), 8)
+    values = _align(_after_string(message, _FRAME), 8)
     return Layout(size=values + 2 * 8, values=values, width=1)
 
 
@@ -204,7 +204,7 @@ def _string(text: str) -> bytes:
 
 
 def _append(message: bytes, alignment: int, content: bytes) -> bytes:
-    return message.ljust(_aligned(len(message), alignment), b"\x00") + content
+    return message.ljust(_align(len(message), alignment), b"\x00") + content
 
 
 def _header(frame_id: str) -> bytes:
@@ -276,9 +276,9 @@ class Decoder:
 
         Raises CdrError for a message of another layout.
         """
-        return self.located(buffer, at, size)[1]
+        return self.stream_with_offsets(buffer, at, size)[1]
 
-    def located(self, buffer: bytes, at: Offsets, size: int) -> tuple[Offsets, Stream]:
+    def stream_with_offsets(self, buffer: bytes, at: Offsets, size: int) -> tuple[Offsets, Stream]:
         """The same, after the offsets (m,) of the messages that the m samples are from."""
         time_ns, values = np.empty(len(at), np.int64), np.empty((len(at), self.width))
         rest, kept = np.arange(len(at)), np.ones(len(at), bool)

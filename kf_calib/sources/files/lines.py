@@ -89,7 +89,7 @@ class Lines:
         return self._latest
 
     def _describe_bench(self, passage: _Passage) -> Bench:
-        return described(self.name, passage.parser, self._overrides)
+        return bench_of(self.name, passage.parser, self._overrides)
 
 
 class Described(Protocol):
@@ -100,7 +100,7 @@ class Described(Protocol):
     pose_width: int
 
 
-def described(name: str, reader: Described, overrides: Mapping[str, str]) -> Bench:
+def bench_of(name: str, reader: Described, overrides: Mapping[str, str]) -> Bench:
     """The bench, once a pose has been read. Raises InputError where it cannot be that one."""
     try:
         bench = Bench.from_metadata({**reader.metadata, **overrides}, reader.has_angles)
@@ -129,7 +129,7 @@ class Cutter:
         """The lines that end in ``block``."""
         end, lines = block.rfind(b"\n") + 1, list[str]()
         if end:
-            lines = self._decoded(bytes(self._tail) + block[: end - 1])
+            lines = self._decode(bytes(self._tail) + block[: end - 1])
             self._tail.clear()
         if len(self._tail) <= LONGEST_LINE_BYTES:  # else what comes up to the next end of line is not kept
             self._tail += block[end:]
@@ -139,9 +139,9 @@ class Cutter:
         """The line without an end, if there is one."""
         block = bytes(self._tail)
         self._tail.clear()
-        return self._decoded(block) if block else []
+        return self._decode(block) if block else []
 
-    def _decoded(self, block: bytes) -> list[str]:
+    def _decode(self, block: bytes) -> list[str]:
         lines = block.replace(b"\r\n", b"\n").removesuffix(b"\r").split(b"\n")
         if len(block) > LONGEST_LINE_BYTES:
             for i, line in enumerate(lines):

@@ -266,12 +266,12 @@ class Recorder:
                 self._disk.shutdown()
             with suppress(OSError):  # what is left in its buffer fails again
                 file.close()
-            kept = self._kept(isinstance(error, OSError))
+            kept = self._keep_intact_part(isinstance(error, OSError))
             if isinstance(error, OSError):
                 raise KfCalibError(f"{self.path} cannot be written on ({error.strerror}): {kept}.") from error
             raise
 
-    def _kept(self, is_full: bool) -> str:
+    def _keep_intact_part(self, is_full: bool) -> str:
         """Keeps what is whole of a file that was given up, where anything is, and says so."""
         size = 0
         with suppress(OSError):  # then it stays as it is, and readable all the same

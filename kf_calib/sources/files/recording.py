@@ -280,7 +280,7 @@ class _Track:
         ids = self.contents.ids(self.topic)
         groups = [group for group in messages.groups if group.channel in ids]
         try:
-            parts = [self.decode.located(block.data, group.at, group.size) for group in groups]
+            parts = [self.decode.stream_with_offsets(block.data, group.at, group.size) for group in groups]
         except CdrError as error:
             raise InputError(f"{self.contents.path}: topic {self.topic} cannot be used: {error}.") from error
         if len(parts) == 1:

@@ -55,7 +55,7 @@ def open_live(
     silent_s = query.pop("silent", silent_s)
     scheme = url.partition("://")[0] if "://" in url else ""
     if scheme == "sim":
-        feed = _simulated(url.partition("://")[2], overrides or {})
+        feed = _simulated_feed(url.partition("://")[2], overrides or {})
     elif (path := _bag(address)) is not None:
         feed = BagFeed(path, lambda path: Recording(path, overrides or {}), idle_s)
     else:
@@ -141,7 +141,7 @@ def _tcp(address: str) -> Tcp:
     return Tcp(host, port)
 
 
-def _simulated(rest: str, overrides: Mapping[str, str]) -> Feed:
+def _simulated_feed(rest: str, overrides: Mapping[str, str]) -> Feed:
     from kf_calib.sources.live.simulated import SimulatedFeed, batch_samples
     from kf_calib.sources.simulation.options import DEFAULTS, options_from_query, simulation
 

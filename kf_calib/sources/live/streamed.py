@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.files.lines import described
+from kf_calib.sources.files.lines import bench_of
 from kf_calib.sources.live.feed import IDLE_S, Feed, Lost, Regained, nothing
 from kf_calib.sources.live.links import Link
 from kf_calib.sources.live.protocols import Protocol
@@ -104,7 +104,7 @@ class StreamedFeed(Feed):
             if not reader.pose_width and time.monotonic() - first_s > _POSE_WAIT_S:
                 reader.pose_width = self._stated_width(reader.metadata)
             if reader.pose_width:
-                return described(self.name, reader, self._overrides)
+                return bench_of(self.name, reader, self._overrides)
             if ahead > _MOST_AHEAD:
                 break
         raise self._protocol.unusable("no platform angles")
@@ -121,9 +121,9 @@ class StreamedFeed(Feed):
         width = reader.pose_width if reader else 0
         while self._ahead:
             item = self._ahead.popleft()
-            yield _widened(item, width) if isinstance(item, Batch) else item
+            yield _with_pose_width(item, width) if isinstance(item, Batch) else item
         for item in self._items:
-            yield _widened(item, width) if isinstance(item, Batch) else item
+            yield _with_pose_width(item, width) if isinstance(item, Batch) else item
 
     @property
     def warnings(self) -> list[str]:
@@ -265,7 +265,7 @@ class StreamedFeed(Feed):
             time.sleep(min(left_s, _TICK_S))
 
 
-def _widened(batch: Batch, width: int) -> Batch:
+def _with_pose_width(batch: Batch, width: int) -> Batch:
     """A batch without poses, made before their width was known, with that width."""
     if batch.pose.values.shape[1] == width:
         return batch

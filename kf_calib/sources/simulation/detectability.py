@@ -72,7 +72,7 @@ def sizes_in_sigma(simulation: Simulation, effects: Sequence[Hidden]) -> list[fl
     if not simulation.noise.white_mps2:
         return [None] * len(effects)
     measured = [effect for effect in effects if effect.kind.stage != "record"]
-    found = iter(_projected(simulation, measured) if measured else ())
+    found = iter(_sizes_in_sigma(simulation, measured) if measured else ())
     return [next(found) if effect.kind.stage != "record" else None for effect in effects]
 
 
@@ -88,7 +88,7 @@ def _why_unseen(effect: Hidden) -> str:
     return f"{effect.name} cannot be seen with these orientations{temperature}"
 
 
-def _projected(simulation: Simulation, effects: Sequence[Hidden]) -> list[float | None]:
+def _sizes_in_sigma(simulation: Simulation, effects: Sequence[Hidden]) -> list[float | None]:
     """n of each effect, None where nothing but rounding is left of it.
 
     All rows of all dwells, whitened: unknowns (r, 12) in blocks (sensitivities times g, bias), effects (r, k).

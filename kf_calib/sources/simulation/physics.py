@@ -126,7 +126,7 @@ class Gravity:
 
     def __call__(self, state: State) -> None:
         up = carried_by_earth(self.bench, np.array([[0.0, self.bench.gravity_mps2, 0.0]]), state.time_s)
-        state.force_mps2 = turned(state.attitude.inv(), up)
+        state.force_mps2 = rotate(state.attitude.inv(), up)
 
 
 def carried_by_earth(bench: Bench, vector: Floats, time_s: Floats) -> Floats:
@@ -135,7 +135,7 @@ def carried_by_earth(bench: Bench, vector: Floats, time_s: Floats) -> Floats:
         return vector
     # a bench that says inertial states its latitude
     rate_radps = earth_rate_radps(bench.latitude_deg or 0.0, bench.azimuth_deg)
-    return turned(Rotation.from_rotvec(time_s[:, None] * rate_radps), vector)
+    return rotate(Rotation.from_rotvec(time_s[:, None] * rate_radps), vector)
 
 
 def earth_rate_radps(latitude_deg: float, azimuth_deg: float) -> Floats:
@@ -160,7 +160,7 @@ class Inputs:
         state.input_mps2 = along(state.force_mps2, self.sensors.input_axes)
 
 
-def turned(rotation: Rotation, vector: Floats) -> Floats:
+def rotate(rotation: Rotation, vector: Floats) -> Floats:
     """A vector (n, 3) turned by rotations, n or 1 of them."""
     return along(vector, rotation.as_matrix().reshape(-1, 3, 3))
 

@@ -44,7 +44,7 @@ def bias_walk(q: Floats, rig: Rig) -> Step:
     return BiasWalk(lambda count: q * walk(count))
 
 
-def _rectified(k: Floats, rig: Rig, *, rms: float, frequency: float, period: float) -> Step:
+def _vibration_rectification(k: Floats, rig: Rig, *, rms: float, frequency: float, period: float) -> Step:
     """K2 <v^2> of the vibration below, the mean over its cycles."""
 
     def step(state: State) -> None:
@@ -53,7 +53,13 @@ def _rectified(k: Floats, rig: Rig, *, rms: float, frequency: float, period: flo
     return step
 
 
-@made("vibration-rectification", "1/(m/s^2)", ("10ug/g^2", "50ug/g^2"), ("0.1mg/g^2", "3mg/g^2"), counted=_rectified)
+@made(
+    "vibration-rectification",
+    "1/(m/s^2)",
+    ("10ug/g^2", "50ug/g^2"),
+    ("0.1mg/g^2", "3mg/g^2"),
+    counted=_vibration_rectification,
+)
 def vibration_rectification(
     k: Floats, rig: Rig, *, rms: float = 3.0, frequency: float = 33.7, period: float = 170.0
 ) -> Step:

@@ -15,7 +15,7 @@ from kf_calib.bench.bench import Vector
 from kf_calib.sources.simulation.gimbal_motion import attitude
 from kf_calib.sources.simulation.injected.kinds import Rig, made
 from kf_calib.sources.simulation.injected.terms import column
-from kf_calib.sources.simulation.physics import State, Step, to_bench, turned
+from kf_calib.sources.simulation.physics import State, Step, rotate, to_bench
 
 _ROUNDS = 6  # of the flexure's fixed point; each gains the digits of its angle
 _PROBE_S = 2e-4  # of the second difference that makes an acceleration
@@ -143,8 +143,8 @@ def flexure(offset: Floats, rig: Rig) -> Step:
     def step(state: State) -> None:
         bent = Rotation.identity()
         for _ in range(_ROUNDS):
-            bent = Rotation.from_rotvec(np.cross(turned(bent.inv(), state.force_mps2), offset))
-        state.force_mps2, state.attitude = turned(bent.inv(), state.force_mps2), state.attitude * bent
+            bent = Rotation.from_rotvec(np.cross(rotate(bent.inv(), state.force_mps2), offset))
+        state.force_mps2, state.attitude = rotate(bent.inv(), state.force_mps2), state.attitude * bent
 
     return step
 
@@ -160,15 +160,15 @@ def lever_arm(arm: Floats, rig: Rig) -> Step:
 
     def step(state: State) -> None:
         if state.moving:
-            before, now, after = (_carried(rig, state.time_s + shift_s) for shift_s in shifts_s)
+            before, now, after = (_into_bench(rig, state.time_s + shift_s) for shift_s in shifts_s)
             felt = (after(arms) - 2.0 * now(arms) + before(arms)) / _PROBE_S**2
             state.input_mps2 = state.input_mps2 + np.sum(now(rig.sensors.input_axes) * felt, axis=2)
 
     return step
 
 
-def _carried(rig: Rig, time_s: Floats) -> Callable[[Floats], Floats]:
+def _into_bench(rig: Rig, time_s: Floats) -> Callable[[Floats], Floats]:
     """What takes three vectors of the platform, rows (3, 3), into the bench at n instants: (n, 3, 3)."""
     time_ns = np.rint(np.maximum(time_s, 0.0) * 1e9).astype(np.int64)
     carried = attitude(rig.axes, rig.motion.angles_at(time_ns))
-    return lambda rows: np.stack([turned(carried, row[None]) for row in rows], axis=1)
+    return lambda rows: np.stack([rotate(carried, row[None]) for row in rows], axis=1)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from kf_calib.bench.arrays import Floats
 from kf_calib.sources.simulation.injected.kinds import Rig, made
 from kf_calib.sources.simulation.injected.terms import adding, column
-from kf_calib.sources.simulation.physics import State, Step, along, carried_by_earth, earth_rate_radps, to_bench, turned
+from kf_calib.sources.simulation.physics import State, Step, along, carried_by_earth, earth_rate_radps, rotate, to_bench
 
 _LATITUDE_RAD = math.radians(50.0)
 
@@ -57,7 +57,7 @@ def magnetic(m: Floats, rig: Rig, *, north: float = 2e-5, up: float = -4.5e-5, e
     field = to_bench([north, up, east], rig.bench.azimuth_deg)[None]
 
     def contribution(state: State) -> Floats:
-        in_platform = turned(state.attitude.inv(), carried_by_earth(rig.bench, field, state.time_s))
+        in_platform = rotate(state.attitude.inv(), carried_by_earth(rig.bench, field, state.time_s))
         return m * along(in_platform, rig.sensors.input_axes)
 
     return adding(contribution)

@@ -1,10 +1,10 @@
-"""How often anyone could name the right effect: the chooser that knows all that can be known before the readings.
+"""The best possible share of right names: that of a chooser that knows all that can be known before the readings.
 
-An effect of n sigma is drawn evenly over the directions its coefficients can take, or over the paths of a random walk,
-and white noise is added; the chooser knows n, these odds, and the noise, and takes the effect that is likeliest after
-the readings (Bayes). Of a constant within an effect it knows the range, not the value. No rule is right more often, so
-what a diagnosis lacks of it is what better rules could gain. Of two effects at once, each of n sigma, it takes the
-likeliest pair. Rivals are what may be, too, and has no name.
+An effect of n sigma is drawn evenly over the directions that its coefficients can take, or over the paths of a random
+walk, and white noise is added. The chooser knows n, these probabilities and the noise, and takes the effect with the
+largest posterior probability (Bayes); for a constant within an effect it knows the range, not the value. No rule is
+right more often, so the distance of a diagnosis from it is what better rules could gain. For two effects at once, each
+of n sigma, it takes the likeliest pair. Rivals are explanations that have no name.
 """
 
 from __future__ import annotations
@@ -13,69 +13,76 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from scipy.special import gammaln
+from scipy.stats import vonmises_fisher
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis import bayes_factor
 
-_NEAR = 12.0  # of the logarithm of the odds: of pairs further behind none is the likeliest
-_DRAWN = 400
-_INTENSITIES, _PATHS = 8, 2000
+_NEAR = 12.0  # in the logarithm of the odds: a pair that lags by more is never the likeliest
+_DRAWN = 400  # directions, for the mean over them
+_INTENSITIES, _PATHS = 8, 2000  # intensities of a process that are tried, and paths that give their range
 
 
 @dataclass(frozen=True)
 class Sphere:
-    """Signals of n sigma, evenly over the directions of an orthonormal basis (d, k)."""
+    """Signals of n sigma, distributed evenly over the directions of an orthonormal basis (d, k)."""
 
     basis: Floats
 
     def log_odds(self, readings: Floats, sigmas: float) -> Floats:
-        """log of the mean likelihood ratio (m,) against none, readings (m, d)."""
+        """Return the log of the mean likelihood ratio (m,) of the signals against none, for readings (m, d)."""
         return bayes_factor.log_odds(self.basis.shape[1], np.sum((readings @ self.basis) ** 2, axis=1), sigmas)
 
     def spread(self, sigmas: float) -> Floats:
-        """Root (d, k) of the covariance of normal signals of the same mean square."""
+        """Return the root (d, k) of the covariance of normal signals of the same mean square."""
         return self.basis * sigmas / np.sqrt(self.basis.shape[1])
 
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal signals of ``variances`` (k,) along an orthonormal basis (d, k)."""
+    """Normal signals with ``variances`` (k,) along an orthonormal basis (d, k)."""
 
     basis: Floats
     variances: Floats
 
     def log_odds(self, readings: Floats, _: float) -> Floats:
+        """Return the log of the likelihood ratio (m,) of the signals against none, for readings (m, d)."""
         wider, along = 1.0 + self.variances, readings @ self.basis
         return 0.5 * np.sum(along**2 * (1.0 - 1.0 / wider) - np.log(wider), axis=-1)
 
     def spread(self, _: float) -> Floats:
+        """Return the root (d, k) of the covariance."""
         return self.basis * np.sqrt(self.variances)
 
-    def whitened(self, rows: Floats) -> Floats:
-        """Rows (d, c) times the inverse root of 1 + the covariance."""
+    def whiten(self, rows: Floats) -> Floats:
+        """Return rows (d, c) times the inverse root of 1 + the covariance."""
         shrunk = 1.0 - 1.0 / np.sqrt(1.0 + self.variances)
         return rows - self.basis @ (shrunk[:, None] * (self.basis.T @ rows))
 
 
 class Effect(Protocol):
-    """What an effect can do in an orthonormal frame of d dimensions."""
+    """The signals of an effect in an orthonormal frame of d dimensions."""
 
     def signals(self, count: int, rng: np.random.Generator) -> Floats:
-        """(count, d), of one sigma each."""
+        """Draw signals (count, d) of one sigma each."""
         ...
 
-    def parts(self, sigmas: float) -> Sequence[Sphere | Normal]:
-        """Equally likely."""
+    def parts(self, sigmas: float, /) -> Sequence[Sphere | Normal]:
+        """Return the distributions that the signals have, all equally likely."""
         ...
 
 
 @dataclass(frozen=True)
 class Columns:
-    """bases: orthonormal (d, k), one for each value of its constant; hidden: those that it is hidden with, where these
-    are others."""
+    """An effect with linear coefficients.
+
+    bases: orthonormal (d, k), one for each value of its constant. hidden: those with which it is hidden, where these
+    differ.
+    """
 
     bases: Sequence[Floats]
     hidden: Sequence[Floats] = ()
@@ -90,8 +97,10 @@ class Columns:
 
 @dataclass(frozen=True)
 class Process:
-    """A random process of covariance ``root`` root^T, root (d, k), as a walk of the biases, all its paths of one size:
-    normal ones, the intensity spread as theirs is."""
+    """A random process with covariance ``root`` root^T, root (d, k), such as a walk of the biases.
+
+    All its paths have one size. The chooser takes them as normal, with the intensities that such paths have.
+    """
 
     root: Floats
 
@@ -123,8 +132,11 @@ def best_possible(
     seed: int = 0,
     rivals: Mapping[str, Effect] | None = None,
 ) -> dict[str, float]:
-    """Of each effect, the share of draws in which the likeliest of all and the ``rivals`` is it, or means the ``same``
-    as it."""
+    """Return for each effect the share of draws in which the likeliest explanation is right.
+
+    effects: by name. same: the names that mean the same as each. sigmas: size of the effects. draws: for each effect.
+    rivals: further explanations, which are never hidden.
+    """
     every = {**effects, **(rivals or {})}
     rng, names, out = np.random.default_rng(seed), list(every), dict[str, float]()
     for name in effects:
@@ -143,10 +155,10 @@ def best_possible_pairs(
     draws: int = 100,
     seed: int = 0,
 ) -> list[tuple[tuple[str, str], bool]]:
-    """In each draw the pair that is hidden, of those that can be, and whether the likeliest pair means both."""
+    """Return for each draw the hidden pair, one of ``pairs``, and whether the likeliest pair means both effects."""
     rng, out = np.random.default_rng(seed), list[tuple[tuple[str, str], bool]]()
     for _ in range(draws):
-        true = pairs[rng.integers(len(pairs))]
+        true = pairs[int(rng.integers(len(pairs)))]
         signal = sigmas * np.sum([effects[name].signals(1, rng)[0] for name in true], axis=0)
         readings = signal + rng.standard_normal(signal.shape)
 
@@ -155,10 +167,10 @@ def best_possible_pairs(
             parts = [of(one, other, readings, sigmas, rng) for one, other in both]
             return float(np.logaddexp.reduce(parts) - np.log(len(parts)))
 
-        rough = [likely(pair, _roughly) for pair in pairs]
+        rough = [likely(pair, _rough_log_odds) for pair in pairs]
         near = [pairs[k] for k in np.argsort(rough)[::-1] if rough[k] > max(rough) - _NEAR]
-        said = max(near, key=lambda pair: likely(pair, _pair_log_odds))
-        out.append((true, any(a in same[true[0]] and b in same[true[1]] for a, b in (said, said[::-1]))))
+        best = max(near, key=lambda pair: likely(pair, _pair_log_odds))
+        out.append((true, any(a in same[true[0]] and b in same[true[1]] for a, b in (best, best[::-1]))))
     return out
 
 
@@ -172,8 +184,8 @@ def _log_odds(effect: Effect, readings: Floats, sigmas: float) -> Floats:
     return np.logaddexp.reduce(parts, axis=0) - np.log(len(parts))
 
 
-def _roughly(one: Sphere | Normal, other: Sphere | Normal, readings: Floats, sigmas: float, _: object) -> float:
-    """log of the mean likelihood ratio of two effects against none, both taken as normal.
+def _rough_log_odds(one: Sphere | Normal, other: Sphere | Normal, readings: Floats, sigmas: float, _: object) -> float:
+    """Return the log of the mean likelihood ratio of two effects against none, both taken as normal:
 
     r^T M (1 + M^T M)^-1 M^T r / 2 - log|1 + M^T M| / 2, M M^T their covariance.
     """
@@ -185,13 +197,16 @@ def _roughly(one: Sphere | Normal, other: Sphere | Normal, readings: Floats, sig
 def _pair_log_odds(
     one: Sphere | Normal, other: Sphere | Normal, readings: Floats, sigmas: float, rng: np.random.Generator
 ) -> float:
-    """The same of effects of n sigma each: over the directions of the larger one, or the paths of a walk, in closed
-    form, given the direction of the smaller, which is drawn about where it is likeliest and weighted by its odds."""
+    """Return the log of the mean likelihood ratio of two effects of n sigma each against none.
+
+    The mean over the directions of the larger effect, or over the paths of a walk, has a closed form. The directions of
+    the smaller one are drawn about the likeliest and weighted.
+    """
     if isinstance(other, Normal) or (isinstance(one, Sphere) and one.basis.shape[1] < other.basis.shape[1]):
         one, other = other, one
     assert isinstance(other, Sphere)
     if isinstance(one, Normal):
-        basis, left = one.whitened(other.basis), one.whitened(readings[:, None])[:, 0]
+        basis, left = one.whiten(other.basis), one.whiten(readings[:, None])[:, 0]
         directions, weights = _directions(basis, left, sigmas, rng)
         signals = sigmas * directions @ basis.T
         parts = weights + signals @ left - 0.5 * np.sum(signals**2, axis=1) + one.log_odds(readings, sigmas)
@@ -204,17 +219,17 @@ def _pair_log_odds(
 
 
 def _directions(basis: Floats, readings: Floats, sigmas: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Directions (m, k) about the likeliest of those that are drawn evenly, and the log of their weights (m,), which
-    add up to one in the mean (von Mises, Fisher)."""
-    from scipy.special import gammaln
-    from scipy.stats import vonmises_fisher
+    """Return directions (m, k) about the likeliest one, and the log of their weights (m,), for a mean over all.
 
+    They are drawn from a von Mises-Fisher distribution; the weights make up for it.
+    """
     dof = basis.shape[1]
     if dof == 1:
         return np.array([[-1.0], [1.0]]), np.log([0.5, 0.5])
     most = np.linalg.lstsq(basis, readings, rcond=1e-6)[0]
     closeness = float(np.linalg.svd(basis, compute_uv=False)[-1]) ** 2
-    proposal = vonmises_fisher(most / np.linalg.norm(most), 1.0 + 0.5 * sigmas**2 * closeness)
+    concentration: Any = 1.0 + 0.5 * sigmas**2 * closeness  # scipy's stubs ask for an integer
+    proposal = vonmises_fisher(most / np.linalg.norm(most), concentration)
     drawn = proposal.rvs(_DRAWN, random_state=rng)
     even = gammaln(0.5 * dof) - np.log(2.0) - 0.5 * dof * np.log(np.pi)  # over the sphere's surface
     return drawn, even - proposal.logpdf(drawn) - np.log(_DRAWN)

@@ -1,0 +1,90 @@
+"""Refits of one run: calibrations with other effects in the model, each computed once."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import replace
+from os import PathLike
+
+from kf_calib.bench.streams import Source
+from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates, candidate_frame
+from kf_calib.diagnosis.unknown_effect import Family, families
+from kf_calib.effects import Effect
+from kf_calib.estimation.calibration import calibrate, evaluate_fit
+from kf_calib.estimation.fit import Fit, fit
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.score_test import Frame
+from kf_calib.sources.files.recording import opened
+from kf_calib.support import stage
+from kf_calib.support.threads import one_blas_thread
+
+
+class Refits:
+    """Calibrations of one run with other effects in the model, and the tests of these, each computed once.
+
+    A refit is computed from the sufficient statistics of the dwells. A model with an oscillation, slews or averages may
+    need other statistics, and for these another pass over the source. ``diagnose`` and ``improve`` share what they
+    compute if both are given the same object.
+
+    source: the recording or source of the run, or a path; None where its readings are gone.
+    """
+
+    def __init__(self, source: Source | str | PathLike[str] | None = None) -> None:
+        self.source = None if source is None else opened(source)
+        self.frames = list[Frame]()
+        # with each value what its key is made of, since the id of an object that is gone may be used again
+        self._refits = dict[tuple[int, tuple[str, ...]], tuple[Calibration, Calibration]]()
+        self._families = dict[Hashable, tuple[Fit, list[Family]]]()
+
+    def of(self, before: Calibration, effects: Sequence[str]) -> Calibration:
+        """The run of a calibration with these effects in the model instead of those it had."""
+        key = id(before), tuple(effects)
+        if key not in self._refits:
+            self._refits[key] = before, self._refit(before, key[1])
+        return self._refits[key][1]
+
+    def with_effects(self, before: Calibration, added: Sequence[str]) -> Calibration:
+        """The run of a calibration with further effects in the model."""
+        return self.of(before, (*before.settings.effects, *added))
+
+    def averaged(self, before: Calibration, window_s: float) -> Calibration | None:
+        """The run of a calibration with its readings averaged over windows; None where the readings are gone."""
+        return None if self.source is None else calibrate(self.source, replace(before.settings, window_s=window_s))
+
+    def assess(self, result: Calibration, tests: float | None = None) -> CandidateTests:
+        """Score tests of all candidates against a calibration, see ``assess_candidates``."""
+        return assess_candidates(result.fit, tests, frames=self.frames)
+
+    def families(self, fitted: Fit, known: Sequence[Effect]) -> list[Family]:
+        """All families of formulas, each tested on what the fit leaves and compared with the effects ``known``."""
+        key = id(fitted), tuple((str(effect), effect.value) for effect in known)
+        if key not in self._families:
+            self._families[key] = fitted, families(fitted, known, candidate_frame(fitted, self.frames))
+        return self._families[key][1]
+
+    def _refit(self, before: Calibration, effects: tuple[str, ...]) -> Calibration:
+        """Fit the model with these effects, and read the source again where the statistics of the dwells do not
+        suffice."""
+        settings, dwells, slews = replace(before.settings, effects=effects), before.fit.dwells, before.carried.slews
+        model = Model.of(before.bench, effects)
+        stage.say(f"refitting with {' + '.join(map(str, model.effects))}" if model.effects else "refitting the twelve")
+        averages = model.averages and not all(dwell.averaged for dwell in dwells)
+        if self.source is not None and (averages or (model.dynamic and not slews)):
+            return calibrate(self.source, settings)
+        with one_blas_thread():
+            fitted = fit(dwells, model, settings.walk_mps2_per_sqrt_s, slews)
+            if self.source is not None and not holds_its_oscillation(fitted):
+                return calibrate(self.source, settings, plain=None if dwells[0].averaged else fitted)
+            return replace(evaluate_fit(fitted, settings), tally=before.tally, readings=before.readings)
+
+
+def calibration_of(
+    run: Calibration | Source | str | PathLike[str], refits: Refits | None = None
+) -> tuple[Calibration, Refits]:
+    """A calibration, or that of a recording, source or path, and its refits: those given or new ones."""
+    if isinstance(run, Calibration):
+        return run, refits or Refits()
+    source = opened(run)
+    return calibrate(source), refits or Refits(source)

@@ -1,0 +1,91 @@
+"""Score tests of effects beyond the catalogue, such as formulas: many groups, each tested for itself.
+
+``Frame.scan`` writes all candidates in one basis, so that any two of them can be compared. Formulas are too many for
+that, and only two things are asked of a group of them: what it explains, and whether it is a known effect by another
+name. The model's columns and those of the known effects are therefore made orthonormal once, and each group is reduced
+to a small triangle of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.qr import triangle
+from kf_calib.effects import Effect
+from kf_calib.estimation.complement import Complement
+from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.score_test import (
+    Frame,
+    Scan,
+    batches,
+    columns_at_once,
+    counts_of,
+    is_within,
+    scan_of,
+    slices,
+)
+
+
+class FurtherEffects:
+    """Tests of groups of effects beside the model in ``carried``, compared with ``known`` effects.
+
+    An effect counts as known if the cosine of the largest angle between it and one of these is above ``cosine``.
+    """
+
+    def __init__(self, frame: Frame, carried: Carried, known: Sequence[Effect], cosine: float) -> None:
+        self._frame, self._carried, self._cosine = frame, carried, cosine
+        rows, width = frame.whitened_model(carried)
+        self._beside = Complement(rows, width)
+        self._residual = self._beside.of(rows[:, -1])
+        self._known, self._parts = self._bases(known)
+
+    def _bases(self, known: Sequence[Effect]) -> tuple[Floats, list[slice]]:
+        """Return orthonormal bases (m, k) of what the model leaves of each known effect, and the columns of each."""
+        out, parts, last = np.empty((len(self._residual), sum(counts_of(known)))), list[slice](), 0
+        for some, columns in self._columns(known):
+            rest = self._beside.of(columns)
+            for effect, own in zip(some, slices(counts_of(some)), strict=True):
+                found = self._scan([effect], columns[:, own], rest[:, own]).candidates[0]
+                parts.append(slice(last, last + found.dof))
+                out[:, parts[-1]], last = rest[:, own] @ found.inverse, parts[-1].stop
+        return out[:, :last], parts
+
+    def _columns(self, known: Sequence[Effect]) -> Iterator[tuple[list[Effect], Floats]]:
+        """Yield a few of the known effects at a time with their whitened columns (m, q)."""
+        held = [effect for effect in known if self._frame.has(effect)]
+        for part in batches(counts_of(held), columns_at_once(self._carried)):
+            some = [held[k] for k in part]
+            yield some, self._frame.columns(some)
+        others = [effect for effect in known if effect not in held]
+        yield others, self._frame.whitened(self._carried, others)
+
+    def scans(self, groups: Sequence[Sequence[Effect]]) -> Iterator[tuple[Scan, bool]]:
+        """Scan each group alone, and tell whether all of its effects are known."""
+        widths = [sum(counts_of(group)) for group in groups]
+        for part in batches(widths, columns_at_once(self._carried)):
+            some = [groups[k] for k in part]
+            columns = self._frame.whitened(self._carried, [effect for group in some for effect in group])
+            rest = self._beside.of(columns)
+            cosines = self._known.T @ rest
+            for group, own in zip(some, slices([widths[k] for k in part]), strict=True):
+                found = self._scan(group, columns[:, own], rest[:, own])
+                yield found, self._is_known(found, cosines[:, own])
+
+    def _scan(self, effects: Sequence[Effect], columns: Floats, rest: Floats) -> Scan:
+        """Scan effects by their columns (m, q) and what the model leaves of these."""
+        upper = triangle(np.column_stack([rest, self._residual]))
+        return scan_of(upper, np.linalg.norm(columns, axis=0), effects, counts_of(effects))
+
+    def _is_known(self, found: Scan, products: Floats) -> bool:
+        """Tell whether each candidate lies within a known effect; products (k, q): of the bases of these with the
+        columns."""
+        for each, own in zip(
+            found.candidates, slices(counts_of([each.effect for each in found.candidates])), strict=True
+        ):
+            cosines = (products[:, own] @ each.inverse).T
+            if not any(is_within(cosines[:, part], self._cosine) for part in self._parts):
+                return False
+        return True
