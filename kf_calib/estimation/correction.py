@@ -13,6 +13,7 @@ wherever they are; they are left out and named.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -130,16 +131,21 @@ class Correction:
 
     def _corrected(self, readings: Floats, temperature_c: Floats) -> Floats:
         """Return the specific force of one block of readings."""
-        start = (readings - self.bias_mps2) @ self.matrix.T
-        if not self.effects:
-            return start
-        force = start
-        for _ in range(_MOST_ROUNDS):
+        force = readings
+        for force in self.rounds(readings, temperature_c):  # noqa: B007  # the last one is wanted
+            pass
+        return force
+
+    def rounds(self, readings: Floats, temperature_c: Floats) -> Iterator[Floats]:
+        """Specific force (n, 3) without effects, then round by round with them, until it changes no more."""
+        force = start = (readings - self.bias_mps2) @ self.matrix.T
+        yield force
+        for _ in range(_MOST_ROUNDS if self.effects else 0):
             before, force = force, start - self._added(force, temperature_c) @ self.matrix.T
+            yield force
             with np.errstate(invalid="ignore"):  # readings that are not finite stay so
                 if not np.nanmax(np.abs(force - before), initial=0.0) > _CONVERGED * self.bench.gravity_mps2:
-                    break
-        return force
+                    return
 
     def _added(self, force: Floats, temperature_c: Floats) -> Floats:
         """Return what the effects add to the readings (n, 3)."""

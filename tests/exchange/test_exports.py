@@ -1,0 +1,419 @@
+"""What is exported, read as the receiving program reads it and applied by its formula."""
+
+from __future__ import annotations
+
+import csv
+import ctypes
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from functools import cache, reduce
+from operator import xor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.paths import RECORDINGS
+
+import kf_calib
+from kf_calib import effects
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.cli.export import export as command
+from kf_calib.effects.inputs import beyond_force_and_temperature
+from kf_calib.errors import InputError, UnobservableError
+from kf_calib.estimation.correction import Correction
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.exchange import calibration_file
+from kf_calib.exchange.calibration_file import SavedCalibration
+from kf_calib.exchange.exports import TARGETS, exported
+
+BENCH = Bench(axes=axes_of("yzx"), gravity_mps2=9.81)
+COLD_C, WARM_C = 5.0, 45.0
+Formula = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Specific force (n, 3) from readings (n, 3) and temperatures (n,)."""
+
+
+@cache
+def saved() -> SavedCalibration:
+    """A calibration file's content; the tests below state numbers of their own in a ``Correction``."""
+    source = kf_calib.open_recording(RECORDINGS / "navigation_24.mcap")
+    found = calibration_file.saved(kf_calib.calibrate(source), "navigation_24.mcap")
+    conditions = found.conditions.model_copy(update={"temperature_min_c": COLD_C, "temperature_max_c": WARM_C})
+    return found.model_copy(update={"conditions": conditions})
+
+
+def correction(*names: str, size: float = 3.0, turned: float = 1e-2, bias: float = 0.05) -> Correction:
+    """Sensors near x, y, z with these effects, each ``size`` times as large as what a user would call large."""
+    rng = np.random.default_rng(7)
+    model = Model.of(BENCH, names)
+    scale = np.diag(1.0 + rng.normal(size=3) * 5e-3)
+    rows = np.column_stack([scale + turned * rng.normal(size=(3, 3)), bias * rng.normal(size=3)])
+    large = np.array([min(size * each.scale, 0.3) for each in model.coefficients])
+    state = np.concatenate([rows.ravel(), rng.choice([-1.0, 1.0], len(large)) * large])
+    return Correction(BENCH, model, state, 1e-16 * np.eye(len(state)), np.full(3, 1e-5))
+
+
+def samples(count: int = 20_000, sizes: tuple[float, float] = (1.0, 1.0)) -> tuple[np.ndarray, np.ndarray]:
+    """Specific force in any direction, and temperatures, at random."""
+    rng = np.random.default_rng(3)
+    direction = rng.normal(size=(count, 3))
+    length = BENCH.gravity_mps2 * rng.uniform(*sizes, size=(count, 1))
+    force = length * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    return force, rng.uniform(COLD_C, WARM_C, count)
+
+
+# -- how the programs read their files ---------------------------------------------------------------------------------
+
+
+def px4(text: str) -> Formula:
+    """Correct of sensor_calibration/Accelerometer.hpp and calc_thermal_offsets_3D of temperature_compensation."""
+    lines = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
+    assert all(line[:2] == ["1", "1"] and line[4] == ("6" if line[2] == "TC_A_ENABLE" else "9") for line in lines)
+    value = {line[2]: np.float32(line[3]) for line in lines}
+    offset, scale = (np.array([value[f"CAL_ACC0_{axis}{name}"] for axis in "XYZ"]) for name in ("OFF", "SCALE"))
+
+    def corrected(readings: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+        thermal = np.zeros(3)
+        if value.get("TC_A_ENABLE") == 1:
+            delta = np.clip(temperature, value["TC_A0_TMIN"], value["TC_A0_TMAX"])[:, None] - value["TC_A0_TREF"]
+            thermal = sum(np.array([value[f"TC_A0_X{k}_{i}"] for i in range(3)]) * delta**k for k in range(4))
+        return (readings - thermal - offset) * scale
+
+    return corrected
+
+
+def ardupilot(text: str) -> Formula:
+    """_rotate_and_correct_accel and TCal::correct_sensor of AP_InertialSensor."""
+    value = {name: float(np.float32(number)) for name, number in
+             (line.split(",") for line in text.splitlines() if not line.startswith("#"))}  # fmt: skip
+    offset, scale = (np.array([value[f"INS_ACC{name}_{axis}"] for axis in "XYZ"]) for name in ("OFFS", "SCAL"))
+
+    def polynomial(temperature: Any) -> np.ndarray:
+        low, high = value["INS_TCAL1_TMIN"], value["INS_TCAL1_TMAX"]
+        u = np.clip(np.atleast_1d(temperature), low, high)[:, None] - 35.0
+        c = [np.array([value[f"INS_TCAL1_ACC{k}_{axis}"] for axis in "XYZ"]) for k in (1, 2, 3)]
+        return (c[0] + (c[1] + c[2] * u) * u) * u * 1e-6
+
+    def corrected(readings: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+        if value.get("INS_TCAL1_ENABLE") == 1:
+            readings = readings - polynomial(temperature) + polynomial(value["INS_ACC1_CALTEMP"])
+        return (readings - offset) * scale
+
+    return corrected
+
+
+def imucal(text: str) -> Formula:
+    """FerrarisCalibrationInfo._calibrate_acc; all seven matrices must be there, and no other key."""
+    content = json.loads(text)
+    assert (content.pop("_format_version"), content.pop("cal_type")) == ("2.0.0", "Ferraris")
+    k, r, b = (np.array(content.pop(name)) for name in ("K_a", "R_a", "b_a"))
+    assert [np.shape(content.pop(name)) for name in ("K_g", "R_g", "K_ga", "b_g")] == [(3, 3)] * 3 + [(3,)]
+    assert set(content) == {"acc_unit", "gyr_unit", "from_acc_unit", "from_gyr_unit", "comment"}
+    assert np.count_nonzero(k - np.diag(np.diag(k))) == 0
+    return lambda readings, _: (np.linalg.inv(r) @ np.linalg.inv(k) @ (readings - b).T).T
+
+
+def imu_calib(text: str) -> Formula:
+    """AccelCalib::loadCalib and applyCalib."""
+    lines = dict(line.split(": ") for line in text.splitlines() if not line.startswith("#"))
+    matrix, bias = np.reshape(json.loads(lines["SM"]), (3, 3)), np.array(json.loads(lines["bias"]))
+    return lambda readings, _: readings @ matrix.T - bias
+
+
+def _rows(text: str, name: str) -> np.ndarray:
+    """A matrix of a YAML file, a row a line."""
+    return np.array([json.loads(row) for row in re.findall(r"- (\[.*\])", text.split(f" {name}:\n")[1])[:3]])
+
+
+def kalibr(text: str) -> Formula:
+    """reading = M f + bias, the bias unknown."""
+    assert "model: scale-misalignment" in text
+    matrix = _rows(text, "M")
+    return lambda readings, _: np.linalg.solve(matrix, readings.T).T
+
+
+def openvins(text: str) -> Formula:
+    """Of the inverse of Ta the lower triangle is kept (VioManagerOptions.h); the bias begins at zero."""
+    assert text.startswith("%YAML:1.0\n") and 'model: "kalibr"' in text
+    da, rotation = np.tril(np.linalg.inv(_rows(text, "Ta"))), _rows(text, "R_IMUtoACC").T
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    return lambda readings, _: readings @ (rotation @ da).T
+
+
+def imu_tk(text: str) -> Formula:
+    """CalibratedTriad_::load and unbiasNormalize."""
+    numbers = np.array(text.split(), float)
+    t, k, b = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:]
+    np.testing.assert_array_equal(np.diag(t), 1.0)
+    assert len(b) == 3 and np.count_nonzero(k - np.diag(np.diag(k))) == 0
+    return lambda readings, _: (readings - b) @ (t @ k).T
+
+
+def vectornav(text: str) -> Formula:
+    """The equation of the manual; checksum: all bytes between $ and * by exclusive or."""
+    body, checksum = text.removeprefix("$").removesuffix("\r\n").split("*")
+    assert int(checksum, 16) == reduce(xor, body.encode())
+    name, register, *numbers = body.split(",")
+    assert (name, register, len(numbers)) == ("VNWRG", "25", 12)
+    c, b = np.array(numbers[:9], np.float32).reshape(3, 3), np.array(numbers[9:], np.float32)
+    return lambda readings, _: (readings - b) @ c.T
+
+
+def table(text: str) -> Formula:
+    """The matrix and the biases of the table."""
+    value = {row["name"]: float(row["value"]) for row in csv.DictReader(text.splitlines())}
+    c = np.array([[value[f"C{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)])
+    return lambda readings, _: (readings - [value["b1"], value["b2"], value["b3"]]) @ c.T
+
+
+READERS: dict[str, Callable[[str], Formula]] = {
+    "px4": px4, "ardupilot": ardupilot, "imucal": imucal, "imu_calib": imu_calib, "kalibr": kalibr,
+    "openvins": openvins, "imu_tk": imu_tk, "vectornav": vectornav, "csv": table,
+}  # fmt: skip
+ROUNDING = {"px4": 3e-6, "ardupilot": 3e-6, "vectornav": 3e-6}
+"""Of programs that count with 32 bits, m/s^2."""
+
+
+def test_the_command_names_the_programs_there_are() -> None:
+    (option,) = [each for each in command.params if each.name == "to"]
+    assert set(option.type.choices) == TARGETS.keys() == {*READERS, "c"}  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize("to", READERS)
+def test_what_a_program_holds_it_corrects_as_we_do(to: str) -> None:
+    """Sensors that stand straight for those that know no alignment, and have no bias for those that know none."""
+    own = correction(turned=0.0 if to in ("px4", "ardupilot") else 1e-2, bias=0.0 if to in ("kalibr", "openvins") else 0.05)
+    # the table's biases are those of the file
+    content = saved()
+    if to == "csv":
+        content, own = content, content.correction()
+    target = exported(content, own, to)
+    assert target.lost == () and target.error_left is None
+    force, temperature = samples()
+    found = READERS[to](target.text())(own.predicted(force, temperature), temperature)
+    np.testing.assert_allclose(found, own(own.predicted(force, temperature)), rtol=0, atol=ROUNDING.get(to, 1e-13))
+
+
+@pytest.mark.parametrize("to", ["px4", "ardupilot"])
+@pytest.mark.parametrize("names", [("thermal-bias",), ("thermal-bias", "thermal-bias-2"), ("mine = T**3",)])
+def test_a_bias_that_follows_the_temperature_is_held_as_a_cubic(to: str, names: tuple[str, ...]) -> None:
+    own = correction(*names, turned=0.0)
+    target = exported(saved(), own, to)
+    assert target.lost == ()
+    force, temperature = samples()
+    readings = own.predicted(force, temperature)
+    assert np.abs(own.predicted(force) - readings).max() > 1e-3  # it does matter
+    np.testing.assert_allclose(READERS[to](target.text())(readings, temperature), force, rtol=0, atol=5e-6)
+
+
+@pytest.mark.parametrize("to", ["imucal", "imu_calib", "imu_tk", "vectornav"])
+def test_an_effect_that_is_linear_in_the_force_is_held_by_a_matrix(to: str) -> None:
+    own = correction("cross-talk")
+    target = exported(saved(), own, to)
+    assert target.lost == ()
+    force, temperature = samples()
+    found = READERS[to](target.text())(own.predicted(force, temperature), temperature)
+    np.testing.assert_allclose(found, force, rtol=0, atol=ROUNDING.get(to, 1e-12))
+
+
+LOSSES = [
+    ("px4", (), ("alignment",)), ("ardupilot", (), ("alignment",)),
+    ("px4", ("thermal-bias", "thermal-scale"), ("alignment", "thermal-scale")),
+    ("ardupilot", ("thermal-bias", "second-order"), ("alignment", "second-order")),
+    ("kalibr", (), ("bias",)), ("openvins", ("third-order",), ("bias", "third-order")),
+    ("imucal", ("second-order",), ("second-order",)), ("imu_calib", ("scale-asymmetry",), ("scale-asymmetry",)),
+    ("imu_tk", ("thermal-bias",), ("thermal-bias",)), ("vectornav", ("cross-coupling-ip",), ("cross-coupling-ip",)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("to", "names", "lost"), LOSSES)
+def test_the_error_left_is_that_of_readings_at_random(to: str, names: tuple[str, ...], lost: tuple[str, ...]) -> None:
+    own = correction(*names)
+    with pytest.raises(InputError, match="--lossy"):
+        exported(saved(), own, to)
+    target = exported(saved(), own, to, lossy=True)
+    force, temperature = samples(200_000)
+    found = READERS[to](target.text())(own.predicted(force, temperature), temperature)
+    errors = np.linalg.norm(found - force, axis=1)
+    assert target.lost == lost and target.error_left is not None
+    assert target.error_left.rms_mps2 == pytest.approx(np.sqrt(np.mean(errors**2)), rel=0.01)
+    assert target.error_left.worst_mps2 == pytest.approx(errors.max(), rel=0.01)
+
+
+@pytest.mark.parametrize("to", ["px4", "ardupilot"])
+def test_no_other_offset_and_scale_leave_a_smaller_error(to: str) -> None:
+    own = correction("second-order")
+    target = exported(saved(), own, to, lossy=True)
+    force, temperature = samples(50_000)
+    readings = own.predicted(force, temperature)
+    affine = target.affine  # pyright: ignore[reportAttributeAccessIssue]
+    offset, scale = affine.offset_mps2, np.diag(affine.matrix)
+
+    def rms(offset: np.ndarray, scale: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(((readings - offset) * scale - force) ** 2)))
+
+    best = rms(offset, scale)
+    for i in range(3):
+        for sign in (-1.0, 1.0):
+            step = sign * np.eye(3)[i]
+            assert rms(offset + 1e-2 * step, scale) > best and rms(offset, scale + 1e-3 * step) > best
+    assert rms(own.bias_mps2, 1.0 / np.diag(own.sensitivity)) > best
+
+
+def test_what_ardupilot_does_not_take_is_refused() -> None:
+    with pytest.raises(InputError, match=r"INS_ACCOFFS_. would be .* takes -3.5 to 3.5 m/s\^2"):
+        exported(saved(), correction(bias=20.0), "ardupilot", lossy=True).text()
+    own = correction()
+    own.state[:3] *= 1.5
+    with pytest.raises(InputError, match=r"INS_ACCSCAL_X would be 0\.\d+, and ArduPilot takes 0.8 to 1.2:"):
+        exported(saved(), own, "ardupilot", lossy=True).text()
+
+
+def test_axes_that_are_not_those_of_the_program_are_refused() -> None:
+    own = correction()
+    own.state[:3] *= -1.0
+    with pytest.raises(InputError, match=r"PX4 takes no scale factor of -.*--channels"):
+        exported(saved(), own, "px4", lossy=True).text()
+    own = correction(bias=0.0)
+    own.state[:8] = np.roll(own.state[:8], 4)  # accelerometers 1 and 2 have changed places
+    with pytest.raises(InputError, match=r"imu_tk .*--channels"):
+        exported(saved(), own, "imu_tk").text()
+    force, temperature = samples(100)  # mirrored: a rotation, and a scale factor that is negative
+    found = openvins(exported(saved(), own, "openvins").text())(own.predicted(force), temperature)
+    np.testing.assert_allclose(found, force, rtol=0, atol=1e-12)
+
+
+def test_parameters_that_the_run_did_not_determine_are_refused(run: Any, tmp_path: Path) -> None:
+    """In one sentence, for every program; a coefficient of an effect that is not corrected does not matter."""
+    content = saved().model_dump(mode="json")
+    content["state"]["undetermined"] = ["phi1"]
+    (tmp_path / "cal.json").write_text(json.dumps(content))
+    for to in TARGETS:
+        code, out, err = run("export", tmp_path / "cal.json", "--to", to, "-o", tmp_path / "out", "--lossy")
+        assert (code, out) == (2, "") and "did not determine phi1" in err and err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(UnobservableError):
+        calibration_file.read(tmp_path / "cal.json").correction()
+
+
+def test_the_command_says_what_is_lost_and_needs_leave_for_it(run: Any, tmp_path: Path) -> None:
+    cal, out = tmp_path / "cal.json", tmp_path / "out.param"
+    calibration_file.write(cal, saved())
+    code, printed, err = run("export", cal, "--to", "px4", "-o", out, "--units", "si")
+    assert (code, printed) == (2, "") and not out.exists()
+    rms, worst = map(float, re.findall(r"([\d.]+) m/s\^2", err))
+    code, printed, err = run("export", cal, "--to", "px4", "-o", out, "--lossy", "--json")
+    found = json.loads(printed)
+    assert code == 0 and (found["out"], found["format"], found["lost"]) == (str(out), "px4", ["alignment"])
+    assert found["error_left_rms_mps2"] == pytest.approx(rms, rel=0.01)
+    assert found["error_left_worst_mps2"] == pytest.approx(worst, rel=0.01)
+    code, printed, _ = run("export", cal, "--to", "csv", "-o", tmp_path / "out.csv", "--json")
+    assert code == 0 and json.loads(printed)["error_left_rms_mps2"] is None
+
+
+def test_a_comment_holds_no_name_that_could_end_it() -> None:
+    made = saved().provenance.model_copy(update={"recording": "a */ \\\\ # ${x} 'b'\".mcap"})
+    text = exported(saved().model_copy(update={"provenance": made}), correction(), "c").text()
+    assert "a_x_b_.mcap" in text
+
+
+# -- C -----------------------------------------------------------------------------------------------------------------
+
+COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+compiled_only = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler: the header is not compiled")
+BY_FORCE_AND_TEMPERATURE = [
+    name for name in effects.names(BENCH) if not beyond_force_and_temperature(effects.effect_named(name, BENCH), BENCH)
+]
+FORMULAS = [
+    "mine = sin(fx/g) + 0.5*a*abs(p)/g", "mine = a**2.5*(a > 0)", "mine = -minimum(a, T*o)**3 + exp(-T/(40*K))",
+    "mine = maximum(fy, fz)*sign(a)/(2 + cos(a/g))", "mine = sqrt(1 + a*a) - tanh(p) - arctan(o)*log(g) + 2**3*T*deg",
+]  # fmt: skip
+
+
+def compiled(text: str, folder: Path) -> Formula:
+    """The function of the header, compiled with every warning an error."""
+    (folder / "kf_calib_correct.h").write_text(text)
+    (folder / "shim.c").write_text(
+        '#include "kf_calib_correct.h"\n'
+        "void all(long n, double *z, double *t) { for (long k = 0; k < n; k++) "
+        "kf_calib_correct(z + 3 * k, t[k], z + 3 * k); }\n"
+    )
+    flags = ["-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
+    words = [str(COMPILER), *flags, "shim.c", "-o", "shim.so", *(["-lm"] if "math.h" in text else [])]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    function = ctypes.CDLL(str(folder / "shim.so")).all
+
+    def corrected(readings: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+        out, warmth = np.array(readings, float, order="C"), np.array(temperature, float)
+        pointer = ctypes.POINTER(ctypes.c_double)
+        function(ctypes.c_long(len(out)), out.ctypes.data_as(pointer), warmth.ctypes.data_as(pointer))
+        return out
+
+    return corrected
+
+
+@compiled_only
+@pytest.mark.parametrize("names", [(), *((name,) for name in [*BY_FORCE_AND_TEMPERATURE, *FORMULAS]),
+                                   ("second-order", "thermal-bias", "cross-coupling-ip", "mine = a**3")])  # fmt: skip
+def test_the_function_in_c_corrects_as_we_do(names: tuple[str, ...], tmp_path: Path) -> None:
+    own = correction(*names)
+    text = exported(saved(), own, "c").text()
+    force, temperature = samples(5000, (0.0, 2.0))
+    force[:500] *= 1e-4  # where a dead zone is, too
+    force[500:1000, 0] *= 1e-5
+    readings = own.predicted(force, temperature)
+    expected = own(readings, temperature)
+    if names:
+        assert np.abs(expected - (readings - own.bias_mps2) @ own.matrix.T).max() > 1e-6  # the effect does matter
+    found = compiled(text, tmp_path)(readings, temperature)
+    assert np.abs(found - expected).max() <= 1e-12 * BENCH.gravity_mps2
+    assert ("math.h" in text) == any(re.search(r"sin|cos|exp|log|sqrt|2\.5", name) for name in names)
+
+
+@compiled_only
+def test_the_function_in_c_takes_an_unknown_temperature_for_the_reference(tmp_path: Path) -> None:
+    own = correction("thermal-bias")
+    function = compiled(exported(saved(), own, "c").text(), tmp_path)
+    readings = own.predicted(samples(10)[0], 25.0)
+    np.testing.assert_array_equal(function(readings, np.full(10, np.nan)), function(readings, np.full(10, 25.0)))
+
+
+def test_effects_of_the_run_and_the_platform_are_named_and_left_out() -> None:
+    target = exported(saved(), correction("second-order", "bias-drift", "base-tilt"), "c")
+    assert "// Not corrected for bias-drift." in target.text() and "// Not corrected for base-tilt." in target.text()
+    assert set(target.correction.left_out) == {"bias-drift", "base-tilt"}
+
+
+def test_a_class_in_python_is_refused_in_c_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(effects, "_registered", {})
+
+    class Fifth(effects.SensorEffect):
+        """c a^5."""
+
+        name, title, source = "fifth", "fifth order", "test"
+        symbol, unit, scale = "Q5_", "s^8/m^4", 1e-8
+
+        def terms(self, s: effects.Stimulus) -> np.ndarray:
+            return s.along**5
+
+    effects.register(Fifth)
+    with pytest.raises(InputError, match=r"fifth is a class in Python, which cannot be written in C"):
+        exported(saved(), correction("fifth"), "c").text()
+
+
+def test_the_table_has_every_parameter_coefficient_and_constant(run: Any, tmp_path: Path) -> None:
+    cal = tmp_path / "cal.json"
+    run("replay", RECORDINGS / "navigation_24.mcap", "--with", "second-order", "--with", "dead-zone", "--save", cal)
+    code, _, err = run("export", cal, "--to", "csv", "-o", tmp_path / "out.csv")
+    assert code == 0, err
+    rows = {row["name"]: row for row in csv.DictReader((tmp_path / "out.csv").read_text().splitlines())}
+    expected = {*paper_parameters.SYMBOLS, "K2_1", "K2_2", "K2_3", "Dz1", "Dz2", "Dz3", "dZone"}
+    assert rows.keys() == expected | {f"C{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)}
+    for own in calibration_file.read(cal).parameters:
+        assert float(rows[own.symbol]["value"]) == own.value and rows[own.symbol]["unit"] == own.unit
