@@ -27,8 +27,10 @@ _NAMES = ["px4", "ardupilot", "imucal", "imu_calib", "kalibr", "openvins", "imu_
 @click.argument("calibration", type=click.Path(path_type=Path), metavar="CAL")
 @click.option("--to", required=True, type=click.Choice(_NAMES), help="The program that is to take it.", panel=OUTPUT)
 @output_option("-o", "--out", required=True, metavar="FILE", panel=OUTPUT, help="The file for that program.")
-@click.option("--lossy", is_flag=True, panel=OUTPUT,
-              help="Export though the program cannot hold all; what is lost, and the error left, are told.")  # fmt: skip
+@click.option(
+    "--lossy", is_flag=True, panel=OUTPUT,
+    help="Export though the program cannot hold all; what is lost, and the error left, are told.",
+)  # fmt: skip
 @effects_from_option
 @trust_option
 @overwrite_option

@@ -118,4 +118,4 @@ class AffineTarget(Target):
         half = 0.5 * (grid.high_c - grid.low_c)
         scaled = Polynomial([(self.reference_c - grid.low_c) / half - 1.0, 1.0 / half])
         found = [Polynomial(own)(scaled).coef for own in coefficients.T]
-        return np.array([np.pad(each, (0, _POWERS + 1 - len(each))) for each in found]).T
+        return np.array([np.pad(each, (0, _POWERS + 1 - len(each))) for each in found], float).T

@@ -12,7 +12,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.estimation.correction import Correction
 
-_DIRECTIONS = 4000  # with the opposite of each, so that odd powers of the force cancel exactly
+_DIRECTIONS = 10_000  # with the opposite of each, so that odd powers of the force cancel exactly
 _LOBATTO = np.array([[-1.0, 0.1], [-np.sqrt(3 / 7), 49 / 90], [0.0, 32 / 45], [np.sqrt(3 / 7), 49 / 90], [1.0, 0.1]])
 """Nodes, weights: exact up to the seventh power of the temperature, and both ends are among the nodes."""
 

@@ -24,7 +24,9 @@ class OpenVins(AffineTarget):
     def text(self) -> str:
         rotation, lower = rotation_and_lower(self.affine.matrix)
         matrices = {"Ta": np.tril(np.linalg.inv(lower)), "R_IMUtoACC": rotation.T}
-        lines = [line for name, own in matrices.items() for line in (f"  {name}:", *(f"    - {r}" for r in own.tolist()))]
+        lines = [
+            line for name, own in matrices.items() for line in (f"  {name}:", *(f"    - {r}" for r in own.tolist()))
+        ]
         return "\n".join(["%YAML:1.0", f"# {self.origin}.", "imu0:", '  model: "kalibr"', *lines, ""])
 
 
