@@ -25,6 +25,7 @@ def exported_object(target: Target, to: str, out: Path) -> dict[str, Any]:
             "left_out": target.correction.left_out,
             "error_left_rms_mps2": None if left is None else left.rms_mps2,
             "error_left_worst_mps2": None if left is None else left.worst_mps2,
+            "warnings": list(target.remarks),
         }
     )
 
@@ -39,4 +40,4 @@ def exported_report(target: Target, out: Path) -> RenderableType:
         lines.append(note(f"it does not hold {', '.join(target.lost)}: corrected readings are wrong by "
                           f"{unit.text(rms)} rms, {unit.text(worst)} at worst"))  # fmt: skip
     lines += [note(f"{name} is not corrected: {why}") for name, why in target.correction.left_out.items()]
-    return Group(*lines)
+    return Group(*lines, *map(note, target.remarks))

@@ -30,6 +30,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.exchange.exports import TARGETS, exported
+from kf_calib.exchange.exports.affine import AffineTarget
 
 BENCH = Bench(axes=axes_of("yzx"), gravity_mps2=9.81)
 COLD_C, WARM_C = 5.0, 45.0
@@ -181,7 +182,7 @@ ROUNDING = {"px4": 3e-6, "ardupilot": 3e-6, "vectornav": 3e-6}
 
 def test_the_command_names_the_programs_there_are() -> None:
     (option,) = [each for each in command.params if each.name == "to"]
-    assert set(option.type.choices) == TARGETS.keys() == {*READERS, "c"}  # pyright: ignore[reportAttributeAccessIssue]
+    assert set(option.type.choices) == TARGETS.keys() == {*READERS, "c"}
 
 
 @pytest.mark.parametrize("to", READERS)
@@ -247,13 +248,22 @@ def test_the_error_left_is_that_of_readings_at_random(to: str, names: tuple[str,
     assert target.error_left.worst_mps2 == pytest.approx(errors.max(), rel=0.01)
 
 
+@pytest.mark.parametrize("to", ["px4", "imucal"])
+@pytest.mark.parametrize("seen_c", [None, 20.0])
+def test_a_drift_is_lost_where_the_run_had_one_temperature(to: str, seen_c: float | None) -> None:
+    conditions = saved().conditions.model_copy(update={"temperature_min_c": seen_c, "temperature_max_c": seen_c})
+    content = saved().model_copy(update={"conditions": conditions})
+    assert exported(content, correction("thermal-bias", turned=0.0), to, lossy=True).lost == ("thermal-bias",)
+
+
 @pytest.mark.parametrize("to", ["px4", "ardupilot"])
 def test_no_other_offset_and_scale_leave_a_smaller_error(to: str) -> None:
     own = correction("second-order")
     target = exported(saved(), own, to, lossy=True)
     force, temperature = samples(50_000)
     readings = own.predicted(force, temperature)
-    affine = target.affine  # pyright: ignore[reportAttributeAccessIssue]
+    assert isinstance(target, AffineTarget)
+    affine = target.affine
     offset, scale = affine.offset_mps2, np.diag(affine.matrix)
 
     def rms(offset: np.ndarray, scale: np.ndarray) -> float:
@@ -314,6 +324,8 @@ def test_the_command_says_what_is_lost_and_needs_leave_for_it(run: Any, tmp_path
     assert code == 0 and (found["out"], found["format"], found["lost"]) == (str(out), "px4", ["alignment"])
     assert found["error_left_rms_mps2"] == pytest.approx(rms, rel=0.01)
     assert found["error_left_worst_mps2"] == pytest.approx(worst, rel=0.01)
+    assert "some releases of PX4 ignore" in found["warnings"][0]  # these sensors are good to 0.001
+    assert exported(saved(), correction(bias=0.5), "px4", lossy=True).remarks == ()
     code, printed, _ = run("export", cal, "--to", "csv", "-o", tmp_path / "out.csv", "--json")
     assert code == 0 and json.loads(printed)["error_left_rms_mps2"] is None
 

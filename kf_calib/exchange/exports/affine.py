@@ -87,6 +87,8 @@ class AffineTarget(Target):
 
     def _holds(self, effect: Effect) -> bool:
         """Whether matrix, offset and drift are enough for an effect: its columns are made of their terms."""
+        if str(effect) in self.correction.needs_temperature and not self.drifts:
+            return False
         grid = self.grid
         terms = self._powers if self.diagonal else np.hstack([self._powers, grid.force_mps2])
         stimulus = stimulus_of(grid.force_mps2, grid.temperature_c, self.correction.bench, self.correction.sensitivity)

@@ -17,6 +17,8 @@ import numpy as np
 from kf_calib.errors import InputError
 from kf_calib.exchange.exports.affine import AffineTarget
 
+_LEAST_CHANGE = 0.01
+
 
 class Px4(AffineTarget):
     """Diagonal matrix, offset, cubic of the temperature."""
@@ -32,6 +34,14 @@ class Px4(AffineTarget):
         head = [f"# {self.origin}.", "# For the accelerometer whose device id is in CAL_ACC0_ID (and TC_A0_ID).",
                 "#", "# Vehicle-Id Component-Id Name Value Type"]  # fmt: skip
         return "\n".join([*head, *lines, ""])
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        changes = self.affine.offset_mps2, np.diag(self.affine.matrix) - 1.0
+        if min(np.linalg.norm(change) for change in changes) > _LEAST_CHANGE:
+            return ()
+        return (f"some releases of PX4 ignore offsets, or changes of scale factors, below {_LEAST_CHANGE} (length of "
+                "the vector): look with its command sensors status whether they are in use",)  # fmt: skip
 
     def _values(self) -> Iterator[tuple[str, float]]:
         affine, grid = self.affine, self.grid

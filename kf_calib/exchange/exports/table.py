@@ -18,7 +18,7 @@ from kf_calib.exchange.exports.target import Target
 class Table(Target):
     """The twelve parameters, coefficients and constants of effects, and the matrix."""
 
-    title = "CSV"
+    title = "spreadsheets"
 
     def text(self) -> str:
         out = io.StringIO()

@@ -32,6 +32,11 @@ class Target(ABC):
     def lost(self) -> tuple[str, ...]:
         return ()
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a user of the program should know besides."""
+        return ()
+
     def corrected(self, readings_mps2: Floats, temperature_c: Floats) -> Floats:
         """Specific force (n, 3) from readings (n, 3), by the formula of the program."""
         return self.correction(readings_mps2, temperature_c)
