@@ -78,7 +78,7 @@ class CHeader(Target):
         yield from (f"static const double {name}_axes[3][3] = {_array(own)};" for name, own in matrices.items())
         yield f"double f[3], e[3] = {{0.0, 0.0, 0.0}}{''.join(f', {name}[3]' for name in matrices)};"
         yield f"for (int i = 0; i < 3; i++) f[i] = {_product('c[i]', 'z')};"
-        yield f"for (int round = 0; round < {self._rounds()}; round++) {{"
+        yield f"for (int n = 0; n < {self._rounds()}; n++) {{"
         for name in matrices:
             yield f"    for (int i = 0; i < 3; i++) {name}[i] = {_product(f'{name}_axes[i]', 'f')};"
         yield from (f"    e[{i}] = {own};" for i, own in enumerate(sums))
