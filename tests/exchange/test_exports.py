@@ -3,71 +3,25 @@
 from __future__ import annotations
 
 import csv
-import ctypes
 import json
 import re
-import shutil
-import subprocess
 from collections.abc import Callable
-from functools import cache, reduce
+from functools import reduce
 from operator import xor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers.calibrations import Formula, correction, samples, saved
 from helpers.paths import RECORDINGS
 
-import kf_calib
-from kf_calib import effects
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.cli.export import export as command
-from kf_calib.effects.inputs import beyond_force_and_temperature
 from kf_calib.errors import InputError, UnobservableError
-from kf_calib.estimation.correction import Correction
-from kf_calib.estimation.measurement_model import Model
 from kf_calib.exchange import calibration_file
-from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.exchange.exports import TARGETS, exported
 from kf_calib.exchange.exports.affine import AffineTarget
-
-BENCH = Bench(axes=axes_of("yzx"), gravity_mps2=9.81)
-COLD_C, WARM_C = 5.0, 45.0
-Formula = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Specific force (n, 3) from readings (n, 3) and temperatures (n,)."""
-
-
-@cache
-def saved() -> SavedCalibration:
-    """A calibration file's content; the tests below state numbers of their own in a ``Correction``."""
-    source = kf_calib.open_recording(RECORDINGS / "navigation_24.mcap")
-    found = calibration_file.saved(kf_calib.calibrate(source), "navigation_24.mcap")
-    conditions = found.conditions.model_copy(update={"temperature_min_c": COLD_C, "temperature_max_c": WARM_C})
-    return found.model_copy(update={"conditions": conditions})
-
-
-def correction(*names: str, size: float = 3.0, turned: float = 1e-2, bias: float = 0.05) -> Correction:
-    """Sensors near x, y, z with these effects, each ``size`` times as large as what a user would call large."""
-    rng = np.random.default_rng(7)
-    model = Model.of(BENCH, names)
-    scale = np.diag(1.0 + rng.normal(size=3) * 5e-3)
-    rows = np.column_stack([scale + turned * rng.normal(size=(3, 3)), bias * rng.normal(size=3)])
-    large = np.array([min(size * each.scale, 0.3) for each in model.coefficients])
-    state = np.concatenate([rows.ravel(), rng.choice([-1.0, 1.0], len(large)) * large])
-    return Correction(BENCH, model, state, 1e-16 * np.eye(len(state)), np.full(3, 1e-5))
-
-
-def samples(count: int = 20_000, sizes: tuple[float, float] = (1.0, 1.0)) -> tuple[np.ndarray, np.ndarray]:
-    """Specific force in any direction, and temperatures, at random."""
-    rng = np.random.default_rng(3)
-    direction = rng.normal(size=(count, 3))
-    length = BENCH.gravity_mps2 * rng.uniform(*sizes, size=(count, 1))
-    force = length * direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    return force, rng.uniform(COLD_C, WARM_C, count)
-
-
-# -- how the programs read their files ---------------------------------------------------------------------------------
 
 
 def px4(text: str) -> Formula:
@@ -334,92 +288,6 @@ def test_a_comment_holds_no_name_that_could_end_it() -> None:
     made = saved().provenance.model_copy(update={"recording": "a */ \\\\ # ${x} 'b'\".mcap"})
     text = exported(saved().model_copy(update={"provenance": made}), correction(), "c").text()
     assert "a_x_b_.mcap" in text
-
-
-# -- C -----------------------------------------------------------------------------------------------------------------
-
-COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-compiled_only = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler: the header is not compiled")
-BY_FORCE_AND_TEMPERATURE = [
-    name for name in effects.names(BENCH) if not beyond_force_and_temperature(effects.effect_named(name, BENCH), BENCH)
-]
-FORMULAS = [
-    "mine = sin(fx/g) + 0.5*a*abs(p)/g**2", "mine = (abs(a)/g)**2.5*(a > 0)",
-    "mine = -minimum(a, o)*T/K + g*exp(-T/(40*K))", "mine = maximum(fy, fz)*sign(a)/(2 + cos(a/g))",
-    "mine = sqrt(g*g + a*a)/g - tanh(p/g) - arctan(o/g)*log(3) + 2**3*T/K*deg",
-]  # fmt: skip
-
-
-def compiled(text: str, folder: Path) -> Formula:
-    """The function of the header, compiled with every warning an error."""
-    (folder / "kf_calib_correct.h").write_text(text)
-    (folder / "shim.c").write_text(
-        '#include "kf_calib_correct.h"\n'
-        "void all(long n, double *z, double *t) { for (long k = 0; k < n; k++) "
-        "kf_calib_correct(z + 3 * k, t[k], z + 3 * k); }\n"
-    )
-    flags = ["-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
-    words = [str(COMPILER), *flags, "shim.c", "-o", "shim.so", *(["-lm"] if "math.h" in text else [])]
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    function = ctypes.CDLL(str(folder / "shim.so")).all
-
-    def corrected(readings: np.ndarray, temperature: np.ndarray) -> np.ndarray:
-        out, warmth = np.array(readings, float, order="C"), np.array(temperature, float)
-        pointer = ctypes.POINTER(ctypes.c_double)
-        function(ctypes.c_long(len(out)), out.ctypes.data_as(pointer), warmth.ctypes.data_as(pointer))
-        return out
-
-    return corrected
-
-
-@compiled_only
-@pytest.mark.parametrize("names", [(), *((name,) for name in [*BY_FORCE_AND_TEMPERATURE, *FORMULAS]),
-                                   ("second-order", "thermal-bias", "cross-coupling-ip", "mine = a**3")])  # fmt: skip
-def test_the_function_in_c_corrects_as_we_do(names: tuple[str, ...], tmp_path: Path) -> None:
-    own = correction(*names)
-    text = exported(saved(), own, "c").text()
-    force, temperature = samples(5000, (0.0, 2.0))
-    force[:500] *= 1e-4  # where a dead zone is, too
-    force[500:1000, 0] *= 1e-5
-    readings = own.predicted(force, temperature)
-    expected = own(readings, temperature)
-    if names:
-        assert np.abs(expected - (readings - own.bias_mps2) @ own.matrix.T).max() > 1e-6  # the effect does matter
-    found = compiled(text, tmp_path)(readings, temperature)
-    assert np.abs(found - expected).max() <= 1e-12 * BENCH.gravity_mps2
-    assert ("math.h" in text) == any(re.search(r"sin|cos|exp|log|sqrt|2\.5", name) for name in names)
-
-
-@compiled_only
-def test_the_function_in_c_takes_an_unknown_temperature_for_the_reference(tmp_path: Path) -> None:
-    own = correction("thermal-bias")
-    function = compiled(exported(saved(), own, "c").text(), tmp_path)
-    readings = own.predicted(samples(10)[0], 25.0)
-    np.testing.assert_array_equal(function(readings, np.full(10, np.nan)), function(readings, np.full(10, 25.0)))
-
-
-def test_effects_of_the_run_and_the_platform_are_named_and_left_out() -> None:
-    target = exported(saved(), correction("second-order", "bias-drift", "base-tilt"), "c")
-    assert "// Not corrected for bias-drift." in target.text() and "// Not corrected for base-tilt." in target.text()
-    assert set(target.correction.left_out) == {"bias-drift", "base-tilt"}
-
-
-def test_a_class_in_python_is_refused_in_c_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(effects, "_registered", {})
-
-    class Fifth(effects.SensorEffect):
-        """c a^5."""
-
-        name, title, source = "fifth", "fifth order", "test"
-        symbol, unit, scale = "Q5_", "s^8/m^4", 1e-8
-
-        def terms(self, s: effects.Stimulus) -> np.ndarray:
-            return s.along**5
-
-    effects.register(Fifth)
-    with pytest.raises(InputError, match=r"fifth is a class in Python, which cannot be written in C"):
-        exported(saved(), correction("fifth"), "c").text()
 
 
 def test_the_table_has_every_parameter_coefficient_and_constant(run: Any, tmp_path: Path) -> None:
