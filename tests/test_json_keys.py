@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "live": ("sim://?speed=500&orientations=6&dwell_s=4&slew_degps=360&sample_hz=20",),
     "simulate": ("made.mcap", *QUICK),
     "record": ("recorded.mcap", "lines.csv", "--axes", "y z x", "--gravity", "9.81"),
+    "export": ("cal.json", "--to", "px4", "-o", "px4.params", "--lossy"),
     "effects": (),
     "plan": ("--count", 4),
     "paper": ("--repetitions", 2),
@@ -38,6 +39,8 @@ def test_every_command_that_prints_json_is_in_the_page() -> None:
 def test_keys_are_those_of_the_page(command: str, run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("lines.csv").write_text(CSV)
+    if "cal.json" in COMMANDS[command]:
+        assert run("replay", HIDDEN, "--save", "cal.json")[0] == 0
     code, out, err = run(command, *COMMANDS[command], "--json")
     assert code == 0, err
     printed = json.loads(out.splitlines()[-1])

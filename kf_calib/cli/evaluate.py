@@ -28,6 +28,7 @@ from kf_calib.cli.options import (
     recording_of,
     recording_options,
     save_model_option,
+    save_option,
     save_view,
     settings_of,
     show,
@@ -53,6 +54,7 @@ STEPS = "Steps"
 @recording_options
 @filter_options
 @picture_options
+@save_option
 @save_model_option
 @overwrite_option
 @strict_option
@@ -62,6 +64,7 @@ STEPS = "Steps"
 def replay(
     ctx: click.Context,
     recording: Path,
+    save: Path | None,
     save_model: Path | None,
     overwrite: bool,
     strict: bool,
@@ -84,6 +87,7 @@ def replay(
 
         show(summary(result))
     with delivery(outputs, as_json) as deliver:
+        deliver.calibration(save, result, source)
         deliver.model(save_model, result)
         pictures.save(deliver, lambda path: save_view(result, path), figures_of(result))
     if strict and result.consistency.consistent is False:

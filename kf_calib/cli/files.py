@@ -16,6 +16,7 @@ from kf_calib.cli.failures import tell
 from kf_calib.support.output_files import Outputs
 
 if TYPE_CHECKING:
+    from kf_calib.bench.streams import Source
     from kf_calib.estimation.results import Calibration
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -86,6 +87,13 @@ class Delivery:
             from kf_calib.estimation import model_file
 
             self.file(path, lambda path: model_file.write(path, result))
+
+    def calibration(self, path: Path | None, result: Calibration, source: Source) -> None:
+        """Write the calibration file of a result, if there is to be one; source: what it was made from."""
+        if path is not None:
+            from kf_calib.exchange import calibration_file
+
+            self.file(path, lambda path: calibration_file.write(path, calibration_file.of_source(result, source)))
 
 
 @contextmanager

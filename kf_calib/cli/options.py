@@ -103,6 +103,10 @@ rrd_option = output_option("--rrd", metavar="FILE.rrd", help="Save the Rerun vie
 save_model_option = output_option(
     "--save-model", metavar="FILE.toml", help="Save the model here, for --model to read.", panel=OUTPUT
 )
+save_option = output_option(
+    "--save", metavar="CAL.json", panel=OUTPUT,
+    help="Save the calibration here, whole: for apply, verify, history, and --model.",
+)  # fmt: skip
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist already.", panel=OUTPUT)
 effects_from_option = click.option(
     "--effects-from", "effects_from", multiple=True, type=click.Path(path_type=Path), metavar="FILE.py", panel=MODEL,
@@ -112,6 +116,25 @@ trust_option = click.option(
     "--trust", is_flag=True, panel=MODEL,
     help="Run the Python files that a model file or a journal names: they can do all that you can.",
 )  # fmt: skip
+
+
+def dwell_options(command: F) -> F:
+    """Which readings of a run count."""
+    options = [
+        click.option("--leave-out", "left_out", type=click.IntRange(min=1), multiple=True, metavar="DWELL", panel=MODEL,
+                     help="Number of a dwell that is not to be used; repeatable."),
+        click.option("--settle-s", type=NOT_NEGATIVE, default=1.0, show_default=True, panel=MODEL,
+                     help="Seconds left out after each arrival; of a short dwell no more than a third."),
+        click.option("--still-deg", type=POSITIVE, default=0.05, show_default=True, panel=MODEL,
+                     help="Motion within half a second that still counts as standing still, deg."),
+        click.option("--gate/--no-gate", default=True, show_default=True, help="Reject outlying readings.",
+                     panel=MODEL),
+        click.option("--gate-sigma", type=NumberInRange(min=3), default=6.0, show_default=True, panel=MODEL,
+                     help="Where the gate stands, robust sigma."),
+    ]  # fmt: skip
+    for option in reversed(options):
+        command = option(command)
+    return command
 
 
 def filter_options(command: F) -> F:
@@ -124,16 +147,7 @@ def filter_options(command: F) -> F:
         trust_option,
         click.option("--model", "model_file", type=click.Path(path_type=Path), metavar="FILE.toml", panel=MODEL,
                      help="A model file (replay --save-model); its effects come before those of --with."),
-        click.option("--leave-out", "left_out", type=click.IntRange(min=1), multiple=True, metavar="DWELL", panel=MODEL,
-                     help="Number of a dwell that is not to be used; repeatable."),
-        click.option("--settle-s", type=NOT_NEGATIVE, default=1.0, show_default=True, panel=MODEL,
-                     help="Seconds left out after each arrival; of a short dwell no more than a third."),
-        click.option("--still-deg", type=POSITIVE, default=0.05, show_default=True, panel=MODEL,
-                     help="Motion within half a second that still counts as standing still, deg."),
-        click.option("--gate/--no-gate", default=True, show_default=True, help="Reject outlying readings.",
-                     panel=MODEL),
-        click.option("--gate-sigma", type=NumberInRange(min=3), default=6.0, show_default=True, panel=MODEL,
-                     help="Where the gate stands, robust sigma."),
+        dwell_options,
         click.option("--prior", type=click.Choice(["diffuse", "navigation", "mems"]), default="diffuse",
                      show_default=True, help="What is believed of the sensors before the run.", panel=MODEL),
         click.option("--bias-walk", type=NOT_NEGATIVE, default=0.0, show_default=True, panel=MODEL,
@@ -201,7 +215,8 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
     return keys
 
 
-def recording_of(path: Path, options: Mapping[str, Any]) -> Recording:
+def recording_of(path: Path, options: Mapping[str, Any], angles: bool = True) -> Recording:
+    """The recording at a path, as the options say it is to be read; angles: whether it must have platform angles."""
     from kf_calib.sources.files.recording import Recording
 
     return Recording(
@@ -213,23 +228,32 @@ def recording_of(path: Path, options: Mapping[str, Any]) -> Recording:
         pose_topic=options["pose_topic"],
         temperature_topic=options["temperature_topic"],
         max_chunk_mb=options["max_chunk_mb"],
+        angles=angles,
     )
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
-    from kf_calib.dwells.stationarity import Stillness
     from kf_calib.estimation.prior import PRIORS
     from kf_calib.estimation.settings import Settings
 
     return Settings(
         engine=options["engine"],
         prior=PRIORS[options["prior"]],
-        stillness=Stillness(tolerance_deg=options["still_deg"], settle_s=options["settle_s"]),
-        gate_sigma=options["gate_sigma"] if options["gate"] else None,
         walk_mps2_per_sqrt_s=options["bias_walk"],
         effects=effects_of(options),
-        left_out=tuple(options["left_out"]),
+        **used_of(options),
     )
+
+
+def used_of(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of ``Settings`` by the options of ``dwell_options``: which readings count."""
+    from kf_calib.dwells.stationarity import Stillness
+
+    return {
+        "stillness": Stillness(tolerance_deg=options["still_deg"], settle_s=options["settle_s"]),
+        "gate_sigma": options["gate_sigma"] if options["gate"] else None,
+        "left_out": tuple(options["left_out"]),
+    }
 
 
 def opened(path: Path, options: Mapping[str, Any]) -> tuple[Recording, Settings]:

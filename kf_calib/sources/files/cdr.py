@@ -237,8 +237,8 @@ def temperature_message(frame_id: str) -> bytes:
     return _append(_header(frame_id), 8, bytes(2 * 8))
 
 
-def pack(kind: MessageType, template: bytes, stream: Stream) -> list[bytes]:
-    """One message for each sample of ``stream``: ``template`` with its stamp and values put in.
+def filled(kind: MessageType, template: bytes, stream: Stream) -> NDArray[np.void]:
+    """One message (n,) for each sample of ``stream``: ``template`` with its stamp and values put in.
 
     Raises CdrError where the number of values is not the template's or a stamp does not fit the message.
     """
@@ -250,8 +250,14 @@ def pack(kind: MessageType, template: bytes, stream: Stream) -> list[bytes]:
         raise CdrError("stamps must be nanoseconds between the years 1970 and 2038")
     messages = np.frombuffer(bytearray(template * len(stream)), dtype_of(layout))
     messages["sec"], messages["nanosec"], messages["values"] = seconds, nanoseconds, stream.values
-    packed = messages.tobytes()
-    return [packed[start : start + layout.size] for start in range(0, len(packed), layout.size)]
+    return messages
+
+
+def pack(kind: MessageType, template: bytes, stream: Stream) -> list[bytes]:
+    """The same, the bytes of each message."""
+    messages = filled(kind, template, stream)
+    packed, size = messages.tobytes(), messages.itemsize
+    return [packed[start : start + size] for start in range(0, len(packed), size)]
 
 
 class Decoder:

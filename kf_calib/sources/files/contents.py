@@ -23,6 +23,8 @@ ACCEL_TOPIC = "/accelerometer"
 ANGLES_TOPIC = "/platform/angles"
 ATTITUDE_TOPIC = "/platform/attitude"
 TEMPERATURE_TOPIC = "/temperature"
+CALIBRATED_TOPIC = "/accelerometer/calibrated"
+"""Of corrected readings, which nobody calibrates again unless he names it."""
 
 
 def bench_checksum(metadata: Mapping[str, str]) -> str:
@@ -159,6 +161,7 @@ class Parts:
                 f"{self.path} has no {role.quantity} topic {wanted!r}, it has {self}: give one of schema "
                 f"{role.schemas} by {role.option}."
             )
+        candidates = [topic for topic in candidates if topic != CALIBRATED_TOPIC] or candidates
         if len(candidates) > 1:
             raise InputError(
                 f"{self.path} has several {role.quantity} topics, {', '.join(candidates)}: choose one by {role.option}."

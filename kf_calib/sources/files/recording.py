@@ -46,7 +46,8 @@ class Recording:
     accel_scale: factor on the readings, one for all or one a sensor (9.80665 for a file in g). angle_scale: factor on
     the gimbal angles (0.017453 for a file in degrees).
     accel_topic, pose_topic, temperature_topic: which to use where the file has several of the kind.
-    max_chunk_mb: chunks that unpack to more are passed over, and told.
+    max_chunk_mb: chunks that unpack to more are passed over, and told. angles: whether angles or attitudes are wanted;
+    without them the batches have none.
     Raises InputError where the file, or what it holds, cannot be used.
     """
 
@@ -61,6 +62,7 @@ class Recording:
         pose_topic: str | None = None,
         temperature_topic: str | None = None,
         max_chunk_mb: float = MAX_CHUNK_MB,
+        angles: bool = True,
     ) -> None:
         self.path = Path(path)
         self.fraction = 0.0
@@ -70,7 +72,8 @@ class Recording:
         self.warnings = [file.trouble for file in self._parts.files if file.trouble]
         self._parts.contents = [self._survey(file) for file in self._parts.files]
         self._accel = self._require(READINGS, "convert the readings to sensor_msgs/msg/Imu")
-        self._pose = self._require(POSES, "record the angles too, as sensor_msgs/msg/JointState by the same clock")
+        advice = "record the angles too, as sensor_msgs/msg/JointState by the same clock"
+        self._pose = self._require(POSES, advice) if angles else None
         self._parts.choose(TEMPERATURES, temperature_topic)  # optional, but not to be guessed
         self.bench = self._describe_bench(overrides)
         self._opening_warnings = len(self.warnings)
@@ -116,17 +119,18 @@ class Recording:
         self, file: McapFile, passage: _Passage, decoders: _Decoders, growing: bool
     ) -> Iterator[tuple[int, Batch]]:
         """The batches of one file, and up to which byte it has been read then."""
-        accel, pose = (passage.track(topic, decoders.of(role, topic)) for role, topic in
-                       ((READINGS, self._accel), (POSES, self._pose)))  # fmt: skip
+        accel = passage.track(self._accel, decoders.of(READINGS, self._accel))
+        pose = passage.track(self._pose, decoders.of(POSES, self._pose)) if self._pose else None
         temperature = None
         for block in file.blocks(self._warn_of_damage, growing=growing):
             messages = passage.find(block)
             if not temperature and (topic := self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])):
                 temperature = passage.track(topic, decoders.of(TEMPERATURES, topic))
-            readings, angles = accel.read(block, messages), pose.read(block, messages)
             batch = Batch(
-                _scaled(readings, self._accel_scale),
-                _scaled(angles, self._angle_scale),
+                _scaled(accel.read(block, messages), self._accel_scale),
+                _scaled(pose.read(block, messages), self._angle_scale)
+                if pose
+                else Stream.empty(self.bench.pose_width),
                 temperature.read(block, messages) if temperature else Stream.empty(1),
             )
             yield block.end, batch
@@ -184,8 +188,8 @@ class Recording:
         damage = f"{self.path}: the description of the bench in it is damaged"
         if is_damaged:
             self.warnings.append(f"{damage}: only what options give is used.")
-        has_angles = self._parts.kind(POSES, self._pose) is JOINT_STATE
-        if not has_angles and self._angle_scale != 1.0:
+        has_angles = self._pose is not None and self._parts.kind(POSES, self._pose) is JOINT_STATE
+        if self._pose and not has_angles and self._angle_scale != 1.0:
             raise InputError(
                 f"{self.path}: topic {self._pose} has attitudes, which have no unit: leave out --angle-unit."
             )

@@ -1,0 +1,1 @@
+"""Calibrations in and out: saved, applied, verified, compared over time, exported to other programs, certified."""

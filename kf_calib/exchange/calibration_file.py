@@ -1,0 +1,382 @@
+"""A calibration as a file: everything that is needed to apply it, to defend it, and to repeat it.
+
+    saved = calibration_file.read("cal.json")
+    saved.correction()(readings_mps2, temperature_c)
+
+JSON in SI units, of one version; ``calibration.schema.json`` beside this module is its JSON Schema. A file may name
+effects whose classes are in a user's Python file: reading runs none, ``model`` runs those that it may.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import platform
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError, model_validator
+
+from kf_calib import effects
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Source
+from kf_calib.effects.programs import Program, allowed
+from kf_calib.errors import BenchError, InputError
+from kf_calib.estimation.correction import Correction
+from kf_calib.estimation.measurement_model import STATE_COUNT, Model
+from kf_calib.estimation.observability import visibility_of
+from kf_calib.estimation.results import Calibration
+from kf_calib.sources.files.bags import files_of
+from kf_calib.support.output_files import write_whole
+from kf_calib.support.plain_text import COMMANDS, LONGEST, cut
+
+FORMAT, VERSION = "kf_calib.calibration", 1
+_LARGEST_BYTES = 50_000_000
+AFFINE = tuple(f"{name}{i}" for i in (1, 2, 3) for name in ("sx", "sy", "sz", "b"))
+"""Symbols of the affine state: reading i = sx_i f_x + sy_i f_y + sz_i f_z + b_i."""
+
+Text = Annotated[str, StringConstraints(max_length=LONGEST, pattern=rf"\A[^{COMMANDS}]*\z")]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Three = Annotated[list[Positive], Field(min_length=3, max_length=3)]
+Sha256 = Annotated[str, StringConstraints(pattern=r"\A[0-9a-f]{64}\z")]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class SavedParameter(_Part):
+    """One of the twelve parameters, or a coefficient or constant of an effect; null where it was not determined."""
+
+    symbol: Text
+    value: Number | None
+    sigma: Positive | None
+    unit: Text
+    nominal: Number
+
+
+class SavedState(_Part):
+    """The state of the filter: affine, then the effects' coefficients; of a constant, ln(constant / its value).
+
+    undetermined: symbols of the parameters and coefficients that the run did not determine.
+    """
+
+    symbols: list[Text]
+    values: list[Number]
+    covariance: list[list[Number]]
+    undetermined: list[Text]
+
+
+class SavedProgram(_Part):
+    """A Python file that defines effects."""
+
+    path: Text
+    sha256: Sha256
+
+
+class SavedEffect(_Part):
+    """An effect of the model: as ``--with`` takes it, with its constant where it has one."""
+
+    text: Text
+    constant: Number | None = None
+
+
+class SavedNoise(_Part):
+    """The noise model, 1 sigma."""
+
+    sigma_mps2: Three
+    inflation: Three
+    dwell_sigma_mps2: Three
+    dwell_sigma_stated: bool
+    angle_sigma_deg: Positive
+    angle_sigma_stated: bool
+    walk_mps2_per_sqrt_s: Positive
+
+
+class SavedConsistency(_Part):
+    """Whether model and measurements agree; null where nothing was left over to judge by."""
+
+    consistent: bool | None
+    p_value: Number | None
+    nis_per_dof: Number | None
+    dof: int
+    residual_rms_mps2: Positive
+    held_out_rms_mps2: Positive | None
+    held_out_floor_mps2: Positive | None
+
+
+class SavedDwell(_Part):
+    """One orientation: gimbal angles (null: attitude recorded), begin, end, readings used."""
+
+    gimbal_deg: list[Number] | None
+    start_s: Number
+    end_s: Number
+    readings: int
+
+
+class SavedConditions(_Part):
+    """Under which conditions it holds: when, how warm, which orientations. began: null where stamps are no dates."""
+
+    began: Text | None
+    duration_s: Positive
+    temperature_min_c: Number | None
+    temperature_mean_c: Number | None
+    temperature_max_c: Number | None
+    dwells: list[SavedDwell]
+
+
+class SavedProvenance(_Part):
+    """Where it comes from."""
+
+    recording: Text
+    sha256: Sha256 | None
+    bench: dict[Text, Text]
+    settings: dict[Text, Text]
+    programs: list[SavedProgram]
+    versions: dict[Text, Text]
+    created: Text
+    warnings: list[Text]
+
+
+class SavedCalibration(_Part):
+    """The content of a calibration file.
+
+    not_seen: effects of the catalogue that the orientations could not show, and which may thus be present.
+    """
+
+    format: Literal["kf_calib.calibration"]
+    version: Literal[1]
+    parameters: list[SavedParameter]
+    state: SavedState
+    effects: list[SavedEffect]
+    noise: SavedNoise
+    consistency: SavedConsistency
+    not_seen: list[Text]
+    conditions: SavedConditions
+    provenance: SavedProvenance
+
+    @model_validator(mode="after")
+    def _agrees_with_itself(self) -> SavedCalibration:
+        state, count = self.state, len(self.state.symbols)
+        if tuple(state.symbols[:STATE_COUNT]) != AFFINE or len(state.values) != count:
+            raise ValueError("state has other symbols than its values need")
+        covariance = np.array(state.covariance) if all(len(row) == count for row in state.covariance) else np.zeros(0)
+        if covariance.shape != (count, count) or not np.allclose(covariance, covariance.T, rtol=1e-9, atol=0.0):
+            raise ValueError(f"state.covariance is no symmetric matrix of {count} rows")
+        scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        if np.linalg.eigvalsh(covariance / np.outer(scale, scale)).min() < -1e-6:
+            raise ValueError("state.covariance is no covariance: it has a negative variance")
+        twelve = [(each.symbol, each.unit) for each in self.parameters[:STATE_COUNT]]
+        if twelve != list(zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True)):
+            raise ValueError(f"parameters must begin with {', '.join(paper_parameters.SYMBOLS)}")
+        found = paper_parameters.parameters_of(np.array(state.values[:STATE_COUNT]))
+        for own, value in zip(self.parameters, found, strict=False):
+            if own.value is not None and not math.isclose(own.value, value, rel_tol=1e-9, abs_tol=1e-12):
+                raise ValueError(f"parameters say {own.symbol} = {own.value!r}, but its state says {value!r}")
+        return self
+
+    @property
+    def bench(self) -> Bench:
+        """The bench of the run."""
+        return Bench.from_metadata(dict(self.provenance.bench), "axes" in self.provenance.bench)
+
+    @property
+    def twelve(self) -> tuple[Floats, Floats]:
+        """The twelve parameters (12,) and their covariance (12, 12)."""
+        state = np.array(self.state.values[:STATE_COUNT])
+        jacobian = paper_parameters.jacobian(state)
+        covariance = np.array(self.state.covariance)[:STATE_COUNT, :STATE_COUNT]
+        return paper_parameters.parameters_of(state), jacobian @ covariance @ jacobian.T
+
+    def model(self, origin: Path | None = None, named: Sequence[Path] = (), trust: bool = False) -> Model:
+        """The fitted model, with the constants of its effects.
+
+        origin: where the file lies, from which paths of programs count. named, trust: Python files that may be run, as
+        of a model file. Raises InputError if a program may not be run, or an effect is not known.
+        """
+        origin = origin or Path(FORMAT)
+        programs = [Program(origin.parent / each.path, each.sha256) for each in self.provenance.programs]
+        for file in allowed(origin, programs, named, trust).files:
+            effects.load_file(file)
+        model = Model(self.bench)
+        for own in self.effects:
+            effect = effects.effect_named(own.text, self.bench)
+            model += effect if own.constant is None else effect.at(own.constant)
+        if model.count != len(self.state.symbols):
+            raise InputError(f"{origin}: its effects have {model.count - STATE_COUNT} coefficients, its state has "
+                             f"{len(self.state.symbols) - STATE_COUNT}: it was saved by another version.")  # fmt: skip
+        return model
+
+    def correction(self, origin: Path | None = None, named: Sequence[Path] = (), trust: bool = False) -> Correction:
+        """What turns readings into specific force by this calibration; arguments as for ``model``."""
+        return Correction(
+            self.bench, self.model(origin, named, trust), np.array(self.state.values),
+            np.array(self.state.covariance), np.array(self.noise.sigma_mps2), tuple(self.state.undetermined),
+        )  # fmt: skip
+
+
+def saved(
+    result: Calibration, recording: str = "", sha256: str | None = None, first_ns: int | None = None
+) -> SavedCalibration:
+    """A calibration as it is saved; recording: its name. sha256: of its file. first_ns: stamp of its first sample."""
+    estimate, noise, judged = result.estimate, result.noise, result.consistency
+    return SavedCalibration(
+        format=FORMAT,
+        version=VERSION,
+        parameters=[SavedParameter(symbol=p.symbol, value=p.value, sigma=p.sigma, unit=p.unit, nominal=p.nominal)
+                    for p in result.parameters.values()],
+        state=SavedState(
+            symbols=[*AFFINE, *(c.symbol for c in result.model.coefficients)],
+            values=estimate.state.tolist(),
+            covariance=estimate.covariance.tolist(),
+            undetermined=[p.symbol for p in result.parameters.values() if p.sigma is None],
+        ),
+        effects=[SavedEffect(text=effects.as_text(each), constant=each.value if each.unknown else None)
+                 for each in result.model.effects],
+        noise=SavedNoise(
+            sigma_mps2=noise.sigma_mps2.tolist(), inflation=noise.inflation.tolist(),
+            dwell_sigma_mps2=noise.scatter_mps2.tolist(), dwell_sigma_stated=noise.scatter_stated,
+            angle_sigma_deg=math.degrees(noise.setting_rad), angle_sigma_stated=noise.setting_stated,
+            walk_mps2_per_sqrt_s=float(noise.walk_mps2_per_sqrt_s),
+        ),
+        consistency=SavedConsistency(
+            consistent=judged.consistent, p_value=judged.p_value, nis_per_dof=judged.nis_per_dof, dof=judged.dof,
+            residual_rms_mps2=result.residual_rms_mps2, held_out_rms_mps2=result.held_out_rms_mps2,
+            held_out_floor_mps2=result.held_out_floor_mps2,
+        ),
+        not_seen=_not_seen(result),
+        conditions=_conditions(result, first_ns),
+        provenance=_provenance(result, recording, sha256),
+    )  # fmt: skip
+
+
+def of_source(result: Calibration, source: Source) -> SavedCalibration:
+    """The calibration of a source: of a recording with its name, checksum and the date of its first sample."""
+    path = getattr(source, "path", None)
+    first_ns = next((int(b.accel.time_ns[0]) for b in source if len(b.accel)), None) if path else None
+    name, sha256 = ("", None) if path is None else (path.name, fingerprint(path))
+    return saved(result, name, sha256, first_ns)
+
+
+def fingerprint(path: Path) -> str:
+    """SHA-256 of a recording, all files of a bag one after the other; raises InputError if it cannot be read."""
+    digest = hashlib.sha256()
+    try:
+        for each in files_of(path):
+            with each.open("rb") as file:
+                hashlib.file_digest(file, lambda: digest)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}): name a recording.") from None
+    return digest.hexdigest()
+
+
+def _not_seen(result: Calibration) -> list[str]:
+    """Return the names of effects of the catalogue that the orientations cannot show."""
+    every = [effects.effect_named(name, result.bench) for name in effects.names(result.bench)]
+    others = [each for each in every if str(each) not in result.model.parts and not each.walks]
+    seen = visibility_of(result.fit, others)
+    return [str(each.effect) for each in seen if not each.visible]
+
+
+def _conditions(result: Calibration, first_ns: int | None) -> SavedConditions:
+    """Return when and how the run was made."""
+    dwells = [visit.dwell for visit in result.visits]
+    warmth = np.concatenate([dwell.nodes.temperature_c for dwell in dwells])
+    known = bool(np.isfinite(warmth).any())
+    return SavedConditions(
+        began=_date(first_ns),
+        duration_s=dwells[-1].end_s,
+        temperature_min_c=float(np.nanmin(warmth)) if known else None,
+        temperature_mean_c=float(np.nanmean(warmth)) if known else None,
+        temperature_max_c=float(np.nanmax(warmth)) if known else None,
+        dwells=[SavedDwell(gimbal_deg=np.degrees(dwell.recorded_pose).tolist() if result.bench.axes else None,
+                           start_s=dwell.start_s, end_s=dwell.end_s, readings=dwell.count) for dwell in dwells],
+    )  # fmt: skip
+
+
+def _date(first_ns: int | None) -> str | None:
+    """Return a stamp as a date in UTC; None for stamps that count from a start of a clock (before the year 2000)."""
+    if first_ns is None or not 946_684_800 <= first_ns / 1e9 < 4_102_444_800:
+        return None
+    return datetime.fromtimestamp(first_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+
+
+def _provenance(result: Calibration, recording: str, sha256: str | None) -> SavedProvenance:
+    """Return where a result comes from."""
+    settings = result.settings
+    return SavedProvenance(
+        recording=recording,
+        sha256=sha256,
+        bench=result.bench.to_metadata(),
+        settings={
+            "engine": settings.engine, "gate_sigma": str(settings.gate_sigma), "prior": str(settings.prior),
+            "walk_mps2_per_sqrt_s": str(settings.walk_mps2_per_sqrt_s), "stillness": str(settings.stillness),
+            "left_out": " ".join(map(str, settings.left_out)),
+        },
+        programs=[SavedProgram(path=str(each.path), sha256=each.sha256)
+                  for each in effects.programs_of(result.model.effects)],
+        versions={"kf_calib": version("kf_calib"), "numpy": np.__version__, "python": platform.python_version()},
+        created=now(),
+        warnings=list(result.warnings),
+    )  # fmt: skip
+
+
+def now() -> str:
+    """The present in UTC; what SOURCE_DATE_EPOCH says where that is set, so that files can be made again."""
+    stated = os.environ.get("SOURCE_DATE_EPOCH", "")
+    moment = datetime.fromtimestamp(int(stated), UTC) if re.fullmatch(r"\d{1,11}", stated) else datetime.now(UTC)
+    return moment.isoformat(timespec="seconds")
+
+
+def write(path: Path, content: SavedCalibration) -> None:
+    """Write a calibration file, wholly or not at all; raises InputError if it cannot be written."""
+    write_whole(path, (json.dumps(content.model_dump(mode="json"), indent=1, allow_nan=False) + "\n").encode())
+
+
+def read(path: str | Path) -> SavedCalibration:
+    """Read a calibration file and check all of it; raises InputError, with the path and the place in it."""
+    path = Path(path)
+    try:
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise InputError(f"{path}: is larger than any calibration: give a file that --save has written.")
+        content = json.loads(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}): give a file that --save has written.") from None
+    except (ValueError, RecursionError):
+        raise InputError(f"{path}: is no JSON: give a calibration that --save has written.") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise InputError(f"{path}: is no calibration (its format is not {FORMAT}): give one that --save has written.")
+    if content.get("version") != VERSION:
+        said = cut(repr(content.get("version")), 20)
+        raise InputError(f"{path}: is of version {said}, this program reads version {VERSION}: update kf_calib.")
+    return _checked(path, content)
+
+
+def _checked(path: Path, content: Any) -> SavedCalibration:
+    """Return the content if all of it is as it must be; raise InputError if not."""
+    try:
+        found = SavedCalibration.model_validate(content)
+        found.bench  # noqa: B018  # raises BenchError
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        place, said = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
+        where = f"{cut(place, 100)}: " if place else ""
+        raise InputError(f"{path}: {where}{said}: give a calibration as --save has written it.") from None
+    except BenchError as error:
+        raise InputError(f"{path}: provenance.bench: {error}") from None
+    return found
+
+
+def schema() -> dict[str, Any]:
+    """The JSON Schema of calibration files."""
+    return SavedCalibration.model_json_schema()

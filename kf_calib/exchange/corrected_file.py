@@ -1,0 +1,134 @@
+"""A copy of a recording with the corrected readings beside the raw ones, as one more topic.
+
+The message is sensor_msgs/msg/Imu: ``linear_acceleration`` is specific force in the frame of the block, and its
+covariance (row by row) that of the calibration, largest over all directions of gravity, and of the noise of a reading.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.streams import Batch, Stream
+from kf_calib.errors import InputError
+from kf_calib.estimation.correction import Correction
+from kf_calib.sources.files import cdr
+from kf_calib.sources.files.contents import CALIBRATED_TOPIC
+from kf_calib.sources.files.mcap_append import TopicAppender, source_file
+from kf_calib.sources.files.recording import Recording
+
+FRAME = "block"
+
+
+@dataclass(frozen=True)
+class Applied:
+    """What was corrected: number of readings, those that are not finite, and the extremes of the temperature, degC
+    (None: not used)."""
+
+    readings: int
+    not_finite: int
+    temperature_c: tuple[float, float] | None
+
+
+def apply_to_file(
+    correction: Correction, recording: Recording, out: Path, on_progress: Callable[[float], None] | None = None
+) -> Applied:
+    """Write the copy to ``out``. Raises InputError where the recording cannot be read, is not whole, or has no
+    temperature where an effect needs one."""
+    thermometer = _Thermometer(bool(correction.needs_temperature))
+    count = bad = 0
+    source = source_file(recording.path)
+    with out.open("wb") as file:
+        copied = _half(on_progress, 0.0)
+        appender = TopicAppender(source, file, CALIBRATED_TOPIC, cdr.IMU, _template(correction), copied)
+        told = _half(on_progress, 0.5)
+        for batch in recording:
+            for readings, temperature_c in thermometer.pairs(batch):
+                values = correction(readings.values, temperature_c)
+                appender.add(Stream(readings.time_ns, values))
+                count, bad = count + len(values), bad + int(np.count_nonzero(~np.isfinite(values).all(axis=1)))
+            if told is not None:
+                told(recording.fraction)
+        for readings, temperature_c in thermometer.rest():
+            appender.add(Stream(readings.time_ns, correction(readings.values, temperature_c)))
+            count += len(readings)
+        appender.finish()
+    return Applied(count, bad, thermometer.extremes)
+
+
+def _half(told: Callable[[float], None] | None, start: float) -> Callable[[float], None] | None:
+    """Return what tells the progress of one of two halves of the work."""
+    return None if told is None else lambda share: told(start + 0.5 * share)
+
+
+def _template(correction: Correction) -> bytes:
+    """Return a message with the covariance of corrected readings filled in."""
+    directions = correction.bench.gravity_mps2 * np.vstack([np.eye(3), -np.eye(3)])
+    temperature = 25.0 if correction.needs_temperature else None
+    covariances = correction.covariance_of(directions, temperature, noise=True)
+    worst = covariances[np.argmax(np.einsum("nii->n", covariances))]
+    message = bytearray(cdr.imu_message(FRAME))
+    message[-72:] = struct.pack("<9d", *worst.ravel())  # the last field of the message
+    return bytes(message)
+
+
+class _Thermometer:
+    """Pairs readings with temperatures, interpolated between measurements and constant beyond them.
+
+    Readings wait until a temperature as late as they are has come; memory is that of the readings between two
+    temperatures.
+    """
+
+    def __init__(self, needed: bool) -> None:
+        self._needed = needed
+        self._times, self._values = np.zeros(0, np.int64), np.zeros(0)
+        self._waiting = Stream.empty(3)
+        self.extremes: tuple[float, float] | None = None
+
+    def pairs(self, batch: Batch) -> list[tuple[Stream, Floats | None]]:
+        """Readings that can be corrected now, and their temperatures (None: not needed)."""
+        if not self._needed:
+            return [(batch.accel, None)] if len(batch.accel) else []
+        self._take(batch.temperature)
+        self._waiting += batch.accel
+        if not len(self._times):
+            return []
+        ready = self._waiting.time_ns <= self._times[-1]
+        count = len(ready) if ready.all() else int(np.argmin(ready))  # in order of their coming
+        found, self._waiting = self._waiting[:count], self._waiting[count:]
+        return [self._paired(found)] if count else []
+
+    def rest(self) -> list[tuple[Stream, Floats | None]]:
+        """Readings after the last temperature. Raises InputError where there was none at all."""
+        if not len(self._waiting):
+            return []
+        if not len(self._times):
+            raise InputError(
+                "the recording has no temperature, which the calibration needs: record it on /temperature, or name "
+                "its topic by --temperature-topic."
+            )
+        return [self._paired(self._waiting)]
+
+    def _take(self, stream: Stream) -> None:
+        """Keep new temperatures that are finite and later than the last, and no more of the old ones than needed."""
+        values = stream.values[:, 0] if len(stream) else np.zeros(0)
+        later = np.maximum.accumulate(np.append(self._times[-1:], stream.time_ns))
+        fresh = stream.time_ns > later[:-1] if len(later) > len(stream) else np.ones(len(stream), bool)
+        fresh &= np.isfinite(values)
+        if not fresh.any():
+            return
+        first = self._waiting.time_ns[0] if len(self._waiting) else stream.time_ns[0]
+        kept = max(int(np.searchsorted(self._times, first)) - 1, 0)
+        self._times = np.append(self._times[kept:], stream.time_ns[fresh])
+        self._values = np.append(self._values[kept:], values[fresh])
+        low, high = float(values[fresh].min()), float(values[fresh].max())
+        old = self.extremes or (low, high)
+        self.extremes = min(low, old[0]), max(high, old[1])
+
+    def _paired(self, readings: Stream) -> tuple[Stream, Floats]:
+        return readings, np.interp(readings.time_ns, self._times, self._values)

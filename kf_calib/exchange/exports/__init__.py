@@ -1,0 +1,53 @@
+"""A calibration in the form of another program: a module for each, with the formula of that program.
+
+    exports.exported(saved, correction, "px4", lossy=True).text()
+
+All take readings in m/s^2 and give specific force in the frame of the block, m/s^2.
+"""
+
+from __future__ import annotations
+
+from kf_calib.errors import InputError
+from kf_calib.estimation.correction import Correction
+from kf_calib.exchange.calibration_file import SavedCalibration
+from kf_calib.exchange.exports.ardupilot import ArduPilot
+from kf_calib.exchange.exports.c_header import CHeader
+from kf_calib.exchange.exports.imu_calib import ImuCalib
+from kf_calib.exchange.exports.imu_tk import ImuTk
+from kf_calib.exchange.exports.imucal import Imucal
+from kf_calib.exchange.exports.kalibr import Kalibr
+from kf_calib.exchange.exports.openvins import OpenVins
+from kf_calib.exchange.exports.px4 import Px4
+from kf_calib.exchange.exports.table import Table
+from kf_calib.exchange.exports.target import Target
+from kf_calib.exchange.exports.vectornav import VectorNav
+from kf_calib.support.units import shown
+
+TARGETS: dict[str, type[Target]] = {
+    "px4": Px4, "ardupilot": ArduPilot, "imucal": Imucal, "imu_calib": ImuCalib, "kalibr": Kalibr,
+    "openvins": OpenVins, "imu_tk": ImuTk, "vectornav": VectorNav, "csv": Table, "c": CHeader,
+}  # fmt: skip
+
+
+def exported(saved: SavedCalibration, correction: Correction, to: str, lossy: bool = False) -> Target:
+    """A calibration in the form of the program ``to``.
+
+    Raises InputError where the program cannot hold all of it, with the size of the error that is left, unless
+    ``lossy``.
+    """
+    target = TARGETS[to](saved, correction)
+    if target.error_left is not None and not lossy:
+        unit, (rms, worst) = shown("m/s^2"), target.error_left
+        raise InputError(
+            f"{target.title} cannot hold {', '.join(target.lost)}, which leaves an error of {unit.text(rms)} rms and "
+            f"{unit.text(worst)} at worst over all directions of gravity{_range(target)}: accept it with --lossy, or "
+            "export to c or csv, which hold all."
+        )
+    return target
+
+
+def _range(target: Target) -> str:
+    """The temperatures, where they matter."""
+    if not target.correction.needs_temperature:
+        return ""
+    return f" at {target.grid.low_c:.1f} to {target.grid.high_c:.1f} °C"

@@ -1,0 +1,246 @@
+"""The calibrations of one block over time: drift, repeatability, and when to calibrate again.
+
+Each parameter is modelled by itself. Between calibrations it drifts at a constant rate and walks at random; from run to
+run it varies by the repeatability r, which is what handling, mounting and switching off do:
+
+    level(t + dt) = level(t) + drift dt + w,  var w = q^2 dt;   found = level + e,  var e = r^2 + sigma^2,
+
+sigma being that of the calibration. A Kalman filter with diffuse level and drift gives level, drift, and the restricted
+likelihood of q and r. Few calibrations tell little of q and r, and a single best pair would make sigmas too small: all
+pairs of a grid are weighted by likelihood and prior, flat in ln q and ln r up to the scatter found, falling beyond.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.errors import InputError
+from kf_calib.exchange.calibration_file import SavedCalibration
+from kf_calib.support.tail_probabilities import chi_squared_tail
+
+DAY_S = 86400.0
+FEWEST = 2
+_COVERED = 2.0  # sigmas of a parameter that have to be within its tolerance
+_GRID = np.concatenate([[0.0], np.geomspace(0.03, 30.0, 25)])
+"""Values of q and r, in units of the scatter that they are to explain."""
+_LONGEST_DAYS = 20 * 365.25
+_DIFFUSE = 1e8  # variance of level and drift before the first calibration, in units of what is found
+
+
+@dataclass(frozen=True)
+class Track:
+    """One parameter over the calibrations, in SI and days.
+
+    values (n,), sigmas (n,): as found and calibrated. level, level_sigma: what it is at the last calibration, by all of
+    them. drift, drift_sigma: its change per day (None: fewer than three). walk: intensity q of its random walk, per
+    square root of a day, rms over what is likely. repeatability: r, likewise. constant_p:
+    that a constant parameter shows such differences. predicted, predicted_sigma (n,): each calibration as those before
+    it predict it; NaN for the first.
+    """
+
+    symbol: str
+    unit: str
+    values: Floats
+    sigmas: Floats
+    predicted: Floats
+    predicted_sigma: Floats
+    level: float
+    level_sigma: float
+    drift: float | None
+    drift_sigma: float | None
+    walk: float
+    repeatability: float
+    constant_p: float
+
+    def known_after(self, days: float) -> tuple[float, float]:
+        """Value and sigma of the parameter so many days after the last calibration, used as the last one found it.
+
+        The sigma is that of the difference from the last value in use: drift that is not corrected, walk,
+        repeatability, and the uncertainty of the calibration itself.
+        """
+        rate, rate_sigma = (self.drift or 0.0), (self.drift_sigma or 0.0)
+        variance = self.level_sigma**2 + self.repeatability**2 + self.walk**2 * days + (rate_sigma * days) ** 2
+        return self.level + rate * days, math.sqrt(variance)
+
+
+@dataclass(frozen=True)
+class History:
+    """All parameters of one block over its calibrations.
+
+    dates (n,): of the calibrations, in order; serial: of the block. due: the date up to which every parameter with a
+    tolerance stays within it (95 %), by ``due_by`` (None: no tolerance, or longer than twenty years).
+    """
+
+    serial: str
+    dates: tuple[datetime, ...]
+    tracks: tuple[Track, ...]
+    tolerances: Mapping[str, float]
+    due: datetime | None
+    due_by: str
+
+    @property
+    def days(self) -> Floats:
+        """Days (n,) since the first calibration."""
+        return np.array([(date - self.dates[0]).total_seconds() / DAY_S for date in self.dates])
+
+
+def history(calibrations: Sequence[SavedCalibration], tolerances: Mapping[str, float] | None = None) -> History:
+    """The history of calibrations of one block, in any order; tolerances: of parameters by symbol, SI.
+
+    Raises InputError for fewer than two, for different blocks, or for two of the same date.
+    """
+    if len(calibrations) < FEWEST:
+        raise InputError(f"a history needs at least {FEWEST} calibrations, {len(calibrations)} is given: save more.")
+    ordered = sorted(calibrations, key=date_of)
+    serials = {each.provenance.bench.get("block_serial", "") for each in ordered} - {""}
+    if len(serials) > 1:
+        raise InputError(f"the calibrations are of different blocks ({', '.join(sorted(serials))}): give those of one.")
+    dates = tuple(map(date_of, ordered))
+    twice = next((one for one, other in itertools.pairwise(dates) if one == other), None)
+    if twice is not None:
+        raise InputError(f"two calibrations have the date {twice.isoformat()}: give each once.")
+    days = np.array([(date - dates[0]).total_seconds() / DAY_S for date in dates])
+    tracks = tuple(_track(k, ordered, days) for k in _common(ordered))
+    wanted = dict(tolerances or {})
+    unknown = sorted(set(wanted) - {track.symbol for track in tracks})
+    if unknown:
+        raise InputError(f"{unknown[0]} has a tolerance, but not all calibrations determine it: leave it out.")
+    due, by = _due(tracks, wanted)
+    date = None if due is None else dates[-1] + timedelta(days=due)
+    return History(next(iter(serials), ""), dates, tracks, wanted, date, by)
+
+
+def date_of(saved: SavedCalibration) -> datetime:
+    """When a calibration was made: when its recording began, or, where that has no date, when it was saved."""
+    text = saved.conditions.began or saved.provenance.created
+    try:
+        date = datetime.fromisoformat(text)
+    except ValueError:
+        raise InputError(f"{text!r} is no date: a calibration needs one (ISO 8601).") from None
+    return date if date.tzinfo else date.replace(tzinfo=UTC)
+
+
+def _common(calibrations: Sequence[SavedCalibration]) -> list[str]:
+    """Return the parameters that every calibration determines, the twelve first."""
+    known = [{p.symbol for p in each.parameters if p.sigma is not None} for each in calibrations]
+    both = set.intersection(*known)
+    first = [p.symbol for p in calibrations[0].parameters if p.symbol in both]
+    return sorted(first, key=lambda symbol: symbol not in paper_parameters.SYMBOLS)  # stable
+
+
+def _track(symbol: str, calibrations: Sequence[SavedCalibration], days: Floats) -> Track:
+    """Return the track of one parameter."""
+    found = [next(p for p in each.parameters if p.symbol == symbol) for each in calibrations]
+    values, sigmas = (np.array([getattr(p, key) for p in found], float) for key in ("value", "sigma"))
+    known = 1.0 / np.maximum(sigmas, 1e-300) ** 2
+    mean = float(known @ values / known.sum())
+    constant_p = chi_squared_tail(len(values) - 1, float(known @ (values - mean) ** 2))
+    with_drift = len(values) >= 3
+    found_by = _filtered(values, sigmas, days, *_pairs(values, sigmas, days), with_drift)
+    weights = found_by.weights
+    walk, repeatability = (math.sqrt(weights @ each**2) for each in (found_by.walks, found_by.repeatabilities))
+    state = weights @ found_by.states
+    variances = weights @ (np.einsum("mii->mi", found_by.covariances) + (found_by.states - state) ** 2)
+    predicted, predicted_variance = weights @ found_by.predicted, weights @ found_by.predicted_variances
+    return Track(
+        symbol, found[0].unit, values, sigmas, predicted, np.sqrt(predicted_variance), float(state[0]),
+        math.sqrt(variances[0]), float(state[1]) if with_drift else None,
+        math.sqrt(variances[1]) if with_drift else None, walk, repeatability, constant_p,
+    )  # fmt: skip
+
+
+def _pairs(values: Floats, sigmas: Floats, days: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return all pairs of walk q and repeatability r, (m,) each, and the logarithm of their prior (m,)."""
+    spread = max(float(np.std(values, ddof=1)), float(np.median(sigmas)))
+    step = max(float(np.median(np.diff(days))), 1e-9)
+    prior = -np.log(np.maximum(_GRID, 1.0))
+    count = len(_GRID) if len(values) > FEWEST else 1  # two calibrations cannot tell a walk from repeatability
+    walks, repeatabilities = np.meshgrid(_GRID[:count] * spread / math.sqrt(step), _GRID * spread, indexing="ij")
+    return walks.ravel(), repeatabilities.ravel(), np.add.outer(prior[:count], prior).ravel()
+
+
+@dataclass(frozen=True)
+class _Filtered:
+    """What the filter gives with m pairs of walk and repeatability.
+
+    weights (m,): of the pairs, by likelihood and prior, of sum 1. states (m, 2), covariances (m, 2, 2): level and drift
+    after the last calibration. predicted (m, n), predicted_variances (m, n): of each calibration by those before it.
+    """
+
+    walks: Floats
+    repeatabilities: Floats
+    weights: Floats
+    states: Floats
+    covariances: Floats
+    predicted: Floats
+    predicted_variances: Floats
+
+
+def _filtered(
+    values: Floats, sigmas: Floats, days: Floats, walks: Floats, repeatabilities: Floats, prior: Floats,
+    with_drift: bool,
+) -> _Filtered:  # fmt: skip
+    """Run the filter over the calibrations for all pairs at once.
+
+    The first calibrations, which only fill the diffuse state, predict nothing and do not count in the likelihood.
+    """
+    size = max(float(np.abs(values - values[0]).max()), float(sigmas.max()), 1e-300)
+    span = max(float(days[-1] - days[0]), 1e-9)
+    m, n = len(walks), len(values)
+    state, covariance = np.tile([values[0], 0.0], (m, 1)), np.zeros((m, 2, 2))
+    covariance[:, 0, 0], covariance[:, 1, 1] = _DIFFUSE * size**2, with_drift * _DIFFUSE * (size / span) ** 2
+    predicted, variances, logarithm = np.full((m, n), np.nan), np.full((m, n), np.nan), prior.copy()
+    for k in range(n):
+        if k:
+            onward = np.array([[1.0, days[k] - days[k - 1]], [0.0, 1.0]])
+            state, covariance = state @ onward.T, onward @ covariance @ onward.T
+            covariance[:, 0, 0] += walks**2 * (days[k] - days[k - 1])
+        noise = repeatabilities**2 + sigmas[k] ** 2
+        variance, innovation = covariance[:, 0, 0] + noise, values[k] - state[:, 0]
+        if k > with_drift:
+            predicted[:, k], variances[:, k] = state[:, 0], variance
+            logarithm -= 0.5 * (innovation**2 / variance + np.log(variance))
+        gain = covariance[:, :, 0] / variance[:, None]
+        state = state + gain * innovation[:, None]
+        left = np.eye(2) - gain[:, :, None] * np.array([1.0, 0.0])
+        added = noise[:, None, None] * gain[:, :, None] * gain[:, None, :]
+        covariance = left @ covariance @ np.swapaxes(left, 1, 2) + added  # Joseph's form
+    relative = np.exp(logarithm - logarithm.max())
+    return _Filtered(walks, repeatabilities, relative / relative.sum(), state, covariance, predicted, variances)
+
+
+def _due(tracks: Sequence[Track], tolerances: Mapping[str, float]) -> tuple[float | None, str]:
+    """Return after how many days the first parameter may leave its tolerance, and which; None beyond twenty years."""
+    first: tuple[float | None, str] = (None, "")
+    for track in tracks:
+        if track.symbol in tolerances:
+            days = _within(track, tolerances[track.symbol])
+            if days is not None and (first[0] is None or days < first[0]):
+                first = days, track.symbol
+    return first
+
+
+def _within(track: Track, tolerance: float) -> float | None:
+    """Return for how many days |change| + 2 sigma of a parameter stays within a tolerance; None beyond twenty years."""
+
+    def reach(days: float) -> float:
+        value, sigma = track.known_after(days)
+        return abs(value - track.level) + _COVERED * sigma
+
+    if reach(0.0) > tolerance:
+        return 0.0
+    if reach(_LONGEST_DAYS) <= tolerance:
+        return None
+    low, high = 0.0, _LONGEST_DAYS
+    for _ in range(60):  # halving: the reach grows with time
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if reach(middle) <= tolerance else (low, middle)
+    return low

@@ -1,0 +1,241 @@
+"""Whether a calibration still holds for a new recording of the same block.
+
+The dwell means z of the new run are predicted by the old state x1 with its covariance P1. The normalised misfit
+
+    min_x  |R^(-1/2) (z - H x)|^2 + |P1^(-1/2) (x - x1)|^2
+
+is chi-squared distributed with one degree of freedom a mean reading if nothing has changed, however few the dwells;
+R is the noise of the means. Where the new run determines a parameter by itself, its difference from the old value is
+tested too, the smallest of all p-values being corrected for their number. Effects that belong to the course of a run
+or to the platform may differ: their coefficients are free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.streams import Source
+from kf_calib.effects import Coefficient
+from kf_calib.effects.inputs import beyond_force_and_temperature
+from kf_calib.errors import UnobservableError
+from kf_calib.estimation.calibration import evaluate_fit
+from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
+from kf_calib.estimation.fit import Fit, fit
+from kf_calib.estimation.measurement_model import STATE_COUNT, Model
+from kf_calib.estimation.noise_model import Noise, mean_covariances
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.settings import Settings
+from kf_calib.exchange.calibration_file import SavedCalibration, fingerprint
+from kf_calib.support.tail_probabilities import chi_squared_tail, sidak
+from kf_calib.support.threads import one_blas_thread
+
+LEVEL = 0.01
+"""A calibration that still holds is said not to in one verification of a hundred: half of them by the misfit as a
+whole, half by a parameter that seems to have moved."""
+
+_DIRECTIONS = 4000
+
+
+@dataclass(frozen=True)
+class Move:
+    """The change of one parameter or coefficient from the old calibration to the new run, in SI.
+
+    p_value: that it did not move, corrected for the number of those tested.
+    """
+
+    symbol: str
+    unit: str
+    old: float
+    new: float
+    difference: float
+    sigma: float
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The result of a verification.
+
+    holds: whether the new run agrees with the old calibration. p_value, statistic, dof: of the joint test. moves: of
+    all parameters that both determine, the clearest first. new: the calibration by the new run alone (None: its
+    orientations determine too little). residual_rms_mps2: of the new means less their prediction by the old
+    calibration. worst_mps2, worst_sigma_mps2: largest error, over all directions of gravity, of readings corrected by
+    the old calibration, and its sigma (None without ``new``). free: effects whose coefficients were not compared.
+    warnings: sentences.
+    """
+
+    holds: bool
+    p_value: float
+    statistic: float
+    dof: int
+    moves: tuple[Move, ...]
+    new: Calibration | None
+    dwells: int
+    residual_rms_mps2: float
+    worst_mps2: float | None
+    worst_sigma_mps2: float | None
+    free: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def moved(self) -> tuple[Move, ...]:
+        """The parameters that have moved significantly."""
+        return tuple(move for move in self.moves if move.p_value < 0.5 * LEVEL)
+
+
+def verify(
+    saved: SavedCalibration,
+    model: Model,
+    source: Source,
+    settings: Settings | None = None,
+    on_progress: Callable[[float], None] | None = None,
+) -> Verification:
+    """Compare a calibration with a new recording; model: that of the calibration (``saved.model()``)."""
+    settings = replace(settings or Settings(), effects=())
+    passed = Pass(source, settings)
+    dwells = passed.fold(on_progress)
+    refuse_unusable(dwells, passed.tally, source.bench)
+    with one_blas_thread():
+        fitted = fit(dwells, Model(source.bench, model.effects))
+        free = tuple(str(each) for each in model.effects if beyond_force_and_temperature(each, source.bench))
+        statistic, rms = _misfit(saved, fitted, _noise(saved, fitted), free)
+        dof = 3 * len(dwells) - _free_count(model, free)
+        p_value = chi_squared_tail(dof, statistic)
+        new = evaluate_fit(fitted, settings)
+        seen = None if new.estimate.unseen.any() else new
+        moves = _moves(saved, new, free)
+        worst = (None, None) if seen is None else _worst(saved, seen)
+    clearest = min((move.p_value for move in moves), default=1.0)
+    both = min(1.0, 2.0 * min(p_value, clearest))  # two tests, of which either may say so
+    return Verification(
+        both >= LEVEL, both, statistic, dof, moves, seen, len(dwells), rms, *worst, free,
+        (*source.warnings, *passed.tally.sentences(), *_warnings(saved, source, new)),
+    )  # fmt: skip
+
+
+def _noise(saved: SavedCalibration, fitted: Fit) -> Noise:
+    """Return the noise of the new run; what is not stated from dwell to dwell is no less than it was in the old one."""
+    noise, old = fitted.noise, saved.noise
+    if not noise.scatter_stated:
+        noise = replace(noise, scatter_mps2=np.maximum(noise.scatter_mps2, old.dwell_sigma_mps2))
+    if not noise.setting_stated:
+        noise = replace(noise, setting_rad=max(noise.setting_rad, np.radians(old.angle_sigma_deg)))
+    return noise
+
+
+def _free_count(model: Model, free: Sequence[str]) -> int:
+    """Return the number of coefficients that are not compared."""
+    return sum(len(range(*model.parts[name].indices(model.count))) for name in free)
+
+
+def _misfit(saved: SavedCalibration, fitted: Fit, noise: Noise, free: Sequence[str]) -> tuple[float, float]:
+    """Return the normalised misfit of the new means, and the rms of their residuals by the old state, m/s^2."""
+    means, model = fitted.carried.means, fitted.carried.model
+    kept = [
+        k for k in range(model.count) if not any(k in range(*model.parts[name].indices(model.count)) for name in free)
+    ]
+    old, covariance = np.array(saved.state.values), np.array(saved.state.covariance)[np.ix_(kept, kept)]
+    lower = np.linalg.inv(np.linalg.cholesky(mean_covariances(noise, means, fitted.carried.state)))
+    residuals = means.readings - means.design @ old
+    rows = (lower @ means.design).reshape(-1, model.count)
+    right = np.einsum("dij,dj->di", lower, residuals).ravel()
+    root = np.linalg.cholesky(covariance)  # x - x1 = root y with y of unit variance
+    mixed = np.hstack([rows[:, kept] @ root, np.delete(rows, kept, axis=1)])
+    prior = np.eye(len(kept), mixed.shape[1])
+    stacked, target = np.vstack([mixed, prior]), np.append(right, np.zeros(len(kept)))
+    scale = np.maximum(np.linalg.norm(stacked, axis=0), 1e-300)
+    left = target - stacked @ (np.linalg.lstsq(stacked / scale, target, rcond=None)[0] / scale)
+    return float(left @ left), float(np.sqrt(np.mean(residuals**2)))
+
+
+def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tuple[Move, ...]:
+    """Return the differences of all that both runs determine, the clearest first."""
+    from math import erfc, sqrt
+
+    skipped = {c.symbol for name in free for c in _effect_symbols(new.model, name)}
+    before = {each.symbol: each for each in saved.parameters}
+    found = list[tuple[str, str, float, float, float]]()
+    for symbol, now in new.parameters.items():
+        was = before.get(symbol)
+        if was is None or symbol in skipped or None in (was.value, was.sigma, now.value, now.sigma):
+            continue
+        found.append((symbol, now.unit, was.value, now.value, float(np.hypot(was.sigma, now.sigma))))  # type: ignore[arg-type]
+    moves = [
+        Move(symbol, unit, old, value, value - old, sigma,
+             sidak(erfc(abs(value - old) / max(sigma, 1e-300) / sqrt(2.0)), len(found)))
+        for symbol, unit, old, value, sigma in found
+    ]  # fmt: skip
+    return tuple(sorted(moves, key=lambda move: move.p_value))
+
+
+def _effect_symbols(model: Model, name: str) -> list[Coefficient]:
+    """Return the coefficients of an effect, its constant included."""
+    part = model.parts[name]
+    return list(model.coefficients[part.start - STATE_COUNT : part.stop - STATE_COUNT])
+
+
+def _worst(saved: SavedCalibration, new: Calibration) -> tuple[float, float]:
+    """Return the largest error of old corrections over the directions of gravity, and its sigma, m/s^2."""
+    old, now = (np.array(state)[:STATE_COUNT].reshape(3, 4) for state in (saved.state.values, new.estimate.state))
+    inverse = np.linalg.inv(old[:, :3])
+    force = new.bench.gravity_mps2 * _sphere(_DIRECTIONS)
+    errors = (force @ now[:, :3].T + now[:, 3] - old[:, 3]) @ inverse.T - force
+    worst = int(np.argmax(np.linalg.norm(errors, axis=1)))
+    size = float(np.linalg.norm(errors[worst]))
+    along = errors[worst] / max(size, 1e-300) @ inverse
+    gain = np.outer(along, np.append(force[worst], 1.0)).ravel()
+    both = (
+        np.array(saved.state.covariance)[:STATE_COUNT, :STATE_COUNT]
+        + new.estimate.covariance[:STATE_COUNT, :STATE_COUNT]
+    )
+    return size, float(np.sqrt(max(gain @ both @ gain, 0.0)))
+
+
+def _sphere(count: int) -> Floats:
+    """Return directions (n, 3) spread evenly over the sphere (Fibonacci's lattice)."""
+    k = np.arange(count) + 0.5
+    height, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + np.sqrt(5.0)) * k
+    across = np.sqrt(1.0 - height**2)
+    return np.column_stack([across * np.cos(turn), height, across * np.sin(turn)])
+
+
+def _warnings(saved: SavedCalibration, source: Source, new: Calibration) -> list[str]:
+    """Return what may make the two runs differ besides the sensors."""
+    out, conditions = list[str](), saved.conditions
+    path = getattr(source, "path", None)
+    if path is not None and saved.provenance.sha256 == fingerprint(path):
+        out.append("this is the recording that it was calibrated from, so it must agree: verify with another.")
+    warmth = np.concatenate([visit.dwell.nodes.temperature_c for visit in new.visits])
+    if (
+        conditions.temperature_min_c is not None
+        and conditions.temperature_max_c is not None
+        and np.isfinite(warmth).any()
+    ):
+        low, high = float(np.nanmin(warmth)), float(np.nanmax(warmth))
+        if low < conditions.temperature_min_c - 1.0 or high > conditions.temperature_max_c + 1.0:
+            out.append(
+                f"it was {low:.1f} to {high:.1f} °C, and {conditions.temperature_min_c:.1f} to "
+                f"{conditions.temperature_max_c:.1f} °C when it was calibrated: a difference may be the temperature's."
+            )
+    ratio = new.bench.gravity_mps2 / saved.bench.gravity_mps2 - 1.0
+    if abs(ratio) > 1e-9:
+        out.append(
+            f"gravity is stated {ratio * 1e6:+.3g} ppm different: all scale factors differ by as much if it is not."
+        )
+    was, now = (bench.notes.get("block_serial") for bench in (saved.bench, new.bench))
+    if was and now and was != now:
+        out.append(f"the block is {now}, the calibration is of {was}.")
+    return out
+
+
+def refuse_incomplete(saved: SavedCalibration) -> None:
+    """Raise UnobservableError if the old run did not determine all that it is to be compared by."""
+    if saved.state.undetermined:
+        raise UnobservableError(
+            f"the calibration did not determine {', '.join(saved.state.undetermined)}, so it predicts no readings: "
+            "verify one that did."
+        )

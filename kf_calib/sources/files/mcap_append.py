@@ -1,0 +1,241 @@
+"""A copy of an MCAP file with one more topic: all that was in it stays byte for byte, the new messages follow.
+
+The data section of the original is copied as it is, up to its end; then come chunks with the messages of the new topic,
+and a summary that has the original's records and the new ones. Readers find messages by time through the summary.
+Messages of one topic have one size, so that a chunk of them is one numpy array: a million take a second or two.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    McapRecord,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from numpy.typing import NDArray
+
+from kf_calib.bench.streams import Stream
+from kf_calib.errors import InputError
+from kf_calib.sources.files import cdr
+from kf_calib.sources.files.mcap_chunks import parse
+from kf_calib.sources.files.mcap_file import McapFile
+from kf_calib.sources.files.mcap_messages import HEAD, MAGIC, MESSAGE_FIELDS
+
+_PIECE = 1 << 22
+_MESSAGES = 1 << 14  # in a chunk
+_GROUPS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX,
+           Opcode.METADATA_INDEX)  # fmt: skip
+
+
+class TopicAppender:
+    """A copy of ``source`` in the open file ``out``, to which messages of a new topic are added; ``finish`` ends it.
+
+    kind, template: what a message is (``cdr``). on_progress: told the share of the original that is copied. Raises
+    InputError where the source was not finished or is damaged, or has the topic already.
+    """
+
+    def __init__(
+        self,
+        source: McapFile,
+        out: IO[bytes],
+        topic: str,
+        kind: cdr.MessageType,
+        template: bytes,
+        on_progress: Callable[[float], None] | None = None,
+    ) -> None:
+        if source.summary is None:
+            raise InputError(
+                f"{source.trouble} Make a finished copy of it first: kf-calib record {source.path.name} whole.mcap."
+            )
+        self._out, self._topic, self._kind = out, topic, kind
+        self._layout, self._template = kind.layout(template), template
+        self._crc = self._position = 0
+        self._groups = dict[int, list[bytes]]({opcode: [] for opcode in _GROUPS})
+        self._statistics = Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0)
+        self._read_summary(source)
+        self._channel = self._new_channel(source, topic, kind)
+        self._count, self._waiting = 0, Stream.empty(self._layout.width)
+        self._copy(source, on_progress)
+        self._put_chunk([*self._defined], [])
+
+    def add(self, stream: Stream) -> None:
+        """Add a message for each sample; raises InputError where a stamp does not fit a message."""
+        self._waiting += stream
+        while len(self._waiting) >= _MESSAGES:
+            self._put_messages(self._waiting[:_MESSAGES])
+            self._waiting = self._waiting[_MESSAGES:]
+
+    def finish(self) -> None:
+        """Write what waits, and the end of the file; the file itself stays open."""
+        if len(self._waiting):
+            self._put_messages(self._waiting)
+        self._put(_bytes(DataEnd(self._crc)))
+        start = self._position
+        self._groups[Opcode.STATISTICS] = [_bytes(self._statistics)]
+        offsets, section = list[bytes](), 0
+        for opcode in _GROUPS:
+            group = b"".join(self._groups[opcode])
+            if group:
+                offsets.append(_bytes(SummaryOffset(opcode, self._position, len(group))))
+                section = self._put(group, section)
+        offset_start = self._position
+        for each in offsets:
+            section = self._put(each, section)
+        footer = _bytes(Footer(start, offset_start, 0))
+        self._put(footer[:-4] + zlib.crc32(footer[:-4], section).to_bytes(4, "little"))
+        self._put(MAGIC)
+
+    def _read_summary(self, source: McapFile) -> None:
+        """Take the records of the original's summary as they are; its statistics are counted on."""
+        assert source.summary is not None
+        with source.open() as file:
+            file.seek(source.summary.start)
+            content = file.read(source.size - source.summary.start)
+        for opcode, record in _records(content):
+            if opcode in (Opcode.FOOTER, Opcode.SUMMARY_OFFSET):
+                continue
+            if opcode == Opcode.STATISTICS:
+                self._statistics = parse(Statistics.read, record[HEAD.size :])
+            elif opcode in self._groups:
+                self._groups[opcode].append(record)
+
+    def _new_channel(self, source: McapFile, topic: str, kind: cdr.MessageType) -> int:
+        """Return the number of the new channel; its definition goes into the data section and the summary."""
+        assert source.summary is not None
+        channels, schemas = source.summary.channels, source.summary.schemas
+        if any(channel.topic == topic for channel in channels):
+            raise InputError(
+                f"{source.path} has a topic {topic} already: take the one it was made from."
+            )
+        numbers = {channel.id for channel in channels}, {schema.id for schema in schemas}
+        own, schema = (next(k for k in range(1, 1 << 16) if k not in taken) for taken in numbers)
+        definition = Schema(id=schema, data=kind.schema.encode(), encoding="ros2msg", name=kind.name)
+        channel = Channel(id=own, topic=topic, message_encoding="cdr", metadata={}, schema_id=schema)
+        self._defined = _bytes(definition), _bytes(channel)
+        self._groups[Opcode.SCHEMA].append(self._defined[0])
+        self._groups[Opcode.CHANNEL].append(self._defined[1])
+        self._statistics.schema_count += 1
+        self._statistics.channel_count += 1
+        return own
+
+    def _copy(self, source: McapFile, on_progress: Callable[[float], None] | None) -> None:
+        """Copy the original up to the record that ends its data section."""
+        assert source.summary is not None
+        end = source.summary.start - len(_bytes(DataEnd(0)))
+        with source.open() as file:
+            while self._position < end:
+                piece = file.read(min(_PIECE, end - self._position))
+                if not piece:
+                    raise InputError(f"{source.path} became shorter while it was read: read it when it is at rest.")
+                self._put(piece)
+                if on_progress is not None:
+                    on_progress(self._position / end)
+            if HEAD.unpack(file.read(HEAD.size))[0] != Opcode.DATA_END:
+                raise InputError(
+                    f"{source.path} is damaged before byte {end}: make a whole copy of it first: kf-calib record "
+                    f"{source.path.name} whole.mcap."
+                )
+
+    def _put_messages(self, stream: Stream) -> None:
+        """Write one chunk of messages."""
+        size = HEAD.size + MESSAGE_FIELDS + self._layout.size
+        records = np.zeros(len(stream), _record_type(self._layout))
+        records["opcode"], records["length"] = Opcode.MESSAGE, size - HEAD.size
+        records["channel"] = self._channel
+        records["sequence"] = np.arange(self._count, self._count + len(stream))
+        records["log_time"] = records["publish_time"] = stream.time_ns
+        records["message"] = self._messages(stream).view(f"V{self._layout.size}")
+        index = np.column_stack([stream.time_ns, np.arange(len(stream)) * size]).astype("<u8")
+        self._put_chunk([records.tobytes()], [(self._channel, index)], stream.time_ns)
+        self._count += len(stream)
+
+    def _messages(self, stream: Stream) -> NDArray[np.void]:
+        """Return the message of each sample."""
+        try:
+            return cdr.filled(self._kind, self._template, stream)
+        except cdr.CdrError as error:
+            raise InputError(f"{self._topic} cannot be written: {error}.") from None
+
+    def _put_chunk(
+        self, parts: list[bytes], indexes: list[tuple[int, NDArray[Any]]], times: NDArray[np.int64] | None = None
+    ) -> None:
+        """Write a chunk and the indexes of its messages, and remember it for the summary."""
+        data, start = b"".join(parts), self._position
+        first, last = (0, 0) if times is None else (int(times.min()), int(times.max()))
+        packed = zstandard.ZstdCompressor(level=1).compress(data)
+        self._put(_bytes(Chunk("zstd", packed, last, first, zlib.crc32(data), len(data))))
+        length, offsets = self._position - start, dict[int, int]()
+        for channel, rows in indexes:
+            offsets[channel] = self._position
+            content = channel.to_bytes(2, "little") + rows.nbytes.to_bytes(4, "little") + rows.tobytes()
+            self._put(HEAD.pack(Opcode.MESSAGE_INDEX, len(content)) + content)
+        index = ChunkIndex(length, start, "zstd", len(packed), last, self._position - start - length, offsets, first,
+                           len(data))  # fmt: skip
+        self._groups[Opcode.CHUNK_INDEX].append(_bytes(index))
+        self._count_in(times)
+
+    def _count_in(self, times: NDArray[np.int64] | None) -> None:
+        """Count a chunk and its messages in the statistics."""
+        known = self._statistics
+        known.chunk_count += 1
+        if times is None:
+            return
+        counts = known.channel_message_counts
+        counts[self._channel] = counts.get(self._channel, 0) + len(times)
+        none = not known.message_count
+        known.message_start_time = int(times.min()) if none else min(known.message_start_time, int(times.min()))
+        known.message_end_time = max(known.message_end_time, int(times.max()))
+        known.message_count += len(times)
+
+    def _put(self, data: bytes, section: int = 0) -> int:
+        """Write bytes, keep the checksum of all so far, and return that of a section continued by them."""
+        self._out.write(data)
+        self._crc, self._position = zlib.crc32(data, self._crc), self._position + len(data)
+        return zlib.crc32(data, section)
+
+
+def _record_type(layout: cdr.Layout) -> np.dtype[np.void]:
+    """Return the structured type of a message record."""
+    return np.dtype([("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"),
+                     ("log_time", "<u8"), ("publish_time", "<u8"), ("message", f"V{layout.size}")])  # fmt: skip
+
+
+def _bytes(record: McapRecord) -> bytes:
+    """Return a record as it lies in a file."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
+
+
+def _records(content: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield opcode and bytes of each record of a summary, up to its footer."""
+    position = 0
+    while position + HEAD.size <= len(content):
+        opcode, length = HEAD.unpack_from(content, position)
+        end = position + HEAD.size + length
+        yield opcode, content[position:end]
+        if opcode == Opcode.FOOTER:
+            return
+        position = end
+
+
+def source_file(path: Path) -> McapFile:
+    """The file of a recording that consists of one; raises InputError for the folder of a bag."""
+    if path.is_dir():
+        raise InputError(f"{path} is the folder of a bag: give one .mcap file of it, or join them first.")
+    return McapFile(path)

@@ -1,0 +1,43 @@
+"""What the command export says: as a report, and as a JSON object."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from kf_calib.exchange.exports.target import Target
+from kf_calib.support.units import shown
+from kf_calib.views.json import clean
+from kf_calib.views.terminal import note
+
+
+def exported_object(target: Target, to: str, out: Path) -> dict[str, Any]:
+    """The JSON object of ``export``."""
+    left = target.error_left
+    return clean(
+        {
+            "out": str(out),
+            "format": to,
+            "lost": list(target.lost),
+            "left_out": target.correction.left_out,
+            "error_left_rms_mps2": None if left is None else left.rms_mps2,
+            "error_left_worst_mps2": None if left is None else left.worst_mps2,
+            "warnings": list(target.remarks),
+        }
+    )
+
+
+def exported_report(target: Target, out: Path) -> RenderableType:
+    """The report of ``export``."""
+    lines = [Text(f"{out} is the calibration for {target.title}.", style="bold")]
+    if target.error_left is None:
+        lines.append(Text("It holds all of it."))
+    else:
+        unit, (rms, worst) = shown("m/s^2"), target.error_left
+        lines.append(note(f"it does not hold {', '.join(target.lost)}: corrected readings are wrong by "
+                          f"{unit.text(rms)} rms, {unit.text(worst)} at worst"))  # fmt: skip
+    lines += [note(f"{name} is not corrected: {why}") for name, why in target.correction.left_out.items()]
+    return Group(*lines, *map(note, target.remarks))
