@@ -18,7 +18,8 @@ from kf_calib.cli.failures import tell
 SECTIONS = {
     "Evaluate a recording": {"replay": "evaluate.replay", "diagnose": "evaluate.diagnose",
                              "improve": "evaluate.improve", "compare": "evaluate.compare"},
-    "Use a calibration": {"apply": "exchange.apply", "verify": "exchange.verify", "history": "exchange.history"},
+    "Use a calibration": {"apply": "exchange.apply", "verify": "exchange.verify", "history": "exchange.history",
+                          "certificate": "certificate.certificate"},
     "Run a bench": {"plan": "plan.plan", "record": "acquire.record", "live": "live.live"},
     "Try it without a bench": {"demo": "acquire.demo", "simulate": "acquire.simulate"},
     "Look up": {"effects": "evaluate.list_effects", "paper": "paper.paper"},

@@ -7,8 +7,8 @@ gain of weighted least squares
     G = (sum_d H_d^T R_d^-1 H_d)^-1 [H_1^T R_1^-1, H_2^T R_2^-1, ...]
 
 the state changes by sum_d G_d c_d per unit, and the parameters by J times that, J = d parameters / d state. An error
-that is drawn anew in each dwell gives the root of the sum of the squares instead. H, R and c are computed from the gimbal
-angles, noise and state that a calibration file holds.
+that is drawn anew in each dwell gives the root of the sum of the squares instead. H, R and c are computed from the
+gimbal angles, noise and state that a calibration file holds.
 """
 
 from __future__ import annotations
@@ -163,7 +163,8 @@ def _known_columns(model: Model, stimulus: Stimulus) -> tuple[list[int], tuple[s
     for effect in model.effects:
         if effect.walks:
             continue
-        if effect.no_columns or effect.oscillates or not np.array_equal(effect.columns(stimulus), effect.columns(other)):
+        shows = not effect.no_columns and not effect.oscillates
+        if not shows or not np.array_equal(effect.columns(stimulus), effect.columns(other)):
             left_out.append(str(effect))
         else:
             kept += range(*model.parts[str(effect)].indices(model.count))
@@ -222,6 +223,6 @@ def _line(own: TypeB, effect: Effect, coefficient: Coefficient, standard: float,
     words = {"run": "", "dwell": ", another in each dwell"}[own.varies]
     at = f", at {own.temperature}" if own.temperature else ""
     return Contribution(
-        coefficient.symbol, f"{effect.title}{words}{at}", "B", abs(standard), coefficient.unit,
+        coefficient.symbol, f"{effect.title} ({effect}){words}{at}", "B", abs(standard), coefficient.unit,
         own.distribution, own.dof or math.inf, own.source, sensitivity, abs(standard * sensitivity),
     )  # fmt: skip

@@ -20,6 +20,10 @@ from kf_calib.exchange.certificate.statement import Rule, Statement
 
 Conformity = Literal["pass", "conditionalPass", "conditionalFail", "fail"]
 """The four outcomes of a rule with guard band (ILAC-G8); simple acceptance has the first and the last."""
+OUTCOMES: dict[Conformity, str] = {
+    "pass": "pass", "conditionalPass": "conditional pass", "conditionalFail": "conditional fail", "fail": "fail",
+}  # fmt: skip
+"""The outcomes in words."""
 
 
 @dataclass(frozen=True)
@@ -121,12 +125,12 @@ def _results(
     combined, expanded, k, dof = (each.tolist() for each in (found.combined, found.expanded, found.k, found.dof))
     limits, out = own.largest, list[Result]()
     for i, parameter in enumerate(saved.parameters[: len(paper_parameters.SYMBOLS)]):
-        known = parameter.value is not None and parameter.sigma is not None
-        limit, judged = limits.get(parameter.symbol), None
-        if known and limit is not None and own.decision_rule is not None:
-            judged = conformity(abs(parameter.value - parameter.nominal), limit, expanded[i], own.decision_rule)
+        value = None if parameter.sigma is None else parameter.value
+        known, limit, judged = value is not None, limits.get(parameter.symbol), None
+        if value is not None and limit is not None and own.decision_rule is not None:
+            judged = conformity(abs(value - parameter.nominal), limit, expanded[i], own.decision_rule)
         out.append(Result(
-            parameter.symbol, parameter.unit, parameter.nominal, parameter.value if known else None,
+            parameter.symbol, parameter.unit, parameter.nominal, value,
             combined[i] if known else None, expanded[i] if known else None, k[i], dof[i],
             before[i] if before else None, limit, judged,
         ))  # fmt: skip

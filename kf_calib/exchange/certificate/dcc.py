@@ -7,6 +7,7 @@ given one, and else looks for the mandatory elements.
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
 from datetime import date
 from importlib.metadata import version
@@ -28,12 +29,14 @@ MODEL = "reading_i = K_i E_i . f + b_i"
 AXES = ("E_1, E_3 = (cos phi cos theta, sin theta, -sin phi cos theta)",
         "E_2 = (sin nu1, sqrt(1 - sin^2 nu1 - sin^2 nu2), -sin nu2)")  # fmt: skip
 METHOD = "Weighted least squares by a sequential Kalman filter over the orientations of a stationary gimballed bench"
+_NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _MANDATORY = (
     "administrativeData/dccSoftware/software", "administrativeData/coreData/countryCodeISO3166_1",
     "administrativeData/coreData/uniqueIdentifier", "administrativeData/coreData/beginPerformanceDate",
     "administrativeData/coreData/endPerformanceDate", "administrativeData/coreData/performanceLocation",
     "administrativeData/items/item/name", "administrativeData/items/item/identifications/identification/value",
-    "administrativeData/calibrationLaboratory/contact/name", "administrativeData/calibrationLaboratory/contact/location",
+    "administrativeData/calibrationLaboratory/contact/name",
+    "administrativeData/calibrationLaboratory/contact/location",
     "administrativeData/respPersons/respPerson/person/name", "administrativeData/customer/name",
     "administrativeData/customer/location", "measurementResults/measurementResult/results/result/data",
 )  # fmt: skip
@@ -65,7 +68,7 @@ def xml(own: Certificate) -> bytes:
 def _in(parent: ET.Element, name: str, text: str | None = None, space: str = DCC) -> ET.Element:
     """A new element at the end of its parent."""
     own = ET.SubElement(parent, f"{{{space}}}{name}")
-    own.text = text
+    own.text = text if text is None else _NOT_XML.sub("\ufffd", text)
     return own
 
 
@@ -154,9 +157,9 @@ def _statements(parent: ET.Element, own: Certificate) -> None:
 def rule(own: Certificate) -> str:
     """The rule by which conformity is decided, in words."""
     if own.statement.decision_rule == "guard band":
-        return ("Guard band of the width of the expanded uncertainty U: pass where the deviation from nominal is at most "
-                "the limit less U, fail where it is more than the limit plus U; between them, conditional pass within the "
-                "limit and conditional fail beyond it (ILAC-G8).")  # fmt: skip
+        return ("Guard band of the width of the expanded uncertainty U: pass where the deviation from nominal is at "
+                "most the limit less U, fail where it is more than the limit plus U; between them, conditional pass "
+                "within the limit and conditional fail beyond it (ILAC-G8).")  # fmt: skip
     return "Simple acceptance: pass where the deviation from nominal is at most the limit, whatever its uncertainty."
 
 
@@ -231,9 +234,9 @@ def check(content: bytes, schema: Path | None) -> str:
     schema: a copy of ``dcc.xsd`` with what it imports beside it; nothing is fetched.
     """
     root = ET.fromstring(content)
-    missing = [path for path in _MANDATORY if root.find("/".join(f"{{{DCC}}}{name}" for name in path.split("/"))) is None]
+    missing = [each for each in _MANDATORY if root.find(f"{{{DCC}}}" + each.replace("/", f"/{{{DCC}}}")) is None]
     if missing:
-        return f"not a DCC: the XML lacks {', '.join(path.rsplit('/', 2)[-2] + '/' + path.rsplit('/', 1)[-1] for path in missing)}"
+        return f"not a DCC: {len(missing)} mandatory elements are not stated"
     if schema is None:
         return f"all mandatory elements of DCC {VERSION} are there; not validated against its schema (--schema dcc.xsd)"
     _validate(content, schema)
@@ -247,12 +250,11 @@ def _validate(content: bytes, schema: Path) -> None:
     try:
         own = xmlschema.XMLSchema(str(schema), allow="local")
     except (OSError, xmlschema.XMLSchemaException, ET.ParseError) as error:
-        raise InputError(f"{schema}: is no XML Schema that can be read ({_line(error)}): give dcc.xsd of DCC {VERSION} "
-                         "with SI_Format.xsd and xmldsig-core-schema.xsd where it imports them from.") from None  # fmt: skip
-    error = next(own.iter_errors(content.decode()), None)
+        said = cut(" ".join(str(error).split()), 200)
+        raise InputError(f"{schema}: cannot be read as an XML Schema ({said}): give dcc.xsd of DCC {VERSION}, with "
+                         "the schemas that it imports where it says.") from None  # fmt: skip
+    error = next(own.iter_errors(ET.fromstring(content)), None)
     if error is not None:
-        raise InputError(f"{schema}: the certificate is not valid by it at {error.path}: {cut(error.reason or '', 300)}")
-
-
-def _line(error: Exception) -> str:
-    return cut(" ".join(str(error).split()), 200)
+        reason = cut(" ".join((error.reason or "").split()), 300)
+        raise InputError(f"{schema}: the certificate is not valid by it at {error.path} ({reason}): is it of DCC "
+                         f"{VERSION}?")  # fmt: skip

@@ -18,16 +18,15 @@ import numpy as np
 from kf_calib.errors import InputError
 from kf_calib.exchange.certificate import dcc
 from kf_calib.exchange.certificate.budget import Contribution
-from kf_calib.exchange.certificate.content import Certificate, Result
+from kf_calib.exchange.certificate.content import OUTCOMES, Certificate, Result
 from kf_calib.exchange.certificate.statement import Party
 from kf_calib.support.extras import need
 from kf_calib.support.plain_text import cut
 from kf_calib.support.units import Unit, field_unit, rounded
 
 ATTACHED = "certificate.xml"
-_UNITS = {"rad": Unit("°", math.degrees(1.0)), "1": Unit("1", 1.0), "m/s^2": Unit("µm/s²", 1e6)}
+_UNITS = {"rad": Unit("°", math.degrees(1.0)), "1": Unit("1", 1.0), "m/s^2": Unit("m/s²", 1.0)}
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
-_OUTCOMES = {"pass": "pass", "conditionalPass": "conditional pass", "conditionalFail": "conditional fail", "fail": "fail"}
 
 Row = dict[str, Any]
 
@@ -86,7 +85,6 @@ def content(own: Certificate, standing: str) -> Row:
         "sensitivities": [_sensitivity(own, line) for line in own.budget.contributions if line.sensitivity is not None],
         "further": [_coefficient(each.symbol, each.value, each.sigma, each.unit) for each in own.further],
         "remarks": _remarks(own, standing),
-        "signed": [["Date of issue", _text(stated.issued)]],
         "persons": [each.model_dump() for each in stated.persons],
     }
 
@@ -99,7 +97,7 @@ def _missing(own: Certificate) -> str | None:
 
 
 def _facts(own: Certificate) -> list[list[str | None]]:
-    stated, saved = own.statement, own.saved
+    stated = own.statement
     days = [_text(own.begun), _text(own.ended)]
     performed = None if None in days else days[0] if days[0] == days[1] else f"{days[0]} to {days[1]}"
     item = stated.item
@@ -115,12 +113,7 @@ def _facts(own: Certificate) -> list[list[str | None]]:
         ["Received", _text(stated.received)],
         ["Calibrated", performed],
         ["Issued", _text(stated.issued)],
-        ["Recording", _recording(saved.provenance.recording, saved.provenance.sha256)],
     ]
-
-
-def _recording(name: str, sha256: str | None) -> str | None:
-    return f"{name}, SHA-256 {sha256}" if name and sha256 else name or None
 
 
 def _party(party: Party) -> str | None:
@@ -189,17 +182,17 @@ def _conformity(results: Sequence[Result]) -> list[Row]:
             rows.append({
                 "name": _name(each.symbol), "deviation": shown, "expanded": expanded, "unit": unit.label,
                 "limit": f"{each.limit * unit.per_si:.6g}",
-                "outcome": "not determined" if each.conformity is None else _OUTCOMES[each.conformity],
+                "outcome": "not determined" if each.conformity is None else OUTCOMES[each.conformity],
             })  # fmt: skip
     return _aligned(rows, "deviation", "expanded", "limit")
 
 
 def _budget_words(own: Certificate) -> str:
     words = (
-        "Type A is the covariance of the filter. Type B carries each stated error of the bench through the weighted least "
-        "squares of this run to the parameters. Contributions are taken as uncorrelated and added in quadrature; k follows "
-        "from the effective degrees of freedom (Welch–Satterthwaite) for a coverage probability of 95.45 %, and is 2.00 "
-        "where these are infinite."
+        "Type A is the covariance of the filter. Type B carries each stated error of the bench through the weighted "
+        "least squares of this run to the parameters. Contributions are taken as uncorrelated and added in quadrature; "
+        "k follows from the effective degrees of freedom (Welch–Satterthwaite) for a coverage probability of 95.45 %, "
+        "and is 2.00 where these are infinite."
     )
     if len(own.budget.contributions) == 1:
         words += " No error of the bench is stated: U covers the scatter of the readings only."
@@ -226,13 +219,12 @@ def _contributions(own: Certificate) -> list[Row]:
     places = [max(0, 2 - math.floor(math.log10(u))) if u > 0 else 3 for u in (found.combined * per_si).tolist()]
 
     def row(symbol: str, values: Any) -> Row:
-        texts = [f"{v:.{n}f}" if ok else None for v, n, ok in zip(values, places, known, strict=True)]
-        return {"symbol": symbol, "values": [None if text is None else {"text": text, "pad": ""} for text in texts]}
+        return texts(symbol, [f"{value:.{digits}f}" for value, digits in zip(values, places, strict=True)])
 
-    plain = [
-        {"symbol": name, "values": [{"text": text, "pad": ""} if ok else None for text, ok in zip(texts, known, strict=True)]}
-        for name, texts in (("ν", [_count(v) for v in found.dof]), ("k", [f"{v:.2f}" for v in found.k]))
-    ]
+    def texts(symbol: str, own: list[str]) -> Row:
+        return {"symbol": symbol, "values": [text if ok else "–" for text, ok in zip(own, known, strict=True)]}
+
+    plain = [texts("ν", [_count(v) for v in found.dof]), texts("k", [f"{v:.2f}" for v in found.k])]
     lines = [row(_name(line.name), line.parts * per_si) for line in found.contributions]
     return [*lines, row("u", found.combined * per_si), *plain, row("U", found.expanded * per_si)]
 
@@ -241,7 +233,7 @@ def _sensitivity(own: Certificate, line: Contribution) -> Row:
     assert line.sensitivity is not None
     per_si = np.array([field_unit(each.unit).per_si for each in own.results]) / field_unit(line.unit).per_si
     values = line.sensitivity * per_si
-    values[np.abs(values) < 1e-9 * np.abs(values).max(initial=0.0)] = 0.0  # rounding
+    values[np.abs(values) < 1e-9] = 0.0  # rounding
     return {"symbol": _name(line.name), "values": [_minus(f"{value:.3g}") for value in values]}
 
 
@@ -264,8 +256,11 @@ def _remarks(own: Certificate, standing: str) -> list[str]:
         remarks.append(f"Effects that this run could not have shown: {', '.join(saved.not_seen)}.")
     remarks += [f"Of the recording: {sentence}" for sentence in saved.provenance.warnings]
     remarks += [own.statement.remarks] if own.statement.remarks else []
-    made = saved.provenance.versions.get("kf_calib", "?")
-    return [*remarks, f"Calculated by kf_calib {made} on {saved.provenance.created}; written by kf_calib "
+    origin = saved.provenance
+    if origin.recording:
+        remarks.append(f"Recording {origin.recording}, SHA-256 {origin.sha256 or 'not known'}.")
+    made = origin.versions.get("kf_calib", "?")
+    return [*remarks, f"Calculated by kf_calib {made} on {origin.created}; written by kf_calib "
                       f"{version('kf_calib')} on {own.created.isoformat()}."]  # fmt: skip
 
 

@@ -17,13 +17,14 @@ from kf_calib.errors import InputError
 from kf_calib.support.plain_text import COMMANDS, cut
 from kf_calib.support.toml_files import table_of
 
-Text = Annotated[str, StringConstraints(max_length=5000, pattern=rf"\A[^{COMMANDS}]*\S[^{COMMANDS}]*\z")]
+_LETTER = rf"[^{COMMANDS}\ufffe\uffff]"
+Text = Annotated[str, StringConstraints(max_length=5000, pattern=rf"\A{_LETTER}*\S{_LETTER}*\z")]
 Country = Annotated[str, StringConstraints(pattern=r"\A[A-Z]{2}\z")]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Rule = Literal["simple acceptance", "guard band"]
 
 DIVISORS = {"normal": 1.0, "rectangular": math.sqrt(3.0), "triangular": math.sqrt(6.0), "arcsine": math.sqrt(2.0)}
-"""What a size is divided by for a standard uncertainty: half the width of the distribution; of a normal one, k sigma."""
+"""What a size, half the width of a distribution, is divided by for a standard uncertainty; a normal one has ``k``."""
 
 
 class _Table(BaseModel):
@@ -118,7 +119,7 @@ class Statement(_Table):
 
 
 def read(path: Path | None) -> Statement:
-    """Read a statement and check all of it; raises InputError, with the path and the place in it. None: an empty one."""
+    """Read a statement and check all of it; raises InputError, with the place in it. None: nothing is stated."""
     if path is None:
         return Statement()
     try:
