@@ -234,7 +234,8 @@ def _sensitivity(own: Certificate, line: Contribution) -> Row:
     per_si = np.array([field_unit(each.unit).per_si for each in own.results]) / field_unit(line.unit).per_si
     values = line.sensitivity * per_si
     values[np.abs(values) < 1e-9] = 0.0  # rounding
-    return {"symbol": _name(line.name), "values": [_minus(f"{value:.3g}") for value in values]}
+    form = "{:.4f}" if 0.01 <= np.abs(values).max() < 1e4 else "{:.2e}"
+    return {"symbol": _name(line.name), "values": [_minus(form.format(value)) for value in values]}
 
 
 def _coefficient(symbol: str, value: float | None, sigma: float | None, unit: str) -> Row:

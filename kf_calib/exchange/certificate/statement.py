@@ -17,8 +17,8 @@ from kf_calib.errors import InputError
 from kf_calib.support.plain_text import COMMANDS, cut
 from kf_calib.support.toml_files import table_of
 
-_LETTER = rf"[^{COMMANDS}\ufffe\uffff]"
-Text = Annotated[str, StringConstraints(max_length=5000, pattern=rf"\A{_LETTER}*\S{_LETTER}*\z")]
+_NONE = rf"{COMMANDS}\ufffe\uffff"  # no control characters, and nothing that XML cannot hold
+Text = Annotated[str, StringConstraints(max_length=5000, pattern=rf"\A[^{_NONE}]*[^{_NONE}\s][^{_NONE}]*\z")]
 Country = Annotated[str, StringConstraints(pattern=r"\A[A-Z]{2}\z")]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Rule = Literal["simple acceptance", "guard band"]
