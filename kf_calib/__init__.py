@@ -68,8 +68,8 @@ _HOMES = {
     "Watch": ("online.sequential_test", "Watch"),
 }
 
-_PRINTING = ("views.console", "views.diagnosis")
-"""What prints the results of these."""
+_SHOWING = ("views.notebook",)
+"""What prints the results of these, and shows them in notebooks."""
 
 __all__ = [
     "Bench", "Calibration", "Diagnosis", "Improvement", "InputError", "KfCalibError", "Parameter", "Recorder",
@@ -86,7 +86,7 @@ def __getattr__(name: str) -> Any:
         return import_module("kf_calib.views.figures")
     if name not in _HOMES:
         raise AttributeError(f"module 'kf_calib' has no attribute {name!r}")
-    for module in _PRINTING:
+    for module in _SHOWING:
         import_module(f"kf_calib.{module}")
     module, attribute = _HOMES[name]
     return getattr(import_module(f"kf_calib.{module}"), attribute)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,13 +13,13 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import pytest
+from helpers.browser import chromium
 
 import kf_calib
 
 pytest.importorskip("sphinx", reason="Sphinx is not there: the documentation is not built")
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.xdist_group("docs")  # built once
 
 
@@ -79,7 +78,8 @@ def test_commands_effects_and_public_names_are_all_there(pages: dict[Path, Page]
     assert {f"kf_calib.{name}" for name in kf_calib.__all__} <= anchors["api.html"]
     listed = json.loads(_printed("effects", "--json"))["effects"]
     assert {each["effect"].partition(":")[0] for each in listed} <= anchors["effects.html"]
-    commands = {"demo", "simulate", "record", "live", "replay", "compare", "diagnose", "improve", "plan", "paper"}
+    commands = {"demo", "simulate", "record", "live", "replay", "compare", "diagnose", "improve", "report", "plan",
+                "paper"}  # fmt: skip
     assert {f"kf-calib-{name}" for name in commands} <= anchors["command_line.html"]
 
 
@@ -92,14 +92,8 @@ def test_equations_are_mathml_without_a_command_of_tex_left_over(site: Path) -> 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """Chromium without a window; skipped where it, or playwright, is not there."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not there: no browser is asked")
-    if BROWSER is None:
-        pytest.skip("no Chromium is there (Debian: apt-get install chromium): no browser is asked")
-    with playwright.sync_playwright() as running:
-        opened = running.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])  # root in a container
+    with chromium() as opened:
         yield opened
-        opened.close()
 
 
 def test_a_browser_shows_every_page_without_an_error_and_asks_nobody(browser: Any, site: Path) -> None:

@@ -20,6 +20,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "compare": (HIDDEN,),
     "diagnose": (HIDDEN,),
     "improve": (HIDDEN, "--unattended"),
+    "report": (HIDDEN, "--against", HIDDEN.with_name("navigation_24.mcap")),
     "live": ("sim://?speed=500&orientations=6&dwell_s=4&slew_degps=360&sample_hz=20",),
     "simulate": ("made.mcap", *QUICK),
     "record": ("recorded.mcap", "lines.csv", "--axes", "y z x", "--gravity", "9.81"),

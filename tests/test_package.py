@@ -53,6 +53,7 @@ def test_the_licence_of_every_locked_package_is_listed(licences: ModuleType) -> 
     wanted = {name: version for lock in licences.TABLES.values() for name, version in licences.locked(lock).items()}
     assert {name: version for name, (version, _) in listed.items()} == wanted, "run tools/licences"
     assert all(licence for _, licence in listed.values())
+    assert licences.PAGE.read_text().startswith(licences.introduction()), "run tools/licences"
     for each in metadata.distributions():
         name = licences.normal(each.name)
         if wanted.get(name) == each.version:

@@ -18,8 +18,18 @@ INTRODUCTION = """\
 
 `kf_calib` is under the MIT licence ([LICENSE](../LICENSE)). The packages it needs are installed beside it, each under
 the licence that its own metadata state. `tools/licences` writes this page from the locked versions.
+
+One library comes within `kf_calib`, and is in every page that `report` makes: uPlot {uplot}, under the MIT licence
+([uPlot.LICENSE](../kf_calib/views/report/uPlot.LICENSE)).
 """
+UPLOT = ROOT / "kf_calib" / "views" / "report" / "uPlot.iife.min.js"
 TABLES = {"What a user installs": "requirements.lock", "Besides, for development": "requirements-dev.lock"}
+
+
+def introduction() -> str:
+    """What stands above the tables, with the version of uPlot that its first line states."""
+    (version,) = re.findall(r"uPlot \(v([\d.]+)\)", UPLOT.read_text()[:200])
+    return INTRODUCTION.format(uplot=version)
 
 
 def locked(lock: str) -> dict[str, str]:
@@ -65,7 +75,7 @@ def _installed(name: str, version: str) -> bool:
 
 
 def main() -> None:
-    page, done = INTRODUCTION, dict[str, str]()
+    page, done = introduction(), dict[str, str]()
     for heading, lock in TABLES.items():
         versions = {name: version for name, version in locked(lock).items() if name not in done}
         page += table(heading, found(versions).items())

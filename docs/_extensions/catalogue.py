@@ -29,7 +29,7 @@ def _said(*words: str) -> str:
 
 
 def _typical_sizes() -> Iterator[str]:
-    yield from ("", "## Typical sizes", "")
+    yield from ("", "## Sizes to hide", "")
     yield "What `simulate --hide EFFECT=SIZE` can hide, and how large it is in sensors of navigation grade and, below"
     yield from ("that, in MEMS sensors:", "", "```text", _said("simulate", "--hide", "help").rstrip(), "```")
 
@@ -55,6 +55,7 @@ def _details(every: list[list[dict[str, Any]]]) -> Iterator[str]:
             names = ", ".join(f"`{each['effect']}`" for each in own)
             yield f"One effect for each gimbal: {names}.\n"
         yield from _coefficients(first)
+        yield from _typical(first)
         if first["confused_with"]:
             yield f"\n**Confused with, shown by:** {_plain(first['confused_with'])}."
         yield f"\n**Source:** {_plain(first['source'])}."
@@ -72,6 +73,19 @@ def _coefficients(effect: dict[str, Any]) -> Iterator[str]:
     if unknown := effect["unknown"]:
         between = f"looked for from {_number(unknown['low'])} to {_number(unknown['high'])} {unknown['unit']}"
         yield f"| `{unknown['symbol']}` | `{unknown['unit']}` | {between} |"
+
+
+def _typical(effect: dict[str, Any]) -> Iterator[str]:
+    """Usual sizes of a coefficient in sensors of each grade."""
+    said = list[str]()
+    for grade, words in (("navigation", "in sensors of navigation grade"), ("mems", "in MEMS sensors")):
+        if (sizes := effect["typical"][grade]) is not None:
+            own = effect["coefficients"][0]
+            low, high = (_number(size * own["per_si"]) for size in sizes)
+            between = high if low == high else f"up to {high}" if not sizes[0] else f"{low} to {high}"
+            said.append(f"{between} {own['shown_unit']} {words}")
+    if said:
+        yield f"\n**Typical size:** {', '.join(said)}."
 
 
 def _number(value: float) -> str:

@@ -16,7 +16,7 @@ import kf_calib
 
 _LITERAL = re.compile(r"(``.*?``)", re.DOTALL)
 _MARKUP = re.compile(r"(?<=\w)_(?=\W|$)|[\\*|`]")
-_KINDS = ("function", "class", "exception")
+_KINDS = ("function", "class", "exception", "data")
 
 
 class PublicNames(SphinxDirective):
@@ -34,11 +34,15 @@ def _directives() -> Iterator[str]:
         yield f".. auto{_kind(name)}:: kf_calib.{name}"
         if _kind(name) == "class":
             yield "   :members:"
+        if _kind(name) == "data":
+            yield "   :no-value:"
         yield ""
 
 
 def _kind(name: str) -> str:
     found = getattr(kf_calib, name)
+    if inspect.ismodule(found):  # which stands for another one, and so is documented as an attribute
+        return "data"
     if not inspect.isclass(found):
         return "function"
     return "exception" if issubclass(found, Exception) else "class"

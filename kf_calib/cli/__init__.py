@@ -17,7 +17,8 @@ from kf_calib.cli.failures import tell
 
 SECTIONS = {
     "Evaluate a recording": {"replay": "evaluate.replay", "diagnose": "evaluate.diagnose",
-                             "improve": "evaluate.improve", "compare": "evaluate.compare"},
+                             "improve": "evaluate.improve", "compare": "evaluate.compare",
+                             "report": "report.report"},
     "Use a calibration": {"apply": "exchange.apply", "verify": "exchange.verify", "history": "exchange.history",
                           "certificate": "certificate.certificate"},
     "Run a bench": {"plan": "plan.plan", "record": "acquire.record", "live": "live.live"},

@@ -36,6 +36,7 @@ from kf_calib.cli.options import (
     units_option,
 )
 from kf_calib.cli.pictures import Pictures, figures_of, picture_options
+from kf_calib.cli.report import measured_of, report_option, save_report
 from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
@@ -98,14 +99,17 @@ def replay(
 @recording_options
 @filter_options
 @picture_options
+@report_option
 @overwrite_option
+@units_option
 @json_option
-def compare(recording: Path, overwrite: bool, as_json: bool, **options: Any) -> None:
+def compare(recording: Path, report: Path | None, overwrite: bool, as_json: bool, **options: Any) -> None:
     """Block engine, filterpy and batch least squares on the same recording: differences, time, memory."""
     from kf_calib.estimation.engine_comparison import compare as run
 
     outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     source, settings = opened(recording, options)
+    measured = measured_of(recording, options) if report else None
     with progress(f"comparing on {recording.name}", as_json) as tick:
         compared = run(source, settings, tick)
     if as_json:
@@ -118,6 +122,7 @@ def compare(recording: Path, overwrite: bool, as_json: bool, **options: Any) -> 
         show(comparison_table(compared))
     with delivery(outputs, as_json) as deliver:
         pictures.save(deliver, lambda path: save_view(compared, path), figures_of(compared))
+        save_report(deliver, report, compared, measured)
 
 
 @click.command(
@@ -234,6 +239,7 @@ def diagnose(ctx: click.Context, recording: Path, overwrite: bool, strict: bool,
 @output_option("--save-model", "--out-model", metavar="FILE.toml", help="Save the last model here.", panel=OUTPUT)
 @output_option("--journal", "journal_file", metavar="FILE", help="Keep a journal of the steps here.", panel=OUTPUT)
 @picture_options
+@report_option
 @overwrite_option
 @strict_option
 @units_option
@@ -249,6 +255,7 @@ def improve(
     save_model: Path | None,
     journal_file: Path | None,
     from_journal: Path | None,
+    report: Path | None,
     overwrite: bool,
     strict: bool,
     as_json: bool,
@@ -272,6 +279,7 @@ def improve(
     _refuse_engine(options)
     settings = settings_of(options)
     origin = replace(origin, **_for_journal(options, settings.effects))
+    measured = measured_of(recording, options) if report else None
 
     with delivery(outputs, as_json) as deliver:
 
@@ -300,6 +308,7 @@ def improve(
         deliver.model(save_model, state.result)
         deliver.file(journal_file, lambda path: selection_journal.write(path, state, origin))
         pictures.save(deliver, lambda path: save_view(state, path), figures_of(state))
+        save_report(deliver, report, state, measured, [views.honest_sentence(checked)] if checked else [])
     if strict and state.found.test.consistent is False:
         ctx.exit(1)
 

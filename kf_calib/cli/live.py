@@ -156,7 +156,7 @@ def live(
         run = _Run(opened, settings, wanted, auto, record, not sys.stdout.isatty() or as_json)
         view = _view(rrd, rerun_port if with_viewer else None, rerun_bind)
         if view is not None:
-            run.listeners.append(lambda judgement: view.offer(judgement.result))
+            run.listeners.append(lambda judgement: view.offer(judgement.result, judgement))
         with answered(run.handle_signal):  # until all is written: who closes a terminal sends several
             _follow(run, source, record, as_json)
             if view is not None:

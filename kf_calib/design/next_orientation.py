@@ -43,6 +43,8 @@ class Advice:
     - before, after: separation in sigma before and after a dwell there.
     - stay_s: how long to stay; None for a dwell of the usual length.
     - told: names of the effects that it tells apart.
+    - shows: number of hidden effects that a dwell there makes visible, where this is what it is advised for; before
+      and after are then no separations, but numbers of these.
     """
 
     gimbal_deg: tuple[float, ...]
@@ -50,6 +52,7 @@ class Advice:
     after: float
     stay_s: float | None = None
     told: tuple[str, ...] = ()
+    shows: int = 0
 
 
 def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequence[Effect]) -> Advice | None:
@@ -110,7 +113,8 @@ def to_show(fitted: Fit, hidden: Sequence[Effect]) -> tuple[Advice, int] | None:
         left = np.abs(triangle(np.concatenate([so_far, rows[:, :, kept]], axis=1))[:, width:, width:])
         shown += (left * scales[start - width : end - width]).max(axis=(1, 2)) > 5.0
     best = int(np.argmax(shown))
-    return Advice(tuple(np.degrees(poses[best]).round(1).tolist()), 0.0, float(shown[best])), int(shown[best])
+    count = int(shown[best])
+    return Advice(tuple(np.degrees(poses[best]).round(1).tolist()), 0.0, float(count), shows=count), count
 
 
 @dataclass(frozen=True)

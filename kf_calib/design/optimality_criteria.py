@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -35,13 +35,15 @@ class Aim:
     measures.
 
     If the cost has kinks, the optimisation uses power means with the exponents ``powers`` in turn; infinity stands for
-    the cost itself.
+    the cost itself. ``tolerated`` (12,) are the sigmas that are asked for, in the units of the factors, infinity where
+    none is; None if the aim is not about any.
     """
 
     name: str
     measures: str
     cost: Score
     powers: tuple[float, ...] = (math.inf,)
+    tolerated: Floats | None = field(default=None, compare=False)
 
     def __call__(self, factors: Floats, power: float = math.inf) -> Floats:
         return self.cost(factors, power)
@@ -83,10 +85,11 @@ def minimax(tolerated: Floats) -> Aim:
         count = len(asked)
         return _largest(np.log(sigmas(factors)[..., :count][..., asked] / tolerated[asked]), power)
 
-    return Aim("minimax", "largest sigma relative to what is tolerated", cost, _SOFT)
+    return Aim("minimax", "largest sigma relative to what is tolerated", cost, _SOFT, tolerated)
 
 
-NAMED: dict[str, Aim] = {aim.name: aim for aim in (D, A, E, minimax(np.ones(12)), CONDITION)}
+LARGEST = replace(minimax(np.ones(12)), tolerated=None)
+NAMED: dict[str, Aim] = {aim.name: aim for aim in (D, A, E, LARGEST, CONDITION)}
 
 
 def _largest(logs: Floats, power: float) -> Floats:

@@ -74,6 +74,14 @@ class Plan:
         out = optimality_criteria.sigmas(self.factors) * self.prospect.units
         return np.where([optimality_criteria.unseen(factor) for factor in self.factors], np.nan, out)
 
+    @property
+    def targets(self) -> Floats:
+        """Sigmas (p,) in SI that the plan aims at; infinite where none is asked for."""
+        out, asked = np.full(len(self.prospect.units), np.inf), self.search.aim.tolerated
+        if asked is not None:
+            out[:STATE_COUNT] = asked * self.prospect.units[:STATE_COUNT]
+        return out
+
     @cached_property
     def directions(self) -> Floats:
         """Unit vectors (n, 3) of the specific force in the platform frame."""

@@ -1,29 +1,54 @@
-"""The smallest size at which each effect would be found, computed from the columns alone."""
+"""The smallest size at which each effect would be found, computed from the columns alone, and why others are unseen."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from kf_calib.diagnosis.candidate_tests import LEVEL, SHARE, CandidateTests
-from kf_calib.effects import Coefficient
+from kf_calib.effects import Coefficient, Effect, Stimulus
+from kf_calib.effects.effect import Grade, Typical
+from kf_calib.estimation.dwell_columns import stimulus_of
+from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.measurement_model import effect_columns
 from kf_calib.estimation.observability import smallest_size
+
+QUIET = 1e-4
+"""Density of white noise below which sensors are of navigation grade, m/s^2/sqrt(Hz) (10 ug/sqrt(Hz))."""
+
+_CONDITIONS = {
+    "temperature_c": "the temperature does not change in this run, or is not recorded",
+    "variance_mps2_2": "the strength of vibration does not change in this run, or is not looked at",
+}
+"""Conditions, other than orientations, that effects may depend on, and what is said where they do not vary."""
 
 
 @dataclass(frozen=True)
 class Detectable:
     """The size of a coefficient at which an effect is found in 90 of 100 runs; of several, that of the least visible.
 
-    name: of the effect. minimum: the size in SI. coefficient: which of them it is the size of.
+    name: of the effect. minimum: the size in SI. coefficient: which of them it is the size of. typical: usual sizes of
+    such coefficients, in SI.
     """
 
     name: str
     minimum: float
     coefficient: Coefficient
+    typical: Typical
 
     @property
     def unit(self) -> str:
         """The SI unit of the coefficient."""
         return self.coefficient.unit
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """An effect of which a run shows nothing, and why."""
+
+    name: str
+    why: str
 
 
 def detectable(test: CandidateTests) -> list[Detectable]:
@@ -34,5 +59,45 @@ def detectable(test: CandidateTests) -> list[Detectable]:
         found = None if name in test.invisible else smallest_size(candidate, SHARE * LEVEL / test.effective_tests)
         if found is not None:
             coefficient, minimum = found
-            out.append(Detectable(name, minimum, coefficient))
+            out.append(Detectable(name, minimum, coefficient, candidate.effect.typical))
     return out
+
+
+def unseen(fitted: Fit, test: CandidateTests) -> list[Unseen]:
+    """The effects of which a run shows nothing, each with the reason; then frequencies that were not searched."""
+    bench, dwells = fitted.carried.model.bench, fitted.dwells
+    stimulus = stimulus_of(dwells, bench, fitted.carried.state)
+    still = [name for name in test.unseen if name not in test.in_slews_only]
+    out = [Unseen(name, _reason(test.candidate(name).effect, stimulus)) for name in still]
+    out += [Unseen(name, "shows while the platform turns, and only dwells are tested") for name in test.in_slews_only]
+    if test.between:
+        out.append(Unseen(test.between, "not among the frequencies that are searched in this run"))
+    return out
+
+
+def _reason(effect: Effect, stimulus: Stimulus) -> str:
+    """Return why nothing of an effect is seen in dwells."""
+    columns = effect_columns([effect], stimulus)
+    for quantity, words in _CONDITIONS.items():
+        values = np.nan_to_num(getattr(stimulus, quantity))
+        ramp = np.arange(len(values), dtype=float).reshape(-1, *[1] * (values.ndim - 1)) / len(values)
+        if not np.ptp(values, axis=0).any():
+            changed = effect_columns([effect], replace(stimulus, **{quantity: values + ramp}))
+            if not np.array_equal(changed, columns):
+                return words
+    if not columns.any():
+        return "adds nothing to a reading in these orientations"
+    return effect.degeneracy(stimulus.bench) or "adds to every dwell what the model adds already"
+
+
+def sensor_grade(fitted: Fit) -> Grade:
+    """The grade of the sensors, by the noise of this run: navigation grade below 10 ug/sqrt(Hz), otherwise MEMS.
+
+    The density of a reading's noise is its effective sigma (as if white) times the square root of the time from one
+    reading to the next; that of the quietest accelerometer counts. Quartz-flexure accelerometers have about
+    1 ug/sqrt(Hz), consumer chips 100 and more; 10 is half way between in logarithm.
+    """
+    dwells = fitted.dwells
+    readings, lasting_s = sum(dwell.count - 1 for dwell in dwells), sum(d.end_s - d.start_s for d in dwells)
+    density = fitted.noise.effective_sigma_mps2 * np.sqrt(lasting_s / max(readings, 1))
+    return "navigation" if float(density.min()) < QUIET else "mems"

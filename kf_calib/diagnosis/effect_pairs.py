@@ -7,10 +7,11 @@ candidate, and a pair holds its name instead.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.candidate_tests import EQUAL, CandidateTests, chance_fall, margin_of, walk_path_margin
 
 _EQUAL_PAIR = 9.21  # as EQUAL, for two pairs that have no effect in common: 1 %, 2 degrees of freedom
@@ -108,3 +109,13 @@ def candidate_overlap(test: CandidateTests, one: Member, other: Member) -> float
     if isinstance(one, str) or isinstance(other, str):
         return 1.0
     return test.scan.candidates[one].overlap(test.scan.candidates[other])
+
+
+def overlap_matrix(test: CandidateTests, names: Sequence[str]) -> Floats:
+    """The overlaps (n, n) of effects with each other; NaN with one that has no columns in the scan and is no walk."""
+    members: list[Member | None] = [test.best.get(name, name if name == test.walking else None) for name in names]
+    overlaps = [
+        [np.nan if one is None or other is None else candidate_overlap(test, one, other) for other in members]
+        for one in members
+    ]
+    return np.array(overlaps, float).reshape(len(names), len(names))

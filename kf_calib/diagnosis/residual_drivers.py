@@ -8,6 +8,7 @@ the difference between the two models' predictions.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,13 +22,14 @@ from kf_calib.effects.formula import formula, quantities
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.residual_table import mean_sigmas, quantity_means
-from kf_calib.estimation.results import Calibration, consistency
-from kf_calib.estimation.score_test import Frame
-from kf_calib.support.tail_probabilities import chi_squared_tail
+from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.score_test import falls_together
+from kf_calib.support.tail_probabilities import f_tail
+from kf_calib.support.threads import one_blas_thread
 
 _OF_FORCE = ("{0}*{0}", "{0}**3", "{0}**4")
 _OF_STEP = ("{0}", "{0}*abs({0})", "sign({0})")
-_OF_ANGLE = tuple(f"{wave}({turns}*{{0}})" for turns in (1, 2, 3) for wave in ("sin", "cos"))
+_WAVES = tuple(f"{wave}({turns}*{{0}})" for turns in (1, 2, 3) for wave in ("sin", "cos"))
 _OF_TIME = ("{0}", "{0}*{0}", "{0}**3")
 _FUNCTIONS = {"a": _OF_FORCE, "p": _OF_FORCE, "o": _OF_FORCE, "da": _OF_STEP, "t": _OF_TIME, "T": _OF_TIME,
               "dT": ("{0}", "{0}*{0}"), "tau": ("{0}",)}  # fmt: skip
@@ -48,7 +50,8 @@ class Driver:
 
     symbol: its name in formulas. words: what it is. unit: its SI unit. values (D, 3): its mean over each dwell, for
     each accelerometer. fall, dof: decrease of chi-squared by smooth functions of it, and their degrees of freedom.
-    share: part of the misfit beyond noise that they explain, 0 to 1; 0 if the model fits.
+    share: part of the misfit beyond noise that they explain beyond what as many arbitrary functions would, 0 to 1; 0 if
+    the model fits. p_value: the chance that as many arbitrary functions explain as much of this misfit.
     """
 
     symbol: str
@@ -58,25 +61,19 @@ class Driver:
     fall: float
     dof: int
     share: float
-
-    @property
-    def p_value(self) -> float:
-        """The chance that functions of this quantity explain so much by noise alone."""
-        return chi_squared_tail(self.dof, self.fall) if self.dof else 1.0
+    p_value: float
 
 
 def drivers_of(result: Calibration) -> list[Driver]:
     """The quantities that vary in a run, those that explain most of the misfit first."""
     fitted, known = result.fit, quantities(result.bench.axes)
     gimbals = range(1, len(result.bench.axes) + 1)
-    functions = _FUNCTIONS | {f"q{k}": _OF_ANGLE for k in gimbals}
+    functions = _FUNCTIONS | {f"q{k}": _WAVES for k in gimbals}
     words = _WORDS | {f"q{k}": f"angle of gimbal {k}" for k in gimbals}
     values = {name: each for name, each in quantity_means(result, list(functions)).items() if _varies(each)}
-    falls = _falls(fitted, {name: [text.format(name) for text in functions[name]] for name in values})
-    misfit = consistency(fitted)
-    excess = misfit.statistic - misfit.dof if misfit.consistent is False else 0.0
+    falls = _falls(fitted, {name: _formulas(name, functions[name]) for name in values})
     found = [
-        Driver(name, words[name], known[name].unit, each, *falls[name], _share(*falls[name], excess))
+        Driver(name, words[name], known[name].unit, each, *falls[name], *_beyond_chance(*falls[name], result))
         for name, each in values.items()
     ]
     return sorted(found, key=lambda each: (-each.share, each.p_value))
@@ -87,24 +84,50 @@ def _varies(values: Floats) -> bool:
     return bool(np.ptp(values, axis=0).max() > _CONSTANT * max(np.abs(values).max(), 1e-3))
 
 
+def misfit_beyond_noise(result: Calibration) -> float:
+    """What chi-squared has more than its degrees of freedom; 0 if the model agrees with the run."""
+    misfit = result.consistency
+    return misfit.statistic - misfit.dof if misfit.consistent is False else 0.0
+
+
 def _share(fall: float, dof: int, excess: float) -> float:
     """Return the part of the misfit beyond noise that a fall of chi-squared beyond its degrees of freedom explains."""
     return float(np.clip((fall - dof) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0
 
 
+def _beyond_chance(fall: float, dof: int, result: Calibration) -> tuple[float, float]:
+    """Return the share of a driver and its p-value.
+
+    Of a misfit of n degrees of freedom, any k functions explain k / n on average, however large the misfit is. So chi-
+    squared per degree of freedom with the functions is compared with that without them (as R-squared is adjusted), and
+    their decrease per function with what they leave per degree of freedom (the F-test), which is noise at least.
+    """
+    misfit = result.consistency
+    rest = misfit.dof - dof
+    if not dof or rest <= 0:
+        return 0.0, 1.0
+    left = max(misfit.statistic - fall, 0.0) / rest
+    p_value = f_tail(dof, rest, fall / dof / max(left, 1.0))
+    excess = misfit_beyond_noise(result) / misfit.dof
+    return (float(np.clip(1.0 - (left - 1.0) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0), p_value
+
+
+def _formulas(symbol: str, functions: Sequence[str]) -> list[str]:
+    """Return what is added to readings in proportion to functions of a quantity; with a gimbal's angle, that gimbal
+    may also turn by such functions, as by errors of its encoder, and the waves of readings are those of one turn."""
+    texts = [text.format(symbol) for text in functions]
+    if not symbol.startswith("q"):
+        return [f"drv{k} = {text}" for k, text in enumerate(texts)]
+    return [*(f"drv{k}:{symbol[1:]} = {text}" for k, text in enumerate(texts)),
+            *(f"drr{k} = {text}" for k, text in enumerate(texts[:2]))]  # fmt: skip
+
+
 def _falls(fitted: Fit, texts: dict[str, list[str]]) -> dict[str, tuple[float, int]]:
     """Return for each driver the decrease of chi-squared by all its functions together, and their rank."""
     bench = fitted.carried.model.bench
-    effects = {
-        name: [formula(f"drv{k} = {text}", bench.axes, bench.gravity_mps2, checked=False)
-               for k, text in enumerate(own)] for name, own in texts.items()
-    }  # fmt: skip
-    frame = Frame(fitted.carried, fitted.noise.judging, [])
-    scanned = frame.scan(fitted.carried, [effect for own in effects.values() for effect in own])
-    left, out = iter(scanned.candidates), dict[str, tuple[float, int]]()
-    for name, own in effects.items():
-        out[name] = scanned.explained(np.concatenate([next(left).basis for _ in own], axis=1))
-    return out
+    groups = [[formula(text, bench.axes, bench.gravity_mps2, checked=False) for text in own] for own in texts.values()]
+    with one_blas_thread():
+        return dict(zip(texts, falls_together(fitted.carried, fitted.noise.judging, groups), strict=True))
 
 
 def is_function_of(values: Floats, driver: Driver) -> bool:
@@ -130,23 +153,33 @@ def is_function_of(values: Floats, driver: Driver) -> bool:
 class Explanation:
     """A model with more in it than the one whose residuals are looked at.
 
-    names: what it has in addition. before, after: the two calibrations. fits: whether it fits the run.
+    names: what it has in addition, formulas without the name that they were given. before, after: the two
+    calibrations. fits: whether it fits the run. p_value: the family-wise p-value of a single effect of the catalogue;
+    None of anything else.
     """
 
     names: tuple[str, ...]
     before: Calibration
     after: Calibration
     fits: bool
+    p_value: float | None = None
 
     @property
     def name(self) -> str:
         """The effects, as a sum."""
         return " + ".join(self.names)
 
+    @property
+    def share(self) -> float | None:
+        """Part of the misfit beyond noise that it explains, 0 to 1: the decrease of chi-squared from refit to refit,
+        less the degrees of freedom that it takes; None if the means of the dwells agree without it."""
+        excess, own, rest = misfit_beyond_noise(self.before), self.before.consistency, self.after.consistency
+        return _share(own.statistic - rest.statistic, own.dof - rest.dof, excess) if excess > 0.0 else None
+
     @cached_property
     def left_mps2(self) -> Floats:
         """What it leaves of the residuals (D, 3)."""
-        return self.after.residuals_mps2 - _walk_path(self.after)
+        return unexplained_mps2(self.after)
 
     @cached_property
     def left_ratios(self) -> Floats:
@@ -174,8 +207,10 @@ class Explanation:
 
     @cached_property
     def _own(self) -> NDArray[np.intp]:
-        """Return the places of its coefficients in the state."""
-        return np.array([p for name in self.names for p in _places(self.after, name)], int)
+        """Return the places of its coefficients in the state; a walk has none, its path is no coefficient."""
+        model, known = self.after.model, self.before.model.parts
+        added = (part for name, part in model.parts.items() if name not in known)
+        return np.array([place for part in added for place in range(*part.indices(model.count))], int)
 
     @cached_property
     def predicted_sigma_mps2(self) -> Floats:
@@ -198,6 +233,23 @@ class Explanation:
         return np.sqrt(np.maximum(np.einsum("dip,pq,diq->di", left, covariance, left), 0.0))
 
 
+def unexplained_mps2(result: Calibration) -> Floats:
+    """Residuals (D, 3) less the path of the biases where these walk, m/s^2."""
+    return result.residuals_mps2 - _walk_path(result)
+
+
+def channel_rms_mps2(residuals_mps2: Floats) -> Floats:
+    """The rms (3,) of residuals (D, 3) of each accelerometer, m/s^2."""
+    return np.sqrt(np.mean(residuals_mps2**2, axis=0))
+
+
+def unexplained_rms_mps2(result: Calibration) -> float:
+    """The in-sample error without the path of the biases where these walk, m/s^2."""
+    if not result.noise.walk_mps2_per_sqrt_s:
+        return result.residual_rms_mps2
+    return float(np.sqrt(np.mean(unexplained_mps2(result) ** 2)))
+
+
 def _walk_path(result: Calibration) -> Floats:
     """Return the path of the biases (D, 3), less where it ends, m/s^2; zeros if they do not walk.
 
@@ -214,12 +266,6 @@ def _walk_path(result: Calibration) -> Floats:
     return np.array(path).T
 
 
-def _places(result: Calibration, name: str) -> list[int]:
-    """Return the places of an effect's coefficients in the state; none for a walk, whose path is no coefficient."""
-    part = result.model.parts.get(name.partition("=")[0].strip())
-    return list(range(*part.indices(result.model.count))) if part is not None else []
-
-
 def explanations(found: Diagnosis, refits: Refits | None = None) -> list[Explanation]:
     """The explanations of a diagnosis, the best first: what is missing, or the formula that describes an unknown
     misfit; then the other suspects.
@@ -228,11 +274,13 @@ def explanations(found: Diagnosis, refits: Refits | None = None) -> list[Explana
     """
     out = list[Explanation]()
     if found.missing and found.after is not None:
-        out.append(Explanation(found.missing, found.before, found.after, True))
+        alone = found.test.p_values.get(found.missing[0]) if len(found.missing) == 1 else None
+        out.append(Explanation(found.missing, found.before, found.after, True, alone))
     elif found.description is not None:
         formulas = found.description.formulas
         names = tuple(text.partition("=")[2].strip() or text for text in formulas)
-        out.append(Explanation(names, found.before, (refits or Refits()).with_effects(found.before, formulas), False))
+        after = (refits or Refits()).with_effects(found.before, formulas)
+        out.append(Explanation(names, found.before, after, after.consistency.consistent is not False))
     rest = [each for each in found.suspects if (each.name,) != found.missing]
     rest.sort(key=lambda each: not each.fits)  # stable: those that fit, by significance, before those that do not
-    return [*out, *(Explanation((each.name,), found.before, each.refit, each.fits) for each in rest)]
+    return [*out, *(Explanation((each.name,), found.before, each.refit, each.fits, each.p_value) for each in rest)]

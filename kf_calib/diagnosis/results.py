@@ -11,11 +11,12 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.design import next_orientation as advise
 from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import CandidateTests
-from kf_calib.diagnosis.detectability import Detectable, detectable
+from kf_calib.diagnosis.detectability import Detectable, Unseen, detectable, sensor_grade, unseen
 from kf_calib.diagnosis.unknown_effect import Description, describe
+from kf_calib.effects.effect import Grade
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration, Parameter
-from kf_calib.support.printing import printed
+from kf_calib.support.printing import as_html, printed
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,9 @@ class Diagnosis:
     def __str__(self) -> str:
         return printed(self)
 
+    def _repr_html_(self) -> str | None:
+        return as_html(self)
+
     @cached_property
     def residual_ratios(self) -> Floats:
         """Residuals of the dwell means (D, 3), over their sigma."""
@@ -97,6 +101,16 @@ class Diagnosis:
     def detectable(self) -> list[Detectable]:
         """The smallest size of every visible effect that such a run would find."""
         return detectable(self.test)
+
+    @cached_property
+    def unseen(self) -> list[Unseen]:
+        """The effects of which the run shows nothing, and why."""
+        return unseen(self.before.fit, self.test)
+
+    @property
+    def grade(self) -> Grade:
+        """The grade of the sensors, by the noise of the run."""
+        return sensor_grade(self.before.fit)
 
     @cached_property
     def next_orientation(self) -> tuple[Advice, str] | None:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import Coefficient, Effect, SensorEffect, Unknown
+from kf_calib.effects.effect import MICRO_G, MILLI_G, Coefficient, Effect, SensorEffect, Typical, Unknown
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -19,6 +19,7 @@ class BiasDrift(SensorEffect):
     name, title, source = "bias-drift", "bias that drifts with time", "IEEE Std 1293, drift"
     confused_with = "warm-up; a monotone order of poses mixes it with angle"
     symbol, unit, scale = "beta", "m/s^3", 1e-6
+    typical = Typical((1 * MICRO_G / 3600, 10 * MICRO_G / 3600), (10 * MICRO_G / 60, MILLI_G / 60))
 
     def terms(self, s: Stimulus) -> Floats:
         return np.repeat(s.elapsed_s[:, None], 3, axis=1)
@@ -30,6 +31,7 @@ class ScaleDrift(SensorEffect):
     name, title, source = "scale-drift", "scale factor that drifts with time", "IEEE Std 1293, drift"
     confused_with = "base-tilt-drift"
     symbol, unit, scale = "kappa", "1/s", 1e-7
+    typical = Typical((1e-6 / 86400, 10e-6 / 86400))
 
     def terms(self, s: Stimulus) -> Floats:
         return s.elapsed_s[:, None] * s.along
@@ -41,6 +43,7 @@ class Hysteresis(SensorEffect):
     name, title, source = "hysteresis", "reading that depends on the side it was come from", "IEEE Std 1293, hysteresis"
     confused_with = "needs the same pose from two sides"
     symbol, unit, scale = "h", "m/s^2", 1e-3
+    typical = Typical((1 * MICRO_G, 20 * MICRO_G), (0.0, 2 * MILLI_G))
 
     def terms(self, s: Stimulus) -> Floats:
         return np.sign(np.where(np.abs(s.step) > 1e-6 * STANDARD_GRAVITY_MPS2, s.step, 0.0))
@@ -61,6 +64,7 @@ class WarmUp(_Decay):
     confused_with = "bias-drift; needs an early long dwell"
     symbol, unit, scale = "B", "m/s^2", 1e-2
     unknown = Unknown("tauWarm", "s", 30.0, 10800.0, "min", 1.0 / 60.0)
+    typical = Typical((10 * MICRO_G, 200 * MICRO_G), (1 * MILLI_G, 10 * MILLI_G))
 
     def terms(self, s: Stimulus) -> Floats:
         return np.repeat(np.exp(-s.elapsed_s / self.value)[:, None], 3, axis=1)
@@ -73,6 +77,7 @@ class Settling(_Decay):
     confused_with = "shows in early against late samples of a dwell"
     symbol, unit, scale = "C", "1", 1e-3
     unknown = Unknown("tauSettle", "s", 3.0, 600.0, "s", 1.0)
+    typical = Typical((1e-6, 30e-6))
 
     def terms(self, s: Stimulus) -> Floats:
         return s.step * np.exp(-s.since_arrival_s / self.value)[:, None]
@@ -92,6 +97,7 @@ class Sinusoid(Effect):
     oscillates = True
     step = 1e-7  # the phase is thousands of rad
     value = 0.15
+    typical = Typical((0.01 * MICRO_G, 1 * MICRO_G))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:

@@ -10,14 +10,36 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.effects.stimulus import Stimulus
-from kf_calib.support.units import field_unit
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2, field_unit
+
+MICRO_G, MILLI_G = 1e-6 * STANDARD_GRAVITY_MPS2, 1e-3 * STANDARD_GRAVITY_MPS2
+MICRO_PER_G, MILLI_PER_G = 1e-6 / STANDARD_GRAVITY_MPS2, 1e-3 / STANDARD_GRAVITY_MPS2
+"""ug/g^2 and mg/g^2 in s^2/m."""
+
+Grade = Literal["navigation", "mems"]
+
+
+@dataclass(frozen=True)
+class Typical:
+    """Sizes of a coefficient that are usual, from ... to, in SI; from 0 where only the greatest is known.
+
+    navigation, mems: in sensors of either grade, or, of what is the bench's, on a bench that such sensors are tested
+    on; None where it is not known.
+    """
+
+    navigation: tuple[float, float] | None = None
+    mems: tuple[float, float] | None = None
+
+    def of(self, grade: Grade) -> tuple[float, float] | None:
+        """The sizes of one grade."""
+        return self.mems if grade == "mems" else self.navigation
 
 
 @dataclass(frozen=True)
@@ -80,6 +102,7 @@ class Effect(ABC):
     ``columns`` gives the part that the stimulus asks for (``Stimulus.part``).
     averages: vibration goes with it, so readings are averaged over windows first, and their variance in these is known.
     step: of ln(value) in the differences of ``derivative``.
+    typical: usual sizes of its coefficients.
     """
 
     name: ClassVar[str]
@@ -93,6 +116,7 @@ class Effect(ABC):
     oscillates: ClassVar[bool] = False
     averages: ClassVar[bool] = False
     step: ClassVar[float] = 1e-4
+    typical: ClassVar[Typical] = Typical()
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""
     value: float = 0.0

@@ -6,9 +6,10 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects.effect import Coefficient, Effect, FrameEffect
+from kf_calib.effects.effect import Coefficient, Effect, FrameEffect, Typical
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 
 class BaseTilt(FrameEffect):
@@ -16,6 +17,7 @@ class BaseTilt(FrameEffect):
 
     name, title, source = "base-tilt", "tilt of the base", "IEEE Std 836, base motion"
     confused_with = "about the outer axis it is the outer encoder's zero"
+    typical = Typical((5e-6, 500e-6))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -33,6 +35,7 @@ class BaseTiltDrift(BaseTilt):
 
     name, title = "base-tilt-drift", "tilt of the base that grows with time"
     confused_with = "scale-drift"
+    typical = Typical((1e-6 / 86400, 50e-6 / 86400))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -49,6 +52,7 @@ class PlatformDrift(FrameEffect):
     """The platform turned by omega_d t, three rates in its own frame."""
 
     name, title, source = "platform-drift", "drift of the platform", "IEEE Std 836"
+    typical = Typical((np.radians(0.01) / 3600, np.radians(1.0) / 3600))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -66,6 +70,7 @@ class EarthRotation(FrameEffect):
 
     name, title, source = "earth-rotation", "rotation of the Earth", "IEEE Std 836; WGS 84 rate"
     confused_with = "platform-drift"
+    typical = Typical((1.0, 1.0), (1.0, 1.0))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -80,6 +85,7 @@ class Flexure(FrameEffect):
 
     name, title, source = "flexure", "bending under the torque of gravity", "IEEE Std 836"
     confused_with = "encoder-harmonic-1, cross-coupling"
+    typical = Typical((5e-6 / STANDARD_GRAVITY_MPS2, 100e-6 / STANDARD_GRAVITY_MPS2))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -94,6 +100,7 @@ class CrossTalk(Effect):
 
     name, title, source = "cross-talk", "a share of another channel's reading", "IEEE Std 1293"
     confused_with = "misalignment, always at rest"
+    typical = Typical((1e-6, 100e-6))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -164,6 +171,7 @@ class EncoderHarmonic1(_GimbalEffect):
 
     name, title, source = "encoder-harmonic-1", "eccentricity of an encoder", "IEEE Std 836, positioning errors"
     order = 1
+    typical = Typical((1e-6, 100e-6))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -186,6 +194,7 @@ class AxisNonorthogonality(_GimbalEffect):
     """Gimbal axis k tilted in its parent by tau: the child turns by tau - R^T tau, R the gimbal's own rotation."""
 
     name, title, source = "axis-nonorthogonality", "tilt of a gimbal axis", "IEEE Std 836, positioning errors"
+    typical = Typical((5e-6, 50e-6))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -204,6 +213,7 @@ class GravityError(Effect):
 
     name, title, source = "gravity-error", "wrong local gravity", "IEEE Std 836"
     confused_with = "a common scale factor, always"
+    typical = Typical((10e-6, 700e-6))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import SensorEffect, Unknown
+from kf_calib.effects.effect import MICRO_G, MICRO_PER_G, MILLI_PER_G, SensorEffect, Typical, Unknown
 from kf_calib.effects.stimulus import Stimulus
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 IEEE = "IEEE Std 1293, model equation"
 _EDGES = 500
@@ -18,6 +19,7 @@ class BiasAsymmetry(SensorEffect):
     name, title, source = "bias-asymmetry", "bias that changes sign with the input", IEEE
     confused_with = "odd-quadratic; invisible in six faces"
     symbol, unit, scale = "K0'", "m/s^2", 1e-3
+    typical = Typical((1 * MICRO_G, 10 * MICRO_G))
 
     def terms(self, s: Stimulus) -> Floats:
         return 0.5 * np.sign(s.along)
@@ -29,6 +31,7 @@ class ScaleAsymmetry(SensorEffect):
     name, title, source = "scale-asymmetry", "scale factor that differs with the sign of the input", IEEE
     confused_with = "second-order"
     symbol, unit, scale = "K1'", "1", 1e-3
+    typical = Typical((1e-6, 30e-6), (0.1e-3, 1e-3))
 
     def terms(self, s: Stimulus) -> Floats:
         return 0.5 * np.abs(s.along)
@@ -40,6 +43,7 @@ class SecondOrder(SensorEffect):
     name, title, source = "second-order", "second-order nonlinearity", IEEE
     confused_with = "scale-asymmetry"
     symbol, unit, scale = "K2_", "s^2/m", 1e-4
+    typical = Typical((1 * MICRO_PER_G, 20 * MICRO_PER_G), (0.1 * MILLI_PER_G, 3 * MILLI_PER_G))
 
     def terms(self, s: Stimulus) -> Floats:
         return s.along**2
@@ -51,6 +55,10 @@ class ThirdOrder(SensorEffect):
     name, title, source = "third-order", "third-order nonlinearity", IEEE
     confused_with = "odd-quadratic; invisible in six faces"
     symbol, unit, scale = "K3_", "s^4/m^2", 1e-5
+    typical = Typical(
+        (0.1 * MICRO_PER_G / STANDARD_GRAVITY_MPS2, 10 * MICRO_PER_G / STANDARD_GRAVITY_MPS2),
+        (0.0, 5 * MILLI_PER_G / STANDARD_GRAVITY_MPS2),
+    )
 
     def terms(self, s: Stimulus) -> Floats:
         return s.along**3
@@ -62,6 +70,7 @@ class OddQuadratic(SensorEffect):
     name, title, source = "odd-quadratic", "odd quadratic nonlinearity", IEEE
     confused_with = "third-order; invisible in six faces"
     symbol, unit, scale = "Koq", "s^2/m", 1e-4
+    typical = Typical((1 * MICRO_PER_G, 10 * MICRO_PER_G), (0.0, MILLI_PER_G))
 
     def terms(self, s: Stimulus) -> Floats:
         return s.along * np.abs(s.along)
@@ -70,6 +79,7 @@ class OddQuadratic(SensorEffect):
 class _CrossCoupling(SensorEffect):
     source, confused_with = IEEE, "seen in poses between the faces only"
     unit, scale = "s^2/m", 1e-4
+    typical = Typical((1 * MICRO_PER_G, 30 * MICRO_PER_G), (0.0, MILLI_PER_G))
 
 
 class CrossCouplingIP(_CrossCoupling):
@@ -104,6 +114,7 @@ class CrossAxisSquare(_CrossCoupling):
 
     name, title, symbol = "cross-axis-square", "square of the pendulous acceleration", "Kpp"
     confused_with = "second-order, bias"
+    typical = Typical((1 * MICRO_PER_G, 20 * MICRO_PER_G), (0.0, MILLI_PER_G))
 
     def terms(self, s: Stimulus) -> Floats:
         return s.pendulous**2
@@ -116,6 +127,7 @@ class VibrationRectification(SensorEffect):
     confused_with = "needs vibration that varies"
     averages = True
     symbol, unit, scale = "K2v", "s^2/m", 1e-4
+    typical = Typical((10 * MICRO_PER_G, 50 * MICRO_PER_G))
 
     def terms(self, s: Stimulus) -> Floats:
         return np.broadcast_to(s.variance_mps2_2, (len(s), 3))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import Coefficient, Effect
+from kf_calib.effects.effect import MICRO_G, Coefficient, Effect, Typical
 from kf_calib.effects.stimulus import Stimulus
 
 
@@ -17,6 +17,7 @@ class Magnetic(Effect):
 
     name, title, source = "magnetic", "response to the local magnetic field", "IEEE Std 1293, magnetic sensitivity"
     confused_with = "needs turns about the vertical"
+    typical = Typical((1 * 0.2 * MICRO_G, 20 * 0.2 * MICRO_G))  # 1 to 20 ug/G in a horizontal field of 0.2 G
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import Coefficient, Effect, SensorEffect, Unknown
+from kf_calib.effects.effect import MICRO_G, MILLI_G, Coefficient, Effect, SensorEffect, Typical, Unknown
 from kf_calib.effects.stimulus import Stimulus
 
 IEEE = "IEEE Std 1293, environmental sensitivities"
@@ -17,6 +17,7 @@ class ThermalBias(SensorEffect):
     name, title, source = "thermal-bias", "bias that follows the temperature", IEEE
     confused_with = "needs a temperature swing"
     symbol, unit, scale = "alpha", "m/s^2/K", 1e-3
+    typical = Typical((5 * MICRO_G, 30 * MICRO_G), (0.15 * MILLI_G, 1 * MILLI_G))
 
     def terms(self, s: Stimulus) -> Floats:
         return np.repeat(s.warmth[:, None], 3, axis=1)
@@ -38,6 +39,7 @@ class ThermalScale(SensorEffect):
     name, title, source = "thermal-scale", "scale factor that follows the temperature", IEEE
     confused_with = "needs both signs of the input at two temperatures"
     symbol, unit, scale = "alphaS", "1/K", 1e-4
+    typical = Typical((50e-6, 150e-6))
 
     def terms(self, s: Stimulus) -> Floats:
         return s.warmth[:, None] * s.along
@@ -49,6 +51,7 @@ class ThermalRate(SensorEffect):
     name, title, source = "thermal-rate", "bias that follows the rate of the temperature", IEEE
     confused_with = "warm-up"
     symbol, unit, scale = "kappaT", "m s^-1/K", 1e-1
+    typical = Typical((1 * 60 * MICRO_G, 50 * 60 * MICRO_G))
 
     def terms(self, s: Stimulus) -> Floats:
         return np.repeat(s.warming[:, None], 3, axis=1)
@@ -58,6 +61,7 @@ class ThermalMisalignment(Effect):
     """gamma_p T a_p + gamma_o T a_o."""
 
     name, title, source = "thermal-misalignment", "alignment that follows the temperature", IEEE
+    typical = Typical((0.1e-6, 10e-6))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:

@@ -7,14 +7,17 @@ filter does not.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.qr import triangle
 from kf_calib.estimation.dwell_columns import Samples
 from kf_calib.estimation.measurement_model import dwell_map
 from kf_calib.estimation.noise_model import Noise
+from kf_calib.estimation.square_root_information import scale_columns
 
 _SEEN = 1e-9  # singular values that are smaller relative to the largest are rounding
 
@@ -36,9 +39,30 @@ def least_squares(
         by_dwell.setdefault((piece.dwell, piece.moving), []).append(piece)
     whitened = (_whitened(pieces, noise.of(pieces[0].moving), linearised_at) for pieces in by_dwell.values())
     stacked = np.concatenate(list(whitened))
-    design, readings = stacked[:, :-1], stacked[:, -1]
-    scale = np.linalg.norm(design, axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
+    scale = np.linalg.norm(stacked[:, :-1], axis=0)
+    return _solution(stacked, np.where(scale > 0, scale, 1.0), around)
+
+
+def running_states(samples: Iterable[Samples], noise: Noise, linearised_at: Floats, around: Floats) -> Floats:
+    """States (D, p) from the samples of the first dwell alone, the first two, ... all D; slews belong to the dwell
+    before. Each is the least-squares solution as in ``least_squares``; the rows so far are kept as a triangle."""
+
+    def solved(upper: Floats) -> Floats:
+        """Return the state; a column of rounding size alone does not determine what other dwells may."""
+        return _solution(upper, scale_columns(upper)[1], around)[0]
+
+    upper, states = np.zeros((0, len(around) + 1)), list[Floats]()
+    for (_, moving), pieces in itertools.groupby(samples, key=lambda piece: (piece.dwell, piece.moving)):
+        if not moving and len(upper):
+            states.append(solved(upper))
+        rows = _whitened(list(pieces), noise.of(moving), linearised_at)
+        upper = triangle(np.vstack([upper, rows]))
+    return np.array([*states, solved(upper)])
+
+
+def _solution(rows: Floats, scale: Floats, around: Floats) -> tuple[Floats, Floats]:
+    """Return state (p,) and covariance (p, p) from whitened rows [H | z] (n, p + 1), columns divided by ``scale``."""
+    design, readings = rows[:, :-1], rows[:, -1]
     left, upper = np.linalg.qr(design / scale)
     rotated, singular, right = np.linalg.svd(upper)
     seen = singular > _SEEN * singular[0]

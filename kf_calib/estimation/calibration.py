@@ -156,11 +156,12 @@ def filterpy_estimate(
     form: Literal["square-root", "plain"] = "square-root",
     on_progress: Callable[[float], None] | None = None,
     at_most: float = math.inf,
+    on_dwell: Callable[[Floats], None] | None = None,
 ) -> Estimate:
     """The same estimate from filterpy's filter, sample by sample, in a second pass over the source.
 
     ``on_progress`` is called with the share of the readings that are done; the pass stops after about ``at_most``
-    readings.
+    readings. ``on_dwell`` is called with the state (p,) after each dwell.
     """
     prior, model = result.settings.prior, result.model
     scale = np.concatenate([np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), result.carried.sizes[STATE_COUNT:]])
@@ -173,6 +174,7 @@ def filterpy_estimate(
         result.carried.state,
         scale,
         form,
+        on_dwell,
     )
     return result.considering(posterior.state, posterior.covariance)
 

@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import time
 import tracemalloc
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import TypeVar
 
 import numpy as np
 
+from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
-from kf_calib.estimation.batch_least_squares import least_squares
+from kf_calib.estimation.allan import AllanDeviation, LongestDwells
+from kf_calib.estimation.batch_least_squares import least_squares, running_states
 from kf_calib.estimation.calibration import calibrate, filterpy_estimate
-from kf_calib.estimation.dwell_columns import samples_of
+from kf_calib.estimation.dwell_columns import Samples, samples_of
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.results import Calibration, Estimate
 from kf_calib.estimation.settings import Settings
@@ -51,11 +53,18 @@ class Way:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The results of the three ways, and remarks on why they may differ."""
+    """The results of the three ways, and remarks on why they may differ.
+
+    - running_sigma: for each of the other ways, the differences (D, p) of the twelve parameters and the coefficients
+      from the block engine after each dwell, in the sigmas that these have then; NaN while not determined.
+    - allan: Allan deviation of the longest dwells.
+    """
 
     result: Calibration
     ways: dict[str, Way]
     remarks: tuple[str, ...]
+    running_sigma: Mapping[str, Floats] = field(default_factory=dict[str, Floats])
+    allan: AllanDeviation | None = None
 
     @property
     def max_difference_sigma(self) -> float:
@@ -77,13 +86,20 @@ def compare(
     stage.say("block engine")
     result, block_s = _timed(lambda: calibrate(source, settings, on_progress))
 
+    by_filterpy, conditions = list[Floats](), (
+        result.noise.weights, result.carried.state, result.model.nominal_state()
+    )  # fmt: skip
+
     def batch() -> Estimate:
-        around = result.model.nominal_state()
-        samples = samples_of(Pass(source, settings).rows(), result.carried)
-        return result.considering(*least_squares(samples, result.noise.weights, result.carried.state, around))
+        return result.considering(*least_squares(samples(), *conditions))
+
+    def samples() -> Iterator[Samples]:
+        return samples_of(Pass(source, settings).rows(), result.carried)
 
     stage.say("filterpy, reading by reading")
-    filterpy, filterpy_s = _timed(lambda: filterpy_estimate(source, result, on_progress=on_progress))
+    filterpy, filterpy_s = _timed(
+        lambda: filterpy_estimate(source, result, on_progress=on_progress, on_dwell=by_filterpy.append)
+    )
     stage.say("batch least squares")
     least, batch_s = _timed(batch)
     stage.say("memory of each")
@@ -93,7 +109,22 @@ def compare(
         "batch": Way(least, batch_s, _peak_mb(batch)),
     }
     ways = {name: _against(way, result.estimate) for name, way in ways.items()}
-    return Comparison(result, ways, tuple(_remarks(settings, result)))
+    longest = LongestDwells(result)
+    running = {"filterpy": by_filterpy, "batch": running_states(longest.passed_by(samples()), *conditions)}
+    differences = {name: _along(states, result) for name, states in running.items()}
+    return Comparison(result, ways, tuple(_remarks(settings, result)), differences, longest.allan_deviation())
+
+
+def _along(states: Iterable[Floats], result: Calibration) -> Floats:
+    """Return the differences (D, p) of the parameters and coefficients in ``states`` (D, p) from those of the block
+    engine after each dwell, in their sigmas then."""
+    out = list[Floats]()
+    for state, visit in zip(states, result.visits, strict=True):
+        own = visit.estimate
+        other = replace(own, state=state)
+        difference = np.append(other.parameters - own.parameters, other.effects - own.effects)
+        out.append(difference / np.append(own.sigma, own.effect_sigma))
+    return np.array(out)
 
 
 def _timed(run: Callable[[], Result]) -> tuple[Result, float]:

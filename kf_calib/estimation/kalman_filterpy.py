@@ -8,7 +8,7 @@ the covariance after tens of thousands of static samples with a wide prior (``fo
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -43,6 +43,7 @@ def estimate(
     linearised_at: Floats,
     scale: Floats,
     form: Literal["square-root", "plain"] = "square-root",
+    on_dwell: Callable[[Floats], None] | None = None,
 ) -> Posterior:
     """Run the filter over all samples and return the posterior.
 
@@ -50,6 +51,7 @@ def estimate(
     - linearised_at: where the nuisance states are linearised.
     - scale (p,): approximate change of a reading per unit of each state, m/s^2.
     - form: which of filterpy's filters is used.
+    - on_dwell: called with the state (p,) after each dwell and the slew that follows it.
 
     The biases walk with the intensity in ``noise`` from reading to reading (process noise Q).
     """
@@ -65,6 +67,8 @@ def estimate(
     place, nis, done, previous_s = (-1, False), 0.0, 0, math.nan
     for piece in samples:
         if (piece.dwell, piece.moving) != place:
+            if on_dwell is not None and done and not piece.moving:
+                on_dwell(kf.state() / scale)
             kf.enter_dwell(noise.of(piece.moving).effective_sigma_mps2)
             place = (piece.dwell, piece.moving)
         own = np.einsum("nc,icp->nip", piece.regressors, nuisances)
@@ -76,6 +80,8 @@ def estimate(
             nis += kf.update(observation, reading)
         done += len(piece.readings)
     state, covariance = kf.posterior()
+    if on_dwell is not None:
+        on_dwell(state / scale)
     return Posterior(state / scale, covariance / np.outer(scale, scale), nis, done)
 
 
@@ -152,7 +158,11 @@ class _Filter:
         self.kf.update(reading)
         return float(self.kf.y @ self.kf.SI @ self.kf.y)
 
+    def state(self) -> Floats:
+        """State without the nuisance states."""
+        return self.kf.x[: self.count].copy()
+
     def posterior(self) -> tuple[Floats, Floats]:
         """State and covariance without the nuisance states."""
         part = slice(0, self.count)
-        return self.kf.x[part].copy(), self.kf.P[part, part].copy()
+        return self.state(), self.kf.P[part, part].copy()

@@ -2,30 +2,60 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects.formula import quantities
-from kf_calib.estimation.dwell_columns import stimulus_of
-from kf_calib.estimation.noise_model import mean_covariances
-
-if TYPE_CHECKING:
-    from kf_calib.estimation.results import Calibration
+from kf_calib.errors import InputError
+from kf_calib.estimation.dwell_columns import Carried, stimulus_of
+from kf_calib.estimation.noise_model import Noise, mean_covariances
+from kf_calib.support.extras import need
 
 _SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0  # weights of begin, middle and end of a piece in its mean
 
 
-def mean_sigmas(result: Calibration) -> Floats:
+class Step(Protocol):
+    """The filter's step on a dwell, as ``Visit`` has it."""
+
+    @property
+    def nis(self) -> float: ...
+    @property
+    def dof(self) -> int: ...
+    @property
+    def innovation_mps2(self) -> Floats: ...
+    @property
+    def innovation_sigma_mps2(self) -> Floats: ...
+
+
+class Run(Protocol):
+    """What the table is made of: a ``Calibration``, which gives the table and so cannot be named here."""
+
+    @property
+    def bench(self) -> Bench: ...
+    @property
+    def carried(self) -> Carried: ...
+    @property
+    def noise(self) -> Noise: ...
+    @property
+    def visits(self) -> Sequence[Step]: ...
+    @property
+    def residuals_mps2(self) -> Floats: ...
+
+
+def mean_sigmas(result: Run) -> Floats:
     """Sigma (D, 3) of the mean of each dwell under the noise model, as the misfit is judged, m/s^2."""
     means = result.carried.means
     return np.sqrt(np.einsum("dii->di", mean_covariances(result.noise.judging, means, result.carried.state)))
 
 
-def quantity_means(result: Calibration, names: list[str]) -> dict[str, Floats]:
+def quantity_means(result: Run, names: list[str]) -> dict[str, Floats]:
     """Means (D, 3) over each dwell of quantities that formulas may name, in SI units, for each accelerometer."""
     dwells, known = result.carried.dwells, quantities(result.bench.axes)
     stimulus, places = stimulus_of(dwells, result.bench, result.carried.state), _weights(dwells)
@@ -42,7 +72,7 @@ def _weights(dwells: list[DwellFactor]) -> Floats:
     return np.concatenate([np.outer(dwell.counts / dwell.count, _SIMPSON).ravel() for dwell in dwells])
 
 
-def residual_table(result: Calibration) -> NDArray[np.void]:
+def residual_table(result: Run) -> NDArray[np.void]:
     """The table as a structured array (3 D,), dwell by dwell, accelerometers 1, 2, 3 in each.
 
     Columns: ``dwell`` (from 1), ``accelerometer``, ``start_s``, ``end_s``, ``readings``; gimbal angles
@@ -90,3 +120,16 @@ def residual_table(result: Calibration) -> NDArray[np.void]:
     for name, values in columns.items():
         table[name] = values
     return table
+
+
+def table_as(table: NDArray[np.void], kind: str) -> Any:
+    """A structured array as ``numpy`` has it, or as a DataFrame of ``pandas`` or ``polars``.
+
+    Raises InputError for another kind, and MissingExtraError where the package is not installed.
+    """
+    if kind == "numpy":
+        return table
+    if kind not in ("pandas", "polars"):
+        raise InputError(f"residuals cannot be given as {kind!r}: use numpy, pandas or polars.")
+    need(kind, None, f"a {kind} table")
+    return import_module(kind).DataFrame({name: table[name] for name in table.dtype.names or ()})

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,9 +21,10 @@ from kf_calib.estimation.dwell_columns import Carried, columns_of, means_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import Noise, considered_information, steps
+from kf_calib.estimation.residual_table import residual_table, table_as
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings
-from kf_calib.support.printing import printed
+from kf_calib.support.printing import as_html, printed
 from kf_calib.support.tail_probabilities import LEVEL, f_tail
 from kf_calib.support.threads import one_blas_thread
 from kf_calib.support.units import field_unit, shown
@@ -291,6 +293,14 @@ class Calibration:
             for (symbol, value, sigma, expected, unit), own in zip(found, units, strict=True)
         }
 
+    def residuals(self, kind: Literal["numpy", "pandas", "polars"] = "numpy") -> Any:
+        """The residuals as a table with a row for each dwell and accelerometer, and what the bench did there.
+
+        kind: ``numpy`` for a structured array, ``pandas`` or ``polars`` for a DataFrame of that package. Columns are
+        those of ``residual_table``, with units in their names.
+        """
+        return table_as(residual_table(self), kind)
+
     @property
     def residuals_mps2(self) -> Floats:
         """Residuals (D, 3): mean readings of the dwells less their prediction by the final estimate."""
@@ -306,6 +316,9 @@ class Calibration:
 
     def __str__(self) -> str:
         return printed(self)
+
+    def _repr_html_(self) -> str | None:
+        return as_html(self)
 
     def __repr__(self) -> str:  # the generated one would print every array, which is megabytes
         return f"<Calibration: {self.model.sum}, {len(self.visits)} dwells, p {format_p(self.consistency.p_value)}>"

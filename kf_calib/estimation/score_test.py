@@ -321,6 +321,23 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
     return np.concatenate(out)
 
 
+def falls_together(carried: Carried, noise: Noise, groups: Sequence[Sequence[Effect]]) -> list[tuple[float, int]]:
+    """Decrease of chi-squared if all effects of a group are added together, and their rank, of each group alone.
+
+    As in ``falls``, rows are not reduced by QR, which would take most of the time in runs of many dwells.
+    """
+    effects = [effect for group in groups for effect in group]
+    rows, width = whiten_model(carried, noise, effects)
+    sizes, rest = np.linalg.norm(rows[:, width:-1], axis=0), Complement(rows, width).of(rows[:, width:])
+    columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
+    out = list[tuple[float, int]]()
+    for part in slices([sum(counts_of(group)) for group in groups]):
+        left, singular, _ = np.linalg.svd(columns[:, part], full_matrices=False)
+        spanned = left[:, singular > _SEEN]
+        out.append((float(np.sum((spanned.T @ rest[:, -1]) ** 2)), spanned.shape[1]))
+    return out
+
+
 def whiten_model(
     carried: Carried,
     noise: Noise,

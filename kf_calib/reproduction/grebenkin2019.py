@@ -24,6 +24,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.estimation import kalman_filterpy
+from kf_calib.estimation.prior import PRIORS
 
 GRAVITY_MPS2 = 9.81
 NOISE_MPS2 = 1e-4
@@ -298,6 +299,14 @@ def shrinking(orientations: OrientationSet, prior: Floats) -> Floats:
     """Covariance of the affine state (n + 1, 12, 12): that of the ``prior`` (12, 12), and after every reading."""
     none, root = np.empty((3, 4 * READINGS, 0)), np.linalg.cholesky(prior).astype(float)
     return np.stack([prior, *_filtered(orientations.force_mps2, none, root)[1]])
+
+
+def falling_sigma(orientations: OrientationSet) -> Floats:
+    """Sigmas (n + 1, 12) in SI: of the prior of the navigation grade, and of the filter after every reading."""
+    nominal = paper_parameters.nominal()
+    jacobian = paper_parameters.jacobian(paper_parameters.state_of(nominal))
+    covariances = shrinking(orientations, PRIORS["navigation"].covariance(nominal))
+    return np.sqrt(np.diagonal(jacobian @ covariances @ jacobian.T, axis1=1, axis2=2))
 
 
 @dataclass(frozen=True)

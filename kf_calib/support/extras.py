@@ -11,7 +11,8 @@ class MissingExtraError(KfCalibError):
     """A package is not installed that this needs; the message has the command that brings it."""
 
 
-def need(package: str, extra: str, purpose: str) -> None:
-    """Raise MissingExtraError unless ``package`` can be imported; extra: of kf_calib, that brings it."""
+def need(package: str, extra: str | None, purpose: str) -> None:
+    """Raise MissingExtraError unless ``package`` can be imported; extra: of kf_calib, that brings it, if one does."""
     if find_spec(package) is None:
-        raise MissingExtraError(f"{purpose} needs {package}, which is not installed: pip install 'kf_calib[{extra}]'.")
+        wanted = package if extra is None else f"'kf_calib[{extra}]'"
+        raise MissingExtraError(f"{purpose} needs {package}, which is not installed: pip install {wanted}.")

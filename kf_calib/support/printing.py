@@ -1,4 +1,4 @@
-"""Results as text: what prints a result knows it, and the result does not know what prints it."""
+"""Results as text and as HTML: what shows a result knows it, and the result does not know what shows it."""
 
 from __future__ import annotations
 
@@ -9,3 +9,9 @@ from functools import singledispatch
 def printed(value: object) -> str:
     """The value as plain text; ``views`` register how for each kind of result."""
     return repr(value)
+
+
+@singledispatch
+def as_html(value: object) -> str | None:
+    """The value as HTML for a notebook; ``views`` register how for each kind of result. None: it is shown as text."""
+    return None

@@ -13,7 +13,7 @@ from rich.text import Text
 from kf_calib.effects import Effect, as_text, remarks_of
 from kf_calib.estimation.observability import Visibility
 from kf_calib.support.units import shown
-from kf_calib.views.console import effect_rows, symbol
+from kf_calib.views.console import GRADES, effect_rows, size_range, symbol
 from kf_calib.views.tables import Table
 
 
@@ -60,9 +60,17 @@ def _detail(effect: Effect) -> list[RenderableType]:
     lines = [f"reading i is larger by: {formula_of(effect)}", f"source: {effect.source}"]
     if effect.confused_with:
         lines.append(f"confused with: {effect.confused_with}")
+    lines += [f"typical size: {sizes}" for sizes in _typical_sizes(effect)]
     lines += [f"note: {remark}" for remark in remarks_of(effect)]
     head = Text(f"{effect}: {effect.title}", style="bold")
     return [head, *map(Text, lines), *([table] if table.rows else []), Text()]
+
+
+def _typical_sizes(effect: Effect) -> list[str]:
+    """Return the usual sizes of a coefficient by grade, in one text; nothing where none is known."""
+    known = [(words, effect.typical.of(grade)) for grade, words in GRADES.items()]
+    said = [f"{size_range(sizes, effect.coefficients[0])} ({words})" for words, sizes in known if sizes is not None]
+    return [", ".join(said)] if said else []
 
 
 def formula_of(effect: Effect) -> str:
@@ -153,7 +161,16 @@ def _object(effect: Effect) -> dict[str, Any]:
         "unknown": None
         if unknown is None
         else {"symbol": unknown.symbol, "unit": unknown.unit, "low": unknown.low, "high": unknown.high},
+        "typical": {
+            "navigation": _bounds(effect.typical.navigation),
+            "mems": _bounds(effect.typical.mems),
+        },
         "confused_with": effect.confused_with,
         "source": effect.source,
         "remarks": list(remarks_of(effect)),
     }
+
+
+def _bounds(sizes: tuple[float, float] | None) -> list[float] | None:
+    """Return usual sizes as JSON: from ... to, SI."""
+    return None if sizes is None else [float(size) for size in sizes]

@@ -9,7 +9,8 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.bench import paper_parameters
-from kf_calib.effects import Effect, as_text
+from kf_calib.effects import Coefficient, Effect, as_text
+from kf_calib.effects.effect import Grade
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.measurement_model import Model
@@ -23,6 +24,8 @@ from kf_calib.views.terminal import PlainConsole, note
 
 _NOT_ESTIMATED = "not estimated"
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
+GRADES: dict[Grade, str] = {"navigation": "navigation grade", "mems": "MEMS"}
+"""Grades of sensors, and what they are called."""
 
 
 def symbol(name: str) -> str:
@@ -120,6 +123,14 @@ def effect_rows(effect: Effect) -> list[tuple[str, str, str]]:
     if (u := effect.unknown) is not None:
         rows.append((symbol(u.symbol), u.unit, f"{shown(u).number(u.low)} to {shown(u).text(u.high)}"))
     return rows
+
+
+def size_range(sizes: tuple[float, float], own: Coefficient) -> str:
+    """Sizes of a coefficient from ... to (SI), as they are shown: ``1 to 20 µg/g²``, or ``up to 100 µg/g²``."""
+    unit = shown(own)
+    if sizes[0] == sizes[1]:
+        return unit.text(sizes[1])
+    return f"{'up to' if sizes[0] == 0.0 else f'{unit.number(sizes[0])} to'} {unit.text(sizes[1])}"
 
 
 def noise_table(result: Calibration) -> Table:

@@ -21,6 +21,13 @@ _NARROWEST = 20  # smallest width of a record, in characters
 class Bar(Text):
     """A number drawn as a bar, which is left out first where the screen is narrow."""
 
+    @property
+    def length(self) -> float:
+        """Its length in characters, the last of which may be a part of a block (U+2589 is seven eighths of one)."""
+        last = ord(self.plain[-1]) if self.plain else 0
+        part = (0x2590 - last) / 8.0 if 0x2588 <= last <= 0x258F else 0.0
+        return max(len(self.plain) - 1, 0) + part
+
 
 class Table(rich.table.Table):
     """A table whose right-aligned columns hold numbers, which are never folded; other columns are folded between words.

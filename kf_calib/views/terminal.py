@@ -24,6 +24,10 @@ class PlainConsole(Console):
             yield Segment(text if control else printable(text), style, control)
 
 
-def note(said: str) -> Text:
+class Note(Text):
     """A remark beside a result, on a line of its own."""
-    return Text(f"Note: {sentence(said)}", style="yellow")
+
+
+def note(said: str) -> Note:
+    """The remark of these words."""
+    return Note(f"Note: {sentence(said)}", style="yellow")

@@ -524,7 +524,7 @@ def test_a_slow_view_shows_in_the_end_what_it_left_out(tmp_path: Path, monkeypat
 
     grown, go = list[tuple[int, int]](), threading.Event()
 
-    def slow(result: object, stream: object, shown: int, lay_out: bool) -> None:
+    def slow(result: object, stream: object, shown: int, lay_out: bool, judgement: object) -> None:
         go.wait(30.0)
         grown.append((shown, len(result.visits)))  # type: ignore[attr-defined]
 

@@ -85,6 +85,11 @@ class Recording:
         """The batches of a file that is being written, from its start; an empty one: nothing more has come yet."""
         return self._batches(growing=True)
 
+    def begin_ns(self) -> int | None:
+        """Stamp of the first reading; None where there is none. Reads the recording as far as to there."""
+        stamps = (batch.accel.time_ns for batch in self)
+        return next((int(each[0]) for each in stamps if len(each)), None)
+
     @property
     def warnings_while_read(self) -> list[str]:
         """Those that are not of the file's end, which one that is still being written has not."""

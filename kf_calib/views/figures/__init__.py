@@ -15,6 +15,21 @@ from kf_calib.support.extras import need
 need("matplotlib", "plot", "a figure")
 
 from kf_calib.views.figures.collection import Figures, figures, save  # noqa: E402  # after the check
+from kf_calib.views.figures.convergence import convergence, estimates  # noqa: E402
+from kf_calib.views.figures.detection_limits import detection_limits  # noqa: E402
+from kf_calib.views.figures.directions import directions  # noqa: E402
+from kf_calib.views.figures.dwell import dwell  # noqa: E402
+from kf_calib.views.figures.engines import allan_deviation, three_ways, whiteness  # noqa: E402
+from kf_calib.views.figures.experiment import falling, table2  # noqa: E402
+from kf_calib.views.figures.improvement import improvement, residuals_of_steps  # noqa: E402
+from kf_calib.views.figures.information import correlations, information  # noqa: E402
+from kf_calib.views.figures.orientations import plan, predicted_sigmas  # noqa: E402
 from kf_calib.views.figures.residuals import residuals, what_they_go_with  # noqa: E402
+from kf_calib.views.figures.sphere import on_the_sphere  # noqa: E402
+from kf_calib.views.figures.suspects import suspects  # noqa: E402
 
-__all__ = ["Figures", "figures", "residuals", "save", "what_they_go_with"]
+__all__ = [
+    "Figures", "allan_deviation", "convergence", "correlations", "detection_limits", "directions", "dwell", "estimates",
+    "falling", "figures", "improvement", "information", "on_the_sphere", "plan", "predicted_sigmas", "residuals",
+    "residuals_of_steps", "save", "suspects", "table2", "three_ways", "what_they_go_with", "whiteness",
+]  # fmt: skip

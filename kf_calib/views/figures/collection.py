@@ -11,11 +11,26 @@ from typing import Any
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
+from kf_calib.design.orientation_plan import Plan
 from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.errors import InputError
+from kf_calib.estimation.engine_comparison import Comparison
+from kf_calib.estimation.results import Calibration
+from kf_calib.reproduction.grebenkin2019 import Experiment
 from kf_calib.support.output_files import write_whole
 from kf_calib.views.figures import style
+from kf_calib.views.figures.convergence import convergence, estimates
+from kf_calib.views.figures.detection_limits import detection_limits
+from kf_calib.views.figures.directions import directions
+from kf_calib.views.figures.engines import allan_deviation, three_ways, whiteness
+from kf_calib.views.figures.experiment import falling, table2
+from kf_calib.views.figures.improvement import improvement, residuals_of_steps
+from kf_calib.views.figures.information import correlations, information
+from kf_calib.views.figures.orientations import plan, predicted_sigmas
 from kf_calib.views.figures.residuals import residuals, what_they_go_with
+from kf_calib.views.figures.sphere import on_the_sphere
+from kf_calib.views.figures.suspects import suspects
 
 Figures = Mapping[str, Callable[[], Figure]]
 """Title of each figure, and what draws it."""
@@ -33,6 +48,55 @@ def _(found: Diagnosis) -> Figures:
     return {
         "Where the model fails": lambda: residuals(found),
         "What the residuals go with": lambda: what_they_go_with(found),
+        "Which effect is missing": lambda: suspects(found),
+        "What could hide here": lambda: detection_limits(found),
+        "Residuals by the direction of gravity": lambda: on_the_sphere(found),
+    }
+
+
+@figures.register
+def _(state: Improvement) -> Figures:
+    return {
+        "The error falls": lambda: improvement(state),
+        "Residuals of each step": lambda: residuals_of_steps(state),
+        "Where the first model fails": lambda: residuals(state.start),
+        "What could still hide": lambda: detection_limits(state.found),
+    }
+
+
+@figures.register
+def _(result: Calibration) -> Figures:
+    return {
+        "Sigma after each orientation, NIS and innovations": lambda: convergence(result),
+        "Estimates on their way": lambda: estimates(result),
+        "What each orientation brought": lambda: information(result),
+        "Correlations": lambda: correlations(result),
+        "Directions of gravity in the platform": lambda: directions(result),
+    }
+
+
+@figures.register
+def _(compared: Comparison) -> Figures:
+    return {
+        "Three ways of estimating": lambda: three_ways(compared),
+        "Whether innovations and readings are white": lambda: whiteness(compared.result),
+        "Allan deviation of the readings": lambda: allan_deviation(compared),
+    }
+
+
+@figures.register
+def _(made: Plan) -> Figures:
+    return {
+        "Orientations and the sigmas to expect": lambda: plan(made),
+        "Predicted sigma after each orientation": lambda: predicted_sigmas(made),
+    }
+
+
+@figures.register
+def _(found: Experiment) -> Figures:
+    return {
+        "Table 2 of the paper": lambda: table2(found),
+        "Sigma as readings come": lambda: falling(found),
     }
 
 

@@ -7,9 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.ticker import MaxNLocator
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.residual_drivers import Driver, Explanation, drivers_of, explanations, is_function_of
+from kf_calib.diagnosis.residual_drivers import (
+    Driver,
+    Explanation,
+    channel_rms_mps2,
+    drivers_of,
+    explanations,
+    is_function_of,
+)
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import format_p
@@ -24,10 +32,14 @@ from kf_calib.views.figures.style import (
     say,
     styled,
 )
+from kf_calib.views.figures.words import rounded_number, wrapped
 
 MICRO_G = 9.80665e-6  # m/s^2
 _UNITS = {"rad": ("deg", 180.0 / np.pi), "m/s^2": ("g", 1.0 / 9.80665), "s": ("min", 1.0 / 60.0),
           "K": ("K", 1.0), "K/s": ("K/h", 3600.0)}  # fmt: skip
+_SMALLER = {"s": ("s", 1.0, 300.0), "K": ("mK", 1e3, 0.5)}  # units for values whose greatest is below the last, SI
+_SIGNIFICANT, _SOME = 0.01, 0.005  # p-value and share above and below which a driver explains nothing
+_TITLE = 36  # letters in a line of a title
 _PANELS = 8  # drivers in small panels
 _MANY = 150  # dwells, above which markers are smaller and bars of sigma are left out
 
@@ -48,16 +60,17 @@ def residuals(found: Diagnosis, driver: str | None = None) -> Figure:
 
 def draw_residuals(figure: FigureBase, found: Diagnosis, drivers: Sequence[Driver], symbol: str | None = None) -> None:
     """The same on a part of a figure; drivers: of the residuals, the first is taken where no symbol is given."""
-    chosen = [each for each in drivers if symbol in (None, each.symbol)]
-    if not chosen:
+    driver = driver_to_show([each for each in drivers if symbol in (None, each.symbol)])
+    if driver is None:
         return say(figure, f"{symbol or 'Nothing that was recorded'} does not vary in this run.")
-    driver, others = chosen[0], explanations(found)
+    others = explanations(found)
     panels = figure.subplots(3, 3 if others else 1, sharex=True, sharey="row", squeeze=False)
-    unit, scale = _UNITS.get(driver.unit, (driver.unit, 1.0))
+    label, scale = driver_axis(driver)
     sigmas = mean_sigmas(found.before)
     for i, row in enumerate(panels):
         x = driver.values[:, i] * scale
         _points(row[0], x, found.before.residuals_mps2[:, i], sigmas[:, i], i)
+        _rms(row[0], found.before.residuals_mps2, i)
         row[0].set_ylabel(f"accelerometer {i + 1}, µg")
         if others:
             best = others[0]
@@ -66,13 +79,37 @@ def draw_residuals(figure: FigureBase, found: Diagnosis, drivers: Sequence[Drive
             _points(row[1], x, best.left_mps2[:, i] + best.contribution_mps2[:, i], sigmas[:, i], i)
             _curve(row[1], x, best, i, is_function_of(best.contribution_mps2, driver))
             _points(row[2], x, best.left_mps2[:, i], sigmas[:, i], i)
-    panels[0, 0].set_title(f"Residuals of the model: {found.before.model.sum}")
+            _rms(row[2], best.left_mps2, i)
+    titles = [f"Residuals of {found.before.model.sum}"]
     if others:
-        panels[0, 1].set_title(f"Readings less all but {others[0].name}")
-        panels[0, 2].set_title(f"What is left with {others[0].name} in the model")
+        name = others[0].name
+        titles += [f"Readings less all but {name}", f"What {name} leaves of them"]
         figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower left", ncols=3)
+    for axes, title in zip(panels[0], titles, strict=True):
+        axes.set_title(wrapped(title, _TITLE if others else 3 * _TITLE))
     for axes in panels[-1]:
-        axes.set_xlabel(f"{driver.words}, {unit}")
+        axes.set_xlabel(f"{driver.words}, {label}")
+        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+
+
+def driver_to_show(drivers: Sequence[Driver]) -> Driver | None:
+    """The quantity that explains most; time where none explains anything, and None where nothing varies."""
+    if drivers and _explains(drivers[0]):
+        return drivers[0]
+    return next((each for each in drivers if each.symbol == "t"), drivers[0] if drivers else None)
+
+
+def driver_axis(driver: Driver) -> tuple[str, float]:
+    """The unit in which a quantity is drawn, and how many of it make one SI unit."""
+    unit, scale, least = _SMALLER.get(driver.unit, ("", 1.0, 0.0))
+    if np.abs(driver.values).max() < least:
+        return unit, scale
+    return _UNITS.get(driver.unit, (driver.unit, 1.0))
+
+
+def _explains(driver: Driver) -> bool:
+    """Tell whether a quantity explains more of the misfit than noise would."""
+    return driver.p_value <= _SIGNIFICANT and driver.share >= _SOME
 
 
 def _points(axes: Axes, x: Floats, values_mps2: Floats, sigmas_mps2: Floats, i: int) -> None:
@@ -82,6 +119,13 @@ def _points(axes: Axes, x: Floats, values_mps2: Floats, sigmas_mps2: Floats, i: 
     bars = None if many else sigmas_mps2 / MICRO_G
     axes.errorbar(x, values_mps2 / MICRO_G, bars, fmt=MARKERS[i], color=ACCELEROMETERS[i], zorder=3, elinewidth=0.9,
                   markersize=2.0 if many else 4.5, markeredgewidth=0.0)  # fmt: skip
+
+
+def _rms(axes: Axes, residuals_mps2: Floats, i: int) -> None:
+    """Write the rms of the residuals of one accelerometer above its panel: on axes of large ones small ones cannot be
+    read."""
+    rms = rounded_number(channel_rms_mps2(residuals_mps2)[i] / MICRO_G, 2)
+    axes.set_title(f"rms {rms} µg", loc="right", fontsize=8.0, color=GREY)
 
 
 def _predictions(axes: Axes, x: Floats, explanation: Explanation, i: int, colour: str, marker: str) -> None:
@@ -121,24 +165,26 @@ def draw_drivers(figure: FigureBase, found: Diagnosis, drivers: Sequence[Driver]
     before = found.before.residuals_mps2 / mean_sigmas(found.before)
     for k, driver in enumerate(shown):
         row, column = divmod(k, wide)
-        unit, scale = _UNITS.get(driver.unit, (driver.unit, 1.0))
+        unit, scale = driver_axis(driver)
         values = [before, *(each.left_ratios for each in others)]
         for below, (ratios, axes) in enumerate(zip(values, panels[row * len(values) :, column], strict=False)):
             _ratios(axes, driver.values * scale, ratios)
             axes.set_xlabel("" if below < len(values) - 1 else f"{driver.symbol}, {unit}")
+            axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
             if not below:
                 axes.set_title(f"{driver.words}\n{_of_share(driver)}", fontsize=8.5)
             if not column:
-                axes.set_ylabel("residual / σ" if not below else f"with {others[0].name}")
+                axes.set_ylabel("residual / σ" if not below else f"with\n{wrapped(others[0].name, 18)}")
     for axes in panels.flat[: panels.size]:
         if not axes.has_data():
             axes.set_axis_off()
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower left", ncols=3)
 
 
 def _of_share(driver: Driver) -> str:
     """Return in a few words how much of the misfit goes with a driver."""
-    if driver.p_value > 0.01 or driver.share < 0.005:
-        return "no more than noise"
+    if not _explains(driver):
+        return "no more than by chance"
     return f"{driver.share:.0%} of the misfit, p {format_p(driver.p_value)}"
 
 
@@ -148,4 +194,4 @@ def _ratios(axes: Axes, x: Floats, ratios: Floats) -> None:
         axes.axhline(bound, color=GREY, linewidth=0.7, linestyle=":")
     for i in range(3):
         axes.plot(x[:, i], ratios[:, i], MARKERS[i], color=ACCELEROMETERS[i], markersize=3.0 if len(x) < _MANY else 1.5,
-                  markeredgewidth=0.0, alpha=0.85)  # fmt: skip
+                  markeredgewidth=0.0, alpha=0.85, label=f"accelerometer {i + 1}")  # fmt: skip

@@ -49,6 +49,7 @@ _RULES: Any = {
     "svg.fonttype": "path",
     "svg.hashsalt": "kf_calib",  # the same figure is the same file
     "path.simplify": True,
+    "text.parse_math": False,  # names and formulas come from recordings: a $ in them is a $
 }
 
 

@@ -1,4 +1,4 @@
-"""The Rerun view of a replay: sigmas falling, axes and their uncertainty in the platform, innovations, correlations.
+"""The Rerun view of a run: sigmas by orientation, the platform, innovations, correlations.
 
 A thin bridge: every number comes from the ``Calibration``, is scaled to a unit an engineer reads, and is sent in
 columns. Two timelines: ``bench_time`` (since the first sample; points within the dwells too) and ``orientation``
@@ -6,81 +6,118 @@ columns. Two timelines: ``bench_time`` (since the first sample; points within th
 in µg, or all in SI (``support.units.shown_in``). Where the orientations so far do not determine a parameter there is no
 point.
 
-Entities: ``parameters/ACCELEROMETER/SYMBOL/{log10_sigma,deviation,band}``, ``platform/...``,
+Entities: ``parameters/ACCELEROMETER/SYMBOL/{sigma,deviation,band}``, ``parameters/effects/SYMBOL/...``, the charts
+``sigmas``, ``each``, ``estimates``, ``fit`` and ``innovations``, ``platform/...``,
 ``innovation/CHANNEL/{value,bound,in_sigma}``, ``nis/{value,above,band}``, ``correlation/{picture,matrix,...}``,
-``bench/{dwell,pose/...}``, ``summary``.
+``bench/pose/...``, ``summary``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from functools import singledispatch
 from pathlib import Path
+from typing import Any
 
 import rerun as rr
 
+from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.diagnosis.stepwise_selection import Improvement
+from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.results import Calibration
+from kf_calib.online.status import Judgement
 from kf_calib.support.plain_text import printable
+from kf_calib.views.rerun.ahead import log_next, words
+from kf_calib.views.rerun.comparison import save as save_comparison
 from kf_calib.views.rerun.correlation import log_correlation
-from kf_calib.views.rerun.file import rrd_file
+from kf_calib.views.rerun.diagnosis import save as save_diagnosis
+from kf_calib.views.rerun.estimates import log_estimates
+from kf_calib.views.rerun.file import rrd_file, strict
+from kf_calib.views.rerun.improvement import save as save_improvement
 from kf_calib.views.rerun.layout import TABS, layout
 from kf_calib.views.rerun.names import BENCH_TIME, ORIENTATION
 from kf_calib.views.rerun.platform import log_platform
+from kf_calib.views.rerun.residuals import log_fit
 from kf_calib.views.rerun.series import History, log_bench, log_innovations, log_nis, log_parameters
+from kf_calib.views.rerun.sigmas import Falling
 from kf_calib.views.rerun.summary import summary
 
 __all__ = ["BENCH_TIME", "ORIENTATION", "TABS", "grow", "layout", "log", "save"]
 
 
-def save(result: Calibration, path: str | Path, timeline: str = BENCH_TIME, tab: str = TABS[0]) -> Path:
-    """Write the view of a run to an .rrd file that opens laid out, at the end of the run.
+@singledispatch
+def save(result: Any, path: str | Path) -> Path:
+    """Write the view of a result to an .rrd file that opens laid out, and return its path.
 
-    ``timeline``: BENCH_TIME or ORIENTATION; ``tab``: which of TABS is in front. Raises InputError where the
-    file cannot be written.
+    Of a calibration, ``timeline`` (BENCH_TIME or ORIENTATION) and ``tab`` (which of TABS is in front) may be chosen.
+    Raises InputError where the file cannot be written.
     """
-    path = Path(path)
+    raise TypeError(f"there is no Rerun view of {type(result).__name__}: give the result of calibrate, diagnose, "
+                    "improve or compare.")  # fmt: skip
+
+
+@save.register
+def _(result: Calibration, path: str | Path, timeline: str = BENCH_TIME, tab: str = TABS[0]) -> Path:
     history = History.of(result)
-    with _strict(), rrd_file(path, layout(result, history, timeline, tab)) as stream:
-        _log(result, history, stream)
-    return path
+    falling = Falling.of(result, history)
+    with rrd_file(Path(path), layout(result, history, falling, timeline, tab)) as stream:
+        _log(result, history, falling, stream)
+    return Path(path)
+
+
+@save.register
+def _(result: Diagnosis, path: str | Path) -> Path:
+    return save_diagnosis(result, Path(path))
+
+
+@save.register
+def _(result: Improvement, path: str | Path) -> Path:
+    return save_improvement(result, Path(path))
+
+
+@save.register
+def _(result: Comparison, path: str | Path) -> Path:
+    return save_comparison(result, Path(path))
 
 
 def log(result: Calibration, stream: rr.RecordingStream) -> None:
     """Send everything a run showed to a recording stream: a file, or a viewer that is open."""
-    with _strict():
-        _log(result, History.of(result), stream)
+    with strict():
+        history = History.of(result)
+        _log(result, history, Falling.of(result, history), stream)
 
 
-def grow(result: Calibration, stream: rr.RecordingStream, shown: int, lay_out: bool) -> None:
+def grow(
+    result: Calibration, stream: rr.RecordingStream, shown: int, lay_out: bool, judgement: Judgement | None = None
+) -> None:
     """Send what a run shows beyond its first ``shown`` dwells, which were sent already, and the layout if asked to.
 
-    A dwell stays in the curves as it was known when it was sent; the platform and the page of text are made anew.
+    A dwell stays in the curves as it was known when it was sent; platform, charts and the page of text are made anew.
+    judgement: of the run so far, for its targets, its verdict and the next orientation.
     """
-    with _strict():
+    with strict():
         history = History.of(result)
-        _log(result, history, stream, shown)
+        falling = Falling.of(result, history, None if judgement is None else judgement.wanted)
+        _log(result, history, falling, stream, shown, "" if judgement is None else words(judgement))
+        if judgement is not None:
+            log_next(judgement, stream)
         if lay_out:
-            stream.send_blueprint(layout(result, history, BENCH_TIME, TABS[0]))
+            stream.send_blueprint(layout(result, history, falling, BENCH_TIME, TABS[0]))
 
 
-def _log(result: Calibration, history: History, stream: rr.RecordingStream, shown: int = 0) -> None:
+def _log(
+    result: Calibration, history: History, falling: Falling, stream: rr.RecordingStream, shown: int = 0, said: str = ""
+) -> None:
+    """Send what a run shows beyond its first ``shown`` dwells; ``said``: what stands above its page of text."""
     fresh = result.visits[shown:]
     if fresh:
-        log_parameters(history.after(result.visits[:shown]), stream)
+        log_parameters(history.after(result.visits[:shown]), stream, shown > 0)
+        falling.log(stream)
+        log_estimates(history, stream)
+        log_fit(result, stream)
         log_platform(result, stream)
         log_innovations(fresh, stream, shown)
         log_nis(fresh, stream, shown)
-        log_correlation(fresh, stream)
+        log_correlation(fresh, history.shown, stream)
         log_bench(result, stream, shown)
-    stream.log("summary", rr.TextDocument(printable(summary(result)), media_type=rr.MediaType.MARKDOWN), static=True)
-
-
-@contextmanager
-def _strict() -> Iterator[None]:
-    """Mistakes in what is logged raise, rather than leave a hole in the view; the caller's mode is given back."""
-    before = rr.strict_mode()
-    rr.set_strict_mode(True)
-    try:
-        yield
-    finally:
-        rr.set_strict_mode(before)
+    text = "\n\n".join([*([said] if said else []), summary(result)])
+    stream.log("summary", rr.TextDocument(printable(text), media_type=rr.MediaType.MARKDOWN), static=True)

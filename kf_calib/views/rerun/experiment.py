@@ -2,13 +2,12 @@
 
 Timelines: ``reading`` (of each accelerometer, 1 to 400), and ``orientation`` (1 to 4, at its last reading); 0 is the
 prior. The covariance is the filter's from the prior of the navigation grade, the same for both sets.
-Entities: ``optimal/...`` and ``nonoptimal/...``: ``parameters/ACCELEROMETER/SYMBOL/log10_sigma``,
-``directions/...``; ``design/{picture,labels}``; ``summary``.
+Entities: ``optimal/...`` and ``nonoptimal/...``: ``parameters/ACCELEROMETER/SYMBOL/sigma``, the charts
+``sigmas/KIND``, ``directions/...``; ``design/{picture,labels}``; ``summary``; ``notes``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,21 +19,21 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.prior import PRIORS
 from kf_calib.reproduction.grebenkin2019 import GRAVITY_MPS2, READINGS, Column, Experiment, shrinking
-from kf_calib.support.units import shown
 from kf_calib.views.rerun.correlation import LIFT, picture
 from kf_calib.views.rerun.file import rrd_file
 from kf_calib.views.rerun.names import (
     ACCELEROMETERS,
     GOLD,
     GREY,
-    GROUPS,
     LABELS,
     ORIENTATION,
     WHITE,
     colour_of,
     path_of,
     per_si,
+    twelve,
 )
+from kf_calib.views.rerun.sigmas import Falling, overview_sheet
 
 READING = "reading"
 SETS = {"optimal": "optimal", "nonoptimal": "non-optimal"}
@@ -49,9 +48,12 @@ def save(found: Experiment, words: str, path: str | Path) -> Path:
     with rrd_file(path, _layout(sigmas)) as stream:
         for name, column in _columns(found).items():
             _log_sigmas(stream, name, sigmas[name])
+            _falling(name, sigmas).log_overview(stream)
             _log_directions(stream, name, column)
         _log_design(stream, found)
-        stream.log("summary", rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN), static=True)
+        table = words.partition("\n\n")[0]
+        for name, text in (("summary", table), ("notes", words)):
+            stream.log(name, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     return path
 
 
@@ -60,22 +62,22 @@ def _columns(found: Experiment) -> dict[str, Column]:
 
 
 def _sigmas(column: Column) -> Floats:
-    """log10 of sigma in shown units (n + 1, 12): of the prior, and after every reading."""
+    """Sigma in shown units (n + 1, 12): of the prior, and after every reading."""
     nominal = paper_parameters.nominal()
     jacobian = paper_parameters.jacobian(paper_parameters.state_of(nominal))
     covariances = shrinking(column.orientations, PRIORS["navigation"].covariance(nominal))
     variance = np.diagonal(jacobian @ covariances @ jacobian.T, axis1=1, axis2=2)
-    return np.log10(np.sqrt(variance) * per_si())
+    return np.sqrt(variance) * per_si()
 
 
-def _log_sigmas(stream: rr.RecordingStream, name: str, logs: Floats) -> None:
-    reading = np.arange(len(logs))
+def _log_sigmas(stream: rr.RecordingStream, name: str, sigma: Floats) -> None:
+    reading = np.arange(len(sigma))
     last = reading % READINGS == 0
     for k, symbol in enumerate(paper_parameters.SYMBOLS):
-        path = f"{name}/{path_of(symbol)}/log10_sigma"
+        path = f"{name}/{path_of(symbol)}/sigma"
         for rows, index in ((last, [rr.TimeColumn(ORIENTATION, sequence=reading[last] // READINGS)]), (~last, [])):
             times = [rr.TimeColumn(READING, sequence=reading[rows]), *index]
-            stream.send_columns(path, times, rr.Scalars.columns(scalars=logs[rows, k]))
+            stream.send_columns(path, times, rr.Scalars.columns(scalars=sigma[rows, k]))
         stream.log(path, rr.SeriesLines(names=LABELS[symbol], colors=colour_of(symbol), widths=1.5), static=True)
 
 
@@ -130,10 +132,7 @@ def _blank(width: int) -> NDArray[np.uint8]:
 
 
 def _layout(sigmas: dict[str, Floats]) -> rrb.Blueprint:
-    curves = [
-        rrb.Vertical(*(_curves(name, shown(group.unit).label, group.symbols, sigmas) for group in GROUPS),
-                     row_shares=[5, 4, 4]) for name in SETS
-    ]  # fmt: skip
+    curves = [overview_sheet(_falling(name, sigmas), f"{SETS[name]}: σ by reading") for name in SETS]
     spheres = [
         rrb.Spatial3DView(
             origin=f"{name}/directions", name=f"{SETS[name]}: up", line_grid=False,
@@ -147,29 +146,24 @@ def _layout(sigmas: dict[str, Floats]) -> rrb.Blueprint:
         name="D: blue −g, orange +g (bias: 1); a row a reading",
         visual_bounds=rrb.VisualBounds2D(x_range=[-40.0, width + 10.0], y_range=[-80.0, 4 * READINGS + 10.0]),
     )
+    overview = rrb.Horizontal(
+        *curves,
+        rrb.Vertical(design, rrb.Horizontal(*spheres), row_shares=[1, 1]),
+        rrb.TextDocumentView(origin="summary", name="Table 2"),
+        column_shares=[3.2, 3.2, 5.0, 4.2],
+        name="Experiment",
+    )
     return rrb.Blueprint(
-        rrb.Horizontal(
-            *curves,
-            rrb.Vertical(design, rrb.Horizontal(*spheres), row_shares=[1, 1]),
-            rrb.TextDocumentView(origin="summary", name="Table 2"),
-            column_shares=[3.2, 3.2, 4.8, 4.2],
-        ),
+        rrb.Tabs(overview, rrb.TextDocumentView(origin="notes", name="Table 2 and what is said of it")),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(state="collapsed", timeline=READING, play_state="following"),
     )
 
 
-def _curves(name: str, unit: str, symbols: Sequence[str], sigmas: dict[str, Floats]) -> rrb.TimeSeriesView:
-    """sigma of one kind of parameter over the readings; the same scale in both sets."""
-    places = [paper_parameters.SYMBOLS.index(symbol) for symbol in symbols]
-    logs = np.concatenate([each[:, places] for each in sigmas.values()])
-    low, high = float(logs.min()), float(logs.max())
-    ends = rr.TimeRangeBoundary.infinite()
-    return rrb.TimeSeriesView(
-        contents=[f"{name}/{path_of(symbol)}/log10_sigma" for symbol in symbols],
-        name=f"{SETS[name]}: σ, log₁₀ of {unit}",
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftBottom, visible=True),
-        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=ends, end=ends)),
-        axis_y=rrb.ScalarAxis(range=(low - 0.2, high + 0.2)),
-    )
+def _falling(name: str, sigmas: dict[str, Floats]) -> Falling:
+    """The sigmas of one set, on the axes of both."""
+    own, none = sigmas[name], np.full(12, np.nan)
+    shares = np.full_like(own, np.nan)  # of single readings they are too many to be drawn
+    both = np.concatenate(list(sigmas.values()))
+    return Falling(twelve(), np.arange(len(own)), own, shares, none, f"{name}/sigmas", READING, both, (230.0, 860.0))

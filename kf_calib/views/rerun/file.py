@@ -23,9 +23,20 @@ def new_stream() -> rr.RecordingStream:
 
 
 @contextmanager
+def strict() -> Iterator[None]:
+    """Mistakes in what is logged raise, rather than leave a hole in the view; the caller's mode is given back."""
+    before = rr.strict_mode()
+    rr.set_strict_mode(True)
+    try:
+        yield
+    finally:
+        rr.set_strict_mode(before)
+
+
+@contextmanager
 def rrd_file(path: Path, blueprint: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
     """A stream whose content is the file when the block has ended. Raises InputError where it cannot be written."""
-    with new_stream() as stream:
+    with strict(), new_stream() as stream:
         memory = stream.memory_recording()
         stream.send_blueprint(blueprint)
         yield stream

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import queue
 import socket
+import struct
 import subprocess
 import tempfile
 import threading
@@ -20,12 +21,14 @@ from typing import IO
 
 from kf_calib.errors import InputError
 from kf_calib.estimation.results import Calibration
+from kf_calib.online.status import Judgement
 from kf_calib.support.output_files import Growing
 from kf_calib.views.rerun import grow
 from kf_calib.views.rerun.file import new_stream
 from kf_calib.views.screenshot import binary, obituary
 
 PORT = 9876
+_HEADER = 12  # bytes before the first message of what Rerun encoded
 _WAITING = 4  # results; the next one that comes through shows what those left out would have
 
 
@@ -40,7 +43,7 @@ class GrowingView:
         self, rrd: Path | None = None, port: int | None = PORT, bind: str = "127.0.0.1", waiting: int = _WAITING
     ) -> None:
         self.dropped, self.trouble = 0, ""
-        self._results = queue.Queue[Calibration | None](waiting)
+        self._results = queue.Queue[tuple[Calibration, Judgement | None] | None](waiting)
         self._file = _GrowingFile(rrd) if rrd else None
         self._viewer, self._relays = None, False
         self._stream = new_stream()
@@ -58,10 +61,10 @@ class GrowingView:
         """Whether there is a file by now."""
         return self._file is not None and self._file.began
 
-    def offer(self, result: Calibration) -> None:
-        """Show a result when there is time; never waits."""
+    def offer(self, result: Calibration, judgement: Judgement | None = None) -> None:
+        """Show a result when there is time, with what was judged of it; never waits."""
         try:
-            self._results.put_nowait(result)
+            self._results.put_nowait((result, judgement))
         except queue.Full:
             self.dropped += 1
 
@@ -87,10 +90,11 @@ class GrowingView:
     def _show(self) -> None:
         shown, laid_out = 0, 0
         try:
-            while (result := self._results.get()) is not None:
+            while (offered := self._results.get()) is not None:
+                result, judgement = offered
                 count = len(result.visits)
                 lay_out = count >= 2 * laid_out or count < shown  # not each time: who looks on may have changed it
-                grow(result, self._stream, shown, lay_out)
+                grow(result, self._stream, shown, lay_out, judgement)
                 shown, laid_out = count, count if lay_out else laid_out
                 self._pass_on(self._encoded.read() or b"")
         except Exception as error:  # a view that fails is no reason for a run to
@@ -134,8 +138,10 @@ class _GrowingFile:
         if self._is_lost:
             return ""
         try:
-            self._file = self._file or self._place.open()
-            self._file.write(data)
+            if self._file is None:
+                self._file = self._place.open()
+                self._file.write(data[:_HEADER])
+            self._file.write(messages(data))
             self._file.flush()
             self._place.settle()
             self.began = True
@@ -153,6 +159,21 @@ class _GrowingFile:
                 self._file.close()
             if not self._place.settled:
                 self._place.discard()
+
+
+def messages(data: bytes) -> bytes:
+    """What Rerun encoded, without header and footer: the parts of a file can then follow one another.
+
+    A footer tells where the messages before it lie, counted from the beginning of the file; the viewer refuses a file
+    whose last footer does not agree. Of a message: kind and size, 8 bytes each, and as many bytes; kind 0 is the end.
+    """
+    at = _HEADER
+    while at < len(data):
+        kind, size = struct.unpack_from("<QQ", data, at)
+        if kind == 0:
+            break
+        at += 16 + size
+    return data[_HEADER:at]
 
 
 def _listens(port: int) -> bool:

@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import rerun as rr
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.support.plain_text import printable
 from kf_calib.support.units import shown
 
 BENCH_TIME = "bench_time"
@@ -30,6 +33,8 @@ LABELS = {
     "nu1": "ν₁", "nu2": "ν₂", "K2": "K₂", "b2": "b₂",
     "theta3": "θ₃", "phi3": "φ₃", "K3": "K₃", "b3": "b₃",
 }  # fmt: skip
+MAUVE: Colour = (214, 150, 235)
+"""Coefficients of effects."""
 UNIT_OF = dict(zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True))
 """SI unit of each parameter."""
 
@@ -63,3 +68,33 @@ def colour_of(symbol: str) -> Colour:
 def path_of(symbol: str) -> str:
     """The parameter's entity; the accelerometer comes first, so that legends list one after the other."""
     return f"parameters/a{paper_parameters.SYMBOLS.index(symbol) // 4 + 1}/{symbol}"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What is estimated and drawn as one curve: the SI value times ``per_si`` is in ``unit``."""
+
+    label: str
+    unit: str
+    per_si: float
+    colour: Colour
+    path: str
+
+
+def twelve() -> tuple[Quantity, ...]:
+    """The twelve parameters in the units that people are shown."""
+    units = {symbol: shown(unit) for symbol, unit in UNIT_OF.items()}
+    return tuple(
+        Quantity(LABELS[symbol], unit.label, unit.per_si, colour_of(symbol), path_of(symbol))
+        for symbol, unit in units.items()
+    )
+
+
+def quantities(model: Model) -> tuple[Quantity, ...]:
+    """The twelve parameters, then the coefficients of the effects in the model."""
+    coefficients = [
+        Quantity(printable(each.symbol), printable(shown(each).label), shown(each).per_si, MAUVE,
+                 rr.new_entity_path(["parameters", "effects", each.symbol]).lstrip("/"))
+        for each in model.coefficients
+    ]  # fmt: skip
+    return (*twelve(), *coefficients)

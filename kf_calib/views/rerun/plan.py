@@ -1,7 +1,7 @@
 """The Rerun view of a plan: where gravity will point in the platform, and the sigmas falling from dwell to dwell.
 
 Timelines as in a replay: ``bench_time`` and ``orientation``. Entities: ``platform/{sphere,frame,tour,visits,up,
-uncertainty}``, ``parameters/ACCELEROMETER/SYMBOL/log10_sigma``, ``bench/pose/GIMBAL``, ``summary``.
+uncertainty}``, the charts ``sigmas/KIND`` and ``angles``, ``summary``.
 """
 
 from __future__ import annotations
@@ -14,32 +14,28 @@ import rerun as rr
 import rerun.blueprint as rrb
 from scipy.spatial.transform import Rotation
 
-from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import slerp
 from kf_calib.design import optimality_criteria
 from kf_calib.design.orientation_plan import Plan
+from kf_calib.estimation.information_share import shares_of
 from kf_calib.estimation.measurement_model import STATE_COUNT
-from kf_calib.support.units import shown
 from kf_calib.views.plan import gimbal_names, sentences
+from kf_calib.views.rerun.chart import LABEL_HEIGHT, Axis, Chart, frames, power, sheet, thin, write
 from kf_calib.views.rerun.file import rrd_file
-from kf_calib.views.rerun.layout import WHOLE_RUN, power
 from kf_calib.views.rerun.names import (
     ACCELEROMETERS,
     BENCH_TIME,
     GIMBALS,
     GOLD,
     GREY,
-    GROUPS,
-    LABELS,
-    UNIT_OF,
     WHITE,
-    colour_of,
-    path_of,
     per_si,
+    twelve,
 )
-from kf_calib.views.rerun.platform import FINAL_SIZE, LARGEST, THINNEST, log_frame
+from kf_calib.views.rerun.platform import ellipsoids, log_ellipsoids, log_frame, magnification
 from kf_calib.views.rerun.series import times
+from kf_calib.views.rerun.sigmas import Falling, overview_sheet
 
 _ARC = 17  # points of the way between two directions
 _LIFT = 1.13
@@ -52,26 +48,26 @@ def save(made: Plan, path: str | Path) -> Path:
         log_frame(stream)
         _log_tour(made, stream)
         _log_uncertainty(made, stream)
-        _log_sigmas(made, stream)
+        _falling(made).log_overview(stream)
         _log_angles(made, stream)
         stream.log("summary", rr.TextDocument(_summary(made), media_type=rr.MediaType.MARKDOWN), static=True)
     return path
 
 
 def _summary(made: Plan) -> str:
-    """Angles, sigmas and figures of merit, in Markdown."""
+    """Figures of merit, sigmas, and angles, in Markdown; the longest comes last."""
     gimbals = "".join(f" {name.replace('_', ' ')}, deg |" for name in gimbal_names(made))
     angles = [
         f"| {k} | {begin:.0f} | " + " | ".join(f"{angle:.2f}" for angle in row) + " |"
         for k, (begin, row) in enumerate(zip(made.at_s - 0.5 * made.timing.dwell_s, made.gimbal_deg, strict=True), 1)
     ]
-    sigmas = [
-        f"| {LABELS[symbol]} | {shown(unit).number(made.sigma[-1, k])} | {shown(unit).label} |"
-        for k, (symbol, unit) in enumerate(UNIT_OF.items())
-    ]
+    final = made.sigma[-1, :STATE_COUNT] * per_si()
+    cells = [f"{each.label} {value:.3g} {each.unit}" for each, value in zip(twelve(), final, strict=True)]
+    sigmas = ["| σ after the plan | | | |", "|:--|:--|:--|:--|",
+              *("| " + " | ".join(cells[4 * i : 4 * i + 4]) + " |" for i in range(3))]  # fmt: skip
     head = f"| | begins, s |{gimbals}\n|--:|--:|{'--:|' * made.poses.shape[1]}"
     told = "\n\n".join([*sentences(made), *(f"**Note**: {remark}" for remark in made.remarks)])
-    return "\n".join([head, *angles, "", "| | σ after the plan | |", "|:--|--:|:--|", *sigmas, "", told, ""])
+    return "\n".join([told, "", *sigmas, "", head, *angles, ""])
 
 
 def _index(made: Plan, first: int = 0) -> list[rr.TimeColumn]:
@@ -134,11 +130,13 @@ def _sensitivities(made: Plan) -> tuple[Floats, Floats]:
     return made.prospect.state[:STATE_COUNT].reshape(3, 4)[:, :3], out
 
 
-def magnification(covariances: Floats) -> float:
-    """1, 2 or 5 times a power of ten that makes the largest final sigma visible."""
-    wanted = FINAL_SIZE / float(np.sqrt(np.linalg.eigvalsh(covariances[-1]).max()))
-    decade = 10.0 ** np.floor(np.log10(wanted))
-    return float(max(step for step in (1.0, 2.0, 5.0) if step * decade <= wanted * (1 + 1e-9)) * decade)
+def _falling(made: Plan) -> Falling:
+    """The sigmas after each orientation; 0 is what was known before."""
+    sigma = made.sigma[:, :STATE_COUNT]
+    first = 0 if np.isfinite(sigma[0]).any() else 1
+    shares = np.vstack([np.zeros((1, STATE_COUNT)), shares_of(sigma)])[first:]
+    aims, shown_sigma = np.full(STATE_COUNT, np.nan), sigma[first:] * per_si()
+    return Falling(twelve(), np.arange(first, len(sigma)), shown_sigma, shares, aims)
 
 
 def _log_uncertainty(made: Plan, stream: rr.RecordingStream) -> None:
@@ -148,50 +146,27 @@ def _log_uncertainty(made: Plan, stream: rr.RecordingStream) -> None:
     stream.log(
         "platform/axes", rr.Arrows3D(vectors=tips, colors=ACCELEROMETERS, labels=labels, radii=0.016), static=True
     )
-    factor, shown = magnification(covariances), list[list[tuple[int, Floats, Floats]]]()
-    for own in covariances:
-        values, turns = (None, None) if np.isnan(own).any() else np.linalg.eigh(own)
-        shown.append([] if values is None or turns is None else [
-            (i, factor * np.sqrt(values[i]), turns[i] * np.linalg.det(turns[i]))
-            for i in range(3) if factor * np.sqrt(values[i].max()) < LARGEST
-        ])  # fmt: skip
-    flat = [each for own in shown for each in own]
-    columns = rr.Ellipsoids3D.columns(
-        centers=np.array([tips[i] for i, _, _ in flat]),
-        half_sizes=[np.maximum(half, THINNEST) for _, half, _ in flat],
-        quaternions=[Rotation.from_matrix(turn).as_quat() for _, _, turn in flat],
-        colors=[(*ACCELEROMETERS[i], 120) for i, _, _ in flat],
-    ).partition([len(own) for own in shown])
-    rr.send_columns("platform/uncertainty", _index(made, 1), columns, recording=stream)
-    stream.log("platform/uncertainty", rr.Ellipsoids3D.from_fields(fill_mode="solid"), static=True)
+    count = len(covariances)
+    log_ellipsoids(
+        stream, _index(made, 1), list(range(count)), [ellipsoids(own) for own in covariances], [tips] * count
+    )
 
 
-def _log_sigmas(made: Plan, stream: rr.RecordingStream) -> None:
-    logs = np.log10(made.sigma[:, :STATE_COUNT] * per_si())
-    for k, symbol in enumerate(paper_parameters.SYMBOLS):
-        seen = np.isfinite(logs[:, k])
-        path = f"{path_of(symbol)}/log10_sigma"
-        index = [rr.TimeColumn(BENCH_TIME, duration=_ends_ns(made)[seen]),
-                 rr.TimeColumn("orientation", sequence=np.flatnonzero(seen))]  # fmt: skip
-        rr.send_columns(path, index, rr.Scalars.columns(scalars=logs[seen, k]), recording=stream)
-        style = rr.SeriesLines(
-            names=LABELS[symbol], colors=colour_of(symbol), widths=2.0, interpolation_mode="StepAfter"
-        )
-        stream.log(path, style, static=True)
-
-
-def _ends_ns(made: Plan) -> np.ndarray:
-    half = 0.5 * made.timing.dwell_s
-    ends = np.append(made.at_s[:1] - half, made.at_s + half)
-    return np.round(ends * 1e9).astype("timedelta64[ns]")
+def _angles(made: Plan) -> Chart:
+    """The chart of the gimbal angles of each orientation."""
+    across = Axis.counted(1, len(made.poses), "orientation")
+    return Chart("angles", across, Axis.around(made.gimbal_deg), width=520.0, height=150.0)
 
 
 def _log_angles(made: Plan, stream: rr.RecordingStream) -> None:
+    chart, number = _angles(made), np.arange(1.0, len(made.poses) + 1.0)
+    frames(stream, "angles", [chart])
     for k, (name, angle) in enumerate(zip(gimbal_names(made), made.gimbal_deg.T, strict=True)):
-        path = f"bench/pose/{name}"
-        rr.send_columns(path, _index(made), rr.Scalars.columns(scalars=angle), recording=stream)
-        style = rr.SeriesPoints(names=name.replace("_", " "), colors=GIMBALS[k % len(GIMBALS)], marker_sizes=4.0)
-        stream.log(path, style, static=True)
+        colour = GIMBALS[k % len(GIMBALS)]
+        radius = thin(3.5 if len(number) < 60 else 1.6)
+        points = rr.Points2D(chart.at(number, angle), colors=colour, radii=radius)
+        stream.log(f"angles/{name}", points, static=True)
+        write(stream, f"angles/{name}/name", [((60.0 + 60.0 * k, -LABEL_HEIGHT - 8.0), name.replace("_", " "))], colour)
 
 
 def _layout(made: Plan) -> rrb.Blueprint:
@@ -201,34 +176,25 @@ def _layout(made: Plan) -> rrb.Blueprint:
         )
         for name in ("orientation", BENCH_TIME)
     ]
-    ranges, factor = rrb.VisibleTimeRanges(so_far), power(magnification(_sensitivities(made)[1]))
+    ranges = rrb.VisibleTimeRanges(so_far)
+    factor = magnification(ellipsoids(_sensitivities(made)[1][-1]))
+    spread = f" with 1σ ×{power(factor)}" if factor else ""
     platform = rrb.Spatial3DView(
         origin="platform",
-        name=f"platform: directions up in order of visits; E₁ E₂ E₃ with 1σ ×{factor}",
+        name=f"up, in order of visits; E₁ E₂ E₃{spread}",
         overrides={"platform/visited": ranges, "platform/numbers": ranges},
         eye_controls=rrb.EyeControls3D(position=(2.1, 1.4, 2.6), look_target=(0.05, 0.0, 0.0), eye_up=(0, 1, 0)),
         line_grid=False,
     )
-    sigmas = [
-        _series(
-            [f"{path_of(symbol)}/log10_sigma" for symbol in group.symbols],
-            f"σ of {group.title}: log₁₀ of {shown(group.unit).label}",
-        )
-        for group in GROUPS
-    ]
-    angles = _series(["bench/pose/**"], "gimbal angles, deg")
+    sigmas = overview_sheet(_falling(made), "σ by orientation; bars: information brought")
+    angles = sheet("angles", "gimbal angles, deg", [_angles(made)])
     summary = rrb.TextDocumentView(origin="summary", name="plan")
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(*sigmas, angles, row_shares=[3, 3, 3, 3]),
-            platform, summary, column_shares=[4, 5, 5],
+            rrb.Vertical(sigmas, angles, row_shares=[8, 3]),
+            platform, summary, column_shares=[5, 5, 4.2],
         ),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(state="collapsed", timeline="orientation", play_state="following"),
     )  # fmt: skip
-
-
-def _series(contents: list[str], name: str) -> rrb.TimeSeriesView:
-    legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=True)
-    return rrb.TimeSeriesView(contents=contents, name=name, plot_legend=legend, axis_x=WHOLE_RUN)

@@ -1,10 +1,14 @@
 """The platform frame in 3-D: the sensitive axes stand still in it, gravity moves from dwell to dwell.
 
-Ellipsoids of 1 sigma sit at the tips of the axes, magnified by one factor for the whole run, so that they are seen to
-shrink: along the axis the scale factor's sigma, across it the two angles' (s_i = K_i E_i, all without unit).
+Ellipsoids of 1 sigma sit at the tips of the axes, magnified by one factor for the whole run, with a bar that shows the
+scale; the first ones stay as wires, so that the others are seen to shrink. Along the axis they have the scale factor's
+sigma, across it the two angles' (s_i = K_i E_i, all without unit).
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -12,33 +16,56 @@ from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.results import Calibration, Estimate
+from kf_calib.views.rerun.chart import number, power, thin
 from kf_calib.views.rerun.names import ACCELEROMETERS, GOLD, GREY, RED, WHITE
 from kf_calib.views.rerun.series import above, crowd, ends, nis_band, times
 
-FINAL_SIZE = 0.2  # of the largest final ellipsoid, as a part of the axis' length
-THINNEST = 0.015  # thinner ones could not be seen
-LARGEST = 1.2  # larger ones would hide the scene
+FINAL_SIZE = 0.16  # of the largest final ellipsoid, as a part of the axis' length
+THINNEST = 0.008  # thinner ones could not be seen
+LARGEST = 0.7  # larger ones would hide the scene
+BAR = 0.6  # at most so long is the bar that shows the scale
+FLOOR = -1.35  # height at which it lies
+_ARCSEC = float(np.degrees(3600.0))
+
+Ellipsoid = tuple[int, Floats, Floats]
+"""Accelerometer, sigmas (3,) of its sensitivity, and their directions (3, 3) as columns."""
 
 
-def magnification(estimate: Estimate) -> float | None:
-    """1, 2 or 5 times a power of ten, that makes the largest final sigma of s_i visible; None: none is determined."""
-    sigmas = [spread.max() for _, spread, _ in _ellipsoids(estimate)]
-    if not sigmas or max(sigmas) <= 0:
-        return None
-    wanted = FINAL_SIZE / max(sigmas)
+def rounded(wanted: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is not above it."""
     decade = 10.0 ** np.floor(np.log10(wanted))
     return float(max(step for step in (1.0, 2.0, 5.0) if step * decade <= wanted * (1 + 1e-9)) * decade)
 
 
-def _ellipsoids(estimate: Estimate) -> list[tuple[int, Floats, Floats]]:
-    """(accelerometer, sigmas (3,), their directions (3, 3) as columns) of the sensitivities that are determined."""
-    out = list[tuple[int, Floats, Floats]]()
-    for i in range(3):
-        if not estimate.unseen[4 * i : 4 * i + 3].any():
-            own = slice(4 * i, 4 * i + 3)
-            variance, directions = np.linalg.eigh(estimate.covariance[own, own])
+def magnification(final: Sequence[Ellipsoid]) -> float | None:
+    """A round factor that makes the largest final sigma visible; None: none is determined."""
+    largest = max((float(spread.max()) for _, spread, _ in final), default=0.0)
+    return rounded(FINAL_SIZE / largest) if largest > 0.0 else None
+
+
+def ellipsoids(sensitivities: Floats) -> list[Ellipsoid]:
+    """Those of covariances (3, 3, 3) of the three sensitivities; NaN where one is not determined."""
+    out = list[Ellipsoid]()
+    for i, covariance in enumerate(sensitivities):
+        if np.isfinite(covariance).all():
+            variance, directions = np.linalg.eigh(covariance)
             out.append((i, np.sqrt(np.maximum(variance, 0.0)), directions * np.linalg.det(directions)))
     return out
+
+
+def ellipsoids_of(estimate: Estimate) -> list[Ellipsoid]:
+    """Return those of the sensitivities that are determined."""
+    own = np.full((3, 3, 3), np.nan)
+    for i in range(3):
+        if not estimate.unseen[4 * i : 4 * i + 3].any():
+            own[i] = estimate.covariance[4 * i : 4 * i + 3, 4 * i : 4 * i + 3]
+    return ellipsoids(own)
+
+
+def magnified(estimate: Estimate) -> str:
+    """What the title of the view says of the ellipsoids."""
+    factor = magnification(ellipsoids_of(estimate))
+    return f" with 1σ ×{power(factor)}" if factor else ""
 
 
 def _axes(estimate: Estimate) -> Floats:
@@ -50,7 +77,10 @@ def _axes(estimate: Estimate) -> Floats:
 def log_platform(result: Calibration, stream: rr.RecordingStream) -> None:
     log_frame(stream)
     _log_axes(result, stream)
-    _log_ellipsoids(result, stream)
+    numbers = ends(result.visits)[1].tolist()
+    steps = [ellipsoids_of(visit.estimate) for visit in result.visits]
+    tips = [_axes(visit.estimate) for visit in result.visits]
+    log_ellipsoids(stream, times(*ends(result.visits)), numbers, steps, tips)
     _log_directions(result, stream)
 
 
@@ -68,7 +98,7 @@ def log_frame(stream: rr.RecordingStream) -> None:
 
 def _log_axes(result: Calibration, stream: rr.RecordingStream) -> None:
     """Estimated sensitive axes after each dwell; those not yet determined are left out."""
-    seen = [[i for i, _, _ in _ellipsoids(visit.estimate)] for visit in result.visits]
+    seen = [[i for i, _, _ in ellipsoids_of(visit.estimate)] for visit in result.visits]
     vectors = [_axes(visit.estimate)[own] for visit, own in zip(result.visits, seen, strict=True)]
     which = [i for own in seen for i in own]
     columns = rr.Arrows3D.columns(
@@ -80,26 +110,50 @@ def _log_axes(result: Calibration, stream: rr.RecordingStream) -> None:
     rr.send_columns("platform/axes", times(*ends(result.visits)), columns, recording=stream)
 
 
-def _log_ellipsoids(result: Calibration, stream: rr.RecordingStream) -> None:
-    factor = magnification(result.estimate)
+def log_ellipsoids(
+    stream: rr.RecordingStream, index: list[rr.TimeColumn], numbers: Sequence[int], steps: list[list[Ellipsoid]],
+    tips: list[Floats],
+) -> None:  # fmt: skip
+    """Ellipsoids at the tips (3, 3) of the axes after each step, all magnified alike, with a bar that shows the scale.
+
+    The first that are not too large to be drawn stay as wires, so that the others are seen to be smaller.
+    """
+    factor = magnification(steps[-1])
     if factor is None:
         return
-    shown = [
-        [(i, factor * s, turn) for i, s, turn in _ellipsoids(v.estimate) if factor * s.max() < LARGEST]
-        for v in result.visits
-    ]
-    centres = [_axes(v.estimate)[[i for i, _, _ in own]] for v, own in zip(result.visits, shown, strict=True)]
-    flat = [each for own in shown for each in own]
-    if not flat:
-        return
-    columns = rr.Ellipsoids3D.columns(
-        centers=np.concatenate(centres),
-        half_sizes=[np.maximum(half, THINNEST) for _, half, _ in flat],
-        quaternions=[Rotation.from_matrix(turn).as_quat() for _, _, turn in flat],
-        colors=[(*ACCELEROMETERS[i], 120) for i, _, _ in flat],
-    ).partition([len(own) for own in shown])
-    rr.send_columns("platform/uncertainty", times(*ends(result.visits)), columns, recording=stream)
-    stream.log("platform/uncertainty", rr.Ellipsoids3D.from_fields(fill_mode="solid"), static=True)
+    shown = [[each for each in own if factor * each[1].max() < LARGEST] for own in steps]
+    fields = [_fields(own, tip, factor) for own, tip in zip(shown, tips, strict=True)]
+    flat = {name: [each for own in fields for each in own[name]] for name in fields[0]}
+    columns = rr.Ellipsoids3D.columns(**flat).partition([len(own) for own in shown])
+    rr.send_columns("platform/uncertainty", index, columns, recording=stream)
+    mode = rr.components.FillMode.TransparentFillMajorWireframe
+    stream.log("platform/uncertainty", rr.Ellipsoids3D.from_fields(fill_mode=mode, line_radii=thin(0.8)), static=True)
+    first = next((k for k, own in enumerate(shown) if len(own) == len(shown[-1])), len(shown) - 1)
+    wires = rr.Ellipsoids3D(**fields[first], fill_mode=rr.components.FillMode.MajorWireframe, line_radii=thin(0.4))
+    stream.log("platform/first", wires if first < len(shown) - 1 else rr.Clear(recursive=False), static=True)
+    _log_bar(stream, factor, f"; wires: orientation {numbers[first]}" if first < len(shown) - 1 else "")
+
+
+def _fields(own: list[Ellipsoid], tips: Floats, factor: float) -> dict[str, Any]:
+    """Return what Rerun draws ellipsoids from."""
+    return {
+        "centers": [tips[i] for i, _, _ in own],
+        "half_sizes": [np.maximum(factor * sigma, THINNEST) for _, sigma, _ in own],
+        "quaternions": [Rotation.from_matrix(turn).as_quat() for _, _, turn in own],
+        "colors": [(*ACCELEROMETERS[i], 150) for i, _, _ in own],
+    }
+
+
+def _log_bar(stream: rr.RecordingStream, factor: float, words: str) -> None:
+    """A bar of a round angle, magnified as the ellipsoids are."""
+    arcsec = rounded(BAR / factor * _ARCSEC)
+    half = 0.5 * factor * arcsec / _ARCSEC
+    bar = rr.LineStrips3D([[(-half, FLOOR, 0.0), (half, FLOOR, 0.0)]], colors=WHITE, radii=0.012)
+    stream.log("platform/scale", bar, static=True)
+    ppm = number(float(f"{arcsec / _ARCSEC * 1e6:.2g}"))
+    text, place = f"{number(arcsec)} arcsec, {ppm} ppm{words}", (0.0, FLOOR - 0.04, 0.0)
+    label = rr.Points3D([place], labels=[text], radii=0.0, colors=WHITE, show_labels=True)
+    stream.log("platform/scale/label", label, static=True)
 
 
 def _log_directions(result: Calibration, stream: rr.RecordingStream) -> None:

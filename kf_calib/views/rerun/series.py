@@ -12,70 +12,74 @@ from scipy.special import chdtri
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation import square_root_information
-from kf_calib.estimation.results import Calibration, Estimate, Visit
-from kf_calib.support.units import shown
+from kf_calib.estimation.information_share import prior_estimate
+from kf_calib.estimation.results import Calibration, Visit
+from kf_calib.support import units
 from kf_calib.views.rerun.names import (
     ACCELEROMETERS,
     BENCH_TIME,
     CHANNELS,
     GIMBALS,
     GREY,
-    LABELS,
     ORIENTATION,
     RED,
     WHITE,
     Colour,
-    colour_of,
-    path_of,
-    per_si,
+    Quantity,
+    quantities,
 )
-
-EDGE = 0.015
-"""The view goes on for this part of the run after its end: the last points are not cut by the frame."""
 
 Counts = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class History:
-    """The parameters along the run, in shown units: deviation from nominal and sigma (n, 12), NaN where not seen.
+    """What is estimated along the run, in shown units: deviation from nominal and sigma (n, 12 + q).
 
-    ``orientation`` (n,) is the number of the dwell, the prior has 0; ``whole`` (n,) tells the rows at which a dwell is
-    complete.
+    NaN where not determined. ``shown``: what the columns are, the q coefficients of effects last. ``orientation`` (n,)
+    is the number of the dwell, the prior has 0; ``whole`` (n,) tells the rows at which a dwell is complete.
     """
 
+    shown: tuple[Quantity, ...]
     elapsed_s: Floats
     orientation: Counts
     whole: NDArray[np.bool_]
     deviation: Floats
     sigma: Floats
 
+    def _only(self, rows: NDArray[np.bool_]) -> History:
+        """Return the same with these rows only."""
+        return History(self.shown, *(getattr(self, each.name)[rows] for each in fields(self)[1:]))
+
     def after(self, visits: Sequence[Visit]) -> History:
         """What came after these visits; the prior only where there were none."""
-        late = self.orientation > (visits[-1].dwell.number if visits else -1)
-        return History(*(getattr(self, each.name)[late] for each in fields(self)))
+        return self._only(self.orientation > (visits[-1].dwell.number if visits else -1))
+
+    @property
+    def by_orientation(self) -> History:
+        """The ends of the dwells only."""
+        return self._only(self.whole)
 
     @classmethod
     def of(cls, result: Calibration) -> History:
-        steps = [(0.0, 0, _prior(result)), *result.trace()]
+        steps = [(0.0, 0, prior_estimate(result)), *result.trace()]
         orientation = np.array([number for _, number, _ in steps])
-        sigma = np.array([estimate.sigma for _, _, estimate in steps])
-        deviation = np.array([estimate.parameters for _, _, estimate in steps]) - paper_parameters.nominal(
-            result.bench.nominal
+        shown, gains = quantities(result.model), result.model.natural(result.estimate.state)[1]
+        nominal = paper_parameters.nominal(result.bench.nominal)
+        sigma = np.array([np.append(each.sigma, each.effect_sigma * gains) for _, _, each in steps])
+        effects = [result.model.natural(each.state)[0] for _, _, each in steps]
+        deviation = np.array(
+            [np.append(e.parameters - nominal, c) for (_, _, e), c in zip(steps, effects, strict=True)]
         )
+        per_si = np.array([each.per_si for each in shown])
         return cls(
+            shown=shown,
             elapsed_s=np.array([elapsed_s for elapsed_s, _, _ in steps]),
             orientation=orientation,
             whole=np.append(np.diff(orientation) > 0, True),
-            deviation=np.where(np.isfinite(sigma), deviation, np.nan) * per_si(),
-            sigma=sigma * per_si(),
+            deviation=np.where(np.isfinite(sigma), deviation, np.nan) * per_si,
+            sigma=sigma * per_si,
         )
-
-
-def _prior(result: Calibration) -> Estimate:
-    factor = square_root_information.start(result.settings.prior, result.model)
-    return Estimate(*square_root_information.solve(factor, result.model.nominal_state()))
 
 
 def times(elapsed_s: Floats, orientation: Counts | None = None) -> list[rr.TimeColumn]:
@@ -91,17 +95,17 @@ def ends(visits: Sequence[Visit]) -> tuple[Floats, Counts]:
     return np.array([dwell.end_s for dwell in dwells]), np.array([dwell.number for dwell in dwells])
 
 
-def log_parameters(history: History, stream: rr.RecordingStream) -> None:
-    """log10 of sigma, deviation from nominal, and the deviation less and plus one sigma."""
-    with np.errstate(divide="ignore"):
-        logs = np.log10(history.sigma)  # an exact prior has no logarithm, and no point
-    for k, symbol in enumerate(paper_parameters.SYMBOLS):
-        path, colour, label = path_of(symbol), colour_of(symbol), LABELS[symbol]
+def log_parameters(history: History, stream: rr.RecordingStream, styled: bool) -> None:
+    """Sigma, deviation from nominal, and the deviation less and plus one sigma; ``styled``: how they look was sent."""
+    for k, shown in enumerate(history.shown):
+        path, colour, label = shown.path, shown.colour, shown.label
         value, sigma = history.deviation[:, k], history.sigma[:, k]
-        _log_curve(stream, f"{path}/log10_sigma", history, logs[:, k])
+        _log_curve(stream, f"{path}/sigma", history, sigma)
         _log_curve(stream, f"{path}/deviation", history, value)
         _log_curve(stream, f"{path}/band", history, np.column_stack([value - sigma, value + sigma]))
-        _style(stream, f"{path}/log10_sigma", rr.SeriesLines(names=label, colors=colour, widths=1.5))
+        if styled:
+            continue
+        _style(stream, f"{path}/sigma", rr.SeriesLines(names=label, colors=colour, widths=2.0))
         _style(stream, f"{path}/deviation", rr.SeriesLines(names=label, colors=colour, widths=2.0))
         _style(stream, f"{path}/band", rr.SeriesLines(names=["−σ", "+σ"], colors=[GREY] * 2, widths=[1.0] * 2))
 
@@ -133,7 +137,7 @@ def log_innovations(visits: Sequence[Visit], stream: rr.RecordingStream, before:
     ``before``: how many dwells were sent before these.
     """
     (elapsed_s, number), count = ends(visits), before + len(visits)
-    unit = shown("m/s^2")
+    unit = units.shown("m/s^2")
     innovation = np.array([visit.innovation_mps2 for visit in visits]) * unit.per_si
     sigma = np.array([visit.innovation_sigma_mps2 for visit in visits]) * unit.per_si
     for i, (channel, colour) in enumerate(zip(CHANNELS, ACCELEROMETERS, strict=True)):
@@ -189,15 +193,10 @@ def _bounds(lower: str, upper: str) -> rr.SeriesLines:
 
 
 def log_bench(result: Calibration, stream: rr.RecordingStream, before: int = 0) -> None:
-    """The lane of dwells (empty while the platform moves), and the pose: gimbal angles in deg, or the quaternion."""
+    """The pose of each dwell: gimbal angles in deg, or the quaternion."""
     dwells = [visit.dwell for visit in result.visits[before:]]
     begun = np.array([dwell.start_s for dwell in dwells])
     done, number = ends(result.visits[before:])
-    states = rr.StateChange.columns(state=[f"{k}" for k in number])
-    rr.send_columns("bench/dwell", times(begun, number), states, recording=stream)
-    edge = done[-1] + EDGE * (done[-1] - begun[0])
-    over = rr.StateChange.columns(state=[""] * (len(dwells) + 1))
-    rr.send_columns("bench/dwell", times(np.append(done, edge)), over, recording=stream)
     poses = np.array([dwell.recorded_pose for dwell in dwells])
     poses = np.degrees(poses) if result.bench.axes else poses
     for k, (name, angle) in enumerate(zip(pose_names(result), poses.T, strict=True)):

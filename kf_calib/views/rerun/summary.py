@@ -7,11 +7,11 @@ from itertools import combinations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation.results import Calibration, Parameter
+from kf_calib.estimation.correlation import correlation
+from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support.units import Unit, shown, significant
 from kf_calib.views.console import noise_origins, whole_value
-from kf_calib.views.rerun.correlation import correlation
-from kf_calib.views.rerun.names import LABELS
+from kf_calib.views.rerun.names import LABELS, quantities
 
 
 def summary(result: Calibration) -> str:
@@ -54,7 +54,7 @@ def _verdict(result: Calibration) -> str:
     else:
         yes = "agree with the model" if judged.consistent else "**disagree with the model**"
         per_dof = significant(judged.statistic / judged.dof)
-        words = f"the dwells {yes}: p = {judged.p_value:.2g}, NIS/dof = {per_dof}, dof = {judged.dof}"
+        words = f"the dwells {yes}: p {format_p(judged.p_value)}, NIS/dof = {per_dof}, dof = {judged.dof}"
     held, unit = "", shown("m/s^2")
     if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2 is not None:
         rms, floor = map(unit.number, (result.held_out_rms_mps2, result.held_out_floor_mps2))
@@ -80,7 +80,7 @@ def _ties(result: Calibration) -> list[str]:
     """The pairs of parameters the orientations tell apart worst."""
     matrix = np.nan_to_num(correlation(result.estimate))
     pairs = sorted(combinations(range(len(matrix)), 2), key=lambda pair: -abs(matrix[pair]))
-    names = list(LABELS.values())
+    names = [each.label for each in quantities(result.model)]
     strong = [f"{names[i]} {names[j]} {matrix[i, j]:+.2f}" for i, j in pairs[:4] if abs(matrix[i, j]) >= 0.5]
     return [f"**Correlated**: {', '.join(strong)}".replace("-", "−")] if strong else []
 

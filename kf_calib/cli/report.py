@@ -1,0 +1,181 @@
+"""The command ``report``, and the option ``--report`` of others: a result as one HTML page."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import rich_click as click
+from click import get_current_context  # rich_click declares that there may be none
+from click.core import ParameterSource
+
+from kf_calib.cli.files import Delivery, claimed, delivery, output_option
+from kf_calib.cli.options import (
+    INPUT,
+    OUTPUT,
+    effects_of,
+    examples,
+    filter_options,
+    json_option,
+    opened,
+    overwrite_option,
+    print_json,
+    progress,
+    recording_of,
+    recording_options,
+    show,
+    strict_option,
+    units_option,
+)
+
+if TYPE_CHECKING:
+    from kf_calib.diagnosis.results import Diagnosis
+    from kf_calib.views.report.measured import Measured
+
+report_option = output_option(
+    "--report", metavar="FILE.html", panel=OUTPUT, help="Save a page with figures and tables here; it needs no network."
+)
+
+
+@click.command(
+    epilog=examples(
+        "report run.mcap", "report after.mcap --against before.mcap -o shift.html",
+        "report run.mcap --model after.toml --against before.toml",
+    )
+)  # fmt: skip
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option(
+    "--against", type=click.Path(path_type=Path), metavar="PATH", panel=INPUT,
+    help="Beside it: another recording, evaluated in the same way, or the same one with the model of a .toml file.",
+)  # fmt: skip
+@recording_options
+@filter_options
+@output_option(
+    "-o", "--out", metavar="FILE.html", default="report.html", show_default=True, panel=OUTPUT,
+    help="Where the page is saved.",
+)  # fmt: skip
+@overwrite_option
+@units_option
+@strict_option
+@json_option
+@click.pass_context
+def report(
+    ctx: click.Context,
+    recording: Path,
+    against: Path | None,
+    out: Path,
+    overwrite: bool,
+    strict: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """A page for the engineer: verdict, figures, residuals to explore, tables, commands to get the numbers again."""
+    from kf_calib.diagnosis.side_by_side import SideBySide
+    from kf_calib.views import diagnosis, side_by_side
+    from kf_calib.views.json import clean
+    from kf_calib.views.report.contents import page_of
+    from kf_calib.views.report.page import save
+
+    outputs = claimed(overwrite=overwrite)
+    has_other_model = against is not None and against.suffix == ".toml"
+    other_options = options | ({"model_file": against, "effects": ()} if has_other_model else {})
+    if has_other_model:
+        outputs.spare(_programs_of(against))
+        effects_of(other_options)  # refused, as that of --model, before any reading is read
+    found, measured = _diagnosed(recording, options, as_json)
+    pair, sources = None, [measured]
+    if against is not None:
+        other, beside = _diagnosed(recording if has_other_model else against, other_options, as_json)
+        pair, sources = SideBySide(other, found, has_other_model), [beside, measured]
+    said = diagnosis.verdict(found) if pair is None else side_by_side.verdict(pair)
+    if as_json:
+        table = {"report": str(out), "recording": measured.name, "sha256": measured.sha256,
+                 "consistent": found.test.consistent, "p_value": found.test.p_value,
+                 "verdict": diagnosis.verdict(found)}  # fmt: skip
+        beside_it = {"against": None, "differences": [], "differences_p_value": None}
+        print_json(clean(table | (beside_it if pair is None else side_by_side.side_by_side_object(pair))))
+    else:
+        show(said)
+    with delivery(outputs, as_json) as deliver, progress("drawing the page", as_json):
+        result = found if pair is None else pair
+        deliver.file(out, lambda path: save(page_of(result, sources, commands_of(ctx)), path))
+    if strict and found.test.consistent is False:
+        ctx.exit(1)
+
+
+def save_report(
+    deliver: Delivery, path: Path | None, result: object, measured: Measured | None, remarks: Sequence[str] = ()
+) -> None:
+    """Save the page of a command's result, if ``--report`` asks for one."""
+    if path is not None and measured is not None:
+        from kf_calib.views.report.contents import page_of
+        from kf_calib.views.report.page import save
+
+        commands = commands_of(get_current_context())
+        deliver.file(path, lambda path: save(page_of(result, [measured], commands, remarks), path))
+
+
+def measured_of(recording: Path, options: dict[str, Any]) -> Measured:
+    """What a page says of a recording's file; raises MissingExtraError, before the work, where no page can be made."""
+    import kf_calib.views.figures  # noqa: F401  # which a page needs
+    from kf_calib.diagnosis.selection_journal import Origin
+    from kf_calib.views.report.measured import Measured
+
+    return Measured(recording.name, Origin.of(recording).sha256, recording_of(recording, options).begin_ns())
+
+
+def _diagnosed(recording: Path, options: dict[str, Any], quiet: bool) -> tuple[Diagnosis, Measured]:
+    """Return the diagnosis of a recording, and what a page says of its file."""
+    from kf_calib.diagnosis.missing_effect import diagnose
+    from kf_calib.diagnosis.refits import Refits
+    from kf_calib.estimation.calibration import calibrate
+
+    measured, (source, settings) = measured_of(recording, options), opened(recording, options)
+    with progress(f"diagnosing {recording.name}", quiet) as tick:
+        return diagnose(calibrate(source, settings, tick), Refits(source)), measured
+
+
+def _programs_of(model: Path | None) -> list[Path]:
+    from kf_calib.estimation import model_file
+
+    return [] if model is None else [each.path for each in model_file.read(model).programs]
+
+
+_HOW_IT_ENDS = ("overwrite", "strict", "as_json")
+"""Options that change no number and no page."""
+
+
+def commands_of(ctx: click.Context) -> list[str]:
+    """The command that runs, as it could be typed again, and what prints its tables alone."""
+    own = [f"kf-calib {ctx.info_name} {_typed(ctx, _HOW_IT_ENDS)}"]
+    if ctx.info_name == "report" and ctx.params.get("against") is None:
+        shared = _typed(ctx, ("out", *_HOW_IT_ENDS))
+        own += [f"kf-calib {name} {shared}" for name in ("replay", "diagnose")]
+    return [*own, *(f"sha256sum {shlex.quote(str(path))}" for path in _recordings(ctx))]
+
+
+def _recordings(ctx: click.Context) -> list[Path]:
+    against = ctx.params.get("against")
+    others = [against] if against is not None and against.suffix != ".toml" else []
+    return [path for path in [ctx.params["recording"], *others] if path.is_file()]
+
+
+def _typed(ctx: click.Context, less: Sequence[str]) -> str:
+    """Return the arguments and options that were given, but for some, as words of a shell."""
+    words = list[str]()
+    for param in ctx.command.params:
+        name = param.name or ""
+        given = ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE
+        if name in less or not given or name not in ctx.params:  # of --units, no value is left
+            continue
+        value = ctx.params[name]
+        if isinstance(param, click.Argument):
+            words.insert(0, str(value))
+        elif isinstance(param, click.Option) and param.is_flag:
+            words.append(param.opts[-1] if value else param.secondary_opts[-1])
+        else:
+            words += [word for each in (value if isinstance(value, tuple) else [value])
+                      for word in (param.opts[-1], str(each))]  # fmt: skip
+    return shlex.join(words)

@@ -1,0 +1,28 @@
+"""Correlations of what a run estimates: the twelve parameters and the coefficients of effects."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.estimation.measurement_model import STATE_COUNT
+from kf_calib.estimation.results import Estimate
+
+
+def correlation(estimate: Estimate) -> Floats:
+    """Correlations (12 + q, 12 + q) of the twelve parameters and the coefficients of effects; NaN in the rows and
+    columns of those that are not determined."""
+    own = estimate.covariance
+    jacobian = np.eye(len(own))
+    jacobian[:STATE_COUNT, :STATE_COUNT] = paper_parameters.jacobian(estimate.state[:STATE_COUNT])
+    sigma = np.sqrt(np.diag(jacobian @ own @ jacobian.T))
+    sigma[np.isnan(np.concatenate([estimate.sigma, estimate.effect_sigma]))] = np.nan
+    return jacobian @ own @ jacobian.T / np.outer(sigma, sigma)
+
+
+def largest_correlation(estimate: Estimate) -> float:
+    """The largest absolute correlation of two different quantities that are determined; 0 if there are none."""
+    apart = np.nan_to_num(correlation(estimate))
+    np.fill_diagonal(apart, 0.0)
+    return float(np.abs(apart).max())

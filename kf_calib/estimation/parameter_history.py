@@ -1,0 +1,85 @@
+"""The parameters along a run: estimate and sigma after each dwell, what each dwell brought, and their correlations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.estimation import square_root_information
+from kf_calib.estimation.measurement_model import STATE_COUNT
+from kf_calib.estimation.results import Calibration, Estimate, Parameter, estimate_of
+
+
+@dataclass(frozen=True)
+class ParameterHistory:
+    """The twelve parameters and the coefficients of effects after each dwell, in SI; NaN while not determined.
+
+    - parameters: what they are, in the order of the columns.
+    - numbers (n,): of the dwells; a stated prior comes first and has the number 0.
+    - values (n, p), sigmas (n, p): estimate and sigma after that dwell.
+    """
+
+    parameters: tuple[Parameter, ...]
+    numbers: NDArray[np.int64]
+    values: Floats
+    sigmas: Floats
+
+    @cached_property
+    def deviations(self) -> Floats:
+        """Estimates less the final one, over the final sigma (n, p)."""
+        return (self.values - self.values[-1]) / self.sigmas[-1]
+
+    @cached_property
+    def shares(self) -> Floats:
+        """Share of the final information 1/sigma^2 about each parameter by which it rose with each dwell, (n, p).
+
+        A column sums to 1, and is NaN for a parameter that is not determined. A share is negative where information
+        is lost, as about biases that walk.
+        """
+        information = np.where(np.isfinite(self.sigmas), self.sigmas, np.inf) ** -2.0
+        final = np.where(information[-1] > 0.0, information[-1], np.nan)
+        return np.diff(information, axis=0, prepend=0.0) / final
+
+    @cached_property
+    def shares_of_accelerometers(self) -> Floats:
+        """Mean shares (n, 3) over the parameters of each accelerometer that are determined; NaN where none is."""
+        twelve = self.shares[:, :STATE_COUNT].reshape(-1, 3, 4)
+        known = np.isfinite(twelve).sum(axis=2)
+        return np.nansum(twelve, axis=2) / np.where(known > 0, known, np.nan)
+
+
+def history_of(result: Calibration) -> ParameterHistory:
+    """The parameters along a run, as the filter estimated them after each dwell."""
+    model, prior = result.model, result.settings.prior
+    estimates, numbers = [visit.estimate for visit in result.visits], [visit.dwell.number for visit in result.visits]
+    if not prior.diffuse:
+        factor = square_root_information.start(prior, model)
+        nothing = np.zeros((model.count, model.count))
+        estimates, numbers = [estimate_of(factor, model.nominal_state(), nothing), *estimates], [0, *numbers]
+    values, sigmas = np.array([_shown(result, each) for each in estimates]).swapaxes(0, 1)
+    symbols = (*paper_parameters.SYMBOLS, *(each.symbol for each in model.coefficients))
+    return ParameterHistory(tuple(result.parameters[symbol] for symbol in symbols), np.array(numbers), values, sigmas)
+
+
+def _shown(result: Calibration, estimate: Estimate) -> tuple[Floats, Floats]:
+    """Return values and sigmas (p,) of an estimate, the states of unknown constants as these constants."""
+    coefficients, gains = result.model.natural(estimate.state)
+    values = np.append(estimate.parameters, coefficients)
+    sigmas = np.append(estimate.sigma, gains * estimate.effect_sigma)
+    return np.where(np.isfinite(sigmas), values, np.nan), sigmas
+
+
+def correlation(estimate: Estimate) -> Floats:
+    """Correlation matrix (p, p) of the twelve parameters and the coefficients; NaN where one is not determined."""
+    count = len(estimate.state)
+    jacobian = np.eye(count)
+    jacobian[:STATE_COUNT, :STATE_COUNT] = paper_parameters.jacobian(estimate.state[:STATE_COUNT])
+    covariance = jacobian @ estimate.covariance @ jacobian.T
+    seen = np.isfinite(np.append(estimate.sigma, estimate.effect_sigma))
+    sigma = np.where(seen, np.sqrt(np.diag(covariance)), np.nan)
+    return covariance / np.outer(sigma, sigma)

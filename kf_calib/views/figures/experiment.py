@@ -1,0 +1,92 @@
+"""The seed paper's experiment: its Table 2 beside the figures computed here, and both sets' sigmas as readings come."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure, FigureBase
+
+from kf_calib.estimation.measurement_model import STATE_COUNT
+from kf_calib.reproduction.grebenkin2019 import (
+    NONOPTIMAL_PRINTED,
+    OPTIMAL_PRINTED,
+    READINGS,
+    Column,
+    Experiment,
+    falling_sigma,
+    printed,
+)
+from kf_calib.views.figures.parameter_panels import parameter_panels
+from kf_calib.views.figures.scales import log_scale, written
+from kf_calib.views.figures.style import GREY, blank, styled
+from kf_calib.views.figures.symbols import twelve
+
+_SETS = {"optimal": ("#0072b2", "-"), "non-optimal": ("#d55e00", "--")}
+
+
+def table2(found: Experiment) -> Figure:
+    """Mean size of the error of each parameter, of both sets: printed, expected, by least squares and by the filter."""
+    with styled():
+        figure = blank(11.0, 6.0)
+        draw_table2(figure, found)
+    return figure
+
+
+def draw_table2(figure: FigureBase, found: Experiment) -> None:
+    """The same on a part of a figure."""
+    axes, place = figure.subplots(), np.arange(STATE_COUNT)
+    every = list[np.ndarray]()
+    for (name, (colour, _)), (column, table) in zip(_SETS.items(), _tables(found), strict=True):
+        computed = (column.orientations.expected, column.least_squares, column.kalman)
+        every += [printed(table), *computed]
+        axes.hlines(column.orientations.expected, place - 0.38, place + 0.38, color=colour, linewidth=2.0,
+                    label=f"{name}: expected, √(2/π) σ")  # fmt: skip
+        for offset, values, marker, what in ((-0.22, printed(table), "X", "printed in the paper"),
+                                             (0.0, column.least_squares, "o", "least squares, here"),
+                                             (0.22, column.kalman, "D", "filter, here")):  # fmt: skip
+            axes.plot(place + offset, values, marker, color=colour, markersize=6.0, markeredgecolor="white",
+                      markeredgewidth=0.6, label=f"{name}: {what}")  # fmt: skip
+    log_scale(axes, every)
+    for edge in (3.5, 7.5):
+        axes.axvline(edge, color=GREY, linewidth=0.8)
+    axes.set_xlim(-0.6, STATE_COUNT - 0.4)
+    axes.set_xticks(place, [each.label for each in twelve()])
+    axes.grid(visible=False, axis="x")
+    axes.set_ylabel("mean of |error|, % of the deviation that was to be found")
+    axes.set_title(f"Table 2 of the paper and {written(found.repetitions)} repetitions: optimal orientations below, "
+                   "non-optimal ones above")  # fmt: skip
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+
+
+def falling(found: Experiment) -> Figure:
+    """Sigma of every parameter as readings come, in the optimal and the non-optimal set, from the same prior."""
+    with styled():
+        figure = blank(11.0, 7.0)
+        draw_falling(figure, found)
+    return figure
+
+
+def draw_falling(figure: FigureBase, found: Experiment) -> None:
+    """The same on a part of a figure."""
+    panels, _ = parameter_panels(figure, "σ")
+    both = [falling_sigma(column.orientations) for column, _ in _tables(found)]
+    for k, axes in enumerate(panels):
+        for (name, (colour, style)), sigmas in zip(_SETS.items(), both, strict=True):
+            values = sigmas[:, k] * twelve()[k].per_si
+            last = written(float(f"{values[-1]:.2g}"))
+            axes.plot(values, style, color=colour, label=f"{name}" if k else f"{name} set")
+            axes.annotate(last, (len(values) - 1, values[-1]), xytext=(3, 0), textcoords="offset points", fontsize=7.5,
+                          color=colour, va="center", annotation_clip=False)  # fmt: skip
+        axes.text(0.985, 0.97, twelve()[k].label, transform=axes.transAxes, ha="right", va="top", fontweight="bold")
+        axes.set_xticks(range(0, len(both[0]), READINGS))
+        axes.set_xlim(0, 1.16 * len(both[0]))
+    for k in range(4):
+        shown = np.array(both)[:, :, k::4] * twelve()[k].per_si
+        log_scale(panels[k], [0.7 * shown, shown])
+    for axes in panels[3::4]:
+        axes.set_xlabel(f"readings ({READINGS} in each orientation)")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+
+
+def _tables(found: Experiment) -> list[tuple[Column, dict[str, float]]]:
+    """Return both sets with their columns of Table 2."""
+    return [(found.optimal, OPTIMAL_PRINTED), (found.nonoptimal, NONOPTIMAL_PRINTED)]

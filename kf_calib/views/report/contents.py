@@ -1,0 +1,174 @@
+"""What is on the page of a result: for each kind of result its verdict, and sections of figures, tables and words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import singledispatch
+from typing import Any
+
+from rich.console import RenderableType
+
+from kf_calib.diagnosis.residual_drivers import Explanation, explanations
+from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.diagnosis.side_by_side import SideBySide, differences
+from kf_calib.diagnosis.stepwise_selection import Improvement
+from kf_calib.estimation.engine_comparison import Comparison
+from kf_calib.estimation.results import Calibration
+from kf_calib.views import console, diagnosis, improvement, side_by_side
+from kf_calib.views.figures import figures
+from kf_calib.views.report.drawing import Drawing
+from kf_calib.views.report.explorer import Explorer, explorer
+from kf_calib.views.report.measured import Measured, facts
+from kf_calib.views.report.page import Facts, Page, Part, Section, Standing
+from kf_calib.views.report.parts import Paragraph, parts_of
+
+_EXPLORED = 3
+"""Explanations, at most, of which the explorer offers what they leave."""
+
+
+@singledispatch
+def page_of(result: Any, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
+    """The page of a result.
+
+    measured: its recordings, one or two. commands: what gives the numbers again, a line each. remarks: sentences that
+    go with the verdict.
+    """
+    raise TypeError(f"there is no report of {type(result).__name__}: give what diagnose, improve or compare returns, "
+                    "or two diagnoses side by side.")  # fmt: skip
+
+
+@page_of.register
+def _(found: Diagnosis, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
+    return Page(
+        measured[0].name, "Calibration report", *_standing(found.test.consistent),
+        (diagnosis.verdict(found), *remarks), (Facts("", tuple(facts(measured[0], found.before))),),
+        (
+            _drawn("Residuals", found, "found"),
+            Section("Explore the residuals", (_explorer_of(found),)),
+            Section("Parameters", (*_calibrated(found.before), *_with_what_is_missing(found))),
+            _drawn("The calibration", found.before, "run"),
+            Section("Suspects, and what this run could show", _evidence(found)),
+            _warnings(found.before.warnings),
+        ), tuple(commands),
+    )  # fmt: skip
+
+
+@page_of.register
+def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
+    steps = _in_text(improvement.progress(state))
+    stopped, *rest = _in_text(improvement.improvement_report(state, None, None))[len(steps) :]
+    assert isinstance(stopped, Paragraph)
+    start, last = state.start.before, state.result
+    explained = {f"{last.model.sum}": Explanation(state.effects, start, last, True).left_mps2} if state.steps else {}
+    return Page(
+        measured[0].name, "Improvement of the model", *_standing(state.found.test.consistent),
+        (stopped.text, *remarks), (Facts("", tuple(facts(measured[0], last))),),
+        (
+            Section("The error, step by step", tuple(steps)),
+            _drawn("Figures of the steps", state, "steps"),
+            Section("Explore the residuals", (explorer(start, explained),)),
+            Section("Parameters with the last model", tuple(rest)),
+            _drawn("The calibration with the last model", last, "run"),
+            Section("What is left, and what this run could show", _evidence(state.found)),
+            _warnings(state.warnings),
+        ), tuple(commands),
+    )  # fmt: skip
+
+
+@page_of.register
+def _(compared: Comparison, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
+    result = compared.result
+    said = f"Filter, filterpy and batch least squares differ by at most {compared.max_difference_sigma:.1e} σ."
+    return Page(
+        measured[0].name, "Filter against batch", *_standing(result.consistency.consistent),
+        (said, console.verdict(result), *remarks), (Facts("", tuple(facts(measured[0], result))),),
+        (
+            Section("Time, memory and difference", _in_text(console.comparison_table(compared), with_notes=True)),
+            _drawn("Figures of the comparison", compared, "compared"),
+            Section("Parameters", _calibrated(result)),
+            Section("Explore the residuals", (explorer(result, {}),)),
+            _drawn("The calibration", result, "run"),
+            _warnings(result.warnings),
+        ), tuple(commands),
+    )  # fmt: skip
+
+
+@page_of.register
+def _(pair: SideBySide, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
+    both = pair.first, pair.second
+    recordings = [measured[0], measured[-1]]
+    names = [each.before.model.sum if pair.same_recording else own.name
+             for each, own in zip(both, recordings, strict=True)]  # fmt: skip
+    told = [f"{name}: {diagnosis.verdict(each)}" for name, each in zip(names, both, strict=True)]
+    table = side_by_side.difference_table(pair.differences, names[0], names[1])
+    standing, headline = _standing(pair.second.test.consistent)
+    measurements = [Facts("" if pair.same_recording else name, tuple(facts(own, each.before)))
+                    for name, own, each in zip(names, recordings, both, strict=True)]  # fmt: skip
+    return Page(
+        measured[0].name if pair.same_recording else f"{names[1]} beside {names[0]}", "Side by side",
+        standing, f"{names[1]}: {headline[0].lower()}{headline[1:]}", (side_by_side.verdict(pair), *told, *remarks),
+        tuple(measurements[1:] if pair.same_recording else measurements),
+        (
+            Section("Difference of the parameters", tuple(parts_of(table))),
+            *(_run(name, each, f"found{k}-") for k, (name, each) in enumerate(zip(names, both, strict=True))),
+        ), tuple(commands),
+    )  # fmt: skip
+
+
+def _run(name: str, found: Diagnosis, prefix: str) -> Section:
+    """Return all of one diagnosis as a section."""
+    parts = (*_drawn("", found, prefix).parts, _explorer_of(found), *_evidence(found))
+    return Section(name, (*parts, *_warnings(found.before.warnings).parts))
+
+
+_HEADLINES: dict[bool | None, tuple[Standing, str]] = {
+    True: ("agrees", "Model and measurements agree"),
+    False: ("disagrees", "Model and measurements disagree"),
+    None: ("open", "There is nothing to judge the model by"),
+}
+
+
+def _standing(consistent: bool | None) -> tuple[Standing, str]:
+    return _HEADLINES[consistent]
+
+
+def _drawn(title: str, result: object, prefix: str) -> Section:
+    """Return the section of a result's figures; it has no part where there is no figure of such a result."""
+    known = figures.dispatch(type(result)) is not figures.dispatch(object)
+    drawn = figures(result) if known else {}
+    return Section(title, tuple(Drawing(name, draw(), f"{prefix}{k}")
+                                for k, (name, draw) in enumerate(drawn.items())))  # fmt: skip
+
+
+def _explorer_of(found: Diagnosis) -> Explorer:
+    """Return the explorer of a diagnosed run, with what its explanations leave."""
+    offered = explanations(found)[:_EXPLORED]
+    return explorer(found.before, {f"with {each.name}": each.left_mps2 for each in offered})
+
+
+def _in_text(drawn: RenderableType, with_notes: bool = False) -> tuple[Part, ...]:
+    """Return what the console draws, without its notes, which have a section of their own."""
+    return tuple(each for each in parts_of(drawn) if with_notes or each.kind != "note")
+
+
+def _calibrated(result: Calibration) -> tuple[Part, ...]:
+    """Return the tables of a calibration, less the counts of readings, which are among what was measured."""
+    return _in_text(console.summary(result))[1:]
+
+
+def _evidence(found: Diagnosis) -> tuple[Part, ...]:
+    """Return what the console says for a diagnosis, less the verdict, which comes first there as on the page."""
+    return _in_text(diagnosis.diagnosis_report(found))[1:]
+
+
+def _with_what_is_missing(found: Diagnosis) -> tuple[Part, ...]:
+    """Return the parameters with the missing effects beside those without; nothing where none is missing."""
+    if found.after is None:
+        return ()
+    both = differences(found.before, found.after, same_recording=True)
+    table = side_by_side.difference_table(both, "model as it is", f"with {' + '.join(found.missing)}")
+    return (*parts_of(table), *parts_of(console.effect_table(found.after)))
+
+
+def _warnings(said: Iterable[str], title: str = "Warnings") -> Section:
+    return Section(title, tuple(Paragraph(text, "note") for text in said))

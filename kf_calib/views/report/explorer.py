@@ -1,0 +1,65 @@
+"""What the residual explorer of a page draws: residuals of every dwell against everything that varies in the run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
+from kf_calib.estimation.residual_table import mean_sigmas
+from kf_calib.estimation.results import Calibration
+from kf_calib.support.units import shown
+from kf_calib.views.json import clean
+
+_UNITS = {"rad": ("deg", 180.0 / np.pi), "m/s^2": ("g", 1.0 / 9.80665), "s": ("min", 1.0 / 60.0),
+          "K/s": ("K/h", 3600.0)}  # fmt: skip
+_DIGITS = 5  # significant ones, which a page needs
+
+
+@dataclass(frozen=True)
+class Explorer:
+    """A part of a page; content: what its program reads."""
+
+    kind: ClassVar[str] = "explorer"
+    content: dict[str, Any]
+
+
+def explorer(first: Calibration, others: Mapping[str, Floats]) -> Explorer:
+    """The explorer of a run; others: residuals (D, 3) that other models leave, m/s^2, by what each is called."""
+    dwells = first.carried.dwells
+    models, unit = {f"{first.model.sum}": first.residuals_mps2, **others}, shown("m/s^2")
+    return Explorer(
+        _short(
+            {
+                "dwells": [dwell.number for dwell in dwells],
+                "begin_s": [dwell.start_s for dwell in dwells],
+                "gimbals_deg": np.degrees([dwell.recorded_pose for dwell in dwells]) if first.bench.axes else None,
+                "unit": unit.label,
+                "sigma": mean_sigmas(first) * unit.per_si,
+                "drivers": [_driver(each) for each in drivers_of(first)],
+                "models": [{"name": name, "residual": left_mps2 * unit.per_si} for name, left_mps2 in models.items()],
+            }
+        )
+    )
+
+
+def _driver(each: Driver) -> dict[str, Any]:
+    """Return a driver with its values in the unit in which people read them."""
+    unit, scale = _UNITS.get(each.unit, (each.unit, 1.0))
+    explains = f"explains {each.share:.0%}" if each.share >= 0.005 and each.p_value <= 0.01 else ""
+    of_all = each.values[:, 0] if np.ptp(each.values, axis=1).max() == 0.0 else each.values  # such as an angle
+    return {"name": each.words, "unit": unit, "explains": explains, "values": of_all * scale}
+
+
+def _short(value: Any) -> Any:
+    """Return what JSON can hold, with numbers of a few digits."""
+    if isinstance(value, dict):
+        return {key: _short(each) for key, each in value.items()}
+    if isinstance(value, list | np.ndarray):
+        return [_short(each) for each in value]
+    value = clean(value)
+    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value

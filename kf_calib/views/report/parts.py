@@ -1,0 +1,114 @@
+"""What the console prints, part by part, for a page: paragraphs, and tables with decimal points in line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from kf_calib.support.plain_text import printable
+from kf_calib.views.tables import Bar
+from kf_calib.views.tables import Table as ConsoleTable
+from kf_calib.views.terminal import Note
+
+_NUMBER = re.compile(r"(?P<whole>.*?\d)(?P<fraction>\.\d+)?(?P<power>e[-+]\d+)?(?P<rest>[^\d.].*)?", re.DOTALL)
+
+_MINUS = re.compile(r"(?<![\w.])-(?=\d)")  # a hyphen that is a minus, which is as wide as a plus
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """A sentence or more; a note is a remark beside a result."""
+
+    text: str
+    kind: Literal["paragraph", "note"] = "paragraph"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The text of a cell; of a number, its parts before the decimal point, behind it, and after the last digit.
+
+    A page leaves room for what the longest fraction of the column has more, and for the longest text after a number.
+    """
+
+    whole: str
+    fraction: str = ""
+    fraction_room: str = ""
+    rest: str = ""
+    rest_room: str = ""
+    bar: float = 0.0
+    """Length of a bar, in characters, in place of text."""
+
+    def __str__(self) -> str:
+        return self.whole + self.fraction + self.rest
+
+
+@dataclass(frozen=True)
+class Heading:
+    """The heading of a column, of numbers or of text."""
+
+    text: str
+    is_number: bool
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; ends: numbers of the rows below which there is a line."""
+
+    kind: ClassVar[str] = "table"
+    title: str
+    headings: tuple[Heading, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    ends: frozenset[int]
+
+
+def parts_of(drawn: RenderableType) -> list[Paragraph | Table]:
+    """The parts of what the console draws, in its order; a text without words is none."""
+    return list(_parts(drawn))
+
+
+def _parts(drawn: RenderableType) -> Iterator[Paragraph | Table]:
+    if isinstance(drawn, Group):
+        for each in drawn.renderables:
+            yield from _parts(each)
+    elif isinstance(drawn, ConsoleTable):
+        yield _table(drawn)
+    elif isinstance(drawn, Text | str) and str(drawn).strip():
+        text = printable(str(drawn))
+        yield Paragraph(text.removeprefix("Note: "), "note") if isinstance(drawn, Note) else Paragraph(text)
+
+
+def _table(drawn: ConsoleTable) -> Table:
+    numbers = [column.justify == "right" for column in drawn.columns]
+    columns = [_column(list(column.cells), each) for column, each in zip(drawn.columns, numbers, strict=True)]
+    headings = [Heading(_said(column.header), each) for column, each in zip(drawn.columns, numbers, strict=True)]
+    ends = frozenset(k for k, row in enumerate(drawn.rows[:-1]) if row.end_section)
+    return Table(_said(drawn.title or ""), tuple(headings), tuple(zip(*columns, strict=True)), ends)
+
+
+def _column(cells: Iterable[RenderableType], is_number: bool) -> list[Cell]:
+    """Return the cells of a column; those of numbers with the room that keeps their decimal points in line."""
+    if not is_number:
+        return [Cell("", bar=each.length) if isinstance(each, Bar) else Cell(_said(each)) for each in cells]
+    split = [_split(_MINUS.sub("−", _said(each))) for each in cells]
+    fraction = max((each[1] for each in split), key=len, default="")
+    rest = max((each[2] for each in split), key=len, default="")
+    return [Cell(own[0], own[1], fraction[len(own[1]) :], own[2], rest) if own[0] else Cell("")
+            for own in split]  # fmt: skip
+
+
+def _split(text: str) -> tuple[str, str, str]:
+    """Return a number's text before its decimal point, from there to the last digit, and after it."""
+    found = _NUMBER.fullmatch(text)
+    if found is None:  # words, such as "not seen"
+        return text, "", ""
+    return found["whole"], (found["fraction"] or "") + (found["power"] or ""), found["rest"] or ""
+
+
+def _said(cell: RenderableType) -> str:
+    """Return the text of a cell or title on one line."""
+    return printable(" ".join(str(cell).split()))

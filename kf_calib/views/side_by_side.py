@@ -1,0 +1,77 @@
+"""Two evaluations side by side as a table, in words, and as a JSON object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from kf_calib.diagnosis.side_by_side import Difference, SideBySide
+from kf_calib.estimation.results import Parameter, format_p
+from kf_calib.support.tail_probabilities import LEVEL
+from kf_calib.support.units import shown
+from kf_calib.views.console import symbol
+from kf_calib.views.json import clean
+from kf_calib.views.tables import Table
+
+
+def verdict(pair: SideBySide) -> str:
+    """In a sentence, by how much the parameters differ."""
+    far = pair.farthest
+    if far is None:
+        return "The two have no parameter in common that both determine."
+    most = f"{symbol(far.symbol)} differs most, by {abs(far.sigmas or 0.0):.1f} σ"
+    if pair.p_value is None:
+        return f"Between the two models, {most}."
+    word = "agree" if pair.p_value >= LEVEL else "DIFFER"
+    chance = f"noise alone gives differences as large with probability p {format_p(pair.p_value)}"
+    return f"The parameters of the two recordings {word}: {chance}; {most}."
+
+
+def difference_table(differences: Sequence[Difference], first: str, second: str) -> Table:
+    """The table of the parameters in both, less nominal, and of their differences; first, second: what they are of."""
+    table = Table(title="Parameters less nominal (1σ)", title_justify="left")
+    for heading in ("parameter", first, "sigma", second, "sigma", "unit", "difference", "in σ"):
+        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
+    for k, each in enumerate(differences):
+        table.add_row(*_row(each), end_section=k % 4 == 3)
+    return table
+
+
+def _row(each: Difference) -> tuple[str, ...]:
+    """Return the row of one parameter."""
+    both, moved = (*_cells(each.first), *_cells(each.second)), ("", "")
+    if each.value is not None and each.sigma is not None and each.sigmas is not None:
+        moved = shown(each.first).rounded(each.value, each.sigma)[0], f"{each.sigmas:+.1f}"
+    return symbol(each.symbol), *both, shown(each.first).label, *moved
+
+
+def _cells(own: Parameter) -> tuple[str, str]:
+    """Return a parameter less its nominal value, and its sigma."""
+    if own.value is None or own.sigma is None:
+        return "not seen", ""
+    value, sigma = shown(own).rounded(own.value - own.nominal, own.sigma)
+    return value, f"± {sigma}"
+
+
+def side_by_side_object(pair: SideBySide) -> dict[str, Any]:
+    """What ``report --json`` adds for a second evaluation: that one, and the differences from it in SI units."""
+    return clean(
+        {
+            "against": {
+                "consistent": pair.first.test.consistent,
+                "p_value": pair.first.test.p_value,
+                "verdict": pair.first.verdict,
+            },
+            "differences": [
+                {
+                    "symbol": each.symbol,
+                    "first": each.first.value,
+                    "second": each.second.value,
+                    "sigmas": each.sigmas,
+                    "unit": each.first.unit,
+                }
+                for each in pair.differences
+            ],
+            "differences_p_value": pair.p_value,
+        }
+    )

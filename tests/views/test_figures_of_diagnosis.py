@@ -1,0 +1,244 @@
+"""Figures of a diagnosis and of an improvement: ink in every panel, real units, and the numbers of the results."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.hidden_effects import noisy_run, run
+from helpers.paths import ROOT
+from helpers.synthetic import Run
+from matplotlib.axes import Axes
+from matplotlib.container import BarContainer
+from matplotlib.figure import Figure
+
+import kf_calib
+from kf_calib import plot
+from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.refits import Refits
+from kf_calib.diagnosis.residual_drivers import explanations
+from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.diagnosis.stepwise_selection import Improvement, begin, extend, improve, undone
+from kf_calib.errors import InputError
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.dwell_readings import readings_of, worst_dwell
+from kf_calib.views.figures.log_axis import label_axis, plain
+from kf_calib.views.figures.words import rounded_number, wrapped
+
+HIDDEN = ROOT / "recordings" / "hidden.mcap"
+MICRO_G = 9.80665e-6
+
+
+@cache
+def found(*hidden: str) -> Diagnosis:
+    return diagnose(run(*hidden))
+
+
+@cache
+def hysteresis() -> Diagnosis:
+    return diagnose(calibrate(kf_calib.open_recording(HIDDEN)))
+
+
+def panels(figure: Figure) -> list[Axes]:
+    figure.canvas.draw()
+    return figure.get_axes()
+
+
+def assert_ink(figure: Figure) -> None:
+    """Every panel holds data or words, none of its words are cut off by the edge, and every axis has a quantity."""
+    width, height = figure.canvas.get_width_height()
+    for axes in panels(figure):
+        assert axes.has_data() or axes.texts or axes.get_title("left") or axes.collections, axes
+        words = [axes.title, axes._left_title, axes._right_title, axes.xaxis.label, axes.yaxis.label, *axes.texts]  # type: ignore[attr-defined]
+        for text in (each for each in words if each.get_text() and each.get_visible() and axes.axison):
+            box = text.get_window_extent()
+            assert box.x0 > -2 and box.x1 < width + 2 and box.y0 > -2 and box.y1 < height + 2, text.get_text()
+
+
+def axes_of(figure: Figure, title: str) -> Axes:
+    return next(axes for axes in panels(figure) if axes.get_title("left").startswith(title))
+
+
+@pytest.mark.parametrize("hidden", [
+    (), ("second-order=15sigma",), ("bias-drift=15sigma",), ("triple-product=25sigma",), ("sinusoid=30sigma",),
+    ("second-order=15sigma", "hysteresis=15sigma"),
+])  # fmt: skip
+def test_every_figure_of_a_diagnosis_has_ink_in_every_panel(hidden: tuple[str, ...]) -> None:
+    for title, draw in plot.figures(found(*hidden)).items():
+        figure = draw()
+        assert_ink(figure)
+        assert len(figure.get_axes()) >= 1, title
+
+
+def test_bars_of_suspects_are_their_shares_and_those_that_do_not_fit_are_hatched() -> None:
+    explained = explanations(hysteresis())
+    figure = plot.suspects(hysteresis())
+    axes = axes_of(figure, "What each explains")
+    bars = [bar for container in axes.containers if isinstance(container, BarContainer) for bar in container]
+    assert [bar.get_width() for bar in bars] == pytest.approx([100.0 * each.share for each in explained])  # type: ignore[operator]
+    assert [bar.get_hatch() is None for bar in bars] == [each.fits for each in explained]
+    assert [label.get_text() for label in axes.get_yticklabels()] == [each.name for each in explained]
+    said = [text.get_text() for text in axes.texts]
+    assert said[0].startswith("fits, p = 7.3e-30") and said[1].startswith("does not fit, p =")
+    assert axes.get_xlabel().endswith("%")
+
+
+def test_cells_of_the_matrix_are_overlaps() -> None:
+    axes = axes_of(plot.suspects(hysteresis()), "Overlap")
+    names = [label.get_text() for label in axes.get_yticklabels()]
+    test = hysteresis().test
+    cells = {tuple(int(x) for x in text.get_position()): text.get_text() for text in axes.texts}
+    for row, one in enumerate(names):
+        for column, other in enumerate(names):
+            walks = test.walking in (one, other)
+            overlap = 1.0 if walks else test.candidate(one).overlap(test.candidate(other))
+            assert cells[column, row] == f"{overlap:.2f}"
+
+
+def test_separation_is_that_of_the_advice() -> None:
+    going = hysteresis().next_orientation
+    assert going is not None
+    axes = axes_of(plot.suspects(hysteresis()), "Next: gimbals at")
+    bars = [bar.get_width() for container in axes.containers for bar in container]
+    assert bars == pytest.approx([going[0].before, going[0].after])
+    assert all(f"{angle:g}" in axes.get_title("left") for angle in going[0].gimbal_deg)
+
+
+def test_what_could_hide_names_every_effect_once() -> None:
+    diagnosis = hysteresis()
+    figure = plot.detection_limits(diagnosis)
+    first, second, below = panels(figure)
+    rows = [label.get_text() for axes in (first, second) for label in axes.get_yticklabels()]
+    assert sorted(rows) == sorted(each.name for each in diagnosis.detectable)
+    text = " ".join(below.texts[0].get_text().split())
+    assert all(name in text and why in text for name, why in ((each.name, each.why) for each in diagnosis.unseen))
+    assert [label.get_text() for label in first.get_xticklabels()] == ["0.01", "0.1", "1", "10", "100", "1000"]
+    sizes = {each.name: each for each in diagnosis.detectable}
+    ends = {round(bar.get_y() + 0.5 * bar.get_height()): bar.get_x() + bar.get_width() for bar in second.patches}
+    for k, label in enumerate(second.get_yticklabels()):
+        each = sizes[label.get_text()]
+        usual = each.typical.of(diagnosis.grade)
+        assert (k in ends) == (usual is not None)
+        if usual is not None:
+            assert ends[k] == pytest.approx(min(usual[1] / each.minimum, 1000.0))
+
+
+def test_residuals_of_single_dwells_are_drawn_in_micro_g() -> None:
+    diagnosis = hysteresis()
+    figure = plot.residuals(diagnosis)
+    first = panels(figure)[0]
+    drawn = first.containers[0].lines[0].get_ydata()  # type: ignore[union-attr]
+    assert np.asarray(drawn) == pytest.approx(diagnosis.before.residuals_mps2[:, 0] / MICRO_G)
+    assert first.get_ylabel() == "accelerometer 1, µg"
+    assert panels(figure)[-1].get_xlabel() == "last step along the input axis, g"
+    rms = np.sqrt(np.mean(diagnosis.before.residuals_mps2[:, 0] ** 2)) / MICRO_G
+    assert first.get_title("right") == f"rms {rounded_number(rms, 2)} µg"
+
+
+def test_errors_fall_in_the_figure_as_in_the_result() -> None:
+    state = improve(run("second-order=15sigma"))
+    figure = plot.improvement(state)
+    assert_ink(figure)
+    axes = axes_of(figure, "The error of the model")
+    lines = {line.get_label(): np.asarray(line.get_ydata(), float) for line in axes.lines}
+    results = [state.start.before, *(step.result for step in state.steps)]
+    held_out = [each.held_out_rms_mps2 for each in results]
+    assert lines["rms of orientations left out of the fit"] == pytest.approx(np.array(held_out) / MICRO_G)
+    fitted = np.array([each.residual_rms_mps2 for each in results])
+    assert lines["rms of orientations in the fit"] == pytest.approx(fitted / MICRO_G)
+    assert lines["what noise alone gives"][0] == pytest.approx(state.result.held_out_floor_mps2 / MICRO_G)
+    assert axes.get_yscale() == "log" and axes.get_ylabel() == "rms error, µg"
+    assert sum(bool(label.get_text()) for label in axes.get_yticklabels()) >= 2
+    ticks = [label.get_text() for label in axes.get_xticklabels()]
+    assert ticks[0].startswith("0: start\np ") and ticks[1].startswith("1: + second-order\np = ")
+    below = axes_of(figure, "second-order")
+    middles = [container.lines[0].get_ydata()[0] for container in below.containers]  # type: ignore[union-attr]
+    own = [state.result.parameters[f"K2_{i}"] for i in (1, 2, 3)]
+    assert middles == pytest.approx([p.value * p.per_si for p in own])
+
+
+def test_undone_steps_and_choices_left_open_are_drawn_beside_the_way() -> None:
+    refits = Refits()
+    state = extend(begin(run("bias-drift=15sigma"), refits), refits, ("second-order",), "user")
+    state = undone(state, refits)
+    figure = plot.improvement(state)
+    assert_ink(figure)
+    axes = axes_of(figure, "The error of the model")
+    ticks = [label.get_text() for label in axes.get_xticklabels()]
+    assert ticks[1].split("\n")[:2] == ["1: + second-order", "(undone)"]
+    assert [tick for tick in ticks if tick.endswith("?")] == [
+        f"{k}: + {each.name}?" for k, each in enumerate(state.alternatives, start=2)
+    ]
+    way = next(line for line in axes.lines if line.get_label() == "rms of orientations left out of the fit")
+    assert list(np.asarray(way.get_xdata())) == [0]
+    assert sum(line.get_marker() == "x" for line in axes.lines) == 2
+    assert_ink(plot.residuals_of_steps(state))
+
+
+@pytest.mark.parametrize("made", [
+    lambda: begin(run(), Refits()), lambda: begin(calibrate(Run(seed=1, dwells=4, count=100)), Refits()),
+    lambda: improve(noisy_run(walk_mps2_per_sqrt_s=3e-6, seed=4)),
+])  # fmt: skip
+def test_odd_improvements_are_drawn(made: object) -> None:
+    """Consistent at once, no degrees of freedom, a walk."""
+    state = made()  # type: ignore[operator]
+    assert isinstance(state, Improvement)
+    for draw in plot.figures(state).values():
+        assert_ink(draw())
+
+
+def test_residuals_of_each_step_share_their_axes() -> None:
+    state = improve(run("second-order=15sigma"))
+    axes = panels(plot.residuals_of_steps(state))
+    assert len(axes) == 3 * (1 + len(state.steps))
+    assert len({each.get_ylim() for each in axes}) == len({each.get_xlim() for each in axes}) == 1
+    drawn = [np.asarray(each.lines[-1].get_ydata(), float) for each in axes]
+    before, after = (np.sqrt(np.mean(np.square(drawn[k::2]))) for k in (0, 1))
+    assert after < 0.5 * before and after < 1.3
+
+
+def test_readings_of_a_dwell_have_the_mean_of_its_residual(tmp_path: Path) -> None:
+    source = Run(seed=2, count=500, batch=700)
+    result = calibrate(source)
+    number = worst_dwell(result)
+    readings = readings_of(source, result, number)
+    k = [visit.dwell.number for visit in result.visits].index(number)
+    assert readings.every == 1 and len(readings.time_s) == result.visits[k].dwell.count
+    assert readings.differences_mps2.mean(axis=0) == pytest.approx(result.visits[k].residual_mps2, abs=1e-12)
+    some = readings_of(source, result, number, most=100)
+    assert len(some.time_s) <= 100 and some.every == -(-readings.count // 100)
+    assert np.array_equal(some.differences_mps2, readings.differences_mps2[:: some.every])
+    figure = plot.dwell(source, result)
+    assert_ink(figure)
+    assert f"Dwell {number}, reading by reading" in panels(figure)[0].get_title("left")
+    with pytest.raises(InputError, match="there is no dwell 99"):
+        plot.dwell(source, result, 99)
+
+
+def test_the_sphere_shows_every_dwell_before_and_after() -> None:
+    diagnosis = hysteresis()
+    figure = plot.on_the_sphere(diagnosis)
+    maps = [axes for axes in panels(figure) if axes.name == "mollweide"]
+    assert len(maps) == 6
+    for axes in maps:
+        assert sum(len(each.get_offsets()) for each in axes.collections) == len(diagnosis.before.visits)
+    drawn = np.concatenate([np.asarray(each.get_array()) for each in maps[0].collections])
+    assert sorted(drawn) == pytest.approx(sorted(diagnosis.residual_ratios[:, 0]))
+    assert figure.get_axes()[-1].get_ylabel() == "residual / σ"
+
+
+def test_decades_are_labelled_with_their_values() -> None:
+    axes = Figure().subplots()
+    axes.set_yscale("log")
+    axes.set_ylim(0.03, 400.0)
+    label_axis(axes.yaxis, 0.03, 400.0)
+    axes.figure.canvas.draw()
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["0.1", "1", "10", "100"]
+    assert plain(1e-7) == "1e-07" and plain(20000.0) == "20000"
+
+
+def test_words_of_effects_stay_whole() -> None:
+    assert wrapped("second-order + cross-coupling-ip", 16) == "second-order +\ncross-coupling-ip"
+    assert rounded_number(11234567.0) == "11200000" and rounded_number(0.0012345, 2) == "0.0012"

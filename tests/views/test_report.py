@@ -1,0 +1,228 @@
+"""The report as its reader has it: in a browser, light, dark and printed, without the network, whatever is in it."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.browser import chromium
+from helpers.paths import ROOT
+from matplotlib.figure import Figure
+from PIL import Image
+
+import kf_calib
+from kf_calib.views import console
+from kf_calib.views.figures import style
+from kf_calib.views.report.contents import page_of
+from kf_calib.views.report.drawing import Drawing, fit
+from kf_calib.views.report.measured import Measured
+from kf_calib.views.report.page import save
+from kf_calib.views.report.parts import Table, parts_of
+
+HIDDEN = ROOT / "recordings" / "hidden.mcap"
+EVIL = "<script>document.title='evil'</script>"
+MORE_EVIL = "</script><img src=x onerror=\"document.title='evil'\">"
+pytestmark = pytest.mark.xdist_group("report")
+
+
+@pytest.fixture(scope="module")
+def found() -> kf_calib.Diagnosis:
+    return kf_calib.diagnose(HIDDEN)
+
+
+@pytest.fixture(scope="module")
+def path(found: kf_calib.Diagnosis, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of a run with a hidden effect, and with all that a recording could say made into markup."""
+    bench = replace(found.before.bench, notes={"block_serial": EVIL, "note": MORE_EVIL})
+    before = replace(found.before, bench=bench, warnings=(EVIL, MORE_EVIL))
+    place = tmp_path_factory.mktemp("report") / "report.html"
+    page = page_of(replace(found, before=before), [Measured(MORE_EVIL, "6e21", 1750000000 * 10**9)], [EVIL], [EVIL])
+    save(page, place)
+    return place
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as opened:
+        yield opened
+
+
+@pytest.fixture
+def told() -> list[str]:
+    return []
+
+
+@pytest.fixture(params=["light", "dark"])
+def shown(browser: Any, path: Path, told: list[str], request: pytest.FixtureRequest) -> Iterator[Any]:
+    """The page, open; what the browser complains of, and asks for beside the page, is told."""
+    page = browser.new_page(viewport={"width": 1200, "height": 700}, color_scheme=request.param)
+    page.on("console", lambda message: told.append(message.text))
+    page.on("pageerror", lambda error: told.append(str(error)))
+    page.on("dialog", lambda dialog: told.append(dialog.message))
+    page.on("request", lambda each: None if each.url in (path.as_uri(),) or each.url.startswith("data:")
+            else told.append(each.url))  # fmt: skip
+    page.goto(path.as_uri())
+    yield page
+    page.close()
+
+
+def test_every_figure_has_ink_and_nothing_is_asked_or_complained_of(shown: Any, told: list[str]) -> None:
+    drawn = shown.locator(".drawing svg, .plot canvas")
+    assert drawn.count() >= 3
+    for k in range(drawn.count()):
+        assert _ink(drawn.nth(k).screenshot()) > 0.003
+    assert shown.title().endswith(MORE_EVIL) and "evil" != shown.title()
+    assert shown.locator("img").count() == 0
+    assert told == []
+
+
+def test_figures_are_light_on_dark_and_dark_on_light(shown: Any, told: list[str]) -> None:
+    ground, ink = shown.evaluate(
+        "[getComputedStyle(document.documentElement).backgroundColor,"
+        " getComputedStyle(document.querySelector('.drawing svg')).fill]"
+    )
+    assert abs(_brightness(ground) - _brightness(ink)) > 200
+    ways = shown.evaluate(
+        "[...document.querySelectorAll('.drawing svg g[id*=text] g')].map(each => getComputedStyle(each).fill)"
+    )
+    assert ways and all(abs(_brightness(each) - _brightness(ground)) > 120 for each in ways)
+    assert told == []
+
+
+def test_nothing_is_wider_than_the_page(shown: Any) -> None:
+    assert shown.evaluate("document.documentElement.scrollWidth") <= 1200
+
+
+def test_the_explorer_shows_what_is_chosen(shown: Any, found: kf_calib.Diagnosis, told: list[str]) -> None:
+    place, canvas = shown.locator(".plot").first, shown.locator(".plot canvas").first
+    pictures = [canvas.screenshot()]
+    for name, choice in (
+        ("driver", {"index": 3}),
+        ("model", {"label": "with hysteresis"}),
+        ("unit", {"value": "sigma"}),
+    ):
+        shown.locator(f"select[name={name}]").select_option(**choice)
+        pictures.append(place.locator("canvas").screenshot())
+    shown.locator("input[name=a2]").uncheck()
+    pictures.append(place.locator("canvas").screenshot())
+    assert len(set(pictures)) == len(pictures)
+    assert told == []
+
+
+def test_the_explorer_reads_out_the_residual_of_a_dwell(shown: Any, found: kf_calib.Diagnosis) -> None:
+    shown.locator(".plot").scroll_into_view_if_needed()
+    box, readout = shown.locator(".plot .u-over").bounding_box(), shown.locator(".readout")
+    for x, y in product(np.linspace(0.1, 0.9, 9), np.linspace(0.2, 0.8, 7)):
+        shown.mouse.move(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        if "Dwell" in readout.inner_text():
+            break
+    text = readout.inner_text().replace("−", "-")
+    dwell, channel = map(int, re.search(r"Dwell (\d+), accelerometer (\d)", text).groups())
+    residual, sigma = map(float, re.search(r"residual (\S+) ± (\S+) µg", text).groups())
+    table = found.before.residuals()
+    (row,) = table[(table["dwell"] == dwell) & (table["accelerometer"] == channel)]
+    micro_g = 9.80665e-6
+    assert residual == pytest.approx(row["residual_mps2"] / micro_g, rel=1e-3)
+    assert sigma == pytest.approx(row["sigma_mps2"] / micro_g, rel=1e-3)
+    angles = [float(each) for each in re.search(r"gimbals at (.*?) deg", text)[1].split(", ")]
+    assert angles == pytest.approx([row[f"gimbal{k}_deg"] for k in (1, 2, 3)], rel=1e-3, abs=1e-3)
+
+
+def test_print_has_the_figures_and_leaves_out_what_needs_a_hand(shown: Any) -> None:
+    shown.emulate_media(media="print")
+    assert not shown.locator(".explorer").first.is_visible() and not shown.locator("nav").is_visible()
+    assert shown.locator(".drawing svg").first.is_visible()
+    assert _brightness(shown.evaluate("getComputedStyle(document.documentElement).backgroundColor")) == 255
+    pages = re.findall(rb"/Type\s*/Page\b", shown.pdf(prefer_css_page_size=True))
+    assert 3 <= len(pages) <= 12
+
+
+def test_what_a_recording_says_is_text(path: Path) -> None:
+    html = path.read_text()
+    assert EVIL not in html and MORE_EVIL not in html and html.count("&lt;script&gt;") >= 3
+    assert len(re.findall(r"<script\b", html)) == 3  # what the explorer reads, uPlot, the explorer
+    assert re.findall(r'(?:src|href)="(?!#|data:)', html) == []
+    assert "2025-06-15" in html
+
+
+def test_the_same_result_is_the_same_file_and_a_small_one(found: kf_calib.Diagnosis, path: Path) -> None:
+    pages = [page_of(found, [Measured("a", "b")], []).html for _ in range(2)]
+    assert pages[0] == pages[1]
+    assert path.stat().st_size < 1.5e6
+
+
+def test_numbers_are_those_of_the_console_with_their_points_in_line(found: kf_calib.Diagnosis) -> None:
+    drawn = console.parameter_table(found.before)
+    (table,) = parts_of(drawn)
+    assert isinstance(table, Table)
+    printed = [[str(cell) for cell in column.cells] for column in drawn.columns]
+    assert [[str(cell).replace("−", "-") for cell in column] for column in zip(*table.rows, strict=True)] == printed
+    for heading, column in zip(table.headings, zip(*table.rows, strict=True), strict=True):
+        widths = {(len(cell.fraction + cell.fraction_room), cell.rest_room) for cell in column}
+        assert len(widths) == 1 or not heading.is_number
+    assert "<i" not in str(table.rows[0][1])
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("-0.52", ("−0", ".52", "")), ("7.3e-30", ("7", ".3e-30", "")), ("< 1e-300", ("< 1", "e-300", "")),
+        ("0.5089 deg", ("0", ".5089", " deg")), ("not seen", ("not seen", "", "")), ("", ("", "", "")),
+        ("145.5 / 3", ("145", ".5", " / 3")), ("-80.7, 178.0", ("−80", ".7", ", 178.0")),
+    ],
+)  # fmt: skip
+def test_a_number_is_split_at_its_decimal_point(text: str, parts: tuple[str, str, str]) -> None:
+    table = console.Table()
+    table.add_column("x", justify="right")
+    table.add_row(text)
+    (shown,) = parts_of(table)
+    assert isinstance(shown, Table)
+    cell = shown.rows[0][0]
+    assert (cell.whole, cell.fraction, cell.rest) == parts
+
+
+def many_points(seed: int) -> Figure:
+    with style.styled():
+        figure = style.blank()
+        values = np.random.default_rng(seed).normal(size=(2, 20000))
+        for axes in figure.subplots(1, 2).flat:
+            axes.plot(*values, "o", color=style.ACCELEROMETERS[0], markersize=1.5)
+            axes.axhline(0.0, color="#6b6b6b")
+    return figure
+
+
+def test_figures_of_many_points_stay_small_and_have_greys_of_the_page() -> None:
+    few = Figure()
+    few.subplots().plot([1, 2, 3], "o", color=style.ACCELEROMETERS[1])
+    drawings = [Drawing("many", many_points(1), "many"), Drawing("few", few, "few")]
+    fit(drawings)
+    many, small = (each.markup for each in drawings)
+    assert len(many) < 400_000 and "data:image/png" in many and many.startswith("<svg")
+    assert "var(--ink)" in many and "stroke: #6b6b6b" not in many and 'id="many-' in many
+    assert "data:image" not in small and small.count("<use") >= 3 and "#009e73 var(--keep)" in small
+
+
+def test_what_is_still_too_large_is_a_picture() -> None:
+    drawings = [Drawing(f"{k}", many_points(k), f"d{k}") for k in range(2)]
+    fit(drawings, 0)
+    for each in drawings:
+        assert each.is_picture and each.markup.startswith("<img") and len(each.markup) < 250_000
+
+
+def _ink(png: bytes) -> float:
+    """The share of pixels that are not like the paper, which most are."""
+    pixels = np.asarray(Image.open(io.BytesIO(png)).convert("L"), float)
+    return float(np.mean(np.abs(pixels - np.median(pixels)) > 40))
+
+
+def _brightness(colour: str) -> float:
+    """Mean of red, green and blue, 0 to 255, of what a browser says of a colour."""
+    numbers = [float(each) for each in re.findall(r"[\d.]+", colour.removeprefix("color(srgb"))[:3]]
+    return float(np.mean(numbers)) * (255.0 if colour.startswith("color(") else 1.0)
