@@ -21,6 +21,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "diagnose": (HIDDEN,),
     "improve": (HIDDEN, "--unattended"),
     "report": (HIDDEN, "--against", HIDDEN.with_name("navigation_24.mcap")),
+    "certificate": ("cal.json", "-o", "certificate.pdf"),
     "live": ("sim://?speed=500&orientations=6&dwell_s=4&slew_degps=360&sample_hz=20",),
     "simulate": ("made.mcap", *QUICK),
     "record": ("recorded.mcap", "lines.csv", "--axes", "y z x", "--gravity", "9.81"),
@@ -28,6 +29,10 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "plan": ("--count", 4),
     "paper": ("--repetitions", 2),
 }
+BEFORE: dict[str, tuple[object, ...]] = {"certificate": ("replay", HIDDEN, "--save", "cal.json")}
+"""What makes the files that a command reads."""
+NEEDED = {"certificate": "typst"}
+"""Packages that a command needs and the machine may not have."""
 
 
 def test_every_command_that_prints_json_is_in_the_page() -> None:
@@ -38,6 +43,10 @@ def test_every_command_that_prints_json_is_in_the_page() -> None:
 def test_keys_are_those_of_the_page(command: str, run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("lines.csv").write_text(CSV)
+    if command in NEEDED:
+        pytest.importorskip(NEEDED[command], reason=f"{NEEDED[command]} is not there")
+    if command in BEFORE:
+        assert run(*BEFORE[command])[0] == 0
     code, out, err = run(command, *COMMANDS[command], "--json")
     assert code == 0, err
     printed = json.loads(out.splitlines()[-1])
