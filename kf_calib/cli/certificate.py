@@ -21,7 +21,10 @@ from kf_calib.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from kf_calib.estimation.measurement_model import Model
+    from kf_calib.exchange.calibration_file import SavedCalibration
     from kf_calib.exchange.certificate.content import Certificate
+    from kf_calib.exchange.certificate.statement import Statement
     from kf_calib.support.output_files import Outputs
 
 _path = click.Path(path_type=Path)
@@ -49,41 +52,41 @@ def certificate(
 
     What is neither in the calibration nor in the statement is left blank. It never claims accreditation.
     """
+    from kf_calib.exchange import calibration_file
+    from kf_calib.exchange.certificate import statement as statements
     from kf_calib.views import certificate as views
 
-    inputs = [] if statement is None else _named_by(statement)
-    outputs = claimed(inputs, overwrite=overwrite)
-    own, standing = write_certificate(calibration, out, outputs, statement, xml, schema, effects_from, trust)
+    own = statements.read(statement)
+    outputs = claimed([] if own.before is None else [own.before], overwrite=overwrite)
+    found = []
+    for path in (calibration, own.before):
+        if path is not None:
+            saved = calibration_file.read(path)
+            found.append((saved, saved.model(path, effects_from, trust)))
+    made, standing = write_certificate(outputs, out, own, *found, xml=xml, schema=schema)
     if as_json:
-        print_json(views.certificate_object(own, standing, out, xml))
+        print_json(views.certificate_object(made, standing, out, xml))
     else:
-        show(views.certificate_report(own, standing, out, xml))
+        show(views.certificate_report(made, standing, out, xml))
 
 
 def write_certificate(
-    calibration: Path, out: Path, outputs: Outputs, statement: Path | None = None, xml: Path | None = None,
-    schema: Path | None = None, effects_from: tuple[Path, ...] = (), trust: bool = False,
+    outputs: Outputs, out: Path, own: Statement, calibrated: tuple[SavedCalibration, Model],
+    before: tuple[SavedCalibration, Model] | None = None, xml: Path | None = None, schema: Path | None = None,
 ) -> tuple[Certificate, str]:  # fmt: skip
-    """Write the certificate of a calibration file as ``out``; what it says, and what the check of its XML found.
+    """Write the certificate of a calibration with its model as ``out``; what it says, and what the check of its XML
+    found. before: the same from before an adjustment.
 
     Raises InputError for a calibration, statement or schema that cannot be used, MissingExtraError without typst.
     """
     from kf_calib.exchange.certificate import content, dcc, document
     from kf_calib.support.output_files import write_whole
 
-    own = content.certificate(calibration, statement, [*effects_from], trust)
-    made = dcc.xml(own)
-    standing = dcc.check(made, schema)
-    printed = document.pdf(own, made, standing)
+    made = content.certificate(*calibrated, own, before)
+    encoded = dcc.xml(made)
+    standing = dcc.check(encoded, schema)
+    printed = document.pdf(made, encoded, standing)
     outputs.write(out, lambda path: write_whole(path, printed))
     if xml is not None:
-        outputs.write(xml, lambda path: write_whole(path, made))
-    return own, standing
-
-
-def _named_by(statement: Path) -> list[Path]:
-    """The calibration before adjustment, if the statement names one: it is read and must not be replaced."""
-    from kf_calib.exchange.certificate import content
-
-    stated = content.statements.read(statement)
-    return [] if stated.before is None else [content.before_path(stated, statement)]
+        outputs.write(xml, lambda path: write_whole(path, encoded))
+    return made, standing

@@ -102,7 +102,9 @@ def lab(tmp_path: Path) -> Path:
 
 
 def made(cal: Path, lab: Path | None) -> content.Certificate:
-    return content.certificate(cal, lab, [], False)
+    saved, own = calibration_file.read(cal), statement.read(lab)
+    earlier = None if own.before is None else calibration_file.read(own.before)
+    return content.certificate(saved, saved.model(), own, None if earlier is None else (earlier, earlier.model()))
 
 
 @pytest.mark.parametrize(("gimbal", "letter"), list(enumerate("yzx")))
@@ -315,7 +317,7 @@ def test_without_typst_it_says_what_to_install(cal: Path, monkeypatch: pytest.Mo
      ('number = "a\\u001b[2J"', "number: must be text without control"),
      ('laboratory = {country = "de"}', "laboratory.country: must be text"), ("number", "is not TOML"),
      ('limits = {K = "1 ppm"}', "without the rule by which conformity is decided"),
-     ('limits = {K = "1 deg"}', "limits: .*1 deg"),
+     ("before = 1", "before: "), ('limits = {K = "1 deg"}', "limits: .*1 deg"),
      ('uncertainty = [{effect = "gravity-error", size = "1 ppm", k = 0.0}]', "uncertainty.0.k: .*greater than 0")],
 )  # fmt: skip
 def test_a_wrong_statement_is_one_sentence(text: str, said: str, tmp_path: Path) -> None:
@@ -364,5 +366,9 @@ def test_the_command_writes_both_files(run: Any, cal: Path, lab: Path, tmp_path:
     assert printed["number"] == "2026-0147" and printed["not_stated"] == []
     assert [each["kind"] for each in printed["budget"]] == ["A", "B", "B", "B"]
     assert pdf.read_bytes().startswith(b"%PDF-") and ET.parse(io.BytesIO(xml.read_bytes()))
-    code, out, err = run("certificate", cal, "-o", lab, "--statement", lab, "--overwrite")
-    assert code == 2 and "is read by this very command" in err
+    earlier = tmp_path / "earlier.json"
+    earlier.write_bytes(cal.read_bytes())
+    lab.write_text(f'before = "earlier.json"\n{LAB}')  # counts from the statement
+    for out in (lab, earlier):
+        code, _, err = run("certificate", cal, "-o", out, "--statement", lab, "--overwrite")
+        assert code == 2 and "is read by this very command" in err

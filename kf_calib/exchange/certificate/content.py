@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
-from pathlib import Path
 from typing import Literal
 
 from kf_calib.bench import paper_parameters
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.calibration_file import SavedCalibration, SavedParameter
 from kf_calib.exchange.certificate import budget as budgets
-from kf_calib.exchange.certificate import statement as statements
 from kf_calib.exchange.certificate.budget import Budget
 from kf_calib.exchange.certificate.statement import Rule, Statement
 
@@ -85,30 +84,24 @@ class Certificate:
         return tuple(name for name, value in needed.items() if not value)
 
 
-def certificate(path: Path, stated: Path | None, named: list[Path], trust: bool) -> Certificate:
-    """The certificate of a calibration file and of a statement; named, trust: Python files that may be run."""
-    own = statements.read(stated)
-    saved = calibration_file.read(path)
-    found = budgets.budget(saved, saved.model(path, named, trust), own.uncertainty)
-    before = None if own.before is None else _before(before_path(own, stated), own, named, trust)
+def certificate(
+    saved: SavedCalibration, model: Model, own: Statement, before: tuple[SavedCalibration, Model] | None = None
+) -> Certificate:
+    """The certificate of a calibration with its model, and of a statement; before: the same before an adjustment."""
+    found = budgets.budget(saved, model, own.uncertainty)
     begun, ended = _dates(saved)
     return Certificate(
-        saved, own, found, _results(saved, found, own, before), own.begun or begun, own.ended or ended,
+        saved, own, found, _results(saved, found, own, _before(before, own)), own.begun or begun, own.ended or ended,
         datetime.fromisoformat(calibration_file.now()),
     )  # fmt: skip
 
 
-def before_path(own: Statement, stated: Path | None) -> Path:
-    """The calibration before adjustment; its path counts from the statement."""
-    assert own.before is not None and stated is not None
-    return stated.parent / own.before
-
-
-def _before(path: Path, own: Statement, named: list[Path], trust: bool) -> list[tuple[float, float]]:
-    """Values and expanded uncertainties (12) of the calibration before adjustment."""
-    saved = calibration_file.read(path)
-    found = budgets.budget(saved, saved.model(path, named, trust), own.uncertainty)
-    return list(zip(saved.twelve[0].tolist(), found.expanded.tolist(), strict=True))
+def _before(before: tuple[SavedCalibration, Model] | None, own: Statement) -> list[tuple[float, float]] | None:
+    """Values and expanded uncertainties (12) before adjustment."""
+    if before is None:
+        return None
+    found = budgets.budget(*before, own.uncertainty)
+    return list(zip(before[0].twelve[0].tolist(), found.expanded.tolist(), strict=True))
 
 
 def _dates(saved: SavedCalibration) -> tuple[date, date] | tuple[None, None]:

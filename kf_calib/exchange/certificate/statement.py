@@ -88,7 +88,7 @@ class TypeB(_Table):
 
 
 class Statement(_Table):
-    """The content of the file."""
+    """The content of the file; before: a calibration file from before an adjustment."""
 
     title: Text | None = None
     number: Text | None = None
@@ -103,7 +103,7 @@ class Statement(_Table):
     traceability: Text | None = None
     remarks: Text | None = None
     decision_rule: Rule | None = None
-    before: Text | None = None
+    before: Annotated[Path, Field(strict=False)] | None = None
     laboratory: Party = Party()
     customer: Party = Party()
     item: Item = Item()
@@ -132,6 +132,8 @@ def read(path: Path | None) -> Statement:
         elif first["type"] == "string_pattern_mismatch":
             said = "must be text without control characters (of a country, two capital letters)"
         raise InputError(f"{path}: {cut(place, 100)}: {said}: see docs/certificate.md for the keys.") from None
+    if found.before is not None:
+        found = found.model_copy(update={"before": path.parent / found.before})
     try:
         limited = bool(found.largest)
     except InputError as error:
