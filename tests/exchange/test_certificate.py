@@ -372,3 +372,19 @@ def test_the_command_writes_both_files(run: Any, cal: Path, lab: Path, tmp_path:
     for out in (lab, earlier):
         code, _, err = run("certificate", cal, "-o", out, "--statement", lab, "--overwrite")
         assert code == 2 and "is read by this very command" in err
+
+
+def test_what_the_run_does_not_determine_has_no_number(saved: SavedCalibration) -> None:
+    first = saved.parameters[0].model_copy(update={"value": None, "sigma": None})
+    own = saved.model_copy(update={"parameters": [first, *saved.parameters[1:]]})
+    made = content.certificate(
+        own, own.model(), statement.Statement(limits={"theta": "1 deg"}, decision_rule="guard band")
+    )
+    assert [each.value is None for each in made.results] == [True] + [False] * 11
+    assert [each.conformity for each in made.results if each.limit] == [None, "pass"]
+    root, names = ET.fromstring(dcc.xml(made)), {"dcc": dcc.DCC, "si": dcc.SI}
+    assert len(root.findall(".//dcc:result//si:real", names)) == 11
+    assert root.findtext(".//dcc:noQuantity/dcc:content", None, names) == "not determined by this run"
+    shown = document.content(made, "checked")
+    assert shown["results"][0]["value"] is None and {row["values"][0] for row in shown["contributions"]} == {"–"}
+    assert shown["conformity"][0]["outcome"] == "not determined"

@@ -113,7 +113,13 @@ def budget(saved: SavedCalibration, model: Model, stated: Sequence[TypeB]) -> Bu
     kept, left_out = _known_columns(model, stimulus)
     changes = _gain(saved, model.columns(stimulus, np.array(saved.state.values))[:, :, kept], stimulus)
     changes = np.einsum("pq,qdi->pdi", paper_parameters.jacobian(np.array(saved.state.values[:STATE_COUNT])), changes)
-    return Budget((first, *(line for own in stated for line in _type_b(own, saved, stimulus, changes))), left_out)
+    lines = [first]
+    for number, own in enumerate(stated, 1):
+        try:
+            lines += _type_b(own, saved, stimulus, changes)
+        except InputError as error:
+            raise InputError(f"[[uncertainty]] {number}, {own.effect}: {error}") from None
+    return Budget(tuple(lines), left_out)
 
 
 def _type_a(saved: SavedCalibration) -> Contribution:
@@ -206,15 +212,13 @@ def _type_b(own: TypeB, saved: SavedCalibration, stimulus: Stimulus, changes: Fl
 def _columns(effect: Effect, own: TypeB, stimulus: Stimulus) -> Floats:
     """What readings change by per unit of an error; of one that goes with temperature, at the change stated."""
     if effect.no_columns or effect.oscillates:
-        raise InputError(f"[[uncertainty]] {effect}: {effect.no_columns or 'is an oscillation'}: "
-                         "name an effect that shows in dwells.")  # fmt: skip
+        raise InputError(f"it {effect.no_columns or 'is an oscillation'}: name an effect that shows in dwells.")
     warm = replace(stimulus, temperature_c=np.full(len(stimulus), REFERENCE_TEMPERATURE_C + 1.0))
     cold = replace(stimulus, temperature_c=np.full(len(stimulus), REFERENCE_TEMPERATURE_C))
     if np.array_equal(effect.columns(warm), effect.columns(cold)):
         return effect.columns(stimulus)
     if own.temperature is None:
-        raise InputError(f"[[uncertainty]] {effect}: say by how much the temperature may be off, "
-                         'for example temperature = "0.5 K".')  # fmt: skip
+        raise InputError('say by how much the temperature may be off, for example temperature = "0.5 K".')
     change = quantity(own.temperature, "K")
     return effect.columns(replace(cold, temperature_c=cold.temperature_c + change))
 

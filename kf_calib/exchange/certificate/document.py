@@ -22,7 +22,7 @@ from kf_calib.exchange.certificate.content import OUTCOMES, Certificate, Result
 from kf_calib.exchange.certificate.statement import Party
 from kf_calib.support.extras import need
 from kf_calib.support.plain_text import cut
-from kf_calib.support.units import Unit, field_unit, rounded
+from kf_calib.support.units import Unit, field_unit
 
 ATTACHED = "certificate.xml"
 _UNITS = {"rad": Unit("°", math.degrees(1.0)), "1": Unit("1", 1.0), "m/s^2": Unit("m/s²", 1.0)}
@@ -47,7 +47,7 @@ def pdf(own: Certificate, xml: bytes, standing: str) -> bytes:
             return _compiled(template, inputs, False)  # a letter that only a font of this machine has
     except typst.TypstError as error:
         raise InputError(f"the certificate cannot be set as PDF/A ({cut(' '.join(error.message.split()), 200)}): "
-                         "write its texts with letters that a font of this machine has.") from None  # fmt: skip
+                         "install a font that has the letter, or write the text with others.") from None  # fmt: skip
 
 
 def _compiled(template: bytes, inputs: dict[str, str], own_fonts_only: bool) -> bytes:
@@ -234,14 +234,15 @@ def _sensitivity(own: Certificate, line: Contribution) -> Row:
     per_si = np.array([field_unit(each.unit).per_si for each in own.results]) / field_unit(line.unit).per_si
     values = line.sensitivity * per_si
     values[np.abs(values) < 1e-9] = 0.0  # rounding
-    form = "{:.4f}" if 0.01 <= np.abs(values).max() < 1e4 else "{:.2e}"
-    return {"symbol": _name(line.name), "values": [_minus(form.format(value)) for value in values]}
+    largest = float(np.abs(values).max())
+    form = "{:.4f}" if not largest or 0.01 <= largest < 1e4 else "{:.2e}"
+    return {"symbol": _name(line.name), "values": [_minus(form.format(value)) for value in values.tolist()]}
 
 
 def _coefficient(symbol: str, value: float | None, sigma: float | None, unit: str) -> Row:
     shown = field_unit(unit)
-    texts = (None, None) if value is None or sigma is None else shown.rounded(value, sigma)
-    return {"name": _name(symbol), "value": _minus(texts[0] or "–"), "sigma": texts[1] or "–", "unit": shown.label}
+    first, second = _pair(value, sigma, shown)
+    return {"name": _name(symbol), "value": first or "–", "sigma": second or "–", "unit": shown.label}
 
 
 def _remarks(own: Certificate, standing: str) -> list[str]:
@@ -278,15 +279,15 @@ def _count(dof: float) -> str:
 
 
 def _minus(text: str) -> str:
-    return text.replace("-", "−")
+    return text.replace("-", "−") if float(text) else text.removeprefix("-")
 
 
 def _pair(value: float | None, sigma: float | None, unit: Unit) -> tuple[str | None, str | None]:
     """A value and its uncertainty, rounded to two significant digits of the latter."""
     if value is None or sigma is None:
         return None, None
-    first, second = rounded(value * unit.per_si, sigma * unit.per_si)
-    return _minus(first), second
+    first, second = unit.rounded(value, sigma)
+    return _minus(first), second if float(second) < 100.0 else unit.number(sigma, 2)
 
 
 def _aligned(rows: list[Row], *keys: str) -> list[Row]:

@@ -115,7 +115,15 @@ class Statement(_Table):
     @property
     def largest(self) -> dict[str, float]:
         """The largest deviation from nominal allowed, by symbol, in SI; raises InputError."""
-        return targets_of([f"{name}={size}" for name, size in self.limits.items()])
+        found = dict[str, float]()
+        for name, size in self.limits.items():
+            try:
+                found |= targets_of([f"{name}={size}"])
+            except InputError:
+                raise InputError(f"limits: {cut(name, 50)} = {cut(size, 50)!r} is none: name a parameter (theta1, K2), "
+                                 "a kind (theta, phi, nu, K, b) or angles, with a size that fits it, such as 20 ppm, "
+                                 "100 ug or 5 arcsec.") from None  # fmt: skip
+        return found
 
 
 def read(path: Path | None) -> Statement:
@@ -129,6 +137,8 @@ def read(path: Path | None) -> Statement:
         place, said = ".".join(map(str, first["loc"])), first["msg"]
         if first["type"] == "extra_forbidden":
             said = "this key is not known"
+        elif first["type"] == "date_type":
+            said = "must be a date without quotes, such as 2026-11-23"
         elif first["type"] == "string_pattern_mismatch":
             said = "must be text without control characters (of a country, two capital letters)"
         raise InputError(f"{path}: {cut(place, 100)}: {said}: see docs/certificate.md for the keys.") from None
@@ -137,7 +147,7 @@ def read(path: Path | None) -> Statement:
     try:
         limited = bool(found.largest)
     except InputError as error:
-        raise InputError(f"{path}: limits: {error}") from None
+        raise InputError(f"{path}: {error}") from None
     if limited and found.decision_rule is None:
         raise InputError(f"{path}: limits are given without the rule by which conformity is decided: add "
                          'decision_rule = "simple acceptance" or "guard band".')  # fmt: skip
