@@ -388,3 +388,40 @@ def test_what_the_run_does_not_determine_has_no_number(saved: SavedCalibration) 
     shown = document.content(made, "checked")
     assert shown["results"][0]["value"] is None and {row["values"][0] for row in shown["contributions"]} == {"–"}
     assert shown["conformity"][0]["outcome"] == "not determined"
+
+
+ORDER = {
+    "administrativeData": "dccSoftware coreData items calibrationLaboratory respPersons customer statements",
+    "software": "name release type description",
+    "coreData": "countryCodeISO3166_1 usedLangCodeISO639_1 mandatoryLangCodeISO639_1 uniqueIdentifier receiptDate "
+    "beginPerformanceDate endPerformanceDate performanceLocation issueDate",
+    "item": "name description manufacturer model identifications",
+    "identification": "issuer value name",
+    "contact": "name eMail phone location",
+    "customer": "name eMail phone location",
+    "respPerson": "person role mainSigner",
+    "statement": "name declaration",
+    "measurementResult": "name usedMethods usedSoftware influenceConditions results",
+    "usedMethod": "name description norm",
+    "influenceCondition": "name data",
+    "result": "name data",
+    "quantity": "name noQuantity real measurementMetaData",
+    "metaData": "name conformity",
+    "real": "label value unit measurementUncertaintyUnivariate",
+    "expandedMU": "valueExpandedMU coverageFactor coverageProbability",
+}
+"""Elements in the order in which DCC 3.3.0 and D-SI 2.2.1 want them."""
+
+
+def test_elements_come_in_the_order_of_the_schema(cal: Path, lab: Path) -> None:
+    conditions = 'conditions = { temperature = "21 °C", humidity = "45 %" }\n'
+    lab.write_text(f'norms = ["IEEE Std 1293"]\nremarks = "None."\n{conditions}{LAB}')
+    seen = set[str]()
+    for element in ET.fromstring(dcc.xml(made(cal, lab))).iter():
+        name, found = element.tag.rpartition("}")[2], [child.tag.rpartition("}")[2] for child in element]
+        if name in ORDER and found:
+            seen.add(name)
+            known = ORDER[name].split()
+            assert set(found) <= set(known), name
+            assert sorted(found, key=known.index) == found, name
+    assert seen == set(ORDER)
