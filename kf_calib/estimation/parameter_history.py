@@ -1,4 +1,4 @@
-"""The parameters along a run: estimate and sigma after each dwell, what each dwell brought, and their correlations."""
+"""The parameters along a run: estimate and sigma after each dwell, and what each dwell brought."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation import square_root_information
+from kf_calib.estimation.information_share import shares_of
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.results import Calibration, Estimate, Parameter, estimate_of
 
@@ -41,9 +42,7 @@ class ParameterHistory:
         A column sums to 1, and is NaN for a parameter that is not determined. A share is negative where information
         is lost, as about biases that walk.
         """
-        information = np.where(np.isfinite(self.sigmas), self.sigmas, np.inf) ** -2.0
-        final = np.where(information[-1] > 0.0, information[-1], np.nan)
-        return np.diff(information, axis=0, prepend=0.0) / final
+        return shares_of(np.vstack([np.full((1, self.sigmas.shape[1]), np.nan), self.sigmas]))
 
     @cached_property
     def shares_of_accelerometers(self) -> Floats:
@@ -72,14 +71,3 @@ def _shown(result: Calibration, estimate: Estimate) -> tuple[Floats, Floats]:
     values = np.append(estimate.parameters, coefficients)
     sigmas = np.append(estimate.sigma, gains * estimate.effect_sigma)
     return np.where(np.isfinite(sigmas), values, np.nan), sigmas
-
-
-def correlation(estimate: Estimate) -> Floats:
-    """Correlation matrix (p, p) of the twelve parameters and the coefficients; NaN where one is not determined."""
-    count = len(estimate.state)
-    jacobian = np.eye(count)
-    jacobian[:STATE_COUNT, :STATE_COUNT] = paper_parameters.jacobian(estimate.state[:STATE_COUNT])
-    covariance = jacobian @ estimate.covariance @ jacobian.T
-    seen = np.isfinite(np.append(estimate.sigma, estimate.effect_sigma))
-    sigma = np.where(seen, np.sqrt(np.diag(covariance)), np.nan)
-    return covariance / np.outer(sigma, sigma)

@@ -17,7 +17,6 @@ from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.residual_drivers import drivers_of, explanations
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, improve
-from kf_calib.estimation.batch_by_dwell import batch_differences
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.information_share import information_shares
@@ -33,7 +32,7 @@ from kf_calib.views.rerun.chart import Axis, Chart, number
 from kf_calib.views.rerun.explorer import shown, signed
 from kf_calib.views.rerun.file import new_stream
 from kf_calib.views.rerun.growing import GrowingView
-from kf_calib.views.rerun.names import PER_SI
+from kf_calib.views.rerun.names import per_si
 from kf_calib.views.rerun.series import History
 from kf_calib.views.rerun.sigmas import Falling
 from kf_calib.views.screenshot import screenshot, viewer
@@ -139,7 +138,7 @@ def test_sigmas_by_orientation_are_those_of_the_run(hidden: Calibration, tmp_pat
         known = np.flatnonzero(np.isfinite(falling.sigma[:, k]))
         drawn.append(values_at(chart, points[at : at + len(known)]))
         at += len(known)
-        expected = [[*visit.estimate.sigma * PER_SI, *visit.estimate.effect_sigma * 1e6 / 9.80665][k]
+        expected = [[*visit.estimate.sigma * per_si(), *visit.estimate.effect_sigma * 1e6 / 9.80665][k]
                     for visit in hidden.visits]  # fmt: skip
         np.testing.assert_allclose(drawn[-1][:, 0], falling.orientation[known], rtol=1e-4)
         np.testing.assert_allclose(drawn[-1][:, 1], np.array(expected)[known], rtol=1e-4)
@@ -200,7 +199,7 @@ def test_an_improvement_is_a_timeline_of_steps(improved: Improvement, tmp_path: 
     points = content(path, "Points2D:positions")
     chart = improvement._error_chart(made)
     held = values_at(chart, points["/errors/held_out/points"][None])[:, 1]
-    np.testing.assert_allclose(held, [each.held_out_rms_mps2 * 1e6 for each in made.results], rtol=1e-3)  # type: ignore[operator]
+    np.testing.assert_allclose(held, [each.held_out_rms_mps2 * 1e6 / 9.80665 for each in made.results], rtol=1e-3)  # type: ignore[operator]
     inside = values_at(chart, points["/errors/within_the_run/points"][None])[:, 1]
     np.testing.assert_allclose(inside, [each.residual_rms_mps2 * 1e6 for each in made.results], rtol=1e-3)
     told = content(path, "Points2D:labels")["/errors/p/told"][None]
@@ -227,7 +226,7 @@ def test_p_that_underflows_is_a_bound(found: Diagnosis) -> None:
 def test_a_comparison_shows_differences_by_orientation(tmp_path: Path) -> None:
     compared = compare(RECORDINGS / "mems_faces.mcap")
     path = view.save(compared, tmp_path / "compared.rrd")
-    apart = np.abs(batch_differences(compared.result))
+    apart = np.abs(compared.running_sigma["batch"])
     points = content(path, "Points2D:positions")
     charts = comparison._charts(compared, np.arange(1, 7), apart)
     known = np.flatnonzero(apart[:, 6] > 0.0)

@@ -12,7 +12,6 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation.batch_by_dwell import batch_differences
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.support.plain_text import printable
 from kf_calib.views.rerun.chart import LABEL_HEIGHT, TOP, Axis, Chart, frames, sheet, thin, write
@@ -27,7 +26,7 @@ _SIZE = (900.0, 210.0)
 
 def save(compared: Comparison, path: Path) -> Path:
     """Write the view of a comparison to an .rrd file that opens laid out."""
-    number, apart = ends(compared.result.visits)[1], np.abs(batch_differences(compared.result))
+    number, apart = ends(compared.result.visits)[1], np.abs(compared.running_sigma["batch"])
     shown = quantities(compared.result.model)
     charts = _charts(compared, number, apart)
     with rrd_file(path, _layout(charts)) as stream:
@@ -87,7 +86,7 @@ def _summary(compared: Comparison) -> str:
         "Lines across, and the last column: after the whole run, the largest difference of all parameters from this "
         "program's filter (gold: filterpy, grey: batch)."
     )
-    curves = "Curves: after each orientation, least squares over the folded dwells so far."
+    curves = "Curves: after each orientation, least squares over the readings so far."
     return "\n\n".join(["\n".join([head, *rows]), curves, lines, *compared.remarks]) + "\n"
 
 

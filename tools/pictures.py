@@ -1,0 +1,123 @@
+"""The pictures of README and docs: ``tools/pictures`` draws them again, or those whose name is given.
+
+Figures are the program's own (``kf_calib.plot``), from recordings/hidden.mcap; pictures of the Rerun view are
+screenshots of it and need a graphics driver. Colours are reduced to a palette, so that a picture has some ten kB.
+
+Each picture carries a digest of what it was drawn from (``drawn_from``): a test compares it with the digest of today.
+docs/blind_trial.png is drawn by the trial, docs/conventions.png by tools/conventions_picture.py.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+import kf_calib
+from kf_calib.views.screenshot import screenshot
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+RECORDING = ROOT / "recordings" / "hidden.mcap"
+KEY = "drawn-from"
+_PALETTE = 96  # colours
+_WIDTH_PX = 1200
+_SIZE_PX = 1200, 750  # of a screenshot
+
+
+@cache
+def found() -> kf_calib.Diagnosis:
+    """The diagnosis of the recording."""
+    return kf_calib.diagnose(RECORDING)
+
+
+@cache
+def improved() -> kf_calib.Improvement:
+    """The recording with what was missing in the model."""
+    return kf_calib.improve(RECORDING)
+
+
+def _figure(draw: Callable[[], object]) -> Callable[[], Image.Image]:
+    """Return what makes a picture of a figure."""
+
+    def made() -> Image.Image:
+        with tempfile.TemporaryDirectory() as folder:
+            png = Path(folder, "figure.png")
+            kf_calib.plot.save(draw(), png, width_px=_WIDTH_PX)  # type: ignore[arg-type]  # a figure
+            return Image.open(io.BytesIO(png.read_bytes())).convert("RGB")
+
+    return made
+
+
+def _view(result: Callable[[], object]) -> Callable[[], Image.Image]:
+    """Return what makes a screenshot of the Rerun view of a result."""
+
+    def made() -> Image.Image:
+        with tempfile.TemporaryDirectory() as folder:
+            rrd, png = Path(folder, "view.rrd"), Path(folder, "view.png")
+            kf_calib.save_view(result(), rrd)  # type: ignore[arg-type]
+            screenshot(rrd, png, _SIZE_PX)
+            return Image.open(io.BytesIO(png.read_bytes())).convert("RGB")
+
+    return made
+
+
+PICTURES: dict[str, Callable[[], Image.Image]] = {
+    "diagnose": _figure(lambda: kf_calib.plot.residuals(found())),
+    "improve": _figure(lambda: kf_calib.plot.improvement(improved())),
+    "replay_figure": _figure(lambda: kf_calib.plot.convergence(found().before)),
+    "tutorial_dwell": _figure(lambda: kf_calib.plot.dwell(kf_calib.open_recording(RECORDING), found().before)),
+    "tutorial_suspects": _figure(lambda: kf_calib.plot.suspects(found())),
+    "tutorial_steps": _figure(lambda: kf_calib.plot.residuals_of_steps(improved())),
+    "tutorial_sigmas": _figure(lambda: kf_calib.plot.convergence(improved().result)),
+    "replay": _view(lambda: found().before),
+    "diagnose_view": _view(found),
+}
+"""Name of each picture in docs, and what draws it."""
+
+
+@cache
+def drawn_from() -> str:
+    """Digest of what the pictures show: the recording, and the numbers to three digits, which other machines share."""
+    numbers = [
+        *(float(p.value or 0.0) for p in improved().result.parameters.values()),
+        *(float(p.sigma or 0.0) for p in improved().result.parameters.values()),
+        *found().before.residuals_mps2.ravel(), *improved().result.residuals_mps2.ravel(),
+    ]  # fmt: skip
+    largest = np.abs(found().before.residuals_mps2).max()
+    rounded = [f"{value if abs(value) > 1e-3 * largest else 0.0:.2e}" for value in numbers]
+    content = {"recording": hashlib.sha256(RECORDING.read_bytes()).hexdigest(), "numbers": rounded,
+               "pictures": sorted(PICTURES)}  # fmt: skip
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def save(name: str) -> Path:
+    """Draw one picture into docs."""
+    path, content = DOCS / f"{name}.png", PngInfo()
+    content.add_text(KEY, drawn_from())
+    picture = PICTURES[name]().quantize(_PALETTE, dither=Image.Dither.NONE)
+    picture.save(path, optimize=True, pnginfo=content)
+    return path
+
+
+def main(names: list[str]) -> None:
+    """Draw the pictures of these names, or all."""
+    unknown = sorted(set(names) - set(PICTURES))
+    if unknown:
+        sys.exit(f"tools/pictures: there is no picture {unknown[0]}: name some of {', '.join(PICTURES)}.")
+    for name in names or PICTURES:
+        path = save(name)
+        print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1000:.0f} kB")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
