@@ -64,6 +64,8 @@ def test_the_commands_of_a_page_print_what_is_shown(
     page: Path, left_out: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = page.read_text()
+    if "kf-calib certificate" in text:
+        pytest.importorskip("typst", reason="typst is not there: no certificate is made")
     shutil.copytree(ROOT / "recordings", tmp_path / "recordings")
     monkeypatch.chdir(tmp_path)
     for name, content in files(text):

@@ -20,7 +20,7 @@ SECTIONS = {
                              "improve": "evaluate.improve", "compare": "evaluate.compare",
                              "report": "report.report"},
     "Use a calibration": {"apply": "exchange.apply", "verify": "exchange.verify", "history": "exchange.history",
-                          "export": "export.export"},
+                          "export": "export.export", "certificate": "certificate.certificate"},
     "Run a bench": {"plan": "plan.plan", "record": "acquire.record", "live": "live.live"},
     "Try it without a bench": {"demo": "acquire.demo", "simulate": "acquire.simulate"},
     "Look up": {"effects": "evaluate.list_effects", "paper": "paper.paper"},

@@ -1,0 +1,92 @@
+"""The command that writes a calibration certificate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import rich_click as click
+
+from kf_calib.cli.files import claimed, output_option
+from kf_calib.cli.options import (
+    INPUT,
+    OUTPUT,
+    effects_from_option,
+    examples,
+    json_option,
+    overwrite_option,
+    print_json,
+    show,
+    trust_option,
+)
+
+if TYPE_CHECKING:
+    from kf_calib.estimation.measurement_model import Model
+    from kf_calib.exchange.calibration_file import SavedCalibration
+    from kf_calib.exchange.certificate.content import Certificate
+    from kf_calib.exchange.certificate.statement import Statement
+    from kf_calib.support.output_files import Outputs
+
+_path = click.Path(path_type=Path)
+statement_option = click.option("--statement", type=_path, metavar="LAB.toml", panel=INPUT,
+                                help="What the laboratory states: docs/certificate.md has the keys.")  # fmt: skip
+
+
+@click.command(epilog=examples("certificate cal.json --statement lab.toml -o certificate.pdf"))
+@click.argument("calibration", type=_path, metavar="CAL")
+@output_option("-o", "--out", required=True, metavar="OUT.pdf", panel=OUTPUT,
+               help="The certificate: PDF/A-3b with the XML attached.")  # fmt: skip
+@output_option("--xml", metavar="OUT.xml", panel=OUTPUT, help="Save the XML as a file of its own, too.")
+@statement_option
+@click.option("--schema", type=_path, metavar="DCC.xsd", panel=INPUT,
+              help="Validate the XML against this copy of the DCC's schema.")  # fmt: skip
+@effects_from_option
+@trust_option
+@overwrite_option
+@json_option
+def certificate(
+    calibration: Path, out: Path, xml: Path | None, statement: Path | None, schema: Path | None,
+    effects_from: tuple[Path, ...], trust: bool, overwrite: bool, as_json: bool,
+) -> None:  # fmt: skip
+    """A calibration certificate as ISO/IEC 17025 asks: results, expanded uncertainties, budget, traceability.
+
+    What is neither in the calibration nor in the statement is left blank. It never claims accreditation.
+    """
+    from kf_calib.exchange import calibration_file
+    from kf_calib.exchange.certificate import statement as statements
+    from kf_calib.views import certificate as views
+
+    own = statements.read(statement)
+    outputs = claimed([] if own.before is None else [own.before], overwrite=overwrite)
+    found = []
+    for path in (calibration, own.before):
+        if path is not None:
+            saved = calibration_file.read(path)
+            found.append((saved, saved.model(path, effects_from, trust)))
+    made, standing = write_certificate(outputs, out, own, *found, xml=xml, schema=schema)
+    if as_json:
+        print_json(views.certificate_object(made, standing, out, xml))
+    else:
+        show(views.certificate_report(made, standing, out, xml))
+
+
+def write_certificate(
+    outputs: Outputs, out: Path, own: Statement, calibrated: tuple[SavedCalibration, Model],
+    before: tuple[SavedCalibration, Model] | None = None, xml: Path | None = None, schema: Path | None = None,
+) -> tuple[Certificate, str]:  # fmt: skip
+    """Write the certificate of a calibration with its model as ``out``; what it says, and what the check of its XML
+    found. before: the same from before an adjustment.
+
+    Raises InputError for a calibration, statement or schema that cannot be used, MissingExtraError without typst.
+    """
+    from kf_calib.exchange.certificate import content, dcc, document
+    from kf_calib.support.output_files import write_whole
+
+    made = content.certificate(*calibrated, own, before)
+    encoded = dcc.xml(made)
+    standing = dcc.check(encoded, schema)
+    printed = document.pdf(made, encoded, standing)
+    outputs.write(out, lambda path: write_whole(path, printed))
+    if xml is not None:
+        outputs.write(xml, lambda path: write_whole(path, encoded))
+    return made, standing

@@ -1,0 +1,232 @@
+"""The uncertainty budget of the twelve parameters, as the GUM has it (JCGM 100).
+
+Type A is the covariance of the filter. Type B is what the readings cannot show: an error of the bench that is the same,
+or has the same spread, in every run. With the change c_d of the mean readings of dwell d per unit of the error, and the
+gain of weighted least squares
+
+    G = (sum_d H_d^T R_d^-1 H_d)^-1 [H_1^T R_1^-1, H_2^T R_2^-1, ...]
+
+the state changes by sum_d G_d c_d per unit, and the parameters by J times that, J = d parameters / d state. An error
+that is drawn anew in each dwell gives the root of the sum of the squares instead. H, R and c are computed from the
+gimbal angles, noise and state that a calibration file holds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kf_calib import effects
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.effects import Coefficient, Effect, Stimulus
+from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
+from kf_calib.errors import InputError
+from kf_calib.estimation.dwell_columns import Means
+from kf_calib.estimation.measurement_model import STATE_COUNT, Model
+from kf_calib.estimation.noise_model import Noise, lift_rounding, mean_covariances
+from kf_calib.exchange.calibration_file import SavedCalibration
+from kf_calib.exchange.certificate.statement import DIVISORS, TypeB
+from kf_calib.support.units import quantity
+
+COVERAGE = math.erf(math.sqrt(2.0))
+"""Probability of the expanded uncertainty: 95.45 %, for which k is 2 at infinitely many degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """One line of the budget.
+
+    name, title: symbol and words. kind: A or B. standard: standard uncertainty of the input quantity in ``unit``, None
+    for type A. sensitivity (12,): change of each parameter per unit of it. parts (12,): contribution to the standard
+    uncertainty of each parameter. dof: degrees of freedom, may be infinite.
+    """
+
+    name: str
+    title: str
+    kind: str
+    standard: float | None
+    unit: str
+    distribution: str
+    dof: float
+    source: str | None
+    sensitivity: Floats | None
+    parts: Floats
+
+
+@dataclass(frozen=True)
+class Budget:
+    """All contributions, and what they give for each of the twelve: combined standard uncertainty, effective degrees of
+    freedom (Welch-Satterthwaite), coverage factor k and expanded uncertainty, (12,) each.
+
+    left_out: effects of the model whose columns need more than a calibration file holds.
+    """
+
+    contributions: tuple[Contribution, ...]
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def combined(self) -> Floats:
+        """Root of the sum of the squares of the contributions."""
+        return np.sqrt(sum((own.parts**2 for own in self.contributions), np.zeros(STATE_COUNT)))
+
+    @property
+    def dof(self) -> Floats:
+        """u^4 / sum_i (u_i^4 / nu_i) (GUM G.4.1)."""
+        parts = [own.parts**4 / own.dof for own in self.contributions]
+        return welch_satterthwaite(self.combined, sum(parts, np.zeros(STATE_COUNT)))
+
+    @property
+    def k(self) -> Floats:
+        """Coverage factors."""
+        return coverage_factor(self.dof)
+
+    @property
+    def expanded(self) -> Floats:
+        """U = k u."""
+        return self.k * self.combined
+
+
+def welch_satterthwaite(combined: Floats, quartics: Floats) -> Floats:
+    """Effective degrees of freedom of combined uncertainties; quartics: the sums of u_i^4 / nu_i."""
+    with np.errstate(divide="ignore"):
+        return np.where(quartics > 0.0, combined**4 / np.where(quartics > 0.0, quartics, 1.0), np.inf)
+
+
+def coverage_factor(dof: Floats) -> Floats:
+    """k (n,) of Student's distribution for ``COVERAGE``, the degrees of freedom cut to a whole number (GUM G.6.4)."""
+    from scipy.special import stdtrit
+
+    whole = np.maximum(np.floor(dof), 1.0)
+    return np.where(np.isinf(dof), 2.0, stdtrit(np.where(np.isinf(dof), 1e12, whole), 0.5 + 0.5 * COVERAGE))
+
+
+def budget(saved: SavedCalibration, model: Model, stated: Sequence[TypeB]) -> Budget:
+    """The budget of a calibration; model: that of it (``saved.model()``). Raises InputError for what cannot be had."""
+    first = _type_a(saved)
+    if not stated:
+        return Budget((first,))
+    stimulus = _stimulus(saved)
+    kept, left_out = _known_columns(model, stimulus)
+    changes = _gain(saved, model.columns(stimulus, np.array(saved.state.values))[:, :, kept], stimulus)
+    changes = np.einsum("pq,qdi->pdi", paper_parameters.jacobian(np.array(saved.state.values[:STATE_COUNT])), changes)
+    lines = [first]
+    for number, own in enumerate(stated, 1):
+        try:
+            lines += _type_b(own, saved, stimulus, changes)
+        except InputError as error:
+            raise InputError(f"[[uncertainty]] {number}, {own.effect}: {error}") from None
+    return Budget(tuple(lines), left_out)
+
+
+def _type_a(saved: SavedCalibration) -> Contribution:
+    """The filter's covariance; its degrees of freedom are those of the misfit where noise was estimated from it."""
+    noise, judged = saved.noise, saved.consistency
+    stated = noise.dwell_sigma_stated and noise.angle_sigma_stated
+    if not stated and judged.dof < 1:
+        raise InputError("the run has as many unknowns as mean readings, so that its noise from dwell to dwell is not "
+                         "known: state --angle-sigma-deg and --scatter-sigma, or visit more orientations.")  # fmt: skip
+    return Contribution(
+        "u_A", "noise of the readings, of the dwells and of the setting of angles", "A", None, "", "normal",
+        math.inf if stated else float(judged.dof), "covariance of the filter", None,
+        np.sqrt(np.diag(saved.twelve[1])),
+    )  # fmt: skip
+
+
+def _stimulus(saved: SavedCalibration) -> Stimulus:
+    """The state of the bench in the middle of each dwell."""
+    bench, dwells = saved.bench, saved.conditions.dwells
+    angles = [each.gimbal_deg for each in dwells if each.gimbal_deg is not None]
+    if len(angles) < len(dwells):
+        raise InputError("the calibration holds no gimbal angles (attitude was recorded), so that errors of the bench "
+                         "cannot be carried to the parameters: leave [[uncertainty]] out.")  # fmt: skip
+    pose, ends = np.radians(np.array(angles)), np.array([(each.start_s, each.end_s) for each in dwells])
+    middle, count = ends.mean(axis=1), len(dwells)
+    force, before = bench.specific_force(middle, pose), np.maximum(np.arange(count) - 1, 0)
+    warm = saved.conditions.temperature_mean_c
+    return Stimulus(
+        bench=bench, elapsed_s=middle, since_arrival_s=middle - ends[:, 0], force_mps2=force,
+        previous_force_mps2=force[before], pose=pose, previous_pose=pose[before],
+        temperature_c=np.full(count, np.nan if warm is None else warm),
+        sensitivity=np.array(saved.state.values[:STATE_COUNT]).reshape(3, 4)[:, :3],
+        variance_mps2_2=np.zeros((count, 3)), rate_radps=np.zeros((count, 3)), rate_change_radps2=np.zeros((count, 3)),
+        half_s=0.5 * (ends[:, 1] - ends[:, 0]), within=np.zeros(count),
+    )  # fmt: skip
+
+
+def _known_columns(model: Model, stimulus: Stimulus) -> tuple[list[int], tuple[str, ...]]:
+    """The states whose columns follow from orientation and time, and the names of the effects whose columns do not."""
+    count = len(stimulus)
+    other = replace(
+        stimulus,
+        temperature_c=REFERENCE_TEMPERATURE_C + np.linspace(1.0, 2.0, count),
+        variance_mps2_2=np.ones((count, 3)),
+    )
+    kept, left_out = list(range(STATE_COUNT)), list[str]()
+    for effect in model.effects:
+        if effect.walks:
+            continue
+        shows = not effect.no_columns and not effect.oscillates
+        if not shows or not np.array_equal(effect.columns(stimulus), effect.columns(other)):
+            left_out.append(str(effect))
+        else:
+            kept += range(*model.parts[str(effect)].indices(model.count))
+    return kept, tuple(left_out)
+
+
+def _gain(saved: SavedCalibration, design: Floats, stimulus: Stimulus) -> Floats:
+    """The change (12, D, 3) of the affine state per unit of each mean reading, by weighted least squares."""
+    own, counts = saved.noise, np.array([float(each.readings) for each in saved.conditions.dwells])
+    noise = Noise(
+        np.array(own.sigma_mps2), np.array(own.inflation), math.radians(own.angle_sigma_deg),
+        np.array(own.dwell_sigma_mps2), checked=own.dwell_sigma_stated,
+    )  # fmt: skip
+    means = Means(design, np.zeros(design.shape[:2]), stimulus.force_mps2, counts, np.zeros((len(counts), 2)))
+    covariances = lift_rounding(mean_covariances(noise.weights, means, np.array(saved.state.values)))
+    whiten = np.linalg.inv(np.linalg.cholesky(covariances))
+    rows = (whiten @ design).reshape(-1, design.shape[2])
+    scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+    inverse = (np.linalg.pinv(rows / scale, rcond=1e-10) / scale[:, None])[:STATE_COUNT]
+    return np.einsum("pdj,dji->pdi", inverse.reshape(STATE_COUNT, len(counts), 3), whiten)
+
+
+def _type_b(own: TypeB, saved: SavedCalibration, stimulus: Stimulus, changes: Floats) -> list[Contribution]:
+    """The lines of one error of the bench, one for each coefficient of its effect."""
+    effect = effects.effect_named(own.effect, saved.bench)
+    columns = _columns(effect, own, stimulus)
+    per_dwell = np.einsum("pdi,diq->qpd", changes, columns)  # q: coefficient, p: parameter, d: dwell
+    if own.varies == "run":
+        sensitivity = per_dwell.sum(axis=2)
+    else:
+        sensitivity = np.sqrt((per_dwell**2).sum(axis=2))
+    divisor = own.k if own.distribution == "normal" else DIVISORS[own.distribution]
+    return [
+        _line(own, effect, coefficient, quantity(own.size, coefficient.unit) / divisor, sensitivity[q])
+        for q, coefficient in enumerate(effect.coefficients)
+    ]
+
+
+def _columns(effect: Effect, own: TypeB, stimulus: Stimulus) -> Floats:
+    """What readings change by per unit of an error; of one that goes with temperature, at the change stated."""
+    if effect.no_columns or effect.oscillates:
+        raise InputError(f"it {effect.no_columns or 'is an oscillation'}: name an effect that shows in dwells.")
+    warm = replace(stimulus, temperature_c=np.full(len(stimulus), REFERENCE_TEMPERATURE_C + 1.0))
+    cold = replace(stimulus, temperature_c=np.full(len(stimulus), REFERENCE_TEMPERATURE_C))
+    if np.array_equal(effect.columns(warm), effect.columns(cold)):
+        return effect.columns(stimulus)
+    if own.temperature is None:
+        raise InputError('say by how much the temperature may be off, for example temperature = "0.5 K".')
+    change = quantity(own.temperature, "K")
+    return effect.columns(replace(cold, temperature_c=cold.temperature_c + change))
+
+
+def _line(own: TypeB, effect: Effect, coefficient: Coefficient, standard: float, sensitivity: Floats) -> Contribution:
+    words = {"run": "", "dwell": ", another in each dwell"}[own.varies]
+    at = f", at {own.temperature}" if own.temperature else ""
+    return Contribution(
+        coefficient.symbol, f"{effect.title} ({effect}){words}{at}", "B", abs(standard), coefficient.unit,
+        own.distribution, own.dof or math.inf, own.source, sensitivity, abs(standard * sensitivity),
+    )  # fmt: skip

@@ -1,0 +1,139 @@
+"""What a certificate says: results with expanded uncertainty, conformity, and all that the laboratory has stated.
+
+Nothing here is made up: what is neither in the calibration nor in the statement is None, and is shown as not stated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, timedelta
+from typing import Literal
+
+from kf_calib.bench import paper_parameters
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.exchange import calibration_file
+from kf_calib.exchange.calibration_file import SavedCalibration, SavedParameter
+from kf_calib.exchange.certificate import budget as budgets
+from kf_calib.exchange.certificate.budget import Budget
+from kf_calib.exchange.certificate.statement import Rule, Statement
+
+Conformity = Literal["pass", "conditionalPass", "conditionalFail", "fail"]
+"""The four outcomes of a rule with guard band (ILAC-G8); simple acceptance has the first and the last."""
+OUTCOMES: dict[Conformity, str] = {
+    "pass": "pass", "conditionalPass": "conditional pass", "conditionalFail": "conditional fail", "fail": "fail",
+}  # fmt: skip
+"""The outcomes in words."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """One parameter: value, standard and expanded uncertainty, coverage factor, effective degrees of freedom, in SI.
+
+    before: value and expanded uncertainty before adjustment. limit: largest deviation from nominal that is allowed.
+    value, standard and what follows from them are None where the run does not determine the parameter.
+    """
+
+    symbol: str
+    unit: str
+    nominal: float
+    value: float | None
+    standard: float | None
+    expanded: float | None
+    k: float
+    dof: float
+    before: tuple[float, float] | None = None
+    limit: float | None = None
+    conformity: Conformity | None = None
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The whole content. begun, ended: of the measurements. created: when this document was made, in UTC."""
+
+    saved: SavedCalibration
+    statement: Statement
+    budget: Budget
+    results: tuple[Result, ...]
+    begun: date | None
+    ended: date | None
+    created: datetime
+
+    @property
+    def serial(self) -> str | None:
+        """The serial number of the item: as stated, or as the recording has it."""
+        return self.statement.item.serial or self.saved.provenance.bench.get("block_serial")
+
+    @property
+    def further(self) -> list[SavedParameter]:
+        """Coefficients of effects that the run determined besides."""
+        return [each for each in self.saved.parameters[len(self.results) :] if each.sigma is not None]
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What a Digital Calibration Certificate must have and nobody has stated: keys of the statement."""
+        own = self.statement
+        parties = {
+            f"{name}.{key}": getattr(party, key)
+            for name, party in (("laboratory", own.laboratory), ("customer", own.customer)) for key in ("name", "city")
+        }  # fmt: skip
+        needed = {
+            "number": own.number, "begun": self.begun, "ended": self.ended, "site": own.site,
+            "laboratory.country": own.laboratory.country, "item.name": own.item.name, "item.serial": self.serial,
+            "persons": own.persons, **parties,
+        }  # fmt: skip
+        return tuple(name for name, value in needed.items() if not value)
+
+
+def certificate(
+    saved: SavedCalibration, model: Model, own: Statement, before: tuple[SavedCalibration, Model] | None = None
+) -> Certificate:
+    """The certificate of a calibration with its model, and of a statement; before: the same before an adjustment."""
+    found = budgets.budget(saved, model, own.uncertainty)
+    begun, ended = _dates(saved)
+    return Certificate(
+        saved, own, found, _results(saved, found, own, _before(before, own)), own.begun or begun, own.ended or ended,
+        datetime.fromisoformat(calibration_file.now()),
+    )  # fmt: skip
+
+
+def _before(before: tuple[SavedCalibration, Model] | None, own: Statement) -> list[tuple[float, float]] | None:
+    """Values and expanded uncertainties (12) before adjustment."""
+    if before is None:
+        return None
+    found = budgets.budget(*before, own.uncertainty)
+    return list(zip(before[0].twelve[0].tolist(), found.expanded.tolist(), strict=True))
+
+
+def _dates(saved: SavedCalibration) -> tuple[date, date] | tuple[None, None]:
+    """The days on which the measurements began and ended, in UTC; None where the stamps are no dates."""
+    if saved.conditions.began is None:
+        return None, None
+    began = datetime.fromisoformat(saved.conditions.began).astimezone(UTC)
+    return began.date(), (began + timedelta(seconds=saved.conditions.duration_s)).date()
+
+
+def _results(
+    saved: SavedCalibration, found: Budget, own: Statement, before: list[tuple[float, float]] | None
+) -> tuple[Result, ...]:
+    combined, expanded, k, dof = (each.tolist() for each in (found.combined, found.expanded, found.k, found.dof))
+    limits, out = own.largest, list[Result]()
+    for i, parameter in enumerate(saved.parameters[: len(paper_parameters.SYMBOLS)]):
+        value = None if parameter.sigma is None else parameter.value
+        known, limit, judged = value is not None, limits.get(parameter.symbol), None
+        if value is not None and limit is not None and own.decision_rule is not None:
+            judged = conformity(abs(value - parameter.nominal), limit, expanded[i], own.decision_rule)
+        out.append(Result(
+            parameter.symbol, parameter.unit, parameter.nominal, value,
+            combined[i] if known else None, expanded[i] if known else None, k[i], dof[i],
+            before[i] if before else None, limit, judged,
+        ))  # fmt: skip
+    return tuple(out)
+
+
+def conformity(deviation: float, limit: float, expanded: float, rule: Rule) -> Conformity:
+    """Whether a deviation is within its limit; the guard band is as wide as the expanded uncertainty."""
+    if rule == "simple acceptance":
+        return "pass" if deviation <= limit else "fail"
+    if deviation <= limit:
+        return "pass" if deviation <= limit - expanded else "conditionalPass"
+    return "conditionalFail" if deviation <= limit + expanded else "fail"

@@ -1,0 +1,154 @@
+"""What a laboratory states for a certificate, in a TOML file: who, for whom, what, how, and what is not in a recording.
+
+Everything may be left out, and is then left blank in the certificate. A misspelt key is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from datetime import date
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+
+from kf_calib.bench.targets import targets_of
+from kf_calib.errors import InputError
+from kf_calib.support.plain_text import COMMANDS, cut
+from kf_calib.support.toml_files import table_of
+
+_NONE = rf"{COMMANDS}\ufffe\uffff"  # no control characters, and nothing that XML cannot hold
+Text = Annotated[str, StringConstraints(max_length=5000, pattern=rf"\A[^{_NONE}]*[^{_NONE}\s][^{_NONE}]*\z")]
+Country = Annotated[str, StringConstraints(pattern=r"\A[A-Z]{2}\z")]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Rule = Literal["simple acceptance", "guard band"]
+
+DIVISORS = {"normal": 1.0, "rectangular": math.sqrt(3.0), "triangular": math.sqrt(6.0), "arcsine": math.sqrt(2.0)}
+"""What a size, half the width of a distribution, is divided by for a standard uncertainty; a normal one has ``k``."""
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class Party(_Table):
+    """A laboratory or a customer; country: two letters of ISO 3166-1."""
+
+    name: Text | None = None
+    street: Text | None = None
+    postcode: Text | None = None
+    city: Text | None = None
+    country: Country | None = None
+    email: Text | None = None
+    phone: Text | None = None
+
+
+class Item(_Table):
+    """What was calibrated."""
+
+    name: Text | None = None
+    manufacturer: Text | None = None
+    model: Text | None = None
+    serial: Text | None = None
+    state: Text | None = None
+
+
+class Person(_Table):
+    """Who is responsible for the certificate."""
+
+    name: Text
+    role: Text | None = None
+
+
+class Conditions(_Table):
+    """Conditions of the surroundings, in words with units."""
+
+    temperature: Text | None = None
+    humidity: Text | None = None
+    pressure: Text | None = None
+    note: Text | None = None
+
+
+class TypeB(_Table):
+    """An error of the bench that readings do not show: an effect of the catalogue and how large it may be.
+
+    size: with a unit; ``distribution`` says of what: half the width, or ``k`` standard deviations of a normal one. It
+    holds for each coefficient of the effect. varies: the same in all dwells (``run``) or another in each (``dwell``).
+    temperature: by how much it may be off, for effects of it. dof: degrees of freedom of the size; None: exact.
+    """
+
+    effect: Text
+    size: Text
+    distribution: Literal["normal", "rectangular", "triangular", "arcsine"] = "normal"
+    k: Positive = 1.0
+    varies: Literal["run", "dwell"] = "run"
+    temperature: Text | None = None
+    dof: Positive | None = None
+    source: Text | None = None
+
+
+class Statement(_Table):
+    """The content of the file; before: a calibration file from before an adjustment."""
+
+    title: Text | None = None
+    number: Text | None = None
+    issued: date | None = None
+    received: date | None = None
+    begun: date | None = None
+    ended: date | None = None
+    site: Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"] | None = None
+    location: Text | None = None
+    method: Text | None = None
+    norms: list[Text] = []
+    traceability: Text | None = None
+    remarks: Text | None = None
+    decision_rule: Rule | None = None
+    before: Annotated[Path, Field(strict=False)] | None = None
+    laboratory: Party = Party()
+    customer: Party = Party()
+    item: Item = Item()
+    conditions: Conditions = Conditions()
+    persons: list[Person] = []
+    limits: dict[str, Text] = {}
+    uncertainty: list[TypeB] = []
+
+    @property
+    def largest(self) -> dict[str, float]:
+        """The largest deviation from nominal allowed, by symbol, in SI; raises InputError."""
+        found = dict[str, float]()
+        for name, size in self.limits.items():
+            try:
+                found |= targets_of([f"{name}={size}"])
+            except InputError:
+                raise InputError(f"limits: {cut(name, 50)} = {cut(size, 50)!r} is none: name a parameter (theta1, K2), "
+                                 "a kind (theta, phi, nu, K, b) or angles, with a size that fits it, such as 20 ppm, "
+                                 "100 ug or 5 arcsec.") from None  # fmt: skip
+        return found
+
+
+def read(path: Path | None) -> Statement:
+    """Read a statement and check all of it; raises InputError, with the place in it. None: nothing is stated."""
+    if path is None:
+        return Statement()
+    try:
+        found = Statement.model_validate(table_of(path, 'number = "2026-0147"'))
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        place, said = ".".join(map(str, first["loc"])), first["msg"]
+        if first["type"] == "extra_forbidden":
+            said = "this key is not known"
+        elif first["type"] == "date_type":
+            said = "must be a date without quotes, such as 2026-11-23"
+        elif first["type"] == "string_pattern_mismatch":
+            said = "must be text without control characters (of a country, two capital letters)"
+        raise InputError(f"{path}: {cut(place, 100)}: {said}: see docs/certificate.md for the keys.") from None
+    if found.before is not None:
+        found = found.model_copy(update={"before": path.parent / found.before})
+    try:
+        limited = bool(found.largest)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    if limited and found.decision_rule is None:
+        raise InputError(f"{path}: limits are given without the rule by which conformity is decided: add "
+                         'decision_rule = "simple acceptance" or "guard band".')  # fmt: skip
+    return found
