@@ -11,6 +11,7 @@ import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 from click.core import ParameterSource
 
+from kf_calib.cli.certificate import statement_option, write_certificate
 from kf_calib.cli.files import Delivery, claimed, delivery, output_option
 from kf_calib.cli.options import (
     INPUT,
@@ -32,6 +33,7 @@ from kf_calib.cli.options import (
 
 if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Diagnosis
+    from kf_calib.exchange.certificate.statement import Statement
     from kf_calib.views.report.measured import Measured
 
 report_option = output_option(
@@ -56,6 +58,11 @@ report_option = output_option(
     "-o", "--out", metavar="FILE.html", default="report.html", show_default=True, panel=OUTPUT,
     help="Where the page is saved.",
 )  # fmt: skip
+@output_option(
+    "--certificate", metavar="OUT.pdf", panel=OUTPUT,
+    help="Save a calibration certificate here, too; kf-calib certificate makes one of a saved calibration.",
+)  # fmt: skip
+@statement_option
 @overwrite_option
 @units_option
 @strict_option
@@ -66,6 +73,8 @@ def report(
     recording: Path,
     against: Path | None,
     out: Path,
+    certificate: Path | None,
+    statement: Path | None,
     overwrite: bool,
     strict: bool,
     as_json: bool,
@@ -78,7 +87,7 @@ def report(
     from kf_calib.views.report.contents import page_of
     from kf_calib.views.report.page import save
 
-    outputs = claimed(overwrite=overwrite)
+    outputs, stated = claimed(overwrite=overwrite), _statement(certificate, statement)
     has_other_model = against is not None and against.suffix == ".toml"
     other_options = options | ({"model_file": against, "effects": ()} if has_other_model else {})
     if has_other_model:
@@ -101,8 +110,28 @@ def report(
     with delivery(outputs, as_json) as deliver, progress("drawing the page", as_json):
         result = found if pair is None else pair
         deliver.file(out, lambda path: save(page_of(result, sources, commands_of(ctx)), path))
+    if certificate is not None and stated is not None:
+        from kf_calib.exchange import calibration_file
+
+        saved = calibration_file.saved(found.before, measured.name, measured.sha256, measured.begin_ns)
+        write_certificate(outputs, certificate, stated, (saved, found.before.model))
+        if not as_json:
+            show(f"saved {certificate}")
     if strict and found.test.consistent is False:
         ctx.exit(1)
+
+
+def _statement(certificate: Path | None, statement: Path | None) -> Statement | None:
+    """What a certificate states, checked before the work; None where there is to be none."""
+    if certificate is None:
+        if statement is not None:
+            raise click.UsageError("--statement is for a certificate: name one with --certificate OUT.pdf.")
+        return None
+    from kf_calib.exchange.certificate import statement as statements
+    from kf_calib.support.extras import need
+
+    need("typst", "report", "a certificate")
+    return statements.read(statement)
 
 
 def save_report(
