@@ -126,10 +126,15 @@ def test_the_file_of_a_standard_stream_is_not_written(here: Path, words: str, st
 
 PICTURES = ["--rrd", "--png", "--svg", "--pdf", "--screenshot"]
 WRITING = [
-    ("replay run.mcap", [*PICTURES, "--save-model"]),
+    ("replay run.mcap", [*PICTURES, "--save", "--save-model"]),
     ("diagnose run.mcap", PICTURES),
-    ("compare run.mcap", PICTURES),
-    ("improve run.mcap", [*PICTURES, "--save-model", "--journal"]),
+    ("compare run.mcap", [*PICTURES, "--report"]),
+    ("improve run.mcap", [*PICTURES, "--save-model", "--journal", "--report"]),
+    ("report run.mcap", ["-o", "--certificate"]),
+    ("apply cal.json run.mcap", ["-o"]),
+    ("export cal.json --to csv", ["-o"]),
+    ("certificate cal.json", ["-o"]),
+    ("certificate cal.json -o new.pdf", ["--xml"]),
     ("plan", ["--csv", *PICTURES]),
     ("paper --repetitions 1", PICTURES),
     ("live sim://?speed=100", ["--record", "--rrd", "--save-model"]),
@@ -148,7 +153,7 @@ def test_every_output_is_among_them_and_can_be_replaced() -> None:
         if name in ("effects", "demo"):
             assert not asked
             continue
-        listed = next(options for words, options in WRITING if words.split()[0] == name)
+        listed = [option for words, options in WRITING if words.split()[0] == name for option in options]
         assert {option for option in listed if option} == {p.opts[0] for p in asked if p.param_type_name == "option"}
         assert any("--overwrite" in param.opts for param in command.params)
 
