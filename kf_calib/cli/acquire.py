@@ -30,7 +30,7 @@ from kf_calib.cli.options import (
     show,
     units_option,
 )
-from kf_calib.cli.signals import answered, interrupt
+from kf_calib.cli.signals import Interrupter, answered
 from kf_calib.errors import InputError
 from kf_calib.support.output_files import Outputs, write_whole
 from kf_calib.support.plain_text import sentence
@@ -157,14 +157,17 @@ def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], 
     from kf_calib.sources.files.recorder import Recorder
 
     readings, first_ns, last_ns, segmenter = 0, None, 0, Segmenter(source.bench)
+    interrupt = Interrupter()
     with answered(interrupt), Recorder(out, source.bench, overwrite=overwrite) as recorder:
         for batch in source:
-            recorder.write(batch)
+            with interrupt.finished_first():
+                recorder.write(batch)
             before = segmenter.dwell_count
             for _ in segmenter.push(batch):
                 pass
             if segmenter.dwell_count > before > 0:
-                recorder.end_dwell()
+                with interrupt.finished_first():
+                    recorder.end_dwell()
             readings += len(batch.accel)
             if len(batch.accel):
                 first_ns = int(batch.accel.time_ns[0]) if first_ns is None else first_ns

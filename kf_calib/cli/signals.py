@@ -37,6 +37,27 @@ def answered(answer: Callable[[signal.Signals], None]) -> Iterator[None]:
             signal.signal(number, signal.SIG_IGN if hung_up else handler)
 
 
-def interrupt(_: signal.Signals) -> None:
-    """Any of them is Ctrl-C: what is at work lets go of what it has open."""
-    raise KeyboardInterrupt
+class Interrupter:
+    """An answer by which any of them is Ctrl-C: what is at work lets go of what it has open.
+
+    Within ``finished_first`` it takes effect only at the end of the block: a file that is being written stays whole.
+    """
+
+    def __init__(self) -> None:
+        self._busy = self._asked = False
+
+    def __call__(self, _: signal.Signals) -> None:
+        self._asked = True
+        if not self._busy:
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def finished_first(self) -> Iterator[None]:
+        """Let the block be done before an interrupt takes effect."""
+        self._busy = True
+        try:
+            yield
+        finally:
+            self._busy = False
+        if self._asked:
+            raise KeyboardInterrupt
