@@ -73,7 +73,7 @@ def _correction(path: Path, options: Mapping[str, Any]) -> tuple[SavedCalibratio
     from kf_calib.exchange import calibration_file
 
     saved = calibration_file.read(path)
-    return saved, saved.correction(path, [Path(each) for each in options["effects_from"]], options["trust"])
+    return saved, saved.correction(path, options["effects_from"], options["trust"])
 
 
 @click.command(epilog=examples("verify cal.json check.mcap", "verify cal.json check.mcap --strict --json"))
@@ -98,8 +98,8 @@ def verify(ctx: click.Context, calibration: Path, recording: Path, strict: bool,
 
     saved = calibration_file.read(calibration)
     verification.refuse_incomplete(saved)
-    model = saved.model(calibration, [Path(each) for each in options["effects_from"]], options["trust"])
     source = recording_of(recording, options)
+    model = saved.model(calibration, options["effects_from"], options["trust"], source.bench)
     with progress(f"verifying with {recording.name}", as_json) as tick:
         found = verification.verify(saved, model, source, Settings(**used_of(options)), tick)
     if as_json:

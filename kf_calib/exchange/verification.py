@@ -12,6 +12,7 @@ or to the platform may differ: their coefficients are free.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -19,7 +20,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
-from kf_calib.effects import Coefficient
+from kf_calib.effects import Effect
 from kf_calib.effects.inputs import beyond_force_and_temperature
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.calibration import evaluate_fit
@@ -143,7 +144,7 @@ def _misfit(saved: SavedCalibration, fitted: Fit, noise: Noise, free: Sequence[s
     residuals = means.readings - means.design @ old
     rows = (lower @ means.design).reshape(-1, model.count)
     right = np.einsum("dij,dj->di", lower, residuals).ravel()
-    root = np.linalg.cholesky(covariance)  # x - x1 = root y with y of unit variance
+    root = _root(covariance)  # x - x1 = root y with y of unit variance
     mixed = np.hstack([rows[:, kept] @ root, np.delete(rows, kept, axis=1)])
     prior = np.eye(len(kept), mixed.shape[1])
     stacked, target = np.vstack([mixed, prior]), np.append(right, np.zeros(len(kept)))
@@ -152,11 +153,16 @@ def _misfit(saved: SavedCalibration, fitted: Fit, noise: Noise, free: Sequence[s
     return float(left @ left), float(np.sqrt(np.mean(residuals**2)))
 
 
+def _root(covariance: Floats) -> Floats:
+    """Return L with L L^T = covariance, of which parts may be known exactly; scaled, as units differ."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+
+
 def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tuple[Move, ...]:
     """Return the differences of all that both runs determine, the clearest first."""
-    from math import erfc, sqrt
-
-    skipped = {c.symbol for name in free for c in _effect_symbols(new.model, name)}
+    skipped = {symbol for each in new.model.effects if str(each) in free for symbol in _symbols(each)}
     before = {each.symbol: each for each in saved.parameters}
     found = list[tuple[str, str, float, float, float]]()
     for symbol, now in new.parameters.items():
@@ -166,16 +172,16 @@ def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tu
         found.append((symbol, now.unit, was.value, now.value, float(np.hypot(was.sigma, now.sigma))))  # type: ignore[arg-type]
     moves = [
         Move(symbol, unit, old, value, value - old, sigma,
-             sidak(erfc(abs(value - old) / max(sigma, 1e-300) / sqrt(2.0)), len(found)))
+             sidak(math.erfc(abs(value - old) / max(sigma, 1e-300) / math.sqrt(2.0)), len(found)))
         for symbol, unit, old, value, sigma in found
     ]  # fmt: skip
     return tuple(sorted(moves, key=lambda move: move.p_value))
 
 
-def _effect_symbols(model: Model, name: str) -> list[Coefficient]:
-    """Return the coefficients of an effect, its constant included."""
-    part = model.parts[name]
-    return list(model.coefficients[part.start - STATE_COUNT : part.stop - STATE_COUNT])
+def _symbols(effect: Effect) -> set[str]:
+    """Return the symbols of all parameters of an effect: coefficients, constant, intensity of a walk."""
+    constant = set[str]() if effect.unknown is None else {effect.unknown.symbol}
+    return constant | {each.symbol for each in (*effect.states, *effect.parameters)}
 
 
 def _worst(saved: SavedCalibration, new: Calibration) -> tuple[float, float]:
