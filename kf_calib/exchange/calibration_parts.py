@@ -8,11 +8,11 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from kf_calib.support.plain_text import COMMANDS, LONGEST
 
-Text = Annotated[str, StringConstraints(max_length=LONGEST, pattern=rf"\A[^{COMMANDS}]*\z")]
+Text = Annotated[str, StringConstraints(max_length=LONGEST, pattern=rf"^[^{COMMANDS}]*$")]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Three = Annotated[list[Positive], Field(min_length=3, max_length=3)]
-Sha256 = Annotated[str, StringConstraints(pattern=r"\A[0-9a-f]{64}\z")]
+Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 
 
 class Part(BaseModel):

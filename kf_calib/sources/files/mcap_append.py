@@ -119,9 +119,7 @@ class TopicAppender:
         assert source.summary is not None
         channels, schemas = source.summary.channels, source.summary.schemas
         if any(channel.topic == topic for channel in channels):
-            raise InputError(
-                f"{source.path} has a topic {topic} already: take the one it was made from."
-            )
+            raise InputError(f"{source.path} has a topic {topic} already: take the one it was made from.")
         numbers = {channel.id for channel in channels}, {schema.id for schema in schemas}
         own, schema = (next(k for k in range(1, 1 << 16) if k not in taken) for taken in numbers)
         definition = Schema(id=schema, data=kind.schema.encode(), encoding="ros2msg", name=kind.name)
