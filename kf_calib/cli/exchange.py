@@ -92,7 +92,8 @@ def _apply_to_lines(correction: Correction, columns: Mapping[str, str]) -> None:
     for name, why in correction.left_out.items():
         complain(f"{name} is not corrected: {why}")
     lines = CorrectedLines(correction, columns)
-    while block := sys.stdin.buffer.read1(_BLOCK_BYTES):
+    read = getattr(sys.stdin.buffer, "read1", sys.stdin.buffer.read)  # read1 does not wait for a whole block
+    while block := read(_BLOCK_BYTES):
         _write_out(lines.push(block))
     _write_out(lines.rest())
     for said in lines.warnings:

@@ -112,9 +112,13 @@ class Correction:
     @cached_property
     def worst_sigma_mps2(self) -> Floats:
         """Sigma (3,) of corrected specific force by the calibration alone, the largest over directions of gravity."""
-        directions = np.vstack([np.eye(3), -np.eye(3)]) * self.bench.gravity_mps2
-        temperature = REFERENCE_TEMPERATURE_C if self.needs_temperature else None
-        return self.sigma_of(directions, temperature).max(axis=0)
+        return self.sigma_of(self.gravities, REFERENCE_TEMPERATURE_C).max(axis=0)
+
+    @property
+    def gravities(self) -> Floats:
+        """Specific force (26, 3) of the block at rest: on its faces, edges and corners."""
+        directions = np.array([each for each in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(each)])
+        return self.bench.gravity_mps2 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
     @cached_property
     def matrix(self) -> Floats:

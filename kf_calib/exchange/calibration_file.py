@@ -56,6 +56,7 @@ from kf_calib.support.plain_text import cut
 
 FORMAT, VERSION = "kf_calib.calibration", 1
 _LARGEST_BYTES = 50_000_000
+_LARGEST_VARIANCE = 1e60  # far beyond any, and products of a few are numbers still
 AFFINE = tuple(f"{name}{i}" for i in (1, 2, 3) for name in ("sx", "sy", "sz", "b"))
 """Symbols of the affine state: reading i = sx_i f_x + sy_i f_y + sz_i f_z + b_i."""
 
@@ -91,6 +92,8 @@ class SavedCalibration(Part):
         covariance = np.array(state.covariance) if all(len(row) == count for row in state.covariance) else np.zeros(0)
         if covariance.shape != (count, count) or not np.allclose(covariance, covariance.T, rtol=1e-9, atol=0.0):
             raise ValueError(f"state.covariance is no symmetric matrix of {count} rows")
+        if np.abs(covariance).max() > _LARGEST_VARIANCE:
+            raise ValueError("state.covariance has numbers that no calibration has")
         scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         relative = covariance / scale / scale[:, None]
         if not np.isfinite(relative).all() or np.linalg.eigvalsh(relative).min() < -1e-6:
