@@ -24,7 +24,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.effects import Effect
-from kf_calib.effects.inputs import beyond_force_and_temperature, stimulus_of
+from kf_calib.effects.inputs import beyond_force_and_temperature, depends_on_temperature, stimulus_of
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C, Stimulus
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
@@ -92,12 +92,7 @@ class Correction:
     @cached_property
     def needs_temperature(self) -> tuple[str, ...]:
         """Names of the corrected effects that depend on temperature."""
-        force = self.bench.gravity_mps2 * np.eye(3)
-        cold, warm = (
-            stimulus_of(force, np.full(3, REFERENCE_TEMPERATURE_C + change), self.bench, self.sensitivity)
-            for change in (0.0, 10.0)
-        )
-        return tuple(str(e) for e in self.effects if not np.array_equal(e.columns(cold), e.columns(warm)))
+        return tuple(str(each) for each in self.effects if depends_on_temperature(each, self.bench))
 
     @property
     def sensitivity(self) -> Floats:

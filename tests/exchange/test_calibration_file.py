@@ -163,9 +163,7 @@ BROKEN: dict[str, tuple[str | Callable[[dict[str, Any]], None], str]] = {
 
 
 @pytest.mark.parametrize("kind", BROKEN)
-def test_what_is_no_calibration_is_refused_in_a_sentence(
-    kind: str, content: dict[str, Any], tmp_path: Path
-) -> None:
+def test_what_is_no_calibration_is_refused_in_a_sentence(kind: str, content: dict[str, Any], tmp_path: Path) -> None:
     change, says = BROKEN[kind]
     path, changed = tmp_path / "broken.json", copy.deepcopy(content)
     if isinstance(change, str):

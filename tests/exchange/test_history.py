@@ -47,6 +47,17 @@ def track(count: int, drift: float, walk: float, repeatability: float, sigma: fl
     return history([at(*each, sigma) for each in zip(days, found, strict=True)]).tracks[0], float(level[-1])
 
 
+def test_over_walks_and_repeatabilities_as_likely_as_assumed_sigmas_cover_what_they_say() -> None:
+    """Drawn from the prior that the weights have, up to its scale, which is that of the scatter found."""
+    rng, scores = np.random.default_rng(8), list[float]()
+    for seed in range(REPETITIONS):
+        walk, repeatability = np.exp(rng.uniform(np.log(0.1), np.log(3.0), 2)) * [1e-6, 3e-6]
+        own, true = track(10, 1e-6, walk, repeatability, 1e-6, seed)
+        scores += [(own.level - true) / own.level_sigma, (own.drift - 1e-6) / own.drift_sigma]
+    inside = np.sum(np.abs(np.reshape(scores, (-1, 2))) < 1.96, axis=0)
+    assert (inside >= stats.binom.ppf(1e-3, REPETITIONS, 0.95)).all()
+
+
 @pytest.mark.parametrize(
     ("count", "walk", "repeatability"), [(20, 2e-6, 5e-6), (12, 0.0, 5e-6), (12, 3e-6, 0.0), (8, 2e-6, 5e-6)]
 )
@@ -54,10 +65,10 @@ def test_level_and_drift_are_within_their_sigma(count: int, walk: float, repeata
     found = [track(count, 1e-6, walk, repeatability, 1e-6, seed) for seed in range(REPETITIONS)]
     level = np.array([(each.level - true) / each.level_sigma for each, true in found])
     drift = np.array([(each.drift - 1e-6) / each.drift_sigma for each, _ in found])
-    low = stats.binom.ppf(1e-4, REPETITIONS, 0.95)  # more may be inside: what q and r are is not known
-    assert np.sum(np.abs(level) < 1.96) >= low and np.sum(np.abs(drift) < 1.96) >= low
+    inside = [float(np.mean(np.abs(scores) < 1.96)) for scores in (level, drift)]
+    assert min(inside) > 0.88  # q and r are not known: more where they are small, less where they are large
     assert abs(level.mean()) < 0.25 and abs(drift.mean()) < 0.25
-    assert 0.5 < level.std() < 1.2 and 0.5 < drift.std() < 1.2
+    assert 0.3 < level.std() < 1.4 and 0.3 < drift.std() < 1.4
     if count == 20:
         assert 0.7e-5 > np.median([each.repeatability for each, _ in found]) > 3e-6
 
@@ -66,7 +77,7 @@ def test_each_calibration_is_predicted_by_those_before_it() -> None:
     found = [track(10, 1e-6, 1e-6, 4e-6, 1e-6, seed)[0] for seed in range(REPETITIONS)]
     scores = np.array([(each.values - each.predicted) / each.predicted_sigma for each in found])
     assert np.isnan(scores[:, :2]).all() and np.isfinite(scores[:, 2:]).all()
-    assert 0.9 < np.mean(np.abs(scores[:, 4:]) < 1.96) < 0.995
+    assert np.mean(np.abs(scores[:, 2:]) < 1.96) > 0.93 and scores[:, 2:].std() > 0.4
 
 
 def test_the_sigma_to_come_is_the_closed_form() -> None:

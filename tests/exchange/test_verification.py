@@ -47,12 +47,12 @@ def test_p_values_are_uniform_where_nothing_has_moved(count: int) -> None:
 
 
 def test_the_parameter_that_moved_is_found_and_named() -> None:
-    found = [verified(seed, K2=5e-6) for seed in range(30)]
+    found = [verified(seed, K2=8e-6) for seed in range(30)]
     assert sum(not each.holds for each in found) >= 28
     named = Counter(each.moved[0].symbol for each in found if each.moved)
     assert named["K2"] >= 28 and sum(named.values()) == named["K2"]
     worst = np.array([(each.worst_mps2, each.worst_sigma_mps2) for each in found])
-    assert np.all(np.abs(worst[:, 0] - 5e-6 * BENCH.gravity_mps2) < 5.0 * worst[:, 1])
+    assert np.all(np.abs(worst[:, 0] - 8e-6 * BENCH.gravity_mps2) < 5.0 * worst[:, 1])
 
 
 def test_three_orientations_see_a_bias_that_moved_though_they_name_nothing() -> None:
@@ -88,7 +88,8 @@ def test_effects_of_the_run_are_not_compared() -> None:
 
 
 def test_a_calibration_that_determined_too_little_predicts_nothing() -> None:
-    own = calibration_file.saved(kf_calib.calibrate(simulated(0, 3)))
+    settings = kf_calib.Settings(effects="thermal-bias")  # the temperature does not vary
+    own = calibration_file.saved(kf_calib.calibrate(simulated(0), settings))
     assert own.state.undetermined
     with pytest.raises(UnobservableError, match="did not determine .*: verify one that did"):
         verification.refuse_incomplete(own)
