@@ -12,7 +12,7 @@ import rich_click as click
 
 from kf_calib.cli.acquire import pair
 from kf_calib.cli.echo import complain
-from kf_calib.cli.files import claimed, output_option
+from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.options import (
     OUTPUT,
     columns_option,
@@ -31,6 +31,7 @@ from kf_calib.cli.options import (
     units_option,
     used_of,
 )
+from kf_calib.cli.pictures import Pictures, figure_options, figures_of
 from kf_calib.errors import KfCalibError
 
 if TYPE_CHECKING:
@@ -171,18 +172,25 @@ def verify(ctx: click.Context, calibration: Path, recording: Path, strict: bool,
     help="By how much a parameter (theta1, K2), a kind (theta, phi, nu, K, b) or all angles may be wrong, "
     "with a unit (20ppm, 100ug, 5arcsec) or in SI; repeatable. The date of the next calibration follows.",
 )
+@figure_options
+@overwrite_option
 @units_option
 @json_option
-def history(calibrations: tuple[Path, ...], tolerances: tuple[str, ...], as_json: bool) -> None:
+def history(
+    calibrations: tuple[Path, ...], tolerances: tuple[str, ...], overwrite: bool, as_json: bool, **options: Any
+) -> None:
     """The calibrations of one block over time: drift, repeatability, and when to calibrate again."""
     from kf_calib.bench.targets import targets_of
     from kf_calib.exchange import calibration_file
     from kf_calib.exchange.history import history as found_in
     from kf_calib.views import exchange as views
 
+    outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     wanted = targets_of(tolerances)
     found = found_in([calibration_file.read(path) for path in calibrations], wanted)
     if as_json:
         print_json(views.history_object(found))
     else:
         show(views.history_report(found))
+    with delivery(outputs, as_json) as deliver:
+        pictures.save_figures(deliver, figures_of(found))

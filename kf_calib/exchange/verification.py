@@ -22,11 +22,13 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
 from kf_calib.effects import Effect
 from kf_calib.effects.inputs import beyond_force_and_temperature
+from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.calibration import evaluate_fit
+from kf_calib.estimation.correction import Correction
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.fit import Fit, fit
-from kf_calib.estimation.measurement_model import STATE_COUNT, Model
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.noise_model import Noise, mean_covariances
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
@@ -65,7 +67,8 @@ class Verification:
     all parameters that both determine, the clearest first. new: the calibration by the new run alone (None: its
     orientations determine too little). residual_rms_mps2: of the new means less their prediction by the old
     calibration. worst_mps2, worst_sigma_mps2: largest error, over all directions of gravity, of readings corrected by
-    the old calibration, and its sigma (None without ``new``). free: effects whose coefficients were not compared.
+    the old calibration, and its sigma (None where the new run does not determine them). free: effects whose
+    coefficients were not compared.
     warnings: sentences.
     """
 
@@ -109,7 +112,7 @@ def verify(
         new = evaluate_fit(fitted, settings)
         seen = None if new.estimate.unseen.any() else new
         moves = _moves(saved, new, free)
-        worst = (None, None) if seen is None else _worst(saved, seen)
+        worst = (None, None) if seen is None else _worst(saved, model, seen)
     clearest = min((move.p_value for move in moves), default=1.0)
     both = min(1.0, 2.0 * min(p_value, clearest))  # two tests, of which either may say so
     return Verification(
@@ -184,21 +187,23 @@ def _symbols(effect: Effect) -> set[str]:
     return constant | {each.symbol for each in (*effect.states, *effect.parameters)}
 
 
-def _worst(saved: SavedCalibration, new: Calibration) -> tuple[float, float]:
-    """Return the largest error of old corrections over the directions of gravity, and its sigma, m/s^2."""
-    old, now = (np.array(state)[:STATE_COUNT].reshape(3, 4) for state in (saved.state.values, new.estimate.state))
-    inverse = np.linalg.inv(old[:, :3])
-    force = new.bench.gravity_mps2 * _sphere(_DIRECTIONS)
-    errors = (force @ now[:, :3].T + now[:, 3] - old[:, 3]) @ inverse.T - force
+def _worst(
+    saved: SavedCalibration, model: Model, new: Calibration
+) -> tuple[float, float] | tuple[None, None]:
+    """Return the largest error of old corrections over the directions of gravity, and its sigma, m/s^2; None where the
+    new run does not determine all that is corrected."""
+    old = Correction(new.bench, model, np.array(saved.state.values), np.array(saved.state.covariance), np.zeros(3))
+    try:
+        now = new.correction
+    except UnobservableError:
+        return None, None
+    force, temperature = new.bench.gravity_mps2 * _sphere(_DIRECTIONS), REFERENCE_TEMPERATURE_C
+    errors = old(now.predicted(force, temperature), temperature) - force
     worst = int(np.argmax(np.linalg.norm(errors, axis=1)))
     size = float(np.linalg.norm(errors[worst]))
-    along = errors[worst] / max(size, 1e-300) @ inverse
-    gain = np.outer(along, np.append(force[worst], 1.0)).ravel()
-    both = (
-        np.array(saved.state.covariance)[:STATE_COUNT, :STATE_COUNT]
-        + new.estimate.covariance[:STATE_COUNT, :STATE_COUNT]
-    )
-    return size, float(np.sqrt(max(gain @ both @ gain, 0.0)))
+    along = errors[worst] / max(size, 1e-300)
+    both = sum(each.covariance_of(force[worst], temperature)[0] for each in (old, now))
+    return size, float(np.sqrt(along @ both @ along))
 
 
 def _sphere(count: int) -> Floats:

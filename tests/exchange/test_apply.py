@@ -197,7 +197,8 @@ def test_readings_wait_for_no_temperature(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "says"),
-    [("", "no readings to correct in 0 lines: check that the logger wrote any"), ("a,b\n1,2\n", "no column gives the time"),
+    [("", "no readings to correct in 0 lines: check that the logger wrote any"),
+     ("a,b\n1,2\n", "no column gives the time"),
      ("time_s,ax_g,ay_g,az_g\n1,2\n", "it has 2 cells, the header has 4"), ("{}\n", "it has no time stamp")],
 )  # fmt: skip
 def test_standard_input_without_readings_is_refused_in_a_sentence(

@@ -91,5 +91,5 @@ def test_a_calibration_that_determined_too_little_predicts_nothing() -> None:
     settings = kf_calib.Settings(effects="thermal-bias")  # the temperature does not vary
     own = calibration_file.saved(kf_calib.calibrate(simulated(0), settings))
     assert own.state.undetermined
-    with pytest.raises(UnobservableError, match="did not determine .*: verify one that did"):
+    with pytest.raises(UnobservableError, match=r"did not determine .*: verify one that did"):
         verification.refuse_incomplete(own)

@@ -15,6 +15,7 @@ from kf_calib.support.extras import need
 need("matplotlib", "plot", "a figure")
 
 from kf_calib.views.figures.collection import Figures, figures, save  # noqa: E402  # after the check
+from kf_calib.views.figures.history import history  # noqa: E402
 from kf_calib.views.figures.residuals import residuals, what_they_go_with  # noqa: E402
 
-__all__ = ["Figures", "figures", "residuals", "save", "what_they_go_with"]
+__all__ = ["Figures", "figures", "history", "residuals", "save", "what_they_go_with"]

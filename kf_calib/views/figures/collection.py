@@ -13,8 +13,10 @@ from matplotlib.figure import Figure
 
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.errors import InputError
+from kf_calib.exchange.history import History
 from kf_calib.support.output_files import write_whole
 from kf_calib.views.figures import style
+from kf_calib.views.figures.history import history
 from kf_calib.views.figures.residuals import residuals, what_they_go_with
 
 Figures = Mapping[str, Callable[[], Figure]]
@@ -25,7 +27,7 @@ Figures = Mapping[str, Callable[[], Figure]]
 def figures(result: Any) -> Figures:
     """The figures of a result by title, the one that tells most first; nothing is drawn before it is called for."""
     raise TypeError(f"there is no figure of {type(result).__name__}: give the result of calibrate, diagnose, improve, "
-                    "compare or plan.")  # fmt: skip
+                    "compare, plan or history.")  # fmt: skip
 
 
 @figures.register
@@ -34,6 +36,11 @@ def _(found: Diagnosis) -> Figures:
         "Where the model fails": lambda: residuals(found),
         "What the residuals go with": lambda: what_they_go_with(found),
     }
+
+
+@figures.register
+def _(found: History) -> Figures:
+    return {"The calibrations over time": lambda: history(found)}
 
 
 def save(what: Figure | Figures, path: str | Path, kind: str = "", width_px: int | None = None) -> Path:
