@@ -187,9 +187,7 @@ def _symbols(effect: Effect) -> set[str]:
     return constant | {each.symbol for each in (*effect.states, *effect.parameters)}
 
 
-def _worst(
-    saved: SavedCalibration, model: Model, new: Calibration
-) -> tuple[float, float] | tuple[None, None]:
+def _worst(saved: SavedCalibration, model: Model, new: Calibration) -> tuple[float, float] | tuple[None, None]:
     """Return the largest error of old corrections over the directions of gravity, and its sigma, m/s^2; None where the
     new run does not determine all that is corrected."""
     old = Correction(new.bench, model, np.array(saved.state.values), np.array(saved.state.covariance), np.zeros(3))
