@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -152,3 +154,16 @@ def test_a_track_is_replaced_whole() -> None:
     still = replace(own, drift=0.0, drift_sigma=0.0, level_drift_covariance=0.0, walk=0.0)
     sigma = still.known_after(np.array([0.0, 5000.0]))[1]
     assert sigma[0] == sigma[1] == np.hypot(own.level_sigma, own.repeatability)
+
+
+def test_the_command_tells_the_date_and_draws_a_panel_a_parameter(run: Any, tmp_path: Path) -> None:
+    files = [tmp_path / f"{k}.json" for k in range(4)]
+    for k, path in enumerate(files):
+        own = at(30.0 * k, 1.0, 1e-6)
+        whole = own.model_copy(update={"parameters": TEMPLATE[0].parameters, "provenance": TEMPLATE[0].provenance})
+        calibration_file.write(path, whole)
+    code, out, err = run("history", *files, "--tolerance", "K=1ppm", "--svg", tmp_path / "chart.svg")
+    assert code == 0 and err == "" and "4 calibrations, 2024-01-01 to 2024-03-31" in out and "Calibrate again" in out
+    found = history([calibration_file.read(path) for path in files])
+    assert len([axes for axes in kf_calib.plot.history(found).axes if axes.get_title(loc="left")]) == 12
+    assert (tmp_path / "chart.svg").read_bytes().startswith(b"<?xml")
