@@ -8,6 +8,9 @@
     print(kf_calib.diagnose(run).verdict)       # which physical effect is missing
     print(kf_calib.improve(run).reason)         # added, refitted, tested, until there is a reason to stop
     kf_calib.save_view(run, "run.rrd")          # opens in Rerun
+    run.apply(readings).force_mps2              # readings corrected, with their uncertainty
+    kf_calib.save_calibration(run, "cal.json", "run.mcap")
+    kf_calib.open_calibration("cal.json").correction()(readings)
 
 Conventions, kept everywhere:
 
@@ -32,9 +35,12 @@ if TYPE_CHECKING:
     from kf_calib.diagnosis.stepwise_selection import Improvement, improve
     from kf_calib.errors import InputError, KfCalibError, UnobservableError
     from kf_calib.estimation.calibration import calibrate
+    from kf_calib.estimation.correction import Corrected, Correction
     from kf_calib.estimation.engine_comparison import compare
     from kf_calib.estimation.results import Calibration, Parameter
     from kf_calib.estimation.settings import Settings
+    from kf_calib.exchange.calibration_file import SavedCalibration, save_calibration
+    from kf_calib.exchange.calibration_file import read as open_calibration
     from kf_calib.online.running_filter import Running
     from kf_calib.online.sequential_test import Watch
     from kf_calib.online.session import Session
@@ -51,6 +57,11 @@ _HOMES = {
     "Settings": ("estimation.settings", "Settings"),
     "calibrate": ("estimation.calibration", "calibrate"),
     "compare": ("estimation.engine_comparison", "compare"),
+    "Corrected": ("estimation.correction", "Corrected"),
+    "Correction": ("estimation.correction", "Correction"),
+    "SavedCalibration": ("exchange.calibration_file", "SavedCalibration"),
+    "open_calibration": ("exchange.calibration_file", "read"),
+    "save_calibration": ("exchange.calibration_file", "save_calibration"),
     "Diagnosis": ("diagnosis.results", "Diagnosis"),
     "diagnose": ("diagnosis.missing_effect", "diagnose"),
     "Improvement": ("diagnosis.stepwise_selection", "Improvement"),
@@ -72,9 +83,10 @@ _SHOWING = ("views.notebook",)
 """What prints the results of these, and shows them in notebooks."""
 
 __all__ = [
-    "Bench", "Calibration", "Diagnosis", "Improvement", "InputError", "KfCalibError", "Parameter", "Recorder",
-    "Refits", "Running", "Session", "Settings", "UnobservableError", "Watch", "calibrate", "compare", "diagnose",
-    "improve", "open_recording", "plot", "save_view", "shown_in",
+    "Bench", "Calibration", "Corrected", "Correction", "Diagnosis", "Improvement", "InputError", "KfCalibError",
+    "Parameter", "Recorder", "Refits", "Running", "SavedCalibration", "Session", "Settings", "UnobservableError",
+    "Watch", "calibrate", "compare", "diagnose", "improve", "open_calibration", "open_recording", "plot",
+    "save_calibration", "save_view", "shown_in",
 ]  # fmt: skip
 
 

@@ -140,9 +140,10 @@ def _said(command: str) -> str:
 
     Not where it loads effects: they would stay in the catalogue of all tests that follow.
     """
+    command, _, given = command.partition(" < ")
     program, *words = shlex.split(command)
     if program == "kf-calib" and "--effects-from" not in words:
-        ours = CliRunner().invoke(cli, words)
+        ours = CliRunner().invoke(cli, words, input=Path(given.strip()).read_bytes() if given else None)
         assert ours.exit_code == 0, f"{command}: {ours.output} {ours.exception}"
         return _words(ours.stdout)
     start = {"kf-calib": [sys.executable, "-m", "kf_calib.cli"], "python": [sys.executable]}.get(program, [program])

@@ -236,6 +236,7 @@ def diagnose(ctx: click.Context, recording: Path, overwrite: bool, strict: bool,
               help="First take the steps of this journal again.")  # fmt: skip
 @recording_options
 @filter_options
+@save_option
 @output_option("--save-model", "--out-model", metavar="FILE.toml", help="Save the last model here.", panel=OUTPUT)
 @output_option("--journal", "journal_file", metavar="FILE", help="Keep a journal of the steps here.", panel=OUTPUT)
 @picture_options
@@ -252,6 +253,7 @@ def improve(
     unattended: bool,
     accept_first: bool,
     honest: bool,
+    save: Path | None,
     save_model: Path | None,
     journal_file: Path | None,
     from_journal: Path | None,
@@ -305,6 +307,7 @@ def improve(
             print_json(views.improvement_object(state, checked, difference, files))
         else:
             show(views.improvement_report(state, checked, difference))
+        deliver.calibration(save, state.result, source)
         deliver.model(save_model, state.result)
         deliver.file(journal_file, lambda path: selection_journal.write(path, state, origin))
         pictures.save(deliver, lambda path: save_view(state, path), figures_of(state))
@@ -339,11 +342,11 @@ def _for_journal(options: Mapping[str, Any], effects: Sequence[str]) -> dict[str
     """Options and programs of an ``Origin``: all that numbers depend on; files of bench keys and of models by what they
     say."""
     from kf_calib.effects import loaded
-    from kf_calib.estimation import model_file
+    from kf_calib.exchange import models
 
     files = [*options["effects_from"]]
     if options["model_file"] is not None:
-        files += model_file.read(options["model_file"]).allowed(options["effects_from"], options["trust"]).files
+        files += models.read(options["model_file"]).allowed(options["effects_from"], options["trust"]).files
     others = (*_BY_CONTENT, *_LEAVE)
     kept = {key: value for key, value in options.items() if value is not None and key not in others}
     return {"options": kept | overrides(options) | {"effects": list(effects)}, "programs": tuple(loaded(files))}

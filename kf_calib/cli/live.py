@@ -33,6 +33,7 @@ from kf_calib.cli.options import (
     rendered,
     rrd_option,
     save_model_option,
+    save_option,
     save_view,
     settings_of,
     strict_option,
@@ -111,6 +112,7 @@ _REFRESH_S = 0.25
 @filter_options
 @overwrite_option
 @rrd_option
+@save_option
 @save_model_option
 @strict_option
 @units_option
@@ -131,6 +133,7 @@ def live(
     rerun_port: int,
     rerun_bind: str,
     rrd: Path | None,
+    save: Path | None,
     save_model: Path | None,
     strict: bool,
     as_json: bool,
@@ -142,7 +145,6 @@ def live(
     Ctrl-C ends the run: the recording is finished and the summary printed.
     """
     from kf_calib.bench.targets import targets_of
-    from kf_calib.estimation import model_file
     from kf_calib.sources.live import files_of, open_live
 
     outputs = claimed(files_of(source), overwrite=overwrite)
@@ -169,7 +171,8 @@ def live(
                 if rrd and view is not None and view.began:
                     outputs.own(rrd)
                 with delivery(outputs, as_json or run.print.lost > 0) as deliver:
-                    deliver.file(save_model, lambda path: model_file.write(path, final.result))
+                    deliver.calibration(save, final.result, run.recording() or opened)
+                    deliver.model(save_model, final.result)
                     deliver.file(rrd, lambda path: save_view(final.result, path))  # by the noise of the whole run
     if run.troubles:
         ctx.exit(2)
@@ -199,7 +202,8 @@ class _Run:
         self.error: BaseException | None = None
         self.listeners: list[Callable[[Judgement], None]] = [self._keep]
         self.judgements = queue.Queue["Judgement"](256)
-        work = self._work, settings, wanted, auto, record, every
+        self._record = record
+        work = self._work, settings, wanted, auto, every
         self._thread = threading.Thread(target=copy_context().run, args=work, daemon=True)  # in the units chosen
 
     def start(self) -> None:
@@ -247,18 +251,17 @@ class _Run:
         except InputError as error:
             self.session.say(str(error))
 
-    def _work(
-        self, settings: Settings, wanted: Mapping[str, float], auto: bool, record: Path | None, every: bool
-    ) -> None:
+    def recording(self) -> Source | None:
+        """What was recorded of the run; None where nothing was, or not all."""
+        from kf_calib.sources.files.recording import Recording
+
+        return Recording(self._record) if self._record and not self.source.status.recording_trouble else None
+
+    def _work(self, settings: Settings, wanted: Mapping[str, float], auto: bool, every: bool) -> None:
         from kf_calib.online.session import Session
 
-        def again() -> Source | None:
-            from kf_calib.sources.files.recording import Recording
-
-            return Recording(record) if record and not self.source.status.recording_trouble else None
-
         try:
-            self.session = Session(self.source, settings, wanted, every=every, auto=auto, again=again)
+            self.session = Session(self.source, settings, wanted, every=every, auto=auto, again=self.recording)
             self.session.listeners += self.listeners
             self.final = self.session.run()
         except BaseException as error:  # for the main thread to tell

@@ -114,7 +114,7 @@ effects_from_option = click.option(
 )  # fmt: skip
 trust_option = click.option(
     "--trust", is_flag=True, panel=MODEL,
-    help="Run the Python files that a model file or a journal names: they can do all that you can.",
+    help="Run the Python files that a model, a calibration or a journal names: they can do all that you can.",
 )  # fmt: skip
 
 
@@ -145,8 +145,9 @@ def filter_options(command: F) -> F:
                      "for example 'mine = fx*fy*T'; repeatable."),
         effects_from_option,
         trust_option,
-        click.option("--model", "model_file", type=click.Path(path_type=Path), metavar="FILE.toml", panel=MODEL,
-                     help="A model file (replay --save-model); its effects come before those of --with."),
+        click.option("--model", "model_file", type=click.Path(path_type=Path), metavar="FILE", panel=MODEL,
+                     help="A model file (--save-model) or a calibration (--save); its effects come before those of "
+                     "--with."),
         dwell_options,
         click.option("--prior", type=click.Choice(["diffuse", "navigation", "mems"]), default="diffuse",
                      show_default=True, help="What is believed of the sensors before the run.", panel=MODEL),
@@ -272,9 +273,9 @@ def effects_of(options: Mapping[str, Any]) -> tuple[str, ...]:
 
     model = None
     if options["model_file"] is not None:
-        from kf_calib.estimation import model_file
+        from kf_calib.exchange import models
 
-        model = model_file.read(options["model_file"])
+        model = models.read(options["model_file"])
     for path in options["effects_from"]:
         load_file(path)
     for text in options["effects"]:

@@ -31,7 +31,7 @@ class Pictures:
     @classmethod
     def taken_from(cls, options: dict[str, Any]) -> Pictures:
         """The pictures among a command's options, which have them no longer."""
-        return cls(**{each.name: options.pop(each.name) for each in fields(cls)})
+        return cls(**{each.name: options.pop(each.name, None) for each in fields(cls)})
 
     def save(self, deliver: Delivery, view: Callable[[Path], object], figures: Callable[[], Figures]) -> None:
         """Save what was asked for. view: writes an .rrd file; figures: those of the result, made when they are needed.
@@ -40,6 +40,10 @@ class Pictures:
         """
         deliver.file(self.rrd, view)
         self._screenshot(deliver, view)
+        self.save_figures(deliver, figures)
+
+    def save_figures(self, deliver: Delivery, figures: Callable[[], Figures]) -> None:
+        """Save the figures that were asked for."""
         for kind, path in (("png", self.png), ("svg", self.svg), ("pdf", self.pdf)):
             deliver.file(path, lambda path, kind=kind: _save(figures, path, kind))
 
@@ -71,14 +75,16 @@ def _save(figures: Callable[[], Figures], path: Path, kind: str) -> None:
 
 def picture_options(command: F) -> F:
     """``--rrd``, ``--screenshot``, and ``--png``, ``--svg``, ``--pdf`` for figures."""
-    options = [rrd_option]
-    for kind, what in (("png", "main figure"), ("svg", "main figure"), ("pdf", "figures, one a page,")):
-        text = f"Save the {what} here, drawn by matplotlib."
-        options.append(output_option(f"--{kind}", metavar=f"FILE.{kind}", help=text, panel=OUTPUT))
     text = "Save a screenshot of the Rerun view here; needs a graphics driver."
-    options.append(output_option("--screenshot", metavar="FILE.png", help=text, panel=OUTPUT))
-    for option in reversed(options):
-        command = option(command)
+    screenshot = output_option("--screenshot", metavar="FILE.png", help=text, panel=OUTPUT)
+    return rrd_option(figure_options(screenshot(command)))
+
+
+def figure_options(command: F) -> F:
+    """``--png``, ``--svg``, ``--pdf`` for figures."""
+    for kind, what in (("pdf", "figures, one a page,"), ("svg", "main figure"), ("png", "main figure")):
+        text = f"Save the {what} here, drawn by matplotlib."
+        command = output_option(f"--{kind}", metavar=f"FILE.{kind}", help=text, panel=OUTPUT)(command)
     return command
 
 

@@ -139,6 +139,10 @@ class Effect(ABC):
     def columns(self, s: Stimulus) -> Floats:
         """What each accelerometer reads more per unit of each coefficient: (m, 3, q), m/s^2."""
 
+    def added(self, s: Stimulus, coefficients: Floats) -> Floats:
+        """What each accelerometer reads more with these ``coefficients`` (q,): (m, 3), m/s^2."""
+        return self.columns(s) @ coefficients
+
     @property
     def parameters(self) -> tuple[Coefficient, ...]:
         """The parameters that state its size: its coefficients, or the intensity of a random walk."""
@@ -229,6 +233,9 @@ class SensorEffect(Effect):
         out = np.zeros((len(s), 3, 3))
         out[:, range(3), range(3)] = self.terms(s)
         return out
+
+    def added(self, s: Stimulus, coefficients: Floats) -> Floats:
+        return self.terms(s) * coefficients
 
 
 class FrameEffect(Effect):

@@ -8,6 +8,7 @@ import numpy as np
 
 from kf_calib.bench.bench import Bench
 from kf_calib.effects.effect import Effect, FrameEffect
+from kf_calib.effects.frame import GravityError
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C, Stimulus
 
 _TRIALS = 64
@@ -47,13 +48,12 @@ def beyond_force_and_temperature(effect: Effect, bench: Bench) -> str:
     """
     if isinstance(effect, FrameEffect):
         return "it is an error of the platform, not of the accelerometers"
+    if isinstance(effect, GravityError):
+        return "it is an error of the stated gravity, not of the accelerometers"
     if effect.walks:
         return "it depends on the course of time"
     rng = np.random.default_rng(1)
-    direction = rng.normal(size=(_TRIALS, 3))
-    force = bench.gravity_mps2 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    temperature = REFERENCE_TEMPERATURE_C + rng.uniform(-20.0, 20.0, _TRIALS)
-    still = replace(stimulus_of(force, temperature, bench, np.eye(3)), elapsed_s=np.linspace(0.0, 600.0, _TRIALS))
+    still = _spread(bench, rng)
     before = effect.columns(still)
     for name, words in _WORDS.items():
         own = getattr(still, name)
@@ -63,3 +63,18 @@ def beyond_force_and_temperature(effect: Effect, bench: Bench) -> str:
     if effect.oscillates:
         return "it depends on the course of time"
     return ""
+
+
+def depends_on_temperature(effect: Effect, bench: Bench) -> bool:
+    """Whether the columns of an effect change with the temperature."""
+    spread = _spread(bench, np.random.default_rng(1))
+    constant = replace(spread, temperature_c=np.full(_TRIALS, REFERENCE_TEMPERATURE_C))
+    return not np.array_equal(effect.columns(spread), effect.columns(constant))
+
+
+def _spread(bench: Bench, rng: np.random.Generator) -> Stimulus:
+    """Return instants at rest in directions and temperatures drawn at random, ten minutes altogether."""
+    direction = rng.normal(size=(_TRIALS, 3))
+    force = bench.gravity_mps2 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    temperature = REFERENCE_TEMPERATURE_C + rng.uniform(-20.0, 20.0, _TRIALS)
+    return replace(stimulus_of(force, temperature, bench, np.eye(3)), elapsed_s=np.linspace(0.0, 600.0, _TRIALS))

@@ -13,8 +13,9 @@ wherever they are; they are left out and named.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,14 +24,31 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.effects import Effect
-from kf_calib.effects.inputs import beyond_force_and_temperature, stimulus_of
-from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
+from kf_calib.effects.inputs import beyond_force_and_temperature, depends_on_temperature, stimulus_of
+from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C, Stimulus
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 
-_BLOCK = 1 << 14  # readings at a time: what is at work stays in the cache
+_BLOCK = 1 << 12  # readings at a time: what is at work stays in the cache
 _MOST_ROUNDS = 20
 _CONVERGED = 1e-13  # of gravity
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """Corrected readings, and how far they may be wrong.
+
+    - force_mps2 (n, 3): specific force in the frame of the block; NaN where a reading is not finite, or none of any
+      specific force.
+    - sigma_mps2 (n, 3): by the calibration alone; it is common to all readings, so a mean has it, too.
+    - noise_mps2 (3,): of a single reading on the bench, in the same frame; a mean of many readings has less.
+    - left_out: effects of the model that are not corrected, and why.
+    """
+
+    force_mps2: Floats
+    sigma_mps2: Floats
+    noise_mps2: Floats
+    left_out: Mapping[str, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +92,7 @@ class Correction:
     @cached_property
     def needs_temperature(self) -> tuple[str, ...]:
         """Names of the corrected effects that depend on temperature."""
-        force = self.bench.gravity_mps2 * np.eye(3)
-        cold, warm = (
-            stimulus_of(force, np.full(3, REFERENCE_TEMPERATURE_C + change), self.bench, self.sensitivity)
-            for change in (0.0, 10.0)
-        )
-        return tuple(str(e) for e in self.effects if not np.array_equal(e.columns(cold), e.columns(warm)))
+        return tuple(str(each) for each in self.effects if depends_on_temperature(each, self.bench))
 
     @property
     def sensitivity(self) -> Floats:
@@ -94,9 +107,13 @@ class Correction:
     @cached_property
     def worst_sigma_mps2(self) -> Floats:
         """Sigma (3,) of corrected specific force by the calibration alone, the largest over directions of gravity."""
-        directions = np.vstack([np.eye(3), -np.eye(3)]) * self.bench.gravity_mps2
-        temperature = REFERENCE_TEMPERATURE_C if self.needs_temperature else None
-        return self.sigma_of(directions, temperature).max(axis=0)
+        return self.sigma_of(self.gravities, REFERENCE_TEMPERATURE_C).max(axis=0)
+
+    @property
+    def gravities(self) -> Floats:
+        """Specific force (26, 3) of the block at rest: on its faces, edges and corners."""
+        directions = np.array([each for each in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(each)])
+        return self.bench.gravity_mps2 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
     @cached_property
     def matrix(self) -> Floats:
@@ -108,9 +125,11 @@ class Correction:
 
         Raises InputError if an effect needs the temperature and there is none.
         """
-        readings = np.atleast_2d(np.asarray(readings_mps2, float))
+        readings = _numbers("readings", readings_mps2)
+        if readings.shape == (3,):
+            readings = readings[None]
         if readings.ndim != 2 or readings.shape[1] != 3:
-            raise InputError(f"readings have the shape {np.shape(readings_mps2)}: give (n, 3), in m/s^2.")
+            raise InputError(f"readings have the shape {readings.shape}: give (n, 3), in m/s^2.")
         temperature = self._temperature(temperature_c, len(readings))
         out = np.empty_like(readings)
         for first in range(0, len(readings), _BLOCK):
@@ -120,68 +139,120 @@ class Correction:
 
     def _temperature(self, temperature_c: Floats | float | None, count: int) -> Floats:
         """Return temperatures (n,); the reference where none is needed."""
-        if temperature_c is None:
-            if self.needs_temperature:
-                raise InputError(
-                    f"{', '.join(self.needs_temperature)} cannot be corrected without the temperature: give one for "
-                    "each reading, degC."
-                )
+        if temperature_c is None and self.needs_temperature:
+            raise InputError(
+                f"{', '.join(self.needs_temperature)} cannot be corrected without the temperature: give one for each "
+                "reading, degC."
+            )
+        if temperature_c is None or not self.needs_temperature:
             return np.full(count, REFERENCE_TEMPERATURE_C)
-        return np.broadcast_to(np.asarray(temperature_c, float), (count,))
+        given = _numbers("temperatures", temperature_c)
+        if given.shape not in ((), (1,), (count,)):
+            raise InputError(f"{count} readings have temperatures of the shape {given.shape}: give ({count},), degC.")
+        return np.broadcast_to(given, (count,))
 
     def _corrected(self, readings: Floats, temperature_c: Floats) -> Floats:
-        """Return the specific force of one block of readings."""
-        force = readings
-        for force in self.rounds(readings, temperature_c):  # noqa: B007  # the last one is wanted
-            pass
-        return force
-
-    def rounds(self, readings: Floats, temperature_c: Floats) -> Iterator[Floats]:
-        """Specific force (n, 3) without effects, then round by round with them, until it changes no more."""
-        force = start = (readings - self.bias_mps2) @ self.matrix.T
-        yield force
-        for _ in range(_MOST_ROUNDS if self.effects else 0):
-            before, force = force, start - self._added(force, temperature_c) @ self.matrix.T
-            yield force
-            with np.errstate(invalid="ignore"):  # readings that are not finite stay so
-                if not np.nanmax(np.abs(force - before), initial=0.0) > _CONVERGED * self.bench.gravity_mps2:
-                    return
-
-    def _added(self, force: Floats, temperature_c: Floats) -> Floats:
-        """Return what the effects add to the readings (n, 3)."""
-        stimulus = stimulus_of(force, temperature_c, self.bench, self.sensitivity)
-        out = np.zeros_like(force)
-        for effect in self.effects:
-            part = self.model.parts[str(effect)]
-            own = self.state[part.start : part.start + len(effect.coefficients)]
-            out += effect.columns(stimulus) @ own
+        """Return the specific force of one block of readings; NaN where there is none that gives such a reading."""
+        start = (readings - self.bias_mps2) @ self.matrix.T
+        if not self.effects:
+            return start
+        good = np.isfinite(start).all(axis=1) & np.isfinite(temperature_c)
+        if good.all():
+            return self._without_effects(start, temperature_c)[0]
+        out = np.full_like(start, np.nan)
+        out[good] = self._without_effects(start[good], temperature_c[good])[0]
         return out
+
+    def rounds(self, readings_mps2: Floats, temperature_c: Floats) -> int:
+        """How many rounds of the iteration these readings (n, 3) need, all of which are finite."""
+        start = (readings_mps2 - self.bias_mps2) @ self.matrix.T
+        return self._without_effects(start, temperature_c)[1] if self.effects else 0
+
+    def _without_effects(self, start: Floats, temperature_c: Floats) -> tuple[Floats, int]:
+        """Return f = start - S^-1 e(f, T), by iteration from ``start``, NaN where it does not converge; and how many
+        rounds it took.
+
+        A step is as much smaller than the one before as the error that it leaves is smaller than itself.
+        """
+        tolerance, inverse = _CONVERGED * self.bench.gravity_mps2, self.matrix.T
+        at_rest = stimulus_of(start, temperature_c, self.bench, self.sensitivity)
+        force, change, size = start, np.full_like(start, np.inf), np.abs(start).max(initial=tolerance)
+        with np.errstate(over="ignore", invalid="ignore"):  # where it diverges
+            for number in range(_MOST_ROUNDS):
+                stimulus = replace(at_rest, force_mps2=force, previous_force_mps2=force)
+                now = start - self._added(stimulus) @ inverse
+                change = np.abs(now - force)
+                step = change.max(initial=0.0)
+                if step * min(step / size, 1.0) <= tolerance:
+                    return now, number + 1
+                force, size = now, step
+            force[~(change <= tolerance).all(axis=1)] = np.nan
+        return force, _MOST_ROUNDS
+
+    def _added(self, stimulus: Stimulus) -> Floats:
+        """Return what the effects add to the readings (n, 3)."""
+        out = np.zeros_like(stimulus.force_mps2)
+        for effect in self.effects:
+            part = self._part(effect)
+            out += effect.added(stimulus, self.state[part.start : part.start + len(effect.coefficients)])
+        return out
+
+    def corrected(self, readings_mps2: Floats, temperature_c: Floats | float | None = None) -> Corrected:
+        """As ``__call__``, with the uncertainty of each corrected reading."""
+        force = self(readings_mps2, temperature_c)
+        noise = self.matrix @ np.diag(self.noise_mps2**2) @ self.matrix.T
+        return Corrected(force, self.sigma_of(force, temperature_c), np.sqrt(np.diag(noise)), self.left_out)
 
     def predicted(self, force_mps2: Floats, temperature_c: Floats | float | None = None) -> Floats:
         """Readings (n, 3) of this specific force (n, 3): what ``__call__`` inverts."""
         temperature = self._temperature(temperature_c, len(force_mps2))
-        return force_mps2 @ self.sensitivity.T + self.bias_mps2 + self._added(force_mps2, temperature)
+        stimulus = stimulus_of(force_mps2, temperature, self.bench, self.sensitivity)
+        return force_mps2 @ self.sensitivity.T + self.bias_mps2 + self._added(stimulus)
 
     def covariance_of(
         self, force_mps2: Floats, temperature_c: Floats | float | None = None, noise: bool = False
     ) -> Floats:
         """Covariance (n, 3, 3) of corrected specific force (n, 3), m^2/s^4, by the uncertainty of the calibration.
 
-        noise: with that of a single reading.
+        noise: with that of a single reading. NaN where specific force or temperature is not finite.
         """
-        temperature = self._temperature(temperature_c, len(force_mps2))
-        stimulus = stimulus_of(np.asarray(force_mps2, float), temperature, self.bench, self.sensitivity)
-        design = Model(self.bench, self.effects).columns(stimulus, self.state)
-        kept = [*range(STATE_COUNT), *(p for e in self.effects for p in range(*self._part(e).indices(len(self.state))))]
-        covariance = self.covariance[np.ix_(kept, kept)]
-        design = self.matrix @ design
-        out = np.einsum("nip,pq,njq->nij", design, covariance, design, optimize=True)
+        force = np.atleast_2d(np.asarray(force_mps2, float))
+        temperature = self._temperature(temperature_c, len(force))
+        out = np.full((len(force), 3, 3), np.nan)
+        good = np.flatnonzero(np.isfinite(force).all(axis=1) & np.isfinite(temperature))
+        for first in range(0, len(good), _BLOCK):
+            part = good[first : first + _BLOCK]
+            design = self.matrix @ self._design(force[part], temperature[part])
+            out[part] = design @ self._covariance @ np.swapaxes(design, 1, 2)
         return out + self.matrix @ np.diag(self.noise_mps2**2) @ self.matrix.T if noise else out
+
+    def _design(self, force: Floats, temperature_c: Floats) -> Floats:
+        """Return what a reading changes by the states that are corrected, (n, 3, p)."""
+        stimulus = stimulus_of(force, temperature_c, self.bench, self.sensitivity)
+        return Model(self.bench, self.effects).columns(stimulus, self.state[self._kept])
+
+    @cached_property
+    def _kept(self) -> list[int]:
+        """Which states are corrected."""
+        own = (range(*self._part(effect).indices(len(self.state))) for effect in self.effects)
+        return [*range(STATE_COUNT), *itertools.chain(*own)]
+
+    @cached_property
+    def _covariance(self) -> Floats:
+        """Their covariance."""
+        return self.covariance[np.ix_(self._kept, self._kept)]
 
     def _part(self, effect: Effect) -> slice:
         return self.model.parts[str(effect)]
 
     def sigma_of(self, force_mps2: Floats, temperature_c: Floats | float | None = None, noise: bool = False) -> Floats:
         """Sigma (n, 3) of each component of corrected specific force (n, 3), m/s^2; as ``covariance_of``."""
-        covariance = self.covariance_of(np.atleast_2d(force_mps2), temperature_c, noise)
-        return np.sqrt(np.einsum("nii->ni", covariance))
+        return np.sqrt(np.einsum("nii->ni", self.covariance_of(force_mps2, temperature_c, noise)))
+
+
+def _numbers(what: str, values: object) -> Floats:
+    """Return values as an array of numbers."""
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} are no array of numbers: give one.") from None

@@ -16,6 +16,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import square_root_information
+from kf_calib.estimation.correction import Corrected, Correction
 from kf_calib.estimation.cross_validation import HeldOut, held_out
 from kf_calib.estimation.dwell_columns import Carried, columns_of, means_of
 from kf_calib.estimation.fit import Fit
@@ -305,6 +306,27 @@ class Calibration:
     def residuals_mps2(self) -> Floats:
         """Residuals (D, 3): mean readings of the dwells less their prediction by the final estimate."""
         return np.array([visit.residual_mps2 for visit in self.visits])
+
+    @cached_property
+    def correction(self) -> Correction:
+        """What turns readings into specific force; raises UnobservableError if the run did not determine all of it."""
+        return Correction(
+            self.bench, self.model, self.estimate.state, self.estimate.covariance, self.noise.sigma_mps2,
+            self.undetermined,
+        )  # fmt: skip
+
+    def apply(self, readings_mps2: Floats, temperature_c: Floats | float | None = None) -> Corrected:
+        """Specific force from readings (n, 3) of the block, m/s^2, with its uncertainty.
+
+        temperature_c: of each reading (n,), or of all; needed where an effect of the model depends on it.
+        """
+        return self.correction.corrected(readings_mps2, temperature_c)
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Symbols of the twelve parameters and of the coefficients of effects that the run does not determine."""
+        states = {*paper_parameters.SYMBOLS, *(each.symbol for each in self.model.coefficients)}
+        return tuple(p.symbol for p in self.parameters.values() if p.symbol in states and p.sigma is None)
 
     def considering(self, state: Floats, covariance: Floats) -> Estimate:
         """The estimate from another engine's state and covariance, with the considered parameters added to the

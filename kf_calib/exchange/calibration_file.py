@@ -19,136 +19,49 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError, model_validator
+from pydantic import ValidationError, model_validator
 
 from kf_calib import effects
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Source
-from kf_calib.effects.programs import Program, allowed
+from kf_calib.effects.programs import Program
 from kf_calib.errors import BenchError, InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
+from kf_calib.estimation.model_file import ModelFile
 from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.results import Calibration
+from kf_calib.exchange.calibration_parts import (
+    Part,
+    SavedConditions,
+    SavedConsistency,
+    SavedDwell,
+    SavedEffect,
+    SavedNoise,
+    SavedParameter,
+    SavedProgram,
+    SavedProvenance,
+    SavedState,
+    Text,
+)
 from kf_calib.sources.files.bags import files_of
+from kf_calib.sources.files.recording import Recording
 from kf_calib.support.output_files import write_whole
-from kf_calib.support.plain_text import COMMANDS, LONGEST, cut
+from kf_calib.support.plain_text import cut
 
 FORMAT, VERSION = "kf_calib.calibration", 1
 _LARGEST_BYTES = 50_000_000
+_LARGEST_VARIANCE = 1e60  # far beyond any, and products of a few are numbers still
 AFFINE = tuple(f"{name}{i}" for i in (1, 2, 3) for name in ("sx", "sy", "sz", "b"))
 """Symbols of the affine state: reading i = sx_i f_x + sy_i f_y + sz_i f_z + b_i."""
 
-Text = Annotated[str, StringConstraints(max_length=LONGEST, pattern=rf"\A[^{COMMANDS}]*\z")]
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-Three = Annotated[list[Positive], Field(min_length=3, max_length=3)]
-Sha256 = Annotated[str, StringConstraints(pattern=r"\A[0-9a-f]{64}\z")]
 
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-
-class SavedParameter(_Part):
-    """One of the twelve parameters, or a coefficient or constant of an effect; null where it was not determined."""
-
-    symbol: Text
-    value: Number | None
-    sigma: Positive | None
-    unit: Text
-    nominal: Number
-
-
-class SavedState(_Part):
-    """The state of the filter: affine, then the effects' coefficients; of a constant, ln(constant / its value).
-
-    undetermined: symbols of the parameters and coefficients that the run did not determine.
-    """
-
-    symbols: list[Text]
-    values: list[Number]
-    covariance: list[list[Number]]
-    undetermined: list[Text]
-
-
-class SavedProgram(_Part):
-    """A Python file that defines effects."""
-
-    path: Text
-    sha256: Sha256
-
-
-class SavedEffect(_Part):
-    """An effect of the model: as ``--with`` takes it, with its constant where it has one."""
-
-    text: Text
-    constant: Number | None = None
-
-
-class SavedNoise(_Part):
-    """The noise model, 1 sigma."""
-
-    sigma_mps2: Three
-    inflation: Three
-    dwell_sigma_mps2: Three
-    dwell_sigma_stated: bool
-    angle_sigma_deg: Positive
-    angle_sigma_stated: bool
-    walk_mps2_per_sqrt_s: Positive
-
-
-class SavedConsistency(_Part):
-    """Whether model and measurements agree; null where nothing was left over to judge by."""
-
-    consistent: bool | None
-    p_value: Number | None
-    nis_per_dof: Number | None
-    dof: int
-    residual_rms_mps2: Positive
-    held_out_rms_mps2: Positive | None
-    held_out_floor_mps2: Positive | None
-
-
-class SavedDwell(_Part):
-    """One orientation: gimbal angles (null: attitude recorded), begin, end, readings used."""
-
-    gimbal_deg: list[Number] | None
-    start_s: Number
-    end_s: Number
-    readings: int
-
-
-class SavedConditions(_Part):
-    """Under which conditions it holds: when, how warm, which orientations. began: null where stamps are no dates."""
-
-    began: Text | None
-    duration_s: Positive
-    temperature_min_c: Number | None
-    temperature_mean_c: Number | None
-    temperature_max_c: Number | None
-    dwells: list[SavedDwell]
-
-
-class SavedProvenance(_Part):
-    """Where it comes from."""
-
-    recording: Text
-    sha256: Sha256 | None
-    bench: dict[Text, Text]
-    settings: dict[Text, Text]
-    programs: list[SavedProgram]
-    versions: dict[Text, Text]
-    created: Text
-    warnings: list[Text]
-
-
-class SavedCalibration(_Part):
+class SavedCalibration(Part):
     """The content of a calibration file.
 
     not_seen: effects of the catalogue that the orientations could not show, and which may thus be present.
@@ -167,14 +80,23 @@ class SavedCalibration(_Part):
 
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> SavedCalibration:
+        with np.errstate(all="ignore"):  # absurd numbers are refused, not computed
+            self._refuse_disagreement()
+        return self
+
+    def _refuse_disagreement(self) -> None:
+        """Raise ValueError if parts of the content contradict each other."""
         state, count = self.state, len(self.state.symbols)
         if tuple(state.symbols[:STATE_COUNT]) != AFFINE or len(state.values) != count:
             raise ValueError("state has other symbols than its values need")
         covariance = np.array(state.covariance) if all(len(row) == count for row in state.covariance) else np.zeros(0)
         if covariance.shape != (count, count) or not np.allclose(covariance, covariance.T, rtol=1e-9, atol=0.0):
             raise ValueError(f"state.covariance is no symmetric matrix of {count} rows")
+        if np.abs(covariance).max() > _LARGEST_VARIANCE:
+            raise ValueError("state.covariance has numbers that no calibration has")
         scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        if np.linalg.eigvalsh(covariance / np.outer(scale, scale)).min() < -1e-6:
+        relative = covariance / scale / scale[:, None]
+        if not np.isfinite(relative).all() or np.linalg.eigvalsh(relative).min() < -1e-6:
             raise ValueError("state.covariance is no covariance: it has a negative variance")
         twelve = [(each.symbol, each.unit) for each in self.parameters[:STATE_COUNT]]
         if twelve != list(zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True)):
@@ -182,8 +104,7 @@ class SavedCalibration(_Part):
         found = paper_parameters.parameters_of(np.array(state.values[:STATE_COUNT]))
         for own, value in zip(self.parameters, found, strict=False):
             if own.value is not None and not math.isclose(own.value, value, rel_tol=1e-9, abs_tol=1e-12):
-                raise ValueError(f"parameters say {own.symbol} = {own.value!r}, but its state says {value!r}")
-        return self
+                raise ValueError(f"parameters say {own.symbol} = {own.value!r}, but its state says {float(value)!r}")
 
     @property
     def bench(self) -> Bench:
@@ -198,26 +119,36 @@ class SavedCalibration(_Part):
         covariance = np.array(self.state.covariance)[:STATE_COUNT, :STATE_COUNT]
         return paper_parameters.parameters_of(state), jacobian @ covariance @ jacobian.T
 
-    def model(self, origin: Path | None = None, named: Sequence[Path] = (), trust: bool = False) -> Model:
+    def model_file(self, origin: Path | None = None) -> ModelFile:
+        """Its effects as a model file at ``origin`` has them."""
+        origin = origin or Path(FORMAT)
+        programs = tuple(Program(origin.parent / each.path, each.sha256) for each in self.provenance.programs)
+        return ModelFile(origin, tuple(each.text for each in self.effects), programs)
+
+    def model(
+        self, origin: Path | None = None, named: Sequence[str | Path] = (), trust: bool = False,
+        bench: Bench | None = None,
+    ) -> Model:  # fmt: skip
         """The fitted model, with the constants of its effects.
 
         origin: where the file lies, from which paths of programs count. named, trust: Python files that may be run, as
-        of a model file. Raises InputError if a program may not be run, or an effect is not known.
+        of a model file. bench: another one to use it on. Raises InputError if a program may not be run, or an effect is
+        not known.
         """
-        origin = origin or Path(FORMAT)
-        programs = [Program(origin.parent / each.path, each.sha256) for each in self.provenance.programs]
-        for file in allowed(origin, programs, named, trust).files:
-            effects.load_file(file)
-        model = Model(self.bench)
+        origin, bench = origin or Path(FORMAT), bench or self.bench
+        self.model_file(origin).load(named, trust)
+        model = Model(bench)
         for own in self.effects:
-            effect = effects.effect_named(own.text, self.bench)
+            effect = effects.effect_named(own.text, bench)
             model += effect if own.constant is None else effect.at(own.constant)
         if model.count != len(self.state.symbols):
             raise InputError(f"{origin}: its effects have {model.count - STATE_COUNT} coefficients, its state has "
                              f"{len(self.state.symbols) - STATE_COUNT}: it was saved by another version.")  # fmt: skip
         return model
 
-    def correction(self, origin: Path | None = None, named: Sequence[Path] = (), trust: bool = False) -> Correction:
+    def correction(
+        self, origin: Path | None = None, named: Sequence[str | Path] = (), trust: bool = False
+    ) -> Correction:
         """What turns readings into specific force by this calibration; arguments as for ``model``."""
         return Correction(
             self.bench, self.model(origin, named, trust), np.array(self.state.values),
@@ -239,7 +170,7 @@ def saved(
             symbols=[*AFFINE, *(c.symbol for c in result.model.coefficients)],
             values=estimate.state.tolist(),
             covariance=estimate.covariance.tolist(),
-            undetermined=[p.symbol for p in result.parameters.values() if p.sigma is None],
+            undetermined=list(result.undetermined),
         ),
         effects=[SavedEffect(text=effects.as_text(each), constant=each.value if each.unknown else None)
                  for each in result.model.effects],
@@ -263,9 +194,23 @@ def saved(
 def of_source(result: Calibration, source: Source) -> SavedCalibration:
     """The calibration of a source: of a recording with its name, checksum and the date of its first sample."""
     path = getattr(source, "path", None)
-    first_ns = next((int(b.accel.time_ns[0]) for b in source if len(b.accel)), None) if path else None
-    name, sha256 = ("", None) if path is None else (path.name, fingerprint(path))
-    return saved(result, name, sha256, first_ns)
+    if path is None:
+        return saved(result)
+    first_ns = next((int(batch.accel.time_ns[0]) for batch in source if len(batch.accel)), None)
+    return saved(result, path.name, fingerprint(path), first_ns)
+
+
+def save_calibration(
+    result: Calibration, path: str | Path, source: Source | str | os.PathLike[str] | None = None
+) -> None:
+    """Save a calibration, for ``open_calibration`` and the commands apply, verify and history.
+
+    source: the recording that it was made from, or its path; its name, checksum and date are saved, too. Raises
+    InputError if the file cannot be written.
+    """
+    if isinstance(source, str | os.PathLike):
+        source = Recording(source, result.bench.to_metadata(), angles=False)
+    write(Path(path), saved(result) if source is None else of_source(result, source))
 
 
 def fingerprint(path: Path) -> str:
@@ -362,7 +307,7 @@ def read(path: str | Path) -> SavedCalibration:
     return _checked(path, content)
 
 
-def _checked(path: Path, content: Any) -> SavedCalibration:
+def _checked(path: Path, content: dict[str, Any]) -> SavedCalibration:
     """Return the content if all of it is as it must be; raise InputError if not."""
     try:
         found = SavedCalibration.model_validate(content)
@@ -378,5 +323,5 @@ def _checked(path: Path, content: Any) -> SavedCalibration:
 
 
 def schema() -> dict[str, Any]:
-    """The JSON Schema of calibration files."""
-    return SavedCalibration.model_json_schema()
+    """The JSON Schema of calibration files, as ``calibration.schema.json`` has it."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | SavedCalibration.model_json_schema()

@@ -7,7 +7,7 @@ covariance (row by row) that of the calibration, largest over all directions of 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,12 +15,14 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Batch, Stream
+from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.sources.files import cdr
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
 from kf_calib.sources.files.mcap_append import TopicAppender, source_file
 from kf_calib.sources.files.recording import Recording
+from kf_calib.support.output_files import whole
 
 FRAME = "block"
 
@@ -38,27 +40,33 @@ class Applied:
 def apply_to_file(
     correction: Correction, recording: Recording, out: Path, on_progress: Callable[[float], None] | None = None
 ) -> Applied:
-    """Write the copy to ``out``. Raises InputError where the recording cannot be read, is not whole, or has no
-    temperature where an effect needs one."""
+    """Write the copy to ``out``, wholly or not at all.
+
+    Raises InputError where the recording cannot be read, is not whole, or has no temperature where an effect needs one.
+    """
     thermometer = _Thermometer(bool(correction.needs_temperature))
     count = bad = 0
     source = source_file(recording.path)
-    with out.open("wb") as file:
-        copied = _half(on_progress, 0.0)
+    with whole(out) as part, part.open("wb") as file:
+        copied, told = _half(on_progress, 0.0), _half(on_progress, 0.5)
         appender = TopicAppender(source, file, CALIBRATED_TOPIC, cdr.IMU, _template(correction), copied)
-        told = _half(on_progress, 0.5)
-        for batch in recording:
-            for readings, temperature_c in thermometer.pairs(batch):
-                values = correction(readings.values, temperature_c)
-                appender.add(Stream(readings.time_ns, values))
-                count, bad = count + len(values), bad + int(np.count_nonzero(~np.isfinite(values).all(axis=1)))
-            if told is not None:
-                told(recording.fraction)
-        for readings, temperature_c in thermometer.rest():
-            appender.add(Stream(readings.time_ns, correction(readings.values, temperature_c)))
-            count += len(readings)
+        for readings, temperature_c in _pairs(recording, thermometer, told):
+            values = correction(readings.values, temperature_c)
+            appender.add(Stream(readings.time_ns, values))
+            count, bad = count + len(values), bad + int(np.count_nonzero(~np.isfinite(values).all(axis=1)))
         appender.finish()
     return Applied(count, bad, thermometer.extremes)
+
+
+def _pairs(
+    recording: Recording, thermometer: _Thermometer, told: Callable[[float], None] | None
+) -> Iterator[tuple[Stream, Floats | None]]:
+    """Yield all readings of a recording with their temperatures."""
+    for batch in recording:
+        yield from thermometer.pairs(batch)
+        if told is not None:
+            told(recording.fraction)
+    yield from thermometer.rest()
 
 
 def _half(told: Callable[[float], None] | None, start: float) -> Callable[[float], None] | None:
@@ -68,9 +76,7 @@ def _half(told: Callable[[float], None] | None, start: float) -> Callable[[float
 
 def _template(correction: Correction) -> bytes:
     """Return a message with the covariance of corrected readings filled in."""
-    directions = correction.bench.gravity_mps2 * np.vstack([np.eye(3), -np.eye(3)])
-    temperature = 25.0 if correction.needs_temperature else None
-    covariances = correction.covariance_of(directions, temperature, noise=True)
+    covariances = correction.covariance_of(correction.gravities, REFERENCE_TEMPERATURE_C, noise=True)
     worst = covariances[np.argmax(np.einsum("nii->n", covariances))]
     message = bytearray(cdr.imu_message(FRAME))
     message[-72:] = struct.pack("<9d", *worst.ravel())  # the last field of the message

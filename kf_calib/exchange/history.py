@@ -40,10 +40,10 @@ class Track:
     """One parameter over the calibrations, in SI and days.
 
     values (n,), sigmas (n,): as found and calibrated. level, level_sigma: what it is at the last calibration, by all of
-    them. drift, drift_sigma: its change per day (None: fewer than three). walk: intensity q of its random walk, per
-    square root of a day, rms over what is likely. repeatability: r, likewise. constant_p:
-    that a constant parameter shows such differences. predicted, predicted_sigma (n,): each calibration as those before
-    it predict it; NaN for the first.
+    them. drift, drift_sigma: its change per day (None: fewer than three); level_drift_covariance: of the two. walk:
+    intensity q of its random walk, per square root of a day, rms over what is likely. repeatability: r, likewise.
+    constant_p: that a constant parameter shows such differences. predicted, predicted_sigma (n,): each calibration as
+    those before it predict it, by the q and r of all; NaN for the first, or the first two where there is a drift.
     """
 
     symbol: str
@@ -56,19 +56,19 @@ class Track:
     level_sigma: float
     drift: float | None
     drift_sigma: float | None
+    level_drift_covariance: float
     walk: float
     repeatability: float
     constant_p: float
 
-    def known_after(self, days: float) -> tuple[float, float]:
-        """Value and sigma of the parameter so many days after the last calibration, used as the last one found it.
+    def known_after(self, days: Floats) -> tuple[Floats, Floats]:
+        """Value and sigma (k,) of the parameter in use, so many days (k,) after the last calibration.
 
-        The sigma is that of the difference from the last value in use: drift that is not corrected, walk,
-        repeatability, and the uncertainty of the calibration itself.
+        The sigma is by level and drift, by the walk since, and by the repeatability: switched on and mounted once more.
         """
         rate, rate_sigma = (self.drift or 0.0), (self.drift_sigma or 0.0)
-        variance = self.level_sigma**2 + self.repeatability**2 + self.walk**2 * days + (rate_sigma * days) ** 2
-        return self.level + rate * days, math.sqrt(variance)
+        known = self.level_sigma**2 + 2.0 * self.level_drift_covariance * days + (rate_sigma * days) ** 2
+        return self.level + rate * days, np.sqrt(known + self.repeatability**2 + self.walk**2 * days)
 
 
 @dataclass(frozen=True)
@@ -148,12 +148,15 @@ def _track(symbol: str, calibrations: Sequence[SavedCalibration], days: Floats) 
     weights = found_by.weights
     walk, repeatability = (math.sqrt(weights @ each**2) for each in (found_by.walks, found_by.repeatabilities))
     state = weights @ found_by.states
-    variances = weights @ (np.einsum("mii->mi", found_by.covariances) + (found_by.states - state) ** 2)
-    predicted, predicted_variance = weights @ found_by.predicted, weights @ found_by.predicted_variances
+    apart = found_by.states - state
+    covariance = np.einsum("m,mij->ij", weights, found_by.covariances + apart[:, :, None] * apart[:, None, :])
+    predicted = weights @ found_by.predicted
+    predicted_variance = weights @ (found_by.predicted_variances + (found_by.predicted - predicted) ** 2)
     return Track(
         symbol, found[0].unit, values, sigmas, predicted, np.sqrt(predicted_variance), float(state[0]),
-        math.sqrt(variances[0]), float(state[1]) if with_drift else None,
-        math.sqrt(variances[1]) if with_drift else None, walk, repeatability, constant_p,
+        math.sqrt(covariance[0, 0]), float(state[1]) if with_drift else None,
+        math.sqrt(covariance[1, 1]) if with_drift else None, float(covariance[0, 1]) * with_drift, walk, repeatability,
+        constant_p,
     )  # fmt: skip
 
 
@@ -229,18 +232,12 @@ def _due(tracks: Sequence[Track], tolerances: Mapping[str, float]) -> tuple[floa
 
 
 def _within(track: Track, tolerance: float) -> float | None:
-    """Return for how many days |change| + 2 sigma of a parameter stays within a tolerance; None beyond twenty years."""
+    """Return for how many days the last calibration's value is within a tolerance of a parameter; None beyond twenty
+    years.
 
-    def reach(days: float) -> float:
-        value, sigma = track.known_after(days)
-        return abs(value - track.level) + _COVERED * sigma
-
-    if reach(0.0) > tolerance:
-        return 0.0
-    if reach(_LONGEST_DAYS) <= tolerance:
-        return None
-    low, high = 0.0, _LONGEST_DAYS
-    for _ in range(60):  # halving: the reach grows with time
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if reach(middle) <= tolerance else (low, middle)
-    return low
+    |what it is then - what was found last| + 2 sigma, seen every day.
+    """
+    days = np.arange(0.0, _LONGEST_DAYS)
+    value, sigma = track.known_after(days)
+    beyond = np.flatnonzero(np.abs(value - track.values[-1]) + _COVERED * sigma > tolerance)
+    return None if not beyond.size else float(max(days[beyond[0]] - 1.0, 0.0))

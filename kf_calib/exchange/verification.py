@@ -12,6 +12,7 @@ or to the platform may differ: their coefficients are free.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -19,13 +20,15 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
-from kf_calib.effects import Coefficient
+from kf_calib.effects import Effect
 from kf_calib.effects.inputs import beyond_force_and_temperature
+from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.calibration import evaluate_fit
+from kf_calib.estimation.correction import Correction
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.fit import Fit, fit
-from kf_calib.estimation.measurement_model import STATE_COUNT, Model
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.noise_model import Noise, mean_covariances
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
@@ -64,7 +67,8 @@ class Verification:
     all parameters that both determine, the clearest first. new: the calibration by the new run alone (None: its
     orientations determine too little). residual_rms_mps2: of the new means less their prediction by the old
     calibration. worst_mps2, worst_sigma_mps2: largest error, over all directions of gravity, of readings corrected by
-    the old calibration, and its sigma (None without ``new``). free: effects whose coefficients were not compared.
+    the old calibration, and its sigma (None where the new run does not determine them). free: effects whose
+    coefficients were not compared.
     warnings: sentences.
     """
 
@@ -108,7 +112,7 @@ def verify(
         new = evaluate_fit(fitted, settings)
         seen = None if new.estimate.unseen.any() else new
         moves = _moves(saved, new, free)
-        worst = (None, None) if seen is None else _worst(saved, seen)
+        worst = (None, None) if seen is None else _worst(saved, model, seen)
     clearest = min((move.p_value for move in moves), default=1.0)
     both = min(1.0, 2.0 * min(p_value, clearest))  # two tests, of which either may say so
     return Verification(
@@ -143,7 +147,7 @@ def _misfit(saved: SavedCalibration, fitted: Fit, noise: Noise, free: Sequence[s
     residuals = means.readings - means.design @ old
     rows = (lower @ means.design).reshape(-1, model.count)
     right = np.einsum("dij,dj->di", lower, residuals).ravel()
-    root = np.linalg.cholesky(covariance)  # x - x1 = root y with y of unit variance
+    root = _root(covariance)  # x - x1 = root y with y of unit variance
     mixed = np.hstack([rows[:, kept] @ root, np.delete(rows, kept, axis=1)])
     prior = np.eye(len(kept), mixed.shape[1])
     stacked, target = np.vstack([mixed, prior]), np.append(right, np.zeros(len(kept)))
@@ -152,11 +156,16 @@ def _misfit(saved: SavedCalibration, fitted: Fit, noise: Noise, free: Sequence[s
     return float(left @ left), float(np.sqrt(np.mean(residuals**2)))
 
 
+def _root(covariance: Floats) -> Floats:
+    """Return L with L L^T = covariance, of which parts may be known exactly; scaled, as units differ."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+
+
 def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tuple[Move, ...]:
     """Return the differences of all that both runs determine, the clearest first."""
-    from math import erfc, sqrt
-
-    skipped = {c.symbol for name in free for c in _effect_symbols(new.model, name)}
+    skipped = {symbol for each in new.model.effects if str(each) in free for symbol in _symbols(each)}
     before = {each.symbol: each for each in saved.parameters}
     found = list[tuple[str, str, float, float, float]]()
     for symbol, now in new.parameters.items():
@@ -166,33 +175,33 @@ def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tu
         found.append((symbol, now.unit, was.value, now.value, float(np.hypot(was.sigma, now.sigma))))  # type: ignore[arg-type]
     moves = [
         Move(symbol, unit, old, value, value - old, sigma,
-             sidak(erfc(abs(value - old) / max(sigma, 1e-300) / sqrt(2.0)), len(found)))
+             sidak(math.erfc(abs(value - old) / max(sigma, 1e-300) / math.sqrt(2.0)), len(found)))
         for symbol, unit, old, value, sigma in found
     ]  # fmt: skip
     return tuple(sorted(moves, key=lambda move: move.p_value))
 
 
-def _effect_symbols(model: Model, name: str) -> list[Coefficient]:
-    """Return the coefficients of an effect, its constant included."""
-    part = model.parts[name]
-    return list(model.coefficients[part.start - STATE_COUNT : part.stop - STATE_COUNT])
+def _symbols(effect: Effect) -> set[str]:
+    """Return the symbols of all parameters of an effect: coefficients, constant, intensity of a walk."""
+    constant = set[str]() if effect.unknown is None else {effect.unknown.symbol}
+    return constant | {each.symbol for each in (*effect.states, *effect.parameters)}
 
 
-def _worst(saved: SavedCalibration, new: Calibration) -> tuple[float, float]:
-    """Return the largest error of old corrections over the directions of gravity, and its sigma, m/s^2."""
-    old, now = (np.array(state)[:STATE_COUNT].reshape(3, 4) for state in (saved.state.values, new.estimate.state))
-    inverse = np.linalg.inv(old[:, :3])
-    force = new.bench.gravity_mps2 * _sphere(_DIRECTIONS)
-    errors = (force @ now[:, :3].T + now[:, 3] - old[:, 3]) @ inverse.T - force
+def _worst(saved: SavedCalibration, model: Model, new: Calibration) -> tuple[float, float] | tuple[None, None]:
+    """Return the largest error of old corrections over the directions of gravity, and its sigma, m/s^2; None where the
+    new run does not determine all that is corrected."""
+    old = Correction(new.bench, model, np.array(saved.state.values), np.array(saved.state.covariance), np.zeros(3))
+    try:
+        now = new.correction
+    except UnobservableError:
+        return None, None
+    force, temperature = new.bench.gravity_mps2 * _sphere(_DIRECTIONS), REFERENCE_TEMPERATURE_C
+    errors = old(now.predicted(force, temperature), temperature) - force
     worst = int(np.argmax(np.linalg.norm(errors, axis=1)))
     size = float(np.linalg.norm(errors[worst]))
-    along = errors[worst] / max(size, 1e-300) @ inverse
-    gain = np.outer(along, np.append(force[worst], 1.0)).ravel()
-    both = (
-        np.array(saved.state.covariance)[:STATE_COUNT, :STATE_COUNT]
-        + new.estimate.covariance[:STATE_COUNT, :STATE_COUNT]
-    )
-    return size, float(np.sqrt(max(gain @ both @ gain, 0.0)))
+    along = errors[worst] / max(size, 1e-300)
+    both = sum(each.covariance_of(force[worst], temperature)[0] for each in (old, now))
+    return size, float(np.sqrt(along @ both @ along))
 
 
 def _sphere(count: int) -> Floats:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.calibrations import BENCH, Formula, correction, samples, saved
+from helpers.stated_sensors import BENCH, Formula, correction, samples, saved
 
 from kf_calib import effects
 from kf_calib.effects.inputs import beyond_force_and_temperature

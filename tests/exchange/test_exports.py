@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.calibrations import Formula, correction, samples, saved
 from helpers.paths import RECORDINGS
+from helpers.stated_sensors import Formula, correction, samples, saved
 
 from kf_calib.bench import paper_parameters
 from kf_calib.cli.export import export as command

@@ -129,7 +129,7 @@ WRITING = [
     ("replay run.mcap", [*PICTURES, "--save", "--save-model"]),
     ("diagnose run.mcap", PICTURES),
     ("compare run.mcap", [*PICTURES, "--report"]),
-    ("improve run.mcap", [*PICTURES, "--save-model", "--journal", "--report"]),
+    ("improve run.mcap", [*PICTURES, "--save", "--save-model", "--journal", "--report"]),
     ("report run.mcap", ["-o", "--certificate"]),
     ("apply cal.json run.mcap", ["-o"]),
     ("export cal.json --to csv", ["-o"]),
@@ -137,7 +137,8 @@ WRITING = [
     ("certificate cal.json -o new.pdf", ["--xml"]),
     ("plan", ["--csv", *PICTURES]),
     ("paper --repetitions 1", PICTURES),
-    ("live sim://?speed=100", ["--record", "--rrd", "--save-model"]),
+    ("live sim://?speed=100", ["--record", "--rrd", "--save-model", "--save"]),
+    ("history cal.json", ["--png", "--svg", "--pdf"]),
     ("record", [""]),
     ("simulate", [""]),
 ]
@@ -150,7 +151,7 @@ def test_every_output_is_among_them_and_can_be_replaced() -> None:
         command = cli.get_command(ctx, name)
         assert command is not None
         asked = [param for param in command.params if isinstance(param.type, OutputFile)]
-        if name in ("effects", "demo", "history", "verify"):
+        if name in ("effects", "demo", "verify"):
             assert not asked
             continue
         listed = [option for words, options in WRITING if words.split()[0] == name for option in options]

@@ -98,9 +98,6 @@ class CHeader(Target):
         for effect in self.correction.effects:
             part = self.correction.model.parts[str(effect)]
             own = self.correction.state[part.start : part.start + len(effect.coefficients)]
-            if str(effect) == "gravity-error":  # one coefficient for all
-                yield f"{number(float(own[0]))} * r[{i}]"
-                continue
             expressions = self._expressions(effect)
             values = own[i * len(expressions) : (i + 1) * len(expressions)]
             for value, expression in zip(values, expressions, strict=True):
@@ -134,7 +131,7 @@ class CHeader(Target):
         grid, correction = self.grid, self.correction
         every = [correction.rounds(correction.predicted(size * grid.force_mps2, grid.temperature_c),
                                    grid.temperature_c) for size in _SIZES]  # fmt: skip
-        return max(sum(1 for _ in rounds) for rounds in every)
+        return max(every) + 1  # between the directions of the grid one more may be needed
 
 
 def _array(matrix: Floats) -> str:

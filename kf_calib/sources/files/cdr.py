@@ -245,12 +245,17 @@ def filled(kind: MessageType, template: bytes, stream: Stream) -> NDArray[np.voi
     layout = kind.layout(template)
     if stream.values.shape != (len(stream), layout.width):
         raise CdrError(f"{kind.name} holds {layout.width} values a sample here, not {stream.values.shape[1:]}")
+    messages = np.frombuffer(bytearray(template * len(stream)), dtype_of(layout))
+    fill(messages, stream)
+    return messages
+
+
+def fill(messages: NDArray[np.void], stream: Stream) -> None:
+    """Put stamps and values, of their number, into messages (n,); raises CdrError where a stamp does not fit."""
     seconds, nanoseconds = np.divmod(stream.time_ns, _NS_PER_S)
     if len(seconds) and not (0 <= seconds.min() and seconds.max() < 2**31):
         raise CdrError("stamps must be nanoseconds between the years 1970 and 2038")
-    messages = np.frombuffer(bytearray(template * len(stream)), dtype_of(layout))
     messages["sec"], messages["nanosec"], messages["values"] = seconds, nanoseconds, stream.values
-    return messages
 
 
 def pack(kind: MessageType, template: bytes, stream: Stream) -> list[bytes]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -51,13 +52,14 @@ class _Columns:
 class CsvLines(LineReader):
     """Reads the rows under one header, block by block.
 
-    ``columns`` renames foreign columns. Poses are gimbal angles (``has_angles``), or the quaternion qx qy qz qw.
+    ``columns`` renames foreign columns. Poses are gimbal angles (``has_angles``), or the quaternion qx qy qz qw;
+    angles: whether there must be any.
     Raises InputError where the header does not say what is needed.
     """
 
     _faults = ((ValueError, "a cell is not a number"), (ArithmeticError, "a cell is not a number"))
 
-    def __init__(self, header: str, columns: Mapping[str, str], account: Account) -> None:
+    def __init__(self, header: str, columns: Mapping[str, str], account: Account, angles: bool = True) -> None:
         super().__init__(account)
         self._delimiter = max(",;\t", key=header.count)
         self._names = [columns.get(name, name.lower()) for name in _cells(header, self._delimiter)]
@@ -68,7 +70,7 @@ class CsvLines(LineReader):
         self._accel = self._accel_columns()
         gimbals = self._gimbal_columns()
         self.has_angles = bool(gimbals.at)
-        self._pose = gimbals if self.has_angles else self._quaternion_columns()
+        self._pose = gimbals if self.has_angles or not angles else self._quaternion_columns()
         self.pose_width = len(self._pose.at)
         self._temperature = self._found([_TEMPERATURE])
         used = {self._time, *self._accel.at, *self._pose.at, *self._temperature.at}
@@ -78,6 +80,17 @@ class CsvLines(LineReader):
     def advice(self) -> str:
         """How columns have to be named."""
         return f"a header such as {_EXAMPLE} is wanted"
+
+    def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
+        is_quoted = '"' in line
+        row = next(csv.reader([line], delimiter=self._delimiter)) if is_quoted else line.split(self._delimiter)
+        for at, factor, value in zip(self._accel.at, self._accel.factors, readings_mps2, strict=True):
+            row[at] = repr(value / factor)
+        if not is_quoted:
+            return self._delimiter.join(row)
+        out = io.StringIO()
+        csv.writer(out, delimiter=self._delimiter, lineterminator="").writerow(row)
+        return out.getvalue()
 
     def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
         is_plain = '"' not in line and " " not in line

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from typing import Any
 
@@ -49,12 +49,23 @@ class JsonLines(LineReader):
     def __init__(self, columns: Mapping[str, str], account: Account) -> None:
         super().__init__(account)
         self._columns = columns
+        keys = [*_ACCEL, *(theirs for theirs, ours in columns.items() if ours in _ACCEL)]
+        self._find_readings = re.compile(rf'("(?:{"|".join(map(re.escape, keys))})"\s*:\s*)\[[^][]*\]')
         self._is_first = True
 
     @property
     def advice(self) -> str:
         """How readings and poses have to be named."""
         return "name the readings accel_mps2 or accel_g, and the poses angles_rad, angles_deg or attitude_xyzw"
+
+    def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
+        entry = json.loads(line)
+        names = {self._columns.get(key, key): key for key in entry}
+        name = next(each for each in _ACCEL if each in names and entry[names[each]] is not None)
+        values = [value / _ACCEL[name] for value in readings_mps2]
+        if len(self._find_readings.findall(line)) == 1:  # in its place, so that all other text stays as it is
+            return self._find_readings.sub(lambda found: found[1] + json.dumps(values), line)
+        return json.dumps(entry | {names[name]: values}, ensure_ascii=False)
 
     def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
         if not line.lstrip().startswith("{"):  # found out at a tenth of the cost, where a link brings much of it

@@ -101,6 +101,10 @@ class LineReader(ABC):
     def advice(self) -> str:
         """How quantities have to be named."""
 
+    @abstractmethod
+    def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
+        """A line that was read and holds readings, with these in their place; all else in it stays as it is."""
+
     def read(self, lines: Sequence[str], first_line: int) -> Batch:
         """The batch of consecutive lines, the first of them of that number."""
         accel, pose, temperature = LineRows(), LineRows(), LineRows()

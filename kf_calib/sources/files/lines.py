@@ -152,9 +152,12 @@ class Cutter:
         return b"\n".join(lines).decode("utf-8", errors="replace").split("\n")
 
 
-def reader_for(first: str, columns: Mapping[str, str], account: Account) -> LineReader:
-    """The reader that the first line asks for. Raises InputError for a header that does not say what is needed."""
-    return JsonLines(columns, account) if first[0] in "{[" else CsvLines(first, columns, account)
+def reader_for(first: str, columns: Mapping[str, str], account: Account, angles: bool = True) -> LineReader:
+    """The reader that the first line asks for; angles: whether a pose is wanted.
+
+    Raises InputError for a header that does not say what is needed.
+    """
+    return JsonLines(columns, account) if first[0] in "{[" else CsvLines(first, columns, account, angles)
 
 
 class _Passage:

@@ -34,7 +34,7 @@ from kf_calib.errors import InputError
 from kf_calib.sources.files import cdr
 from kf_calib.sources.files.mcap_chunks import parse
 from kf_calib.sources.files.mcap_file import McapFile
-from kf_calib.sources.files.mcap_messages import HEAD, MAGIC, MESSAGE_FIELDS
+from kf_calib.sources.files.mcap_messages import HEAD, MAGIC
 
 _PIECE = 1 << 22
 _MESSAGES = 1 << 14  # in a chunk
@@ -62,16 +62,17 @@ class TopicAppender:
             raise InputError(
                 f"{source.trouble} Make a finished copy of it first: kf-calib record {source.path.name} whole.mcap."
             )
-        self._out, self._topic, self._kind = out, topic, kind
-        self._layout, self._template = kind.layout(template), template
+        self._out, self._topic = out, topic
+        self._layout = kind.layout(template)
         self._crc = self._position = 0
         self._groups = dict[int, list[bytes]]({opcode: [] for opcode in _GROUPS})
         self._statistics = Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0)
         self._read_summary(source)
         self._channel = self._new_channel(source, topic, kind)
         self._count, self._waiting = 0, Stream.empty(self._layout.width)
+        self._records = self._blank_records(template)
         self._copy(source, on_progress)
-        self._put_chunk([*self._defined], [])
+        self._put_chunk(b"".join(self._defined), [])
 
     def add(self, stream: Stream) -> None:
         """Add a message for each sample; raises InputError where a stamp does not fit a message."""
@@ -119,9 +120,7 @@ class TopicAppender:
         assert source.summary is not None
         channels, schemas = source.summary.channels, source.summary.schemas
         if any(channel.topic == topic for channel in channels):
-            raise InputError(
-                f"{source.path} has a topic {topic} already: take the one it was made from."
-            )
+            raise InputError(f"{source.path} has a topic {topic} already: take the one it was made from.")
         numbers = {channel.id for channel in channels}, {schema.id for schema in schemas}
         own, schema = (next(k for k in range(1, 1 << 16) if k not in taken) for taken in numbers)
         definition = Schema(id=schema, data=kind.schema.encode(), encoding="ros2msg", name=kind.name)
@@ -152,30 +151,33 @@ class TopicAppender:
                 )
 
     def _put_messages(self, stream: Stream) -> None:
-        """Write one chunk of messages."""
-        size = HEAD.size + MESSAGE_FIELDS + self._layout.size
-        records = np.zeros(len(stream), _record_type(self._layout))
-        records["opcode"], records["length"] = Opcode.MESSAGE, size - HEAD.size
-        records["channel"] = self._channel
-        records["sequence"] = np.arange(self._count, self._count + len(stream))
+        """Write one chunk of messages; ``_records`` is used again for each, as little in it changes."""
+        records, count = self._records[: len(stream)], len(stream)
+        records["sequence"] = np.arange(self._count, self._count + count)
         records["log_time"] = records["publish_time"] = stream.time_ns
-        records["message"] = self._messages(stream).view(f"V{self._layout.size}")
-        index = np.column_stack([stream.time_ns, np.arange(len(stream)) * size]).astype("<u8")
-        self._put_chunk([records.tobytes()], [(self._channel, index)], stream.time_ns)
-        self._count += len(stream)
-
-    def _messages(self, stream: Stream) -> NDArray[np.void]:
-        """Return the message of each sample."""
         try:
-            return cdr.filled(self._kind, self._template, stream)
+            cdr.fill(records["message"], stream)
         except cdr.CdrError as error:
             raise InputError(f"{self._topic} cannot be written: {error}.") from None
+        index = np.column_stack([stream.time_ns, np.arange(count) * records.itemsize]).astype("<u8")
+        self._put_chunk(records.view("u1").data, [(self._channel, index)], stream.time_ns)
+        self._count += count
+
+    def _blank_records(self, template: bytes) -> NDArray[np.void]:
+        """Return as many records of messages as a chunk has, without what differs between them."""
+        kind = _record_type(self._layout)
+        blank = np.zeros(1, kind)
+        blank["opcode"], blank["length"] = Opcode.MESSAGE, kind.itemsize - HEAD.size
+        blank["channel"] = self._channel
+        record = blank.tobytes()[: -len(template)] + template
+        return np.frombuffer(bytearray(record * _MESSAGES), kind)
 
     def _put_chunk(
-        self, parts: list[bytes], indexes: list[tuple[int, NDArray[Any]]], times: NDArray[np.int64] | None = None
-    ) -> None:
+        self, data: bytes | memoryview, indexes: list[tuple[int, NDArray[Any]]],
+        times: NDArray[np.int64] | None = None,
+    ) -> None:  # fmt: skip
         """Write a chunk and the indexes of its messages, and remember it for the summary."""
-        data, start = b"".join(parts), self._position
+        start = self._position
         first, last = (0, 0) if times is None else (int(times.min()), int(times.max()))
         packed = zstandard.ZstdCompressor(level=1).compress(data)
         self._put(_bytes(Chunk("zstd", packed, last, first, zlib.crc32(data), len(data))))
@@ -212,7 +214,7 @@ class TopicAppender:
 def _record_type(layout: cdr.Layout) -> np.dtype[np.void]:
     """Return the structured type of a message record."""
     return np.dtype([("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"),
-                     ("log_time", "<u8"), ("publish_time", "<u8"), ("message", f"V{layout.size}")])  # fmt: skip
+                     ("log_time", "<u8"), ("publish_time", "<u8"), ("message", cdr.dtype_of(layout))])  # fmt: skip
 
 
 def _bytes(record: McapRecord) -> bytes:

@@ -128,9 +128,7 @@ class Recording:
                 temperature = passage.track(topic, decoders.of(TEMPERATURES, topic))
             batch = Batch(
                 _scaled(accel.read(block, messages), self._accel_scale),
-                _scaled(pose.read(block, messages), self._angle_scale)
-                if pose
-                else Stream.empty(self.bench.pose_width),
+                _scaled(pose.read(block, messages), self._angle_scale) if pose else Stream.empty(self.bench.pose_width),
                 temperature.read(block, messages) if temperature else Stream.empty(1),
             )
             yield block.end, batch

@@ -17,6 +17,7 @@ from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.errors import InputError
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.results import Calibration
+from kf_calib.exchange.history import History
 from kf_calib.reproduction.grebenkin2019 import Experiment
 from kf_calib.support.output_files import write_whole
 from kf_calib.views.figures import style
@@ -25,6 +26,7 @@ from kf_calib.views.figures.detection_limits import detection_limits
 from kf_calib.views.figures.directions import directions
 from kf_calib.views.figures.engines import allan_deviation, three_ways, whiteness
 from kf_calib.views.figures.experiment import falling, table2
+from kf_calib.views.figures.history import history
 from kf_calib.views.figures.improvement import improvement, residuals_of_steps
 from kf_calib.views.figures.information import correlations, information
 from kf_calib.views.figures.orientations import plan, predicted_sigmas
@@ -40,7 +42,7 @@ Figures = Mapping[str, Callable[[], Figure]]
 def figures(result: Any) -> Figures:
     """The figures of a result by title, the one that tells most first; nothing is drawn before it is called for."""
     raise TypeError(f"there is no figure of {type(result).__name__}: give the result of calibrate, diagnose, improve, "
-                    "compare or plan.")  # fmt: skip
+                    "compare, plan or history.")  # fmt: skip
 
 
 @figures.register
@@ -98,6 +100,11 @@ def _(found: Experiment) -> Figures:
         "Table 2 of the paper": lambda: table2(found),
         "Sigma as readings come": lambda: falling(found),
     }
+
+
+@figures.register
+def _(found: History) -> Figures:
+    return {"The calibrations over time": lambda: history(found)}
 
 
 def save(what: Figure | Figures, path: str | Path, kind: str = "", width_px: int | None = None) -> Path:

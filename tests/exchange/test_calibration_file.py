@@ -1,0 +1,176 @@
+"""A calibration file holds all of a calibration, and refuses what is none in one sentence."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.calibrations import SENSORS, simulated
+from helpers.paths import ROOT
+
+import kf_calib
+from kf_calib.bench.bench import Bench
+from kf_calib.errors import InputError
+from kf_calib.exchange import calibration_file, models
+from kf_calib.sources.simulation.noise_processes import TrueNoise
+from kf_calib.sources.simulation.simulator import Simulation
+from kf_calib.sources.simulation.visit_plans import Visit
+
+SCHEMA = ROOT / "kf_calib" / "exchange" / "calibration.schema.json"
+OWN = '''
+from kf_calib.effects import SensorEffect
+
+
+class Cube(SensorEffect):
+    """a^3, once more."""
+
+    name, title, source = "my-cube", "my cube", "me"
+    symbol, unit, scale = "Cu", "s^4/m^2", 1e-5
+
+    def terms(self, s):
+        return s.along**3
+'''
+
+
+@pytest.fixture(scope="module")
+def run() -> kf_calib.Calibration:
+    settings = kf_calib.Settings(effects=("second-order", "warm-up", "mine = fx*fy"))
+    return kf_calib.calibrate(simulated(0, 14), settings)
+
+
+@pytest.fixture(scope="module")
+def content(run: kf_calib.Calibration) -> dict[str, Any]:
+    return calibration_file.saved(run).model_dump(mode="json")
+
+
+def test_the_schema_in_the_package_is_that_of_the_program() -> None:
+    made = json.dumps(calibration_file.schema(), indent=1) + "\n"
+    assert SCHEMA.read_text() == made, (
+        "write it anew: python -c 'import json; from kf_calib.exchange import calibration_file as c; "
+        f"print(json.dumps(c.schema(), indent=1))' > {SCHEMA.relative_to(ROOT)}"
+    )
+    patterns = re.findall(r'"pattern": (".*")', made)
+    assert patterns and not any(r"\\A" in each or r"\\z" in each for each in patterns)  # which JSON Schema has not
+
+
+def test_what_is_saved_is_read_again(run: kf_calib.Calibration, tmp_path: Path) -> None:
+    kf_calib.save_calibration(run, tmp_path / "cal.json")
+    saved = kf_calib.open_calibration(tmp_path / "cal.json")
+    assert saved == calibration_file.saved(run).model_copy(update={"provenance": saved.provenance})
+    np.testing.assert_array_equal(saved.state.values, run.estimate.state)
+    np.testing.assert_array_equal(saved.state.covariance, run.estimate.covariance)
+    values, covariance = saved.twelve
+    np.testing.assert_array_equal(values, run.estimate.parameters)
+    np.testing.assert_allclose(covariance, run.estimate.parameter_covariance, rtol=1e-12)
+    model = saved.model()
+    assert model.sum == run.model.sum
+    assert [each.value for each in model.effects] == [each.value for each in run.model.effects]
+    readings = np.array([[0.1, 9.8, -0.1], [5.0, 5.0, 7.0]])
+    np.testing.assert_array_equal(saved.correction()(readings), run.apply(readings).force_mps2)
+
+
+@pytest.mark.parametrize("axes", ["y z x", "0.6,0.8,0 z", "z x z y"])
+def test_any_bench_is_kept(axes: str) -> None:
+    bench = Bench.from_metadata({"axes": axes, "gravity_mps2": "9.8012345678901234", "up": "z", "block_serial": "A 7"})
+    rng = np.random.default_rng(0)
+    plan = [Visit(tuple(rng.uniform(-180, 180, len(bench.axes))), 3.0) for _ in range(8)]
+    source = Simulation(bench, SENSORS, TrueNoise(white_mps2=5e-5), plan, sample_hz=20.0, slew_rate_degps=np.inf)
+    saved = calibration_file.saved(kf_calib.calibrate(source))
+    assert saved.bench == bench and saved.bench.notes["block_serial"] == "A 7"
+
+
+def test_a_recording_gives_its_name_checksum_and_date(tmp_path: Path) -> None:
+    path = ROOT / "recordings" / "mems_faces.mcap"
+    kf_calib.save_calibration(kf_calib.calibrate(path), tmp_path / "cal.json", path)
+    saved = kf_calib.open_calibration(tmp_path / "cal.json")
+    assert saved.provenance.recording == "mems_faces.mcap"
+    assert saved.provenance.sha256 == calibration_file.fingerprint(path)
+    assert saved.conditions.began is not None and saved.conditions.began.startswith("2025-06-15T15:06:4")
+    assert saved.conditions.temperature_mean_c == pytest.approx(25.0, abs=5.0)
+
+
+def test_the_model_option_reads_its_effects(run: kf_calib.Calibration, tmp_path: Path) -> None:
+    kf_calib.save_calibration(run, tmp_path / "named.toml")  # what is in it decides, not its name
+    assert models.read(tmp_path / "named.toml").effects == ("second-order", "warm-up", "mine = fx*fy")
+
+
+def test_programs_are_run_only_where_allowed(tmp_path: Path) -> None:
+    own, cal, recording = tmp_path / "my.py", tmp_path / "cal.json", ROOT / "recordings" / "navigation_24.mcap"
+    own.write_text(OWN)
+    code, _, err = _called(tmp_path, "replay", recording, "--with", "my-cube", "--effects-from", own, "--save", cal)
+    assert code == 0, err
+    for words in (["replay", recording, "--model", cal], ["verify", cal, recording]):
+        code, _, err = _called(tmp_path, *words)
+        assert code == 2 and "would run the Python file" in err and err.count("\n") == 1
+        assert _called(tmp_path, *words, "--trust")[0] == 0
+        assert _called(tmp_path, *words, "--effects-from", own)[0] == 0
+
+
+def _called(folder: Path, *words: object) -> tuple[int, str, str]:
+    """In a process of its own, which knows no effect yet."""
+    done = subprocess.run(
+        [sys.executable, "-m", "kf_calib", *map(str, words)], cwd=folder, capture_output=True, text=True,
+        env={"PYTHONPATH": str(ROOT), "PATH": "", "OPENBLAS_NUM_THREADS": "1"},
+    )  # fmt: skip
+    return done.returncode, done.stdout, done.stderr
+
+
+def put(*path: str | int, value: object) -> Callable[[dict[str, Any]], None]:
+    def change(content: Any) -> None:
+        for key in path[:-1]:
+            content = content[key]
+        content[path[-1]] = value
+
+    return change
+
+
+BROKEN: dict[str, tuple[str | Callable[[dict[str, Any]], None], str]] = {
+    "empty": ("", "is no JSON"),
+    "text": ("hello", "is no JSON"),
+    "list": ("[]", "is no calibration"),
+    "nested": ("[" * 100_000, "is no JSON"),
+    "long number": ('{"format": "kf_calib.calibration", "x": ' + "9" * 5000 + "}", "is no JSON"),
+    "another format": (put("format", value="x"), "is no calibration"),
+    "another version": (put("version", value=2), "is of version 2, this program reads version 1"),
+    "key too many": (put("foo", value=1), "foo: Extra inputs"),
+    "NaN": (put("state", "values", 0, value=math.nan), "state.values.0: Input should be a finite number"),
+    "infinite": (put("noise", "sigma_mps2", 0, value=math.inf), "noise.sigma_mps2.0"),
+    "huge": (put("state", "values", 0, value=1e300), "parameters say theta1"),
+    "huge variance": (put("state", "covariance", 0, 0, value=1e308), "numbers that no calibration has"),
+    "negative variance": (put("state", "covariance", 0, 0, value=-1.0), "is no covariance"),
+    "not symmetric": (put("state", "covariance", 0, 1, value=1.0), "is no symmetric matrix"),
+    "too small": (put("state", "covariance", value=[[1.0]]), "is no symmetric matrix"),
+    "text for a list": (put("effects", value="second-order"), "effects: Input should be a valid list"),
+    "true for a number": (put("consistency", "dof", value=True), "consistency.dof"),
+    "zeros": (put("state", "values", value=[0.0] * 22), "parameters say theta1"),
+    "other symbols": (put("state", "symbols", 0, value="q"), "other symbols"),
+    "axes": (put("provenance", "bench", "axes", value="q"), "provenance.bench: axis 'q' is not known"),
+    "contradiction": (put("parameters", 0, "value", value=1.0), "parameters say theta1 = 1.0"),
+    "command of a terminal": (put("provenance", "recording", value="\x1b[2J"), "provenance.recording"),
+    "no such effect": (put("effects", 0, "text", value="no-such"), "no effect is called 'no-such'"),
+    "a formula that is a program": (put("effects", 2, "text", value="x = __import__('os')"), "not a function"),
+    "an effect too few": (put("effects", value=[]), "was saved by another version"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_what_is_no_calibration_is_refused_in_a_sentence(kind: str, content: dict[str, Any], tmp_path: Path) -> None:
+    change, says = BROKEN[kind]
+    path, changed = tmp_path / "broken.json", copy.deepcopy(content)
+    if isinstance(change, str):
+        path.write_text(change)
+    else:
+        change(changed)
+        path.write_text(json.dumps(changed))
+    with pytest.raises(InputError) as error:
+        kf_calib.open_calibration(path).correction(path)
+    assert says in str(error.value) and "\n" not in str(error.value) and str(error.value).endswith((".", "?"))
