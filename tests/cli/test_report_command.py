@@ -38,7 +38,7 @@ def test_the_name_of_a_file_is_text(run) -> None:
     code, _, err = run("report", name)
     assert (code, err) == (0, "")
     page = Path("report.html").read_text()
-    assert "<img" not in page and "&lt;img src=x" in page
+    assert "<img src=x" not in page and "&lt;img src=x" in page
 
 
 def test_what_is_there_stays_without_overwrite(run) -> None:

@@ -66,14 +66,14 @@ def test_a_dwell_asked_for_at_every_block_is_the_same_to_the_last_bit(rows: list
 
 
 def test_no_piece_of_a_long_dwell_is_taken_up_at_every_block(rows: list[Rows], monkeypatch: pytest.MonkeyPatch) -> None:
-    handled, merged = [0], DwellFactor.merged
+    handled, merged = [0], DwellFactor.merge
 
     def counted(self: DwellFactor, others: Sequence[DwellFactor]) -> DwellFactor:
         out = merged(self, others)
         handled[0] += len(out.pieces)
         return out
 
-    monkeypatch.setattr(DwellFactor, "merged", counted)
+    monkeypatch.setattr(DwellFactor, "merge", counted)
     folder = Folder()
     for block in rows:
         folder.add(block)

@@ -10,7 +10,7 @@ from helpers.synthetic import plan_of
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.diagnosis.candidate_tests import candidates
-from kf_calib.diagnosis.results import with_effects
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.effects import effect_named
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_columns import candidate_columns, piece_columns, stimulus_of
@@ -65,7 +65,7 @@ def test_an_effect_that_the_frame_lacks_is_known_too(before: Calibration) -> Non
 
 
 def test_an_effect_in_the_model_leaves_nothing_of_its_formula(before: Calibration) -> None:
-    fitted = with_effects(before, ("second-order",)).fit
+    fitted = Refits().with_effects(before, ("second-order",)).fit
     frame = Frame(fitted.carried, fitted.noise.judging, candidates(Model(BENCH)))
     ((found, is_known),) = FurtherEffects(frame, fitted.carried, [], 0.99).scans([[effect_named("mine = a*a", BENCH)]])
     assert found.candidates[0].dof == 0

@@ -11,14 +11,14 @@ import pytest
 from kf_calib.bench.bench import Bench
 from kf_calib.effects import effect_named, names
 from kf_calib.errors import InputError
-from kf_calib.estimation.fit import WALK
 from kf_calib.support import units
 from kf_calib.support.units import Unit, field_unit, quantity, rounded, shown, shown_angle, shown_in, si, significant
 
 G = 9.80665  # m/s^2, by definition
 ARCSEC = math.pi / 180 / 3600
 BENCH = Bench.from_metadata({"axes": "y z x", "latitude_deg": "50"})
-QUANTITIES = {c.symbol: c for name in names(BENCH) for c in effect_named(name, BENCH).coefficients} | {"qb": WALK}
+QUANTITIES = {c.symbol: c for name in names(BENCH) for c in effect_named(name, BENCH).coefficients}
+QUANTITIES["qb"] = effect_named("bias-walk", BENCH).intensity
 
 
 @pytest.mark.parametrize(
