@@ -214,7 +214,7 @@ def test_what_is_still_too_large_is_a_picture() -> None:
     drawings = [Drawing(f"{k}", many_points(k), f"d{k}") for k in range(2)]
     fit(drawings, 0)
     for each in drawings:
-        assert each.is_picture and each.markup.startswith("<img") and len(each.markup) < 250_000
+        assert each.on_white and each.markup.startswith("<img") and len(each.markup) < 250_000
 
 
 def _ink(png: bytes) -> float:

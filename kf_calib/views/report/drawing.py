@@ -11,9 +11,10 @@ from typing import ClassVar
 
 import numpy as np
 from matplotlib.artist import Artist
-from matplotlib.collections import Collection
+from matplotlib.collections import Collection, QuadMesh
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from PIL import Image
 
@@ -36,32 +37,35 @@ class Drawing:
 
     A grey of the figure is mixed of the page's ``--ink`` and ``--paper``, black being ink alone; of other colours
     ``--keep`` says how much is kept beside white. On white paper with black ink, colours are those of the figure.
+    ``on_white``: a picture, or a figure in which a map of colours gives numbers: it keeps its colours, on a white card.
     """
 
     kind: ClassVar[str] = "drawing"
     title: str
     figure: Figure
     prefix: str
-    is_picture: bool = False
+    on_white: bool = False
     markup: str = ""
 
     def __post_init__(self) -> None:
+        self.on_white = any(isinstance(each, AxesImage | QuadMesh) for axes in self.figure.axes
+                            for each in axes.get_children())  # fmt: skip
         for patch in (self.figure.patch, *(axes.patch for axes in self.figure.axes)):
             patch.set_visible(False)
-        self.markup = _element(self.figure, self.prefix)
+        self.markup = _element(self.figure, self.prefix, self.on_white)
 
     def with_points_as_picture(self) -> None:
         """Draw again, the points of each kind as a picture where there are many."""
         for axes in self.figure.axes:
             for artist in axes.get_children():
                 artist.set_rasterized(_is_of_many_points(artist))
-        self.markup = _element(self.figure, self.prefix)
+        self.markup = _element(self.figure, self.prefix, self.on_white)
 
     def as_picture(self) -> None:
         """Draw again, all of it as a picture, on white in the dark, too."""
         self.figure.patch.set_visible(True)
         content = b64encode(_of_few_shades(content_of(self.figure, "png", _PICTURE_DPI))).decode()
-        self.markup, self.is_picture = f'<img alt="" src="data:image/png;base64,{content}">', True
+        self.markup, self.on_white = f'<img alt="" src="data:image/png;base64,{content}">', True
 
 
 def fit(drawings: Sequence[Drawing], most: int = _MOST) -> None:
@@ -73,13 +77,14 @@ def fit(drawings: Sequence[Drawing], most: int = _MOST) -> None:
             smaller(each)
 
 
-def _element(figure: Figure, prefix: str) -> str:
+def _element(figure: Figure, prefix: str, on_white: bool) -> str:
     """Return the ``svg`` element, as wide as its place, with the colours that it uses defined in its style."""
     text = content_of(figure, "svg", _PICTURE_DPI).decode()
     text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :].strip(), flags=re.DOTALL)
     text = re.sub(r' (width|height)="[\d.]+pt"', "", text, count=2).replace("xlink:href", "href")
     colours = sorted({colour for _, colour in _COLOUR.findall(text)})
-    mixed = "; ".join(f"--c{colour}: {_mixture(colour)}" for colour in colours)
+    mixed = "; ".join(f"--c{colour}: {f'#{colour}' if on_white else _mixture(colour)}" for colour in colours)
+    mixed += "; fill: #000000" * on_white
     text = _NAME.sub(rf"\g<1>{prefix}-", _COLOUR.sub(r"\1: var(--c\2)", text))
     text = _PICTURE.sub(_smaller, _PLACES.sub(lambda found: _DECIMALS.sub(r"\1", found[0]), text))
     return text.replace("<svg", f'<svg style="{mixed}"', 1)
