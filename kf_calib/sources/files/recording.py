@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -30,6 +30,7 @@ from kf_calib.sources.files.mcap_chunks import MAX_CHUNK_MB, DamagedError, parse
 from kf_calib.sources.files.mcap_file import McapFile, Warn
 from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, RecordBlock
 
+STANDARD_GRAVITY_MPS2 = 9.80665
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
 GAP_RECORD = "kf_calib.gap"
 """Metadata record at a place where the link to the bench was down: after_ns, seconds, reason."""
@@ -47,6 +48,7 @@ class Recording:
     the gimbal angles (0.017453 for a file in degrees).
     accel_topic, pose_topic, temperature_topic: which to use where the file has several of the kind.
     max_chunk_mb: chunks that unpack to more are passed over, and told.
+    angles: False to do without the angles, as where nothing but gravity is known; the file may then have none.
     Raises InputError where the file, or what it holds, cannot be used.
     """
 
@@ -61,6 +63,7 @@ class Recording:
         pose_topic: str | None = None,
         temperature_topic: str | None = None,
         max_chunk_mb: float = MAX_CHUNK_MB,
+        angles: bool = True,
     ) -> None:
         self.path = Path(path)
         self.fraction = 0.0
@@ -70,7 +73,9 @@ class Recording:
         self.warnings = [file.trouble for file in self._parts.files if file.trouble]
         self._parts.contents = [self._survey(file) for file in self._parts.files]
         self._accel = self._require(READINGS, "convert the readings to sensor_msgs/msg/Imu")
-        self._pose = self._require(POSES, "record the angles too, as sensor_msgs/msg/JointState by the same clock")
+        self._pose = None
+        if angles:
+            self._pose = self._require(POSES, "record the angles too, as sensor_msgs/msg/JointState by the same clock")
         self._parts.choose(TEMPERATURES, temperature_topic)  # optional, but not to be guessed
         self.bench = self._describe_bench(overrides)
         self._opening_warnings = len(self.warnings)
@@ -116,14 +121,15 @@ class Recording:
         self, file: McapFile, passage: _Passage, decoders: _Decoders, growing: bool
     ) -> Iterator[tuple[int, Batch]]:
         """The batches of one file, and up to which byte it has been read then."""
-        accel, pose = (passage.track(topic, decoders.of(role, topic)) for role, topic in
-                       ((READINGS, self._accel), (POSES, self._pose)))  # fmt: skip
+        accel = passage.track(self._accel, decoders.of(READINGS, self._accel))
+        pose = passage.track(self._pose, decoders.of(POSES, self._pose)) if self._pose else None
         temperature = None
         for block in file.blocks(self._warn_of_damage, growing=growing):
             messages = passage.find(block)
             if not temperature and (topic := self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])):
                 temperature = passage.track(topic, decoders.of(TEMPERATURES, topic))
-            readings, angles = accel.read(block, messages), pose.read(block, messages)
+            readings = accel.read(block, messages)
+            angles = pose.read(block, messages) if pose else Stream.empty(4)
             batch = Batch(
                 _scaled(readings, self._accel_scale),
                 _scaled(angles, self._angle_scale),
@@ -184,6 +190,8 @@ class Recording:
         damage = f"{self.path}: the description of the bench in it is damaged"
         if is_damaged:
             self.warnings.append(f"{damage}: only what options give is used.")
+        if self._pose is None:
+            return self._bench_without_angles({**recorded, **overrides})
         has_angles = self._parts.kind(POSES, self._pose) is JOINT_STATE
         if not has_angles and self._angle_scale != 1.0:
             raise InputError(
@@ -194,6 +202,23 @@ class Recording:
         except BenchError as error:
             where = f"{damage}, so give it by options" if is_damaged else str(self.path)
             raise BenchError(f"{where}: {error}") from error
+
+    def _bench_without_angles(self, stated: dict[str, str]) -> Bench:
+        """The bench of a recording whose angles are not used: where gravity is not stated, it is the standard one."""
+        if not {"gravity_mps2", "latitude_deg"} & stated.keys():
+            stated["gravity_mps2"] = str(STANDARD_GRAVITY_MPS2)
+            self.warnings.append(
+                f"gravity is taken as the standard {STANDARD_GRAVITY_MPS2} m/s^2; the local value differs by up to "
+                "0.3 %, and every scale factor with it: state it by --gravity or --latitude."
+            )
+        try:
+            bench = Bench.from_metadata(stated, has_angles=False)
+        except BenchError as error:
+            raise BenchError(f"{self.path}: {error}") from error
+        square = {"theta1": 0.0, "theta3": 0.0}
+        return replace(
+            bench, angles=False, reference="base", angle_sigma_deg=None, nominal=square | dict(bench.nominal)
+        )
 
 
 def _look_up_bench(file: McapFile, contents: Contents, position: int) -> None:
