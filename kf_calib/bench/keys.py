@@ -18,8 +18,15 @@ from kf_calib.support.plain_text import COMMANDS, LONGEST, cut
 FORMAT_VERSION = "1"
 UP = ("y", "z", "x", "-y", "-z", "-x")
 """The axes that can point up when all angles are zero."""
-NUMBERS = ("gravity_mps2", "latitude_deg", "height_m", "azimuth_deg", "angle_sigma_deg", "scatter_sigma_mps2",
-           "square_sigma_deg")
+NUMBERS = (
+    "gravity_mps2",
+    "latitude_deg",
+    "height_m",
+    "azimuth_deg",
+    "angle_sigma_deg",
+    "scatter_sigma_mps2",
+    "square_sigma_deg",
+)
 FREE_TEXT = ("block_serial", "bench", "operator", "note")
 
 _COMMAND = re.compile(f"[{COMMANDS}]")

@@ -174,6 +174,10 @@ def _after(recording: Path, options: Mapping[str, Any], quiet: bool) -> Prospect
     from kf_calib.estimation.calibration import calibrate
 
     source, settings = opened(recording, options)
+    if not source.bench.angles:
+        raise InputError(
+            "a plan is of gimbal angles, which --no-angles does without: replay says which side to turn up next."
+        )
     if not source.bench.axes:
         raise InputError(f"{recording} has an attitude and no gimbal angles, so no angles can be planned: give --axes.")
     with progress(f"reading {recording.name}", quiet) as tick:

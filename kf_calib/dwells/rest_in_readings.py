@@ -2,19 +2,20 @@
 shows a motion.
 
 The readings are cut into windows of a quarter of a second. The noise is that of the quiet windows: the lower quartile
-of their variances. A window is still if its variance is at most three times that, and if its mean differs from that
-of the window before by no more than six sigma and the tolerance of ``Stillness``.
+of their variances, which are chi-squared distributed where the sensor rests. A window is still if its variance is
+within what that noise leaves to chance, and a dwell goes on as long as the mean differs from that of the still window
+before by no more than six sigma and the tolerance of ``Stillness``. One window that is not still, as by an outlier,
+does not end a dwell.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Ints, Mask
+from kf_calib.bench.arrays import Floats, Ints
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.dwells.blocks import Block
 from kf_calib.dwells.dwell_events import SECOND_NS, carry_on
@@ -23,16 +24,15 @@ from kf_calib.dwells.segmenter import BLOCK_SAMPLES, Segmenter
 _WINDOW_NS = SECOND_NS // 4
 _FEWEST = 4  # readings of a window
 _LEAST_WINDOWS = 4  # of a dwell
-_QUIETER = 3.0  # largest variance of a still window in that of the noise
+_ALLOWED = 1.5  # correlated noise has fewer degrees of freedom than readings
 _SIGMAS = 6.0
-_LEAST_G = 1e-5  # scatter that is never called a motion, in g
+_LEAST_G, _MOST_G = 1e-5, 0.05  # scatter that is never, and always, called a motion, in g
 _UP = np.array([[0.0, 0.0, 0.0, 1.0]])  # stands for an attitude that is not known
 
 
 @dataclass
 class RestSegmenter(Segmenter):
-    """Cuts readings into dwells by themselves. Because the noise is that of the whole run, ``finish`` yields all blocks.
-    """
+    """Cuts readings into dwells by themselves. Because the noise is that of the whole run, ``finish`` yields all blocks."""
 
     _readings: list[Stream] = field(default_factory=list[Stream])
 
@@ -62,11 +62,11 @@ class RestSegmenter(Segmenter):
             return
         means, variances, counts = _moments(accel.values, edges)
         least = (_LEAST_G * self.bench.gravity_mps2) ** 2
-        noise = np.quantile(variances.sum(axis=1), 0.25) + least
-        still = variances.sum(axis=1) <= _QUIETER * noise
+        most, freedom = (_MOST_G * self.bench.gravity_mps2) ** 2, 3 * (int(counts[0]) - 1)
+        noise = min(np.quantile(variances.sum(axis=1), 0.25) / _chi_squared(-0.674, freedom), most) + least
+        still = variances.sum(axis=1) <= _ALLOWED * _chi_squared(5.0, freedom) * noise
         allowed = _SIGMAS * np.sqrt(noise / counts) + self.stillness.tolerance_rad * self.bench.gravity_mps2
-        steps = np.linalg.norm(np.diff(means, axis=0), axis=1) <= np.minimum(allowed[1:], allowed[:-1]) * np.sqrt(2.0)
-        for first, last in _runs(still, steps):
+        for first, last in _runs(np.flatnonzero(still), means, np.sqrt(2.0) * allowed):
             inside = np.arange(first, last)
             near = np.linalg.norm(means[inside] - np.median(means[inside], axis=0), axis=1) <= 2.0 * allowed[inside]
             kept = inside[near]
@@ -114,10 +114,18 @@ def _moments(values: Floats, edges: Ints) -> tuple[Floats, Floats, Ints]:
     return means, squares / (counts - 1)[:, None], counts
 
 
-def _runs(still: Mask, steps: Mask) -> Iterator[tuple[int, int]]:
-    """Yield first and last + 1 of each run of still windows with no step between them."""
-    joined = still[1:] & still[:-1] & steps
-    label = np.cumsum(np.append(True, ~joined))
-    for _, group in itertools.groupby(np.flatnonzero(still).tolist(), key=lambda k: label[k]):
-        own = list(group)
-        yield own[0], own[-1] + 1
+def _chi_squared(normal: float, freedom: int) -> float:
+    """Return the quantile of chi-squared, divided by its degrees of freedom, at that of a normal variable (Wilson and
+    Hilferty)."""
+    spread = 2.0 / (9.0 * freedom)
+    return (1.0 - spread + normal * spread**0.5) ** 3
+
+
+def _runs(still: Ints, means: Floats, allowed: Floats) -> Iterator[tuple[int, int]]:
+    """Yield first and last + 1 of each run of windows of which no two consecutive ones are not ``still`` and whose means
+    move by no more than is ``allowed``."""
+    if not still.size:
+        return
+    apart = np.linalg.norm(np.diff(means[still], axis=0), axis=1) > allowed[still[1:]]
+    for own in np.split(still, np.flatnonzero(apart | (np.diff(still) > 2)) + 1):
+        yield int(own[0]), int(own[-1]) + 1

@@ -195,10 +195,11 @@ def next_in_words(carried: Carried, noise: Noise) -> str:
 
 def up_in_words(up: str) -> str:
     """A direction of ``DIRECTIONS`` in words."""
-    axes = up.split()
+    axes = [(str("xyz".index(axis) + 1), "up" if sign == "+" else "down") for sign, axis in up.split()]
     if len(axes) == 1:
-        return f"{up} (accelerometer {'xyz'.index(up[1]) + 1}) points {'up' if up[0] == '+' else 'up, that is its axis down'}"
-    return f"{' and '.join([', '.join(axes[:-1]), axes[-1]])} point up alike"
+        return f"the axis of accelerometer {axes[0][0]} points {axes[0][1]}"
+    *most, last = [f"{number} ({way})" for number, way in axes]
+    return f"the axes of accelerometers {', '.join(most)} and {last} are equally far from the vertical"
 
 
 def most_informative(covariance: Floats, state: Floats, gravity_mps2: float) -> str:
