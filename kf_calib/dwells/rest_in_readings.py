@@ -32,7 +32,7 @@ _UP = np.array([[0.0, 0.0, 0.0, 1.0]])  # stands for an attitude that is not kno
 
 @dataclass
 class RestSegmenter(Segmenter):
-    """Cuts readings into dwells by themselves. Because the noise is that of the whole run, ``finish`` yields all blocks."""
+    """Cuts readings into dwells by themselves; as the noise is that of the whole run, ``finish`` yields all blocks."""
 
     _readings: list[Stream] = field(default_factory=list[Stream])
 
@@ -122,8 +122,8 @@ def _chi_squared(normal: float, freedom: int) -> float:
 
 
 def _runs(still: Ints, means: Floats, allowed: Floats) -> Iterator[tuple[int, int]]:
-    """Yield first and last + 1 of each run of windows of which no two consecutive ones are not ``still`` and whose means
-    move by no more than is ``allowed``."""
+    """Yield first and last + 1 of each run of ``still`` windows, with at most one other between two of them, whose
+    means move by no more than is ``allowed``."""
     if not still.size:
         return
     apart = np.linalg.norm(np.diff(means[still], axis=0), axis=1) > allowed[still[1:]]

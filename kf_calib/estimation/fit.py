@@ -232,7 +232,7 @@ def _without_angles(dwells: list[DwellFactor], model: Model, walk_mps2_per_sqrt_
             "without angles (--no-angles) the model has scale factors, biases and the angles between the axes only: "
             "leave out effects (--with, --model) and --bias-walk, or record the angles."
         )
-    bench, stated = model.bench, model.bench.scatter_sigma_mps2
+    stated = model.bench.scatter_sigma_mps2
     noise = replace(
         within_dwells(dwells), setting_rad=free_attitude.UNBOUNDED_RAD, setting_stated=True, free=True,
         scatter_mps2=np.full(3, stated or 0.0), scatter_stated=stated is not None,

@@ -20,6 +20,7 @@ from dataclasses import replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.dwell_columns import Carried, Means, Samples
@@ -51,7 +52,7 @@ def tangents(force: Floats) -> Floats:
     start = np.eye(3)[np.abs(unit).argmin(axis=1)]
     one = np.cross(unit, start)
     one /= np.linalg.norm(one, axis=1, keepdims=True)
-    return np.stack([one, np.cross(unit, one)], axis=2)
+    return np.asarray(np.stack([one, np.cross(unit, one)], axis=2), float)
 
 
 def felt(readings: Floats, state: Floats) -> Floats:
@@ -120,7 +121,7 @@ def with_scatter(noise: Noise, means: Means, state: Floats, square: bool) -> Noi
     def cost(variance: float) -> tuple[float, float]:
         """Return the cost of a variance, less a constant, and the misfit at it."""
         sigma = np.sqrt(own + variance * shape)
-        upper = np.linalg.qr(np.column_stack([columns, residual]) / sigma[:, None], mode="r")
+        upper = triangle(np.column_stack([columns, residual]) / sigma[:, None])
         misfit = float(upper[-1, -1] ** 2)
         return float(np.log(sigma).sum() + np.log(np.abs(np.diag(upper))[:-1]).sum() + 0.5 * misfit), misfit
 

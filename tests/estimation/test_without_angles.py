@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.paths import RECORDINGS, SHARED
+from helpers.recordings import ACCEL, read, write_officially
 from helpers.synthetic import G, Run, sensitivities
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -15,7 +17,7 @@ from scipy.stats import chi2, kstest
 
 import kf_calib
 from kf_calib.bench.bench import Bench
-from kf_calib.bench.paper_parameters import SYMBOLS, jacobian, parameters_of
+from kf_calib.bench.paper_parameters import SYMBOLS, parameters_of
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import evaluate
 from kf_calib.estimation.dwell_pass import Pass
@@ -212,6 +214,14 @@ def test_effects_are_refused_in_one_sentence() -> None:
         kf_calib.improve(kf_calib.calibrate(run))
 
 
-def test_standard_gravity_is_used_and_told_where_none_is_stated() -> None:
+def test_a_recording_needs_no_angles_and_standard_gravity_is_used_where_none_is_stated(tmp_path: Path) -> None:
     source = kf_calib.open_recording(RECORDINGS / "navigation_24.mcap", angles=False)
     assert source.bench.gravity_mps2 != 9.80665 and not any("standard" in said for said in source.warnings)
+    bare = write_officially(tmp_path / "bare.mcap", (ACCEL,), metadata={})
+    with pytest.raises(InputError, match=r"or do without them \(--no-angles\)"):
+        kf_calib.open_recording(bare)
+    source = kf_calib.open_recording(bare, angles=False)
+    assert source.bench.gravity_mps2 == 9.80665 and any("standard 9.80665" in said for said in source.warnings)
+    assert np.array_equal(read(source).accel.values, ACCEL[3].values)
+    stated = kf_calib.open_recording(bare, {"gravity_mps2": "9.8123"}, angles=False)
+    assert stated.bench.gravity_mps2 == 9.8123 and not stated.warnings

@@ -75,7 +75,8 @@ class Recording:
         self._accel = self._require(READINGS, "convert the readings to sensor_msgs/msg/Imu")
         self._pose = None
         if angles:
-            self._pose = self._require(POSES, "record the angles too, as sensor_msgs/msg/JointState by the same clock")
+            advice = "record the angles too, as sensor_msgs/msg/JointState by the same clock"
+            self._pose = self._require(POSES, f"{advice}, or do without them (--no-angles)")
         self._parts.choose(TEMPERATURES, temperature_topic)  # optional, but not to be guessed
         self.bench = self._describe_bench(overrides)
         self._opening_warnings = len(self.warnings)
