@@ -58,7 +58,7 @@ def tangents(force: Floats) -> Floats:
 def felt(readings: Floats, state: Floats) -> Floats:
     """Specific force (D, 3) by the mean readings (D, 3) alone: S^-1 (z - b)."""
     affine = state[:STATE_COUNT].reshape(3, 4)
-    return np.linalg.solve(affine[:, :3], (readings - affine[:, 3]).T).T
+    return np.asarray(np.linalg.solve(affine[:, :3], (readings - affine[:, 3]).T).T, float)
 
 
 def turned(dwells: Sequence[DwellFactor], state: Floats, gravity_mps2: float) -> list[DwellFactor]:
