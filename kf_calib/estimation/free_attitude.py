@@ -144,12 +144,27 @@ def covariance_of(carried: Carried, noise: Noise, square_rad: float = 1.0) -> Fl
     _, _, across = radial(means, carried.state)
     design = np.einsum("di,dip->dp", across, regressors_of(means))
     variance = across**2 @ (noise.scatter_mps2**2) + ((across * noise.effective_sigma_mps2) ** 2).sum(1) / means.counts
-    sizes = np.ones(STATE_COUNT)
-    sizes[3::4], sizes[list(SQUARE)] = 10.0, square_rad
-    information = (design.T / variance) @ design + np.diag(sizes**-2.0)
+    nine = np.ix_(_NINE, _NINE)
+    information = ((design.T / variance) @ design)[nine] + np.linalg.inv(weak_covariance(square_rad)[nine])
     out = np.zeros((STATE_COUNT, STATE_COUNT))
-    out[np.ix_(_NINE, _NINE)] = np.linalg.inv(information[np.ix_(_NINE, _NINE)])
+    out[nine] = np.linalg.inv(information)
     return out
+
+
+def weak_covariance(square_rad: float = 1.0) -> Floats:
+    """Covariance (12, 12) of the nine parameters before any dwell, see ``covariance_of``; zeros for the frame."""
+    sizes = np.ones(STATE_COUNT)
+    sizes[3::4], sizes[list(SQUARE)], sizes[list(FRAME)] = 10.0, square_rad, 0.0
+    return np.diag(sizes**2)
+
+
+def row_of(up: str, state: Floats, gravity_mps2: float) -> tuple[Floats, Floats]:
+    """The change (12,) of |f| per unit of each state if these axes point up, and the weights (3,) of the channels in
+    it."""
+    row, affine = np.zeros(STATE_COUNT), state[:STATE_COUNT].reshape(3, 4)
+    across = np.linalg.solve(affine[:, :3].T, DIRECTIONS[up])
+    row.reshape(3, 4)[:] = across[:, None] * np.append(gravity_mps2 * DIRECTIONS[up], 1.0)
+    return row, np.asarray(across, float)
 
 
 def tells_angles(carried: Carried, noise: Noise) -> bool:
@@ -207,10 +222,8 @@ def most_informative(covariance: Floats, state: Floats, gravity_mps2: float) -> 
     """The axes that should point up next: of the faces, edges and corners of a cube, the direction in which |f| is
     known worst; of equal ones the one with fewer axes."""
     best, worst = "", 0.0
-    for name, unit in DIRECTIONS.items():
-        row = np.zeros(STATE_COUNT)
-        across = np.linalg.solve(state[:STATE_COUNT].reshape(3, 4)[:, :3].T, unit)
-        row.reshape(3, 4)[:] = across[:, None] * np.append(gravity_mps2 * unit, 1.0)
+    for name in DIRECTIONS:
+        row, _ = row_of(name, state, gravity_mps2)
         spread = float(row @ covariance @ row)
         if spread > 1.1 * worst:
             best, worst = name, spread
