@@ -145,11 +145,25 @@ def _save_view(made: Plan, path: Path) -> None:
 
 
 def _refuse_contradictions(options: Mapping[str, Any]) -> None:
-    unused = ("targets", "fewest", "limits", "zones", "grid_deg", "positions", "beside_paper", "csv_file")
+    unused = (
+        "targets",
+        "fewest",
+        "limits",
+        "zones",
+        "grid_deg",
+        "positions",
+        "beside_paper",
+        "csv_file",
+        "rrd",
+        "screenshot",
+        "png",
+        "svg",
+        "pdf",
+    )
     if options["no_angles"] and any(options.get(name) for name in unused):
         raise click.UsageError(
-            "--no-angles plans sides to turn up by hand: leave out targets, limits of gimbals, files of angles and "
-            "--beside-paper."
+            "--no-angles plans sides to turn up by hand: leave out targets, limits of gimbals, pictures, files of "
+            "angles and --beside-paper."
         )
     if options["fewest"] and not options["targets"]:
         raise click.UsageError("--fewest needs a target to reach, for example --target K=2ppm.")
