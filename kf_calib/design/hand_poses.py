@@ -27,7 +27,7 @@ class HandPlan:
 
     @classmethod
     def of(cls, count: int, model: Model, mean_mps2: float, before: Fit | None = None) -> HandPlan:
-        """The plan of ``count`` poses after a run or from nothing; a pose's mean reading has the sigma ``mean_mps2``."""
+        """The plan of ``count`` poses after a run or from nothing; ``mean_mps2``: sigma of a pose's mean reading."""
         state = model.nominal_state() if before is None else before.carried.state
         square_rad = model.bench.square_rad
         covariance = weak_covariance() if before is None else covariance_of(before.carried, before.noise, square_rad)
