@@ -89,12 +89,17 @@ def _pose(unit: Floats) -> Floats:
     return quaternion / np.linalg.norm(quaternion)
 
 
-def radial(means: Means, state: Floats) -> tuple[Floats, Floats, Floats]:
-    """What no rotation changes: design (D, p), residual (D,) in m/s^2 of |f|, and the weights (D, 3) n of the channels
-    in it."""
+def weights_of_size(means: Means, state: Floats) -> Floats:
+    """The weights (D, 3) n = S^-T f / g of the three readings in |f|."""
     sensitivity = state[:STATE_COUNT].reshape(3, 4)[:, :3]
     unit = means.force_mps2 / np.linalg.norm(means.force_mps2, axis=1, keepdims=True)
-    across = np.linalg.solve(sensitivity.T, unit.T).T
+    return np.asarray(np.linalg.solve(sensitivity.T, unit.T).T, float)
+
+
+def radial(means: Means, state: Floats) -> tuple[Floats, Floats, Floats]:
+    """What no rotation changes: design (D, p), residual (D,) in m/s^2 of |f|, and the weights (D, 3) of the channels in
+    it."""
+    across = weights_of_size(means, state)
     residual = np.einsum("di,di->d", across, means.readings - means.design @ state)
     return np.einsum("di,dip->dp", across, means.design), residual, across
 
@@ -141,7 +146,7 @@ def covariance_of(carried: Carried, noise: Noise, square_rad: float = 1.0) -> Fl
     """Covariance (12, 12) that the dwells give of the nine parameters, with weak knowledge of each: 100 % of a scale
     factor, 10 m/s^2 of a bias, and ``square_rad`` of each angle between axes."""
     means = carried.means
-    _, _, across = radial(means, carried.state)
+    across = weights_of_size(means, carried.state)
     design = np.einsum("di,dip->dp", across, regressors_of(means))
     variance = across**2 @ (noise.scatter_mps2**2) + ((across * noise.effective_sigma_mps2) ** 2).sum(1) / means.counts
     nine = np.ix_(_NINE, _NINE)

@@ -236,7 +236,7 @@ def lift_rounding(covariances: Floats) -> Floats:
     error, rounding would decide whether the matrix is positive definite.
     """
     least = _ROUNDING * np.einsum("dii->d", covariances)
-    return np.asarray(covariances + least[:, None, None] * np.eye(3), float)
+    return np.asarray(covariances + least[:, None, None] * np.eye(covariances.shape[-1]), float)
 
 
 def setting_covariances(means: Means, state: Floats) -> Floats:

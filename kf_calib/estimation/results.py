@@ -230,10 +230,7 @@ class Calibration:
 
     @cached_property
     def held_out(self) -> HeldOut | None:
-        """The predictions of each orientation by a fit to all others; None if there are too few orientations, or no
-        angles to predict the readings from."""
-        if not self.bench.angles:
-            return None
+        """The predictions of each orientation by a fit to all others; None if there are too few orientations."""
         with one_blas_thread():
             return held_out(self.fit)
 

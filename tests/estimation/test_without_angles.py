@@ -134,6 +134,18 @@ def test_agrees_with_the_calibration_by_angles_of_the_same_recording() -> None:
     assert other.consistency.consistent
 
 
+def test_the_size_of_f_in_poses_left_out_is_predicted_within_its_covariance() -> None:
+    for seed in (1, 2, 3):
+        result, _ = calibrated(seed)
+        assert result.held_out is not None
+        dwells = [visit.dwell for visit in result.visits]
+        rest = evaluate([*dwells[:4], *dwells[5:]], result.bench, Settings())
+        affine = rest.estimate.state.reshape(3, 4)
+        force = np.linalg.solve(affine[:, :3], dwells[4].means[4:] - affine[:, 3])
+        assert result.held_out.errors_mps2[4, 0] == pytest.approx(np.linalg.norm(force) - G, rel=0.02, abs=1e-5)
+        assert 0.1 < np.mean(result.held_out.statistics) < 3.0
+
+
 def test_scatter_between_poses_is_found_and_enters_sigma() -> None:
     quiet, _ = calibrated(2, 30)
     run = without_angles(Run(2, 30, 100, white_mps2=2e-2, spread=(1e-2, 2e-2, 0.1), scatter_mps2=0.02,
