@@ -11,7 +11,6 @@ does not end a dwell.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -30,11 +29,8 @@ _LEAST_G, _MOST_G = 1e-5, 0.05  # scatter that is never, and always, called a mo
 _UP = np.array([[0.0, 0.0, 0.0, 1.0]])  # stands for an attitude that is not known
 
 
-@dataclass
 class RestSegmenter(Segmenter):
     """Cuts readings into dwells by themselves; as the noise is that of the whole run, ``finish`` yields all blocks."""
-
-    _readings: list[Stream] = field(default_factory=list[Stream])
 
     def push(self, batch: Batch) -> Iterator[Block]:
         """Keep the readings of a batch until the end."""
