@@ -124,6 +124,8 @@ class Bench:
     - up: the axis that points up when all angles are zero. The azimuth is that of x, or of y if x is vertical.
     - channels: the channel of the recording for accelerometers 1, 2, 3, negative if its sign is reversed.
     - joints: names of the gimbals' joints, outer to inner, if angles come as joint states; empty if their names tell.
+    - angles: whether angles or attitudes are used. Without them only the size of gravity is known (``free_attitude``).
+    - square_sigma_deg: how square the axes of the accelerometers are, one standard deviation; None for 1 deg.
     """
 
     axes: tuple[Vector, ...]
@@ -139,6 +141,8 @@ class Bench:
     up: str = "y"
     channels: tuple[int, int, int] = CHANNELS
     joints: tuple[str, ...] = ()
+    angles: bool = True
+    square_sigma_deg: float | None = None
 
     def __post_init__(self) -> None:
         from kf_calib.bench.keys import FREE_TEXT, NUMBERS, checked
@@ -158,6 +162,11 @@ class Bench:
                 f"joints names {len(self.joints)} gimbals ({' '.join(self.joints)}) where there are {len(self.axes)} "
                 "axes: name each once, outer to inner."
             )
+
+    @property
+    def square_rad(self) -> float:
+        """How square the axes of the accelerometers are, one standard deviation, rad."""
+        return math.radians(1.0 if self.square_sigma_deg is None else self.square_sigma_deg)
 
     @property
     def axis_letters(self) -> tuple[str, ...]:

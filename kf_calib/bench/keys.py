@@ -18,7 +18,15 @@ from kf_calib.support.plain_text import COMMANDS, LONGEST, cut
 FORMAT_VERSION = "1"
 UP = ("y", "z", "x", "-y", "-z", "-x")
 """The axes that can point up when all angles are zero."""
-NUMBERS = ("gravity_mps2", "latitude_deg", "height_m", "azimuth_deg", "angle_sigma_deg", "scatter_sigma_mps2")
+NUMBERS = (
+    "gravity_mps2",
+    "latitude_deg",
+    "height_m",
+    "azimuth_deg",
+    "angle_sigma_deg",
+    "scatter_sigma_mps2",
+    "square_sigma_deg",
+)
 FREE_TEXT = ("block_serial", "bench", "operator", "note")
 
 _COMMAND = re.compile(f"[{COMMANDS}]")
@@ -107,6 +115,7 @@ KEYS: Mapping[str, Key] = {
                                "not known"),
     "scatter_sigma_mps2": _number(0, 100, "the scatter from dwell to dwell, 1 sigma, in m/s^2; leave it out where it "
                                   "is not known"),
+    "square_sigma_deg": _number(1e-4, 45, "how square the axes are, 1 sigma, in deg, for runs without angles"),
     "nominal": Key(
         _nominal,
         f'a JSON object such as {{"theta1": 0}} of parameters ({", ".join(paper_parameters.SYMBOLS)}) in rad, 1 or '

@@ -54,6 +54,10 @@ BENCH_OPTIONS = {
         "--scatter-sigma", NOT_NEGATIVE, "M/S^2",
         "Scatter of each sensor from dwell to dwell, 1 sigma, m/s^2; estimated where it is not stated.",
     ),
+    "square_sigma_deg": (
+        "--square-sigma", POSITIVE, "DEG",
+        "How square the axes of the accelerometers are, 1 sigma, deg, where --no-angles cannot tell; 1 if not stated.",
+    ),
     "reference": (
         "--reference", str, "WORD",
         "base: angles are relative to the bench (usual); inertial: stabilised platform.",
@@ -83,6 +87,8 @@ def recording_options(command: F) -> F:
                      help="Size of one count, in the unit of the readings.", panel=INPUT),
         click.option("--angle-unit", type=click.Choice(_ANGLE_UNITS), default="rad", show_default=True,
                      help="Unit of the gimbal angles.", panel=INPUT),
+        click.option("--no-angles", is_flag=True, panel=INPUT,
+                     help="Use no platform angles: only the size of gravity is known, nine parameters are left."),
         click.option("--accel-topic", metavar="TOPIC", help="Topic of the accelerometer, where there are several.",
                      panel=INPUT),
         click.option("--pose-topic", metavar="TOPIC", help="Topic of the platform's angles or attitude.", panel=INPUT),
@@ -229,7 +235,7 @@ def recording_of(path: Path, options: Mapping[str, Any], angles: bool = True) ->
         pose_topic=options["pose_topic"],
         temperature_topic=options["temperature_topic"],
         max_chunk_mb=options["max_chunk_mb"],
-        angles=angles,
+        angles=angles and not options.get("no_angles", False),
     )
 
 

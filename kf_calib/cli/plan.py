@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -112,7 +113,10 @@ def plan(
     from kf_calib.design.visit_order import Timing
     from kf_calib.views import plan as views
 
-    _refuse_contradictions(options)
+    _refuse_contradictions(options | {"csv_file": csv_file})
+    if options["no_angles"]:
+        _plan_by_hand(options, as_json)
+        return
     outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     prospect = _prospect(options, as_json)
     reach = _reach(prospect.model.bench, options)
@@ -141,6 +145,26 @@ def _save_view(made: Plan, path: Path) -> None:
 
 
 def _refuse_contradictions(options: Mapping[str, Any]) -> None:
+    unused = (
+        "targets",
+        "fewest",
+        "limits",
+        "zones",
+        "grid_deg",
+        "positions",
+        "beside_paper",
+        "csv_file",
+        "rrd",
+        "screenshot",
+        "png",
+        "svg",
+        "pdf",
+    )
+    if options["no_angles"] and any(options.get(name) for name in unused):
+        raise click.UsageError(
+            "--no-angles plans sides to turn up by hand: leave out targets, limits of gimbals, pictures, files of "
+            "angles and --beside-paper."
+        )
     if options["fewest"] and not options["targets"]:
         raise click.UsageError("--fewest needs a target to reach, for example --target K=2ppm.")
     if options["fewest"] and options["count"]:
@@ -153,6 +177,33 @@ def _refuse_contradictions(options: Mapping[str, Any]) -> None:
         raise click.UsageError(
             "--with needs a recording (--recording): a plan from nothing is for the twelve parameters."
         )
+
+
+def _plan_by_hand(options: Mapping[str, Any], as_json: bool) -> None:
+    """Print which sides to turn up where there are no angles."""
+    from kf_calib.bench.bench import Bench
+    from kf_calib.design.hand_poses import HandPlan
+    from kf_calib.estimation.calibration import calibrate
+    from kf_calib.estimation.measurement_model import Model
+    from kf_calib.views import hand_poses as views
+
+    if options["recording"] is not None:
+        source, settings = opened(options["recording"], options)
+        with progress("reading", as_json) as tick:
+            before = calibrate(source, settings, tick).fit
+        counts, noise = [dwell.count for dwell in before.dwells], before.noise
+        sigma = math.hypot(noise.effective_sigma_mps2.mean() / math.sqrt(sum(counts) / len(counts)),
+                           noise.scatter_mps2.mean())  # fmt: skip
+        made = HandPlan.of(options["count"] or 1, before.carried.model, sigma, before)
+    else:
+        keys = {"gravity_mps2": "9.80665", **overrides(options)}
+        bench = replace(Bench.from_metadata(keys, has_angles=False), angles=False, nominal={"theta1": 0, "theta3": 0})
+        readings = options["readings"] or max((options["dwell_s"] or 30.0) * options["sample_hz"], 1.0)
+        made = HandPlan.of(options["count"] or 12, Model(bench), options["white_mps2"] / math.sqrt(readings))
+    if as_json:
+        print_json(views.hand_plan_object(made))
+    else:
+        show(views.hand_plan_report(made))
 
 
 def _prospect(options: Mapping[str, Any], quiet: bool) -> Prospect:

@@ -28,6 +28,7 @@ from kf_calib.estimation import kalman_filterpy, square_root_information
 from kf_calib.estimation.dwell_columns import Carried, Samples, samples_of
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.fit import Fit, fit
+from kf_calib.estimation.free_attitude import holding_frame
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import considered_information, mean_covariances
 from kf_calib.estimation.observability import visibility_of
@@ -166,6 +167,7 @@ def filterpy_estimate(
     prior, model = result.settings.prior, result.model
     scale = np.concatenate([np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), result.carried.sizes[STATE_COUNT:]])
     samples = samples_of(Pass(source, result.settings).rows(), result.carried)
+    samples = holding_frame(samples, result.carried)
     posterior = kalman_filterpy.estimate(
         _counted(samples, result.carried, on_progress, at_most),
         result.noise.weights,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import random_walk, square_root_information
 from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.free_attitude import weights_of_size
 from kf_calib.estimation.noise_model import considered_information, lift_rounding, mean_covariances
 from kf_calib.estimation.prior import Prior
 
@@ -38,7 +39,7 @@ def orientations(dwells: Sequence[DwellFactor]) -> list[list[int]]:
 @dataclass(frozen=True)
 class HeldOut:
     """Mean readings of the dwells less their prediction from all other orientations (D, 3), and the covariance (D, 3,
-    3)."""
+    3); (D, 1) and (D, 1, 1) of the size of f where no angles are used."""
 
     errors_mps2: Floats
     covariance: Floats
@@ -63,9 +64,14 @@ class HeldOut:
 def held_out(fitted: Fit) -> HeldOut | None:
     """The held-out errors of all dwells; None if the fit without some orientation would be undetermined.
 
-    Slews are not left out of any fit.
+    Slews are not left out of any fit. Without angles the errors are those of |f|, one a dwell.
     """
     predicted = (_beside if fitted.noise.walk_mps2_per_sqrt_s else _without)(fitted, orientations(fitted.dwells))
+    if predicted is not None and fitted.noise.free:
+        errors, covariance = predicted
+        across = weights_of_size(fitted.carried.means, fitted.carried.state)
+        errors, covariance = across[:, None] @ errors[:, :, None], across[:, None] @ covariance @ across[:, :, None]
+        return HeldOut(errors[:, :, 0], covariance)
     return None if predicted is None else HeldOut(*predicted)
 
 
@@ -75,12 +81,15 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
     The fit without an orientation is found by merging the factors of the orientations before it and after it.
     """
     carried, noise, around = fitted.carried, fitted.noise.judging, fitted.carried.model.nominal_state()
-    rows = fitted.rows(noise.weights)
+    noise = replace(noise, setting_rad=0.0) if noise.free else noise
+    rows = fitted.rows(fitted.noise.judging.weights)
     extra, own = (
         considered_information(noise, carried.means, carried.state),
         mean_covariances(noise, carried.means, carried.state),
     )
     empty = square_root_information.start(Prior(), carried.model)
+    for place in carried.model.fixed:  # held at zero, whichever orientation is left out
+        empty[place, place] = carried.model.bench.gravity_mps2 / noise.effective_sigma_mps2.min()
     slews = square_root_information.update(empty, np.concatenate(fitted.following))[0] if carried.slews else empty
     heads, tails = [slews], [empty]
     for group in groups[:-1]:

@@ -222,6 +222,7 @@ def samples_of(rows: Iterable[Rows], carried: Carried) -> Iterator[Samples]:
     squares."""
     every, columns = [*carried.dwells, *carried.slews], [*carried.columns, *carried.slew_columns]
     known = {(each.number, each.moving): iter(own) for each, own in zip(every, columns, strict=True)}
+    forces = {dwell.number: dwell.means[:4] for dwell in carried.dwells}
     for block in rows:
         key = block.dwell, block.moving
         if key not in known:
@@ -231,4 +232,6 @@ def samples_of(rows: Iterable[Rows], carried: Carried) -> Iterator[Samples]:
             functions = basis(u, block.elapsed_s[part], carried.carrier_hz)
             observation = (functions.T @ on_basis(own.reshape(len(own), -1))).reshape(len(u), *own.shape[1:])
             regressors, readings = block.columns[part], block.readings[part]
+            if not carried.model.bench.angles:
+                regressors = np.tile(forces[block.dwell], (len(u), 1))
             yield Samples(block.dwell, block.elapsed_s[part], observation, regressors, readings, block.moving)

@@ -13,6 +13,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Source
 from kf_calib.dwells import window_average
 from kf_calib.dwells.blocks import LARGEST_RAD, Block, Tally
+from kf_calib.dwells.rest_in_readings import RestSegmenter
 from kf_calib.dwells.rows import Rows, model_rows
 from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
 from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder, dwells_without
@@ -41,6 +42,8 @@ class Pass:
 
     def segmenter(self) -> Segmenter:
         """The segmenter for this source, which also returns slews if the model has effects that show in slews only."""
+        if not self.source.bench.angles:
+            return RestSegmenter(self.source.bench, self.settings.stillness, self.tally)
         return Segmenter(self.source.bench, self.settings.stillness, self.tally, bool(self.model.dynamic))
 
     def rows(self) -> Iterator[Rows]:
@@ -82,18 +85,20 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
     a set-up that cannot be right."""
     if not tally.read:
         raise InputError("the recording holds no accelerometer readings: check that the logger wrote any.")
-    if tally.poses_dropped and not tally.poses:
+    if not bench.angles:
+        _refuse_restless(dwells, tally)
+    elif tally.poses_dropped and not tally.poses:
         raise InputError(
             f"none of the {tally.poses_dropped} angle messages can be used: they are not finite, beyond "
             f"{LARGEST_RAD:.0e} rad (counts of an encoder?) or no unit quaternions; record angles in rad or deg, or "
             "unit quaternions."
         )
-    if not tally.poses:
+    elif not tally.poses:
         raise InputError(
             "the recording holds no platform angles (or attitude), so the direction of gravity is not known: "
             "record them on /platform/angles, at any rate."
         )
-    if not dwells:
+    elif not dwells:
         turns = tally.farthest_rad / (2.0 * math.pi)
         unit = f"; angles of up to {turns:.0f} turns look like degrees (--angle-unit deg)" if turns > 3.0 else ""
         raise InputError(
@@ -103,7 +108,8 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
         )
     level = float(np.median([np.linalg.norm(dwell.means[4:]) for dwell in dwells])) / bench.gravity_mps2
     if 0.5 <= level <= 2.0:
-        setup_blunders.refuse(dwells, bench)
+        if bench.angles:
+            setup_blunders.refuse(dwells, bench)
         return
     measured = level * bench.gravity_mps2
     for unit in ("g", "mg", "ug"):
@@ -116,3 +122,13 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
         f"the readings have a norm of {measured:.4g} at rest where gravity is {bench.gravity_mps2:.4g} m/s^2: they "
         "look like counts; give the size of one count in m/s^2 with --accel-scale."
     )
+
+
+def _refuse_restless(dwells: list[DwellFactor], tally: Tally) -> None:
+    """Raise InputError if no dwell shows in the readings themselves."""
+    if not dwells:
+        raise InputError(
+            f"no dwell was found in {tally.read} readings ({tally.moving} moving, {tally.settling} settling, "
+            f"{tally.not_finite} not finite, {tally.too_large} too large): without angles it must lie still for at "
+            "least a second and a half on each side; if it did, raise --still-deg or lower --settle-s."
+        )

@@ -23,6 +23,7 @@ from kf_calib.estimation.batch_least_squares import least_squares, running_state
 from kf_calib.estimation.calibration import calibrate, filterpy_estimate
 from kf_calib.estimation.dwell_columns import Samples, samples_of
 from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.free_attitude import holding_frame
 from kf_calib.estimation.results import Calibration, Estimate
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.files.recording import opened
@@ -91,10 +92,13 @@ def compare(
     )  # fmt: skip
 
     def batch() -> Estimate:
-        return result.considering(*least_squares(samples(), *conditions))
+        return result.considering(*least_squares(held(samples()), *conditions))
 
     def samples() -> Iterator[Samples]:
         return samples_of(Pass(source, settings).rows(), result.carried)
+
+    def held(some: Iterable[Samples]) -> Iterator[Samples]:
+        return holding_frame(some, result.carried)
 
     stage.say("filterpy, reading by reading")
     filterpy, filterpy_s = _timed(
@@ -110,7 +114,7 @@ def compare(
     }
     ways = {name: _against(way, result.estimate) for name, way in ways.items()}
     longest = LongestDwells(result)
-    running = {"filterpy": by_filterpy, "batch": running_states(longest.passed_by(samples()), *conditions)}
+    running = {"filterpy": by_filterpy, "batch": running_states(held(longest.passed_by(samples())), *conditions)}
     differences = {name: _along(states, result) for name, states in running.items()}
     return Comparison(result, ways, tuple(_remarks(settings, result)), differences, longest.allan_deviation())
 

@@ -21,7 +21,8 @@ from kf_calib.bench.bench import Bench
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect
-from kf_calib.estimation import square_root_information
+from kf_calib.errors import InputError, UnobservableError
+from kf_calib.estimation import free_attitude, square_root_information
 from kf_calib.estimation.dwell_columns import Carried, Means, candidate_columns, stimulus_of
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, steps, within_dwells
@@ -31,6 +32,9 @@ from kf_calib.estimation.score_test import falls
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
 _EXACT_RAD = 1e-9
+_TURNS = 50  # most times that forces and state are found in turn
+_SETTLED = 1e-9  # relative to g; the next step is of the size of rounding
+_SINGULAR = 100.0
 _STILL = 2.5e-4  # the search ends when no step of ln(value) exceeds this share of its largest allowed step
 
 
@@ -65,9 +69,10 @@ class Fit:
     def judged(self) -> list[Floats]:
         """Whitened rows [H | W | z] by which the misfit is judged, see ``square_root_information.misfit_rows``."""
         carried = self.carried
-        return square_root_information.misfit_rows(
+        rows, _ = square_root_information.misfit_rows(
             self.dwells, carried.columns, self.noise.judging, carried.state, carried.model.count
-        )[0]
+        )
+        return square_root_information.with_frame(rows, carried.model, self.noise, len(rows) - len(self.dwells))
 
     @cached_property
     def following(self) -> list[Floats]:
@@ -100,17 +105,26 @@ class Fit:
         estimated (Schmidt-Kalman filter).
         """
         carried, out = self.carried, np.zeros((self.carried.model.count,) * 2)
+        if carried.model.square:
+            out += self._considered(free_attitude.square_changes(carried))
         for effect in carried.model.stepped:
             spread, part = self.spreads.get(str(effect), 0.0), carried.model.parts[str(effect)]
             ends = [effect.at(effect.value * math.exp(step)) for step in (spread, -spread)]
             more, less = (candidate_columns(carried.dwells, [end], carried.model.bench, carried.state) for end in ends)
-            changes = [0.5 * (a - b) @ carried.state[part, None] for a, b in zip(more, less, strict=True)]
-            columns = [np.concatenate(both, axis=3) for both in zip(carried.columns, changes, strict=True)]
-            rows = square_root_information.whiten(carried.dwells, columns, self.noise.weights, carried.state)
-            upper = square_root_information.accumulate(rows, self.steps)
-            gain = upper[: len(out), : len(out)].T @ upper[: len(out), len(out)]
-            out += np.outer(gain, gain)
+            out += self._considered(
+                [0.5 * (a - b) @ carried.state[part, None] for a, b in zip(more, less, strict=True)]
+            )
         return out
+
+    def _considered(self, changes: Sequence[Floats]) -> Floats:
+        """Return B (p, p) of considered constants from the changes (pieces, K nodes, 3, c) of each dwell's readings by
+        1 sigma of each."""
+        carried, count = self.carried, self.carried.model.count
+        columns = [np.concatenate(both, axis=3) for both in zip(carried.columns, changes, strict=True)]
+        rows = square_root_information.whiten(carried.dwells, columns, self.noise.weights, carried.state)
+        upper = square_root_information.accumulate(rows, self.steps)
+        gains = upper[:count, :count].T @ upper[:count, count:-1]
+        return gains @ gains.T
 
     @cached_property
     def walk_gain(self) -> float:
@@ -162,7 +176,9 @@ class Fit:
         return self._whitened(self.noise.weights)
 
     def _whitened(self, noise: Noise) -> list[Floats]:
-        return square_root_information.whiten(self.dwells, self.carried.columns, noise, self.carried.state)
+        carried = self.carried
+        rows = square_root_information.whiten(self.dwells, carried.columns, noise, carried.state)
+        return square_root_information.with_frame(rows, carried.model, noise)
 
 
 def fit(
@@ -175,6 +191,8 @@ def fit(
     - walk_mps2_per_sqrt_s: stated intensity of the random walk of the biases, m/s^2/s^(1/2).
     - slews: the slews; used only if the model has effects that show in slews only.
     """
+    if not model.bench.angles:
+        return _without_angles(dwells, model, walk_mps2_per_sqrt_s)
     within, bench = within_dwells(dwells, walk_mps2_per_sqrt_s), model.bench
     within = replace(within, walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
     slews = [slew for slew in slews if slew.number >= dwells[0].number] if model.dynamic else []
@@ -202,6 +220,57 @@ def fit(
         if number >= _PASSES - 1 and (np.abs(moved) <= _STILL * reach).all() and not model.stepped:
             break
     return fitted
+
+
+def _without_angles(dwells: list[DwellFactor], model: Model, walk_mps2_per_sqrt_s: float) -> Fit:
+    """Fit nine parameters where only |f| = g is known, or six with square axes where the poses do not tell the rest.
+
+    Raises InputError for a model with effects or a walk, and UnobservableError if the poses tell too little.
+    """
+    if model.effects or walk_mps2_per_sqrt_s:
+        raise InputError(
+            "without angles (--no-angles) the model has scale factors, biases and the angles between the axes only: "
+            "leave out effects (--with, --model) and --bias-walk, or record the angles."
+        )
+    stated = model.bench.scatter_sigma_mps2
+    noise = replace(
+        within_dwells(dwells), setting_rad=free_attitude.UNBOUNDED_RAD, setting_stated=True, free=True,
+        scatter_mps2=np.full(3, stated or 0.0), scatter_stated=stated is not None,
+    )  # fmt: skip
+    square = replace(model, square=True)
+    free_attitude.refuse_poses(_turned(dwells, square, square.nominal_state(), noise).carried, noise)
+    fitted = _settled(_turned(dwells, square, square.nominal_state(), noise))
+    if free_attitude.tells_angles(fitted.carried, noise):
+        fitted = _settled(_turned(dwells, model, fitted.carried.state, noise))
+    if stated is None:
+        for _ in range(_PASSES):
+            carried = fitted.carried
+            noise = free_attitude.with_scatter(noise, carried.means, carried.state, carried.model.square)
+            fitted = _settled(replace(fitted, noise=noise))
+    return fitted
+
+
+def _turned(dwells: Sequence[DwellFactor], model: Model, state: Floats, noise: Noise) -> Fit:
+    """Return the fit linearised at a state and at the forces that the dwells have there."""
+    own = free_attitude.turned(dwells, state, model.bench.gravity_mps2)
+    return Fit(Carried(own, model, state), noise)
+
+
+def _settled(fitted: Fit) -> Fit:
+    """Return the fit with forces and state found in turn until neither moves."""
+    unit = np.tile([1.0, 1.0, 1.0, fitted.carried.model.bench.gravity_mps2], 3)
+    for _ in range(_TURNS):
+        state = fitted.state
+        if not (np.isfinite(state).all() and np.linalg.cond(state.reshape(3, 4)[:, :3]) < _SINGULAR):
+            break
+        moved = np.abs((state - fitted.carried.state) / unit).max()
+        fitted = _turned(fitted.dwells, fitted.carried.model, state, fitted.noise)
+        if moved < _SETTLED:
+            return fitted
+    raise UnobservableError(
+        "the sizes of the readings at rest lead to no sensible set of scale factors, biases and angles: check the unit "
+        "of the readings (--accel-unit) and gravity, and turn it to more sides."
+    )
 
 
 def _setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:

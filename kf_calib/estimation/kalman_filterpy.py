@@ -58,8 +58,8 @@ def estimate(
     count, used = len(nominal_state), np.flatnonzero(noise.dwell_sigmas > 0)
     nuisances = dwell_map(linearised_at)[:, :, used]
     if prior_covariance is None:
-        gravity = scale[0]
-        widest = max(noise.effective_sigma_mps2.max(), noise.scatter_mps2.max(), gravity * noise.setting_rad)
+        setting_mps2 = 0.0 if noise.free else scale[0] * noise.setting_rad
+        widest = max(noise.effective_sigma_mps2.max(), noise.scatter_mps2.max(), setting_mps2)
         root = _DIFFUSE * widest * np.eye(count)
     else:
         root = np.linalg.cholesky(prior_covariance * np.outer(scale, scale))

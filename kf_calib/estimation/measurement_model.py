@@ -23,6 +23,10 @@ from kf_calib.support.printing import printed
 
 STATE_COUNT = 12
 _ROUNDING_MPS2 = 1e-13
+FRAME = (1, 2, 6)
+"""s1y, s1z, s2z: without angles the frame is that in which accelerometer 1 is x and 2 lies in the plane of x and y."""
+SQUARE = (4, 8, 9)
+"""s2x, s3x, s3y: by how much the axes are not square, in that frame."""
 DWELL_STATES = 6
 """Number of nuisance states of a dwell: three small rotations (setting error) and three offsets (scatter)."""
 
@@ -34,6 +38,8 @@ class Model:
 
     bench: Bench
     effects: tuple[Effect, ...] = ()
+    square: bool = False
+    """Without angles: whether the input axes are taken for square to each other."""
 
     @classmethod
     def of(cls, bench: Bench, names: Iterable[str] = ()) -> Model:
@@ -148,7 +154,14 @@ class Model:
     def nominal_state(self) -> Floats:
         """The state (p,) at nominal parameters and without effects."""
         twelve = paper_parameters.state_of(paper_parameters.nominal(self.bench.nominal))
+        twelve[list(self.fixed)] = 0.0
         return np.concatenate([twelve, np.zeros(len(self.coefficients))])
+
+    @property
+    def fixed(self) -> tuple[int, ...]:
+        """The states that are zero by convention: those of the frame where no angles are used, and the three others
+        across the axes where these are taken for square."""
+        return () if self.bench.angles else FRAME + SQUARE if self.square else FRAME
 
     def columns(self, stimulus: Stimulus, state: Floats) -> Floats:
         """The design H (m, 3, p): the change of each accelerometer's reading per unit of each state, linearised at
@@ -165,6 +178,7 @@ class Model:
             out[:, :, own] = effect_columns([effect], stimulus)
             if own.stop < part.stop:
                 out[:, :, own.stop : part.stop] = effect.derivative(stimulus, state[own])
+        out[:, :, list(self.fixed)] = 0.0
         return out
 
 

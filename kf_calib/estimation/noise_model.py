@@ -50,6 +50,7 @@ class Noise:
       no rotation changes, then get more weight. Otherwise dwells are weighted by their scatter alone and the setting
       error is a considered parameter (Schmidt), which enlarges the covariance but does not change the estimate.
     - slew_sigma_mps2 (3,): the effective sigma in slews; None if no slews are used.
+    - free: the attitude of a dwell is not known at all (``free_attitude``); setting_rad then only stands for that.
     - walk_mps2_per_sqrt_s: the intensity q of the random walk of each bias.
     - walk_spread: the sigma of ln q; None if q was stated or is zero.
     """
@@ -64,6 +65,7 @@ class Noise:
     slew_sigma_mps2: Floats | None = None
     walk_mps2_per_sqrt_s: float = 0.0
     walk_spread: float | None = None
+    free: bool = False
 
     def __post_init__(self) -> None:
         if self.scatter_mps2 is None:  # pyright: ignore[reportUnnecessaryComparison]
@@ -234,7 +236,7 @@ def lift_rounding(covariances: Floats) -> Floats:
     error, rounding would decide whether the matrix is positive definite.
     """
     least = _ROUNDING * np.einsum("dii->d", covariances)
-    return np.asarray(covariances + least[:, None, None] * np.eye(3), float)
+    return np.asarray(covariances + least[:, None, None] * np.eye(covariances.shape[-1]), float)
 
 
 def setting_covariances(means: Means, state: Floats) -> Floats:

@@ -47,7 +47,7 @@ def outlying_dwells(
     ``evaluate`` makes a calibration from some of the dwells with the same model.
     """
     left_out, dwells = result.held_out, result.fit.dwells
-    if left_out is None or len(dwells) < 6 or result.noise.walk_mps2_per_sqrt_s:
+    if left_out is None or not result.bench.angles or len(dwells) < 6 or result.noise.walk_mps2_per_sqrt_s:
         return ()
     statistics = left_out.statistics
     if statistics.max() < 30.0:  # no dwell can be significant

@@ -11,7 +11,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells import window_average
 from kf_calib.effects import remarks_of
-from kf_calib.estimation import setup_blunders
+from kf_calib.estimation import free_attitude, setup_blunders
 from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.noise_model import TOO_SHORT, Noise
 from kf_calib.estimation.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, directions
@@ -22,6 +22,11 @@ from kf_calib.support.units import shown
 def misfit_remark(judged: Consistency, residuals: Floats, bench: Bench, noise: Noise) -> str:
     """A sentence on what may be wrong if the dwells do not fit the model, from residuals (D, 3); '' if they fit."""
     rms = float(np.sqrt(np.mean(residuals**2)))
+    if not bench.angles and judged.consistent is False:
+        return (
+            "the sizes of the readings at rest differ by more than the noise: gravity is not felt alone (a hand that "
+            "moves, vibration), or there is scatter or an effect that the nine parameters have not."
+        )
     if rms > 0.03 * bench.gravity_mps2:
         return (
             f"the angles do not explain the readings (residual {shown('m/s^2').text(rms, 2)} rms between dwells): "
@@ -67,13 +72,15 @@ def remarks_on(
     yield from (remark for effect in model.effects for remark in remarks_of(effect))
     unseen = [symbol for symbol, hidden in zip(paper_parameters.SYMBOLS, estimate.unseen, strict=True) if hidden]
     unseen += [c.symbol for c, s in zip(model.coefficients, estimate.effect_sigma, strict=True) if np.isnan(s)]
-    if unseen:
+    if not model.bench.angles:
+        yield from _without_angles(carried, noise, judged)
+    elif unseen:
         yield f"these orientations do not determine {', '.join(unseen)}: visit more, spread over the sphere."
     for effect in model.effects:
         exact = effect.degeneracy(model.bench)
         if exact and any(coefficient.symbol in unseen for coefficient in effect.coefficients):
             yield f"{exact}."
-    if judged.dof == 0:
+    if judged.dof == 0 and model.bench.angles:
         yield (
             f"{len(dwells)} dwell{'s are' if len(dwells) > 1 else ' is'} too few to test the model: "
             "visit at least five spread orientations."
@@ -100,7 +107,7 @@ def remarks_on(
             f"and their whole misfit ({shown('m/s^2').text(noise.scatter_mps2[0], 2)}) enters every sigma. Visit "
             f"{ENOUGH_DIRECTIONS} spread directions to distinguish them."
         )
-    if unstated(noise) and degrees_of_freedom(carried.means) < FEWEST:
+    if model.bench.angles and unstated(noise) and degrees_of_freedom(carried.means) < FEWEST:
         yield (
             f"{len(dwells)} dwell{'s are' if len(dwells) > 1 else ' is'} too few to estimate what was not stated "
             f"({' and '.join(unstated(noise))}): it is taken as zero; if it is not zero, the sigmas are too small."
@@ -116,3 +123,21 @@ def remarks_on(
             f"angle_sigma_deg was not stated; {np.degrees(noise.setting_rad):.2g} deg was estimated from the misfit "
             "between dwells, which an effect not in the model could also cause."
         )
+
+
+def _without_angles(carried: Carried, noise: Noise, judged: Consistency) -> Iterator[str]:
+    """Yield what a reader must know of a run without angles: the frame, and what the poses do not tell."""
+    model, count = carried.model, len(carried.dwells)
+    yield (
+        "no angles are used: of each pose only |f| = g is known. The frame is that of the sensors: x is the axis of "
+        "accelerometer 1, and accelerometer 2 lies in the plane of x and y (theta1, phi1 and nu2 are zero by that); "
+        "how the block is mounted, left or right hand, cannot be seen."
+    )
+    turn = f"next, turn it so that {free_attitude.next_in_words(carried, noise)}"
+    if model.square:
+        yield (
+            f"these poses do not tell the angles between the axes (nu1, theta3, phi3), which are taken for square to "
+            f"{np.degrees(model.bench.square_rad):.3g} deg (--square-sigma), as sigmas allow for: {turn}."
+        )
+    elif judged.dof < FEWEST:
+        yield f"{count} poses leave {judged.dof} degrees of freedom, too few to see scatter between poses: {turn}."

@@ -223,6 +223,13 @@ class Calibration:
     """The dwell that alone does not fit, or several if any one of them could be the cause."""
 
     @cached_property
+    def fixed(self) -> dict[str, str]:
+        """Parameters that are not estimated because no angles are used, and what fixes each: the ``frame`` of the
+        sensors, or axes that are taken for ``square``."""
+        both = {"frame": ("theta1", "phi1", "nu2"), "square": ("nu1", "theta3", "phi3") if self.model.square else ()}
+        return {} if self.bench.angles else {symbol: name for name, own in both.items() for symbol in own}
+
+    @cached_property
     def held_out(self) -> HeldOut | None:
         """The predictions of each orientation by a fit to all others; None if there are too few orientations."""
         with one_blas_thread():
@@ -285,8 +292,8 @@ class Calibration:
         return {
             symbol: Parameter(
                 symbol,
-                float(value) if np.isfinite(sigma) else None,
-                float(sigma) if np.isfinite(sigma) else None,
+                float(value) if np.isfinite(sigma) and symbol not in self.fixed else None,
+                float(sigma) if np.isfinite(sigma) and symbol not in self.fixed else None,
                 unit,
                 float(expected),
                 *own,

@@ -20,6 +20,7 @@ from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
 from kf_calib.estimation import random_walk
+from kf_calib.estimation.free_attitude import tangents
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model, dwell_map
 from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, flicker_sigma, slow_scatter
 from kf_calib.estimation.prior import Prior
@@ -97,7 +98,8 @@ def _weighted(
     """
     sigma, sigmas = noise.effective_sigma_mps2, noise.dwell_sigmas
     used, slow = np.flatnonzero(sigmas > 0), 0 if flicker_mps2 is None else len(_SLOW)
-    offsets, priors = len(used), sigmas[used]
+    priors = np.append([np.inf, np.inf], sigmas[3:][sigmas[3:] > 0]) if noise.free else sigmas[used]
+    offsets = len(priors)
     if flicker_mps2 is not None:
         priors = np.append(priors, np.outer(np.maximum(flicker_mps2, FLOOR_MPS2), 1.0 / np.sqrt(_SLOW)))
     count, (many, pieces, functions, _, width) = len(priors), columns.shape
@@ -105,7 +107,13 @@ def _weighted(
     triangles = np.array([dwell.triangles for dwell in dwells])
     carried = triangles[:, :, :functions, :functions]
     regressors = np.array([dwell.regressors for dwell in dwells])
-    nuisances = dwell_map(state)[:, :, used]
+    nuisances = list(dwell_map(state)[:, :, used])
+    if noise.free:
+        across = tangents(np.array([dwell.means[1:4] for dwell in dwells]))
+        nuisances = [
+            np.concatenate([own[:, :3] @ across, np.repeat(own[None, :, 3:], many, axis=0)], axis=2)[:, None]
+            for own in nuisances
+        ]
     waves = carried[..., :3] @ on_basis(np.array([_waves(dwell) for dwell in dwells])) if slow else None
     rows = np.zeros((many, 3 * size + count, count + inside + width + 1))
     for i in range(3):
@@ -218,6 +226,17 @@ class MisfitColumns:
             rows[:, :size] = np.moveaxis(found, 3, 1).reshape(many, size, count)
             out[each.rows] = rows - each.nuisances @ (np.swapaxes(each.nuisances[:, :size], 1, 2) @ rows[:, :size])
         return out
+
+
+def with_frame(rows: list[Floats], model: Model, noise: Noise, first: int = 0) -> list[Floats]:
+    """The rows [H | W | z] with one more for each state that the model fixes at zero, which has no column: a reading of
+    that state times g. They join the rows at index ``first``."""
+    if not model.fixed:
+        return rows
+    own = np.zeros((len(model.fixed), rows[first].shape[1]))
+    for k, place in enumerate(model.fixed):
+        own[k, place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2[k % 3]
+    return [*rows[:first], np.vstack([own, rows[first]]), *rows[first + 1 :]]
 
 
 def _waves(dwell: DwellFactor) -> Floats:

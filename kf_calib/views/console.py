@@ -22,7 +22,7 @@ from kf_calib.support.units import rounded, shown, shown_angle
 from kf_calib.views.tables import Table
 from kf_calib.views.terminal import PlainConsole, note
 
-_NOT_ESTIMATED = "not estimated"
+_NOT_ESTIMATED, _NOT_USED = "not estimated", "not used"
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
 GRADES: dict[Grade, str] = {"navigation": "navigation grade", "mems": "MEMS"}
 """Grades of sensors, and what they are called."""
@@ -45,10 +45,10 @@ def whole_value(parameter: Parameter) -> str:
     return f"{unit.rounded(parameter.value, parameter.sigma)[0]} {unit.label}"
 
 
-def _row(parameter: Parameter) -> tuple[str, str, str, str, str]:
-    """Return symbol, value, deviation from nominal, sigma and unit of a parameter."""
+def _row(parameter: Parameter, fixed_by: str = "") -> tuple[str, str, str, str, str]:
+    """Return symbol, value, deviation from nominal, sigma and unit of a parameter, or what it is fixed by."""
     if parameter.value is None or parameter.sigma is None:
-        return symbol(parameter.symbol), "not seen", "", "", ""
+        return symbol(parameter.symbol), fixed_by or "not seen", "", "", ""
     unit = shown(parameter)
     deviation, sigma = unit.rounded(parameter.value - parameter.nominal, parameter.sigma)
     sign = "" if deviation.startswith("-") else "+"
@@ -62,7 +62,7 @@ def parameter_table(result: Calibration) -> Table:
     for heading in ("parameter", "value", "less nominal", "sigma", "unit"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for k, parameter in enumerate(list(result.parameters.values())[:12]):
-        table.add_row(*_row(parameter), end_section=k % 4 == 3)
+        table.add_row(*_row(parameter, result.fixed.get(parameter.symbol, "")), end_section=k % 4 == 3)
     return table
 
 
@@ -146,7 +146,7 @@ def noise_table(result: Calibration) -> Table:
         ("dwell to dwell", scatter, noise.scatter_mps2, reading),
         ("setting of angles", setting, np.full(3, noise.setting_rad), angle),
     ):
-        cells = ["-"] * 3 if origin == _NOT_ESTIMATED else [unit.number(value) for value in values]
+        cells = ["-"] * 3 if origin in (_NOT_ESTIMATED, _NOT_USED) else [unit.number(value) for value in values]
         table.add_row(f"{name}, {origin}", *cells, unit.label)
     return table
 
@@ -155,6 +155,9 @@ def noise_origins(result: Calibration) -> tuple[str, str]:
     """Whether scatter and setting error were stated, estimated or not estimated, in words."""
     noise, few = result.noise, degrees_of_freedom(result.carried.means) < FEWEST
     scatter = "stated" if noise.scatter_stated else _NOT_ESTIMATED if few else "estimated"
+    if noise.free:
+        few = len(result.visits) - len(paper_parameters.SYMBOLS) + len(result.fixed) < FEWEST
+        return "stated" if noise.scatter_stated else _NOT_ESTIMATED if few else "estimated", _NOT_USED
     if not noise.setting_stated:
         return scatter, _NOT_ESTIMATED if few or not noise.checked else "estimated"
     return scatter, "with the angles' noise" if beyond_stated(noise, result.bench) else "stated"

@@ -26,14 +26,15 @@ def replay_object(result: Calibration) -> dict[str, Any]:
             "engine": result.settings.engine,
             "model": [str(effect) for effect in result.model.effects],
             "parameters": parameters_object(result),
+            "frame": frame_object(result),
             "biases_at_s": dwells[-1].end_s if noise.walk_mps2_per_sqrt_s else None,
             "noise": {
                 "sigma_mps2": noise.sigma_mps2,
                 "inflation": noise.inflation,
                 "dwell_sigma_mps2": noise.scatter_mps2,
                 "dwell_sigma_stated": noise.scatter_stated,
-                "angle_sigma_deg": math.degrees(noise.setting_rad),
-                "angle_sigma_stated": noise.setting_stated,
+                "angle_sigma_deg": None if noise.free else math.degrees(noise.setting_rad),
+                "angle_sigma_stated": noise.setting_stated and not noise.free,
             },
             "consistency": {
                 "consistent": judged.consistent,
@@ -58,6 +59,19 @@ def parameters_object(result: Calibration) -> list[dict[str, Any]]:
         {"symbol": p.symbol, "value": p.value, "sigma": p.sigma, "unit": p.unit, "nominal": p.nominal}
         for p in result.parameters.values()
     ]
+
+
+def frame_object(result: Calibration) -> dict[str, Any] | None:
+    """Without angles: the parameters that the frame fixes, and those of axes taken for square; else None."""
+    if result.bench.angles:
+        return None
+    return {
+        "x": "axis of accelerometer 1",
+        "xy": "plane of the axes of accelerometers 1 and 2",
+        "fixed": [symbol for symbol, by in result.fixed.items() if by == "frame"],
+        "square": [symbol for symbol, by in result.fixed.items() if by == "square"],
+        "square_sigma_deg": math.degrees(result.bench.square_rad),
+    }
 
 
 def outlying_object(found: OutlyingDwell) -> dict[str, Any]:

@@ -39,6 +39,7 @@ def plan_object(made: Plan, beside_paper: bool = False) -> dict[str, Any]:
         "axes": made.prospect.model.bench.to_metadata()["axes"],
         "count": len(made.poses),
         "gimbal_deg": made.gimbal_deg,
+        "up": None,
         "directions": made.directions,
         "begin_s": made.at_s - 0.5 * made.timing.dwell_s,
         "duration_s": made.duration_s,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -30,6 +30,7 @@ from kf_calib.sources.files.mcap_chunks import MAX_CHUNK_MB, DamagedError, parse
 from kf_calib.sources.files.mcap_file import McapFile, Warn
 from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, RecordBlock
 
+STANDARD_GRAVITY_MPS2 = 9.80665
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
 GAP_RECORD = "kf_calib.gap"
 """Metadata record at a place where the link to the bench was down: after_ns, seconds, reason."""
@@ -46,8 +47,8 @@ class Recording:
     accel_scale: factor on the readings, one for all or one a sensor (9.80665 for a file in g). angle_scale: factor on
     the gimbal angles (0.017453 for a file in degrees).
     accel_topic, pose_topic, temperature_topic: which to use where the file has several of the kind.
-    max_chunk_mb: chunks that unpack to more are passed over, and told. angles: whether angles or attitudes are wanted;
-    without them the batches have none.
+    max_chunk_mb: chunks that unpack to more are passed over, and told.
+    angles: False to do without angles and attitudes; the file may then have none, and the batches have none.
     Raises InputError where the file, or what it holds, cannot be used.
     """
 
@@ -72,8 +73,10 @@ class Recording:
         self.warnings = [file.trouble for file in self._parts.files if file.trouble]
         self._parts.contents = [self._survey(file) for file in self._parts.files]
         self._accel = self._require(READINGS, "convert the readings to sensor_msgs/msg/Imu")
-        advice = "record the angles too, as sensor_msgs/msg/JointState by the same clock"
-        self._pose = self._require(POSES, advice) if angles else None
+        self._pose = None
+        if angles:
+            advice = "record the angles too, as sensor_msgs/msg/JointState by the same clock"
+            self._pose = self._require(POSES, f"{advice}, or do without them (--no-angles)")
         self._parts.choose(TEMPERATURES, temperature_topic)  # optional, but not to be guessed
         self.bench = self._describe_bench(overrides)
         self._opening_warnings = len(self.warnings)
@@ -186,8 +189,10 @@ class Recording:
         damage = f"{self.path}: the description of the bench in it is damaged"
         if is_damaged:
             self.warnings.append(f"{damage}: only what options give is used.")
-        has_angles = self._pose is not None and self._parts.kind(POSES, self._pose) is JOINT_STATE
-        if self._pose and not has_angles and self._angle_scale != 1.0:
+        if self._pose is None:
+            return self._bench_without_angles({**recorded, **overrides})
+        has_angles = self._parts.kind(POSES, self._pose) is JOINT_STATE
+        if not has_angles and self._angle_scale != 1.0:
             raise InputError(
                 f"{self.path}: topic {self._pose} has attitudes, which have no unit: leave out --angle-unit."
             )
@@ -196,6 +201,23 @@ class Recording:
         except BenchError as error:
             where = f"{damage}, so give it by options" if is_damaged else str(self.path)
             raise BenchError(f"{where}: {error}") from error
+
+    def _bench_without_angles(self, stated: dict[str, str]) -> Bench:
+        """The bench of a recording whose angles are not used: where gravity is not stated, it is the standard one."""
+        if not {"gravity_mps2", "latitude_deg"} & stated.keys():
+            stated["gravity_mps2"] = str(STANDARD_GRAVITY_MPS2)
+            self.warnings.append(
+                f"gravity is taken as the standard {STANDARD_GRAVITY_MPS2} m/s^2; the local value differs by up to "
+                "0.3 %, and every scale factor with it: state it by --gravity or --latitude."
+            )
+        try:
+            bench = Bench.from_metadata(stated, has_angles=False)
+        except BenchError as error:
+            raise BenchError(f"{self.path}: {error}") from error
+        square = {"theta1": 0.0, "theta3": 0.0}
+        return replace(
+            bench, angles=False, reference="base", angle_sigma_deg=None, nominal=square | dict(bench.nominal)
+        )
 
 
 def _look_up_bench(file: McapFile, contents: Contents, position: int) -> None:

@@ -1,0 +1,246 @@
+"""Calibration without angles: of each dwell only the size of the specific force is known, |f| = g.
+
+The setting error of a dwell is then unbounded: two rotations, about axes across f, are nuisance states of any size. At
+the current state the specific force of a dwell is f = g unit(S^-1 (z - b)), where S holds the sensitivities in its
+rows, b the biases and z the mean readings; the rows are linearised there, and of a dwell's three readings the one
+combination n = S^-T f / g is left that no rotation changes. Force and state are found in turn (``settled``).
+
+A common rotation of all axes shows in no |f|. The frame is therefore that of the sensors: accelerometer 1 is its x
+axis, accelerometer 2 lies in its plane of x and y. Nine parameters are left: three scale factors, three biases, and
+three angles between the axes. Where the poses do not tell the three angles (six faces do not), the axes are taken for
+square, and the uncertainty of that enters the covariance (considered parameters, Schmidt).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.qr import triangle
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.errors import UnobservableError
+from kf_calib.estimation.dwell_columns import Carried, Means, Samples
+from kf_calib.estimation.measurement_model import FRAME, SQUARE, STATE_COUNT
+from kf_calib.estimation.noise_model import Noise
+from kf_calib.support.tail_probabilities import chi_squared_tail
+
+UNBOUNDED_RAD = 10.0
+"""Prior sigma of a rotation in the engines that need a finite one: what it tells is 1e-8 of a reading or less."""
+DIRECTIONS: dict[str, Floats] = {
+    " ".join(f"{'+' if sign > 0 else '-'}{axis}" for sign, axis in zip(signs, "xyz", strict=True) if sign): (
+        np.array(signs, float) / np.linalg.norm(signs)
+    )
+    for signs in sorted(itertools.product((0, 1, -1), repeat=3), key=np.count_nonzero)
+    if any(signs)
+}
+"""Faces, edges and corners of a cube by the axes that point up."""
+
+_NINE = [k for k in range(STATE_COUNT) if k not in FRAME]
+_SIX = [k for k in _NINE if k not in SQUARE]
+_FEWEST = 6  # degrees of freedom; with fewer no scatter is estimated
+_HOPELESS_SCALE, _HOPELESS_MPS2 = 0.2, 2.0
+_CHARGE = 2.7  # log-likelihood that scatter has to gain: 1 % point of the likelihood ratio
+
+
+def tangents(force: Floats) -> Floats:
+    """Two unit vectors across each force, as columns (D, 3, 2)."""
+    unit = force / np.linalg.norm(force, axis=1, keepdims=True)
+    start = np.eye(3)[np.abs(unit).argmin(axis=1)]
+    one = np.cross(unit, start)
+    one /= np.linalg.norm(one, axis=1, keepdims=True)
+    return np.asarray(np.stack([one, np.cross(unit, one)], axis=2), float)
+
+
+def felt(readings: Floats, state: Floats) -> Floats:
+    """Specific force (D, 3) by the mean readings (D, 3) alone: S^-1 (z - b)."""
+    affine = state[:STATE_COUNT].reshape(3, 4)
+    return np.asarray(np.linalg.solve(affine[:, :3], (readings - affine[:, 3]).T).T, float)
+
+
+def turned(dwells: Sequence[DwellFactor], state: Floats, gravity_mps2: float) -> list[DwellFactor]:
+    """The dwells with the specific force that their readings show at ``state``, of size g, and a pose that has it up.
+
+    The heading of such a pose is arbitrary.
+    """
+    raw = felt(np.array([dwell.means[4:] for dwell in dwells]), state)
+    unit = raw / np.linalg.norm(raw, axis=1, keepdims=True)
+    return [_with_force(dwell, gravity_mps2 * own, _pose(own)) for dwell, own in zip(dwells, unit, strict=True)]
+
+
+def _with_force(dwell: DwellFactor, force: Floats, pose: Floats) -> DwellFactor:
+    """Return the dwell with another specific force and pose at all its nodes."""
+    pieces = (
+        replace(each, nodes=replace(each.nodes, force_mps2=np.tile(force, (3, 1)), pose=np.tile(pose, (3, 1))))
+        for each in dwell.pieces
+    )
+    return replace(dwell, pieces=tuple(pieces))
+
+
+def _pose(unit: Floats) -> Floats:
+    """Return the quaternion (x, y, z, w) of the shortest rotation that brings a direction up, that is to +y."""
+    x, y, z = unit
+    if y < -1.0 + 1e-12:
+        return np.array([1.0, 0.0, 0.0, 0.0])
+    quaternion = np.array([-z, 0.0, x, 1.0 + y])
+    return quaternion / np.linalg.norm(quaternion)
+
+
+def weights_of_size(means: Means, state: Floats) -> Floats:
+    """The weights (D, 3) n = S^-T f / g of the three readings in |f|."""
+    sensitivity = state[:STATE_COUNT].reshape(3, 4)[:, :3]
+    unit = means.force_mps2 / np.linalg.norm(means.force_mps2, axis=1, keepdims=True)
+    return np.asarray(np.linalg.solve(sensitivity.T, unit.T).T, float)
+
+
+def radial(means: Means, state: Floats) -> tuple[Floats, Floats, Floats]:
+    """What no rotation changes: design (D, p), residual (D,) in m/s^2 of |f|, and the weights (D, 3) of the channels in
+    it."""
+    across = weights_of_size(means, state)
+    residual = np.einsum("di,di->d", across, means.readings - means.design @ state)
+    return np.einsum("di,dip->dp", across, means.design), residual, across
+
+
+def regressors_of(means: Means) -> Floats:
+    """The columns (D, 3, 12) of all twelve states, those that are fixed as well."""
+    out = np.zeros((len(means.counts), 3, STATE_COUNT))
+    for i in range(3):
+        out[:, i, 4 * i : 4 * i + 3], out[:, i, 4 * i + 3] = means.force_mps2, 1.0
+    return out
+
+
+def with_scatter(noise: Noise, means: Means, state: Floats, square: bool) -> Noise:
+    """The noise with scatter from dwell to dwell, one size for all accelerometers, if the sizes of f need it.
+
+    It is estimated by restricted likelihood, like that of a run with angles (``reml``), and with the same charge.
+    """
+    design, residual, across = radial(means, state)
+    own = ((across * noise.effective_sigma_mps2) ** 2).sum(axis=1) / means.counts
+    shape, columns = (across**2).sum(axis=1), design[:, _SIX if square else _NINE]
+    scale = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(scale > 0, scale, 1.0)
+
+    def cost(variance: float) -> tuple[float, float]:
+        """Return the cost of a variance, less a constant, and the misfit at it."""
+        sigma = np.sqrt(own + variance * shape)
+        upper = triangle(np.column_stack([columns, residual]) / sigma[:, None])
+        misfit = float(upper[-1, -1] ** 2)
+        return float(np.log(sigma).sum() + np.log(np.abs(np.diag(upper))[:-1]).sum() + 0.5 * misfit), misfit
+
+    free = len(residual) - columns.shape[1]
+    if free < _FEWEST or chi_squared_tail(free, cost(0.0)[1]) > 0.1:
+        return replace(noise, scatter_mps2=np.zeros(3))
+    best, reach = 0.5 * np.log(np.sum(residual**2) / free), 5.0
+    for _ in range(4):  # ever finer grids of ln(sigma)
+        grid = best + np.linspace(-reach, reach, 41)
+        best, reach = grid[np.argmin([cost(float(np.exp(2.0 * each)))[0] for each in grid])], reach / 10.0
+    if cost(0.0)[0] - cost(float(np.exp(2.0 * best)))[0] < _CHARGE:
+        return replace(noise, scatter_mps2=np.zeros(3))
+    return replace(noise, scatter_mps2=np.full(3, np.exp(best)))
+
+
+def covariance_of(carried: Carried, noise: Noise, square_rad: float = 1.0) -> Floats:
+    """Covariance (12, 12) that the dwells give of the nine parameters, with weak knowledge of each: 100 % of a scale
+    factor, 10 m/s^2 of a bias, and ``square_rad`` of each angle between axes."""
+    means = carried.means
+    across = weights_of_size(means, carried.state)
+    design = np.einsum("di,dip->dp", across, regressors_of(means))
+    variance = across**2 @ (noise.scatter_mps2**2) + ((across * noise.effective_sigma_mps2) ** 2).sum(1) / means.counts
+    nine = np.ix_(_NINE, _NINE)
+    information = ((design.T / variance) @ design)[nine] + np.linalg.inv(weak_covariance(square_rad)[nine])
+    out = np.zeros((STATE_COUNT, STATE_COUNT))
+    out[nine] = np.linalg.inv(information)
+    return out
+
+
+def weak_covariance(square_rad: float = 1.0) -> Floats:
+    """Covariance (12, 12) of the nine parameters before any dwell, see ``covariance_of``; zeros for the frame."""
+    sizes = np.ones(STATE_COUNT)
+    sizes[3::4], sizes[list(SQUARE)], sizes[list(FRAME)] = 10.0, square_rad, 0.0
+    return np.diag(sizes**2)
+
+
+def row_of(up: str, state: Floats, gravity_mps2: float) -> tuple[Floats, Floats]:
+    """The change (12,) of |f| per unit of each state if these axes point up, and the weights (3,) of the channels in
+    it."""
+    row, affine = np.zeros(STATE_COUNT), state[:STATE_COUNT].reshape(3, 4)
+    across = np.linalg.solve(affine[:, :3].T, DIRECTIONS[up])
+    row.reshape(3, 4)[:] = across[:, None] * np.append(gravity_mps2 * DIRECTIONS[up], 1.0)
+    return row, np.asarray(across, float)
+
+
+def tells_angles(carried: Carried, noise: Noise) -> bool:
+    """Whether the dwells tell every angle between the axes better than they are known to be square."""
+    covariance, places = covariance_of(carried, noise), list(SQUARE)
+    scale = carried.state[:STATE_COUNT].reshape(3, 4)[:, :3].diagonal()[[1, 2, 2]]
+    spread = covariance[np.ix_(places, places)] / np.outer(scale, scale)
+    return float(np.linalg.eigvalsh(spread)[-1]) < carried.model.bench.square_rad**2
+
+
+def square_changes(carried: Carried) -> list[Floats]:
+    """Changes (pieces, nodes, 3, 3) of each dwell's readings if one of the three angles between the axes is 1 sigma
+    from square."""
+    out, affine = list[Floats](), carried.state[:STATE_COUNT].reshape(3, 4)
+    for dwell in carried.dwells:
+        force = np.array([piece.nodes.force_mps2 for piece in dwell.pieces])
+        own = np.zeros((*force.shape[:2], 3, len(SQUARE)))
+        for k, (channel, axis) in enumerate(divmod(place, 4) for place in SQUARE):
+            own[:, :, channel, k] = force[:, :, axis] * affine[channel, channel] * carried.model.bench.square_rad
+        out.append(own)
+    return out
+
+
+def refuse_poses(carried: Carried, noise: Noise) -> None:
+    """Raise UnobservableError if the poses do not determine every scale factor and bias, and say which is missing."""
+    covariance = covariance_of(carried, noise, carried.model.bench.square_rad)
+    sigma = np.sqrt(covariance.diagonal()).reshape(3, 4)
+    poor = [f"K{i + 1}" for i in range(3) if sigma[i, i] > _HOPELESS_SCALE]
+    poor += [f"b{i + 1}" for i in range(3) if sigma[i, 3] > _HOPELESS_MPS2]
+    if poor:
+        dwells = len(carried.dwells)
+        up = most_informative(covariance, carried.state, carried.model.bench.gravity_mps2)
+        raise UnobservableError(
+            f"{dwells} pose{'s do' if dwells != 1 else ' does'} not determine {', '.join(poor)}: turn it so that "
+            f"{up_in_words(up)}, hold it still, and go on until each axis has pointed up and down."
+        )
+
+
+def next_in_words(carried: Carried, noise: Noise) -> str:
+    """Which axes should point up next, in words."""
+    covariance = covariance_of(carried, noise, carried.model.bench.square_rad)
+    return up_in_words(most_informative(covariance, carried.state, carried.model.bench.gravity_mps2))
+
+
+def up_in_words(up: str) -> str:
+    """A direction of ``DIRECTIONS`` in words."""
+    axes = [(str("xyz".index(axis) + 1), "up" if sign == "+" else "down") for sign, axis in up.split()]
+    if len(axes) == 1:
+        return f"the axis of accelerometer {axes[0][0]} points {axes[0][1]}"
+    *most, last = [f"{number} ({way})" for number, way in axes]
+    return f"the axes of accelerometers {', '.join(most)} and {last} are equally far from the vertical"
+
+
+def most_informative(covariance: Floats, state: Floats, gravity_mps2: float) -> str:
+    """The axes that should point up next: of the faces, edges and corners of a cube, the direction in which |f| is
+    known worst; of equal ones the one with fewer axes."""
+    best, worst = "", 0.0
+    for name in DIRECTIONS:
+        row, _ = row_of(name, state, gravity_mps2)
+        spread = float(row @ covariance @ row)
+        if spread > 1.1 * worst:
+            best, worst = name, spread
+    return best
+
+
+def holding_frame(samples: Iterable[Samples], carried: Carried) -> Iterator[Samples]:
+    """Yield first a reading of each state that is fixed at zero, times g, then the samples."""
+    for first in range(0, len(carried.model.fixed), 3):
+        observation = np.zeros((1, 3, carried.model.count))
+        for i, place in enumerate(carried.model.fixed[first : first + 3]):
+            observation[0, i, place] = carried.model.bench.gravity_mps2
+        number, start_s = carried.dwells[0].number, np.array([carried.dwells[0].start_s])
+        yield Samples(number, start_s, observation, np.zeros((1, 4)), np.zeros((1, 3)))
+    yield from samples
