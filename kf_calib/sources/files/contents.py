@@ -13,7 +13,8 @@ from mcap.records import Channel, Metadata, Schema
 from kf_calib.errors import InputError
 from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, MessageType
 from kf_calib.sources.files.mcap_chunks import DamagedError, parse
-from kf_calib.sources.files.mcap_file import McapFile, Warn
+from kf_calib.sources.files.mcap_file import Warn
+from kf_calib.sources.files.record_files import RecordFile
 
 BENCH_RECORD = "kf_calib.bench"
 CHECKSUM_KEY = "crc32"
@@ -41,8 +42,8 @@ class Role:
     preferred: tuple[str, ...]
 
     def kind(self, schema: str) -> MessageType | None:
-        """The message type of that schema name, if this role can use it; older names lack the ``msg/``."""
-        return next((kind for kind in self.kinds if schema in (kind.name, kind.name.replace("/msg/", "/"))), None)
+        """The message type of that schema name, if this role can use it."""
+        return next((kind for kind in self.kinds if schema in kind.names), None)
 
     @property
     def schemas(self) -> str:
@@ -52,6 +53,8 @@ class Role:
 READINGS = Role("accelerometer", "--accel-topic", (IMU,), (ACCEL_TOPIC,))
 POSES = Role("angle or attitude", "--pose-topic", (JOINT_STATE, QUATERNION), (ANGLES_TOPIC, ATTITUDE_TOPIC))
 TEMPERATURES = Role("temperature", "--temperature-topic", (TEMPERATURE,), (TEMPERATURE_TOPIC,))
+ROLES = (READINGS, POSES, TEMPERATURES)
+USABLE_SCHEMAS = frozenset(name for role in ROLES for kind in role.kinds for name in kind.names)
 
 
 @dataclass
@@ -130,7 +133,7 @@ class Parts:
     """The files of a recording, which follow each other."""
 
     path: Path
-    files: list[McapFile]
+    files: list[RecordFile]
     contents: list[Contents] = field(default_factory=list[Contents])
 
     @property

@@ -1,4 +1,4 @@
-"""A recording (MCAP files, docs/format.md) as a source of batches, one a chunk.
+"""A recording (MCAP or .db3 files, docs/format.md) as a source of batches, one a chunk.
 
 Topics are found by their schema. What is whole in a damaged or unfinished file is used, what is lost is told in
 ``warnings``. Sample time is ``header.stamp``. Memory is that of a few chunks, however long the recording.
@@ -24,11 +24,21 @@ from kf_calib.bench.streams import Batch, Source, Stream
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.bags import files_of
 from kf_calib.sources.files.cdr import JOINT_STATE, CdrError, Decoder
-from kf_calib.sources.files.contents import BENCH_RECORD, POSES, READINGS, TEMPERATURES, Contents, Parts, Role
+from kf_calib.sources.files.contents import (
+    BENCH_RECORD,
+    POSES,
+    READINGS,
+    TEMPERATURES,
+    USABLE_SCHEMAS,
+    Contents,
+    Parts,
+    Role,
+)
 from kf_calib.sources.files.joints import Joints
 from kf_calib.sources.files.mcap_chunks import MAX_CHUNK_MB, DamagedError, parse
-from kf_calib.sources.files.mcap_file import McapFile, Warn
+from kf_calib.sources.files.mcap_file import Warn
 from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, RecordBlock
+from kf_calib.sources.files.record_files import RecordFile, open_record_file
 
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
 GAP_RECORD = "kf_calib.gap"
@@ -66,7 +76,8 @@ class Recording:
         self.fraction = 0.0
         self._accel_scale, self._angle_scale = np.asarray(accel_scale, float), angle_scale
         self._wanted = {READINGS: accel_topic, POSES: pose_topic, TEMPERATURES: temperature_topic}
-        self._parts = Parts(self.path, [McapFile(file, int(max_chunk_mb * (1 << 20))) for file in files_of(self.path)])
+        limit = int(max_chunk_mb * (1 << 20))
+        self._parts = Parts(self.path, [open_record_file(file, limit, USABLE_SCHEMAS) for file in files_of(self.path)])
         self.warnings = [file.trouble for file in self._parts.files if file.trouble]
         self._parts.contents = [self._survey(file) for file in self._parts.files]
         self._accel = self._require(READINGS, "convert the readings to sensor_msgs/msg/Imu")
@@ -113,7 +124,7 @@ class Recording:
         self.fraction = 1.0
 
     def _part(
-        self, file: McapFile, passage: _Passage, decoders: _Decoders, growing: bool
+        self, file: RecordFile, passage: _Passage, decoders: _Decoders, growing: bool
     ) -> Iterator[tuple[int, Batch]]:
         """The batches of one file, and up to which byte it has been read then."""
         accel, pose = (passage.track(topic, decoders.of(role, topic)) for role, topic in
@@ -140,7 +151,7 @@ class Recording:
     def _warn_of_joints(self, said: str) -> None:
         self.warnings.append(f"{self.path}: topic {self._pose}: {said}.")
 
-    def _survey(self, file: McapFile) -> Contents:
+    def _survey(self, file: RecordFile) -> Contents:
         """Topics and bench: from the summary, else by reading on until no better choice of topics can come, and where
         something is damaged the bench."""
         contents, summary = Contents(file.path), file.summary
@@ -196,7 +207,7 @@ class Recording:
             raise BenchError(f"{where}: {error}") from error
 
 
-def _look_up_bench(file: McapFile, contents: Contents, position: int) -> None:
+def _look_up_bench(file: RecordFile, contents: Contents, position: int) -> None:
     try:
         contents.add(Opcode.METADATA, file.record_at(position, Opcode.METADATA), warn=_ignore)
     except DamagedError:

@@ -1,0 +1,136 @@
+"""A file of a ROS 2 bag in SQLite (.db3), given out as blocks of MCAP records.
+
+It has two tables: topics (name, type) and messages (topic, time of receipt, bytes). Messages are taken in the order in
+which they were written. Where the file is damaged, the messages around the damage are lost and told, the rest is used.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import zstandard
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+
+from kf_calib.errors import InputError
+from kf_calib.sources.files.mcap_chunks import DamagedError, allowed_sizes, megabytes
+from kf_calib.sources.files.mcap_file import Warn
+from kf_calib.sources.files.mcap_messages import MESSAGE_RECORD, RecordBlock
+from kf_calib.sources.files.mcap_summary import Summary
+
+_ROWS = 4096  # messages fetched at a time, and lost at once where one of them is damaged
+_ZSTD = b"\x28\xb5\x2f\xfd"  # no CDR message begins so: a bag's messages may be compressed one by one
+_LATEST = (1 << 63) - 1
+_Row = tuple[int, int, int, bytes]  # id, topic, time of receipt, message
+
+
+class SqliteBag:
+    """A .db3 file on disk; ``summary`` has its topics.
+
+    place: where the file lies, if not at ``path``, which messages name. usable: types of messages to be read; all
+    others (pictures, say) stay in the file. max_chunk: bytes that a compressed message may unpack to.
+    """
+
+    trouble = ""
+
+    def __init__(self, path: Path, place: Path, usable: Iterable[str], max_chunk: int) -> None:
+        self.path = path
+        self._place, self._usable, self._max_chunk = place, frozenset(usable), max_chunk
+        self.size = place.stat().st_size
+        try:
+            with closing(self._connect()) as base:
+                topics = base.execute("SELECT id, name, type, serialization_format FROM topics ORDER BY id").fetchall()
+                self._last = base.execute("SELECT max(id) FROM messages").fetchone()[0] or 0
+        except sqlite3.Error as error:
+            raise InputError(
+                f"{path} is an SQLite file but cannot be read as a ROS 2 bag ({error}): give a bag's .db3 file; a "
+                f"damaged one may be mended by `sqlite3 {path} .recover | sqlite3 mended.db3`."
+            ) from None
+        self._topics = {topic: k + 1 for k, (topic, *_) in enumerate(topics)}
+        self.summary = Summary(0)
+        for k, (_, name, kind, encoding) in enumerate(topics, 1):
+            self.summary.schemas.append(Schema(k, b"", "ros2msg", str(kind)))
+            self.summary.channels.append(Channel(k, str(name), str(encoding), {}, k))
+
+    def blocks(self, warn: Warn, growing: bool = False) -> Iterator[RecordBlock]:
+        """The usable messages, some thousands a block; ``warn`` is told what is lost. Raises InputError."""
+        if growing:
+            raise InputError(f"{self.path} is a bag in SQLite, which can be read when it is finished: use replay.")
+        damaged = list[str]()
+        with closing(self._connect()) as base:
+            for rows, after in self._pages(base, damaged):
+                yield self._block(rows, after, warn)
+        if damaged:
+            lost = min(len(damaged) * _ROWS, self._last)
+            warn(f"{self.path} is damaged ({damaged[0]}): up to {lost} of its {self._last} messages are lost.")
+
+    def record_at(self, position: int, opcode: int) -> bytes:
+        raise DamagedError(f"an SQLite file has no record of kind {opcode} at byte {position}")
+
+    def _connect(self) -> sqlite3.Connection:
+        # A bag that was closed has no journal, and is then read without one: the folder may be write-protected.
+        closed = not self._place.with_name(f"{self._place.name}-wal").exists()
+        base = sqlite3.connect(
+            f"{self._place.absolute().as_uri()}?mode=ro{'&immutable=1' * closed}", uri=True, check_same_thread=False
+        )
+        base.text_factory = lambda text: text.decode(errors="replace")
+        return base
+
+    def _pages(self, base: sqlite3.Connection, damaged: list[str]) -> Iterator[tuple[list[_Row], int]]:
+        """Rows of usable topics, and the id up to which the table has been read; what fails is put in ``damaged``."""
+        wanted = [topic for topic, k in self._topics.items() if self.summary.schemas[k - 1].name in self._usable]
+        query = (
+            "SELECT id, topic_id, CAST(timestamp AS INTEGER), CAST(data AS BLOB) FROM messages "
+            f"WHERE id > ? AND topic_id IN ({','.join('?' * len(wanted))}) ORDER BY id LIMIT {_ROWS}"
+        )
+        after = 0
+        while after < self._last:
+            try:
+                rows = base.execute(query, (after, *wanted)).fetchall()
+            except sqlite3.Error as error:
+                damaged.append(str(error))
+                after += _ROWS
+                continue
+            after = rows[-1][0] if len(rows) == _ROWS else self._last
+            yield rows, after
+
+    def _block(self, rows: list[_Row], after: int, warn: Warn) -> RecordBlock:
+        records, lost = list[bytes](), list[str]()
+        for _, topic, stamp, data in rows:
+            try:
+                message = self._unpack(data)
+            except DamagedError as damage:
+                lost.append(str(damage))
+                continue
+            time_ns = min(max(stamp or 0, 0), _LATEST)
+            head = MESSAGE_RECORD.pack(
+                Opcode.MESSAGE, MESSAGE_RECORD.size - 9 + len(message), self._topics[topic], 0, time_ns, time_ns
+            )
+            records.append(head + message)
+        if lost:
+            warn(f"{self.path}: {len(lost)} messages before id {after} are lost ({lost[0]}).")
+        data = b"".join(records)
+        starts = np.cumsum([0, *map(len, records)])[:-1]
+        return RecordBlock(data, (len(data),), starts.astype(np.int64), self.size * after // max(self._last, 1))
+
+    def _unpack(self, data: bytes) -> bytes:
+        if data is None:
+            raise DamagedError("they hold nothing")
+        if data[:4] != _ZSTD:
+            return data
+        try:
+            size = zstandard.frame_content_size(data)
+            if size > self._max_chunk:
+                raise DamagedError(f"one claims to hold {megabytes(size)} MB, {allowed_sizes(self._max_chunk)}")
+            return self._decompressor.decompress(data, max_output_size=self._max_chunk)
+        except (zstandard.ZstdError, MemoryError):
+            raise DamagedError("they do not decompress") from None
+
+    @cached_property
+    def _decompressor(self) -> zstandard.ZstdDecompressor:
+        return zstandard.ZstdDecompressor()
