@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -23,17 +23,20 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Source, Stream
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.bags import files_of
-from kf_calib.sources.files.cdr import JOINT_STATE, CdrError, Decoder
+from kf_calib.sources.files.cdr import CdrError, Decoder
 from kf_calib.sources.files.contents import (
     BENCH_RECORD,
     POSES,
     READINGS,
+    ROLES,
     TEMPERATURES,
     USABLE_SCHEMAS,
     Contents,
     Parts,
     Role,
 )
+from kf_calib.sources.files.field_messages import FieldDecoder
+from kf_calib.sources.files.fields import FieldError, Fields
 from kf_calib.sources.files.joints import Joints
 from kf_calib.sources.files.mcap_chunks import MAX_CHUNK_MB, DamagedError, parse
 from kf_calib.sources.files.mcap_file import Warn
@@ -56,6 +59,8 @@ class Recording:
     accel_scale: factor on the readings, one for all or one a sensor (9.80665 for a file in g). angle_scale: factor on
     the gimbal angles (0.017453 for a file in degrees).
     accel_topic, pose_topic, temperature_topic: which to use where the file has several of the kind.
+    fields: where the numbers are in JSON or protobuf messages, for example ``"accel=/imu:acc.x,acc.y,acc.z"``
+    (docs/bags.md).
     max_chunk_mb: chunks that unpack to more are passed over, and told.
     Raises InputError where the file, or what it holds, cannot be used.
     """
@@ -70,19 +75,24 @@ class Recording:
         accel_topic: str | None = None,
         pose_topic: str | None = None,
         temperature_topic: str | None = None,
+        fields: Sequence[str] = (),
         max_chunk_mb: float = MAX_CHUNK_MB,
     ) -> None:
         self.path = Path(path)
         self.fraction = 0.0
         self._accel_scale, self._angle_scale = np.asarray(accel_scale, float), angle_scale
-        self._wanted = {READINGS: accel_topic, POSES: pose_topic, TEMPERATURES: temperature_topic}
+        self._stated = _by_role(fields)
+        wanted = {READINGS: accel_topic, POSES: pose_topic, TEMPERATURES: temperature_topic}
+        self._wanted = wanted | {role: stated.topic for role, stated in self._stated.items()}
         limit = int(max_chunk_mb * (1 << 20))
         self._parts = Parts(self.path, [open_record_file(file, limit, USABLE_SCHEMAS) for file in files_of(self.path)])
         self.warnings = [file.trouble for file in self._parts.files if file.trouble]
         self._parts.contents = [self._survey(file) for file in self._parts.files]
-        self._accel = self._require(READINGS, "convert the readings to sensor_msgs/msg/Imu")
+        self._accel = self._require(
+            READINGS, "convert the readings to sensor_msgs/msg/Imu, or name them in JSON or protobuf by --field"
+        )
         self._pose = self._require(POSES, "record the angles too, as sensor_msgs/msg/JointState by the same clock")
-        self._parts.choose(TEMPERATURES, temperature_topic)  # optional, but not to be guessed
+        self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])  # optional, but not to be guessed
         self.bench = self._describe_bench(overrides)
         self._opening_warnings = len(self.warnings)
 
@@ -107,7 +117,7 @@ class Recording:
         del self.warnings[self._opening_warnings :]
         self.fraction, begun, parts = 0.0, 0, self._parts
         joints = Joints(len(self.bench.axes), self.bench.joints, self.bench.axis_letters, self._warn_of_joints)
-        decoders = _Decoders(parts, self.bench.pose_width, joints)
+        decoders = _Decoders(parts, self.bench.pose_width, joints, self.warnings.append)
         for file, contents in zip(parts.files, parts.contents, strict=True):
             passage = _Passage(contents, self._warn_of_damage)
             for end, batch in self._part(file, passage, decoders, growing and file is parts.files[-1]):
@@ -154,7 +164,7 @@ class Recording:
     def _survey(self, file: RecordFile) -> Contents:
         """Topics and bench: from the summary, else by reading on until no better choice of topics can come, and where
         something is damaged the bench."""
-        contents, summary = Contents(file.path), file.summary
+        contents, summary = Contents(file.path, self._stated), file.summary
         if summary:
             contents.schemas = {schema.id: schema for schema in summary.schemas}
             contents.channels = {channel.id: channel for channel in summary.channels}
@@ -188,6 +198,7 @@ class Recording:
             raise InputError(
                 f"{self.path} has no {role.quantity} topic ({role.schemas}), it has {self._parts}{state}: {advice}."
             )
+        self._parts.having(topic).refuse_unreadable(role, topic)
         return topic
 
     def _describe_bench(self, overrides: Mapping[str, str]) -> Bench:
@@ -195,7 +206,7 @@ class Recording:
         damage = f"{self.path}: the description of the bench in it is damaged"
         if is_damaged:
             self.warnings.append(f"{damage}: only what options give is used.")
-        has_angles = self._parts.kind(POSES, self._pose) is JOINT_STATE
+        has_angles = self._parts.having(self._pose).has_angles(self._pose)
         if not has_angles and self._angle_scale != 1.0:
             raise InputError(
                 f"{self.path}: topic {self._pose} has attitudes, which have no unit: leave out --angle-unit."
@@ -205,6 +216,18 @@ class Recording:
         except BenchError as error:
             where = f"{damage}, so give it by options" if is_damaged else str(self.path)
             raise BenchError(f"{where}: {error}") from error
+
+
+def _by_role(fields: Sequence[str]) -> dict[Role, Fields]:
+    """Fields as they are written, by what they are of. Raises InputError."""
+    found = dict[Role, Fields]()
+    for text in fields:
+        stated = Fields.of(text)
+        role = next(role for role in ROLES if stated.quantity in role.fields)
+        if role in found:
+            raise InputError(f"--field says twice where the {role.quantity} is: say it once.")
+        found[role] = stated
+    return found
 
 
 def _look_up_bench(file: RecordFile, contents: Contents, position: int) -> None:
@@ -221,12 +244,14 @@ class _Decoders:
     parts: Parts
     pose_width: int
     joints: Joints
-    known: dict[Role, Decoder] = field(default_factory=dict[Role, Decoder])
+    warn: Warn
+    known: dict[Role, Decoder | FieldDecoder] = field(default_factory=dict[Role, Decoder | FieldDecoder])
 
-    def of(self, role: Role, topic: str) -> Decoder:
+    def of(self, role: Role, topic: str) -> Decoder | FieldDecoder:
         if role not in self.known:
             width = {READINGS: 3, POSES: self.pose_width, TEMPERATURES: 1}[role]
-            self.known[role] = Decoder(self.parts.kind(role, topic), width, self.joints if role is POSES else None)
+            joints = self.joints if role is POSES else None
+            self.known[role] = self.parts.having(topic).decoder(role, topic, width, joints, self.warn)
         return self.known[role]
 
 
@@ -246,7 +271,7 @@ class _Passage:
         self._met = Counter[int]()
         self._marks = list[Metadata]()
 
-    def track(self, topic: str, decode: Decoder) -> _Track:
+    def track(self, topic: str, decode: Decoder | FieldDecoder) -> _Track:
         track = _Track(self.contents, topic, decode)
         self._tracks.append(track)
         return track
@@ -285,7 +310,7 @@ class _Track:
 
     contents: Contents
     topic: str
-    decode: Decoder
+    decode: Decoder | FieldDecoder
 
     def read(self, block: RecordBlock, messages: Messages) -> Stream:
         """The topic's samples in ``block``. Raises InputError where a message is not what its schema says."""
@@ -293,7 +318,7 @@ class _Track:
         groups = [group for group in messages.groups if group.channel in ids]
         try:
             parts = [self.decode.stream_with_offsets(block.data, group.at, group.size) for group in groups]
-        except CdrError as error:
+        except (CdrError, FieldError) as error:
             raise InputError(f"{self.contents.path}: topic {self.topic} cannot be used: {error}.") from error
         if len(parts) == 1:
             return parts[0][1]

@@ -26,7 +26,7 @@ from kf_calib.sources.files.mcap_summary import Summary
 _ROWS = 4096  # messages fetched at a time, and lost at once where one of them is damaged
 _ZSTD = b"\x28\xb5\x2f\xfd"  # no CDR message begins so: a bag's messages may be compressed one by one
 _LATEST = (1 << 63) - 1
-_Row = tuple[int, int, int, bytes]  # id, topic, time of receipt, message
+_Row = tuple[int, int, int, bytes | None]  # id, topic, time of receipt, message
 
 
 class SqliteBag:
@@ -118,7 +118,7 @@ class SqliteBag:
         starts = np.cumsum([0, *map(len, records)])[:-1]
         return RecordBlock(data, (len(data),), starts.astype(np.int64), self.size * after // max(self._last, 1))
 
-    def _unpack(self, data: bytes) -> bytes:
+    def _unpack(self, data: bytes | None) -> bytes:
         if data is None:
             raise DamagedError("they hold nothing")
         if data[:4] != _ZSTD:

@@ -125,7 +125,7 @@ def _cut(path: Path, share: float) -> None:
 
 BROKEN: dict[str, tuple[Any, str]] = {
     "no tables": (lambda path: altered(path, "DROP TABLE messages"), "cannot be read as a ROS 2 bag .no such table"),
-    "other tables": (lambda path: altered(path, "ALTER TABLE topics RENAME COLUMN type TO kind"), "no such column: typ"),
+    "other tables": (lambda path: altered(path, "ALTER TABLE topics RENAME COLUMN type TO k"), "no such column: type"),
     "head only": (lambda path: path.write_bytes(path.read_bytes()[:100]), "cannot be read as a ROS 2 bag"),
     "cut to a page": (lambda path: _cut(path, 0.01), "cannot be read as a ROS 2 bag|malformed"),
     "no topics": (lambda path: altered(path, "DELETE FROM topics"), "no accelerometer topic .*no topics"),
