@@ -34,7 +34,7 @@ class FieldDecoder:
         warn: Callable[[str], None],
     ) -> None:  # fmt: skip
         self.width = width
-        self._parse = _of_protobuf(schema) if encoding == "protobuf" else _of_json
+        self._parse = parser_of(encoding, schema)
         self._fields, self._joints, self._warn = fields, joints, warn
         self._time = ""
 
@@ -79,6 +79,11 @@ class FieldDecoder:
         if self._time != LOG_TIME:
             return time_ns(message, self._time)
         return min(_LOG_TIME.unpack_from(buffer, start - _LOG_TIME_BEFORE)[0], (1 << 63) - 1)
+
+
+def parser_of(encoding: str, schema: Schema | None) -> Callable[[bytes], Any]:
+    """What makes an object of a message in one of ``ENCODINGS``; raises FieldError, as this does."""
+    return _of_protobuf(schema) if encoding == "protobuf" else _of_json
 
 
 def _of_json(data: bytes) -> Any:

@@ -130,6 +130,18 @@ def time_ns(message: Any, path: str) -> int:
     return _within(parts[0] * 1_000_000_000 + parts[1], path)
 
 
+def paths_of(message: Any, before: str = "") -> Iterator[str]:
+    """Paths to all that is in a message; of a list of objects those in its first."""
+    if _is_list(message):
+        message = message[0] if len(message) and _is_object(message[0]) else None
+    if not _is_object(message):
+        yield from [before] if before else []
+        return
+    for name in message if isinstance(message, Mapping) else message.DESCRIPTOR.fields_by_name:
+        value = message[name] if isinstance(message, Mapping) else getattr(message, name)
+        yield from paths_of(value, f"{before}.{name}" if before else str(name))
+
+
 def _exactly(value: float, unit: int, path: str) -> int:
     """As it is written in decimals, to the nanosecond."""
     try:

@@ -13,7 +13,7 @@ def advice(path: Path, head: bytes) -> str:
     """What a file is that begins with ``head``, and how to make a recording of it."""
     if head.startswith(_ROS1):
         return f"{path} is a bag of ROS 1: convert it by {_by_rosbags(path)}, and give OUT."
-    if _is_lines(head):
+    if is_lines(head):
         made = path.with_suffix(".mcap") if path.suffix != ".mcap" else path.with_name(f"{path.stem}_recorded.mcap")
         return (
             f"{path} is not an MCAP file, it holds lines of text: record them first, by "
@@ -29,7 +29,7 @@ def _by_rosbags(bag: Path) -> str:
     return f"`rosbags-convert --src {bag} --dst OUT --dst-storage mcap` (after `pip install rosbags`)"
 
 
-def _is_lines(head: bytes) -> bool:
+def is_lines(head: bytes) -> bool:
     """JSON lines, or a table."""
     text = head.decode("utf-8-sig", errors="replace")[:-1]  # the last character may be cut
     first = text.lstrip().partition("\n")[0]

@@ -16,6 +16,7 @@ import numpy as np
 import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
+from numpy.typing import NDArray
 
 from kf_calib.errors import InputError
 from kf_calib.sources.files.mcap_chunks import DamagedError, allowed_sizes, megabytes
@@ -68,6 +69,19 @@ class SqliteBag:
         if damaged:
             lost = min(len(damaged) * _ROWS, self._last)
             warn(f"{self.path} is damaged ({damaged[0]}): up to {lost} of its {self._last} messages are lost.")
+
+    def receipts(self, warn: Warn) -> Iterator[tuple[int, NDArray[np.int64]]]:
+        """Of all topics: the channel and the times of receipt of messages of it, some thousands at a time."""
+        query = "SELECT topic_id, CAST(timestamp AS INTEGER) FROM messages ORDER BY id"
+        try:
+            with closing(self._connect()) as base:
+                cursor = base.execute(query)
+                while rows := cursor.fetchmany(_ROWS):
+                    table = np.array([(self._topics.get(topic, 0), stamp or 0) for topic, stamp in rows], np.int64)
+                    for channel in np.unique(table[:, 0]).tolist():
+                        yield channel, table[table[:, 0] == channel, 1]
+        except sqlite3.Error as error:
+            warn(f"{self.path} is damaged ({error}): what lies behind that is not counted.")
 
     def record_at(self, position: int, opcode: int) -> bytes:
         raise DamagedError(f"an SQLite file has no record of kind {opcode} at byte {position}")
