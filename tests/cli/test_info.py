@@ -94,7 +94,7 @@ def test_what_messages_in_json_have(facts: Any, tmp_path: Path) -> None:
         writer.finish()
     found = facts(path)
     assert found["topics"][0]["fields"] == ["t", "acc.x", "l.v"]
-    assert len(found["missing"]) == 1 and "has no accelerometer topic" in found["missing"][0]
+    assert len(found["missing"]) == 2 and "has no accelerometer topic" in found["missing"][0]
     assert "--field" in found["missing"][0]
 
 
@@ -132,7 +132,7 @@ def test_damage_is_told_beside_what_is_there(facts: Any, tmp_path: Path) -> None
         (b"", "is empty"),
         (b"\0\1\2" * 100, "is not an MCAP file"),
         (b"SQLite format 3\0" + bytes(500), "cannot be read as a ROS 2 bag"),
-        (b"\x28\xb5\x2f\xfd" + bytes(50), "does not decompress"),
+        (b"\x28\xb5\x2f\xfd....", "does not decompress"),
         (b"#ROSBAG V2.0\n", "is a bag of ROS 1"),
         (b"a,b\n1,2\n", "gives the time"),
     ],

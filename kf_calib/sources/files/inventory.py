@@ -202,13 +202,15 @@ def _from_blocks(
         messages = find(block)
         for opcode, content in messages.others:
             contents.add(opcode, content, warn)
-        for channel in dict.fromkeys(group.channel for group in messages.groups):
-            groups = [group for group in messages.groups if group.channel == channel]
+        for channel in contents.channels.values() if messages.others else ():
+            _topic(channel, contents, topics)
+        for number in dict.fromkeys(group.channel for group in messages.groups):
+            groups = [group for group in messages.groups if group.channel == number]
             at = np.sort(np.concatenate([group.at for group in groups]))
             every = np.ndarray((len(block.data) - 7,), "<u8", block.data, strides=(1,))
-            yield channel, np.minimum(every[at - _LOG_TIME_BEFORE], _LATEST).astype(np.int64)
+            yield number, np.minimum(every[at - _LOG_TIME_BEFORE], _LATEST).astype(np.int64)
             first = block.data[int(groups[0].at[0]) : int(groups[0].at[0]) + groups[0].size]
-            _look_into(first, channel, contents, topics)
+            _look_into(first, number, contents, topics)
 
 
 def _look_into(message: bytes, number: int, contents: Contents, topics: dict[str, Topic]) -> None:
