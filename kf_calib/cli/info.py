@@ -53,7 +53,7 @@ def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json:
 
     renamed = dict(map(pair, columns))
     with progress(f"reading {recording.name}", as_json) as tick:
-        inventory = inventory_of(recording, renamed)
+        inventory = inventory_of(recording, renamed, options["fields"])
         bench = {**inventory.bench, **overrides(options)}
         missing = _lacking(inventory, bench)
         dwells, warnings = None, list(inventory.warnings)
@@ -67,7 +67,7 @@ def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json:
             missing = {"": str(error), **missing}
     if dwells is not None and not dwells:
         missing[""] = "a stretch in which the platform stands still: --still-deg says what counts as standing still"
-    words = [*_given(ctx, inventory), *(_NAMED[key][0] for key in missing if key in _NAMED)]
+    words = [*_given(ctx, inventory), *_fields(inventory), *(_NAMED[key][0] for key in missing if key in _NAMED)]
     found = Overview(inventory, bench, dwells, list(missing.values()), _command(inventory, words), warnings)
     if as_json:
         print_json(overview_object(found))
@@ -77,7 +77,7 @@ def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json:
 
 def _lacking(inventory: Inventory, bench: Mapping[str, str]) -> dict[str, str]:
     """What the bench's description lacks, by the key."""
-    keys = {"axes": inventory.has_angles and not bench.get("axes"),
+    keys = {"axes": inventory.has_angles is not False and not bench.get("axes"),
             "gravity_mps2": not bench.get("gravity_mps2") and not bench.get("latitude_deg")}  # fmt: skip
     return {key: _NAMED[key][1] for key, lacks in keys.items() if lacks}
 
@@ -110,6 +110,15 @@ def _given(ctx: click.Context, inventory: Inventory) -> list[str]:
             words += [f"{param.opts[0]} {shlex.quote(str(each))}" for each in
                       (value if isinstance(value, tuple) else [value])]  # fmt: skip
     return words
+
+
+def _fields(inventory: Inventory) -> list[str]:
+    """How the numbers would be named that are in messages which tell what they have, but not what it is."""
+    if not any(topic.paths for topic in inventory.topics):
+        return []
+    accel = [] if inventory.has_readings else ["--field accel=TOPIC:X,Y,Z@TIME"]
+    angles = [] if inventory.has_angles is not None else ["--field angles=TOPIC:OUTER,MIDDLE,INNER@TIME"]
+    return accel + angles
 
 
 def _command(inventory: Inventory, words: list[str]) -> str:

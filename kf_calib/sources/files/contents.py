@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -65,6 +65,18 @@ POSES = Role(
 TEMPERATURES = Role("temperature", "--temperature-topic", (TEMPERATURE,), (TEMPERATURE_TOPIC,), ("temperature",))
 ROLES = (READINGS, POSES, TEMPERATURES)
 USABLE_SCHEMAS = frozenset(name for role in ROLES for kind in role.kinds for name in kind.names)
+
+
+def fields_by_role(fields: Sequence[str]) -> dict[Role, Fields]:
+    """Fields as they are written, by what they are of. Raises InputError."""
+    found = dict[Role, Fields]()
+    for text in fields:
+        stated = Fields.of(text)
+        role = next(role for role in ROLES if stated.quantity in role.fields)
+        if role in found:
+            raise InputError(f"--field says twice where the {role.quantity} is: say it once.")
+        found[role] = stated
+    return found
 
 
 @dataclass

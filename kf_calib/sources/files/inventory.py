@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kf_calib.errors import InputError
 from kf_calib.sources.files.bags import files_of
-from kf_calib.sources.files.contents import POSES, USABLE_SCHEMAS, Contents
+from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, fields_by_role
 from kf_calib.sources.files.field_messages import ENCODINGS, parser_of
 from kf_calib.sources.files.fields import FieldError, paths_of
 from kf_calib.sources.files.foreign import HEAD_BYTES, is_lines
@@ -97,7 +97,8 @@ class Topic:
 
 @dataclass
 class Inventory:
-    """What a recording's files hold. has_angles: the platform is described by angles; None: nothing tells."""
+    """What a recording's files hold. has_readings: of an accelerometer, by a schema that is known. has_angles: the
+    platform is described by angles; None: it is not described in a schema that is known."""
 
     path: Path
     format: str
@@ -105,6 +106,7 @@ class Inventory:
     size: int
     topics: list[Topic]
     bench: dict[str, str]
+    has_readings: bool
     has_angles: bool | None
     warnings: list[str]
 
@@ -113,26 +115,33 @@ class Inventory:
         return self.format == "lines"
 
 
-def inventory_of(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> Inventory:
-    """All of a file or a bag's folder, read once. columns: our names of a table's. Raises InputError."""
+def inventory_of(
+    path: Path, columns: Mapping[str, str] = MappingProxyType({}), fields: Sequence[str] = ()
+) -> Inventory:
+    """All of a file or a bag's folder, read once. columns: our names of a table's. fields: as of a ``Recording``.
+
+    Raises InputError.
+    """
+    stated = fields_by_role(fields)
     files = files_of(path)
     if len(files) == 1 and _holds_lines(files[0]):
         return _of_lines(files[0], columns)
     warnings = list[str]()
     parts = [open_record_file(file, int(MAX_CHUNK_MB * (1 << 20)), USABLE_SCHEMAS) for file in files]
-    topics, bench, has_angles = dict[str, Topic](), dict[str, str](), None
+    topics, bench, has_readings, has_angles = dict[str, Topic](), dict[str, str](), False, None
     for part in parts:
         warnings += [part.trouble] if part.trouble else []
-        contents = Contents(part.path)
+        contents = Contents(part.path, stated)
         _count(part, contents, topics, warnings.append)
         bench = bench or contents.bench or {}
+        has_readings |= bool(contents.topics(READINGS))
         poses = contents.topics(POSES)
         has_angles = contents.has_angles(poses[0]) if poses and has_angles is None else has_angles
     for topic in topics.values():
         topic.settle()
     kind = "+".join(dict.fromkeys("db3" if isinstance(part, SqliteBag) else "mcap" for part in parts))
     size = sum(part.size for part in parts)
-    return Inventory(path, kind, files, size, list(topics.values()), bench, has_angles, warnings)
+    return Inventory(path, kind, files, size, list(topics.values()), bench, has_readings, has_angles, warnings)
 
 
 def _holds_lines(file: Path) -> bool:
@@ -157,7 +166,8 @@ def _of_lines(path: Path, columns: Mapping[str, str]) -> Inventory:
     assert said
     topics[1].name = "platform angles" if said.has_angles else "platform attitude"
     met = [topic for topic in topics if topic.count]
-    return Inventory(path, "lines", [path], path.stat().st_size, met, said.metadata, said.has_angles, lines.warnings)
+    size = path.stat().st_size
+    return Inventory(path, "lines", [path], size, met, said.metadata, True, said.has_angles, lines.warnings)
 
 
 def _count(file: RecordFile, contents: Contents, topics: dict[str, Topic], warn: Warn) -> None:

@@ -28,15 +28,15 @@ from kf_calib.sources.files.contents import (
     BENCH_RECORD,
     POSES,
     READINGS,
-    ROLES,
     TEMPERATURES,
     USABLE_SCHEMAS,
     Contents,
     Parts,
     Role,
+    fields_by_role,
 )
 from kf_calib.sources.files.field_messages import FieldDecoder
-from kf_calib.sources.files.fields import FieldError, Fields
+from kf_calib.sources.files.fields import FieldError
 from kf_calib.sources.files.joints import Joints
 from kf_calib.sources.files.mcap_chunks import MAX_CHUNK_MB, DamagedError, parse
 from kf_calib.sources.files.mcap_file import Warn
@@ -81,7 +81,7 @@ class Recording:
         self.path = Path(path)
         self.fraction = 0.0
         self._accel_scale, self._angle_scale = np.asarray(accel_scale, float), angle_scale
-        self._stated = _by_role(fields)
+        self._stated = fields_by_role(fields)
         wanted = {READINGS: accel_topic, POSES: pose_topic, TEMPERATURES: temperature_topic}
         self._wanted = wanted | {role: stated.topic for role, stated in self._stated.items()}
         limit = int(max_chunk_mb * (1 << 20))
@@ -216,18 +216,6 @@ class Recording:
         except BenchError as error:
             where = f"{damage}, so give it by options" if is_damaged else str(self.path)
             raise BenchError(f"{where}: {error}") from error
-
-
-def _by_role(fields: Sequence[str]) -> dict[Role, Fields]:
-    """Fields as they are written, by what they are of. Raises InputError."""
-    found = dict[Role, Fields]()
-    for text in fields:
-        stated = Fields.of(text)
-        role = next(role for role in ROLES if stated.quantity in role.fields)
-        if role in found:
-            raise InputError(f"--field says twice where the {role.quantity} is: say it once.")
-        found[role] = stated
-    return found
 
 
 def _look_up_bench(file: RecordFile, contents: Contents, position: int) -> None:
