@@ -25,6 +25,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "simulate": ("made.mcap", *QUICK),
     "record": ("recorded.mcap", "lines.csv", "--axes", "y z x", "--gravity", "9.81"),
     "effects": (),
+    "info": (HIDDEN,),
     "plan": ("--count", 4),
     "paper": ("--repetitions", 2),
 }

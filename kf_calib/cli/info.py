@@ -107,9 +107,15 @@ def _given(ctx: click.Context, inventory: Inventory) -> list[str]:
             continue
         if is_taken:
             value = ctx.params[name]
-            words += [f"{param.opts[0]} {shlex.quote(str(each))}" for each in
+            words += [f"{param.opts[0]} {_quoted(str(each))}" for each in
                       (value if isinstance(value, tuple) else [value])]  # fmt: skip
     return words
+
+
+def _quoted(text: str) -> str:
+    """As a word of a shell, in double quotes where these do: other shells know no single ones."""
+    plain = shlex.quote(text)
+    return plain if plain == text or any(each in text for each in '"$`\\!%') else f'"{text}"'
 
 
 def _fields(inventory: Inventory) -> list[str]:
@@ -123,8 +129,8 @@ def _fields(inventory: Inventory) -> list[str]:
 
 def _command(inventory: Inventory, words: list[str]) -> str:
     """The command that evaluates the recording; for lines the one that records them, which goes before."""
-    path = shlex.quote(str(inventory.path))
+    path = _quoted(str(inventory.path))
     if not inventory.is_lines:
         return " ".join(["kf-calib replay", path, *words])
-    made = shlex.quote(str(inventory.path.with_suffix(".mcap")))
+    made = _quoted(str(inventory.path.with_suffix(".mcap")))
     return f"{' '.join(['kf-calib record', made, path, *words])} && kf-calib replay {made}"

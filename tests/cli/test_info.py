@@ -59,7 +59,7 @@ def test_the_command_of_a_bag_that_lacks_its_bench_works(facts: Any, run: Any, t
     found = facts(bag, "--angle-sigma", "0.2")
     assert found["format"] == "db3" and found["bench"] == {"angle_sigma_deg": "0.2"} and found["dwells"] is None
     assert [text.partition(":")[0] for text in found["missing"]] == ["the gimbal axes, outer to inner", "local gravity"]
-    assert found["command"] == f"kf-calib replay '{bag}' --angle-sigma 0.2 --axes \"y z x\" --gravity 9.81"
+    assert found["command"] == f'kf-calib replay "{bag}" --angle-sigma 0.2 --axes "y z x" --gravity 9.81'
     words = shlex.split(found["command"])[1:]
     code, out, err = run(*words, "--json")
     assert code == 0, err
