@@ -22,6 +22,10 @@ _LOG_TIME_BEFORE = 16  # bytes from a record's log time to its message
 _Parse = Callable[[bytes], Any]
 
 
+class _UnreadError(FieldError):
+    """A message is not in the encoding that its topic is said to have."""
+
+
 class FieldDecoder:
     """Samples from messages of one topic, ``width`` numbers each, taken from where ``fields`` says.
 
@@ -37,13 +41,25 @@ class FieldDecoder:
         self._parse = parser_of(encoding, schema)
         self._fields, self._joints, self._warn = fields, joints, warn
         self._time = ""
+        self._unread = list[str]()
+
+    def take_unread(self) -> list[str]:
+        """Why messages were left out since this was asked last."""
+        unread, self._unread = self._unread, []
+        return unread
 
     def stream_with_offsets(self, buffer: bytes, at: Offsets, size: int) -> tuple[Offsets, Stream]:
         """Those of the messages of ``size`` bytes each at offsets ``at`` of ``buffer``, after the offsets that they are
-        from. Raises FieldError."""
+        from. Raises FieldError; a message that cannot be read is left out, if any before it could be."""
         kept, stamps, values = list[int](), list[int](), list[list[float]]()
         for start in at.tolist():
-            message = self._parse(buffer[start : start + size])
+            try:
+                message = self._parse(buffer[start : start + size])
+            except _UnreadError as error:
+                if not self._time:
+                    raise
+                self._unread.append(str(error))
+                continue
             numbers = self._chosen(self._fields.numbers(message), self._fields.labels(message))
             if numbers is not None:
                 kept.append(start)
@@ -90,7 +106,7 @@ def _of_json(data: bytes) -> Any:
     try:
         return json.loads(data)
     except (ValueError, RecursionError):
-        raise FieldError(f"a message is not JSON, it begins with {data[:20]!r}") from None
+        raise _UnreadError(f"a message is not JSON, it begins with {data[:20]!r}") from None
 
 
 def _of_protobuf(schema: Schema | None) -> _Parse:
@@ -126,6 +142,6 @@ def _of_protobuf(schema: Schema | None) -> _Parse:
         try:
             return kind.FromString(data)
         except DecodeError:
-            raise FieldError(f"a message is no {name} in protobuf") from None
+            raise _UnreadError(f"a message is no {name} in protobuf") from None
 
     return parse

@@ -214,8 +214,8 @@ def _from_blocks(
             contents.add(opcode, content, warn)
         for channel in contents.channels.values() if messages.others else ():
             _topic(channel, contents, topics)
-        for number in dict.fromkeys(group.channel for group in messages.groups):
-            groups = [group for group in messages.groups if group.channel == number]
+        for number in dict.fromkeys(group.channel for group in messages.groups if len(group.at)):
+            groups = [group for group in messages.groups if group.channel == number and len(group.at)]
             at = np.sort(np.concatenate([group.at for group in groups]))
             every = np.ndarray((len(block.data) - 7,), "<u8", block.data, strides=(1,))
             yield number, np.minimum(every[at - _LOG_TIME_BEFORE], _LATEST).astype(np.int64)

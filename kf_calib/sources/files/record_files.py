@@ -44,7 +44,7 @@ def open_record_file(path: Path, max_chunk: int, usable: frozenset[str]) -> Reco
     file: RecordFile
     try:
         if _head(place).startswith(_SQLITE):
-            file = SqliteBag(path, place, usable, max_chunk)
+            file = SqliteBag(path, place, usable)
         else:
             file = McapFile(path, max_chunk, place)
     except BaseException:

@@ -41,6 +41,7 @@ from kf_calib.sources.files.joints import Joints
 from kf_calib.sources.files.mcap_chunks import MAX_CHUNK_MB, DamagedError, parse
 from kf_calib.sources.files.mcap_file import Warn
 from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, RecordBlock
+from kf_calib.sources.files.packed_messages import are_packed, unpacked
 from kf_calib.sources.files.record_files import RecordFile, open_record_file
 
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
@@ -84,8 +85,9 @@ class Recording:
         self._stated = fields_by_role(fields)
         wanted = {READINGS: accel_topic, POSES: pose_topic, TEMPERATURES: temperature_topic}
         self._wanted = wanted | {role: stated.topic for role, stated in self._stated.items()}
-        limit = int(max_chunk_mb * (1 << 20))
-        self._parts = Parts(self.path, [open_record_file(file, limit, USABLE_SCHEMAS) for file in files_of(self.path)])
+        self._limit = int(max_chunk_mb * (1 << 20))
+        files = [open_record_file(file, self._limit, USABLE_SCHEMAS) for file in files_of(self.path)]
+        self._parts = Parts(self.path, files)
         self.warnings = [file.trouble for file in self._parts.files if file.trouble]
         self._parts.contents = [self._survey(file) for file in self._parts.files]
         self._accel = self._require(
@@ -119,7 +121,7 @@ class Recording:
         joints = Joints(len(self.bench.axes), self.bench.joints, self.bench.axis_letters, self._warn_of_joints)
         decoders = _Decoders(parts, self.bench.pose_width, joints, self.warnings.append)
         for file, contents in zip(parts.files, parts.contents, strict=True):
-            passage = _Passage(contents, self._warn_of_damage)
+            passage = _Passage(contents, self._limit, self._warn_of_damage)
             for end, batch in self._part(file, passage, decoders, growing and file is parts.files[-1]):
                 self.fraction = math.nan if growing else min((begun + end) / parts.size, 1.0)
                 if growing or len(batch.accel) or len(batch.pose) or len(batch.temperature):
@@ -141,7 +143,7 @@ class Recording:
                        ((READINGS, self._accel), (POSES, self._pose)))  # fmt: skip
         temperature = None
         for block in file.blocks(self._warn_of_damage, growing=growing):
-            messages = passage.find(block)
+            block, messages = passage.find(block)
             if not temperature and (topic := self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])):
                 temperature = passage.track(topic, decoders.of(TEMPERATURES, topic))
             readings, angles = accel.read(block, messages), pose.read(block, messages)
@@ -251,8 +253,8 @@ def opened(source: Source | str | PathLike[str]) -> Source:
 class _Passage:
     """One reading of a file from its start, with the account of the messages met."""
 
-    def __init__(self, contents: Contents, warn: Warn) -> None:
-        self.contents = contents
+    def __init__(self, contents: Contents, max_message: int, warn: Warn) -> None:
+        self.contents, self._max_message = contents, max_message
         self.warn = warn
         self._find = MessageFinder()
         self._tracks: list[_Track] = []
@@ -264,7 +266,8 @@ class _Passage:
         self._tracks.append(track)
         return track
 
-    def find(self, block: RecordBlock) -> Messages:
+    def find(self, block: RecordBlock) -> tuple[RecordBlock, Messages]:
+        """The messages in a block, and the block that they are in."""
         messages = self._find(block)
         for opcode, content in messages.others:
             self.contents.add(opcode, content, self.warn)
@@ -273,7 +276,18 @@ class _Passage:
             self.warn(f"{self.contents.path}: {messages.lost} bytes of records before byte {block.end} make no sense.")
         for group in messages.groups:
             self._met[group.channel] += len(group.at)
-        return messages
+        in_cdr = (group for group in messages.groups if self._is_in_cdr(group.channel))
+        return self._unpacked(block, messages) if are_packed(block, in_cdr) else (block, messages)
+
+    def _is_in_cdr(self, number: int) -> bool:
+        channel = self.contents.channels.get(number)
+        return channel is not None and channel.message_encoding == "cdr"
+
+    def _unpacked(self, block: RecordBlock, messages: Messages) -> tuple[RecordBlock, Messages]:
+        whole, lost = unpacked(block, messages.groups, self._max_message)
+        if lost:
+            self.warn(f"{self.contents.path}: {len(lost)} messages before byte {block.end} are lost ({lost[0]}).")
+        return whole, self._find(whole)
 
     def account(self, stated: Mapping[int, int], warn: Warn) -> None:
         """Warns of messages that the file should have (``stated``, by channel) but that were not met, and of gaps."""
@@ -282,6 +296,9 @@ class _Passage:
                 reason = marks[0].metadata.get("reason", "unknown")
                 warn(f"{self.contents.path}: {what} {len(marks)} times (first: {reason}).")
         for track in self._tracks:
+            if isinstance(track.decode, FieldDecoder) and (unread := track.decode.take_unread()):
+                said = f"{self.contents.path}: topic {track.topic}"
+                warn(f"{said}: {len(unread)} messages are left out (first: {unread[0]}).")
             ids = self.contents.ids(track.topic)
             total = sum(stated.get(channel, 0) for channel in ids)
             lost = total - sum(self._met[channel] for channel in ids)

@@ -9,23 +9,20 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import closing
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from kf_calib.errors import InputError
-from kf_calib.sources.files.mcap_chunks import DamagedError, allowed_sizes, megabytes
+from kf_calib.sources.files.mcap_chunks import DamagedError
 from kf_calib.sources.files.mcap_file import Warn
-from kf_calib.sources.files.mcap_messages import MESSAGE_RECORD, RecordBlock
+from kf_calib.sources.files.mcap_messages import MESSAGE_FIELDS, MESSAGE_RECORD, RecordBlock
 from kf_calib.sources.files.mcap_summary import Summary
 
 _ROWS = 4096  # messages fetched at a time, and lost at once where one of them is damaged
-_ZSTD = b"\x28\xb5\x2f\xfd"  # no CDR message begins so: a bag's messages may be compressed one by one
 _LATEST = (1 << 63) - 1
 _Row = tuple[int, int, int, bytes | None]  # id, topic, time of receipt, message
 
@@ -34,14 +31,14 @@ class SqliteBag:
     """A .db3 file on disk; ``summary`` has its topics.
 
     place: where the file lies, if not at ``path``, which messages name. usable: types of messages to be read; all
-    others (pictures, say) stay in the file. max_chunk: bytes that a compressed message may unpack to.
+    others (pictures, say) stay in the file.
     """
 
     trouble = ""
 
-    def __init__(self, path: Path, place: Path, usable: Iterable[str], max_chunk: int) -> None:
+    def __init__(self, path: Path, place: Path, usable: Iterable[str]) -> None:
         self.path = path
-        self._place, self._usable, self._max_chunk = place, frozenset(usable), max_chunk
+        self._place, self._usable = place, frozenset(usable)
         self.size = place.stat().st_size
         try:
             with closing(self._connect()) as base:
@@ -65,7 +62,7 @@ class SqliteBag:
         damaged = list[str]()
         with closing(self._connect()) as base:
             for rows, after in self._pages(base, damaged):
-                yield self._block(rows, after, warn)
+                yield self._block(rows, after)
         if damaged:
             lost = min(len(damaged) * _ROWS, self._last)
             warn(f"{self.path} is damaged ({damaged[0]}): up to {lost} of its {self._last} messages are lost.")
@@ -113,38 +110,14 @@ class SqliteBag:
             after = rows[-1][0] if len(rows) == _ROWS else self._last
             yield rows, after
 
-    def _block(self, rows: list[_Row], after: int, warn: Warn) -> RecordBlock:
-        records, lost = list[bytes](), list[str]()
+    def _block(self, rows: list[_Row], after: int) -> RecordBlock:
+        records = list[bytes]()
         for _, topic, stamp, data in rows:
-            try:
-                message = self._unpack(data)
-            except DamagedError as damage:
-                lost.append(str(damage))
-                continue
-            time_ns = min(max(stamp or 0, 0), _LATEST)
-            head = MESSAGE_RECORD.pack(
-                Opcode.MESSAGE, MESSAGE_RECORD.size - 9 + len(message), self._topics[topic], 0, time_ns, time_ns
+            message, time_ns = data or b"", min(max(stamp or 0, 0), _LATEST)
+            length = MESSAGE_FIELDS + len(message)
+            records.append(
+                MESSAGE_RECORD.pack(Opcode.MESSAGE, length, self._topics[topic], 0, time_ns, time_ns) + message
             )
-            records.append(head + message)
-        if lost:
-            warn(f"{self.path}: {len(lost)} messages before id {after} are lost ({lost[0]}).")
+        starts = np.cumsum([0, *map(len, records)])[:-1].astype(np.int64)
         data = b"".join(records)
-        starts = np.cumsum([0, *map(len, records)])[:-1]
-        return RecordBlock(data, (len(data),), starts.astype(np.int64), self.size * after // max(self._last, 1))
-
-    def _unpack(self, data: bytes | None) -> bytes:
-        if data is None:
-            raise DamagedError("they hold nothing")
-        if data[:4] != _ZSTD:
-            return data
-        try:
-            size = zstandard.frame_content_size(data)
-            if size > self._max_chunk:
-                raise DamagedError(f"one claims to hold {megabytes(size)} MB, {allowed_sizes(self._max_chunk)}")
-            return self._decompressor.decompress(data, max_output_size=self._max_chunk)
-        except (zstandard.ZstdError, MemoryError):
-            raise DamagedError("they do not decompress") from None
-
-    @cached_property
-    def _decompressor(self) -> zstandard.ZstdDecompressor:
-        return zstandard.ZstdDecompressor()
+        return RecordBlock(data, (len(data),), starts, self.size * after // max(self._last, 1))

@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.recordings import ACCEL, ANGLES, BATCH, HEAT, Topic, assert_equal, read, write_officially
+import zstandard
+from helpers.recordings import ACCEL, ANGLES, BATCH, BENCH, HEAT, Topic, assert_equal, read, stamped, write_officially
+from mcap.writer import Writer
 
 from kf_calib.bench.streams import Stream
 from kf_calib.diagnosis.selection_journal import Origin
@@ -104,3 +106,17 @@ def test_other_files_say_what_to_do(tmp_path: Path, name: str, content: bytes, s
 def test_an_empty_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"holds no \.mcap and no \.db3 file"):
         Recording(tmp_path)
+
+
+def test_messages_compressed_one_by_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    pack = zstandard.ZstdCompressor().compress
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=8_000)
+        writer.start(profile="ros2")
+        channels = [writer.register_channel(topic, "cdr", writer.register_schema(kind.name, "ros2msg", b""))
+                    for topic, kind, *_ in (ACCEL, ANGLES, HEAT)]  # fmt: skip
+        for stamp, k, data in stamped((ACCEL, ANGLES, HEAT)):
+            writer.add_message(channels[k - 1], stamp, pack(data), stamp)
+        writer.finish()
+    assert_equal(read(Recording(path, BENCH.to_metadata())), BATCH)

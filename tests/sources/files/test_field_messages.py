@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.recordings import BATCH, BENCH, START_NS, assert_equal, read, record
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
@@ -181,6 +181,18 @@ def test_what_is_no_json_is_told(tmp_path: Path) -> None:
         writer.finish()
     with pytest.raises(InputError, match=r"topic /imu cannot be used: a message is not JSON, it begins with b'\[\["):
         read(Recording(path, KEYS))
+
+
+def test_a_message_that_is_no_json_is_left_out_and_told(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "json.mcap", ROS, enable_crcs=False, compression=CompressionType.NONE)
+    content = path.read_bytes()
+    where = content.index(b'{"header"', len(content) // 2)
+    path.write_bytes(content[:where] + b"[" + content[where + 1 :])
+    recording = Recording(path, KEYS)
+    found = read(recording)
+    streams = (found.accel, found.pose, found.temperature)
+    assert sum(map(len, streams)) == len(BATCH.accel) + len(BATCH.pose) + len(BATCH.temperature) - 1
+    assert [said for said in recording.warnings if "1 messages are left out (first: a message is not JSON" in said]
 
 
 @pytest.mark.parametrize(
