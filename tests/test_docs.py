@@ -79,7 +79,7 @@ def test_commands_effects_and_public_names_are_all_there(pages: dict[Path, Page]
     listed = json.loads(_printed("effects", "--json"))["effects"]
     assert {each["effect"].partition(":")[0] for each in listed} <= anchors["effects.html"]
     commands = {"demo", "simulate", "record", "live", "replay", "compare", "diagnose", "improve", "report", "plan",
-                "paper"}  # fmt: skip
+                "paper", "info"}  # fmt: skip
     assert {f"kf-calib-{name}" for name in commands} <= anchors["command_line.html"]
 
 

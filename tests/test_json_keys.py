@@ -29,6 +29,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "record": ("recorded.mcap", "lines.csv", "--axes", "y z x", "--gravity", "9.81"),
     "export": ("cal.json", "--to", "px4", "-o", "px4.params", "--lossy"),
     "effects": (),
+    "info": (HIDDEN,),
     "plan": ("--count", 4),
     "paper": ("--repetitions", 2),
     "apply": ("cal.json", HIDDEN, "-o", "corrected.mcap"),

@@ -23,7 +23,7 @@ SECTIONS = {
                           "export": "export.export", "certificate": "certificate.certificate"},
     "Run a bench": {"plan": "plan.plan", "record": "acquire.record", "live": "live.live"},
     "Try it without a bench": {"demo": "acquire.demo", "simulate": "acquire.simulate"},
-    "Look up": {"effects": "evaluate.list_effects", "paper": "paper.paper"},
+    "Look up": {"info": "info.info", "effects": "evaluate.list_effects", "paper": "paper.paper"},
 }  # fmt: skip
 """The commands, as ``--help`` has them, and where in this package each is."""
 

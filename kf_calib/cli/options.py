@@ -93,6 +93,9 @@ def recording_options(command: F) -> F:
                      panel=INPUT),
         click.option("--pose-topic", metavar="TOPIC", help="Topic of the platform's angles or attitude.", panel=INPUT),
         click.option("--temperature-topic", metavar="TOPIC", help="Topic of the temperature.", panel=INPUT),
+        click.option("--field", "fields", multiple=True, metavar="WHAT=TOPIC:PATHS", panel=INPUT,
+                     help="Where numbers are in JSON or protobuf messages, for example accel=/imu:acc.x,acc.y,acc.z; "
+                     "repeatable, for angles, attitude and temperature too."),
         click.option("--max-chunk-mb", type=POSITIVE, default=256, show_default=True, metavar="MB", panel=INPUT,
                      help="Chunks of the file that unpack to more are passed over, and told."),
     ]  # fmt: skip
@@ -234,6 +237,7 @@ def recording_of(path: Path, options: Mapping[str, Any], angles: bool = True) ->
         accel_topic=options["accel_topic"],
         pose_topic=options["pose_topic"],
         temperature_topic=options["temperature_topic"],
+        fields=options["fields"],
         max_chunk_mb=options["max_chunk_mb"],
         angles=angles and not options.get("no_angles", False),
     )

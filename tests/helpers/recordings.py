@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -112,4 +114,35 @@ def write_officially(
             writer.finish()
         else:
             writer.flush()
+    return path
+
+
+def stamped(topics: tuple[Topic, ...]) -> list[tuple[int, int, bytes]]:
+    """Stamp, number of the topic (from 1) and bytes of each message, in the order of the stamps."""
+    messages: list[tuple[int, int, bytes]] = []
+    for k, (_, kind, template, stream) in enumerate(topics, 1):
+        messages += [(stamp, k, data) for stamp, data in
+                     zip(stream.time_ns.tolist(), cdr.pack(kind, template, stream), strict=True)]  # fmt: skip
+    return sorted(messages, key=lambda message: message[0])
+
+
+def write_db3(
+    path: Path, topics: tuple[Topic, ...] = (ACCEL, ANGLES, HEAT), pack: Callable[[bytes], bytes] = bytes
+) -> Path:
+    """A bag's SQLite file with the tables that ROS 2 makes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with closing(sqlite3.connect(path)) as base, base:
+        base.execute(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, "
+            "serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL)"
+        )
+        base.execute(
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, "
+            "data BLOB NOT NULL)"
+        )
+        base.execute("CREATE INDEX timestamp_idx ON messages (timestamp ASC)")
+        for k, (name, kind, *_) in enumerate(topics, 1):
+            base.execute("INSERT INTO topics VALUES(?, ?, ?, 'cdr', '')", (k, name, kind.name))
+        rows = [(k, stamp, pack(data)) for stamp, k, data in stamped(topics)]
+        base.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", rows)
     return path

@@ -90,7 +90,8 @@ def test_figures_are_light_on_dark_and_dark_on_light(shown: Any, told: list[str]
     )
     assert abs(_brightness(ground) - _brightness(ink)) > 200
     ways = shown.evaluate(
-        "[...document.querySelectorAll('.drawing:not(.card) svg g[id*=text] g')].map(each => getComputedStyle(each).fill)"
+        "[...document.querySelectorAll('.drawing:not(.card) svg g[id*=text] g')]"
+        ".map(each => getComputedStyle(each).fill)"
     )
     apart = [abs(_brightness(each) - _brightness(ground)) > 120 for each in ways]
     assert len(apart) > 100 and np.mean(apart) > 0.9  # numbers in a dark cell of a matrix are light

@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 
 from kf_calib.errors import InputError
-from kf_calib.sources.files.foreign import folder_advice
 
 _NUMBERED = re.compile(r"(.*)_(\d+)")
 _SHOWN = 6  # names in a message
@@ -14,7 +13,7 @@ _LISTED = re.compile(r"^( *)relative_file_paths:\s*\n((?:\1 *- .*(?:\n|$))+)", r
 
 
 def files_of(path: Path) -> list[Path]:
-    """The MCAP files at ``path``, in order of time. Raises InputError where a folder is not one bag of such files."""
+    """The MCAP or .db3 files at ``path``, in order of time. Raises InputError where a folder is not one bag of such."""
     if not path.is_dir():
         return [path]
     listed = _files_in_metadata(path / "metadata.yaml")
@@ -22,11 +21,13 @@ def files_of(path: Path) -> list[Path]:
     if lost:
         raise InputError(
             f"{path} lacks {', '.join(lost)}, which its metadata.yaml names: bring the whole bag, or give one of its "
-            ".mcap files."
+            "files."
         )
-    files = [path / name for name in listed if name.endswith(".mcap")] or sorted(path.glob("*.mcap"), key=_place)
+    files = [path / name for name in listed if _is_part(name)] or _lying_in(path)
     if not files:
-        raise InputError(folder_advice(path))
+        raise InputError(
+            f"{path} holds no .mcap and no .db3 file: give the folder of a ROS 2 bag, or one of its files."
+        )
     if not listed and len({_place(file)[0] for file in files}) > 1:
         raise InputError(
             f"{path} holds several recordings ({', '.join(file.name for file in files[:_SHOWN])}"
@@ -35,10 +36,21 @@ def files_of(path: Path) -> list[Path]:
     return files
 
 
+def _lying_in(path: Path) -> list[Path]:
+    """The files of a folder without metadata.yaml; of a file and its compressed copy, the file."""
+    files = {file.name: file for file in path.iterdir() if _is_part(file.name) and file.is_file()}
+    return sorted((file for name, file in files.items() if name.removesuffix(".zstd") == name
+                   or name.removesuffix(".zstd") not in files), key=_place)  # fmt: skip
+
+
+def _is_part(name: str) -> bool:
+    return name.removesuffix(".zstd").endswith((".mcap", ".db3"))
+
+
 def _place(file: Path) -> tuple[str, int]:
     """The name of the bag that a file is part of, and its number in it."""
-    numbered = _NUMBERED.fullmatch(file.stem)
-    return (numbered[1], int(numbered[2])) if numbered else (file.stem, 0)
+    numbered = _NUMBERED.fullmatch(stem := file.name.partition(".")[0])
+    return (numbered[1], int(numbered[2])) if numbered else (stem, 0)
 
 
 def _files_in_metadata(metadata: Path) -> list[str]:

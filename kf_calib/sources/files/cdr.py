@@ -81,6 +81,11 @@ class MessageType:
     schema: str
     layout: Callable[[bytes], Layout]
 
+    @property
+    def names(self) -> tuple[str, str]:
+        """The name, and as it was in older bags."""
+        return self.name, self.name.replace("/msg/", "/")
+
 
 def _align(offset: int, to: int) -> int:
     return offset + (4 - offset) % to

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,9 +11,13 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 
 from kf_calib.errors import InputError
-from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, MessageType
+from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, Decoder, MessageType
+from kf_calib.sources.files.field_messages import ENCODINGS, FieldDecoder
+from kf_calib.sources.files.fields import FieldError, Fields, known_fields
+from kf_calib.sources.files.joints import Joints
 from kf_calib.sources.files.mcap_chunks import DamagedError, parse
-from kf_calib.sources.files.mcap_file import McapFile, Warn
+from kf_calib.sources.files.mcap_file import Warn
+from kf_calib.sources.files.record_files import RecordFile
 
 BENCH_RECORD = "kf_calib.bench"
 CHECKSUM_KEY = "crc32"
@@ -35,25 +39,46 @@ def bench_checksum(metadata: Mapping[str, str]) -> str:
 
 @dataclass(frozen=True)
 class Role:
-    """What a topic is wanted for. ``preferred`` topics win, in this order, where several have a fitting schema."""
+    """What a topic is wanted for. ``preferred`` topics win, in this order, where several have a fitting schema.
+
+    fields: what its numbers are called in ``Fields``.
+    """
 
     quantity: str
     option: str
     kinds: tuple[MessageType, ...]
     preferred: tuple[str, ...]
+    fields: tuple[str, ...]
 
     def kind(self, schema: str) -> MessageType | None:
-        """The message type of that schema name, if this role can use it; older names lack the ``msg/``."""
-        return next((kind for kind in self.kinds if schema in (kind.name, kind.name.replace("/msg/", "/"))), None)
+        """The message type of that schema name, if this role can use it."""
+        return next((kind for kind in self.kinds if schema in kind.names), None)
 
     @property
     def schemas(self) -> str:
         return " or ".join(kind.name for kind in self.kinds)
 
 
-READINGS = Role("accelerometer", "--accel-topic", (IMU,), (ACCEL_TOPIC,))
-POSES = Role("angle or attitude", "--pose-topic", (JOINT_STATE, QUATERNION), (ANGLES_TOPIC, ATTITUDE_TOPIC))
-TEMPERATURES = Role("temperature", "--temperature-topic", (TEMPERATURE,), (TEMPERATURE_TOPIC,))
+READINGS = Role("accelerometer", "--accel-topic", (IMU,), (ACCEL_TOPIC,), ("accel",))
+POSES = Role(
+    "angle or attitude", "--pose-topic", (JOINT_STATE, QUATERNION), (ANGLES_TOPIC, ATTITUDE_TOPIC),
+    ("angles", "attitude"),
+)  # fmt: skip
+TEMPERATURES = Role("temperature", "--temperature-topic", (TEMPERATURE,), (TEMPERATURE_TOPIC,), ("temperature",))
+ROLES = (READINGS, POSES, TEMPERATURES)
+USABLE_SCHEMAS = frozenset(name for role in ROLES for kind in role.kinds for name in kind.names)
+
+
+def fields_by_role(fields: Sequence[str]) -> dict[Role, Fields]:
+    """Fields as they are written, by what they are of. Raises InputError."""
+    found = dict[Role, Fields]()
+    for text in fields:
+        stated = Fields.of(text)
+        role = next(role for role in ROLES if stated.quantity in role.fields)
+        if role in found:
+            raise InputError(f"--field says twice where the {role.quantity} is: say it once.")
+        found[role] = stated
+    return found
 
 
 @dataclass
@@ -61,6 +86,8 @@ class Contents:
     """Topics of a file and its bench's description, as far as they have been met."""
 
     path: Path
+    stated: Mapping[Role, Fields] = field(default_factory=dict[Role, Fields])
+    """Where a topic's numbers are, by ``--field``."""
     schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
     channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
     bench: dict[str, str] | None = None
@@ -100,23 +127,63 @@ class Contents:
 
     def topics(self, role: Role) -> list[str]:
         """Topics with a schema that ``role`` can use, in the order of the file."""
-        fitting = [channel.topic for channel in self.channels.values() if role.kind(self._schema(channel))]
+        fitting = [channel.topic for channel in self.channels.values() if self._fits(role, channel)]
         return list(dict.fromkeys(fitting))
+
+    def _fits(self, role: Role, channel: Channel) -> bool:
+        if channel.message_encoding in ENCODINGS or role in self.stated:
+            fields = self._fields(role, channel)
+            return fields is not None and fields.quantity in role.fields
+        return role.kind(self._schema(channel)) is not None
+
+    def _fields(self, role: Role, channel: Channel) -> Fields | None:
+        stated = self.stated.get(role)
+        if stated:
+            return stated if stated.topic == channel.topic else None
+        return known_fields(self._schema(channel))
 
     def ids(self, topic: str) -> list[int]:
         return [channel.id for channel in self.channels.values() if channel.topic == topic]
 
-    def kind(self, role: Role, topic: str) -> MessageType:
-        """What the messages of a chosen topic are. Raises InputError where they are not encoded as in ROS 2."""
+    def has_angles(self, topic: str) -> bool:
+        """Whether a chosen topic gives the platform's angles, not its attitude."""
         channel = self.channels[self.ids(topic)[0]]
-        schema = self.schemas[channel.schema_id]
-        kind = role.kind(schema.name)
-        if kind is None or channel.message_encoding != "cdr" or schema.encoding not in ("ros2msg", "ros2idl"):
-            raise InputError(
-                f"{self.path}: topic {topic} has {channel.message_encoding!r} messages with a schema {schema.name} in "
-                f"{schema.encoding!r}, only 'cdr' with 'ros2msg' can be read: convert the file to ROS 2 first."
+        if channel.message_encoding in ENCODINGS:
+            fields = self._fields(POSES, channel)
+            return fields is not None and fields.quantity == "angles"
+        return POSES.kind(self._schema(channel)) is JOINT_STATE
+
+    def refuse_unreadable(self, role: Role, topic: str) -> None:
+        """Raises InputError where nothing reads the messages of a chosen topic."""
+        channel = self.channels[self.ids(topic)[0]]
+        schema = self.schemas.get(channel.schema_id)
+        is_ros = channel.message_encoding == "cdr" and schema and schema.encoding in ("ros2msg", "ros2idl")
+        if channel.message_encoding not in ENCODINGS and (role in self.stated or not is_ros):
+            raise InputError(self._unreadable(role, channel))
+
+    def decoder(self, role: Role, topic: str, width: int, joints: Joints | None, warn: Warn) -> Decoder | FieldDecoder:
+        """What reads the messages of a chosen topic. Raises InputError where nothing does."""
+        self.refuse_unreadable(role, topic)
+        channel = self.channels[self.ids(topic)[0]]
+        if kind := role.kind(self._schema(channel)) if channel.message_encoding not in ENCODINGS else None:
+            return Decoder(kind, width, joints)
+        fields = self._fields(role, channel)
+        assert fields  # else the topic would not have been chosen
+        schema, said = self.schemas.get(channel.schema_id), f"{self.path}: topic {topic}"
+        try:
+            return FieldDecoder(
+                channel.message_encoding, schema, fields, width, joints, lambda text: warn(f"{said}: {text}.")
             )
-        return kind
+        except FieldError as error:
+            raise InputError(f"{said} cannot be used: {error}.") from None
+
+    def _unreadable(self, role: Role, channel: Channel) -> str:
+        schema = self.schemas.get(channel.schema_id)
+        said = f"{self.path}: topic {channel.topic} has {channel.message_encoding!r} messages with "
+        said += f"a schema {schema.name} in {schema.encoding!r}" if schema else "no schema"
+        if role in self.stated:
+            return f"{said}, and --field is for messages in 'json' and 'protobuf': leave it out."
+        return f"{said}, only 'cdr' with 'ros2msg', 'json' and 'protobuf' can be read: convert the file to ROS 2 first."
 
     @property
     def schemas_of_topics(self) -> dict[str, str]:
@@ -132,7 +199,7 @@ class Parts:
     """The files of a recording, which follow each other."""
 
     path: Path
-    files: list[McapFile]
+    files: list[RecordFile]
     contents: list[Contents] = field(default_factory=list[Contents])
 
     @property
@@ -159,7 +226,7 @@ class Parts:
         if wanted is not None:
             raise InputError(
                 f"{self.path} has no {role.quantity} topic {wanted!r}, it has {self}: give one of schema "
-                f"{role.schemas} by {role.option}."
+                f"{role.schemas} by {role.option}, or of another in JSON or protobuf by --field."
             )
         candidates = [topic for topic in candidates if topic != CALIBRATED_TOPIC] or candidates
         if len(candidates) > 1:
@@ -168,9 +235,9 @@ class Parts:
             )
         return candidates[0] if candidates else None
 
-    def kind(self, role: Role, topic: str) -> MessageType:
-        """What the messages of a chosen topic are. Raises InputError where they are not encoded as in ROS 2."""
-        return next(own for own in self.contents if own.ids(topic)).kind(role, topic)
+    def having(self, topic: str) -> Contents:
+        """Those of the first file that has a chosen topic."""
+        return next(own for own in self.contents if own.ids(topic))
 
     def __str__(self) -> str:
         topics = {topic: schema for own in self.contents for topic, schema in own.schemas_of_topics.items()}

@@ -70,8 +70,17 @@ class Lines:
 
     def __iter__(self) -> Iterator[Batch]:
         _ = self.bench  # so that a bench that cannot be used is told first
+        return self.batches()
+
+    def batches(self) -> Iterator[Batch]:
+        """What the lines hold, whatever the bench may be."""
         passage, self._waiting = self._waiting or self._begin(), None
         return iter(passage)
+
+    @property
+    def described(self) -> Described | None:
+        """What the lines say of the bench, as far as they were read."""
+        return self._latest.parser if self._latest else None
 
     def _begin(self) -> _Passage:
         try:

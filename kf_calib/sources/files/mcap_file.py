@@ -62,11 +62,13 @@ _NOTHING_YET = -1  # in place of an opcode: the next record of a growing file is
 class McapFile:
     """An MCAP file on disk. ``summary`` is None where the file's end is missing or damaged: ``trouble`` says so.
 
-    max_chunk: bytes that a chunk may take, packed or unpacked.
+    max_chunk: bytes that a chunk may take, packed or unpacked. place: where the file lies, if not at ``path``, which
+    messages name.
     """
 
-    def __init__(self, path: Path, max_chunk: int = int(MAX_CHUNK_MB * (1 << 20))) -> None:
+    def __init__(self, path: Path, max_chunk: int = int(MAX_CHUNK_MB * (1 << 20)), place: Path | None = None) -> None:
         self.path = path
+        self._place = place or path
         self.max_chunk = max_chunk
         self.summary: Summary | None = None
         self.trouble = ""
@@ -85,7 +87,7 @@ class McapFile:
 
     def open(self) -> IO[bytes]:
         try:
-            return self.path.open("rb")
+            return self._place.open("rb")
         except FileNotFoundError:
             raise InputError(f"{self.path} does not exist: check the path.") from None
         except IsADirectoryError:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")  # opcode, length of the content
 MESSAGE_FIELDS = 22  # channel u16, sequence u32, log time u64, publish time u64; then the message itself
+MESSAGE_RECORD = struct.Struct("<BQHIQQ")  # head and fields of a message's record
 Integers = NDArray[np.int64]
 _MOST_KINDS = 16  # of record heads; beyond that, searching for them costs more than walking
 _MOST_OTHERS = 1 << 17  # records of a block that are no messages: every schema and channel there can be

@@ -1,4 +1,4 @@
-"""A recording (MCAP files, docs/format.md) as a source of batches, one a chunk.
+"""A recording (MCAP or .db3 files, docs/format.md) as a source of batches, one a chunk.
 
 Topics are found by their schema. What is whole in a damaged or unfinished file is used, what is lost is told in
 ``warnings``. Sample time is ``header.stamp``. Memory is that of a few chunks, however long the recording.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -23,12 +23,26 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Source, Stream
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.bags import files_of
-from kf_calib.sources.files.cdr import JOINT_STATE, CdrError, Decoder
-from kf_calib.sources.files.contents import BENCH_RECORD, POSES, READINGS, TEMPERATURES, Contents, Parts, Role
+from kf_calib.sources.files.cdr import CdrError, Decoder
+from kf_calib.sources.files.contents import (
+    BENCH_RECORD,
+    POSES,
+    READINGS,
+    TEMPERATURES,
+    USABLE_SCHEMAS,
+    Contents,
+    Parts,
+    Role,
+    fields_by_role,
+)
+from kf_calib.sources.files.field_messages import FieldDecoder
+from kf_calib.sources.files.fields import FieldError
 from kf_calib.sources.files.joints import Joints
 from kf_calib.sources.files.mcap_chunks import MAX_CHUNK_MB, DamagedError, parse
-from kf_calib.sources.files.mcap_file import McapFile, Warn
+from kf_calib.sources.files.mcap_file import Warn
 from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, RecordBlock
+from kf_calib.sources.files.packed_messages import are_packed, unpacked
+from kf_calib.sources.files.record_files import RecordFile, open_record_file
 
 STANDARD_GRAVITY_MPS2 = 9.80665
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
@@ -47,6 +61,8 @@ class Recording:
     accel_scale: factor on the readings, one for all or one a sensor (9.80665 for a file in g). angle_scale: factor on
     the gimbal angles (0.017453 for a file in degrees).
     accel_topic, pose_topic, temperature_topic: which to use where the file has several of the kind.
+    fields: where the numbers are in JSON or protobuf messages, for example ``"accel=/imu:acc.x,acc.y,acc.z"``
+    (docs/bags.md).
     max_chunk_mb: chunks that unpack to more are passed over, and told.
     angles: False to do without angles and attitudes; the file may then have none, and the batches have none.
     Raises InputError where the file, or what it holds, cannot be used.
@@ -62,22 +78,29 @@ class Recording:
         accel_topic: str | None = None,
         pose_topic: str | None = None,
         temperature_topic: str | None = None,
+        fields: Sequence[str] = (),
         max_chunk_mb: float = MAX_CHUNK_MB,
         angles: bool = True,
     ) -> None:
         self.path = Path(path)
         self.fraction = 0.0
         self._accel_scale, self._angle_scale = np.asarray(accel_scale, float), angle_scale
-        self._wanted = {READINGS: accel_topic, POSES: pose_topic, TEMPERATURES: temperature_topic}
-        self._parts = Parts(self.path, [McapFile(file, int(max_chunk_mb * (1 << 20))) for file in files_of(self.path)])
+        self._stated = fields_by_role(fields)
+        wanted = {READINGS: accel_topic, POSES: pose_topic, TEMPERATURES: temperature_topic}
+        self._wanted = wanted | {role: stated.topic for role, stated in self._stated.items()}
+        self._limit = int(max_chunk_mb * (1 << 20))
+        files = [open_record_file(file, self._limit, USABLE_SCHEMAS) for file in files_of(self.path)]
+        self._parts = Parts(self.path, files)
         self.warnings = [file.trouble for file in self._parts.files if file.trouble]
         self._parts.contents = [self._survey(file) for file in self._parts.files]
-        self._accel = self._require(READINGS, "convert the readings to sensor_msgs/msg/Imu")
+        self._accel = self._require(
+            READINGS, "convert the readings to sensor_msgs/msg/Imu, or name them in JSON or protobuf by --field"
+        )
         self._pose = None
         if angles:
             advice = "record the angles too, as sensor_msgs/msg/JointState by the same clock"
             self._pose = self._require(POSES, f"{advice}, or do without them (--no-angles)")
-        self._parts.choose(TEMPERATURES, temperature_topic)  # optional, but not to be guessed
+        self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])  # optional, but not to be guessed
         self.bench = self._describe_bench(overrides)
         self._opening_warnings = len(self.warnings)
 
@@ -102,9 +125,9 @@ class Recording:
         del self.warnings[self._opening_warnings :]
         self.fraction, begun, parts = 0.0, 0, self._parts
         joints = Joints(len(self.bench.axes), self.bench.joints, self.bench.axis_letters, self._warn_of_joints)
-        decoders = _Decoders(parts, self.bench.pose_width, joints)
+        decoders = _Decoders(parts, self.bench.pose_width, joints, self.warnings.append)
         for file, contents in zip(parts.files, parts.contents, strict=True):
-            passage = _Passage(contents, self._warn_of_damage)
+            passage = _Passage(contents, self._limit, self._warn_of_damage)
             for end, batch in self._part(file, passage, decoders, growing and file is parts.files[-1]):
                 self.fraction = math.nan if growing else min((begun + end) / parts.size, 1.0)
                 if growing or len(batch.accel) or len(batch.pose) or len(batch.temperature):
@@ -119,14 +142,14 @@ class Recording:
         self.fraction = 1.0
 
     def _part(
-        self, file: McapFile, passage: _Passage, decoders: _Decoders, growing: bool
+        self, file: RecordFile, passage: _Passage, decoders: _Decoders, growing: bool
     ) -> Iterator[tuple[int, Batch]]:
         """The batches of one file, and up to which byte it has been read then."""
         accel = passage.track(self._accel, decoders.of(READINGS, self._accel))
         pose = passage.track(self._pose, decoders.of(POSES, self._pose)) if self._pose else None
         temperature = None
         for block in file.blocks(self._warn_of_damage, growing=growing):
-            messages = passage.find(block)
+            block, messages = passage.find(block)
             if not temperature and (topic := self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])):
                 temperature = passage.track(topic, decoders.of(TEMPERATURES, topic))
             batch = Batch(
@@ -145,10 +168,10 @@ class Recording:
     def _warn_of_joints(self, said: str) -> None:
         self.warnings.append(f"{self.path}: topic {self._pose}: {said}.")
 
-    def _survey(self, file: McapFile) -> Contents:
+    def _survey(self, file: RecordFile) -> Contents:
         """Topics and bench: from the summary, else by reading on until no better choice of topics can come, and where
         something is damaged the bench."""
-        contents, summary = Contents(file.path), file.summary
+        contents, summary = Contents(file.path, self._stated), file.summary
         if summary:
             contents.schemas = {schema.id: schema for schema in summary.schemas}
             contents.channels = {channel.id: channel for channel in summary.channels}
@@ -182,6 +205,7 @@ class Recording:
             raise InputError(
                 f"{self.path} has no {role.quantity} topic ({role.schemas}), it has {self._parts}{state}: {advice}."
             )
+        self._parts.having(topic).refuse_unreadable(role, topic)
         return topic
 
     def _describe_bench(self, overrides: Mapping[str, str]) -> Bench:
@@ -191,7 +215,7 @@ class Recording:
             self.warnings.append(f"{damage}: only what options give is used.")
         if self._pose is None:
             return self._bench_without_angles({**recorded, **overrides})
-        has_angles = self._parts.kind(POSES, self._pose) is JOINT_STATE
+        has_angles = self._parts.having(self._pose).has_angles(self._pose)
         if not has_angles and self._angle_scale != 1.0:
             raise InputError(
                 f"{self.path}: topic {self._pose} has attitudes, which have no unit: leave out --angle-unit."
@@ -220,7 +244,7 @@ class Recording:
         )
 
 
-def _look_up_bench(file: McapFile, contents: Contents, position: int) -> None:
+def _look_up_bench(file: RecordFile, contents: Contents, position: int) -> None:
     try:
         contents.add(Opcode.METADATA, file.record_at(position, Opcode.METADATA), warn=_ignore)
     except DamagedError:
@@ -234,12 +258,14 @@ class _Decoders:
     parts: Parts
     pose_width: int
     joints: Joints
-    known: dict[Role, Decoder] = field(default_factory=dict[Role, Decoder])
+    warn: Warn
+    known: dict[Role, Decoder | FieldDecoder] = field(default_factory=dict[Role, Decoder | FieldDecoder])
 
-    def of(self, role: Role, topic: str) -> Decoder:
+    def of(self, role: Role, topic: str) -> Decoder | FieldDecoder:
         if role not in self.known:
             width = {READINGS: 3, POSES: self.pose_width, TEMPERATURES: 1}[role]
-            self.known[role] = Decoder(self.parts.kind(role, topic), width, self.joints if role is POSES else None)
+            joints = self.joints if role is POSES else None
+            self.known[role] = self.parts.having(topic).decoder(role, topic, width, joints, self.warn)
         return self.known[role]
 
 
@@ -251,20 +277,21 @@ def opened(source: Source | str | PathLike[str]) -> Source:
 class _Passage:
     """One reading of a file from its start, with the account of the messages met."""
 
-    def __init__(self, contents: Contents, warn: Warn) -> None:
-        self.contents = contents
+    def __init__(self, contents: Contents, max_message: int, warn: Warn) -> None:
+        self.contents, self._max_message = contents, max_message
         self.warn = warn
         self._find = MessageFinder()
         self._tracks: list[_Track] = []
         self._met = Counter[int]()
         self._marks = list[Metadata]()
 
-    def track(self, topic: str, decode: Decoder) -> _Track:
+    def track(self, topic: str, decode: Decoder | FieldDecoder) -> _Track:
         track = _Track(self.contents, topic, decode)
         self._tracks.append(track)
         return track
 
-    def find(self, block: RecordBlock) -> Messages:
+    def find(self, block: RecordBlock) -> tuple[RecordBlock, Messages]:
+        """The messages in a block, and the block that they are in."""
         messages = self._find(block)
         for opcode, content in messages.others:
             self.contents.add(opcode, content, self.warn)
@@ -273,7 +300,18 @@ class _Passage:
             self.warn(f"{self.contents.path}: {messages.lost} bytes of records before byte {block.end} make no sense.")
         for group in messages.groups:
             self._met[group.channel] += len(group.at)
-        return messages
+        in_cdr = (group for group in messages.groups if self._is_in_cdr(group.channel))
+        return self._unpacked(block, messages) if are_packed(block, in_cdr) else (block, messages)
+
+    def _is_in_cdr(self, number: int) -> bool:
+        channel = self.contents.channels.get(number)
+        return channel is not None and channel.message_encoding == "cdr"
+
+    def _unpacked(self, block: RecordBlock, messages: Messages) -> tuple[RecordBlock, Messages]:
+        whole, lost = unpacked(block, messages.groups, self._max_message)
+        if lost:
+            self.warn(f"{self.contents.path}: {len(lost)} messages before byte {block.end} are lost ({lost[0]}).")
+        return whole, self._find(whole)
 
     def account(self, stated: Mapping[int, int], warn: Warn) -> None:
         """Warns of messages that the file should have (``stated``, by channel) but that were not met, and of gaps."""
@@ -282,6 +320,9 @@ class _Passage:
                 reason = marks[0].metadata.get("reason", "unknown")
                 warn(f"{self.contents.path}: {what} {len(marks)} times (first: {reason}).")
         for track in self._tracks:
+            if isinstance(track.decode, FieldDecoder) and (unread := track.decode.take_unread()):
+                said = f"{self.contents.path}: topic {track.topic}"
+                warn(f"{said}: {len(unread)} messages are left out (first: {unread[0]}).")
             ids = self.contents.ids(track.topic)
             total = sum(stated.get(channel, 0) for channel in ids)
             lost = total - sum(self._met[channel] for channel in ids)
@@ -298,7 +339,7 @@ class _Track:
 
     contents: Contents
     topic: str
-    decode: Decoder
+    decode: Decoder | FieldDecoder
 
     def read(self, block: RecordBlock, messages: Messages) -> Stream:
         """The topic's samples in ``block``. Raises InputError where a message is not what its schema says."""
@@ -306,7 +347,7 @@ class _Track:
         groups = [group for group in messages.groups if group.channel in ids]
         try:
             parts = [self.decode.stream_with_offsets(block.data, group.at, group.size) for group in groups]
-        except CdrError as error:
+        except (CdrError, FieldError) as error:
             raise InputError(f"{self.contents.path}: topic {self.topic} cannot be used: {error}.") from error
         if len(parts) == 1:
             return parts[0][1]

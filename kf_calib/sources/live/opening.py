@@ -10,7 +10,6 @@ from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from kf_calib.errors import InputError
-from kf_calib.sources.files.foreign import folder_advice
 from kf_calib.sources.files.joints import as_columns
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live.bag import BagFeed
@@ -91,7 +90,9 @@ def _bag(address: str) -> Path | None:
     if path.is_dir():
         files = sorted(path.glob("*.mcap"), key=lambda file: file.stat().st_mtime)
         if not files:
-            raise InputError(folder_advice(path))
+            raise InputError(
+                f"{path} holds no .mcap file to follow: bags in SQLite are read when they are finished, by replay."
+            )
         return files[-1]
     return path if path.suffix == ".mcap" else None
 

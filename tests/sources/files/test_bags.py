@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import sqlite3
 from pathlib import Path
 
 import pytest
-from helpers.recordings import ACCEL, ANGLES, BATCH, HEAT, Topic, assert_equal, read, write_officially
+import zstandard
+from helpers.recordings import ACCEL, ANGLES, BATCH, BENCH, HEAT, Topic, assert_equal, read, stamped, write_officially
+from mcap.writer import Writer
 
 from kf_calib.bench.streams import Stream
 from kf_calib.diagnosis.selection_journal import Origin
@@ -81,23 +82,6 @@ def test_recordings_that_only_lie_in_one_folder_are_not_joined(tmp_path: Path) -
         Recording(folder)
 
 
-def test_a_bag_in_sqlite_says_how_it_is_converted(tmp_path: Path) -> None:
-    folder = tmp_path / "bag"
-    folder.mkdir()
-    with sqlite3.connect(folder / "bag_0.db3") as base:
-        base.execute("create table messages (id integer)")
-    (folder / "metadata.yaml").write_text(METADATA.replace("mcap", "sqlite3").format("    - bag_0.db3"))
-    for path in (folder, folder / "bag_0.db3"):
-        with pytest.raises(InputError, match="in SQLite") as refused:
-            Recording(path)
-        for part in (
-            f"`ros2 bag convert -i {folder} -o convert.yaml`",
-            "`output_bags: [{uri: OUT, storage_id: mcap, all: true}]`",
-            f"`rosbags-convert --src {folder} --dst OUT --dst-storage mcap`",
-        ):
-            assert part in str(refused.value)
-
-
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
@@ -105,7 +89,11 @@ def test_a_bag_in_sqlite_says_how_it_is_converted(tmp_path: Path) -> None:
         ("a.csv", b"time_s,ax_mps2\n1,2\n", r"holds lines of text: .*`kf-calib record \S*a.mcap \S*a.csv`"),
         ("a.jsonl", b'{"time_s": 1}\n', r"`kf-calib record \S*a.mcap \S*a.jsonl`, and give \S*a.mcap"),
         ("named.mcap", b"\xef\xbb\xbfa;b\n", r"`kf-calib record \S*named_recorded.mcap \S*named.mcap`"),
-        ("x.mcap.zstd", b"\x28\xb5\x2f\xfd....", r"`zstd -d \S*x.mcap.zstd -o OUT.mcap`"),
+        (
+            "x.mcap.zstd",
+            b"\x28\xb5\x2f\xfd....",
+            r"x.mcap.zstd does not decompress \(.*\): it is damaged, copy it anew",
+        ),
         ("other", b"\0\1\2" * 9, "its first bytes differ"),
     ],
 )
@@ -116,5 +104,19 @@ def test_other_files_say_what_to_do(tmp_path: Path, name: str, content: bytes, s
 
 
 def test_an_empty_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"holds no \.mcap file"):
+    with pytest.raises(InputError, match=r"holds no \.mcap and no \.db3 file"):
         Recording(tmp_path)
+
+
+def test_messages_compressed_one_by_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    pack = zstandard.ZstdCompressor().compress
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=8_000)
+        writer.start(profile="ros2")
+        channels = [writer.register_channel(topic, "cdr", writer.register_schema(kind.name, "ros2msg", b""))
+                    for topic, kind, *_ in (ACCEL, ANGLES, HEAT)]  # fmt: skip
+        for stamp, k, data in stamped((ACCEL, ANGLES, HEAT)):
+            writer.add_message(channels[k - 1], stamp, pack(data), stamp)
+        writer.finish()
+    assert_equal(read(Recording(path, BENCH.to_metadata())), BATCH)

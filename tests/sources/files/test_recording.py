@@ -261,14 +261,14 @@ def test_missing_topics(tmp_path: Path, topics: tuple[Topic, ...], says: str) ->
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"encoding": "json"}, "'json' messages"),
+        ({"encoding": "json"}, "/accelerometer cannot be used: a message is not JSON, it begins with b"),
         ({"encoding": "ros1"}, "'ros1' messages"),
-        ({"schema_encoding": "protobuf"}, "in 'protobuf', only 'cdr' with 'ros2msg' can be read"),
+        ({"schema_encoding": "protobuf"}, "in 'protobuf', only 'cdr' with 'ros2msg', 'json' and 'protobuf' can"),
     ],
 )
 def test_other_encodings(tmp_path: Path, options: dict[str, str], says: str) -> None:
     with pytest.raises(InputError, match=says):
-        Recording(write_officially(tmp_path / "a.mcap", **options))
+        read(Recording(write_officially(tmp_path / "a.mcap", **options)))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,136 @@
+"""The command that says what is in a recording."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import rich_click as click
+from click.core import ParameterSource
+
+from kf_calib.cli.options import (
+    BENCH_OPTIONS,
+    columns_option,
+    examples,
+    json_option,
+    overrides,
+    print_json,
+    progress,
+    recording_of,
+    recording_options,
+    show,
+)
+from kf_calib.errors import BenchError, KfCalibError
+
+if TYPE_CHECKING:
+    from kf_calib.bench.streams import Source
+    from kf_calib.dwells.overview import DwellFound
+    from kf_calib.sources.files.inventory import Inventory
+
+_NAMED = {
+    "axes": ('--axes "y z x"', "the gimbal axes, outer to inner: --axes"),
+    "gravity_mps2": ("--gravity 9.81", "local gravity: --gravity in m/s^2 (best), or --latitude in degrees"),
+}
+"""What a bench's description must have: how an option gives it, and what it is."""
+
+
+@click.command(epilog=examples("info run.mcap", "info rosbag2_2026_05_04", "info log.csv --json"))
+@click.argument("recording", type=click.Path(path_type=Path), metavar="FILE")
+@recording_options
+@columns_option
+@json_option
+@click.pass_context
+def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json: bool, **options: Any) -> None:
+    """What is in a recording: topics, rates, gaps, dwells, what is missing to evaluate it, and the command to try.
+
+    FILE is an MCAP file, the folder of a ROS 2 bag, a .db3 file, or lines of CSV or JSON.
+    """
+    from kf_calib.cli.acquire import pair
+    from kf_calib.sources.files.inventory import inventory_of
+    from kf_calib.views.overview import Overview, overview_object, overview_report
+
+    renamed = dict(map(pair, columns))
+    with progress(f"reading {recording.name}", as_json) as tick:
+        inventory = inventory_of(recording, renamed, options["fields"])
+        bench = {**inventory.bench, **overrides(options)}
+        missing = _lacking(inventory, bench)
+        dwells, warnings = None, list(inventory.warnings)
+        try:
+            source = _opened(inventory, renamed, options)
+            dwells = _dwells(source, tick)
+            warnings = list(dict.fromkeys([*warnings, *source.warnings]))
+        except BenchError as error:
+            missing = missing or {"": str(error)}
+        except KfCalibError as error:
+            missing = {"": str(error), **missing}
+    if dwells is not None and not dwells:
+        missing[""] = "a stretch in which the platform stands still: --still-deg says what counts as standing still"
+    words = [*_given(ctx, inventory), *_fields(inventory), *(_NAMED[key][0] for key in missing if key in _NAMED)]
+    found = Overview(inventory, bench, dwells, list(missing.values()), _command(inventory, words), warnings)
+    if as_json:
+        print_json(overview_object(found))
+    else:
+        show(overview_report(found))
+
+
+def _lacking(inventory: Inventory, bench: Mapping[str, str]) -> dict[str, str]:
+    """What the bench's description lacks, by the key."""
+    keys = {"axes": inventory.has_angles is not False and not bench.get("axes"),
+            "gravity_mps2": not bench.get("gravity_mps2") and not bench.get("latitude_deg")}  # fmt: skip
+    return {key: _NAMED[key][1] for key, lacks in keys.items() if lacks}
+
+
+def _opened(inventory: Inventory, columns: Mapping[str, str], options: Mapping[str, Any]) -> Source:
+    if not inventory.is_lines:
+        return recording_of(inventory.path, options)
+    from kf_calib.sources.files.lines import Lines
+
+    return Lines(inventory.path, overrides(options), columns)
+
+
+def _dwells(source: Source, tick: Any) -> list[DwellFound]:
+    from kf_calib.dwells.overview import dwells_found
+
+    return dwells_found(source, on_progress=tick)
+
+
+def _given(ctx: click.Context, inventory: Inventory) -> list[str]:
+    """The options of this command line, as they were written, that the command to try takes too."""
+    of_lines = {"bench_file", "columns", *BENCH_OPTIONS}
+    words = list[str]()
+    for param in ctx.command.params:
+        name = param.name or ""
+        is_taken = name in of_lines if inventory.is_lines else name not in ("columns", "as_json")
+        if not isinstance(param, click.Option) or ctx.get_parameter_source(name) is not ParameterSource.COMMANDLINE:
+            continue
+        if is_taken:
+            value = ctx.params[name]
+            words += [f"{param.opts[0]} {_quoted(str(each))}" for each in
+                      (value if isinstance(value, tuple) else [value])]  # fmt: skip
+    return words
+
+
+def _quoted(text: str) -> str:
+    """As a word of a shell, in double quotes where these do: other shells know no single ones."""
+    plain = shlex.quote(text)
+    return plain if plain == text or any(each in text for each in '"$`\\!%') else f'"{text}"'
+
+
+def _fields(inventory: Inventory) -> list[str]:
+    """How the numbers would be named that are in messages which tell what they have, but not what it is."""
+    if not any(topic.paths for topic in inventory.topics):
+        return []
+    accel = [] if inventory.has_readings else ["--field accel=TOPIC:X,Y,Z@TIME"]
+    angles = [] if inventory.has_angles is not None else ["--field angles=TOPIC:OUTER,MIDDLE,INNER@TIME"]
+    return accel + angles
+
+
+def _command(inventory: Inventory, words: list[str]) -> str:
+    """The command that evaluates the recording; for lines the one that records them, which goes before."""
+    path = _quoted(str(inventory.path))
+    if not inventory.is_lines:
+        return " ".join(["kf-calib replay", path, *words])
+    made = _quoted(str(inventory.path.with_suffix(".mcap")))
+    return f"{' '.join(['kf-calib record', made, path, *words])} && kf-calib replay {made}"

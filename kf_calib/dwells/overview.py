@@ -1,0 +1,43 @@
+"""The dwells of a run, found before any of its readings is evaluated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib.bench.streams import Source
+from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
+from kf_calib.dwells.stationarity import Stillness
+
+
+@dataclass
+class DwellFound:
+    """A dwell: when it was arrived at, from the first sample on, how long its readings last, and where it is.
+
+    pose: mean gimbal angles in rad, outer to inner, or attitude.
+    """
+
+    number: int
+    arrival_s: float
+    lasts_s: float
+    readings: int
+    pose: tuple[float, ...]
+
+
+def dwells_found(
+    source: Source, stillness: Stillness | None = None, on_progress: Callable[[float], None] = lambda _: None
+) -> list[DwellFound]:
+    """The dwells of a source, which is read to its end; raises what reading it raises."""
+    found = dict[int, DwellFound]()
+    segmenter = Segmenter(source.bench, stillness or Stillness())
+    for block in dwell_blocks(source, segmenter):
+        on_progress(source.fraction)
+        if not len(block.elapsed_s) or block.curve is not None:
+            continue
+        pose = tuple(float(each) for each in np.asarray(block.pose)[0])
+        own = found.setdefault(block.dwell, DwellFound(block.dwell, block.arrival_s, 0.0, 0, pose))
+        own.readings += len(block.elapsed_s)
+        own.lasts_s = float(block.elapsed_s[-1]) - own.arrival_s
+    return list(found.values())

@@ -1,0 +1,147 @@
+"""Samples from JSON and protobuf messages, one after the other."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from mcap.records import Schema
+
+from kf_calib.bench.streams import Stream
+from kf_calib.sources.files.cdr import Offsets
+from kf_calib.sources.files.fields import LOG_TIME, FieldError, Fields, time_ns
+from kf_calib.sources.files.joints import Joints, JointsError
+from kf_calib.support.extras import MissingExtraError
+
+ENCODINGS = ("json", "protobuf")
+_LOG_TIME = struct.Struct("<Q")
+_LOG_TIME_BEFORE = 16  # bytes from a record's log time to its message
+_Parse = Callable[[bytes], Any]
+
+
+class _UnreadError(FieldError):
+    """A message is not in the encoding that its topic is said to have."""
+
+
+class FieldDecoder:
+    """Samples from messages of one topic, ``width`` numbers each, taken from where ``fields`` says.
+
+    encoding: of ``ENCODINGS``. joints: finds the gimbals among numbers that have names. warn: is told once where the
+    messages have no time of their own. Raises FieldError where the schema does not say what the messages are.
+    """
+
+    def __init__(
+        self, encoding: str, schema: Schema | None, fields: Fields, width: int, joints: Joints | None,
+        warn: Callable[[str], None],
+    ) -> None:  # fmt: skip
+        self.width = width
+        self._parse = parser_of(encoding, schema)
+        self._fields, self._joints, self._warn = fields, joints, warn
+        self._time = ""
+        self._unread = list[str]()
+
+    def take_unread(self) -> list[str]:
+        """Why messages were left out since this was asked last."""
+        unread, self._unread = self._unread, []
+        return unread
+
+    def stream_with_offsets(self, buffer: bytes, at: Offsets, size: int) -> tuple[Offsets, Stream]:
+        """Those of the messages of ``size`` bytes each at offsets ``at`` of ``buffer``, after the offsets that they are
+        from. Raises FieldError; a message that cannot be read is left out, if any before it could be."""
+        kept, stamps, values = list[int](), list[int](), list[list[float]]()
+        for start in at.tolist():
+            try:
+                message = self._parse(buffer[start : start + size])
+            except _UnreadError as error:
+                if not self._time:
+                    raise
+                self._unread.append(str(error))
+                continue
+            numbers = self._chosen(self._fields.numbers(message), self._fields.labels(message))
+            if numbers is not None:
+                kept.append(start)
+                stamps.append(self._stamp(message, buffer, start))
+                values.append(numbers)
+        table = np.array(values, float).reshape(len(values), self.width)
+        return np.array(kept, np.int64), Stream(np.array(stamps, np.int64), table)
+
+    def _chosen(self, numbers: list[float], names: tuple[str, ...]) -> list[float] | None:
+        if self._joints and names:
+            if len(names) != len(numbers):
+                raise FieldError(f"a message names {len(names)} joints but gives {len(numbers)} positions")
+            try:
+                columns = self._joints(names, len(numbers))
+            except JointsError as error:
+                raise FieldError(str(error)) from None
+            return None if columns is None else [numbers[k] for k in columns]
+        if len(numbers) != self.width:
+            raise FieldError(
+                f"{', '.join(self._fields.paths)} gives {len(numbers)} numbers a message in place of {self.width}: "
+                "name as many by --field"
+            )
+        return numbers
+
+    def _stamp(self, message: Any, buffer: bytes, start: int) -> int:
+        if not self._time:
+            self._time = self._fields.timed_by(message)
+            if self._time == LOG_TIME and self._fields.time is None:
+                self._warn(
+                    "its messages have no time of their own that is known, so the time of receipt is taken; --field "
+                    "names another behind @"
+                )
+        if self._time != LOG_TIME:
+            return time_ns(message, self._time)
+        return min(_LOG_TIME.unpack_from(buffer, start - _LOG_TIME_BEFORE)[0], (1 << 63) - 1)
+
+
+def parser_of(encoding: str, schema: Schema | None) -> Callable[[bytes], Any]:
+    """What makes an object of a message in one of ``ENCODINGS``; raises FieldError, as this does."""
+    return _of_protobuf(schema) if encoding == "protobuf" else _of_json
+
+
+def _of_json(data: bytes) -> Any:
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError):
+        raise _UnreadError(f"a message is not JSON, it begins with {data[:20]!r}") from None
+
+
+def _of_protobuf(schema: Schema | None) -> _Parse:
+    """What reads messages of a schema, which is a set of file descriptors."""
+    try:
+        from google.protobuf.descriptor_pb2 import FileDescriptorSet
+        from google.protobuf.descriptor_pool import DescriptorPool
+        from google.protobuf.message import DecodeError
+        from google.protobuf.message_factory import GetMessageClass
+    except ImportError:
+        raise MissingExtraError(
+            "reading protobuf messages needs protobuf, which is not installed: pip install 'kf_calib[bags]'."
+        ) from None
+    name = schema.name if schema else ""
+    try:
+        files = {file.name: file for file in FileDescriptorSet.FromString(schema.data if schema else b"").file}
+        pool, added = DescriptorPool(), set[str]()
+
+        def add(file: str) -> None:
+            if file not in added and file in files:
+                added.add(file)
+                for needed in files[file].dependency:
+                    add(needed)
+                pool.Add(files[file])
+
+        for file in files:
+            add(file)
+        kind = GetMessageClass(pool.FindMessageTypeByName(name))
+    except (DecodeError, TypeError, KeyError):
+        raise FieldError(f"its schema {name!r} does not say what its protobuf messages are: record it anew") from None
+
+    def parse(data: bytes) -> Any:
+        try:
+            return kind.FromString(data)
+        except DecodeError:
+            raise _UnreadError(f"a message is no {name} in protobuf") from None
+
+    return parse

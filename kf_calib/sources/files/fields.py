@@ -1,0 +1,233 @@
+"""Where the numbers of a quantity are in JSON or protobuf messages, by the names that lead to them.
+
+Written ``QUANTITY=TOPIC:PATH,PATH,...@TIME``: ``accel=/imu:acc.x,acc.y,acc.z@header.stamp``. A path is of names and, in
+lists, of places from 0 on, with dots between: ``acc.0``. It may lead to a list of numbers, ``acc``, or go through a
+list of objects, ``joints.position``, and then may be followed by where the names of these numbers are, in brackets:
+``joints.position[joints.name]``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from kf_calib.errors import InputError
+
+QUANTITIES = ("accel", "angles", "attitude", "temperature")
+LOG_TIME = "log_time"
+"""In place of a path to the time: when the file says that it got the message."""
+_USUAL_TIMES = ("header.stamp", "timestamp", "stamp")
+_UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000}  # the end of a name of a time; any other is in seconds
+_SECONDS, _NANOSECONDS = ("sec", "secs", "seconds", "s"), ("nsec", "nanosec", "nsecs", "nanos", "nanoseconds", "ns")
+_GRAMMAR = re.compile(r"(?P<quantity>\w+)=(?P<topic>[^:@]+):(?P<paths>[^@]+?)(?:@(?P<time>[\w.]+))?")
+_PATH = re.compile(r"[\w.-]+")
+_SHOWN = 12  # names in a message
+_INT64 = 1 << 63
+
+
+class FieldError(ValueError):
+    """A message does not have what is sought in it."""
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Where ``quantity`` is in the messages of ``topic``.
+
+    names: path to the names of the numbers, where it was stated. time: path to the time; None: where it usually is.
+    """
+
+    quantity: str
+    topic: str
+    paths: tuple[str, ...]
+    names: str | None = None
+    time: str | None = None
+
+    @classmethod
+    def of(cls, text: str) -> Fields:
+        """As written (see above). Raises InputError."""
+        found = _GRAMMAR.fullmatch(text.strip())
+        if not found or found["quantity"] not in QUANTITIES:
+            raise InputError(
+                f"--field {text!r} cannot be read: write QUANTITY=TOPIC:PATH,PATH,... with "
+                f"{', '.join(QUANTITIES[:-1])} or {QUANTITIES[-1]} for the quantity, for example "
+                "accel=/imu:acc.x,acc.y,acc.z."
+            )
+        body, names = found["paths"].strip(), None
+        if body.endswith("]") and "[" in body:
+            body, _, names = body[:-1].partition("[")
+        paths = tuple(path.strip() for path in body.split(","))
+        wrong = [path for path in (*paths, *([names] if names is not None else [])) if not _PATH.fullmatch(path)]
+        if wrong or (names is not None and len(paths) > 1):
+            raise InputError(
+                f"--field {text!r}: {(wrong or [body])[0]!r} is no path: join names by dots, and paths by commas, for "
+                "example acc.x,acc.y,acc.z, or one path to a list, position, with its names, position[name]."
+            )
+        return cls(found["quantity"], found["topic"].strip(), paths, names, found["time"])
+
+    @cached_property
+    def _steps(self) -> list[list[str]]:
+        return [path.split(".") for path in self.paths]
+
+    def numbers(self, message: Any) -> list[float]:
+        """The numbers in a message. Raises FieldError."""
+        found = list[float]()
+        for path, steps in zip(self.paths, self._steps, strict=True):
+            value = _at(message, steps, path)
+            if type(value) is float:
+                found.append(value)
+            else:
+                found += [_number(each, path) for each in _flat(value)]
+        return found
+
+    def labels(self, message: Any) -> tuple[str, ...]:
+        """The names of the numbers; none where no path to them is known."""
+        if self.names is None:
+            return ()
+        return tuple(str(each) for each in _flat(_at(message, self.names.split("."), self.names)))
+
+    def timed_by(self, message: Any) -> str:
+        """Path to the time in messages like this one; ``LOG_TIME`` where they have none."""
+        return self.time or next((path for path in _USUAL_TIMES if _has(message, path)), LOG_TIME)
+
+
+_XYZ = ("x", "y", "z")
+_KNOWN = {
+    "sensor_msgs/Imu": Fields("accel", "", tuple(f"linear_acceleration.{axis}" for axis in _XYZ)),
+    "sensor_msgs/JointState": Fields("angles", "", ("position",), "name"),
+    "foxglove.JointStates": Fields("angles", "", ("joints.position",), "joints.name"),
+    "geometry_msgs/QuaternionStamped": Fields("attitude", "", tuple(f"quaternion.{axis}" for axis in (*_XYZ, "w"))),
+    "foxglove.PoseInFrame": Fields("attitude", "", tuple(f"pose.orientation.{axis}" for axis in (*_XYZ, "w"))),
+    "sensor_msgs/Temperature": Fields("temperature", "", ("temperature",)),
+}
+
+
+def known_fields(schema: str) -> Fields | None:
+    """Those of a message of ROS or Foxglove, by the name of its schema; None where it is none of these."""
+    return _KNOWN.get(schema.replace("/msg/", "/"))
+
+
+def time_ns(message: Any, path: str) -> int:
+    """The time in a message: an object with seconds and nanoseconds, a number, or text. Raises FieldError."""
+    value = _at(message, path.split("."), path)
+    if isinstance(value, str):
+        return _time_of_text(value, path)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        unit = _UNITS.get(re.split(r"[_.]", path)[-1], 1_000_000_000)
+        return _within(value * unit if isinstance(value, int) else _exactly(value, unit, path), path)
+    seconds, nanoseconds = (next((name for name in names if _has(value, name)), None) for names in
+                            (_SECONDS, _NANOSECONDS))  # fmt: skip
+    if seconds is None:
+        raise FieldError(f"{path} in a message is no time: name another by @, or the time of receipt, @{LOG_TIME}")
+    parts = _at(value, [seconds], path), _at(value, [nanoseconds], path) if nanoseconds else 0
+    if not all(isinstance(part, int) for part in parts):
+        raise FieldError(f"{path} in a message has seconds and nanoseconds that are no whole numbers")
+    return _within(parts[0] * 1_000_000_000 + parts[1], path)
+
+
+def paths_of(message: Any, before: str = "") -> Iterator[str]:
+    """Paths to all that is in a message; of a list of objects those in its first."""
+    if _is_list(message):
+        message = message[0] if len(message) and _is_object(message[0]) else None
+    if not _is_object(message):
+        yield from [before] if before else []
+        return
+    for name in message if isinstance(message, Mapping) else message.DESCRIPTOR.fields_by_name:
+        value = message[name] if isinstance(message, Mapping) else getattr(message, name)
+        yield from paths_of(value, f"{before}.{name}" if before else str(name))
+
+
+def _exactly(value: float, unit: int, path: str) -> int:
+    """As it is written in decimals, to the nanosecond."""
+    try:
+        return int((Decimal(repr(value)) * unit).to_integral_value())
+    except (ArithmeticError, ValueError):
+        raise FieldError(f"{path} in a message is {value}, which is no time") from None
+
+
+def _within(value: int, path: str) -> int:
+    if not -_INT64 <= value < _INT64:
+        raise FieldError(f"{path} in a message is too large for a time: name its unit by its end, _ns, _us or _ms")
+    return value
+
+
+def _time_of_text(text: str, path: str) -> int:
+    """As in ISO 8601, in UTC."""
+    try:
+        stamp = np.datetime64(re.sub(r"(Z|[+-]00:?00)$", "", text), "ns")
+    except ValueError:
+        stamp = np.datetime64("NaT")
+    if np.isnat(stamp):
+        raise FieldError(f"{path} in a message is {text[:40]!r}, not a time such as 2026-05-04T12:00:00.25Z (in UTC)")
+    return int(stamp.astype(np.int64))
+
+
+def _number(value: Any, path: str) -> float:
+    if value is None:  # JSON has no other way to write what is not a number
+        return float("nan")
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        kind = f"an object with {_names(value)}" if _is_object(value) else repr(value)[:40]
+        raise FieldError(f"{path} in a message is {kind} in place of a number: name the right one by --field")
+    try:
+        return float(value)
+    except OverflowError:
+        return float("inf")
+
+
+def _flat(value: Any) -> Iterator[Any]:
+    if not _is_list(value):
+        yield value
+        return
+    for each in value:
+        yield from _flat(each)
+
+
+def _at(value: Any, steps: Sequence[str], path: str) -> Any:
+    """What the steps lead to; through each object of a list, where a step is no place in it."""
+    for k, step in enumerate(steps):
+        if _is_list(value) and not step.isdigit():
+            return [_at(each, steps[k:], path) for each in value]
+        try:
+            value = value[step] if isinstance(value, Mapping) else _part(value, step)
+        except (KeyError, IndexError, AttributeError, TypeError):
+            raise FieldError(
+                f"a message has no {path}: it has {_names(value)}, so name what is to be used by --field"
+            ) from None
+    return value
+
+
+def _part(value: Any, step: str) -> Any:
+    if _is_list(value):
+        return value[int(step)]
+    if step not in value.DESCRIPTOR.fields_by_name:  # a protobuf message
+        raise KeyError(step)
+    return getattr(value, step)
+
+
+def _has(value: Any, path: str) -> bool:
+    try:
+        _at(value, path.split("."), path)
+    except FieldError:
+        return False
+    return True
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, Sequence) and not isinstance(value, str | bytes)
+
+
+def _is_object(value: Any) -> bool:
+    return isinstance(value, Mapping) or hasattr(value, "DESCRIPTOR")
+
+
+def _names(value: Any) -> str:
+    """What an object has, or what it is."""
+    if not _is_object(value):
+        return f"a list of {len(value)} there" if _is_list(value) else f"{value!r:.40} there"
+    names = [str(name) for name in (value if isinstance(value, Mapping) else value.DESCRIPTOR.fields_by_name)]
+    return ", ".join(names[:_SHOWN]) + " ..." * (len(names) > _SHOWN) or "nothing"

@@ -1,0 +1,237 @@
+"""What is in a file before anything is made of it: topics with their types, counts, rates and gaps, and the bench."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from mcap.records import Channel
+from numpy.typing import NDArray
+
+from kf_calib.errors import InputError
+from kf_calib.sources.files.bags import files_of
+from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, fields_by_role
+from kf_calib.sources.files.field_messages import ENCODINGS, parser_of
+from kf_calib.sources.files.fields import FieldError, paths_of
+from kf_calib.sources.files.foreign import HEAD_BYTES, is_lines
+from kf_calib.sources.files.lines import Lines
+from kf_calib.sources.files.mcap_chunks import MAX_CHUNK_MB
+from kf_calib.sources.files.mcap_file import McapFile, Warn
+from kf_calib.sources.files.mcap_messages import MessageFinder
+from kf_calib.sources.files.record_files import RecordFile, open_record_file
+from kf_calib.sources.files.sqlite_bag import SqliteBag
+from kf_calib.support.extras import MissingExtraError
+
+Times = NDArray[np.int64]
+_GAP = 5  # times the usual interval
+_USUAL = 1000  # intervals from which the usual one is taken
+_LEAST = 10  # intervals, for one to be usual
+_LOG_TIME_BEFORE = 16  # bytes from a record's log time to its message
+_LATEST = (1 << 63) - 1
+
+
+@dataclass
+class Topic:
+    """Messages of one topic, or samples of one quantity of lines, by their times as they come.
+
+    first_ns, last_ns: the earliest and the latest. gaps: intervals of more than five times the usual one;
+    longest_gap_s, longest_gap_at_s: the longest, and when it began, from the first on. backward: times before the one
+    that precedes them. paths: what a message holds, of JSON and protobuf.
+    """
+
+    name: str
+    schema: str
+    encoding: str
+    count: int = 0
+    first_ns: int | None = None
+    last_ns: int | None = None
+    gaps: int = 0
+    longest_gap_s: float = 0.0
+    longest_gap_at_s: float = 0.0
+    backward: int = 0
+    paths: tuple[str, ...] = ()
+    _waiting: list[Times] = field(default_factory=list[Times])  # until it is known what is usual
+    _latest_ns: int | None = None  # of those that were looked at
+    _usual_ns: float = 0.0
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Messages a second, from the first to the last."""
+        if self.first_ns is None or self.last_ns is None or self.last_ns == self.first_ns:
+            return None
+        return (self.count - 1) / (self.last_ns - self.first_ns) * 1e9
+
+    def add(self, times: Times) -> None:
+        if not len(times):
+            return
+        first, last = int(times.min()), int(times.max())
+        self.first_ns = first if self.first_ns is None else min(self.first_ns, first)
+        self.last_ns = last if self.last_ns is None else max(self.last_ns, last)
+        self.count += len(times)
+        self._waiting.append(times)
+        if self._usual_ns or sum(map(len, self._waiting)) > _USUAL:
+            self.settle()
+
+    def settle(self) -> None:
+        """Looks for gaps in what has come so far; to be called at the end."""
+        before = [] if self._latest_ns is None else [np.array([self._latest_ns])]
+        times = np.concatenate([np.empty(0, np.int64), *before, *self._waiting])
+        self._waiting.clear()
+        if len(times) < 2:
+            return
+        self._latest_ns = int(times[-1])
+        intervals = np.diff(times)
+        self.backward += int((intervals < 0).sum())
+        if not self._usual_ns:
+            self._usual_ns = float(np.median(intervals[:_USUAL])) if len(intervals) >= _LEAST else np.inf
+        wide = intervals > _GAP * max(self._usual_ns, 1.0)
+        self.gaps += int(wide.sum())
+        at = int(intervals.argmax())
+        if wide[at] and intervals[at] > self.longest_gap_s * 1e9:
+            assert self.first_ns is not None
+            self.longest_gap_s, self.longest_gap_at_s = intervals[at] / 1e9, (int(times[at]) - self.first_ns) / 1e9
+
+
+@dataclass
+class Inventory:
+    """What a recording's files hold. has_readings: of an accelerometer, by a schema that is known. has_angles: the
+    platform is described by angles; None: it is not described in a schema that is known."""
+
+    path: Path
+    format: str
+    files: list[Path]
+    size: int
+    topics: list[Topic]
+    bench: dict[str, str]
+    has_readings: bool
+    has_angles: bool | None
+    warnings: list[str]
+
+    @property
+    def is_lines(self) -> bool:
+        return self.format == "lines"
+
+
+def inventory_of(
+    path: Path, columns: Mapping[str, str] = MappingProxyType({}), fields: Sequence[str] = ()
+) -> Inventory:
+    """All of a file or a bag's folder, read once. columns: our names of a table's. fields: as of a ``Recording``.
+
+    Raises InputError.
+    """
+    stated = fields_by_role(fields)
+    files = files_of(path)
+    if len(files) == 1 and _holds_lines(files[0]):
+        return _of_lines(files[0], columns)
+    warnings = list[str]()
+    parts = [open_record_file(file, int(MAX_CHUNK_MB * (1 << 20)), USABLE_SCHEMAS) for file in files]
+    topics, bench, has_readings, has_angles = dict[str, Topic](), dict[str, str](), False, None
+    for part in parts:
+        warnings += [part.trouble] if part.trouble else []
+        contents = Contents(part.path, stated)
+        _count(part, contents, topics, warnings.append)
+        bench = bench or contents.bench or {}
+        has_readings |= bool(contents.topics(READINGS))
+        poses = contents.topics(POSES)
+        has_angles = contents.has_angles(poses[0]) if poses and has_angles is None else has_angles
+    for topic in topics.values():
+        topic.settle()
+    kind = "+".join(dict.fromkeys("db3" if isinstance(part, SqliteBag) else "mcap" for part in parts))
+    size = sum(part.size for part in parts)
+    return Inventory(path, kind, files, size, list(topics.values()), bench, has_readings, has_angles, warnings)
+
+
+def _holds_lines(file: Path) -> bool:
+    try:
+        with file.open("rb") as opened:
+            return is_lines(opened.read(HEAD_BYTES))
+    except FileNotFoundError:
+        raise InputError(f"{file} does not exist: check the path.") from None
+    except OSError as error:
+        raise InputError(f"{file} cannot be read ({error.strerror}): check its permissions.") from None
+
+
+def _of_lines(path: Path, columns: Mapping[str, str]) -> Inventory:
+    lines = Lines(path, columns=columns)
+    topics = [Topic(name, "", "") for name in ("readings", "platform", "temperature")]
+    for batch in lines.batches():
+        for topic, stream in zip(topics, (batch.accel, batch.pose, batch.temperature), strict=True):
+            topic.add(stream.time_ns)
+    for topic in topics:
+        topic.settle()
+    said = lines.described
+    assert said
+    topics[1].name = "platform angles" if said.has_angles else "platform attitude"
+    met = [topic for topic in topics if topic.count]
+    size = path.stat().st_size
+    return Inventory(path, "lines", [path], size, met, said.metadata, True, said.has_angles, lines.warnings)
+
+
+def _count(file: RecordFile, contents: Contents, topics: dict[str, Topic], warn: Warn) -> None:
+    """Adds what a file holds to the topics met so far."""
+    if file.summary:
+        contents.schemas = {schema.id: schema for schema in file.summary.schemas}
+        contents.channels = {channel.id: channel for channel in file.summary.channels}
+    for channel in contents.channels.values():
+        _topic(channel, contents, topics)
+    stray = 0
+    for number, times in _receipts(file, contents, topics, warn):
+        channel = contents.channels.get(number)
+        if channel is None:
+            stray += len(times)
+        else:
+            _topic(channel, contents, topics).add(times)
+    if stray:
+        warn(f"{file.path}: {stray} messages belong to no topic the file defines.")
+
+
+def _topic(channel: Channel, contents: Contents, topics: dict[str, Topic]) -> Topic:
+    schema = contents.schemas.get(channel.schema_id)
+    made = Topic(channel.topic, schema.name if schema else "", channel.message_encoding)
+    return topics.setdefault(channel.topic, made)
+
+
+def _receipts(
+    file: RecordFile, contents: Contents, topics: dict[str, Topic], warn: Warn
+) -> Iterable[tuple[int, Times]]:
+    """Channel and times of receipt of messages of it, some thousands at a time."""
+    if isinstance(file, SqliteBag):
+        return file.receipts(warn)
+    assert isinstance(file, McapFile)
+    return _from_blocks(file, contents, topics, warn)
+
+
+def _from_blocks(
+    file: McapFile, contents: Contents, topics: dict[str, Topic], warn: Warn
+) -> Iterator[tuple[int, Times]]:
+    find = MessageFinder()
+    for block in file.blocks(warn):
+        messages = find(block)
+        for opcode, content in messages.others:
+            contents.add(opcode, content, warn)
+        for channel in contents.channels.values() if messages.others else ():
+            _topic(channel, contents, topics)
+        for number in dict.fromkeys(group.channel for group in messages.groups if len(group.at)):
+            groups = [group for group in messages.groups if group.channel == number and len(group.at)]
+            at = np.sort(np.concatenate([group.at for group in groups]))
+            every = np.ndarray((len(block.data) - 7,), "<u8", block.data, strides=(1,))
+            yield number, np.minimum(every[at - _LOG_TIME_BEFORE], _LATEST).astype(np.int64)
+            first = block.data[int(groups[0].at[0]) : int(groups[0].at[0]) + groups[0].size]
+            _look_into(first, number, contents, topics)
+
+
+def _look_into(message: bytes, number: int, contents: Contents, topics: dict[str, Topic]) -> None:
+    """Takes note of what a message holds, of the first one."""
+    channel = contents.channels.get(number)
+    if channel is None or channel.message_encoding not in ENCODINGS:
+        return
+    topic = _topic(channel, contents, topics)
+    if not topic.paths:
+        try:
+            parse = parser_of(channel.message_encoding, contents.schemas.get(channel.schema_id))
+            topic.paths = tuple(paths_of(parse(message)))
+        except (FieldError, MissingExtraError):
+            pass

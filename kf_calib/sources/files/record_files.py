@@ -1,0 +1,92 @@
+"""What kind of file a part of a recording is, by its first bytes; one that is compressed as a whole is unpacked."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Protocol
+
+import zstandard
+
+from kf_calib.errors import InputError
+from kf_calib.sources.files.mcap_file import McapFile, Warn
+from kf_calib.sources.files.mcap_messages import RecordBlock
+from kf_calib.sources.files.mcap_summary import Summary
+from kf_calib.sources.files.sqlite_bag import SqliteBag
+
+_SQLITE, _ZSTD = b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
+
+
+class RecordFile(Protocol):
+    """A file that gives out its records in blocks; ``trouble`` says what is wrong with its end."""
+
+    path: Path
+    size: int
+    trouble: str
+
+    @property
+    def summary(self) -> Summary | None: ...
+
+    def blocks(self, warn: Warn, *, growing: bool = False) -> Iterator[RecordBlock]: ...
+
+    def record_at(self, position: int, opcode: int) -> bytes: ...
+
+
+def open_record_file(path: Path, max_chunk: int, usable: frozenset[str]) -> RecordFile:
+    """The MCAP or .db3 file at ``path``. usable: types of messages wanted. Raises InputError where it is neither."""
+    place = path
+    if _head(path).startswith(_ZSTD):
+        place = _unpacked(path)
+    file: RecordFile
+    try:
+        if _head(place).startswith(_SQLITE):
+            file = SqliteBag(path, place, usable)
+        else:
+            file = McapFile(path, max_chunk, place)
+    except BaseException:
+        _remover(place, path)()
+        raise
+    weakref.finalize(file, _remover(place, path))
+    return file
+
+
+def _head(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_SQLITE))
+    except OSError:  # said where the file is opened to be read
+        return b""
+
+
+def _remover(place: Path, path: Path) -> Callable[[], None]:
+    """Removes what was unpacked, where anything was."""
+
+    def remove() -> None:
+        if place != path:
+            with suppress(OSError):
+                place.unlink()
+
+    return remove
+
+
+def _unpacked(path: Path) -> Path:
+    """A temporary file with what the compressed file holds."""
+    descriptor, name = tempfile.mkstemp(prefix="kf_calib_", suffix=Path(path.stem).suffix)
+    try:
+        with os.fdopen(descriptor, "wb") as target, path.open("rb") as packed:
+            zstandard.ZstdDecompressor().copy_stream(packed, target)
+    except BaseException as error:
+        Path(name).unlink()
+        if isinstance(error, zstandard.ZstdError):
+            raise InputError(f"{path} does not decompress ({error}): it is damaged, copy it anew.") from None
+        if isinstance(error, OSError):
+            raise InputError(
+                f"{path} cannot be unpacked to {Path(name).parent} ({error.strerror}): make room there, or let the "
+                "variable TMPDIR name another place."
+            ) from None
+        raise
+    return Path(name)

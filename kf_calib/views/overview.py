@@ -1,0 +1,128 @@
+"""What is in a recording, as tables and as a JSON object."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from kf_calib.dwells.overview import DwellFound
+from kf_calib.sources.files.inventory import Inventory, Topic
+from kf_calib.views.json import clean
+from kf_calib.views.tables import Table
+from kf_calib.views.terminal import note
+
+_FORMATS = {"mcap": "MCAP", "db3": "SQLite of ROS 2", "lines": "lines of text", "mcap+db3": "MCAP and SQLite of ROS 2"}
+_SHOWN = 40  # dwells
+_PATHS = 12  # of a message
+
+
+@dataclass(frozen=True)
+class Overview:
+    """What is in a recording, what it lacks to be evaluated, and the command that evaluates it then.
+
+    dwells: None where it cannot be said which there are. bench: keys of the file's record with those of options.
+    """
+
+    inventory: Inventory
+    bench: dict[str, str]
+    dwells: list[DwellFound] | None
+    missing: list[str]
+    command: str
+    warnings: list[str] = field(default_factory=list[str])
+
+
+def overview_object(found: Overview) -> dict[str, Any]:
+    """One JSON object."""
+    own = found.inventory
+    return clean(
+        {
+            "recording": str(own.path), "format": own.format, "files": [str(file) for file in own.files],
+            "bytes": own.size, "topics": [_topic_object(topic) for topic in own.topics], "bench": found.bench,
+            "dwells": None if found.dwells is None else [vars(dwell) for dwell in found.dwells],
+            "missing": found.missing, "command": found.command, "warnings": found.warnings,
+        }
+    )  # fmt: skip
+
+
+def _topic_object(topic: Topic) -> dict[str, Any]:
+    return {
+        "topic": topic.name, "schema": topic.schema, "encoding": topic.encoding, "messages": topic.count,
+        "rate_hz": topic.rate_hz, "first_ns": topic.first_ns, "last_ns": topic.last_ns, "gaps": topic.gaps,
+        "longest_gap_s": topic.longest_gap_s, "longest_gap_at_s": topic.longest_gap_at_s,
+        "backward": topic.backward, "fields": list(topic.paths),
+    }  # fmt: skip
+
+
+def overview_report(found: Overview) -> RenderableType:
+    """What ``info`` prints."""
+    own = found.inventory
+    files = f"{len(own.files)} files, " if len(own.files) > 1 else ""
+    parts: list[RenderableType] = [
+        Text(f"{own.path}: {_FORMATS.get(own.format, own.format)}, {files}{own.size / 1e6:.3g} MB"),
+        _topic_table(own.topics),
+    ]
+    for topic in own.topics:
+        if topic.paths:
+            more = " ..." * (len(topic.paths) > _PATHS)
+            parts.append(Text(f"A message of {topic.name} has {', '.join(topic.paths[:_PATHS])}{more}"))
+    bench = ", ".join(f"{key} = {value}" for key, value in found.bench.items())
+    parts.append(Text(f"Bench: {bench or 'nothing is said of it'}"))
+    if found.dwells is not None:
+        parts += _dwell_parts(found.dwells)
+    parts += [note(said) for said in found.warnings]
+    parts += [Text(f"Missing: {said}") for said in found.missing]
+    parts.append(Text(f"{'Then try' if found.missing else 'Try'}: {found.command}"))
+    return Group(*parts)
+
+
+def _topic_table(topics: Sequence[Topic]) -> Table:
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for heading in ("topic", "type", "messages", "Hz", "from s", "to s", "gaps"):
+        table.add_column(heading, justify="left" if heading in ("topic", "type", "gaps") else "right")
+    begin = min((topic.first_ns for topic in topics if topic.first_ns is not None), default=0)
+    for topic in topics:
+        times = ["" if each is None else f"{(each - begin) / 1e9:.2f}" for each in (topic.first_ns, topic.last_ns)]
+        rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.4g}"
+        kind = f"{topic.schema or 'no schema'} ({topic.encoding})" if topic.encoding else ""
+        table.add_row(topic.name, kind, str(topic.count), rate, *times, _gaps(topic))
+    return table
+
+
+def _gaps(topic: Topic) -> str:
+    said = ["none"] if topic.count and not topic.gaps and not topic.backward else []
+    if topic.gaps:
+        said.append(f"{topic.gaps}, the longest {topic.longest_gap_s:.3g} s at {topic.longest_gap_at_s:.2f} s")
+    if topic.backward:
+        said.append(f"{topic.backward} times back")
+    return ", ".join(said)
+
+
+def _dwell_parts(dwells: Sequence[DwellFound]) -> list[RenderableType]:
+    if not dwells:
+        return [Text("No dwell was found.")]
+    lasts = [dwell.lasts_s for dwell in dwells]
+    parts: list[RenderableType] = [Text(f"{len(dwells)} dwells of {min(lasts):.3g} to {max(lasts):.3g} s:")]
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for heading in ("dwell", "at s", "lasts s", "readings", "platform"):
+        table.add_column(heading, justify="right")
+    for dwell in dwells[:_SHOWN]:
+        table.add_row(
+            str(dwell.number), f"{dwell.arrival_s:.2f}", f"{dwell.lasts_s:.2f}", str(dwell.readings), _pose(dwell.pose)
+        )
+    parts.append(table)
+    if len(dwells) > _SHOWN:
+        parts.append(Text(f"and {len(dwells) - _SHOWN} more, all of them by --json"))
+    return parts
+
+
+def _pose(pose: tuple[float, ...]) -> str:
+    """Gimbal angles in degrees; an attitude as it is."""
+    if len(pose) == 4:
+        return " ".join(f"{each:.4f}" for each in pose)
+    return " ".join(f"{math.degrees(each) + 0.0:.2f}°" for each in pose)
