@@ -164,7 +164,8 @@ def verdict(result: Calibration) -> str:
     """One or two sentences: whether model and measurements agree, and the held-out error beside the noise floor."""
     judged = result.consistency
     if judged.p_value is None:
-        text = "Nothing is left over to judge the model by."
+        taken = "All noise was estimated from the misfit, so that the misfit itself cannot be judged."
+        text = taken if judged.dof else "Nothing is left over to judge the model by."
     else:
         word = "agree" if judged.consistent else "DISAGREE"
         text = (
