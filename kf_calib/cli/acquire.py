@@ -24,6 +24,7 @@ from kf_calib.cli.options import (
     json_option,
     overrides,
     overwrite_option,
+    pair,
     print_json,
     progress,
     save_view,
@@ -249,13 +250,6 @@ def record(
     echo(f"{out}: {made}")
     for warning in warnings:
         echo(f"Note: {sentence(warning)}")
-
-
-def pair(text: str) -> tuple[str, str]:
-    theirs, equals, ours = text.rpartition("=")
-    if not (equals and theirs and ours):
-        raise InputError(f"--column {text!r} names no pair: write --column THEIRS=OURS, for example acc_x=ax_g.")
-    return theirs, ours
 
 
 def _folder() -> str:

@@ -29,7 +29,7 @@ class Refits:
     need other statistics, and for these another pass over the source. ``diagnose`` and ``improve`` share what they
     compute if both are given the same object.
 
-    source: the recording or source of the run, or a path; None where its readings are gone; those of a table were never there.
+    source: the recording or source of the run, or a path; None where its readings are gone, as those of a table.
     """
 
     def __init__(self, source: Source | str | PathLike[str] | None = None) -> None:

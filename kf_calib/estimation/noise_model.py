@@ -83,8 +83,8 @@ class Noise:
 
     @property
     def judging(self) -> Noise:
-        """The noise by which the misfit is judged: without scatter that was itself estimated from this misfit, unless no
-        other noise is known."""
+        """The noise by which the misfit is judged: without scatter that was itself estimated from this misfit, unless
+        no other noise is known."""
         return self if self.scatter_stated or not self.within_seen else replace(self, scatter_mps2=np.zeros(3))
 
     def of(self, moving: bool) -> Noise:

@@ -29,6 +29,7 @@ from kf_calib.sources.files.joints import Joints
 from kf_calib.sources.files.mcap_chunks import MAX_CHUNK_MB, DamagedError, parse
 from kf_calib.sources.files.mcap_file import McapFile, Warn
 from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, RecordBlock
+from kf_calib.sources.tables.opening import is_table, open_table
 
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
 GAP_RECORD = "kf_calib.gap"
@@ -220,8 +221,10 @@ class _Decoders:
 
 
 def opened(source: Source | str | PathLike[str]) -> Source:
-    """The source itself, or the recording at a path."""
-    return Recording(source) if isinstance(source, str | PathLike) else source
+    """The source itself, or the recording or table at a path."""
+    if not isinstance(source, str | PathLike):
+        return source
+    return open_table(source) if is_table(source) else Recording(source)
 
 
 class _Passage:
