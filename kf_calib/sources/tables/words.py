@@ -18,7 +18,7 @@ _UNITS = {
     "g": "g gn g0 g_n", "mg": "mg", "ug": "ug µg μg",
     "count": "count counts lsb digit digits raw adc",
     "rad": "rad radian radians", "mrad": "mrad", "deg": "deg degree degrees grad ° º",
-    "s": "s sec second seconds sekunden", "ms": "ms", "us": "us µs μs", "ns": "ns", "min": "min", "h": "h std hours",
+    "s": "s sec second seconds sekunden", "ms": "ms", "us": "us µs μs", "ns": "ns", "min": "min", "h": "h hours",
     "c": "°c ºc c degc deg_c celsius ℃", "k": "k kelvin", "f": "°f f degf fahrenheit",
 }  # fmt: skip
 
@@ -33,7 +33,7 @@ _SPREAD = _words(
 )
 _READING = _words(
     "a acc accel acceleration accelerometer accelerometers beschleunigung f force specific reading readings mean avg "
-    "average mittel mittelwert m sensor channel ch kanal messwert out output signal value wert"
+    "average mittel mittelwert m sensor channel ch kanal messwert out output signal value wert raw"
 )
 _ANGLE = _words(
     "outer middle inner aussen mitte mittlerer innen innere innerer aeussere ausserer angle winkel gimbal roll pitch "
@@ -111,7 +111,7 @@ def _unit_of(name: str) -> tuple[str, str]:
     found = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]", name)
     if found and found[2] in _OF_WORD:
         return found[1], _OF_WORD[found[2]]
-    for pattern in (r"(.+?)\s+in\s+(\S+)", r"(.+?)\s*,\s*(\S+)", r"(.+?)\s*/\s*(\S+)", r"(.+?)[_ ](\S+)"):
+    for pattern in (r"(.+)\s+in\s+(\S+)", r"(.+?)\s*,\s*(\S+)", r"(.+)[_ ](\S+)", r"(.+?)\s*/\s*(\S+)"):
         found = re.fullmatch(pattern, name)
         if found and found[2] in _OF_WORD:
             return found[1], _OF_WORD[found[2]]
