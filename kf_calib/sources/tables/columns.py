@@ -78,10 +78,10 @@ class Columns:
         """Find faces, stamps and readings by what stands in columns whose names say nothing."""
         for k in range(len(self.meanings)):
             own, cells = self.meanings[k].ours, self.grid.column(k)
-            faces = all(isinstance(cell, str) and face_of(cell) for cell in cells)
-            if k not in stated and own in ("", "face", "angle") and not faces and own == "face":
+            are_faces = [isinstance(cell, str) and face_of(cell) is not None for cell in cells]
+            if k not in stated and own == "face" and not any(are_faces):
                 self.meanings[k] = Meaning("", "")
-            if k not in stated and faces and own in ("", "angle") and not self.has("face"):
+            if k not in stated and all(are_faces) and own in ("", "angle") and not self.has("face"):
                 self._guess(k, "face")
             if k not in stated and own == "" and not self.has("time") and self._are_stamps(k):
                 self._guess(k, "time")

@@ -74,8 +74,10 @@ def _decimal_of(cell: str) -> str:
     if points and commas:
         return "," if cell.rfind(",") > cell.rfind(".") else "."
     sign = "," if commas else "."
-    if points + commas > 1:
-        return "." if commas else ","
+    if points + commas > 1:  # of a date there are groups of other lengths
+        groups = re.split(r"[.,]", cell.translate(_SPACES).lstrip("+-−"))
+        is_thousands = 1 <= len(groups[0]) <= 3 and all(len(group) == 3 for group in groups[1:])
+        return ("." if commas else ",") if is_thousands else ""
     if not points + commas:
         return ""
     whole, _, rest = cell.translate(_SPACES).lstrip("+-−").partition(sign)

@@ -99,8 +99,8 @@ def face_of(text: str) -> tuple[int, int] | None:
     if not found:
         return None
     before, axis, after = found.groups()
-    if before and after in tuple("+-−–"):
-        return None
+    if (before and after in tuple("+-−–")) or (axis.isdigit() and not (before or after)):
+        return None  # a number alone is one of a list
     reversed_by = [mark in "-−–" if len(mark) == 1 else mark.lower() in ("down", "unten")
                    for mark in (before, after) if mark]  # fmt: skip
     return "xyz123".index(axis.lower()) % 3, -1 if sum(reversed_by) % 2 else 1

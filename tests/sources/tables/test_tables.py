@@ -285,7 +285,7 @@ def test_names_of_columns_are_understood(name: str, ours: str, unit: str) -> Non
 
 @pytest.mark.parametrize(
     ("text", "face"),
-    [("+x", (0, 1)), ("X", (0, 1)), ("−z", (2, -1)), ("y down", (1, -1)), ("z-", (2, -1)), ("2", (1, 1)), ("up", None),
+    [("+x", (0, 1)), ("X", (0, 1)), ("−z", (2, -1)), ("y down", (1, -1)), ("z-", (2, -1)), ("2", None), ("+2", (1, 1)), ("up", None),
      ("xx", None), ("", None)],
 )  # fmt: skip
 def test_faces_are_read(text: str, face: tuple[int, int] | None) -> None:
