@@ -279,7 +279,7 @@ def _copy_recordings(folder: Path, as_json: bool) -> None:
     own = {
         folder / file.name: file.read_bytes()
         for file in sorted(files("kf_calib").joinpath("recordings").iterdir(), key=lambda file: file.name)
-        if file.name.endswith((".mcap", ".json"))
+        if file.name.endswith((".mcap", ".json", ".csv"))
     }
     for path, content in own.items():
         if path.exists() and path.read_bytes() != content:

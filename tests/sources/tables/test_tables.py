@@ -123,7 +123,8 @@ WRITTEN = {
     "a delimiter stated": "sep=;\n" + PLAIN.replace(",", ";"),
     "quoted": "\n".join(",".join(f'"{cell}"' for cell in line.split(",")) for line in PLAIN.splitlines()),
     "comments": "# measured on Monday\n" + PLAIN,
-    "other names": PLAIN.replace(HEADER, "outer_deg,middle_deg,inner_deg,Acc1 (g),Acc2 (g),Acc3 (g),Stabw. [mg],Anzahl"),
+    "other names": PLAIN.replace(HEADER,
+                                 "outer_deg,middle_deg,inner_deg,Acc1 (g),Acc2 (g),Acc3 (g),Stabw. [mg],Anzahl"),
     "other order": "\n".join(",".join(line.split(",")[::-1]) for line in PLAIN.splitlines()),
     "minus of a typesetter": PLAIN.replace("-0", "−0").replace("-1", "−1"),
     "no unit at all": PLAIN.replace(" [deg]", "").replace(" [g]", ""),
@@ -285,8 +286,9 @@ def test_names_of_columns_are_understood(name: str, ours: str, unit: str) -> Non
 
 @pytest.mark.parametrize(
     ("text", "face"),
-    [("+x", (0, 1)), ("X", (0, 1)), ("−z", (2, -1)), ("y down", (1, -1)), ("z-", (2, -1)), ("2", None), ("+2", (1, 1)), ("up", None),
-     ("xx", None), ("", None)],
+    [("+x", (0, 1)), ("X", (0, 1)), ("−z", (2, -1)), ("y down", (1, -1)), ("z-", (2, -1)), ("2", None),
+     ("+2", (1, 1)),
+     ("up", None), ("xx", None), ("", None)],
 )  # fmt: skip
 def test_faces_are_read(text: str, face: tuple[int, int] | None) -> None:
     assert face_of(text) == face
