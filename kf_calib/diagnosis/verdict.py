@@ -22,8 +22,8 @@ def verdict_in_words(found: Diagnosis) -> str:
         noise = found.before.noise
         if not (noise.within_seen or noise.scatter_stated):
             return (
-                f"No effect explains a significant part of the scatter of the dwells (p {format_p(test.p_value)}), from "
-                f"which all noise was estimated.{blind}"
+                f"No effect explains a significant part of the scatter of the dwells (p {format_p(test.p_value)}), "
+                f"from which all noise was estimated.{blind}"
             )
         agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
         return f"{agreed}: no effect is missing that this run could show.{blind}"
