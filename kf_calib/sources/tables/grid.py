@@ -70,12 +70,10 @@ def grid_of(table: Any) -> Grid:
 def _of_text(path: Path) -> Grid:
     """Return the cells of a CSV file: any usual encoding and delimiter, with or without lines above the header."""
     text = _decoded(path, path.read_bytes())
-    remark, delimiter = "", ""
+    delimiter, skipped = "", 0
     first, _, rest = text.partition("\n")
     if first.lower().startswith("sep=") and len(first.strip()) == 5:
         delimiter, text, skipped = first.strip()[-1], rest, 1
-    else:
-        skipped = 0
     delimiter = delimiter or _delimiter(text)
     try:
         reader = csv.reader(text.splitlines(), delimiter=delimiter, skipinitialspace=True)
@@ -84,7 +82,7 @@ def _of_text(path: Path) -> Grid:
         raise InputError(f"{path}: is no CSV file ({error}): save the table as CSV or .xlsx.") from None
     lines = [line for line in lines if not (line[1] and str(line[1][0] or "").startswith("#"))]
     grid = _headed(str(path), lines)
-    return replace(grid, is_semicolon=delimiter == ";", remarks=(remark,) if remark else ())
+    return replace(grid, is_semicolon=delimiter == ";")
 
 
 def _decoded(path: Path, content: bytes) -> str:

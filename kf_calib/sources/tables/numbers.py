@@ -124,8 +124,3 @@ def _stamp(text: str, month_first: bool) -> datetime:
     micro = f".{(fraction + '000000')[:6]}" if fraction else ""
     clock = f"{hours:02d}:{minute or '00'}:{second_s or '00'}{micro}{offset}"
     return datetime.fromisoformat(f"{years:04d}-{int(month):02d}-{int(day):02d}T{clock}")
-
-
-def refuse_cell(grid: Grid, row: int, name: str, cell: Cell, numbers: Numbers, least: str = "a number") -> InputError:
-    """The error for a cell that holds no number."""
-    return grid.refuse(row, name, cell, f"write {least} such as {numbers.example}")
