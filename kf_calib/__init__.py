@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from kf_calib.online.session import Session
     from kf_calib.sources.files.recorder import Recorder
     from kf_calib.sources.files.recording import Recording as open_recording
+    from kf_calib.sources.tables.opening import open_table
     from kf_calib.support.units import shown_in
     from kf_calib.views import figures as plot
     from kf_calib.views.rerun import save as save_view
@@ -74,6 +75,7 @@ _HOMES = {
     "Session": ("online.session", "Session"),
     "Recorder": ("sources.files.recorder", "Recorder"),
     "open_recording": ("sources.files.recording", "Recording"),
+    "open_table": ("sources.tables.opening", "open_table"),
     "save_view": ("views.rerun", "save"),
     "shown_in": ("support.units", "shown_in"),
     "Watch": ("online.sequential_test", "Watch"),
@@ -85,8 +87,8 @@ _SHOWING = ("views.notebook",)
 __all__ = [
     "Bench", "Calibration", "Corrected", "Correction", "Diagnosis", "Improvement", "InputError", "KfCalibError",
     "Parameter", "Recorder", "Refits", "Running", "SavedCalibration", "Session", "Settings", "UnobservableError",
-    "Watch", "calibrate", "compare", "diagnose", "improve", "open_calibration", "open_recording", "plot",
-    "save_calibration", "save_view", "shown_in",
+    "Watch", "calibrate", "compare", "diagnose", "improve", "open_calibration", "open_recording", "open_table",
+    "plot", "save_calibration", "save_view", "shown_in",
 ]  # fmt: skip
 
 

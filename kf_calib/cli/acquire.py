@@ -24,6 +24,7 @@ from kf_calib.cli.options import (
     json_option,
     overrides,
     overwrite_option,
+    pair,
     print_json,
     progress,
     save_view,
@@ -254,13 +255,6 @@ def record(
         echo(f"Note: {sentence(warning)}")
 
 
-def pair(text: str) -> tuple[str, str]:
-    theirs, equals, ours = text.rpartition("=")
-    if not (equals and theirs and ours):
-        raise InputError(f"--column {text!r} names no pair: write --column THEIRS=OURS, for example acc_x=ax_g.")
-    return theirs, ours
-
-
 def _folder() -> str:
     return "recordings" if get_current_context().params["tutorial"] else "out"
 
@@ -288,7 +282,7 @@ def _copy_recordings(folder: Path, as_json: bool) -> None:
     own = {
         folder / file.name: file.read_bytes()
         for file in sorted(files("kf_calib").joinpath("recordings").iterdir(), key=lambda file: file.name)
-        if file.name.endswith((".mcap", ".json"))
+        if file.name.endswith((".mcap", ".json", ".csv"))
     }
     for path, content in own.items():
         if path.exists() and path.read_bytes() != content:

@@ -20,6 +20,7 @@ from kf_calib.cli.options import (
     effects_from_option,
     examples,
     json_option,
+    messages_of,
     overwrite_option,
     print_json,
     progress,
@@ -76,7 +77,7 @@ def apply(calibration: Path, recording: Path, out: Path | None, overwrite: bool,
     outputs = claimed(overwrite=overwrite)
     saved, correction = _correction(calibration, options)
     options["gravity_mps2"] = options["gravity_mps2"] or saved.bench.gravity_mps2
-    source = recording_of(recording, options, angles=False)
+    source = messages_of(recording, options, angles=False)
     found = []
     with progress(f"correcting {recording.name}", as_json) as tick:
         outputs.write(out, lambda path: found.append(apply_to_file(correction, source, path, tick)))

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
-from kf_calib.cli.acquire import pair
 from kf_calib.cli.echo import Printer, complain
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.live_keys import pressed_keys
@@ -30,6 +29,7 @@ from kf_calib.cli.options import (
     json_option,
     overrides,
     overwrite_option,
+    pair,
     rendered,
     rrd_option,
     save_model_option,

@@ -17,7 +17,7 @@ import rich_click as click
 from kf_calib.cli.echo import complain, echo, echo_drawn
 from kf_calib.cli.files import output_option
 from kf_calib.cli.numbers import NOT_NEGATIVE, NUMBER, POSITIVE, NumberInRange
-from kf_calib.errors import BenchError
+from kf_calib.errors import BenchError, InputError
 from kf_calib.support.units import shown_in, si
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from kf_calib.estimation.results import Calibration
     from kf_calib.estimation.settings import Settings
     from kf_calib.sources.files.recording import Recording
+    from kf_calib.sources.tables.table import Table
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -78,17 +79,35 @@ def bench_options(command: F) -> F:
     )(command)  # fmt: skip
 
 
+columns_option = click.option(
+    "--column", "columns", multiple=True, metavar="THEIRS=OURS", panel=INPUT,
+    help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.',
+)  # fmt: skip
+
+
+def pair(text: str) -> tuple[str, str]:
+    """Theirs and ours of a ``--column``."""
+    theirs, equals, ours = text.rpartition("=")
+    if not (equals and theirs and ours):
+        raise InputError(f"--column {text!r} names no pair: write --column THEIRS=OURS, for example acc_x=ax_g.")
+    return theirs, ours
+
+
 def recording_options(command: F) -> F:
     """How to read a recording: the bench, unit of the readings, and topics."""
     options = [
-        click.option("--accel-unit", type=click.Choice(_ACCEL_UNITS), default="m/s2", show_default=True,
-                     help="Unit of the readings.", panel=INPUT),
+        click.option("--accel-unit", type=click.Choice(_ACCEL_UNITS), show_default="m/s2; in a table, as its header or "
+                     "its numbers tell", help="Unit of the readings.", panel=INPUT),
         click.option("--accel-scale", type=NUMBER, default=1.0, show_default=True,
                      help="Size of one count, in the unit of the readings.", panel=INPUT),
-        click.option("--angle-unit", type=click.Choice(_ANGLE_UNITS), default="rad", show_default=True,
-                     help="Unit of the gimbal angles.", panel=INPUT),
+        click.option("--angle-unit", type=click.Choice(_ANGLE_UNITS), show_default="rad; in a table, as its header or "
+                     "its numbers tell", help="Unit of the gimbal angles.", panel=INPUT),
         click.option("--no-angles", is_flag=True, panel=INPUT,
                      help="Use no platform angles: only the size of gravity is known, nine parameters are left."),
+        click.option("--g-unit", metavar="M/S^2", default="9.80665", show_default=True,
+                     help="What 1 g stands for in a table of orientations; local: gravity of the bench.",
+                     panel=INPUT),
+        columns_option,
         click.option("--accel-topic", metavar="TOPIC", help="Topic of the accelerometer, where there are several.",
                      panel=INPUT),
         click.option("--pose-topic", metavar="TOPIC", help="Topic of the platform's angles or attitude.", panel=INPUT),
@@ -104,10 +123,6 @@ def recording_options(command: F) -> F:
     return bench_options(command)
 
 
-columns_option = click.option(
-    "--column", "columns", multiple=True, metavar="THEIRS=OURS", panel=INPUT,
-    help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.',
-)  # fmt: skip
 rrd_option = output_option("--rrd", metavar="FILE.rrd", help="Save the Rerun view here.", panel=OUTPUT)
 save_model_option = output_option(
     "--save-model", metavar="FILE.toml", help="Save the model here, for --model to read.", panel=OUTPUT
@@ -225,21 +240,43 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
     return keys
 
 
-def recording_of(path: Path, options: Mapping[str, Any], angles: bool = True) -> Recording:
-    """The recording at a path, as the options say it is to be read; angles: whether it must have platform angles."""
+def recording_of(path: Path, options: Mapping[str, Any]) -> Recording | Table:
+    """The recording or table at a path."""
+    from kf_calib.sources.tables.opening import is_table, open_table
+
+    columns = dict(map(pair, options["columns"]))
+    if is_table(path):
+        if options["no_angles"]:
+            raise InputError(f"{path}: a table of orientations has them: leave out --no-angles.")
+        return open_table(
+            path,
+            overrides(options),
+            columns=columns,
+            accel_unit=options["accel_unit"],
+            accel_scale=options["accel_scale"],
+            angle_unit=options["angle_unit"],
+            g_unit=options["g_unit"],
+        )
+    if columns:
+        raise InputError(f"{path}: is no table (.csv, .xlsx), so it has no columns to be named by --column.")
+    return messages_of(path, options, not options["no_angles"])
+
+
+def messages_of(path: Path, options: Mapping[str, Any], angles: bool) -> Recording:
+    """The recording of samples at a path, as the options say it is to be read; angles: whether it must have angles."""
     from kf_calib.sources.files.recording import Recording
 
     return Recording(
         path,
         overrides(options),
-        si(f"1 {options['accel_unit']}") * options["accel_scale"],
-        angle_scale=si(f"1 {options['angle_unit']}"),
+        si(f"1 {options['accel_unit'] or 'm/s2'}") * options["accel_scale"],
+        angle_scale=si(f"1 {options['angle_unit'] or 'rad'}"),
         accel_topic=options["accel_topic"],
         pose_topic=options["pose_topic"],
         temperature_topic=options["temperature_topic"],
         fields=options["fields"],
         max_chunk_mb=options["max_chunk_mb"],
-        angles=angles and not options.get("no_angles", False),
+        angles=angles,
     )
 
 
@@ -267,8 +304,8 @@ def used_of(options: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def opened(path: Path, options: Mapping[str, Any]) -> tuple[Recording, Settings]:
-    """A recording and how to evaluate it; a model that cannot be made is refused before any reading is read."""
+def opened(path: Path, options: Mapping[str, Any]) -> tuple[Recording | Table, Settings]:
+    """A recording or table, and how to evaluate it; an impossible model is refused before any reading is read."""
     from kf_calib.estimation.measurement_model import Model
 
     settings = settings_of(options)

@@ -18,6 +18,7 @@ from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import Frame
 from kf_calib.sources.files.recording import opened
+from kf_calib.sources.tables.table import Table
 from kf_calib.support import stage
 from kf_calib.support.threads import one_blas_thread
 
@@ -29,11 +30,12 @@ class Refits:
     need other statistics, and for these another pass over the source. ``diagnose`` and ``improve`` share what they
     compute if both are given the same object.
 
-    source: the recording or source of the run, or a path; None where its readings are gone.
+    source: the recording or source of the run, or a path; None where its readings are gone, as those of a table.
     """
 
     def __init__(self, source: Source | str | PathLike[str] | None = None) -> None:
-        self.source = None if source is None else opened(source)
+        source = None if source is None else opened(source)
+        self.source = None if isinstance(source, Table) else source
         self.frames = list[Frame]()
         # with each value what its key is made of, since the id of an object that is gone may be used again
         self._refits = dict[tuple[int, tuple[str, ...]], tuple[Calibration, Calibration]]()

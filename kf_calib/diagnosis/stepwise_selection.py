@@ -184,7 +184,7 @@ class Improvement:
         first = self.start.before
         of_models = evaluate_fit(first.fit, first.settings).warnings
         said = [sentence for sentence in first.warnings if sentence not in of_models]
-        return [*said, *self.result.warnings]
+        return list(dict.fromkeys([*said, *self.result.warnings]))
 
     @property
     def because(self) -> Because:

@@ -19,6 +19,12 @@ def verdict_in_words(found: Diagnosis) -> str:
         return "The model cannot be tested: there are no more measurements than parameters. Visit more orientations."
     if test.consistent:
         blind = f" This run cannot show {len(test.unseen)} of {test.count} effects." if test.unseen else ""
+        noise = found.before.noise
+        if not (noise.within_seen or noise.scatter_stated):
+            return (
+                f"No effect explains a significant part of the scatter of the dwells (p {format_p(test.p_value)}), "
+                f"from which all noise was estimated.{blind}"
+            )
         agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
         return f"{agreed}: no effect is missing that this run could show.{blind}"
     start = f"Residuals fail (p {format_p(test.p_value)})."

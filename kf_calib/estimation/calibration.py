@@ -36,6 +36,7 @@ from kf_calib.estimation.oscillation_carrier import fitted_to, on_carrier
 from kf_calib.estimation.outlying_dwell import outlying_dwells, outlying_in_words
 from kf_calib.estimation.random_walk import predict, to_mean
 from kf_calib.estimation.remarks import misfit_remark, remarks_on
+from kf_calib.estimation.reml import FEWEST, degrees_of_freedom
 from kf_calib.estimation.results import Calibration, Estimate, Visit, consistency, estimate_of, estimates
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.square_root_information import FilterStep
@@ -102,6 +103,7 @@ def conclude(
         fitted = fitted_to(passed, dwells)
     result = evaluate_fit(fitted, settings)
     refuse_unseen(result)
+    _refuse_without_noise(result)
     if again is not None and settings.engine == "filterpy":
         stage.say("filterpy, reading by reading")
         result = replace(result, estimate=filterpy_estimate(again, result, on_progress=on_progress))
@@ -215,6 +217,17 @@ def refuse_unseen(result: Calibration) -> None:
             f"the {dwells} too few different directions of gravity, so none "
             f"of the parameters can be seen ({', '.join(paper_parameters.SYMBOLS)}): visit at least four spread "
             "orientations, or state a --prior."
+        )
+
+
+def _refuse_without_noise(result: Calibration) -> None:
+    """Raise InputError if nothing at all shows how large the noise is, so that no sigma can be given."""
+    noise, free = result.noise, degrees_of_freedom(result.carried.means)
+    if not (noise.within_seen or noise.scatter_stated or noise.setting_stated) and free < FEWEST:
+        raise InputError(
+            f"{len(result.visits)} orientations without standard deviations leave {free} degrees of freedom, too few "
+            f"to estimate the noise from ({FEWEST}): give standard deviation and number of readings in each row, "
+            "state --scatter-sigma, or measure more orientations."
         )
 
 

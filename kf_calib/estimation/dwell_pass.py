@@ -11,7 +11,7 @@ import numpy as np
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Source
-from kf_calib.dwells import window_average
+from kf_calib.dwells import tabulated, window_average
 from kf_calib.dwells.blocks import LARGEST_RAD, Block, Tally
 from kf_calib.dwells.rest_in_readings import RestSegmenter
 from kf_calib.dwells.rows import Rows, model_rows
@@ -22,6 +22,7 @@ from kf_calib.estimation import setup_blunders
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import ReadingsMonitor
+from kf_calib.sources.tables.table import Table
 from kf_calib.support.units import WORDS
 
 
@@ -47,7 +48,9 @@ class Pass:
         return Segmenter(self.source.bench, self.settings.stillness, self.tally, bool(self.model.dynamic))
 
     def rows(self) -> Iterator[Rows]:
-        """Rows of all blocks of the source."""
+        """Rows of all blocks of the source; of a table, with every reading at its mean."""
+        if isinstance(self.source, Table):
+            return tabulated.rows_of(self.source.orientations, self.source.bench)
         return self.rows_of(dwell_blocks(self.source, self.segmenter()))
 
     def rows_of(self, blocks: Iterable[Block]) -> Iterator[Rows]:
@@ -63,20 +66,31 @@ class Pass:
 
     def fold(self, on_progress: Callable[[float], None] | None = None) -> list[DwellFactor]:
         """Read the whole source and return its usable dwells."""
+        if isinstance(self.source, Table):
+            self._take(self.source)
+            return self.dwells
         for rows in self.rows():
             self.add(rows)
             if on_progress is not None:
                 on_progress(self.source.fraction)
         return self.dwells
 
+    def _take(self, table: Table) -> None:
+        """Take the dwells of a table as they are; raises InputError if the model needs more than their means."""
+        if self.folder.carrier_hz or self.settings.window_s:
+            table.refuse(" and ".join(map(str, self.model.effects)) or "an average over windows")
+        self.folder.dwells = tabulated.dwells_of(table.orientations, table.bench)
+        read = sum(row.count for row in table.orientations)
+        self.tally.read, self.tally.used, self.tally.poses = read, read, len(table.orientations)
+
     @property
     def dwells(self) -> list[DwellFactor]:
-        """The usable dwells so far: of at least 8 readings, since fewer do not show their own noise, and not left out
-        by the settings."""
-        left_out = self.settings.left_out
+        """The usable dwells so far: not left out by the settings and, but for those of a table, of at least 8 readings,
+        since fewer do not show their own noise."""
+        left_out, least = self.settings.left_out, 1 if isinstance(self.source, Table) else 8
         if not left_out:
-            return [dwell for dwell in self.folder.dwells if dwell.count >= 8]
-        unused = {k for k, each in enumerate(self.folder.dwells) if each.count < 8 or each.number in left_out}
+            return [dwell for dwell in self.folder.dwells if dwell.count >= least]
+        unused = {k for k, each in enumerate(self.folder.dwells) if each.count < least or each.number in left_out}
         return dwells_without(self.folder.dwells, unused)
 
 

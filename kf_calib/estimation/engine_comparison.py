@@ -27,6 +27,7 @@ from kf_calib.estimation.free_attitude import holding_frame
 from kf_calib.estimation.results import Calibration, Estimate
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.files.recording import opened
+from kf_calib.sources.tables.table import Table
 from kf_calib.support import stage
 
 Result = TypeVar("Result")
@@ -58,7 +59,7 @@ class Comparison:
 
     - running_sigma: for each of the other ways, the differences (D, p) of the twelve parameters and the coefficients
       from the block engine after each dwell, in the sigmas that these have then; NaN while not determined.
-    - allan: Allan deviation of the longest dwells.
+    - allan: Allan deviation of the longest dwells; None for a table, which has no readings.
     """
 
     result: Calibration
@@ -116,7 +117,8 @@ def compare(
     longest = LongestDwells(result)
     running = {"filterpy": by_filterpy, "batch": running_states(held(longest.passed_by(samples())), *conditions)}
     differences = {name: _along(states, result) for name, states in running.items()}
-    return Comparison(result, ways, tuple(_remarks(settings, result)), differences, longest.allan_deviation())
+    allan = None if isinstance(source, Table) else longest.allan_deviation()
+    return Comparison(result, ways, tuple(_remarks(settings, result)), differences, allan)
 
 
 def _along(states: Iterable[Floats], result: Calibration) -> Floats:

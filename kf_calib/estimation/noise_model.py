@@ -53,6 +53,7 @@ class Noise:
     - free: the attitude of a dwell is not known at all (``free_attitude``); setting_rad then only stands for that.
     - walk_mps2_per_sqrt_s: the intensity q of the random walk of each bias.
     - walk_spread: the sigma of ln q; None if q was stated or is zero.
+    - within_seen: whether readings within dwells showed their noise; in a table of means alone they do not.
     """
 
     sigma_mps2: Floats
@@ -66,6 +67,7 @@ class Noise:
     walk_mps2_per_sqrt_s: float = 0.0
     walk_spread: float | None = None
     free: bool = False
+    within_seen: bool = True
 
     def __post_init__(self) -> None:
         if self.scatter_mps2 is None:  # pyright: ignore[reportUnnecessaryComparison]
@@ -83,8 +85,9 @@ class Noise:
 
     @property
     def judging(self) -> Noise:
-        """The noise by which the misfit is judged: without scatter that was itself estimated from this misfit."""
-        return self if self.scatter_stated else replace(self, scatter_mps2=np.zeros(3))
+        """The noise by which the misfit is judged: without scatter that was itself estimated from this misfit, unless
+        no other noise is known."""
+        return self if self.scatter_stated or not self.within_seen else replace(self, scatter_mps2=np.zeros(3))
 
     def of(self, moving: bool) -> Noise:
         """The noise that applies in slews if ``moving``, else the noise in dwells."""
@@ -129,7 +132,8 @@ def within_dwells(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float = 0
     long = counts[:, None] >= np.where(variance > 0, 40.0 * inflation, 0.0)
     freedom = np.where(long, np.maximum(counts[:, None] - 3.0 * inflation - on_carrier, 0.0), 0.0).sum(axis=0)
     pooled = np.where(long, squares, 0.0).sum(axis=0) / np.maximum(freedom, 1.0)
-    return Noise(np.sqrt(np.where(long.any(axis=0), pooled, variance)), inflation)
+    sigma = np.sqrt(np.where(long.any(axis=0), pooled, variance))
+    return Noise(sigma, inflation, within_seen=any(dwell.count > 1 for dwell in dwells))
 
 
 def _walk_products(dwells: Sequence[DwellFactor]) -> Floats:

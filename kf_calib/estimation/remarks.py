@@ -85,6 +85,11 @@ def remarks_on(
             f"{len(dwells)} dwell{'s are' if len(dwells) > 1 else ' is'} too few to test the model: "
             "visit at least five spread orientations."
         )
+    elif judged.p_value is None:
+        yield (
+            "no standard deviation and number of readings were given: the noise is what the dwells scatter about the "
+            "model, so whether an effect is missing can be judged only by what that effect would explain of it."
+        )
     if misfit := misfit_remark(judged, residuals, model.bench, noise):
         yield misfit
     scales, expected = estimate.parameters[2::4], paper_parameters.nominal(model.bench.nominal)[2::4]

@@ -141,7 +141,7 @@ class Consistency:
     The statistic is the sum of the normalised innovations squared, chi-squared distributed with ``dof`` degrees of
     freedom; its quotient by ``dof`` is tested against an F distribution, because the noise itself was estimated from
     finitely many readings. Scatter that was estimated from the same misfit is left out. ``p_value`` and ``consistent``
-    are None if there are no degrees of freedom.
+    are None if there are no degrees of freedom, or if all of the noise was estimated from the misfit.
     """
 
     statistic: float
@@ -414,6 +414,8 @@ def consistency(fitted: Fit) -> Consistency:
     dof -= int(not noise.setting_stated and noise.setting_rad > 0)
     if dof <= 0:
         return Consistency(statistic, 0, None, None)
+    if not noise.within_seen and not noise.scatter_stated:  # the noise was taken from this misfit
+        return Consistency(statistic, dof, None, None)
     noise_dof = float(sum(max(dwell.count - 4, 1) for dwell in dwells) / noise.inflation.mean())
     p_value = f_tail(dof, max(noise_dof, 1.0), statistic / dof)
     return Consistency(statistic, dof, p_value, p_value >= LEVEL)

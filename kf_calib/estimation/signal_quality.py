@@ -194,7 +194,9 @@ class ReadingsMonitor:
             seen.out = seen.out + rows.gated.sum(axis=1)
 
     def judged(self, dwells: Sequence[DwellFactor], noise: Noise) -> Readings:
-        """The defects of a run with these dwells and this noise."""
+        """The defects of a run with these dwells and this noise; none where no readings were seen, as of a table."""
+        if not self._dwells:
+            return Readings()
         seen = [self._dwells[dwell.number] for dwell in dwells]
         steps = [_step(seen, channel) for channel in range(3)]
         grids = [_quantisation(i, q, noise, seen) for i, q in enumerate(steps) if q is not None]

@@ -139,7 +139,8 @@ def noise_table(result: Calibration) -> Table:
     for heading in ("", "accelerometer 1", "accelerometer 2", "accelerometer 3", "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
     reading, angle = shown("m/s^2"), shown("rad")
-    table.add_row("within a dwell", *map(reading.number, noise.sigma_mps2), reading.label)
+    within = map(reading.number, noise.sigma_mps2) if noise.within_seen else ["-"] * 3
+    table.add_row("within a dwell" + ", not known" * (not noise.within_seen), *within, reading.label)
     table.add_row("inflation by correlation", *(f"{value:.3g}" for value in noise.inflation), "of variance")
     scatter, setting = noise_origins(result)
     for name, origin, values, unit in (
@@ -167,7 +168,8 @@ def verdict(result: Calibration) -> str:
     """One or two sentences: whether model and measurements agree, and the held-out error beside the noise floor."""
     judged = result.consistency
     if judged.p_value is None:
-        text = "Nothing is left over to judge the model by."
+        taken = "All noise was estimated from the misfit, so that the misfit itself cannot be judged."
+        text = taken if judged.dof else "Nothing is left over to judge the model by."
     else:
         word = "agree" if judged.consistent else "DISAGREE"
         text = (

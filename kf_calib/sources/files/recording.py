@@ -43,6 +43,7 @@ from kf_calib.sources.files.mcap_file import Warn
 from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, RecordBlock
 from kf_calib.sources.files.packed_messages import are_packed, unpacked
 from kf_calib.sources.files.record_files import RecordFile, open_record_file
+from kf_calib.sources.tables.opening import is_table, open_table
 
 STANDARD_GRAVITY_MPS2 = 9.80665
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
@@ -270,8 +271,10 @@ class _Decoders:
 
 
 def opened(source: Source | str | PathLike[str]) -> Source:
-    """The source itself, or the recording at a path."""
-    return Recording(source) if isinstance(source, str | PathLike) else source
+    """The source itself, or the recording or table at a path."""
+    if not isinstance(source, str | PathLike):
+        return source
+    return open_table(source) if is_table(source) else Recording(source)
 
 
 class _Passage:

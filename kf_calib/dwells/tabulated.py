@@ -1,0 +1,97 @@
+"""Dwells of which only mean, standard deviation and number of readings are known.
+
+Such a dwell is one piece whose conditions are the same throughout. Its triangle has a row for the mean and, below it,
+the scatter about the mean; the rows of u and u^2 are zero, since nothing is known of the course within the dwell.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.dwells.rows import REGRESSORS, Nodes, Rows
+from kf_calib.dwells.sufficient_statistics import DwellFactor, Piece
+
+LEAST_COUNT = 8
+"""A standard deviation of fewer readings counts as if there were more readings of more noise: the same sigma of the
+mean."""
+_CURVE = 3  # basis functions of a piece
+
+
+class Known(Protocol):
+    """What is known of a dwell; see ``kf_calib.sources.tables.orientation.Orientation``."""
+
+    @property
+    def mean_mps2(self) -> Floats: ...
+
+    @property
+    def pose(self) -> Floats: ...
+
+    @property
+    def elapsed_s(self) -> float: ...
+
+    @property
+    def sigma_mps2(self) -> Floats | None: ...
+
+    @property
+    def count(self) -> int: ...
+
+    @property
+    def temperature_c(self) -> float: ...
+
+
+def dwells_of(table: Sequence[Known], bench: Bench) -> list[DwellFactor]:
+    """The sufficient statistics of each row of a table."""
+    times = _times(table)
+    return [
+        DwellFactor(k + 1, (_piece(own, nodes, bench, times),))
+        for k, (own, nodes) in enumerate(zip(table, _nodes(table, bench), strict=True))
+    ]
+
+
+def rows_of(table: Sequence[Known], bench: Bench) -> Iterator[Rows]:
+    """Rows of each dwell with every reading at the mean, from which any engine makes the same estimate as from the
+    readings themselves."""
+    times = _times(table)
+    for k, (own, nodes) in enumerate(zip(table, _nodes(table, bench), strict=True)):
+        count = own.count * times
+        readings = np.tile(bench.readings(own.mean_mps2[None]), (count, 1))
+        columns = np.tile(nodes.regressors[:1], (count, 1))
+        assert columns.shape[1] == len(REGRESSORS)
+        piece = slice(0, count), np.zeros(count), nodes
+        elapsed_s = np.full(count, own.elapsed_s)
+        yield Rows(k + 1, elapsed_s, columns, readings, np.zeros((3, count)), True, (piece,))
+
+
+def _times(table: Sequence[Known]) -> int:
+    """Return by how much the counts have to be multiplied."""
+    fewest = min((own.count for own in table if own.sigma_mps2 is not None), default=LEAST_COUNT)
+    return math.ceil(LEAST_COUNT / fewest)
+
+
+def _nodes(table: Sequence[Known], bench: Bench) -> Iterator[Nodes]:
+    """Yield the nodes of each dwell; their times are apart by a tenth of the shortest pause, the rest does not
+    change."""
+    middles = np.array([own.elapsed_s for own in table])
+    half_s = 0.1 * float(np.diff(middles).min(initial=60.0))
+    every = bench.specific_force(middles, np.array([own.pose for own in table]))
+    for own, force in zip(table, every, strict=True):
+        at_s = own.elapsed_s + half_s * np.array([-1.0, 0.0, 1.0])
+        pose, force = np.repeat(own.pose[None], 3, axis=0), np.repeat(force[None], 3, axis=0)
+        yield Nodes(at_s, np.full(3, half_s), force, pose, np.full(3, own.temperature_c))
+
+
+def _piece(own: Known, nodes: Nodes, bench: Bench, times: int) -> Piece:
+    """Return the one piece of a dwell."""
+    count, mean = own.count * times, bench.readings(own.mean_mps2[None])[0]
+    triangle = np.zeros((_CURVE + 3, _CURVE + 3))
+    triangle[0, 0], triangle[0, _CURVE:] = math.sqrt(count), math.sqrt(count) * mean
+    if own.sigma_mps2 is not None:  # about a parabola, since that is what the noise model takes it for
+        sigma = np.abs(bench.readings(own.sigma_mps2[None]))[0] * math.sqrt(times * (count - _CURVE))
+        triangle[_CURVE:, _CURVE:] = np.diag(sigma)
+    return Piece(triangle, nodes, count, 0.0, own.count)

@@ -1,0 +1,1 @@
+"""Tables of orientations: a row a dwell, with its mean readings."""

@@ -1,0 +1,145 @@
+"""Which column of a table is what: told by names and units, by the numbers themselves, or by the user."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.errors import InputError
+from kf_calib.sources.tables.grid import Grid
+from kf_calib.sources.tables.numbers import Numbers, stamps_of
+from kf_calib.sources.tables.words import Meaning, face_of, meaning_of
+from kf_calib.support.plain_text import cut
+
+READINGS, SPREADS, QUATERNION = ("ax", "ay", "az"), ("sx", "sy", "sz"), ("qx", "qy", "qz", "qw")
+_SEVERAL = ("angle", "time", "")
+_ALIKE = 1.3  # of the norms of readings at rest, largest to smallest
+HOW = "--column THEIRS=OURS says what a column is"
+KNOWN = "ax_g (ay_mps2, az_mg), sx_g or sd_g, outer_deg (middle_rad, inner_deg), qx, face, time_s, count, temperature_c"
+
+
+@dataclass
+class Columns:
+    """The columns of a grid by what they are; see ``words.Meaning`` for the names.
+
+    numbers: how its numbers are written. guessed: names of columns that were recognised by their numbers alone.
+    """
+
+    grid: Grid
+    numbers: Numbers
+    meanings: list[Meaning]
+    guessed: list[str] = field(default_factory=list[str])
+
+    @classmethod
+    def of(cls, grid: Grid, stated: Mapping[str, str], numbers: Numbers) -> Columns:
+        """The columns of a grid; ``stated`` are those that the user names, theirs to ours. Raises InputError."""
+        columns = cls(grid, numbers, _meanings(grid, stated))
+        columns._recognise_contents({k for k, name in enumerate(grid.header) if name in stated})
+        columns._refuse_doubles()
+        return columns
+
+    def places(self, *wanted: str) -> list[int]:
+        """Indices of the columns of these kinds, in the order asked for."""
+        return [k for ours in wanted for k, own in enumerate(self.meanings) if own.ours == ours]
+
+    @property
+    def angles(self) -> list[int]:
+        """Indices of the gimbal angles, outer to inner where the names tell, else in the order of the header."""
+        return sorted(self.places("angle"), key=lambda k: self.meanings[k].rank)
+
+    def has(self, *wanted: str) -> bool:
+        """Whether there is a column of each of these kinds."""
+        return all(self.places(ours) for ours in wanted)
+
+    def named(self, places: Sequence[int]) -> str:
+        """The names of columns, quoted."""
+        return ", ".join(repr(cut(self.grid.header[k], 40)) for k in places)
+
+    @property
+    def unused(self) -> list[int]:
+        """Indices of the columns that mean nothing here."""
+        return [k for k, own in enumerate(self.meanings) if not own.ours and self.grid.header[k]]
+
+    def values(self, place: int, wanted: str = "a number") -> Floats:
+        """The numbers (n,) of a column; raises InputError for the first cell that holds none."""
+        out = np.empty(len(self.grid.rows))
+        for row, cell in enumerate(self.grid.column(place)):
+            try:
+                out[row] = self.numbers.value(cell)
+            except (ValueError, OverflowError):
+                wanted_now = f"write {wanted} such as {self.numbers.example}"
+                raise self.grid.refuse(row, self.grid.header[place], cell, wanted_now) from None
+        return out
+
+    def _recognise_contents(self, stated: set[int]) -> None:
+        """Find faces, stamps and readings by what stands in columns whose names say nothing."""
+        for k in range(len(self.meanings)):
+            own, cells = self.meanings[k].ours, self.grid.column(k)
+            are_faces = [isinstance(cell, str) and face_of(cell) is not None for cell in cells]
+            if k not in stated and own == "face" and not any(are_faces):
+                self.meanings[k] = Meaning("", "")
+            if k not in stated and all(are_faces) and own in ("", "angle") and not self.has("face"):
+                self._guess(k, "face")
+            if k not in stated and own == "" and not self.has("time") and self._are_stamps(k):
+                self._guess(k, "time")
+        if self.places(*READINGS):
+            return
+        left = [k for k in range(len(self.meanings)) if not self.meanings[k].ours and k not in stated]
+        numeric = [k for k in left if self._are_numbers(k)]
+        if len(numeric) == 3:
+            norms = np.linalg.norm([self.values(k) for k in numeric], axis=0)
+            if norms.min() > 0 and norms.max() < _ALIKE * norms.min():
+                for k, ours in zip(numeric, READINGS, strict=True):
+                    self._guess(k, ours)
+
+    def _guess(self, place: int, ours: str) -> None:
+        self.meanings[place] = Meaning(ours, self.meanings[place].unit)
+        self.guessed.append(self.grid.header[place])
+
+    def _are_stamps(self, place: int) -> bool:
+        cells = self.grid.column(place)
+        if self._are_numbers(place) or not all(cell is not None for cell in cells):
+            return False
+        try:
+            return bool(stamps_of(self.grid, "", cells))
+        except InputError:
+            return False
+
+    def _are_numbers(self, place: int) -> bool:
+        try:
+            self.values(place)
+        except InputError:
+            return False
+        return True
+
+    def _refuse_doubles(self) -> None:
+        kinds = [own.ours for own in self.meanings]
+        for k, ours in enumerate(kinds):
+            first = kinds.index(ours)
+            if ours not in _SEVERAL and first != k:
+                one, other = self.grid.header[first], self.grid.header[k]
+                raise InputError(
+                    f"{self.grid.name}: columns {one!r} and {other!r} are both taken for {ours}: leave one out by "
+                    f"--column {other + '=-'!r}; {HOW}."
+                )
+
+
+def _meanings(grid: Grid, stated: Mapping[str, str]) -> list[Meaning]:
+    """Return what the header and the user say; raises InputError for names that are not known."""
+    for theirs, ours in stated.items():
+        if theirs not in grid.header:
+            raise InputError(
+                f"{grid.name}: has no column {cut(theirs, 60)!r} (--column), it has "
+                f"{cut(', '.join(map(repr, grid.header)), 300)}."
+            )
+        if ours != "-" and not meaning_of(ours).ours:
+            raise InputError(f"--column {theirs}={ours}: {cut(ours, 60)!r} is not known: use {KNOWN}, or - for none.")
+    found = [meaning_of(name) for name in grid.header]
+    for k, name in enumerate(grid.header):
+        if name in stated:
+            own = meaning_of(stated[name])
+            found[k] = own if own.unit else own._replace(unit=found[k].unit)
+    return found

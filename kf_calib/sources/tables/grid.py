@@ -1,0 +1,208 @@
+"""The cells of a table as they stand in a CSV file, a sheet of Excel, a structured array or a DataFrame."""
+
+from __future__ import annotations
+
+import csv
+import zipfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from kf_calib.errors import InputError
+from kf_calib.sources.tables.words import is_unit
+from kf_calib.support.extras import need
+from kf_calib.support.plain_text import cut
+
+Cell = str | float | datetime | None
+"""A cell as it was read; text is not interpreted yet, an empty cell is None."""
+ZIP, MCAP = b"PK\x03\x04", b"\x89MCAP"
+TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
+EXCEL_SUFFIXES = (".xlsx", ".xlsm")
+OLD_SUFFIXES = (".xls", ".ods")
+_LARGEST = 50_000_000
+_DELIMITERS = ";\t,|"
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table: name for messages, header, and rows with the number that each has in the file.
+
+    remarks: how the file was read, where that was a choice.
+    """
+
+    name: str
+    header: tuple[str, ...]
+    numbers: tuple[int, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    is_semicolon: bool = False
+    remarks: tuple[str, ...] = ()
+
+    def column(self, index: int) -> list[Cell]:
+        """The cells of one column."""
+        return [row[index] for row in self.rows]
+
+    def refuse(self, row: int, column: str, value: Cell, wanted: str) -> InputError:
+        """The error that names a cell (row counted from 0), its value, and what would be read."""
+        said = "is empty" if value is None else f"is {cut(str(value), 60)!r}"
+        return InputError(f"{self.name}: row {self.numbers[row]}, column {column!r} {said}: {wanted}.")
+
+
+def grid_of(table: Any) -> Grid:
+    """The cells of a file, a structured array, a DataFrame or a mapping of columns."""
+    if isinstance(table, str | PathLike):
+        path = Path(table)
+        try:
+            with path.open("rb") as file:
+                start = file.read(8)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+        if path.suffix.lower() in OLD_SUFFIXES:
+            raise InputError(f"{path}: files of the kind {path.suffix} are not read: save it as .xlsx or .csv.")
+        if path.stat().st_size > _LARGEST:
+            raise InputError(f"{path}: is larger than a table of orientations can be: kf-calib record reads samples.")
+        return _of_excel(path) if start.startswith(ZIP) else _of_text(path)
+    return _of_columns(table)
+
+
+def _of_text(path: Path) -> Grid:
+    """Return the cells of a CSV file: any usual encoding and delimiter, with or without lines above the header."""
+    text = _decoded(path, path.read_bytes())
+    delimiter, skipped = "", 0
+    first, _, rest = text.partition("\n")
+    if first.lower().startswith("sep=") and len(first.strip()) == 5:
+        delimiter, text, skipped = first.strip()[-1], rest, 1
+    delimiter = delimiter or _delimiter(text)
+    try:
+        reader = csv.reader(text.splitlines(), delimiter=delimiter, skipinitialspace=True)
+        lines = [(reader.line_num + skipped, [cell.strip() or None for cell in row]) for row in reader]
+    except csv.Error as error:
+        raise InputError(f"{path}: is no CSV file ({error}): save the table as CSV or .xlsx.") from None
+    lines = [line for line in lines if not (line[1] and str(line[1][0] or "").startswith("#"))]
+    grid = _headed(str(path), lines)
+    return replace(grid, is_semicolon=delimiter == ";")
+
+
+def _decoded(path: Path, content: bytes) -> str:
+    """Return the text of a file in UTF-8 or UTF-16 with or without a byte-order mark, or else in Windows-1252."""
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return content.decode("utf-16", errors="replace")
+    if b"\0" in content:
+        raise InputError(f"{path}: is no text (it has bytes of zero): save the table as CSV or .xlsx.")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("cp1252", errors="replace")
+
+
+def _delimiter(text: str) -> str:
+    """Return the delimiter with which the most lines have the same number of cells, two or more."""
+    lines = [line for line in text.splitlines()[:200] if line.strip() and not line.startswith("#")]
+
+    def fitness(delimiter: str) -> int:
+        widths = [len(row) for row in csv.reader(lines, delimiter=delimiter) if len(row) > 1]
+        return max(map(widths.count, set(widths)), default=0)
+
+    try:
+        return max(_DELIMITERS, key=fitness)
+    except csv.Error:
+        return ","
+
+
+def _of_excel(path: Path) -> Grid:
+    """Return the cells of the first sheet of an Excel file that holds any."""
+    need("openpyxl", "tables", f"reading {path}")
+    import openpyxl
+    from openpyxl.utils.exceptions import InvalidFileException
+
+    try:
+        with path.open("rb") as file:
+            book = openpyxl.load_workbook(file, read_only=True, data_only=True)
+            sheets = [(sheet.title, list(sheet.iter_rows(values_only=True))) for sheet in book.worksheets]
+    except (InvalidFileException, zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
+        raise InputError(f"{path}: is no Excel file that can be read ({cut(str(error), 80)}): save it again.") from None
+    filled = [(name, rows) for name, rows in sheets if any(cell is not None for row in rows for cell in row)]
+    if not filled:
+        raise InputError(f"{path}: all sheets are empty: write a header and a row for each orientation.")
+    name, rows = filled[0]
+    others = ", ".join(repr(other) for other, _ in filled[1:])
+    lines = [(k + 1, [_cell(value) for value in row]) for k, row in enumerate(rows)]
+    remark = f"sheet {name!r} was read, not {others}; put the table on the first sheet"
+    return replace(_headed(str(path), lines), remarks=(remark,) if others else ())
+
+
+def _of_columns(table: Any) -> Grid:
+    """Return the cells of a structured array, a DataFrame of pandas or polars, or a mapping of columns."""
+    names = getattr(getattr(table, "dtype", None), "names", None)
+    if names is None:
+        names = list(table) if isinstance(table, Mapping) else getattr(table, "columns", None)
+    if names is None or isinstance(table, str):
+        raise InputError(
+            f"a table of type {type(table).__name__} has no names of columns: give a path, a structured array, a "
+            "DataFrame or a dict of columns."
+        )
+    names = list(names)
+    columns = [[_cell(value) for value in _values(table[name])] for name in names]
+    lengths = {len(column) for column in columns}
+    if len(lengths) > 1:
+        raise InputError(f"the columns of the table have different lengths ({sorted(lengths)}): give one row a dwell.")
+    rows = list(zip(*columns, strict=True))
+    _refuse_without_rows("the table", rows)
+    return Grid("the table", tuple(map(str, names)), tuple(range(1, len(rows) + 1)), tuple(rows))
+
+
+def _values(column: Any) -> Iterable[Any]:
+    """Return the values of a column as Python's own types, where it can give them."""
+    as_list = getattr(column, "tolist", None) or getattr(column, "to_list", None)
+    return as_list() if as_list else column
+
+
+def _cell(value: Any) -> Cell:
+    """Return a cell of a spreadsheet or an array: number, stamp or text; None where there is nothing."""
+    if value is None or value != value:  # NaN and NaT
+        return None
+    if isinstance(value, datetime) or (isinstance(value, str) and value.strip()):
+        return value.strip() if isinstance(value, str) else value
+    if isinstance(value, str):
+        return None
+    if isinstance(value, bytes):
+        return value.decode(errors="replace").strip() or None
+    try:
+        return float(value) if not isinstance(value, bool) else str(value)
+    except (TypeError, ValueError):
+        return str(value)
+
+
+def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
+    """Return the grid of lines: the header is the first with more than two cells, a line of units may follow it."""
+    filled = [(number, list(cells)) for number, cells in lines if any(cell is not None for cell in cells)]
+    while filled and sum(cell is not None for cell in filled[0][1]) <= 2:  # a title, a date, a serial number
+        del filled[0]
+    if not filled:
+        raise InputError(f"{name}: has no table: write a header and a row for each orientation (docs/tables.md).")
+    cells = filled[0][1]
+    width = max(k + 1 for k, cell in enumerate(cells) if cell is not None)
+    header = ["" if cell is None else str(cell) for cell in cells[:width]]
+    rows = filled[1:]
+    if rows and all(cell is None or (isinstance(cell, str) and is_unit(cell)) for cell in rows[0][1]):
+        units = [*rows[0][1], *[None] * width]
+        header = [f"{title} [{unit}]" if unit else title for title, unit in zip(header, units, strict=False)]
+        del rows[0]
+    for number, own in rows:
+        beyond = [cell for cell in own[width:] if cell is not None]
+        if beyond:
+            raise InputError(
+                f"{name}: row {number} has {width + len(beyond)} cells where the header has {width}, the last is "
+                f"{cut(str(beyond[-1]), 60)!r}: write one cell for each column, and quote a cell that holds a "
+                "delimiter."
+            )
+    _refuse_without_rows(name, rows)
+    full = tuple(tuple([*own[:width], *[None] * (width - len(own))]) for _, own in rows)
+    return Grid(name, tuple(header), tuple(number for number, _ in rows), full)
+
+
+def _refuse_without_rows(name: str, rows: Sequence[object]) -> None:
+    if not rows:
+        raise InputError(f"{name}: has a header and no rows: write a row for each orientation.")

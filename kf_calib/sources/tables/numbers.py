@@ -1,0 +1,125 @@
+"""Numbers and stamps in the cells of a table, as spreadsheets of different countries write them."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from datetime import datetime
+
+from kf_calib.sources.tables.grid import Cell, Grid
+
+_NUMBER = re.compile(r"[+\-−]?[\d.,'’ \u00a0\u202f]*\d[\d.,]*(?:[eE][+\-]?\d+)?")
+_SPACES = str.maketrans("", "", "'’ \u00a0\u202f")
+_LOCAL = re.compile(
+    r"(\d{1,4})[./-](\d{1,2})[./-](\d{1,4})[,T ]*\s*(?:(\d{1,2})[:.](\d{2})(?:[:.](\d{2})(?:[.,](\d+))?)?)?"
+    r"\s*([AaPp][Mm])?\s*(Z|UTC|GMT|CET|MEZ|CEST|MESZ|[+-]\d{2}:?\d{2})?"
+)
+_ZONES_H = {"Z": 0, "UTC": 0, "GMT": 0, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2}
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """How the numbers of a table are written: the sign before decimals, and the one between thousands."""
+
+    decimal: str = "."
+    thousands: str = ","
+
+    @classmethod
+    def of(cls, grid: Grid) -> Numbers:
+        """How the numbers in a grid are written; raises InputError where two cells contradict each other."""
+        seen = dict[str, tuple[int, int]]()
+        for k, row in enumerate(grid.rows):
+            for j, cell in enumerate(row):
+                if isinstance(cell, str) and _NUMBER.fullmatch(cell) and (decimal := _decimal_of(cell)):
+                    seen.setdefault(decimal, (k, j))
+        if len(seen) == 2:
+            (_, (k, j)), (other, _) = sorted(seen.items(), key=lambda item: item[1])[::-1]
+            raise grid.refuse(k, grid.header[j], grid.rows[k][j], f"other numbers of the table have decimals after "
+                              f"{other!r}: write all of them in one way")  # fmt: skip
+        decimal = next(iter(seen), "")
+        cells = [cell for row in grid.rows for cell in row if isinstance(cell, str) and _NUMBER.fullmatch(cell)]
+        if not decimal and grid.is_semicolon and any("," in cell for cell in cells):
+            decimal = ","
+        return cls(",", ".") if decimal == "," else cls()
+
+    def value(self, cell: Cell) -> float:
+        """The number in a cell; raises ValueError where there is none."""
+        if isinstance(cell, str):
+            text = cell.translate(_SPACES).replace("−", "-")
+            whole, _, rest = text.partition(self.decimal)
+            if self.thousands in rest or self.decimal in rest:
+                raise ValueError
+            if self.thousands in whole:
+                if not re.fullmatch(rf"[+-]?\d{{1,3}}(?:\{self.thousands}\d{{3}})+", whole):
+                    raise ValueError
+                whole = whole.replace(self.thousands, "")
+            if "_" in text:
+                raise ValueError
+            cell = float(f"{whole}.{rest}" if rest else whole)
+        if not isinstance(cell, float) or not math.isfinite(cell):
+            raise ValueError
+        return cell
+
+    @property
+    def example(self) -> str:
+        """A number as it would be read."""
+        return f"9{self.decimal}80665"
+
+
+def _decimal_of(cell: str) -> str:
+    """Return the decimal sign that a number shows, or nothing where it could be either or has none."""
+    points, commas = cell.count("."), cell.count(",")
+    if points and commas:
+        return "," if cell.rfind(",") > cell.rfind(".") else "."
+    sign = "," if commas else "."
+    if points + commas > 1:  # of a date there are groups of other lengths
+        groups = re.split(r"[.,]", cell.translate(_SPACES).lstrip("+-−"))
+        is_thousands = 1 <= len(groups[0]) <= 3 and all(len(group) == 3 for group in groups[1:])
+        return ("." if commas else ",") if is_thousands else ""
+    if not points + commas:
+        return ""
+    whole, _, rest = cell.translate(_SPACES).lstrip("+-−").partition(sign)
+    may_be_thousands = len(rest) == 3 and 1 <= len(whole) <= 3 and not whole.startswith("0")
+    return "" if may_be_thousands else sign
+
+
+def stamps_of(grid: Grid, name: str, cells: list[Cell]) -> list[datetime]:
+    """The stamps in a column: ISO 8601, or local with day or month first, whichever all of them allow."""
+    texts = [cell for cell in cells if isinstance(cell, str)]
+    parts = [found.groups() for text in texts if (found := _LOCAL.fullmatch(text))]
+    month_first = any(int(part[1]) > 12 for part in parts) or (
+        any(part[7] for part in parts) and not any(int(part[0]) > 12 for part in parts if len(part[0]) <= 2)
+    )
+    wanted = "write a stamp such as 2026-05-04T13:45:00+02:00 or 04.05.2026 13:45:00, or seconds"
+    out = list[datetime]()
+    for row, cell in enumerate(cells):
+        try:
+            out.append(cell if isinstance(cell, datetime) else _stamp(str(cell or ""), month_first))
+        except ValueError:
+            raise grid.refuse(row, name, cell, wanted) from None
+        if (out[row].tzinfo is None) != (out[0].tzinfo is None):
+            raise grid.refuse(row, name, cell, "other stamps have a time zone or have none: write all in one way")
+    return out
+
+
+def _stamp(text: str, month_first: bool) -> datetime:
+    """Return one stamp; raises ValueError."""
+    try:
+        return datetime.fromisoformat(text)
+    except ValueError:
+        found = _LOCAL.fullmatch(text.strip())
+    if not found:
+        raise ValueError
+    first, second, third, hour, minute, second_s, fraction, half, zone = found.groups()
+    year, month, day = (first, second, third) if len(first) == 4 else (third, second, first)
+    if month_first and len(first) != 4:
+        month, day = day, month
+    hours = int(hour or 0) % 12 + 12 * (half.lower() == "pm") if half else int(hour or 0)
+    offset = ""
+    if zone:
+        offset = f"+{_ZONES_H[zone]:02d}:00" if zone in _ZONES_H else f"{zone[:3]}:{zone[-2:]}"
+    years = int(year) + 2000 * (len(year) <= 2)
+    micro = f".{(fraction + '000000')[:6]}" if fraction else ""
+    clock = f"{hours:02d}:{minute or '00'}:{second_s or '00'}{micro}{offset}"
+    return datetime.fromisoformat(f"{years:04d}-{int(month):02d}-{int(day):02d}T{clock}")

@@ -1,0 +1,129 @@
+"""What names of columns mean: quantity, channel and unit, in English and German."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from typing import NamedTuple
+
+from kf_calib.support.units import WORDS
+
+ACCEL = {"m/s2": 1.0, **{unit: WORDS["m/s^2"][unit] for unit in ("g", "mg", "ug")}, "count": 1.0}
+"""Units of readings in m/s^2; counts as they are."""
+ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": WORDS["rad"]["deg"]}
+TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+TEMPERATURE = ("c", "k", "f")
+_UNITS = {
+    "m/s2": "m/s2 m/s^2 m/s² m/s/s mps2 ms-2 ms^-2 m/s**2 m·s⁻² m·s-2 ms⁻²",
+    "g": "g gn g0 g_n", "mg": "mg", "ug": "ug µg μg",
+    "count": "count counts lsb digit digits raw adc",
+    "rad": "rad radian radians", "mrad": "mrad", "deg": "deg degree degrees grad ° º",
+    "s": "s sec second seconds sekunden", "ms": "ms", "us": "us µs μs", "ns": "ns", "min": "min", "h": "h hours",
+    "c": "°c ºc c degc deg_c celsius ℃", "k": "k kelvin", "f": "°f f degf fahrenheit",
+}  # fmt: skip
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+_OF_WORD = {word: unit for unit, words in _UNITS.items() for word in words.split()}
+_SPREAD = _words(
+    "sd std stdev stddev sigma s rms dev deviation standardabweichung streuung stabw stdabw noise rauschen"
+)
+_READING = _words(
+    "a acc accel acceleration accelerometer accelerometers beschleunigung f force specific reading readings mean avg "
+    "average mittel mittelwert m sensor channel ch kanal messwert out output signal value wert raw"
+)
+_ANGLE = _words(
+    "outer middle inner aussen mitte mittlerer innen innere innerer aeussere ausserer angle winkel gimbal roll pitch "
+    "yaw azimuth elevation tilt achse axis q phi theta psi rotation rot table rahmen"
+)
+_TIME = _words("time zeit date datum stamp timestamp uhrzeit datetime elapsed zeitstempel")
+_LENGTH = _words("dwell duration dauer length lange")
+_TEMPERATURE = _words("temp temperature temperatur t")
+_COUNT = _words("count counts n samples num number anzahl messungen stichprobe readings werte")
+_FACE = _words("face side seite position pose orientation lage richtung direction flache")
+_FACES = re.compile(r"['’]?([+\-−–]?)\s*([xyz123])\s*([+\-−–]?|up|down|oben|unten)", re.IGNORECASE)
+
+
+class Meaning(NamedTuple):
+    """ours: ax ay az (readings), sx sy sz or sd (standard deviations), angle, qx qy qz qw, face, time, count,
+    temperature; empty if the name means nothing. unit: as the name states it; empty if it does not."""
+
+    ours: str
+    unit: str
+    rank: int = 0
+    """Place of a gimbal whose name tells it: 1 outer, 2 middle, 3 inner; 0 for others."""
+
+
+def is_unit(text: str) -> bool:
+    """Whether a cell is nothing but a unit, or a dash."""
+    return text.strip("[]() ").lower() in _OF_WORD or text.strip() in ("-", "1")
+
+
+def meaning_of(name: str) -> Meaning:
+    """What the name of a column says."""
+    own = name.strip().lower()
+    if own in ("qx", "qy", "qz", "qw", "-"):
+        return Meaning("" if own == "-" else own, "")
+    text, unit = _unit_of(own)
+    tokens = _tokens(text)
+    channel = next((each for each in tokens if each in "xyz123"), "")
+    channel = channel.translate(str.maketrans("123", "xyz"))
+    words = set(tokens) - set("xyz123")
+    if words & _LENGTH:
+        return Meaning("", unit)
+    if (words & _TIME and (not unit or unit in TIME)) or (unit in TIME and not channel):
+        return Meaning("time", unit)
+    if words & (_TEMPERATURE - {"t"}) or ("t" in words and unit in TEMPERATURE) or unit == "c":
+        return Meaning("temperature", unit if unit in TEMPERATURE else "")
+    if unit in ANGLE or (words & _ANGLE and unit not in ACCEL):
+        ranks = ("outer aussen aeussere ausserer", "middle mitte mittlerer", "inner innen innere innerer")
+        rank = next((k + 1 for k, known in enumerate(ranks) if words & set(known.split())), 0)
+        return Meaning("angle", unit if unit in ANGLE else "", rank)
+    if words & _SPREAD or {"standard", "deviation"} <= words:
+        return Meaning(f"s{channel}" if channel else "sd", unit if unit in ACCEL else "")
+    if channel and (words & _READING or not words):
+        return Meaning(f"a{channel}", unit if unit in ACCEL else "")
+    if words & _FACE:
+        return Meaning("face", "")
+    if words & _COUNT or own in _COUNT:
+        return Meaning("count", "")
+    return Meaning("", unit)
+
+
+def face_of(text: str) -> tuple[int, int] | None:
+    """Axis (0, 1, 2) and sign of a named face such as +x, -z, ``y up`` or ``z down``; None if it names none."""
+    found = _FACES.fullmatch(text.strip())
+    if not found:
+        return None
+    before, axis, after = found.groups()
+    if (before and after in tuple("+-−–")) or (axis.isdigit() and not (before or after)):
+        return None  # a number alone is one of a list
+    reversed_by = [mark in "-−–" if len(mark) == 1 else mark.lower() in ("down", "unten")
+                   for mark in (before, after) if mark]  # fmt: skip
+    return "xyz123".index(axis.lower()) % 3, -1 if sum(reversed_by) % 2 else 1
+
+
+def _unit_of(name: str) -> tuple[str, str]:
+    """Return a name without its unit, and the unit: in brackets, or after a slash, a comma, ``in`` or an underscore."""
+    found = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]", name)
+    if found and found[2] in _OF_WORD:
+        return found[1], _OF_WORD[found[2]]
+    for pattern in (r"(.+)\s+in\s+(\S+)", r"(.+?)\s*,\s*(\S+)", r"(.+)[_ ](\S+)", r"(.+?)\s*/\s*(\S+)"):
+        found = re.fullmatch(pattern, name)
+        if found and found[2] in _OF_WORD:
+            return found[1], _OF_WORD[found[2]]
+    return name, ""
+
+
+def _tokens(text: str) -> list[str]:
+    """Return the words of a name, without accents; a channel that ends a known word becomes a word of its own."""
+    plain = unicodedata.normalize("NFKD", text.replace("ß", "ss")).encode("ascii", "ignore").decode()
+    out = list[str]()
+    for word in re.findall(r"[a-z]+|\d+", plain):
+        stem, last = word[:-1], word[-1]
+        known = stem in _SPREAD | _READING | {"grav"}
+        out += [stem, last] if last in "xyz" and known else [word]
+    return out
