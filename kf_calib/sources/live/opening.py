@@ -94,6 +94,8 @@ def _bag(address: str) -> Path | None:
                 f"{path} holds no .mcap file to follow: bags in SQLite are read when they are finished, by replay."
             )
         return files[-1]
+    if path.suffix in (".db3", ".zstd"):
+        raise InputError(f"{path} can be read when it is finished, not while it is recorded: use replay.")
     return path if path.suffix == ".mcap" else None
 
 
