@@ -15,7 +15,6 @@ from kf_calib.cli.echo import complain
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.options import (
     OUTPUT,
-    columns_option,
     dwell_options,
     effects_from_option,
     examples,
@@ -51,7 +50,6 @@ _file = partial(click.argument, type=click.Path(path_type=Path))
 @output_option("-o", "--out", metavar="OUT.mcap", panel=OUTPUT,
                help="The copy, with /accelerometer/calibrated beside the raw topic.")  # fmt: skip
 @recording_options
-@columns_option
 @effects_from_option
 @trust_option
 @overwrite_option

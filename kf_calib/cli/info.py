@@ -12,13 +12,12 @@ from click.core import ParameterSource
 
 from kf_calib.cli.options import (
     BENCH_OPTIONS,
-    columns_option,
     examples,
     json_option,
+    messages_of,
     overrides,
     print_json,
     progress,
-    recording_of,
     recording_options,
     show,
 )
@@ -39,7 +38,6 @@ _NAMED = {
 @click.command(epilog=examples("info run.mcap", "info rosbag2_2026_05_04", "info log.csv --json"))
 @click.argument("recording", type=click.Path(path_type=Path), metavar="FILE")
 @recording_options
-@columns_option
 @json_option
 @click.pass_context
 def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json: bool, **options: Any) -> None:
@@ -84,7 +82,7 @@ def _lacking(inventory: Inventory, bench: Mapping[str, str]) -> dict[str, str]:
 
 def _opened(inventory: Inventory, columns: Mapping[str, str], options: Mapping[str, Any]) -> Source:
     if not inventory.is_lines:
-        return recording_of(inventory.path, options)
+        return messages_of(inventory.path, options, not options["no_angles"])
     from kf_calib.sources.files.lines import Lines
 
     return Lines(inventory.path, overrides(options), columns)
