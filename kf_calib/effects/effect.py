@@ -102,6 +102,9 @@ class Effect(ABC):
     ``columns`` gives the part that the stimulus asks for (``Stimulus.part``).
     averages: vibration goes with it, so readings are averaged over windows first, and their variance in these is known.
     step: of ln(value) in the differences of ``derivative``.
+    formulas: what an accelerometer reads more per unit of each coefficient that it has, where that depends on specific
+    force and temperature alone: of a, p, o (along its axes), before, after (readings of the two other accelerometers,
+    in their order), T and the constant. Empty where it cannot be written so.
     typical: usual sizes of its coefficients.
     """
 
@@ -116,6 +119,7 @@ class Effect(ABC):
     oscillates: ClassVar[bool] = False
     averages: ClassVar[bool] = False
     step: ClassVar[float] = 1e-4
+    formulas: ClassVar[tuple[str, ...]] = ()
     typical: ClassVar[Typical] = Typical()
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""

@@ -99,6 +99,7 @@ class CrossTalk(Effect):
     """X_ij A_j: a share of another accelerometer's reading; at rest a misalignment, and so always invisible."""
 
     name, title, source = "cross-talk", "a share of another channel's reading", "IEEE Std 1293"
+    formulas = ("before", "after")
     confused_with = "misalignment, always at rest"
     typical = Typical((1e-6, 100e-6))
 

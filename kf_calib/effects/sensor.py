@@ -17,6 +17,7 @@ class BiasAsymmetry(SensorEffect):
     """1/2 K0' sgn a_i."""
 
     name, title, source = "bias-asymmetry", "bias that changes sign with the input", IEEE
+    formulas = ("0.5*sign(a)",)
     confused_with = "odd-quadratic; invisible in six faces"
     symbol, unit, scale = "K0'", "m/s^2", 1e-3
     typical = Typical((1 * MICRO_G, 10 * MICRO_G))
@@ -29,6 +30,7 @@ class ScaleAsymmetry(SensorEffect):
     """1/2 K1' |a_i|."""
 
     name, title, source = "scale-asymmetry", "scale factor that differs with the sign of the input", IEEE
+    formulas = ("0.5*abs(a)",)
     confused_with = "second-order"
     symbol, unit, scale = "K1'", "1", 1e-3
     typical = Typical((1e-6, 30e-6), (0.1e-3, 1e-3))
@@ -41,6 +43,7 @@ class SecondOrder(SensorEffect):
     """K2 a_i^2."""
 
     name, title, source = "second-order", "second-order nonlinearity", IEEE
+    formulas = ("a**2",)
     confused_with = "scale-asymmetry"
     symbol, unit, scale = "K2_", "s^2/m", 1e-4
     typical = Typical((1 * MICRO_PER_G, 20 * MICRO_PER_G), (0.1 * MILLI_PER_G, 3 * MILLI_PER_G))
@@ -53,6 +56,7 @@ class ThirdOrder(SensorEffect):
     """K3 a_i^3."""
 
     name, title, source = "third-order", "third-order nonlinearity", IEEE
+    formulas = ("a**3",)
     confused_with = "odd-quadratic; invisible in six faces"
     symbol, unit, scale = "K3_", "s^4/m^2", 1e-5
     typical = Typical(
@@ -71,6 +75,7 @@ class OddQuadratic(SensorEffect):
     """Koq a_i |a_i|."""
 
     name, title, source = "odd-quadratic", "odd quadratic nonlinearity", IEEE
+    formulas = ("a*abs(a)",)
     confused_with = "third-order; invisible in six faces"
     symbol, unit, scale = "Koq", "s^2/m", 1e-4
     typical = Typical((1 * MICRO_PER_G, 10 * MICRO_PER_G), (0.0, MILLI_PER_G))
@@ -89,6 +94,7 @@ class CrossCouplingIP(_CrossCoupling):
     """Kip a_i a_p."""
 
     name, title, symbol = "cross-coupling-ip", "input-pendulous cross-coupling", "Kip"
+    formulas = ("a*p",)
 
     def terms(self, s: Stimulus) -> Floats:
         return s.along * s.pendulous
@@ -98,6 +104,7 @@ class CrossCouplingIO(_CrossCoupling):
     """Kio a_i a_o."""
 
     name, title, symbol = "cross-coupling-io", "input-output cross-coupling", "Kio"
+    formulas = ("a*o",)
 
     def terms(self, s: Stimulus) -> Floats:
         return s.along * s.output
@@ -107,6 +114,7 @@ class CrossCouplingPO(_CrossCoupling):
     """Kpo a_p a_o."""
 
     name, title, symbol = "cross-coupling-po", "pendulous-output cross-coupling", "Kpo"
+    formulas = ("p*o",)
 
     def terms(self, s: Stimulus) -> Floats:
         return s.pendulous * s.output
@@ -116,6 +124,7 @@ class CrossAxisSquare(_CrossCoupling):
     """Kpp a_p^2; Koo a_o^2 is then redundant, because the squares sum to g^2."""
 
     name, title, symbol = "cross-axis-square", "square of the pendulous acceleration", "Kpp"
+    formulas = ("p**2",)
     confused_with = "second-order, bias"
     typical = Typical((1 * MICRO_PER_G, 20 * MICRO_PER_G), (0.0, MILLI_PER_G))
 
@@ -140,6 +149,7 @@ class DeadZone(SensorEffect):
     """-a_i where |a_i| < d: a share of 1 is a reading that stays where it is over the whole zone."""
 
     name, title, source = "dead-zone", "no response to small inputs", IEEE
+    formulas = ("-a*(abs(a) < constant)",)
     confused_with = "needs poses that sweep through zero"
     symbol, unit, scale, shown = "Dz", "1", 1.0, ("of the input", 1.0)
     unknown = Unknown("dZone", "m/s^2", 1e-6, 1e-2)

@@ -15,6 +15,7 @@ class ThermalBias(SensorEffect):
     """alpha T."""
 
     name, title, source = "thermal-bias", "bias that follows the temperature", IEEE
+    formulas = ("T",)
     confused_with = "needs a temperature swing"
     symbol, unit, scale = "alpha", "m/s^2/K", 1e-3
     typical = Typical((5 * MICRO_G, 30 * MICRO_G), (0.15 * MILLI_G, 1 * MILLI_G))
@@ -27,6 +28,7 @@ class ThermalBias2(SensorEffect):
     """alpha_2 T^2."""
 
     name, title, source = "thermal-bias-2", "bias that follows the square of the temperature", IEEE
+    formulas = ("T**2",)
     symbol, unit, scale = "alpha2_", "m/s^2/K^2", 1e-4
 
     def terms(self, s: Stimulus) -> Floats:
@@ -37,6 +39,7 @@ class ThermalScale(SensorEffect):
     """alpha_s T a_i."""
 
     name, title, source = "thermal-scale", "scale factor that follows the temperature", IEEE
+    formulas = ("T*a",)
     confused_with = "needs both signs of the input at two temperatures"
     symbol, unit, scale = "alphaS", "1/K", 1e-4
     typical = Typical((50e-6, 150e-6))
@@ -61,6 +64,7 @@ class ThermalMisalignment(Effect):
     """gamma_p T a_p + gamma_o T a_o."""
 
     name, title, source = "thermal-misalignment", "alignment that follows the temperature", IEEE
+    formulas = ("T*p", "T*o")
     typical = Typical((0.1e-6, 10e-6))
 
     @property

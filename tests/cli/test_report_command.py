@@ -53,6 +53,7 @@ def test_strict_tells_by_the_exit_code(run) -> None:
     assert Path("report.html").exists()
 
 
+@pytest.mark.slow
 def test_two_models_side_by_side(run) -> None:
     assert run("replay", HIDDEN, "--with", "hysteresis", "--save-model", "after.toml")[0] == 0
     code, out, err = run("report", HIDDEN, "--against", "after.toml", "--json")

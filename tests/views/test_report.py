@@ -154,6 +154,7 @@ def test_what_a_recording_says_is_text(path: Path) -> None:
     assert "2025-06-15" in html
 
 
+@pytest.mark.slow
 def test_the_same_result_is_the_same_file_and_a_small_one(found: kf_calib.Diagnosis, path: Path) -> None:
     pages = [page_of(found, [Measured("a", "b")], []).html for _ in range(2)]
     assert pages[0] == pages[1]

@@ -15,7 +15,6 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-from kf_calib import effects
 from kf_calib.bench.arrays import Floats
 from kf_calib.effects import Effect
 from kf_calib.effects.expression import Expression
@@ -24,14 +23,6 @@ from kf_calib.errors import InputError
 from kf_calib.exchange.exports.c_expression import HELPERS, MATH, Piece, in_c, number
 from kf_calib.exchange.exports.target import Target
 
-_TERMS: dict[str, tuple[str, ...]] = {
-    "bias-asymmetry": ("0.5*sign(a)",), "scale-asymmetry": ("0.5*abs(a)",), "second-order": ("a**2",),
-    "third-order": ("a**3",), "odd-quadratic": ("a*abs(a)",), "cross-coupling-ip": ("a*p",),
-    "cross-coupling-io": ("a*o",), "cross-coupling-po": ("p*o",), "cross-axis-square": ("p**2",),
-    "dead-zone": ("-a*(abs(a) < constant)",), "thermal-bias": ("T",), "thermal-bias-2": ("T**2",),
-    "thermal-scale": ("T*a",), "thermal-misalignment": ("T*p", "T*o"), "cross-talk": ("before", "after"),
-}  # fmt: skip
-"""Effects of the catalogue as formulas, one for each coefficient of an accelerometer."""
 _OWN_NAMES = ("a", "p", "o", "T", "constant", "before", "after")
 _SIZES = (1e-8, 1e-5, 1e-3, 1.0, 2.0)
 """Of specific force, in g: so that the rounds are enough in a dead zone, too."""
@@ -121,10 +112,10 @@ class CHeader(Target):
         if isinstance(effect, Formula):
             known = quantities(self.correction.bench.axes)
             return [Expression(effect.title, {name: each.meaning for name, each in known.items()})]
-        if effects.of_the_users(effect) or str(effect) not in _TERMS:
+        if not effect.formulas:
             raise InputError(f"{effect} is a class in Python, which cannot be written in C: use kf-calib apply, or "
                              f"write the effect as a formula (--with 'my-{effect} = ...').")  # fmt: skip
-        return [Expression(text, dict.fromkeys(_OWN_NAMES, "")) for text in _TERMS[str(effect)]]
+        return [Expression(text, dict.fromkeys(_OWN_NAMES, "")) for text in effect.formulas]
 
     def _rounds(self) -> int:
         """How often the correction has to be repeated, wherever the specific force points."""
