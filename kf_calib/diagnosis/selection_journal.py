@@ -29,7 +29,6 @@ Figures keep all their digits, so that a replay can tell whether it gave the sam
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -44,7 +43,7 @@ from kf_calib.effects import refuse_unfit
 from kf_calib.effects.programs import Program
 from kf_calib.errors import InputError
 from kf_calib.estimation.results import Calibration
-from kf_calib.sources.files.bags import files_of
+from kf_calib.sources.files.bags import fingerprint
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.toml_files import table_of
 from kf_calib.support.value_schema import FINITE, TEXT, Misfit, converted
@@ -66,14 +65,7 @@ class Origin:
     @classmethod
     def of(cls, recording: Path) -> Origin:
         """The origin of an improvement of this recording; raises InputError where it cannot be read."""
-        try:
-            digest = hashlib.sha256()
-            for path in files_of(recording):
-                with path.open("rb") as file:
-                    hashlib.file_digest(file, lambda: digest)
-            return cls(recording.name, digest.hexdigest())
-        except OSError as error:
-            raise InputError(f"{recording}: cannot be read ({error.strerror}): name a recording.") from None
+        return cls(recording.name, fingerprint(recording))
 
 
 @dataclass(frozen=True)

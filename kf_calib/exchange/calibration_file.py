@@ -9,7 +9,6 @@ effects whose classes are in a user's Python file: reading runs none, ``model`` 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -49,7 +48,7 @@ from kf_calib.exchange.calibration_parts import (
     SavedState,
     Text,
 )
-from kf_calib.sources.files.bags import files_of
+from kf_calib.sources.files.bags import fingerprint
 from kf_calib.sources.files.recording import Recording
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.plain_text import cut
@@ -211,18 +210,6 @@ def save_calibration(
     if isinstance(source, str | os.PathLike):
         source = Recording(source, result.bench.to_metadata(), angles=False)
     write(Path(path), saved(result) if source is None else of_source(result, source))
-
-
-def fingerprint(path: Path) -> str:
-    """SHA-256 of a recording, all files of a bag one after the other; raises InputError if it cannot be read."""
-    digest = hashlib.sha256()
-    try:
-        for each in files_of(path):
-            with each.open("rb") as file:
-                hashlib.file_digest(file, lambda: digest)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}): name a recording.") from None
-    return digest.hexdigest()
 
 
 def _not_seen(result: Calibration) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from pathlib import Path
 
@@ -61,3 +62,15 @@ def _files_in_metadata(metadata: Path) -> list[str]:
         return []
     names = re.findall(r"^ *- *(.+?) *$", found[2], re.MULTILINE) if found else []
     return [Path(name.strip("'\"")).name for name in names]
+
+
+def fingerprint(path: Path) -> str:
+    """SHA-256 of a recording, all files of a bag one after the other; raises InputError if it cannot be read."""
+    digest = hashlib.sha256()
+    try:
+        for each in files_of(path):
+            with each.open("rb") as file:
+                hashlib.file_digest(file, lambda: digest)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}): name a recording.") from None
+    return digest.hexdigest()

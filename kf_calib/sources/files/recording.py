@@ -44,8 +44,8 @@ from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, Record
 from kf_calib.sources.files.packed_messages import are_packed, unpacked
 from kf_calib.sources.files.record_files import RecordFile, open_record_file
 from kf_calib.sources.tables.opening import is_table, open_table
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
-STANDARD_GRAVITY_MPS2 = 9.80665
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
 GAP_RECORD = "kf_calib.gap"
 """Metadata record at a place where the link to the bench was down: after_ns, seconds, reason."""
