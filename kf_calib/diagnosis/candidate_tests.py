@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.bayes_factor import as_fall
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.dwells.coherent_tone import band_hz
 from kf_calib.dwells.line_spectrum import Line, lowest_hz
@@ -31,37 +31,6 @@ SHARE = 0.4
 REST = 0.5 * (1.0 - 2.0 * SHARE)
 """Share that is given to the test of spectral lines, and as much to that of trends within dwells."""
 
-EQUAL = 6.63
-"""Two suspects whose chi-squared differs by less than this cannot be told apart (1 %, 1 degree of freedom)."""
-
-
-@functools.cache
-def rival_margin(dof: int, tried: int = 1) -> float:
-    """By how much noise may let a wrong effect lower chi-squared more than the missing one, in at most 1 of 100 runs.
-
-    Take one pair of principal directions of the two effects, at an angle a. Let x be the residual along the missing
-    effect and n the noise perpendicular to it in their plane. The wrong effect then lowers chi-squared by
-    (x cos a + n sin a)^2 and the missing one by x^2. The difference is largest at x = n / tan a, where it is n^2.
-    Summed over all pairs, the margin is a quantile of chi-squared with the degrees of freedom of the wrong effect.
-
-    dof: degrees of freedom of the wrong effect. tried: number of values of its constant of which it is the best.
-    """
-    from scipy.special import chdtri
-
-    return float(chdtri(dof, 0.01 / tried))
-
-
-def margin_of(candidate: Candidate | None) -> float:
-    """The margin of ``rival_margin`` for a candidate.
-
-    A constant that was searched counts as one more degree of freedom. None stands for a random walk or a spectral line,
-    which has one degree of freedom.
-    """
-    if candidate is None:
-        return rival_margin(1)
-    return rival_margin(candidate.dof + (candidate.effect.unknown is not None), candidate.tried)
-
-
 _DRAWS = 4000
 _FEWEST_WALKED = 8  # dwells that are needed before a random walk of the biases is tested
 
@@ -80,8 +49,7 @@ class CandidateTests:
     significant lines in the spectrum of the readings within dwells. oscillating: name of the effect that would explain
     them. vibration: lines that are not an oscillation of constant amplitude, and so count as noise. without_lines: the
     same tests with the lines treated as vibration. between: in words, the frequencies of an oscillation that are too
-    fast for the scan and too slow for a line. paths: what is added to the score of the random walk so that it ranks
-    ahead of the best other effect exactly where its likelihood is higher. trend: the test of trends within dwells
+    fast for the scan and too slow for a line. trend: the test of trends within dwells
     (None: it cannot be made, or there are lines).
     """
 
@@ -98,7 +66,6 @@ class CandidateTests:
     vibration: tuple[Line, ...] = ()
     without_lines: CandidateTests | None = None
     between: str = ""
-    paths: float = 0.0
     trend: Trend | None = None
 
     @property
@@ -132,39 +99,6 @@ class CandidateTests:
     def unseen(self) -> list[str]:
         """Effects of which the run shows nothing: those invisible in these orientations, and those of slews only."""
         return [*(name for name, k in self.best.items() if not self.scan.candidates[k].dof), *self.in_slews_only]
-
-    def nearness(self, name: str) -> float:
-        """The score of an effect for comparison with its rivals.
-
-        It leaves out what a search over many values of a constant adds to the threshold: that part guards against
-        chance, and says nothing against the effect in comparison with another.
-        """
-        if name not in self.best:
-            return self.scores[name]
-        own, tests = self.candidate(name), self.effective_tests
-        return self.scores[name] + chance_fall(own, tests) - chance_fall(replace(own, tried=1), tests)
-
-    def rivals(self, first: str) -> list[str]:
-        """Effects that the first one may lead by noise alone, the likeliest of them first."""
-        ahead, out = margin_of(self.candidate(first) if first in self.best else None), list[str]()
-        for name in self.ranked:
-            behind = self.scores[first] - self.nearness(name)
-            # an effect is no rival just because it has fewer coefficients: chi-squared itself has to come near
-            if first in self.best and name in self.best:
-                falls = (float(self.scan.statistics[self.best[each]]) for each in (first, name))
-                behind = max(behind, next(falls) - next(falls))
-            if behind < ahead and name != first:
-                out.append(name)
-        return out
-
-    def holding(self, name: str) -> list[str]:
-        """Effects whose columns span those of this one: no reading can speak for it and against any of them."""
-        if name not in self.best:
-            return []
-        own = self.candidate(name)
-        return [
-            other for other in self.ranked if other != name and other in self.best and own.within(self.candidate(other))
-        ]
 
     def candidate(self, name: str) -> Candidate:
         """The best candidate of an effect."""
@@ -209,17 +143,15 @@ def assess_candidates(
             if candidate.dof:
                 own = sidak(float(chdtrc(candidate.dof, statistics[k])), candidate.tried)
                 scores[name], p_values[name] = score, sidak(own, tests)
-    name, paths = _walking(fitted), 0.0
+    name = _walking(fitted)
     if name:
         # The likelihood uses the chi-squared of the dwells' means. Where the misfit is huge, that exceeds the
         # chi-squared of the scan by up to one per cent, which must not count for the walk.
         fall = max(2.0 * fitted.walk_gain - max(fitted.misfit - agreed.statistic, 0.0), 0.0)
         p_values[name] = sidak(0.5 * float(chdtrc(1, fall)), tests)
-        beyond = fall - threshold(1, tests)
-        paths = _beside_best(found, scores, tests) if beyond > 0.0 else 0.0
-        scores[name] = beyond + paths
+        scores[name] = fall - threshold(1, tests)
     slewing = slew_effects(model.bench)
-    test = CandidateTests(found, best, scores, p_values, agreed.p_value, name, tests, slewing, (), paths=paths)
+    test = CandidateTests(found, best, scores, p_values, agreed.p_value, name, tests, slewing, ())
     return _with_lines(test, fitted, frame)
 
 
@@ -348,52 +280,18 @@ def _walking(fitted: Fit) -> str:
     return walk_named(model.bench)
 
 
-def _beside_best(found: Scan, scores: Mapping[str, float], tests: float) -> float:
-    """Return what to add to the score of a random walk before it is compared with the best other effect.
-
-    With it, the walk ranks ahead exactly where its likelihood, which is averaged over all paths, is higher than that of
-    the other effect, averaged over its directions and the values of its constant.
-    """
-    best = max(scores, key=lambda name: scores[name], default="")
-    if not best or scores[best] <= 0.0:
-        return 0.0
-    own = values_of(found, best)
-    return walk_path_margin(found, own, found.statistics[own], scores[best], tests)
-
-
-def walk_path_margin(found: Scan, own: Sequence[int], falls: Floats, score: float, tests: float) -> float:
-    """What is added to the score of a random walk so that it compares fairly with another effect.
-
-    own: numbers of the candidates of the other effect. falls: fall of chi-squared of each of them. score: the score of
-    the best of them. Where the walk is tested beside a further effect, falls and score are counted beside it, too.
-    tests: effective number of independent tests.
-    """
-    return score + threshold(1, tests) - evidence_as_fall(found, own, falls)
-
-
 def values_of(found: Scan, name: str) -> list[int]:
     """Numbers of the candidates of one effect: one for each value of its constant at which it is visible."""
     return [k for k, each in enumerate(found.candidates) if str(each.effect) == name and each.dof]
 
 
-def evidence_as_fall(found: Scan, own: Sequence[int], falls: Floats) -> float:
-    """The Bayes factor of one effect, as a fall of chi-squared (``as_fall``) that can be compared with a likelihood.
-
-    own: numbers of its candidates, one for each value of its constant. falls: fall of chi-squared of each of them.
-    """
-    each = [found.candidates[k] for k in own]
-    tried = max(_values(found, each[0]), *(one.tried for one in each))
-    return as_fall(np.array([one.dof for one in each]), falls, tried)
-
-
-def joint_evidence_as_fall(found: Scan, own: Sequence[int]) -> float:
-    """The Bayes factor of several effects together, as a fall of chi-squared, each at one value of its constant."""
-    each = [found.candidates[k] for k in own]
-    fall, dof = found.explained(np.concatenate([one.basis for one in each], axis=1))
-    tried = int(np.prod([max(_values(found, one), one.tried) for one in each]))
-    return as_fall(np.array([dof]), np.array([fall]), tried)
-
-
-def _values(found: Scan, candidate: Candidate) -> int:
-    """Return the number of values of its constant at which the effect of a candidate was scanned."""
-    return sum(str(other.effect) == str(candidate.effect) for other in found.candidates)
+def overlap_matrix(test: CandidateTests, names: Sequence[str]) -> Floats:
+    """The overlaps (n, n) of effects with each other: 1 with a random walk, which can take any path, and NaN with an
+    effect that has no columns in the scan and is no walk."""
+    out = np.ones((len(names), len(names)))
+    for (j, one), (k, other) in itertools.product(enumerate(names), repeat=2):
+        if one in test.best and other in test.best:
+            out[j, k] = test.candidate(one).overlap(test.candidate(other))
+        elif not {one, other} <= {*test.best, test.walking}:
+            out[j, k] = np.nan
+    return out

@@ -12,7 +12,8 @@ from kf_calib.design import next_orientation as advise
 from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.detectability import Detectable, Unseen, detectable, sensor_grade, unseen
-from kf_calib.diagnosis.unknown_effect import Description, describe
+from kf_calib.diagnosis.hypotheses import SURE, Hypothesis, Table
+from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe, explained_share
 from kf_calib.effects.effect import Grade
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration, Parameter
@@ -46,30 +47,33 @@ class Suspect:
 class Diagnosis:
     """What a diagnosis found.
 
-    before: the calibration that was diagnosed. test: the tests of all candidates. suspects: the significant ones, the
-    likeliest first. missing: names of the effects that make the model fit (empty: nothing is missing, or no known
-    effect fits). unknown: whether something is missing that no known effect explains. ambiguity: all effects that
-    explain as much, those named as missing included. overlaps: overlap of each look-alike with the effect that it could
-    replace. after: the calibration with the missing effects. verdict: the result in a sentence.
+    before: the calibration that was diagnosed. test: the tests of all candidates. table: all explanations with their
+    probabilities (None: nothing could be tested, or one dwell is wrong). verdict: the result in a sentence.
 
-    together: pairs of effects that explain as much. alone: a single effect that could replace two. as_scatter: scatter
-    from dwell to dwell larger than stated would explain the misfit as well, or, where no effect is named, better than
-    those that would fit. back_s: time constant with which the biases may return, s, in place of the random walk that is
-    named (None: they do not). judged: the run with the noise by which the effects were compared, where that noise was
-    estimated (None: it is that of ``before``).
+    missing: names of the effects of the likeliest explanation (empty: nothing is missing, or no known effect). unknown:
+    whether the likeliest is none of the known effects. noise: whether it is noise that was not stated. ambiguity: the
+    effects of the explanations that have 99 % of the probability together, those missing first. overlaps: overlap of
+    each other effect with the one that it could replace. together: pairs among these explanations. as_scatter: noise
+    that was not stated has more than 1 %. after: the calibration with the missing effects. suspects: single effects that
+    were refitted, the likeliest first.
+
+    back_s: time constant with which the biases may return, s, in place of the random walk that is named (None: they do
+    not). judged: the run with the noise that the likeliest explanation leaves, where noise was estimated (None: it is
+    that of ``before``).
     """
 
     before: Calibration
     test: CandidateTests
     verdict: str = ""
+    table: Table | None = None
     suspects: tuple[Suspect, ...] = ()
     missing: tuple[str, ...] = ()
     unknown: bool = False
+    noise: bool = False
     ambiguity: tuple[str, ...] = ()
     overlaps: dict[str, float] = field(default_factory=dict[str, float])
     after: Calibration | None = None
     together: tuple[tuple[str, str], ...] = ()
-    alone: str = ""
     as_scatter: bool = False
     back_s: float | None = None
     judged: Calibration | None = None
@@ -95,7 +99,18 @@ class Diagnosis:
         """What an unknown misfit looks like; None where the misfit is known (one dwell, too), or there is none."""
         if not self.unknown or self.before.outlying:
             return None
-        return describe(self.before.fit, self.before.residuals_mps2, self.test.trend)
+        first, residuals = self.likeliest, self.before.residuals_mps2
+        if first is None or not first.formulas or first.refit is None:
+            return describe(self.before.fit, residuals, self.test.trend)
+        share = explained_share(self.before.fit, first.refit.fit)
+        return Description(channel_of(residuals), first.driver, share, first.formulas)
+
+    @property
+    def likeliest(self) -> Hypothesis | None:
+        """The likeliest explanation of a misfit; None where there is none to explain."""
+        if self.table is None or self.test.consistent is not False:
+            return None
+        return self.table.first
 
     @cached_property
     def detectable(self) -> list[Detectable]:
@@ -106,6 +121,11 @@ class Diagnosis:
     def unseen(self) -> list[Unseen]:
         """The effects of which the run shows nothing, and why."""
         return unseen(self.before.fit, self.test)
+
+    @property
+    def sure(self) -> bool:
+        """Whether the effects that are named are missing with 95 % probability, alone or with others."""
+        return bool(self.missing) and self.table is not None and self.table.probability(self.missing) >= SURE
 
     @property
     def grade(self) -> Grade:

@@ -21,6 +21,7 @@ import numpy as np
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.streams import Source
+from kf_calib.diagnosis.hypotheses import SURE
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.diagnosis.results import Diagnosis
@@ -244,7 +245,7 @@ def improve(
     """
     start, refits = calibration_of(run, refits)
     state = begin(start, refits)
-    while (name := next_effect(state.found, refits, accept_first)) is not None:
+    while (name := next_effect(state.found, accept_first)) is not None:
         state = take_step(state, refits, name, None, "diagnosis")
         if on_step is not None:
             on_step(state)
@@ -284,31 +285,20 @@ def _with_instead(result: Calibration, refits: Refits, place: int, name: str) ->
     return refits.of(result, effects)
 
 
-def next_effect(found: Diagnosis, refits: Refits, accept_first: bool = False) -> str | None:
-    """The effect to add next; None where nothing is missing, or where the choice is left to a person."""
-    if found.test.consistent is not False or not found.missing:
+def next_effect(found: Diagnosis, accept_first: bool = False) -> str | None:
+    """The effect to add next: the likeliest where it is missing with 95 % probability, whether alone or with others.
+
+    None where nothing is missing, or where the choice is left to a person. accept_first: take the likeliest in any case.
+    """
+    if found.test.consistent is not False or not found.missing or found.table is None:
         return None
-    if accept_first:
-        return found.missing[0]
-    if _rivals(found) or (found.as_scatter and found.test.walking not in found.missing):
-        return None  # a random walk is excepted: the noise is as large whether it is a walk or scatter
-    return found.missing[0] if len(found.missing) == 1 else _only_choice(found, refits)
-
-
-def _only_choice(found: Diagnosis, refits: Refits) -> str | None:
-    """Return the first of several effects needed together that has no look-alike beside the others, or None."""
-    before = found.before
-    for name in found.missing:
-        rest = [other for other in found.missing if other != name]
-        beside = diagnose(refits.with_effects(before, rest), refits)
-        if beside.missing == (name,) and not _rivals(beside):
-            return name
-    return None
+    first = max(found.missing, key=lambda name: found.table.probability((name,)) if found.table else 0.0)
+    return first if accept_first or found.table.probability((first,)) >= SURE else None
 
 
 def _rivals(found: Diagnosis) -> list[str]:
-    """Return the effects that explain as much as those that are named as missing."""
-    return [name for name in found.ambiguity if found.missing and name not in found.missing]
+    """Return the effects that could be missing in place of those that are named, where these are not sure."""
+    return [] if found.sure else [name for name in found.ambiguity if name not in found.missing]
 
 
 def extend(state: Improvement, refits: Refits, names: Sequence[str], by: By) -> Improvement:

@@ -10,7 +10,6 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.diagnosis.candidate_tests import EQUAL
 from kf_calib.diagnosis.within_dwell_trend import Trend
 from kf_calib.diagnosis.within_dwell_trend import trend as trend_of
 from kf_calib.dwells.sufficient_statistics import DwellFactor
@@ -24,6 +23,7 @@ from kf_calib.estimation.score_test import Frame
 from kf_calib.support import stage
 
 _CHANCE = 1e-4  # significance level of one family, of which there are about a hundred
+_EQUAL = 6.63  # chi-squared that one constant more has to gain (1 %)
 _WITHIN = 0.01  # significance level of trends within dwells
 _SAME = 0.99  # cosine of the angle between a formula and a known effect above which they count as the same
 _DECAYS_S = (10, 30, 100, 300)
@@ -114,16 +114,16 @@ def describe(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Desc
     within = name and _goes_on(trend) and (best.score <= 0.0 or _goes_on(_trend_beside(fitted, best)))
     if name and (within or irregular - float(chdtri(1, _CHANCE)) > max(best.score, 0.0)):
         share = irregular / max(excess, irregular, 1.0)
-        back_s = _back_s(fitted, name) if 2.0 * (walk - scatter) > EQUAL else None
+        back_s = _back_s(fitted, name) if 2.0 * (walk - scatter) > _EQUAL else None
         driver = f"time (irregular, back within about {one_digit_seconds(back_s)})" if back_s else IRREGULAR
-        return Description(_channel(residuals), WITHIN if within and not back_s else driver, share, (name,))
+        return Description(channel_of(residuals), WITHIN if within and not back_s else driver, share, (name,))
     if best.score <= 0.0:
         return None
     order = np.argsort(best.falls)[::-1]
     enough = 1 if best.falls[order[0]] > 0.7 * best.fall else len(order)
     formulas = tuple(_named(best.texts[k], number) for number, k in enumerate(order[:enough]))
     share = min((best.fall - best.dof) / excess, 1.0) if excess > 0.0 else 1.0
-    return Description(_channel(residuals), best.driver, share, formulas)
+    return Description(channel_of(residuals), best.driver, share, formulas)
 
 
 def one_digit_seconds(duration_s: float) -> str:
@@ -138,7 +138,7 @@ def _back_s(fitted: Fit, walk: str) -> float | None:
     if not walked.noise.walk_mps2_per_sqrt_s:
         return None
     gain, back_s = walked.back_gain
-    return back_s if 2.0 * gain > EQUAL else None
+    return back_s if 2.0 * gain > _EQUAL else None
 
 
 def _goes_on(trend: Trend | None) -> bool:
@@ -185,8 +185,15 @@ def _named(text: str, number: int = 0) -> str:
     return f"{name}{text}" if text.startswith(":") else f"{name} = {text}"
 
 
-def _channel(residuals: Floats) -> str:
-    """Return the axis of the accelerometer with most of the squared residuals (D, 3); "all" where none stands out."""
+def explained_share(fitted: Fit, refit: Fit) -> float:
+    """Share of the chi-squared beyond noise that a refit with further effects explains."""
+    before, left = consistency(fitted), consistency(refit)
+    excess = before.statistic - before.dof
+    return min(max(before.statistic - left.statistic - (before.dof - left.dof), 0.0) / excess, 1.0) if excess > 0 else 1.0
+
+
+def channel_of(residuals: Floats) -> str:
+    """The axis of the accelerometer with most of the squared residuals (D, 3); "all" where none stands out."""
     squares = np.sum(residuals**2, axis=0)
     return "xyz"[int(np.argmax(squares))] if squares.max() > 0.7 * squares.sum() else "all"
 

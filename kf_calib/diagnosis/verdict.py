@@ -5,11 +5,23 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.scatter_hypothesis import dwell_noise_is_stated
+from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated
+from kf_calib.diagnosis.hypotheses import NOISE, NONE, NOTHING, SURE, Hypothesis
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
 from kf_calib.estimation.results import format_p
 from kf_calib.support.units import shown
+
+
+_TOLD = 4  # most other explanations that are told
+_FAMILIES = {
+    "bias in time": "The bias changes with time", "scale in time": "The scale factor changes with time",
+    "temperature": "It goes with temperature", "nonlinearity": "The accelerometer is not linear",
+    "cross-axis": "Acceleration across the input axis enters", "memory": "It depends on the orientation before",
+    "gimbal and encoder": "The gimbals or their encoders err", "base and platform": "The base or platform moves or yields",
+    "surroundings": "Something around the bench enters", "slews": "It shows while the platform turns",
+}  # fmt: skip
+"""What each family of effects means, in words."""
 
 
 def verdict_in_words(found: Diagnosis) -> str:
@@ -27,19 +39,12 @@ def verdict_in_words(found: Diagnosis) -> str:
             )
         agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
         return f"{agreed}: no effect is missing that this run could show.{blind}"
-    start = f"Residuals fail (p {format_p(test.p_value)})."
-    if found.missing and found.after is not None:
-        return f"{start} {_explanation(found)}.{_held_out(found)}"
-    if found.unknown:
-        return f"{start} {_why_unknown(found)}"
-    noise, nearest = found.before.noise, _nearest(found)
-    stated = ("angle_sigma_deg", noise.setting_stated), ("scatter_sigma_mps2", noise.scatter_stated)
-    keys = " and ".join(key for key, known in stated if not known)
-    effect = f"an effect is missing ({nearest} would fit)" if nearest else "an unknown effect is missing"
-    return (
-        f"{start} Either the dwells scatter by an amount that was not stated, or {effect}. "
-        f"To find out, state {keys} or repeat an orientation."
-    )
+    start, first = f"Residuals fail (p {format_p(test.p_value)}).", found.likeliest
+    if first is None:
+        return start
+    if first.effects:
+        return f"{start} {_named(found, first)}{_returning(found)}.{_held_out(found)}"
+    return f"{start} {_noise(found, first) if found.noise else _unknown(found, first)}"
 
 
 def second_pass_in_words(found: Diagnosis) -> str:
@@ -55,50 +60,70 @@ def second_pass_in_words(found: Diagnosis) -> str:
     )
 
 
-def _explanation(found: Diagnosis) -> str:
-    """Return the missing effects, and the explanations from which they cannot be distinguished."""
-    rivals, (first, *more) = _rivals(found), found.missing
-    if more:
-        named = f"{' and '.join(found.missing)} together explain it; no single known effect does as well"
-    else:
-        sure = len(found.ambiguity) <= 1 and not found.as_scatter and not found.back_s
-        named = f"{'Missing' if sure else 'Likeliest'}: {first}{_size(found)}"
-    return f"{named}. Cannot yet be distinguished from {', '.join(rivals)}" if rivals else named
+def _named(found: Diagnosis, first: Hypothesis) -> str:
+    """Return the likeliest effects in words, with the other explanations and their probabilities."""
+    assert found.table is not None
+    share, others = found.table.probability(first.effects), _others(found)
+    named = f"{_effects_of(first)}{_size(found)} ({_percent(share)})"
+    if share >= SURE:
+        return f"Missing: {named}{others}"
+    family, of_family = next(each for each in found.table.families.items() if each[0] not in (NOTHING, NOISE, NONE))
+    if of_family >= SURE and first.families == (family,):
+        return f"{_FAMILIES[family]} ({_percent(of_family)}): {named}{others}"
+    return f"Likeliest: {named}{others}"
 
 
-def _rivals(found: Diagnosis) -> list[str]:
-    """Return in words the explanations from which the missing effects cannot be distinguished."""
-    instead = "" if len(found.missing) == 1 else "in place of one of them, "
-    out = [
-        f"{name} alone" if name == found.alone else f"{name} ({instead}overlap {overlap:.2f})"
-        for name, overlap in found.overlaps.items()
-    ]
-    out += [f"{' and '.join(pair)} together" for pair in found.together]
-    if found.as_scatter:
-        out.append(_scattering(found))
-    if found.back_s:
-        out.append(f"biases that return to their mean within about {one_digit_seconds(found.back_s)}")
-    return out
+def _unknown(found: Diagnosis, first: Hypothesis) -> str:
+    """Return a sentence on a misfit that no known effect explains."""
+    what = "it changes irregularly" if not first.formulas else f"it goes with {first.driver}"
+    return f"Unknown: no known effect explains it, {what} ({_percent(first.probability)}){_others(found)}."
 
 
-def _why_unknown(found: Diagnosis) -> str:
-    """Return a sentence on why the cause is unknown."""
-    nearest = _nearest(found)
-    if nearest and found.as_scatter:
-        return f"{nearest} would fit, but {_scattering(found)} is likelier: unknown. Repeat an orientation to find out."
-    if nearest:
-        return f"{nearest} would fit, but a formula that is no known effect explains it better: unknown."
-    return "No known effect explains it, alone or in pairs: unknown."
+def _noise(found: Diagnosis, first: Hypothesis) -> str:
+    """Return a sentence on noise from dwell to dwell that was not stated, and on how to be sure of it."""
+    noise = found.before.noise
+    stated = ("angle_sigma_deg", noise.setting_stated), ("scatter_sigma_mps2", noise.scatter_stated)
+    keys = " and ".join(key for key, known in stated if not known)
+    what = "more than was stated" if dwell_noise_is_stated(found.before) else "by an amount that was not stated"
+    advice = f"state {keys} or repeat an orientation" if keys else "repeat an orientation"
+    share = _percent(first.probability)
+    return f"The dwells scatter {what} ({share}){_others(found)}. To find out, {advice}."
 
 
-def _nearest(found: Diagnosis) -> str | None:
-    """Return the likeliest suspect that fits."""
-    return next((each.name for each in found.suspects if each.fits), None)
+def _others(found: Diagnosis) -> str:
+    """Return the other explanations in words."""
+    assert found.table is not None
+    rows = found.table.rivals
+    told = [f"{_in_words(found, row)} {_percent(row.probability)}" for row in rows[:_TOLD]]
+    told += [f"{len(rows) - _TOLD} others"] if len(rows) > _TOLD else []
+    return f"; or {', '.join(told)}" if told else ""
 
 
-def _scattering(found: Diagnosis) -> str:
-    """Return the words for scatter from dwell to dwell as an explanation."""
-    return f"scatter from dwell to dwell larger than {'stated' if dwell_noise_is_stated(found.before) else 'estimated'}"
+def _in_words(found: Diagnosis, row: Hypothesis) -> str:
+    """Return an explanation in words."""
+    if row.effects:
+        return _effects_of(row)
+    if row.driver:
+        return "no known effect, irregular" if not row.formulas else f"no known effect, goes with {row.driver}"
+    return f"scatter from dwell to dwell{' larger than stated' if dwell_noise_is_stated(found.before) else ''}"
+
+
+def _effects_of(row: Hypothesis) -> str:
+    """Return the effects of a row in words."""
+    return row.effects[0] if len(row.effects) == 1 else f"{' and '.join(row.effects)} together"
+
+
+def _percent(probability: float) -> str:
+    """Return a probability in per cent, never rounded to certainty."""
+    percent = 100.0 * probability
+    return "over 99.9 %" if percent > 99.9 else f"{percent:.1f} %" if percent > 99.0 or percent < 1.0 else f"{percent:.0f} %"
+
+
+def _returning(found: Diagnosis) -> str:
+    """Return the words for biases that return, as an alternative to a walk."""
+    if not found.back_s:
+        return ""
+    return f"; biases that return to their mean within about {one_digit_seconds(found.back_s)} fit better"
 
 
 def _size(found: Diagnosis) -> str:

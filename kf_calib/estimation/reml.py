@@ -181,13 +181,23 @@ def degrees_of_freedom(means: Means) -> int:
     return means.readings.size - _reduce(means)[0].design.shape[2]
 
 
+def likelihood_of(
+    noise: Noise, parts: Collection[Part], means: Means, state: Floats, prior: Floats
+) -> Likelihood:
+    """The likelihood of the dwells' means in a noise to which these parts may be added.
+
+    ``means`` and ``prior`` are those that ``with_slow_scatter`` returns; further rows may be added to ``prior``.
+    """
+    means, prior = _reduce(means, prior)
+    return _likelihood(noise, parts, means, state, prior)
+
+
 def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats) -> float:
     """Gain in log-likelihood if a part of the noise is raised to its most likely size.
 
     ``means`` and ``prior`` are those that ``with_slow_scatter`` returns.
     """
-    means, prior = _reduce(means, prior)
-    likelihood = _likelihood(noise, {part}, means, state, prior)
+    likelihood = likelihood_of(noise, (part,), means, state, prior)
     _, point = likelihood.of((part,)).most_likely()
     return max(likelihood.without().cost - point.cost, 0.0)
 

@@ -116,6 +116,26 @@ class Scan:
         spanned = left[:, singular > 1e-6]
         return float(np.sum((spanned.T @ self.residual) ** 2)), spanned.shape[1]
 
+    def beside(self, k: int) -> Floats:
+        """Decrease of chi-squared (n,) if each candidate is added beside candidate ``k``; zero for ``k`` itself."""
+        own, out = self.candidates[k].basis, np.zeros(len(self.candidates))
+        rest = self.residual - own @ (own.T @ self.residual)
+        for places, bases in self._stacked:
+            left = bases - own @ (own.T @ bases)
+            along, gram = rest @ left, np.swapaxes(left, 1, 2) @ left
+            values, vectors = np.linalg.eigh(gram)  # squared cosines, of which those near zero are seen no more
+            turned = np.einsum("ni,nij->nj", along, vectors)
+            out[places] = np.sum(np.where(values > _SEEN, turned**2 / np.maximum(values, _SEEN), 0.0), axis=1)
+        return out
+
+    @cached_property
+    def _stacked(self) -> list[tuple[list[int], Floats]]:
+        """Numbers of the candidates of equal degrees of freedom, and their bases (n, d, k)."""
+        found = dict[int, list[int]]()
+        for k, each in enumerate(self.candidates):
+            found.setdefault(each.dof, []).append(k)
+        return [(own, np.array([self.candidates[k].basis for k in own])) for dof, own in found.items() if dof]
+
     def coefficients(self, candidate: Candidate) -> Floats:
         """Estimated coefficients (q,) of a candidate if only this effect is added."""
         return candidate.inverse @ (candidate.basis.T @ self.residual)

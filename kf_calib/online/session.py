@@ -232,11 +232,11 @@ class Session:
             listener(judgement)
 
     def _automatic(self, judgement: Judgement) -> None:
-        """With ``auto``, accept the missing effects once several judgements in a row have told them from all others."""
+        """With ``auto``, accept the missing effects once several judgements in a row were sure of them."""
         if not (self.auto and judgement.alarm and judgement.look.settled):
             return
         found = judgement.found
-        if found.after is None or len(found.ambiguity) != len(found.missing):
+        if not found.sure:
             return
         try:
             self.accept(*found.missing)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from rich.text import Text
 from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import LEVEL
 from kf_calib.diagnosis.detectability import Detectable
+from kf_calib.diagnosis.hypotheses import Table as Hypotheses
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
 from kf_calib.diagnosis.within_dwell_trend import Trend
@@ -32,7 +35,8 @@ def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
 
 def found_object(found: Diagnosis) -> dict[str, Any]:
     """The same without the next orientation."""
-    missing = "unknown" if found.unknown else found.missing[0] if found.missing else None
+    named = found.missing[0] if found.missing else "noise" if found.noise else None
+    missing = "unknown" if found.unknown else named
     return clean(
         {
             "consistent": found.test.consistent,
@@ -41,6 +45,10 @@ def found_object(found: Diagnosis) -> dict[str, Any]:
             "model": [str(effect) for effect in found.before.model.effects],
             "missing": missing,
             "all_missing": list(found.missing),
+            "hypotheses": _hypotheses_object(found.table),
+            "families": [{"family": name, "probability": p} for name, p in found.table.families.items()]
+            if found.table
+            else [],
             "suspects": [_suspect_object(each) for each in found.suspects],
             "ambiguity_set": list(found.ambiguity),
             "overlaps": found.overlaps,
@@ -60,6 +68,26 @@ def found_object(found: Diagnosis) -> dict[str, Any]:
             "warnings": list(found.before.warnings),
         }
     )
+
+
+def _hypotheses_object(table: Hypotheses | None) -> list[dict[str, Any]]:
+    """Return the rows of the table of hypotheses as JSON objects, the likeliest first."""
+    rows = () if table is None else table.rows
+    after = [row.log_evidence for row in rows[1:]]
+    return [
+        {
+            "effects": list(row.effects),
+            "formula": row.formulas[0] if row.formulas else None,
+            "formulas": list(row.formulas),
+            "driver": row.driver or None,
+            "families": list(row.families),
+            "probability": row.probability,
+            "log10_odds_to_next": (row.log_evidence - next_) / math.log(10.0) if next_ is not None else None,
+            "statistic": row.statistic,
+            "dof": row.dof,
+        }
+        for row, next_ in zip_longest(rows, after)
+    ]
 
 
 def _trend_object(trend: Trend | None) -> dict[str, Any] | None:

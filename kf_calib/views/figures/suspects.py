@@ -10,7 +10,7 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.ticker import MaxNLocator
 
 from kf_calib.design.next_orientation import ENOUGH, Advice
-from kf_calib.diagnosis.effect_pairs import overlap_matrix
+from kf_calib.diagnosis.candidate_tests import overlap_matrix
 from kf_calib.diagnosis.residual_drivers import Driver, Explanation, drivers_of, explanations
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.results import format_p

@@ -1,0 +1,192 @@
+"""The evidence of an explanation: the likelihood of the readings with all that is unknown about it averaged out.
+
+What is averaged: the parameters of the model (flat prior); the coefficients of the added effects, of which neither
+direction nor size is known; and the noise from dwell to dwell, where it was not stated or may be larger than stated. All
+explanations of a run are weighed in the same noise within dwells and by the same priors, so that their evidence may be
+compared, however many coefficients they have.
+
+The means of the dwells have the restricted likelihood of ``reml``. What is seen within dwells adds rows of its own,
+which no noise from dwell to dwell enters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.qr import triangle
+from kf_calib.estimation.dwell_columns import Carried, Means
+from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.measurement_model import STATE_COUNT
+from kf_calib.estimation.noise_model import Noise
+from kf_calib.estimation.reml import Likelihood, Part, Parts, likelihood_of, with_slow_scatter
+from kf_calib.estimation.square_root_information import whiten
+
+_SIZES = np.exp(np.linspace(0.0, math.log(1e14), 120))  # prior variance of a coefficient over that of its estimate
+_RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of noise
+_UNSTATED = 0.5  # prior probability of noise from dwell to dwell that was not stated
+_BEYOND = 0.02  # prior probability of more noise than was stated
+_FREE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
+_SEEN = 1e-6  # as in ``score_test``: the least share of a column that the model must leave
+_FEWEST = 6  # degrees of freedom from which noise from dwell to dwell can be told from nothing
+
+
+def size_evidence(dof: int, falls: Floats | float) -> Floats:
+    """Log Bayes factor of an effect whose size and direction are unknown, against no effect.
+
+    The coefficients have the prior N(0, g C) with C the covariance of their estimate, and ln g is uniform from 0 to
+    ln 1e14, which is a size of 1 to 1e7 sigma (the g-prior of A. Zellner, 1986, mixed over g; F. Liang et al., 2008):
+
+      B = mean over g of (1 + g)^(-k/2) exp(g / (1 + g) F / 2)
+
+    dof: number of coefficients k. falls: fall of chi-squared F with them; a number or an array. Returns ln B.
+    """
+    parts = -0.5 * dof * np.log1p(_SIZES) + 0.5 * np.asarray(falls, float)[..., None] * (_SIZES / (1.0 + _SIZES))
+    return np.logaddexp.reduce(parts, axis=-1) - math.log(len(_SIZES))
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """The evidence of an explanation with certain parts of the noise free.
+
+    - parts: the free parts. log: logarithm of the evidence, with the prior of the parts.
+    - sizes: of the free parts, SI. fall: of chi-squared by the added effects, in this noise. dof: their number.
+    """
+
+    parts: Parts
+    log: float
+    sizes: tuple[float, ...]
+    fall: float
+    dof: int
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Means of dwells with rows of prior knowledge, and how many of the last columns belong to added effects."""
+
+    means: Means
+    known: Floats
+    dof: int
+
+
+class Evidence:
+    """The evidence of effects added to the model of a fit, and of none."""
+
+    def __init__(self, before: Fit) -> None:
+        noise = before.noise
+        self._fit, self._walks = before, before.carried.model.walks
+        self.noise: Noise = replace(
+            noise,
+            walk_mps2_per_sqrt_s=0.0 if self._walks else noise.walk_mps2_per_sqrt_s,
+            scatter_mps2=noise.scatter_mps2 if noise.scatter_stated else np.zeros(3),
+            setting_rad=noise.setting_rad if noise.setting_stated else 0.0,
+        )
+
+    @cached_property
+    def _alone(self) -> _Rows:
+        return self._rows(self._fit.carried)
+
+    def of(self, refit: Fit | None = None, walk: bool = False) -> list[Weighed]:
+        """The evidence of the effects that a refit has and the fit has not, for each set of free parts of the noise.
+
+        refit: the fit with the effects (None: none is added). walk: whether a random walk of the biases is among them.
+        """
+        own = self._alone if refit is None else self._rows(refit.carried)
+        alone = replace(self._alone, known=_lengthened(self._alone.known, float(np.linalg.norm(own.known[:, -1]))))
+        walking: Parts = ("walk",) if walk or self._walks else ()
+        every = [*walking, "setting", "common"]
+        both = [likelihood_of(self.noise, every, each.means, self._fit.carried.state, each.known) for each in (own, alone)]
+        found = [self._weighed(*both, parts + walking, own.dof) for parts in self._free(len(alone.means.counts))]
+        return [each for each in found if each is not None]
+
+    def _free(self, dwells: int) -> Iterator[Parts]:
+        """Yield the sets of parts of the noise from dwell to dwell that may be free."""
+        yield ()
+        if 3 * dwells - self._fit.carried.model.count < _FEWEST:
+            return
+        yield "setting",
+        yield "common",
+        if not (self.noise.setting_stated and self.noise.scatter_stated):
+            yield "setting", "common"
+
+    def _weighed(self, own: Likelihood, alone: Likelihood, parts: Parts, dof: int) -> Weighed | None:
+        """Return the evidence with these parts of the noise free; None where one of them is best at zero.
+
+        The logarithms of the sizes of the parts are averaged out by Laplace's method. A part of no size is counted
+        where it is absent.
+        """
+        likelihood = own.of(parts)
+        relative, point = likelihood.most_likely() if parts else (np.zeros(0), own.without())
+        if not relative.all():
+            return None
+        sizes = np.array([own.units[part][0] for part in parts]) * relative
+        without = alone.of(parts).at((sizes / np.array([alone.units[part][0] for part in parts])) ** 2)
+        fall, log = max(without.misfit - point.misfit, 0.0), self._log_prior(parts) - without.cost
+        if parts:
+            curves = np.linalg.eigvalsh(likelihood.curvature(relative))
+            log += float(np.sum(0.5 * np.log(2.0 * np.pi / np.maximum(curves, 2.0 * np.pi / _RANGE**2)) - math.log(_RANGE)))
+        log += float(size_evidence(dof, fall)) if dof else 0.0
+        return Weighed(parts, log, tuple(sizes.tolist()), fall, dof)
+
+    def _log_prior(self, parts: Parts) -> float:
+        """Return the logarithm of the prior probability that these parts of the noise are there and no others."""
+        stated: dict[Part, bool] = {"setting": self.noise.setting_stated, "common": self.noise.scatter_stated}
+        chances = {part: _BEYOND if known else _UNSTATED for part, known in stated.items()}
+        return sum(math.log(own if part in parts else 1.0 - own) for part, own in chances.items())
+
+    def _rows(self, carried: Carried) -> _Rows:
+        """Return what the likelihood needs: columns that the model hides are left out, and with an effect that was
+        fitted with a constant the derivative by this constant counts as a column, but as no coefficient."""
+        means, slow = with_slow_scatter(carried.dwells, self.noise, carried.means)
+        first, last, count = self._fit.carried.model.count, carried.model.count, means.design.shape[2]
+        within = _within(carried, self.noise, self._fit.carried.state)
+        known = np.vstack([slow, np.zeros((len(within), count + 1))])
+        known[len(slow) :, [*range(STATE_COUNT, last), count]] = within
+        turn = _visible(means, self.noise, known, first, last)
+        design, constants = means.design, sum(place >= first for place in carried.model.unknowns)
+        parts = design[..., :first], design[..., first:last] @ turn, design[..., last:]
+        known = np.hstack([known[:, :first], known[:, first:last] @ turn, known[:, last:]])
+        return _Rows(replace(means, design=np.concatenate(parts, axis=2)), known, max(turn.shape[1] - constants, 0))
+
+
+def _lengthened(known: Floats, length: float) -> Floats:
+    """Return rows of prior knowledge with one more, which makes their last column as long as ``length``.
+
+    Where an oscillation is fitted, more of the readings within dwells is kept than elsewhere.
+    """
+    more = np.zeros((1, known.shape[1]))
+    more[0, -1] = math.sqrt(max(length**2 - float(known[:, -1] @ known[:, -1]), 0.0))
+    return np.vstack([known, more])
+
+
+def _within(carried: Carried, noise: Noise, state: Floats) -> Floats:
+    """Return the triangular factor [G | z] of what the readings within dwells say of all effects G.
+
+    The mean of each dwell is left out: it is as if scatter had no limit.
+    """
+    free = replace(noise, scatter_mps2=np.full(3, _FREE_MPS2), setting_rad=0.0, walk_mps2_per_sqrt_s=0.0)
+    columns = [own[..., STATE_COUNT:] for own in carried.columns]
+    rows = np.concatenate(whiten(carried.dwells, columns, free, state, reduced=False))
+    lacking = max(rows.shape[1] - len(rows), 0)
+    return triangle(np.vstack([rows, np.zeros((lacking, rows.shape[1]))]))
+
+
+def _visible(means: Means, noise: Noise, known: Floats, first: int, last: int) -> Floats:
+    """Return combinations (q, k) of the added columns that are orthonormal beside the model's, without hidden ones.
+
+    first, last: the added columns follow those of the model, and come before those that have a prior.
+    """
+    sigma = noise.effective_sigma_mps2 / np.sqrt(means.counts[:, None])
+    columns = np.vstack([(means.design / sigma[..., None]).reshape(-1, means.design.shape[2]), known[:, :-1]])
+    scale = np.linalg.norm(columns, axis=0)
+    columns, units = columns / np.where(scale > 0, scale, 1.0), np.where(scale > 0, scale, 1.0)[first:last, None]
+    left, singular, _ = np.linalg.svd(columns[:, :first], full_matrices=False)
+    basis, own = left[:, singular > 1e-9 * singular[0]], columns[:, first:last]
+    _, singular, right = np.linalg.svd(own - basis @ (basis.T @ own), full_matrices=False)
+    seen = singular > _SEEN
+    return (right[seen].T / singular[seen]) / units

@@ -1,0 +1,294 @@
+"""The table of hypotheses: every explanation of a misfit as one row, with its probability.
+
+Rows are: nothing; noise from dwell to dwell that was not stated; each effect; pairs of effects, which may mask each
+other; an effect beside a random walk of the biases; formulas that are no known effect, by what they depend on; and
+irregular changes of an unknown cause. The likeliest of each kind by the linear tests are refitted, because large effects
+are not linear, and weighed by their ``Evidence``. The prior of a kind is shared among its members, so that a hundred
+formulas do not outvote one effect.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.candidate_tests import CandidateTests, values_of
+from kf_calib.diagnosis.evidence import Evidence, Weighed, size_evidence
+from kf_calib.diagnosis.refits import Refits
+from kf_calib.diagnosis.unknown_effect import Family as Formulas
+from kf_calib.effects import effect_named
+from kf_calib.estimation.results import Calibration
+
+NOTHING, NOISE, NONE = "nothing", "unstated noise", "none of the known"
+"""Families of the rows that name no effect: nothing missing, noise that was not stated, and no known effect."""
+
+SURE = 0.95
+"""Probability from which an effect is taken for certain enough to be added without asking."""
+
+HOLDS = 0.99
+"""Probability of the set of explanations that is told."""
+
+_KINDS = {"nothing": 0.4, "effect": 0.4, "pair": 0.1, "formula": 0.1}
+_IRREGULAR = {True: 0.75, False: 0.1}  # share of an unknown cause in irregular changes, by whether noise was stated
+_WITHIN = 12.0  # rows whose evidence is smaller by this many units of ln are not refitted
+_MOST = {"effect": 8, "pair": 4, "walk": 3, "formula": 3}
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One row of the table.
+
+    - effects: names of the effects that would be missing. formulas: those of no known effect, as they can be added.
+    - driver: in words, what the formulas depend on; "irregular" for changes of an unknown cause that follow nothing.
+    - families: the physical classes of the effects.
+    - log_evidence: of the row with its prior, natural logarithm. probability: its share in all rows.
+    - statistic, dof: fall of chi-squared in the likeliest noise, and the number of coefficients.
+    - refit: the calibration with it; None where none was made.
+    """
+
+    effects: tuple[str, ...] = ()
+    formulas: tuple[str, ...] = ()
+    driver: str = ""
+    families: tuple[str, ...] = ()
+    log_evidence: float = 0.0
+    statistic: float = 0.0
+    dof: int = 0
+    refit: Calibration | None = None
+    probability: float = 0.0
+
+    @property
+    def unknown(self) -> bool:
+        """Whether the row says that something is missing that no known effect explains."""
+        return bool(self.driver)
+
+
+@dataclass(frozen=True)
+class Table:
+    """All rows, the likeliest first; their probabilities sum to one."""
+
+    rows: tuple[Hypothesis, ...]
+
+    @cached_property
+    def families(self) -> dict[str, float]:
+        """Probability that something of each family is missing; with two effects at once they sum to more than one."""
+        found = dict[str, float]()
+        for row in self.rows:
+            for family in row.families:
+                found[family] = found.get(family, 0.0) + row.probability
+        return dict(sorted(found.items(), key=lambda each: -each[1]))
+
+    def of(self, *families: str) -> float:
+        """Probability of the rows of these families that name no effect."""
+        return sum(row.probability for row in self.rows if not row.effects and set(row.families) & set(families))
+
+    def probability(self, effects: Sequence[str]) -> float:
+        """Probability that all these effects are missing, alone or with others."""
+        return sum(row.probability for row in self.rows if set(effects) <= set(row.effects))
+
+    @property
+    def first(self) -> Hypothesis:
+        """The likeliest explanation, with nothing missing left out."""
+        return next(row for row in self.rows if row.families != (NOTHING,))
+
+    @cached_property
+    def rivals(self) -> tuple[Hypothesis, ...]:
+        """The explanations other than the first that have ``HOLDS`` of the probability together with it, without those
+        that only add to its effects."""
+        first, rows = self.first, [row for row in self.rows if row.families != (NOTHING,)]
+        before = np.cumsum([0.0, *(row.probability for row in rows)]) / sum(row.probability for row in rows)
+        likely = [row for k, row in enumerate(rows) if before[k] < HOLDS and row is not first]
+        return tuple(row for row in likely if not (first.effects and set(first.effects) <= set(row.effects)))
+
+
+def table_of(rows: Iterable[Hypothesis]) -> Table:
+    """The table of rows, of which only the evidence is known."""
+    rows = list(rows)
+    logs = np.array([row.log_evidence for row in rows])
+    shares = np.exp(logs - np.logaddexp.reduce(logs))
+    found = [replace(row, probability=float(share)) for row, share in zip(rows, shares, strict=True)]
+    return Table(tuple(sorted(found, key=lambda row: -row.probability)))
+
+
+def log_odds_of(p_value: float) -> float:
+    """The largest log odds that a p-value gives against what it tests: -ln(-e p ln p), 0 above 1/e (T. Sellke, M.
+    Bayarri, J. Berger, 2001)."""
+    p_value = max(p_value, 1e-300)
+    return -math.log(-math.e * p_value * math.log(p_value)) if p_value < 1.0 / math.e else 0.0
+
+
+class Hypotheses:
+    """Makes the rows of one run.
+
+    refits: those of the run. before: the run without what is missing. test: its linear tests.
+    """
+
+    def __init__(self, refits: Refits, before: Calibration, test: CandidateTests) -> None:
+        self.refits, self.before, self.test = refits, before, test
+        self.evidence, self.inflation = Evidence(before.fit), 1.0
+
+    def table(self) -> Table:
+        """The table with the likeliest rows refitted."""
+        effects = self._screened()
+        for name in list(effects)[:1]:  # misfit that the best effect leaves makes every fall less significant
+            judged = self._refit((name,)).consistency
+            self.inflation = max(1.0, judged.statistic / judged.dof) if judged.dof > 0 else 1.0
+        effects = self._screened()
+        tried = [*self._without(), *self._effects(effects), *self._pairs(effects), *self._formulas(effects)]
+        return table_of(row for row in tried if math.isfinite(row.log_evidence))
+
+    def quick_table(self) -> Table:
+        """The table of nothing, noise and single effects by the linear tests alone, for a run with no misfit."""
+        rows, prior = list(self._without()), self._prior("effect", len(self.test.scores))
+        least = next(own.log for own in self.evidence.of() if not own.parts)
+        rows += [
+            Hypothesis((name,), families=self._families((name,)), log_evidence=least + own + prior,
+                       statistic=self._fall(name), dof=self._dof(name))
+            for name, own in self._screened().items()
+        ]  # fmt: skip
+        return table_of(rows)
+
+    def _without(self) -> Iterator[Hypothesis]:
+        """Yield the rows without an effect: nothing, noise that was not stated, and irregular changes."""
+        found, prior = self.evidence.of(), math.log(_KINDS["nothing"])
+        yield from (Hypothesis(families=(NOTHING,), log_evidence=own.log + prior) for own in found if not own.parts)
+        noise = [own.log for own in found if own.parts]
+        if noise:
+            log, stated = float(np.logaddexp.reduce(noise)) + prior, self.evidence.noise
+            share = _IRREGULAR[stated.scatter_stated and stated.setting_stated]
+            within = log_odds_of(self.test.trend.p_value) if self.test.trend else 0.0
+            yield Hypothesis(families=(NOISE,), log_evidence=log + math.log(1.0 - share))
+            yield Hypothesis(driver="irregular", families=(NONE,), log_evidence=log + math.log(share) + within)
+
+    def _screened(self) -> dict[str, float]:
+        """Return the log Bayes factor of each effect by the linear tests, the likeliest first."""
+        found = {name: self._screen(name, self._fall(name)) for name in self.test.scores}
+        return dict(sorted(found.items(), key=lambda each: -each[1]))
+
+    def _screen(self, name: str, fall: float) -> float:
+        """Return the log Bayes factor of an effect from its fall of chi-squared in the linear tests."""
+        if name not in self.test.best:
+            return 0.5 * fall / self.inflation
+        fall = fall / self.inflation
+        return float(size_evidence(self._dof(name), fall)) + self._log_share((name,), fall)
+
+    def _fall(self, name: str) -> float:
+        """Return the fall of chi-squared of an effect; of a random walk, twice its gain in likelihood."""
+        test = self.test
+        if name in test.best:
+            return float(test.scan.statistics[test.best[name]])
+        return 2.0 * self.before.fit.walk_gain if name == test.walking else test.scores[name]
+
+    def _dof(self, name: str) -> int:
+        return self.test.candidate(name).dof if name in self.test.best else 1
+
+    def _log_share(self, names: Sequence[str], fall: float) -> float:
+        """Return the log of the mean of likelihood over the values of constants, relative to the best value."""
+        return sum(self._log_share_of(name, fall) for name in names if name in self.test.best)
+
+    def _log_share_of(self, name: str, fall: float) -> float:
+        test = self.test
+        own = values_of(test.scan, name)
+        tried = max(len(own), *(test.scan.candidates[k].tried for k in own))
+        falls = test.scan.statistics[own]
+        relative = min(1.0, fall / max(float(falls.max()), 1e-9))
+        return float(np.logaddexp.reduce(0.5 * relative * (falls - falls.max()))) - math.log(tried)
+
+    def _effects(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
+        """Yield the rows of single effects."""
+        least = max(screened.values(), default=0.0) - _WITHIN
+        chosen = [name for name, log in screened.items() if log > least][: _MOST["effect"]]
+        walk = self.test.walking
+        for name in [*chosen, *([walk] if walk and walk not in chosen else [])]:
+            yield self._row((name,), self._prior("effect", len(screened)))
+
+    def _pairs(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
+        """Yield the rows of the likeliest pairs, and of the likeliest effects beside a random walk."""
+        count = math.comb(len(screened), 2)
+        if not count:
+            return
+        found = self._joint(screened)
+        likely = sorted(found, key=lambda names: -found[names])[: _MOST["pair"]]
+        best = max([*screened.values(), *found.values()])
+        chosen = [names for names in likely if found[names] > best - _WITHIN]
+        walk = self.test.walking
+        if walk and self.before.fit.walk_gain > 0.0:
+            beside = Hypotheses(self.refits, self._refit((walk,)), self._assessed((walk,)))
+            own = [name for name in beside._screened() if name in beside.test.best]
+            chosen += [(name, walk) for name in own[: _MOST["walk"]]]
+        for names in chosen:
+            yield self._row(names, self._prior("pair", count))
+
+    def _joint(self, screened: Mapping[str, float]) -> dict[tuple[str, str], float]:
+        """Return the log Bayes factors of pairs by the linear tests: each effect at the value of its constant that is
+        best alone, and the other at any value."""
+        test, out = self.test, dict[tuple[str, str], float]()
+        seen = [k for k, each in enumerate(test.scan.candidates) if each.dof]
+        for name in screened:
+            if name not in test.best:
+                continue
+            falls, alone = test.scan.beside(test.best[name]), self._screen(name, self._fall(name))
+            for k in seen:
+                other, dof = str(test.scan.candidates[k].effect), test.scan.candidates[k].dof
+                if other == name or falls[k] <= 0.0:
+                    continue
+                fall = falls[k] / self.inflation
+                log = alone + float(size_evidence(dof, fall)) + self._log_share_of(other, fall)
+                both = (name, other) if screened[name] >= screened[other] else (other, name)
+                out[both] = max(out.get(both, -math.inf), log)
+        return out
+
+    def _formulas(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
+        """Yield the rows of formulas that are no known effect, the likeliest of each driver."""
+        known = [self.test.candidate(name).effect for name in self.test.best]
+        drivers = dict[str, list[Formulas]]()
+        for each in self.refits.families(self.before.fit, known):
+            if each.rank and not each.known:
+                drivers.setdefault(each.driver, []).append(each)
+        logs = {driver: self._over_members(own) for driver, own in drivers.items()}
+        best = max([*screened.values(), *(log.max() for log in logs.values())], default=0.0)
+        likely = sorted(drivers, key=lambda driver: -np.logaddexp.reduce(logs[driver]))[: _MOST["formula"]]
+        for driver in likely:
+            if logs[driver].max() < best - _WITHIN:
+                continue
+            first = int(np.argmax(logs[driver]))
+            share = float(np.logaddexp.reduce(logs[driver]) - logs[driver][first]) - math.log(len(logs[driver]))
+            row = self._row((), self._prior("formula", len(drivers)) + share, drivers[driver][first].formulas)
+            yield replace(row, driver=driver, families=(NONE,))
+
+    def _over_members(self, own: Sequence[Formulas]) -> Floats:
+        """Return the log Bayes factors of the formulas of one driver by the linear tests."""
+        return np.array([float(size_evidence(each.rank, each.fall / self.inflation)) for each in own])
+
+    def _row(self, effects: tuple[str, ...], log_prior: float, formulas: tuple[str, ...] = ()) -> Hypothesis:
+        """Return the row of effects or formulas, refitted and weighed."""
+        refit = self._refit((*effects, *formulas))
+        found = self.evidence.of(refit.fit, walk=self.test.walking in effects)
+        if not found:
+            return Hypothesis(effects, formulas, log_evidence=-math.inf)
+        logs = [own.log + self._log_share(effects, own.fall) for own in found]
+        best: Weighed = found[int(np.argmax(logs))]
+        walks = self.test.walking in effects
+        return Hypothesis(
+            effects, formulas, "", self._families(effects), float(np.logaddexp.reduce(logs)) + log_prior, best.fall,
+            best.dof + walks, refit,
+        )  # fmt: skip
+
+    def _families(self, effects: Sequence[str]) -> tuple[str, ...]:
+        """Return the families of effects, each once."""
+        return tuple(dict.fromkeys(effect_named(name, self.before.bench).family for name in effects))
+
+    def _refit(self, added: Sequence[str]) -> Calibration:
+        return self.refits.with_effects(self.before, added)
+
+    def _assessed(self, added: Sequence[str]) -> CandidateTests:
+        return self.refits.assess(self._refit(added), self.test.effective_tests)
+
+    @staticmethod
+    def _prior(kind: str, members: int) -> float:
+        """Return the log of the prior probability of one of so many members of a kind."""
+        return math.log(_KINDS[kind] / max(members, 1))
