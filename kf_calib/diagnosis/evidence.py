@@ -1,9 +1,9 @@
 """The evidence of an explanation: the likelihood of the readings with all that is unknown about it averaged out.
 
 What is averaged: the parameters of the model (flat prior); the coefficients of the added effects, of which neither
-direction nor size is known; and the noise from dwell to dwell, where it was not stated or may be larger than stated. All
-explanations of a run are weighed in the same noise within dwells and by the same priors, so that their evidence may be
-compared, however many coefficients they have.
+direction nor size is known; and the noise from dwell to dwell, where it was not stated or may be larger than stated.
+All explanations of a run are weighed in the same noise within dwells and by the same priors, so that their evidence may
+be compared, however many coefficients they have.
 
 The means of the dwells have the restricted likelihood of ``reml``. What is seen within dwells adds rows of its own,
 which no noise from dwell to dwell enters.
@@ -99,9 +99,12 @@ class Evidence:
         own = self._alone if refit is None else self._rows(refit.carried)
         alone = replace(self._alone, known=_lengthened(self._alone.known, float(np.linalg.norm(own.known[:, -1]))))
         walking: Parts = ("walk",) if walk or self._walks else ()
-        every = [*walking, "setting", "common"]
-        both = [likelihood_of(self.noise, every, each.means, self._fit.carried.state, each.known) for each in (own, alone)]
-        found = [self._weighed(*both, parts + walking, own.dof) for parts in self._free(len(alone.means.counts))]
+        every: Parts = (*walking, "setting", "common")
+        with_, without = (
+            likelihood_of(self.noise, every, each.means, self._fit.carried.state, each.known) for each in (own, alone)
+        )
+        free = self._free(len(alone.means.counts))
+        found = (self._weighed(with_, without, parts + walking, own.dof) for parts in free)
         return [each for each in found if each is not None]
 
     def _free(self, dwells: int) -> Iterator[Parts]:
@@ -109,8 +112,8 @@ class Evidence:
         yield ()
         if 3 * dwells - self._fit.carried.model.count < _FEWEST:
             return
-        yield "setting",
-        yield "common",
+        yield ("setting",)
+        yield ("common",)
         if not (self.noise.setting_stated and self.noise.scatter_stated):
             yield "setting", "common"
 
@@ -129,7 +132,9 @@ class Evidence:
         fall, log = max(without.misfit - point.misfit, 0.0), self._log_prior(parts) - without.cost
         if parts:
             curves = np.linalg.eigvalsh(likelihood.curvature(relative))
-            log += float(np.sum(0.5 * np.log(2.0 * np.pi / np.maximum(curves, 2.0 * np.pi / _RANGE**2)) - math.log(_RANGE)))
+            log += float(
+                np.sum(0.5 * np.log(2.0 * np.pi / np.maximum(curves, 2.0 * np.pi / _RANGE**2)) - math.log(_RANGE))
+            )
         log += float(size_evidence(dof, fall)) if dof else 0.0
         return Weighed(parts, log, tuple(sizes.tolist()), fall, dof)
 

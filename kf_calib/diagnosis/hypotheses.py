@@ -2,9 +2,9 @@
 
 Rows are: nothing; noise from dwell to dwell that was not stated; each effect; pairs of effects, which may mask each
 other; an effect beside a random walk of the biases; formulas that are no known effect, by what they depend on; and
-irregular changes of an unknown cause. The likeliest of each kind by the linear tests are refitted, because large effects
-are not linear, and weighed by their ``Evidence``. The prior of a kind is shared among its members, so that a hundred
-formulas do not outvote one effect.
+irregular changes of an unknown cause. The likeliest of each kind by the linear tests are refitted, because large
+effects are not linear, and weighed by their ``Evidence``. The prior of a kind is shared among its members, so that a
+hundred formulas do not outvote one effect.
 """
 
 from __future__ import annotations

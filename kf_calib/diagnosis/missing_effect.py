@@ -1,7 +1,7 @@
 """Diagnosis of a calibration: which physical effect is missing in its model, and which others explain it, too.
 
-Whether anything is missing is decided by ``candidate_tests``, with a false-alarm rate that holds for the run. What it is
-is decided by the table of ``hypotheses``: the likeliest row gives the verdict, and the rows that have 99 % of the
+Whether anything is missing is decided by ``candidate_tests``, with a false-alarm rate that holds for the run. What it
+is, is decided by the table of ``hypotheses``: the likeliest row gives the verdict, and the rows that have 99 % of the
 probability together are the set that is named.
 """
 
@@ -98,7 +98,9 @@ def _beside_lines(refits: Refits, before: Calibration, test: CandidateTests) -> 
         rows = (Hypothesis(families=(NOTHING,), log_evidence=log_odds_of(test.p_values[name])),)
     families = known.model.effects[-1].family
     own = [_with(row, name, families, refits.with_effects(before, (*row.effects, name))) for row in rows]
-    none = Hypothesis(families=(NOTHING,), log_evidence=max(row.log_evidence for row in rows) - log_odds_of(test.p_values[name]))
+    none = Hypothesis(
+        families=(NOTHING,), log_evidence=max(row.log_evidence for row in rows) - log_odds_of(test.p_values[name])
+    )
     return table_of([*own, none])
 
 

@@ -54,8 +54,8 @@ class Diagnosis:
     whether the likeliest is none of the known effects. noise: whether it is noise that was not stated. ambiguity: the
     effects of the explanations that have 99 % of the probability together, those missing first. overlaps: overlap of
     each other effect with the one that it could replace. together: pairs among these explanations. as_scatter: noise
-    that was not stated has more than 1 %. after: the calibration with the missing effects. suspects: single effects that
-    were refitted, the likeliest first.
+    that was not stated has more than 1 %. after: the calibration with the missing effects. suspects: single effects
+    that were refitted, the likeliest first.
 
     back_s: time constant with which the biases may return, s, in place of the random walk that is named (None: they do
     not). judged: the run with the noise that the likeliest explanation leaves, where noise was estimated (None: it is

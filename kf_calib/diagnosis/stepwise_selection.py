@@ -288,7 +288,7 @@ def _with_instead(result: Calibration, refits: Refits, place: int, name: str) ->
 def next_effect(found: Diagnosis, accept_first: bool = False) -> str | None:
     """The effect to add next: the likeliest where it is missing with 95 % probability, whether alone or with others.
 
-    None where nothing is missing, or where the choice is left to a person. accept_first: take the likeliest in any case.
+    None where nothing is missing, or where the choice is left to a person. accept_first: take the likeliest anyway.
     """
     if found.test.consistent is not False or not found.missing or found.table is None:
         return None

@@ -189,7 +189,9 @@ def explained_share(fitted: Fit, refit: Fit) -> float:
     """Share of the chi-squared beyond noise that a refit with further effects explains."""
     before, left = consistency(fitted), consistency(refit)
     excess = before.statistic - before.dof
-    return min(max(before.statistic - left.statistic - (before.dof - left.dof), 0.0) / excess, 1.0) if excess > 0 else 1.0
+    return (
+        min(max(before.statistic - left.statistic - (before.dof - left.dof), 0.0) / excess, 1.0) if excess > 0 else 1.0
+    )
 
 
 def channel_of(residuals: Floats) -> str:

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated
 from kf_calib.diagnosis.hypotheses import NOISE, NONE, NOTHING, SURE, Hypothesis
+from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
 from kf_calib.estimation.results import format_p
 from kf_calib.support.units import shown
-
 
 _TOLD = 4  # most other explanations that are told
 _FAMILIES = {
     "bias in time": "The bias changes with time", "scale in time": "The scale factor changes with time",
     "temperature": "It goes with temperature", "nonlinearity": "The accelerometer is not linear",
     "cross-axis": "Acceleration across the input axis enters", "memory": "It depends on the orientation before",
-    "gimbal and encoder": "The gimbals or their encoders err", "base and platform": "The base or platform moves or yields",
+    "gimbal and encoder": "The gimbals or their encoders err",
+    "base and platform": "The base or platform moves or yields",
     "surroundings": "Something around the bench enters", "slews": "It shows while the platform turns",
 }  # fmt: skip
 """What each family of effects means, in words."""
@@ -64,19 +64,19 @@ def _named(found: Diagnosis, first: Hypothesis) -> str:
     """Return the likeliest effects in words, with the other explanations and their probabilities."""
     assert found.table is not None
     share, others = found.table.probability(first.effects), _others(found)
-    named = f"{_effects_of(first)}{_size(found)} ({_percent(share)})"
+    named = f"{_effects_of(first)}{_size(found)} ({format_probability(share)})"
     if share >= SURE:
         return f"Missing: {named}{others}"
     family, of_family = next(each for each in found.table.families.items() if each[0] not in (NOTHING, NOISE, NONE))
     if of_family >= SURE and first.families == (family,):
-        return f"{_FAMILIES[family]} ({_percent(of_family)}): {named}{others}"
+        return f"{_FAMILIES[family]} ({format_probability(of_family)}): {named}{others}"
     return f"Likeliest: {named}{others}"
 
 
 def _unknown(found: Diagnosis, first: Hypothesis) -> str:
     """Return a sentence on a misfit that no known effect explains."""
     what = "it changes irregularly" if not first.formulas else f"it goes with {first.driver}"
-    return f"Unknown: no known effect explains it, {what} ({_percent(first.probability)}){_others(found)}."
+    return f"Unknown: no known effect explains it, {what} ({format_probability(first.probability)}){_others(found)}."
 
 
 def _noise(found: Diagnosis, first: Hypothesis) -> str:
@@ -86,7 +86,7 @@ def _noise(found: Diagnosis, first: Hypothesis) -> str:
     keys = " and ".join(key for key, known in stated if not known)
     what = "more than was stated" if dwell_noise_is_stated(found.before) else "by an amount that was not stated"
     advice = f"state {keys} or repeat an orientation" if keys else "repeat an orientation"
-    share = _percent(first.probability)
+    share = format_probability(first.probability)
     return f"The dwells scatter {what} ({share}){_others(found)}. To find out, {advice}."
 
 
@@ -94,7 +94,7 @@ def _others(found: Diagnosis) -> str:
     """Return the other explanations in words."""
     assert found.table is not None
     rows = found.table.rivals
-    told = [f"{_in_words(found, row)} {_percent(row.probability)}" for row in rows[:_TOLD]]
+    told = [f"{_in_words(found, row)} {format_probability(row.probability)}" for row in rows[:_TOLD]]
     told += [f"{len(rows) - _TOLD} others"] if len(rows) > _TOLD else []
     return f"; or {', '.join(told)}" if told else ""
 
@@ -113,10 +113,16 @@ def _effects_of(row: Hypothesis) -> str:
     return row.effects[0] if len(row.effects) == 1 else f"{' and '.join(row.effects)} together"
 
 
-def _percent(probability: float) -> str:
-    """Return a probability in per cent, never rounded to certainty."""
+def format_probability(probability: float) -> str:
+    """A probability in per cent as text, never rounded to certainty."""
     percent = 100.0 * probability
-    return "over 99.9 %" if percent > 99.9 else f"{percent:.1f} %" if percent > 99.0 or percent < 1.0 else f"{percent:.0f} %"
+    return (
+        "over 99.9 %"
+        if percent > 99.9
+        else f"{percent:.1f} %"
+        if percent > 99.0 or percent < 1.0
+        else f"{percent:.0f} %"
+    )
 
 
 def _returning(found: Diagnosis) -> str:

@@ -17,6 +17,7 @@ from kf_calib.diagnosis.detectability import Detectable
 from kf_calib.diagnosis.hypotheses import Table as Hypotheses
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
+from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.diagnosis.within_dwell_trend import Trend
 from kf_calib.estimation.results import format_p
 from kf_calib.support.printing import printed
@@ -25,6 +26,8 @@ from kf_calib.views.console import plain, symbol
 from kf_calib.views.json import clean, outlying_object, readings_object
 from kf_calib.views.tables import Table
 from kf_calib.views.terminal import note
+
+_TOLD = 0.01  # least probability of an explanation that is shown
 
 
 def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
@@ -157,6 +160,8 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
     readings = found.before.readings
     if readings.findings:
         parts.append(Text(f"In the readings: {'; '.join(readings.findings)}."))
+    if found.table and found.test.consistent is False:
+        parts.append(_hypothesis_table(found.table))
     if found.suspects:
         parts.append(_suspect_table(found))
     if found.test.consistent is False:
@@ -207,6 +212,23 @@ def of_what_p_is(found: Diagnosis) -> list[str]:
 def plain_report(found: Diagnosis) -> str:
     """The text of a diagnosis that ``print`` shows."""
     return plain(diagnosis_report(found))
+
+
+def _hypothesis_table(table: Hypotheses) -> Table:
+    """Return the table of the explanations that have 1 % of the probability or more."""
+    shown_ = Table(title="What it may be, and with what probability", title_justify="left")
+    for heading in ("explanation", "family", "probability", "χ² / dof"):
+        left = heading in ("explanation", "family")
+        shown_.add_column(heading, justify="left" if left else "right", no_wrap=not left)
+    for row in table.rows:
+        if row.probability < _TOLD and row is not table.first:
+            continue
+        what = " + ".join(row.effects) or (
+            f"formula of {row.driver}" if row.formulas else row.driver or row.families[0]
+        )
+        fall = f"{row.statistic:.1f} / {row.dof}" if row.dof else ""
+        shown_.add_row(what, ", ".join(row.families), format_probability(row.probability), fall)
+    return shown_
 
 
 def _suspect_table(found: Diagnosis) -> Table:
