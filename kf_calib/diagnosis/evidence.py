@@ -54,7 +54,7 @@ def size_evidence(dof: int, falls: Floats | float) -> Floats:
 class Weighed:
     """The evidence of an explanation with certain parts of the noise free.
 
-    - parts: the free parts. log: logarithm of the evidence, with the prior of the parts.
+    - parts: the free parts but for a walk. log: logarithm of the evidence, with the prior of the parts.
     - sizes: of the free parts, SI. fall: of chi-squared by the added effects, in this noise. dof: their number.
     """
 
@@ -125,7 +125,7 @@ class Evidence:
         """
         likelihood = own.of(parts)
         relative, point = likelihood.most_likely() if parts else (np.zeros(0), own.without())
-        if not relative.all():
+        if not all(size for part, size in zip(parts, relative, strict=True) if part != "walk" or not self._walks):
             return None
         sizes = np.array([own.units[part][0] for part in parts]) * relative
         without = alone.of(parts).at((sizes / np.array([alone.units[part][0] for part in parts])) ** 2)
@@ -136,7 +136,8 @@ class Evidence:
                 np.sum(0.5 * np.log(2.0 * np.pi / np.maximum(curves, 2.0 * np.pi / _RANGE**2)) - math.log(_RANGE))
             )
         log += float(size_evidence(dof, fall)) if dof else 0.0
-        return Weighed(parts, log, tuple(sizes.tolist()), fall, dof)
+        beyond = tuple(part for part in parts if part != "walk")
+        return Weighed(beyond, log, tuple(sizes.tolist()), fall, dof)
 
     def _log_prior(self, parts: Parts) -> float:
         """Return the logarithm of the prior probability that these parts of the noise are there and no others."""

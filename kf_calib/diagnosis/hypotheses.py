@@ -34,7 +34,8 @@ HOLDS = 0.99
 """Probability of the set of explanations that is told."""
 
 _KINDS = {"nothing": 0.4, "effect": 0.4, "pair": 0.1, "formula": 0.1}
-_IRREGULAR = {True: 0.75, False: 0.1}  # share of an unknown cause in irregular changes, by whether noise was stated
+_IRREGULAR = {True: 0.6, False: 0.1}  # share of an unknown cause in more scatter, by whether noise was stated
+_SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _WITHIN = 12.0  # rows whose evidence is smaller by this many units of ln are not refitted
 _MOST = {"effect": 8, "pair": 4, "walk": 3, "formula": 3}
 
@@ -121,6 +122,11 @@ def log_odds_of(p_value: float) -> float:
     return -math.log(-math.e * p_value * math.log(p_value)) if p_value < 1.0 / math.e else 0.0
 
 
+def _sum(logs: Sequence[float]) -> float:
+    """Return the log of a sum from the logs of its terms."""
+    return float(np.logaddexp.reduce([-math.inf, *logs]))
+
+
 class Hypotheses:
     """Makes the rows of one run.
 
@@ -133,9 +139,9 @@ class Hypotheses:
 
     def table(self) -> Table:
         """The table with the likeliest rows refitted."""
-        effects = self._screened()
-        for name in list(effects)[:1]:  # misfit that the best effect leaves makes every fall less significant
-            judged = self._refit((name,)).consistency
+        best = next((name for name in self._screened() if name in self.test.best), None)
+        if best is not None:  # what even the best effect leaves makes every fall less significant
+            judged = self._refit((best,)).consistency
             self.inflation = max(1.0, judged.statistic / judged.dof) if judged.dof > 0 else 1.0
         effects = self._screened()
         tried = [*self._without(), *self._effects(effects), *self._pairs(effects), *self._formulas(effects)]
@@ -155,14 +161,15 @@ class Hypotheses:
     def _without(self) -> Iterator[Hypothesis]:
         """Yield the rows without an effect: nothing, noise that was not stated, and irregular changes."""
         found, prior = self.evidence.of(), math.log(_KINDS["nothing"])
-        yield from (Hypothesis(families=(NOTHING,), log_evidence=own.log + prior) for own in found if not own.parts)
-        noise = [own.log for own in found if own.parts]
-        if noise:
-            log, stated = float(np.logaddexp.reduce(noise)) + prior, self.evidence.noise
-            share = _IRREGULAR[stated.scatter_stated and stated.setting_stated]
-            within = log_odds_of(self.test.trend.p_value) if self.test.trend else 0.0
-            yield Hypothesis(families=(NOISE,), log_evidence=log + math.log(1.0 - share))
-            yield Hypothesis(driver="irregular", families=(NONE,), log_evidence=log + math.log(share) + within)
+        still = float(next(own.log for own in found if not own.parts)) + prior
+        turned = _sum([own.log for own in found if own.parts == ("setting",)]) + prior
+        spread = _sum([own.log for own in found if "common" in own.parts]) + prior
+        share = _IRREGULAR[self.evidence.noise.scatter_stated and self.evidence.noise.setting_stated]
+        within = log_odds_of(self.test.trend.p_value) if self.test.trend else 0.0
+        either = _sum([spread + math.log(share), still + math.log(_SHORT)]) + within
+        yield Hypothesis(families=(NOTHING,), log_evidence=still)
+        yield Hypothesis(families=(NOISE,), log_evidence=_sum([turned, spread + math.log(1.0 - share)]))
+        yield Hypothesis(driver="irregular", families=(NONE,), log_evidence=either)
 
     def _screened(self) -> dict[str, float]:
         """Return the log Bayes factor of each effect by the linear tests, the likeliest first."""
@@ -200,10 +207,10 @@ class Hypotheses:
 
     def _effects(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
         """Yield the rows of single effects."""
-        least = max(screened.values(), default=0.0) - _WITHIN
-        chosen = [name for name, log in screened.items() if log > least][: _MOST["effect"]]
-        walk = self.test.walking
-        for name in [*chosen, *([walk] if walk and walk not in chosen else [])]:
+        columns = {name: log for name, log in screened.items() if name != self.test.walking}
+        least = max(columns.values(), default=0.0) - _WITHIN
+        chosen = [name for name, log in columns.items() if log > least][: _MOST["effect"]]
+        for name in [*chosen, *([self.test.walking] if self.test.walking else [])]:
             yield self._row((name,), self._prior("effect", len(screened)))
 
     def _pairs(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
@@ -213,7 +220,7 @@ class Hypotheses:
             return
         found = self._joint(screened)
         likely = sorted(found, key=lambda names: -found[names])[: _MOST["pair"]]
-        best = max([*screened.values(), *found.values()])
+        best = max(found.values(), default=0.0)
         chosen = [names for names in likely if found[names] > best - _WITHIN]
         walk = self.test.walking
         if walk and self.before.fit.walk_gain > 0.0:
@@ -250,7 +257,7 @@ class Hypotheses:
             if each.rank and not each.known:
                 drivers.setdefault(each.driver, []).append(each)
         logs = {driver: self._over_members(own) for driver, own in drivers.items()}
-        best = max([*screened.values(), *(log.max() for log in logs.values())], default=0.0)
+        best = max([log for name, log in screened.items() if name != self.test.walking], default=0.0)
         likely = sorted(drivers, key=lambda driver: -np.logaddexp.reduce(logs[driver]))[: _MOST["formula"]]
         for driver in likely:
             if logs[driver].max() < best - _WITHIN:
