@@ -33,7 +33,6 @@ _UNSTATED = 0.5  # prior probability of noise from dwell to dwell that was not s
 _BEYOND = 0.02  # prior probability of more noise than was stated
 _FREE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
 _SEEN = 1e-6  # as in ``score_test``: the least share of a column that the model must leave
-_FEWEST = 6  # degrees of freedom from which noise from dwell to dwell can be told from nothing
 
 
 def size_evidence(dof: int, falls: Floats | float) -> Floats:
@@ -110,7 +109,7 @@ class Evidence:
     def _free(self, dwells: int) -> Iterator[Parts]:
         """Yield the sets of parts of the noise from dwell to dwell that may be free."""
         yield ()
-        if 3 * dwells - self._fit.carried.model.count < _FEWEST:
+        if 3 * dwells <= self._fit.carried.model.count:
             return
         yield ("setting",)
         yield ("common",)

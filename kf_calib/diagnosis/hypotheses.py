@@ -17,11 +17,11 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.candidate_tests import CandidateTests, values_of
+from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates, values_of
 from kf_calib.diagnosis.evidence import Evidence, Weighed, size_evidence
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.unknown_effect import Family as Formulas
-from kf_calib.effects import effect_named
+from kf_calib.effects import effect_named, walk_named
 from kf_calib.estimation.results import Calibration
 
 NOTHING, NOISE, NONE = "nothing", "unstated noise", "none of the known"
@@ -136,6 +136,7 @@ class Hypotheses:
     def __init__(self, refits: Refits, before: Calibration, test: CandidateTests) -> None:
         self.refits, self.before, self.test = refits, before, test
         self.evidence, self.inflation = Evidence(before.fit), 1.0
+        self.walk = "" if before.model.walks else walk_named(before.bench)
 
     def table(self) -> Table:
         """The table with the likeliest rows refitted."""
@@ -188,7 +189,7 @@ class Hypotheses:
         test = self.test
         if name in test.best:
             return float(test.scan.statistics[test.best[name]])
-        return 2.0 * self.before.fit.walk_gain if name == test.walking else test.scores[name]
+        return 2.0 * self.before.fit.walk_gain if name == self.walk else test.scores[name]
 
     def _dof(self, name: str) -> int:
         return self.test.candidate(name).dof if name in self.test.best else 1
@@ -207,10 +208,10 @@ class Hypotheses:
 
     def _effects(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
         """Yield the rows of single effects."""
-        columns = {name: log for name, log in screened.items() if name != self.test.walking}
+        columns = {name: log for name, log in screened.items() if name != self.walk}
         least = max(columns.values(), default=0.0) - _WITHIN
         chosen = [name for name, log in columns.items() if log > least][: _MOST["effect"]]
-        for name in [*chosen, *([self.test.walking] if self.test.walking else [])]:
+        for name in [*chosen, *([self.walk] if self.walk else [])]:
             yield self._row((name,), self._prior("effect", len(screened)))
 
     def _pairs(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
@@ -222,9 +223,11 @@ class Hypotheses:
         likely = sorted(found, key=lambda names: -found[names])[: _MOST["pair"]]
         best = max(found.values(), default=0.0)
         chosen = [names for names in likely if found[names] > best - _WITHIN]
-        walk = self.test.walking
+        walk = self.walk
         if walk and self.before.fit.walk_gain > 0.0:
-            beside = Hypotheses(self.refits, self._refit((walk,)), self._assessed((walk,)))
+            walked = self._refit((walk,))
+            # in a frame of its own: that of the run without a walk is needed again, and only one is kept
+            beside = Hypotheses(self.refits, walked, assess_candidates(walked.fit, self.test.effective_tests))
             own = [name for name in beside._screened() if name in beside.test.best]
             chosen += [(name, walk) for name in own[: _MOST["walk"]]]
         for names in chosen:
@@ -252,19 +255,21 @@ class Hypotheses:
     def _formulas(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
         """Yield the rows of formulas that are no known effect, the likeliest of each driver."""
         known = [self.test.candidate(name).effect for name in self.test.best]
+        taken = [effect.name for effect in self.before.model.effects]
         drivers = dict[str, list[Formulas]]()
         for each in self.refits.families(self.before.fit, known):
             if each.rank and not each.known:
                 drivers.setdefault(each.driver, []).append(each)
         logs = {driver: self._over_members(own) for driver, own in drivers.items()}
-        best = max([log for name, log in screened.items() if name != self.test.walking], default=0.0)
+        best = max([log for name, log in screened.items() if name != self.walk], default=0.0)
         likely = sorted(drivers, key=lambda driver: -np.logaddexp.reduce(logs[driver]))[: _MOST["formula"]]
         for driver in likely:
             if logs[driver].max() < best - _WITHIN:
                 continue
             first = int(np.argmax(logs[driver]))
             share = float(np.logaddexp.reduce(logs[driver]) - logs[driver][first]) - math.log(len(logs[driver]))
-            row = self._row((), self._prior("formula", len(drivers)) + share, drivers[driver][first].formulas)
+            formulas = drivers[driver][first].formulas_beside(taken)
+            row = self._row((), self._prior("formula", len(drivers)) + share, formulas)
             yield replace(row, driver=driver, families=(NONE,))
 
     def _over_members(self, own: Sequence[Formulas]) -> Floats:
@@ -274,12 +279,12 @@ class Hypotheses:
     def _row(self, effects: tuple[str, ...], log_prior: float, formulas: tuple[str, ...] = ()) -> Hypothesis:
         """Return the row of effects or formulas, refitted and weighed."""
         refit = self._refit((*effects, *formulas))
-        found = self.evidence.of(refit.fit, walk=self.test.walking in effects)
+        found = self.evidence.of(refit.fit, walk=self.walk in effects)
         if not found:
             return Hypothesis(effects, formulas, log_evidence=-math.inf)
         logs = [own.log + self._log_share(effects, own.fall) for own in found]
         best: Weighed = found[int(np.argmax(logs))]
-        walks = self.test.walking in effects
+        walks = self.walk in effects
         return Hypothesis(
             effects, formulas, "", self._families(effects), float(np.logaddexp.reduce(logs)) + log_prior, best.fall,
             best.dof + walks, refit,
@@ -291,9 +296,6 @@ class Hypotheses:
 
     def _refit(self, added: Sequence[str]) -> Calibration:
         return self.refits.with_effects(self.before, added)
-
-    def _assessed(self, added: Sequence[str]) -> CandidateTests:
-        return self.refits.assess(self._refit(added), self.test.effective_tests)
 
     @staticmethod
     def _prior(kind: str, members: int) -> float:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,7 +76,12 @@ class Family:
     @property
     def formulas(self) -> tuple[str, ...]:
         """The formulas as they can be added to a model, each with a name."""
-        return tuple(_named(text, number) for number, text in enumerate(self.texts))
+        return self.formulas_beside(())
+
+    def formulas_beside(self, taken: Collection[str]) -> tuple[str, ...]:
+        """The formulas with names that are not taken, as those of the effects of a model are."""
+        first = next(k for k in itertools.count() if not {*_names(k, len(self.texts))} & {*taken})
+        return tuple(_named(text, first + number) for number, text in enumerate(self.texts))
 
     @property
     def dof(self) -> int:
@@ -179,9 +185,14 @@ def _tried(fitted: Fit, tests: FurtherEffects) -> list[Family]:
     return out
 
 
+def _names(first: int, count: int) -> list[str]:
+    """Return names for so many formulas: mine, mine2, mine3 ..."""
+    return [f"mine{number + 1}" if number else "mine" for number in range(first, first + count)]
+
+
 def _named(text: str, number: int = 0) -> str:
     """Return a formula with a name in front, from ``:z = sin(q1)`` or ``sin(q1)``."""
-    name = f"mine{number + 1}" if number else "mine"
+    (name,) = _names(number, 1)
     return f"{name}{text}" if text.startswith(":") else f"{name} = {text}"
 
 

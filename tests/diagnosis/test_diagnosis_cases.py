@@ -12,7 +12,7 @@ from helpers.hidden_effects import noisy_source as source
 from helpers.long_runs import slow
 from helpers.synthetic import Run, plan_of
 
-from kf_calib.diagnosis.candidate_tests import EQUAL, assess_candidates
+from kf_calib.diagnosis.candidate_tests import assess_candidates
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
@@ -121,7 +121,7 @@ def test_one_cycle_a_run_is_not_told_from_what_the_temperature_does() -> None:
 def test_pairs_that_explain_as_much_as_a_single_effect_are_said() -> None:
     both = diagnose(source("thermal-bias=12sigma", "thermal-rate=12sigma"))
     assert {"thermal-bias", "thermal-rate"} <= set(both.ambiguity), both.verdict
-    assert ("thermal-bias", "thermal-rate") in both.together and "thermal-rate together" in both.verdict
+    assert {"thermal-bias", "thermal-rate"} in map(set, both.together) and "thermal-rate" in both.verdict
 
 
 def test_what_the_run_has_no_sight_of_is_said() -> None:
@@ -282,8 +282,8 @@ def test_scatter_of_more_than_is_stated_is_no_effect(
     named = [each for each in noticed if each.missing]
     assert len(noticed) > len(found) / 3 and len(named) < len(noticed)
     assert all("scatter from dwell to dwell larger than stated" in each.verdict for each in named)
-    said = [each.description for each in noticed if each.unknown]
-    assert sum(each is not None and each.driver == IRREGULAR for each in said) > 0.5 * len(said)
+    rows = [each.likeliest for each in noticed if not each.missing]
+    assert sum(row is not None and not row.formulas for row in rows) > 0.5 * len(rows)
 
 
 @pytest.mark.parametrize("name", ["second-order", *slow("scale-drift", "thermal-bias", "bias-asymmetry")])
@@ -316,7 +316,7 @@ def test_a_bias_that_goes_to_and_fro_is_no_walk(seeds: range) -> None:
 def test_a_walk_rarely_looks_as_if_it_came_back(runs: int) -> None:
     walks = [run("bias-walk=15sigma", seed=seed, dwells=24) for seed in range(runs)]
     gains = [2.0 * Refits().with_effects(each, ("bias-walk",)).fit.back_gain[0] for each in walks]
-    assert sum(gain > EQUAL for gain in gains) <= runs // 24
+    assert sum(gain > 6.63 for gain in gains) <= runs // 24
     assert sum(gain > 0.5 for gain in gains) > runs // 12  # they do differ
 
 

@@ -10,8 +10,8 @@ from helpers.hidden_effects import noisy_run, run
 from helpers.synthetic import Run, plan_of
 from scipy.stats import binom, chi2, f
 
-from kf_calib.diagnosis.detectability import QUIET, sensor_grade
 from kf_calib.diagnosis.candidate_tests import overlap_matrix
+from kf_calib.diagnosis.detectability import QUIET, sensor_grade
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.residual_drivers import (

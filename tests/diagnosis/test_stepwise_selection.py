@@ -88,7 +88,7 @@ def test_nothing_is_added_to_noise(quiet: Calibration) -> None:
 
 def test_the_unknown_stops_it() -> None:
     state = improve(source("encoder-harmonic-3:z=20sigma"))
-    assert state.because == "unknown" and not state.steps and "unknown" in state.reason
+    assert state.because == "unknown" and not state.steps and "Unknown" in state.reason
 
 
 def test_equal_explanations_are_left_to_a_person() -> None:

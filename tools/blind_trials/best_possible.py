@@ -19,8 +19,8 @@ import numpy as np
 from scipy.special import gammaln
 from scipy.stats import vonmises_fisher
 
+from blind_trials.known_size import log_odds
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis import bayes_factor
 
 _NEAR = 12.0  # in the logarithm of the odds: a pair that lags by more is never the likeliest
 _DRAWN = 400  # directions, for the mean over them
@@ -35,7 +35,7 @@ class Sphere:
 
     def log_odds(self, readings: Floats, sigmas: float) -> Floats:
         """Return the log of the mean likelihood ratio (m,) of the signals against none, for readings (m, d)."""
-        return bayes_factor.log_odds(self.basis.shape[1], np.sum((readings @ self.basis) ** 2, axis=1), sigmas)
+        return log_odds(self.basis.shape[1], np.sum((readings @ self.basis) ** 2, axis=1), sigmas)
 
     def spread(self, sigmas: float) -> Floats:
         """Return the root (d, k) of the covariance of normal signals of the same mean square."""

@@ -1,9 +1,4 @@
-"""Bayes factor of an effect whose coefficients may point in any direction.
-
-The fall of chi-squared of an effect belongs to the best direction of its coefficients and to the best value of its
-constant. The likelihood of a random walk, in contrast, is averaged over all paths. To compare the two fairly, the
-likelihood of the effect is averaged over its directions and values, too.
-"""
+"""Odds of an effect of known size, whose coefficients may point in any direction."""
 
 from __future__ import annotations
 
@@ -30,17 +25,3 @@ def log_odds(dof: int, falls: Floats | float, sigmas: float) -> Floats:
     order, x = 0.5 * dof - 1.0, sigmas * np.sqrt(np.maximum(falls, _LEAST))
     bessel = np.where(x < _LARGE, ive(order, np.minimum(x, _LARGE)), 1.0 / np.sqrt(2.0 * np.pi * x))
     return gammaln(0.5 * dof) + order * np.log(2.0 / x) + np.log(bessel) + x - 0.5 * sigmas**2
-
-
-def as_fall(dofs: Floats, falls: Floats, tried: int = 1) -> float:
-    """Twice the log of the Bayes factor of an effect at its likeliest size, averaged over the values of its constant.
-
-    This is the fall of chi-squared by which the effect may be compared with a likelihood that has nothing left to
-    choose, such as that of a random walk.
-
-    dofs, falls (values,): degrees of freedom and fall of chi-squared at each value of the constant. tried: number of
-    values of which these are the best, where more were tried than are given.
-    """
-    sigmas = float(np.sqrt(max((falls - dofs).max(), 1.0)))
-    parts = [log_odds(int(dof), fall, sigmas) for dof, fall in zip(dofs, falls, strict=True)]
-    return 2.0 * float(np.logaddexp.reduce(parts) - np.log(max(len(parts), tried)))

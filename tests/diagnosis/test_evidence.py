@@ -1,0 +1,104 @@
+"""The evidence of an explanation, against integrals computed in other ways."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.hidden_effects import run
+from helpers.synthetic import plan_of
+from scipy.special import logsumexp
+from scipy.stats import chi2, multivariate_normal
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.evidence import Evidence, size_evidence
+from kf_calib.diagnosis.refits import Refits
+from kf_calib.estimation.noise_model import mean_covariances
+from kf_calib.estimation.results import Calibration
+
+
+@pytest.mark.parametrize("dof", [1, 3, 6])
+def test_noise_gives_an_effect_a_bayes_factor_of_one_on_average(dof: int) -> None:
+    """As any two likelihoods do; the average is over chi-squared with nothing missing, on a logarithmic scale."""
+
+    falls = np.exp(np.linspace(-30.0, 36.0, 200_000))
+    own = np.exp(chi2.logpdf(falls, dof) + size_evidence(dof, falls)) * falls
+    assert np.trapezoid(own, np.log(falls)) == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("dof", [1, 3])
+def test_a_size_is_averaged_over_its_prior(dof: int) -> None:
+    """Against the density of k readings with the variance 1 + g, for sizes ln g drawn evenly."""
+    readings = np.linspace(2.0, 5.0, dof)
+    logs = np.linspace(0.0, np.log(1e14), 20_000)
+    own = [multivariate_normal.logpdf(readings, cov=(1.0 + g) * np.eye(dof)) for g in np.exp(logs)]
+    none = multivariate_normal.logpdf(readings, cov=np.eye(dof))
+    expected = logsumexp(own) - np.log(len(own)) - none
+    assert float(size_evidence(dof, float(readings @ readings))) == pytest.approx(expected, abs=0.05)
+
+
+@pytest.fixture(scope="module")
+def before() -> Calibration:
+    """A run with an effect of 10 sigma, in which scatter is not stated."""
+    found = run("second-order=10sigma", plan=plan_of(18, dwell_s=8.0, seed=3))
+    return Refits().of(replace(found, bench=replace(found.bench, scatter_sigma_mps2=None)), ())
+
+
+def _dense(result: Calibration, scatter_mps2: float) -> tuple[Floats, Floats]:
+    """Whitened columns and readings of the means of dwells, by a dense Cholesky factor of each dwell."""
+    noise = replace(result.noise, scatter_mps2=np.full(3, scatter_mps2), walk_mps2_per_sqrt_s=0.0)
+    means = result.carried.means
+    lower = np.linalg.cholesky(mean_covariances(noise, means, result.carried.state))
+    columns = np.linalg.solve(lower, np.concatenate([means.design, means.readings[:, :, None]], axis=2))
+    flat = columns.reshape(-1, columns.shape[2])
+    return flat[:, :-1], flat[:, -1]
+
+
+def _left(columns: Floats, readings: Floats) -> float:
+    """Chi-squared that columns leave."""
+    scaled = columns / np.linalg.norm(columns, axis=0)
+    return float(np.sum((readings - scaled @ np.linalg.lstsq(scaled, readings, rcond=1e-12)[0]) ** 2))
+
+
+def test_falls_are_those_of_dense_least_squares(before: Calibration) -> None:
+    """The effect shows in the means of dwells alone, where dense least squares sees it, too."""
+    refit = Refits().with_effects(before, ("second-order",))
+    for own in Evidence(before.fit).of(refit.fit):
+        scatter = dict(zip(own.parts, own.sizes, strict=True)).get("common", 0.0)
+        if "setting" in own.parts:
+            continue
+        fall = _left(*_dense(before, scatter)) - _left(*_dense(refit, scatter))
+        assert own.fall == pytest.approx(fall, rel=2e-3) and own.dof == 3
+
+
+def test_scatter_of_unknown_size_is_averaged_out(before: Calibration) -> None:
+    """Against a sum over a grid of sizes, with a flat prior of their logarithm over a factor of 1e4."""
+    found = {own.parts: own for own in Evidence(before.fit).of()}
+    own, still = found["common",], found[()]
+
+    def likelihood(scatter: float) -> float:
+        columns, readings = _dense(before, scatter)
+        noise = replace(before.noise, scatter_mps2=np.full(3, scatter), walk_mps2_per_sqrt_s=0.0)
+        spread = mean_covariances(noise, before.carried.means, before.carried.state)
+        unit = before.carried.means.design.reshape(-1, columns.shape[1])
+        basis = np.linalg.svd(unit / np.linalg.norm(unit, axis=0), full_matrices=False)[2].T
+        scaled = columns / np.linalg.norm(unit, axis=0) @ basis
+        _, log_det = np.linalg.slogdet(scaled.T @ scaled)
+        return float(-0.5 * (np.linalg.slogdet(spread)[1].sum() + log_det + _left(columns, readings)))
+
+    sizes = np.geomspace(own.sizes[0] / 100.0, own.sizes[0] * 100.0, 201)
+    grid = logsumexp([likelihood(size) for size in sizes]) - np.log(len(sizes))
+    assert own.log - still.log == pytest.approx(grid - likelihood(0.0), abs=0.15)
+
+
+def test_an_effect_that_is_there_beats_one_that_is_not(before: Calibration) -> None:
+    refits, evidence = Refits(), Evidence(before.fit)
+
+    def log(name: str) -> float:
+        return float(logsumexp([own.log for own in evidence.of(refits.with_effects(before, (name,)).fit)]))
+
+    none = float(logsumexp([own.log for own in evidence.of()]))
+    assert log("second-order") > none + 10.0 > log("hysteresis") + 8.0
+    walk = refits.with_effects(before, ("bias-walk",))
+    assert logsumexp([own.log for own in evidence.of(walk.fit, walk=True)]) < log("second-order") - 10.0

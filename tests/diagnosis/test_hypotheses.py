@@ -1,0 +1,89 @@
+"""The table of hypotheses: its rows, their probabilities, and what the diagnosis makes of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.hidden_effects import run, source
+from helpers.synthetic import plan_of
+
+from kf_calib.diagnosis.hypotheses import NOTHING, Hypothesis, log_odds_of, table_of
+from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.effects import effect_named, names
+from kf_calib.views.diagnosis import diagnosis_object
+
+FAMILIES = {
+    "bias in time", "scale in time", "temperature", "nonlinearity", "cross-axis", "memory", "gimbal and encoder",
+    "base and platform", "surroundings", "slews", "unstated noise", "none of the known", "nothing",
+}  # fmt: skip
+
+
+def rows() -> list[Hypothesis]:
+    """Four rows with probabilities in the ratios 80 : 15 : 4 : 1."""
+    shares = [(("a", "b"), 0.15), (("a",), 0.80), ((), 0.01), (("c",), 0.04)]
+    return [
+        Hypothesis(effects, families=("memory",) if effects else (NOTHING,), log_evidence=float(np.log(share)) - 900.0)
+        for effects, share in shares
+    ]
+
+
+def test_probabilities_are_evidence_over_the_sum_of_all() -> None:
+    table = table_of(rows())
+    assert [row.probability for row in table.rows] == pytest.approx([0.80, 0.15, 0.04, 0.01])
+    assert table.first.effects == ("a",) and table.probability(["a"]) == pytest.approx(0.95)
+    assert table.probability(["a", "b"]) == pytest.approx(0.15)
+    assert table.families == pytest.approx({"memory": 0.99, NOTHING: 0.01})
+
+
+def test_rivals_do_not_only_add_to_the_first() -> None:
+    assert [row.effects for row in table_of(rows()).rivals] == [("c",)]
+    few = table_of(row for row in rows() if row.effects != ("c",))
+    assert not few.rivals
+
+
+def test_odds_of_a_p_value() -> None:
+    """The bound of Sellke, Bayarri and Berger for p = 0.05 is 1 : 2.46, and none above 1/e."""
+    assert np.exp(log_odds_of(0.05)) == pytest.approx(2.456, abs=1e-3)
+    assert log_odds_of(0.5) == 0.0 and np.isfinite(log_odds_of(0.0))
+
+
+def test_every_effect_has_a_family() -> None:
+    bench = run().bench
+    assert {effect_named(name, bench).family for name in names(bench)} <= FAMILIES - {"none of the known"}
+
+
+def test_an_effect_far_above_the_noise_is_sure_and_its_family_too() -> None:
+    found = diagnose(run("encoder-harmonic-1:z=15sigma"))
+    said = diagnosis_object(found)
+    first = said["hypotheses"][0]
+    assert first["effects"] == ["encoder-harmonic-1:z"] and first["formula"] is None
+    assert said["families"][0] == {"family": "gimbal and encoder", "probability": pytest.approx(1.0, abs=0.02)}
+    assert sum(row["probability"] for row in said["hypotheses"]) == pytest.approx(1.0)
+    assert found.sure and "Missing: encoder-harmonic-1:z" in found.verdict
+    odds = [row["log10_odds_to_next"] for row in said["hypotheses"][:-1]]
+    ratios = [a["probability"] / b["probability"] for a, b in zip(said["hypotheses"], said["hypotheses"][1:])]
+    assert np.log10(ratios[:3]) == pytest.approx(odds[:3])
+    assert {row["family"] for row in said["families"]} <= FAMILIES
+
+
+def test_where_names_share_it_the_family_comes_first() -> None:
+    """A quadratic and an asymmetry of the scale factor overlap almost wholly."""
+    found = diagnose(run("scale-asymmetry=9sigma"))
+    assert set(found.ambiguity) >= {"scale-asymmetry", "second-order"}
+    assert "The accelerometer is not linear (" in found.verdict or found.sure
+    assert found.table is not None and found.table.families["nonlinearity"] > 0.95
+
+
+def test_nothing_is_likeliest_in_noise() -> None:
+    found = diagnose(run())
+    assert found.table is not None and found.table.rows[0].families == (NOTHING,)
+    assert found.table.rows[0].probability > 0.5 and found.likeliest is None
+    assert diagnosis_object(found)["missing"] is None
+
+
+def test_a_formula_is_told_where_no_known_effect_explains_it() -> None:
+    said = diagnosis_object(diagnose(source("encoder-harmonic-3:z=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5))))
+    first = said["hypotheses"][0]
+    assert said["missing"] == "unknown" and not first["effects"] and "sin(3*q" in first["formula"]
+    assert said["unknown"]["formula"] == first["formula"] and said["unknown"]["driver"] == first["driver"]
+    assert said["families"][0]["family"] == "none of the known"
