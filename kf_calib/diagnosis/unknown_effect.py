@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -36,6 +37,13 @@ ARRIVAL = "time since arrival"
 PERIODIC = "time (periodic)"
 IRREGULAR = "nothing that was recorded (irregular from dwell to dwell)"
 WITHIN = "time (irregular, within dwells too)"
+
+
+_CLASSES = (
+    (ARRIVAL, "memory"), ("previous orientation", "memory"), ("time", "bias in time"), ("temperature", "temperature"),
+    ("rate of temperature", "temperature"),
+)  # fmt: skip
+"""How the drivers of formulas begin, and the physical class of effects to which these belong."""
 
 
 @dataclass(frozen=True)
@@ -89,9 +97,16 @@ class Family:
         return self.rank + (self.rank > 0 and self.driver in (JUMP, DECAY, ARRIVAL, PERIODIC))
 
     @property
-    def of_time(self) -> bool:
-        """Whether the family depends on time."""
-        return self.driver.startswith("time")
+    def family(self) -> str:
+        """The physical class of effects to which such formulas belong; "" where there is none."""
+        if self.driver.startswith("angle"):
+            return "gimbal and encoder" if all(text[0] == ":" for text in self.texts) else ""
+        if self.driver.startswith("specific force"):
+            across = any(re.search(r"\b[po]\b", text) for text in self.texts)
+            return "cross-axis" if across else "nonlinearity"
+        if self.texts[0].startswith(":base") and self.driver == "time":
+            return "base and platform"
+        return next(family for start, family in _CLASSES if self.driver.startswith(start))
 
     @property
     def score(self) -> float:

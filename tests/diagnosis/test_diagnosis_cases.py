@@ -16,7 +16,7 @@ from kf_calib.diagnosis.candidate_tests import assess_candidates
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.unknown_effect import IRREGULAR, JUMP
+from kf_calib.diagnosis.unknown_effect import JUMP
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import GRADES

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from helpers.hidden_effects import run, source
@@ -61,7 +63,7 @@ def test_an_effect_far_above_the_noise_is_sure_and_its_family_too() -> None:
     assert sum(row["probability"] for row in said["hypotheses"]) == pytest.approx(1.0)
     assert found.sure and "Missing: encoder-harmonic-1:z" in found.verdict
     odds = [row["log10_odds_to_next"] for row in said["hypotheses"][:-1]]
-    ratios = [a["probability"] / b["probability"] for a, b in zip(said["hypotheses"], said["hypotheses"][1:])]
+    ratios = [a["probability"] / b["probability"] for a, b in itertools.pairwise(said["hypotheses"])]
     assert np.log10(ratios[:3]) == pytest.approx(odds[:3])
     assert {row["family"] for row in said["families"]} <= FAMILIES
 
@@ -86,4 +88,4 @@ def test_a_formula_is_told_where_no_known_effect_explains_it() -> None:
     first = said["hypotheses"][0]
     assert said["missing"] == "unknown" and not first["effects"] and "sin(3*q" in first["formula"]
     assert said["unknown"]["formula"] == first["formula"] and said["unknown"]["driver"] == first["driver"]
-    assert said["families"][0]["family"] == "none of the known"
+    assert {row["family"] for row in said["families"][:2]} == {"gimbal and encoder", "none of the known"}
