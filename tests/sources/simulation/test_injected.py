@@ -172,9 +172,6 @@ def test_thermal_hysteresis_lags_behind_every_turn_by_its_play():
     found = contribution("thermal-hysteresis=1e-3,0,0;play=1", [(0, 0, 0)], dwell_s=720.0, ambient=swing)[:, 0]
     true = 4.0 * np.sin(np.radians(np.arange(720.0)))
     rising, falling = np.arange(15, 91), np.arange(151, 271)
-        np.arange(15, 91),
-        np.arange(210 - 30 + 30, 271),
-    )  # below sin = -1/2 it is 1 K above on the way down
     np.testing.assert_allclose(found[:14], 0.0, atol=1e-12)
     np.testing.assert_allclose(found[rising], 1e-3 * (true[rising] - 1.0), atol=1e-12)
     np.testing.assert_allclose(found[90:150], 1e-3 * 3.0, atol=1e-12)
