@@ -16,6 +16,7 @@ _HELD = 2.5  # cycles in a piece, of which its parabola holds a fourteenth of th
 class BiasDrift(SensorEffect):
     """beta t, t since the first sample."""
 
+    family = "bias in time"
     name, title, source = "bias-drift", "bias that drifts with time", "IEEE Std 1293, drift"
     confused_with = "warm-up; a monotone order of poses mixes it with angle"
     symbol, unit, scale = "beta", "m/s^3", 1e-6
@@ -28,6 +29,7 @@ class BiasDrift(SensorEffect):
 class ScaleDrift(SensorEffect):
     """kappa t a_i."""
 
+    family = "scale in time"
     name, title, source = "scale-drift", "scale factor that drifts with time", "IEEE Std 1293, drift"
     confused_with = "base-tilt-drift"
     symbol, unit, scale = "kappa", "1/s", 1e-7
@@ -40,6 +42,7 @@ class ScaleDrift(SensorEffect):
 class Hysteresis(SensorEffect):
     """h sgn(Delta a_i), Delta a_i the last step of the input."""
 
+    family = "memory"
     name, title, source = "hysteresis", "reading that depends on the side it was come from", "IEEE Std 1293, hysteresis"
     confused_with = "needs the same pose from two sides"
     symbol, unit, scale = "h", "m/s^2", 1e-3
@@ -60,6 +63,7 @@ class _Decay(SensorEffect):
 class WarmUp(_Decay):
     """B exp(-t / tau), t since the first sample."""
 
+    family = "bias in time"
     name, title, source = "warm-up", "bias that settles after switching on", "IEEE Std 1293, turn-on transient"
     confused_with = "bias-drift; needs an early long dwell"
     symbol, unit, scale = "B", "m/s^2", 1e-2
@@ -73,6 +77,7 @@ class WarmUp(_Decay):
 class Settling(_Decay):
     """C Delta a_i exp(-tau / tau_0), tau since the arrival in the dwell, Delta a_i the last step of the input."""
 
+    family = "memory"
     name, title, source = "settling", "creep after a change of the input", "IEEE Std 1293, settling"
     confused_with = "shows in early against late samples of a dwell"
     symbol, unit, scale = "C", "1", 1e-3
@@ -91,6 +96,7 @@ class Sinusoid(Effect):
     In a piece of a dwell it is the parabola nearest to it, so that one of a cycle or two a piece is still seen.
     """
 
+    family = "surroundings"
     name, title, source = "sinusoid", "oscillation of one frequency", "Peterson, USGS OFR 93-322 (microseism); mains"
     confused_with = "slower than a dwell: bias-drift, thermal effects"
     unknown = Unknown("fSin", "Hz", 1e-6, 1e5, "Hz", 1.0)
@@ -147,6 +153,7 @@ def _parts(s: Stimulus, wave: NDArray[np.complex128]) -> tuple[Floats, Floats]:
 class BiasWalk(Effect):
     """The integral of white noise in each bias: no column, but process noise of the filter."""
 
+    family = "bias in time"
     name, title, source = "bias-walk", "bias that walks at random", "IEEE Std 1293, annex on Allan variance"
     confused_with = "bias-drift; scatter from dwell to dwell"
     intensity = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5)

@@ -12,6 +12,7 @@ from kf_calib.effects.stimulus import Stimulus
 class Latency(Effect):
     """-tau_d da_i/dt, for the block as a whole: a reading stamped t is what was true at t - tau_d."""
 
+    family = "slews"
     name, title, source = "latency", "delay of the readings", "acquisition chain"
     confused_with = "seen in slews only"
     dynamic = True
@@ -27,6 +28,7 @@ class Latency(Effect):
 class LeverArm(Effect):
     """K_i E_i . (omega x (omega x r_i) + domega/dt x r_i), r_i the place of accelerometer i in the platform."""
 
+    family = "slews"
     name, title, source = "lever-arm", "place of each accelerometer", "rigid-body kinematics"
     confused_with = "seen in slews only, about several axes"
     dynamic = True

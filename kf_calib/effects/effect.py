@@ -105,7 +105,7 @@ class Effect(ABC):
     formulas: what an accelerometer reads more per unit of each coefficient that it has, where that depends on specific
     force and temperature alone: of a, p, o (along its axes), before, after (readings of the two other accelerometers,
     in their order), T and the constant. Empty where it cannot be written so.
-    typical: usual sizes of its coefficients.
+    typical: usual sizes of its coefficients. family: the physical class to which it belongs.
     """
 
     name: ClassVar[str]
@@ -121,6 +121,7 @@ class Effect(ABC):
     step: ClassVar[float] = 1e-4
     formulas: ClassVar[tuple[str, ...]] = ()
     typical: ClassVar[Typical] = Typical()
+    family: ClassVar[str] = "none of the known"
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""
     value: float = 0.0

@@ -15,6 +15,7 @@ from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 class BaseTilt(FrameEffect):
     """A base turned by (delta_N, delta_E): the specific force turns the other way in it."""
 
+    family = "base and platform"
     name, title, source = "base-tilt", "tilt of the base", "IEEE Std 836, base motion"
     confused_with = "about the outer axis it is the outer encoder's zero"
     typical = Typical((5e-6, 500e-6))
@@ -51,6 +52,7 @@ class BaseTiltDrift(BaseTilt):
 class PlatformDrift(FrameEffect):
     """The platform turned by omega_d t, three rates in its own frame."""
 
+    family = "base and platform"
     name, title, source = "platform-drift", "drift of the platform", "IEEE Std 836"
     typical = Typical((np.radians(0.01) / 3600, np.radians(1.0) / 3600))
 
@@ -68,6 +70,7 @@ class EarthRotation(FrameEffect):
     The coefficient is the share of the Earth's rate, 1 where the platform is truly inertial.
     """
 
+    family = "base and platform"
     name, title, source = "earth-rotation", "rotation of the Earth", "IEEE Std 836; WGS 84 rate"
     confused_with = "platform-drift"
     typical = Typical((1.0, 1.0), (1.0, 1.0))
@@ -83,6 +86,7 @@ class EarthRotation(FrameEffect):
 class Flexure(FrameEffect):
     """The platform turns by f x d under the torque of gravity, d the compliance times the offset of its mass."""
 
+    family = "base and platform"
     name, title, source = "flexure", "bending under the torque of gravity", "IEEE Std 836"
     confused_with = "encoder-harmonic-1, cross-coupling"
     typical = Typical((5e-6 / STANDARD_GRAVITY_MPS2, 100e-6 / STANDARD_GRAVITY_MPS2))
@@ -98,6 +102,7 @@ class Flexure(FrameEffect):
 class CrossTalk(Effect):
     """X_ij A_j: a share of another accelerometer's reading; at rest a misalignment, and so always invisible."""
 
+    family = "cross-axis"
     name, title, source = "cross-talk", "a share of another channel's reading", "IEEE Std 1293"
     formulas = ("before", "after")
     confused_with = "misalignment, always at rest"
@@ -125,6 +130,7 @@ def about_axis(s: Stimulus, gimbal: int) -> Floats:
 class _GimbalEffect(FrameEffect):
     """An effect of one gimbal, named by its letter or number after the colon."""
 
+    family = "gimbal and encoder"
     def __init__(self, gimbal: int, variant: str) -> None:
         self.gimbal, self.variant = gimbal, variant
 
@@ -212,6 +218,7 @@ class AxisNonorthogonality(_GimbalEffect):
 class GravityError(Effect):
     """epsilon f in all channels: always a common scale factor, and so always invisible."""
 
+    family = "base and platform"
     name, title, source = "gravity-error", "wrong local gravity", "IEEE Std 836"
     confused_with = "a common scale factor, always"
     typical = Typical((10e-6, 700e-6))

@@ -16,6 +16,7 @@ _EDGES = 500
 class BiasAsymmetry(SensorEffect):
     """1/2 K0' sgn a_i."""
 
+    family = "nonlinearity"
     name, title, source = "bias-asymmetry", "bias that changes sign with the input", IEEE
     formulas = ("0.5*sign(a)",)
     confused_with = "odd-quadratic; invisible in six faces"
@@ -29,6 +30,7 @@ class BiasAsymmetry(SensorEffect):
 class ScaleAsymmetry(SensorEffect):
     """1/2 K1' |a_i|."""
 
+    family = "nonlinearity"
     name, title, source = "scale-asymmetry", "scale factor that differs with the sign of the input", IEEE
     formulas = ("0.5*abs(a)",)
     confused_with = "second-order"
@@ -42,6 +44,7 @@ class ScaleAsymmetry(SensorEffect):
 class SecondOrder(SensorEffect):
     """K2 a_i^2."""
 
+    family = "nonlinearity"
     name, title, source = "second-order", "second-order nonlinearity", IEEE
     formulas = ("a**2",)
     confused_with = "scale-asymmetry"
@@ -55,6 +58,7 @@ class SecondOrder(SensorEffect):
 class ThirdOrder(SensorEffect):
     """K3 a_i^3."""
 
+    family = "nonlinearity"
     name, title, source = "third-order", "third-order nonlinearity", IEEE
     formulas = ("a**3",)
     confused_with = "odd-quadratic; invisible in six faces"
@@ -74,6 +78,7 @@ class ThirdOrder(SensorEffect):
 class OddQuadratic(SensorEffect):
     """Koq a_i |a_i|."""
 
+    family = "nonlinearity"
     name, title, source = "odd-quadratic", "odd quadratic nonlinearity", IEEE
     formulas = ("a*abs(a)",)
     confused_with = "third-order; invisible in six faces"
@@ -85,6 +90,7 @@ class OddQuadratic(SensorEffect):
 
 
 class _CrossCoupling(SensorEffect):
+    family = "cross-axis"
     source, confused_with = IEEE, "seen in poses between the faces only"
     unit, scale = "s^2/m", 1e-4
     typical = Typical((1 * MICRO_PER_G, 30 * MICRO_PER_G), (0.0, MILLI_PER_G))
@@ -135,6 +141,7 @@ class CrossAxisSquare(_CrossCoupling):
 class VibrationRectification(SensorEffect):
     """K2v <v^2>, <v^2> the variance of the readings about here."""
 
+    family = "surroundings"
     name, title, source = "vibration-rectification", "shift of the bias under vibration", IEEE
     confused_with = "needs vibration that varies"
     averages = True
@@ -148,6 +155,7 @@ class VibrationRectification(SensorEffect):
 class DeadZone(SensorEffect):
     """-a_i where |a_i| < d: a share of 1 is a reading that stays where it is over the whole zone."""
 
+    family = "nonlinearity"
     name, title, source = "dead-zone", "no response to small inputs", IEEE
     formulas = ("-a*(abs(a) < constant)",)
     confused_with = "needs poses that sweep through zero"

@@ -15,6 +15,7 @@ class Magnetic(Effect):
     The vertical part is along gravity, and so a scale factor.
     """
 
+    family = "surroundings"
     name, title, source = "magnetic", "response to the local magnetic field", "IEEE Std 1293, magnetic sensitivity"
     confused_with = "needs turns about the vertical"
     typical = Typical((1 * 0.2 * MICRO_G, 20 * 0.2 * MICRO_G))  # 1 to 20 ug/G in a horizontal field of 0.2 G

@@ -14,6 +14,7 @@ IEEE = "IEEE Std 1293, environmental sensitivities"
 class ThermalBias(SensorEffect):
     """alpha T."""
 
+    family = "temperature"
     name, title, source = "thermal-bias", "bias that follows the temperature", IEEE
     formulas = ("T",)
     confused_with = "needs a temperature swing"
@@ -27,6 +28,7 @@ class ThermalBias(SensorEffect):
 class ThermalBias2(SensorEffect):
     """alpha_2 T^2."""
 
+    family = "temperature"
     name, title, source = "thermal-bias-2", "bias that follows the square of the temperature", IEEE
     formulas = ("T**2",)
     symbol, unit, scale = "alpha2_", "m/s^2/K^2", 1e-4
@@ -38,6 +40,7 @@ class ThermalBias2(SensorEffect):
 class ThermalScale(SensorEffect):
     """alpha_s T a_i."""
 
+    family = "temperature"
     name, title, source = "thermal-scale", "scale factor that follows the temperature", IEEE
     formulas = ("T*a",)
     confused_with = "needs both signs of the input at two temperatures"
@@ -51,6 +54,7 @@ class ThermalScale(SensorEffect):
 class ThermalRate(SensorEffect):
     """kappa dT/dt."""
 
+    family = "temperature"
     name, title, source = "thermal-rate", "bias that follows the rate of the temperature", IEEE
     confused_with = "warm-up"
     symbol, unit, scale = "kappaT", "m s^-1/K", 1e-1
@@ -63,6 +67,7 @@ class ThermalRate(SensorEffect):
 class ThermalMisalignment(Effect):
     """gamma_p T a_p + gamma_o T a_o."""
 
+    family = "temperature"
     name, title, source = "thermal-misalignment", "alignment that follows the temperature", IEEE
     formulas = ("T*p", "T*o")
     typical = Typical((0.1e-6, 10e-6))
@@ -82,6 +87,7 @@ class ThermalMisalignment(Effect):
 class ThermalLag(SensorEffect):
     """alpha L, tau dL/dt = T - L: the sensor follows the thermometer late, in balance at the first sample."""
 
+    family = "temperature"
     name, title, source = "thermal-lag", "bias that follows the temperature late", IEEE
     confused_with = "thermal-bias and thermal-rate together"
     symbol, unit, scale = "alphaL", "m/s^2/K", 1e-3

@@ -225,7 +225,7 @@ def loose_mount(play: Floats, rig: Rig) -> Step:
     the part of gravity's direction along the axis that follows j, z a standard normal number, the friction: it rests
     between two stops, mostly near the one that gravity pulls it to."""
     angles_rad, count = rig.motion.angles_rad, len(rig.motion.angles_rad)
-    upward = carried_by_earth(rig.bench, np.array([[0.0, 1.0, 0.0]]), rig.motion.arrive_ns * 1e-9)
+    upward = carried_by_earth(rig.bench, np.array([[0.0, 1.0, 0.0]]), np.multiply(rig.motion.arrive_ns, 1e-9))
     pull = rotate(attitude(rig.axes, angles_rad, rig.bench.up).inv(), upward)[:, [1, 2, 0]]
     friction = rig.generator("loose-mount").standard_normal((count, 3))
     return SettingError(play * np.clip(pull + friction, -1.0, 1.0))
