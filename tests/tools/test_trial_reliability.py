@@ -98,11 +98,12 @@ def test_what_is_outside_the_catalogue_is_unknown_or_noise_and_has_a_family() ->
     unstated = {"figure": "unstated-outside", "options": NOISES["unstated"]}
     found = by_name([made("unknown", BIAS, BIAS), made("warm", BIAS, BIAS), made("noise", NOISE, NOISE),
                      made("unknown", NONE, NONE), made("noise", BIAS, NOISE), made(None, NOISE, NOISE),
+                     made("one", BIAS, BIAS, names=("two", "one"), alike=(("one", "two"),)),
                      made(None, NOISE, NOISE, **unstated), made("warm", NONE, BIAS, **unstated)])  # fmt: skip
-    assert found["outside the catalogue, n = 15: unknown"].value == pytest.approx(3 / 6)
-    assert found["outside the catalogue: a wrong name"].value == pytest.approx(1 / 6)
-    assert found["outside the catalogue: family right, of those that belong to one"].value == pytest.approx(4 / 5)
-    assert found[f"outside the catalogue: family right, worst effect: of {BIAS}"].value == pytest.approx(2 / 3)
+    assert found["outside the catalogue, n = 15: unknown"].value == pytest.approx(4 / 7)
+    assert found["outside the catalogue: a wrong name"].value == pytest.approx(1 / 7)
+    assert found["outside the catalogue: family right, of those that belong to one"].value == pytest.approx(5 / 6)
+    assert found[f"outside the catalogue: family right, worst effect: of {BIAS}"].value == pytest.approx(3 / 4)
     assert found["nothing stated, outside the catalogue, n = 15: unknown"].value == 0.5
     assert found["nothing stated, outside the catalogue: a wrong name"].value == 0.5
     assert found["nothing stated, outside the catalogue: family right, of those that belong to one"].count == 1

@@ -24,7 +24,7 @@ def confusion(outcomes: Sequence[Outcome], figure: str | None = None) -> dict[st
             continue
         if figure in (None, each.task.figure):
             true = each.truth[0] if each.truth else "(nothing)"
-            right = each.right or (each.task.family in OUTSIDE and each.unknown_right)
+            right = each.right or (each.task.family in OUTSIDE and each.outside_right)
             said = true if right else "(refused)" if each.refused else each.first or "(nothing)"
             out.setdefault(true, Counter())[said] += 1
     return out

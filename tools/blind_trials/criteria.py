@@ -39,7 +39,7 @@ def is_failure(each: Outcome) -> bool:
     if family in ("noise", "plans", "benches") and not each.truth:
         return is_alarm(each)
     if family in OUTSIDE:
-        told = each.unknown_right and (each.first != "unknown" or is_driver_right(each))
+        told = each.outside_right and (each.first != "unknown" or is_driver_right(each))
         return not close and not told
     return {
         "name": not each.right, "unstated": not each.right, "plans": each.wrong, "benches": each.wrong,

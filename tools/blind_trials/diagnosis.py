@@ -36,7 +36,7 @@ def diagnose_trial(task: Task) -> Outcome:
     with cpu_time(times, "judge"):
         given = {*names, *said["ambiguity_set"], *itertools.chain.from_iterable(likely)}
         same = equivalent_names(task, path, effects, given)
-        alike = exact_sets(task, outside[0], likely) if len(effects) == len(outside) == 1 else ()
+        alike = exact_sets(task, outside[0], [*likely, names]) if len(effects) == len(outside) == 1 else ()
     return Outcome(
         task, tuple(effect["name"] for effect in effects), missing, names, tuple(said["ambiguity_set"]), same,
         said["consistent"], said["p_value"], tuple(said["invisible"]),

@@ -134,14 +134,15 @@ def _outside(which: str, every: list[Outcome]) -> Iterator[Figure]:
     stated = every[0].task.family == "outside"
     said, least = ("outside the catalogue", 0.90) if stated else ("nothing stated, outside the catalogue", 0.85)
     own = [each for each in every if overlap_of(each) < APART]
-    yield rate(f"{said}, n = {which}: unknown", [each.unknown_right for each in own], least)
+    yield rate(f"{said}, n = {which}: unknown", [each.outside_right for each in own], least)
     if own:
-        lowest, hits = _worst((each.truth[0], each.unknown_right) for each in own)
+        lowest, hits = _worst((each.truth[0], each.outside_right) for each in own)
         yield rate(f"{said}: unknown, worst effect: {lowest}", hits)
-    yield rate(f"{said}: a wrong name", [each.named is not None for each in own], most=0.05)
+    wrong = [each.named is not None and not each.outside_right for each in own]
+    yield rate(f"{said}: a wrong name", wrong, most=0.05)
     answers = [each for each in own if each.first == "unknown" or each.refused]
     yield rate(f"{said}: driver right, of unknown", [is_driver_right(each) for each in answers], 0.80)
-    near = [each.unknown_right for each in every if overlap_of(each) >= APART]
+    near = [each.outside_right for each in every if overlap_of(each) >= APART]
     yield rate(f"{said}, but overlap >= {APART}: unknown", near)
     if any(each.families for each in every):
         classed = [each for each in every if each.true_families != (NONE,)]

@@ -66,10 +66,13 @@ class Outcome:
         return None if self.first in ("unknown", "noise") else self.first
 
     @property
-    def unknown_right(self) -> bool:
-        """Whether what is in no catalogue is called so; noise may be called noise, or estimated where none is stated."""
+    def outside_right(self) -> bool:
+        """Whether what is in no catalogue is called unknown, or by names that together mean it.
+
+        Noise may be called noise, too, or be estimated where none is stated.
+        """
         if self.true_families != (NOISE,):
-            return self.first == "unknown"
+            return self.first == "unknown" or self.explained_by(self.names)
         estimated = self.first is None and "--unstated" in self.task.options and not self.refused
         return self.first in ("unknown", "noise") or estimated
 

@@ -75,7 +75,7 @@ def effect_rows(outcomes: Sequence[Outcome]) -> list[list[str]]:
     for true in dict.fromkeys(each.truth[0] for each in judged):
         own = [each for each in judged if each.truth[0] == true]
         named = {figure: [each for each in own if each.task.figure == figure] for figure in heads}
-        right = [[e.unknown_right if e.task.family in OUTSIDE else e.right for e in each] for each in named.values()]
+        right = [[e.outside_right if e.task.family in OUTSIDE else e.right for e in each] for each in named.values()]
         given = [each.held for each in own if each.task.family in ("name", "unstated") and each.ambiguity]
         noticed = [each.consistent is False for each in own if each.task.family == "power"]
         others = [f"{name} {count}" for name, count in said.get(true, Counter()).most_common() if name != true]
