@@ -86,12 +86,12 @@ def save_reliability(outcomes: Sequence[Outcome], path: Path) -> None:
         places = np.arange(len(own))
         axes.bar(
             places, [each.high - each.low for each in own], 0.8, [each.low for each in own],
-            color="0.85", edgecolor="0.6", label="range stated",
+            color="0.85", edgecolor="0.6", label="stated: range",
         )  # fmt: skip
-        axes.hlines([each.stated for each in own], places - 0.4, places + 0.4, color="0.4", label="mean stated")
+        axes.hlines([each.stated for each in own], places - 0.4, places + 0.4, color="0.4", label="stated: mean")
         shares = np.array([each.true.value for each in own])
         limits = np.array([[each.true.low, each.true.high] for each in own]).reshape(-1, 2).T
-        axes.errorbar(places, shares, np.abs(limits - shares), fmt="o", capsize=3, label="true, 95 % limits")
+        axes.errorbar(places, shares, np.abs(limits - shares), fmt="o", capsize=3, label="true, with 95 % limits")
         axes.set_xticks(places, [f"{each.words}\n{each.true.count}" for each in own], rotation=60, fontsize=8)
         axes.set(title=what, xlabel="stated probability, and number of statements", ylim=(-0.03, 1.03))
     sheet.axes[0].set_ylabel("share that is true")
