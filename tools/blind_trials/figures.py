@@ -78,8 +78,8 @@ def _mean_share(name: str, shares: Sequence[float], least: float | None) -> Figu
     """Return the mean of probabilities, and the range of 95 % of the trials."""
     mean, low, high = _mean_and_range(shares)
     bar = "" if least is None else f">= {least:.2f}"
-    judged = least is not None and len(shares) >= ENOUGH_TRIALS
-    return Figure(name, mean, low, high, len(shares), bar, mean >= least if judged else None)
+    meets = None if least is None or len(shares) < ENOUGH_TRIALS else mean >= least
+    return Figure(name, mean, low, high, len(shares), bar, meets)
 
 
 def _understated(which: str, own: list[Outcome]) -> Iterator[Figure]:
