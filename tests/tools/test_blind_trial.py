@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 from blind_trials import command, diagnosis
-from blind_trials.equivalence import equivalent_names
+from blind_trials.catalogue import outside_effects
+from blind_trials.equivalence import equivalent_names, exact_sets
 from blind_trials.figures import figures
 from blind_trials.outcome import Outcome
+from blind_trials.physical_families import families_of
 from blind_trials.plays import PLAYS, play_trial
 from blind_trials.recording import simulate_trial
 from blind_trials.schedule import tasks, thin
-from blind_trials.task import Task
+from blind_trials.task import NOISES, OUTSIDE, Task
 from blind_trials.trial_log import read_outcomes
 from click.testing import CliRunner
 
@@ -62,6 +65,36 @@ def test_effects_with_equal_readings_mean_the_same(tmp_path: Path, monkeypatch: 
         truth = simulate_trial(task, Path("t.mcap"))["effects"]
         same = equivalent_names(task, Path("t.mcap"), truth, ["base-tilt", "second-order", "earth-rotation"])
         assert {said for _, said in same} == {"magnetic"} | others
+
+
+def test_two_errors_with_one_cause_are_named_by_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An eccentric bearing is an error of the encoder and of the axis, and neither of them alone."""
+    monkeypatch.chdir(tmp_path)
+    task = Task("unstated-outside@15", "unstated-outside", 10_000_003, ("eccentric-bearing:z=15sigma",))
+    task = dataclasses.replace(task, options=NOISES["unstated"])
+    (effect,) = simulate_trial(task, Path("t.mcap"))["effects"]
+    both, alone = ("encoder-harmonic-1:z", "axis-nonorthogonality:z"), ("axis-nonorthogonality:z",)
+    assert exact_sets(task, effect, [both, alone, (), (*alone, "flexure")]) == (tuple(sorted(both)),)
+    assert families_of(Path("t.mcap"), [effect], [(effect["name"],) * 2]) == ("gimbal and encoder",)
+
+
+def test_families_of_the_catalogue_are_told_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tilt of the base that a magnetic sensitivity equals belongs to the families of both."""
+    monkeypatch.chdir(tmp_path)
+    effects = simulate_trial(Task("", "", 1, ("base-tilt=1e-4",)), Path("t.mcap"))["effects"]
+    same = [("base-tilt", "base-tilt"), ("base-tilt", "magnetic")]
+    assert families_of(Path("t.mcap"), effects, same) == ("base and platform", "surroundings")
+
+
+def test_effects_outside_the_catalogue_are_hidden_with_noise_stated_and_not() -> None:
+    every = tasks(["outside", "unstated-outside"], 1, 3)
+    names = {each: {task.names for task in every if task.family == each} for each in OUTSIDE}
+    assert names["outside"] == names["unstated-outside"] == {(name,) for name in outside_effects()}
+    assert {("--unstated" in task.options, task.play) for task in every} == {
+        (False, "outside"), (True, "unstated-outside")
+    }  # fmt: skip
+    (one, *others) = tasks(["unstated-outside"], 1, 3, ["double-warm-up", "second-order"])
+    assert one.names == ("double-warm-up",) and not others and "--unstated" not in one.stated.options
 
 
 def test_a_trial_that_cannot_be_made_says_why() -> None:

@@ -25,7 +25,7 @@ def compare_advice(task: Task, advised: int = 4, random: int = 12) -> Outcome:
     rows = [visit.gimbal_deg for visit in spread_plan(FEW_ORIENTATIONS, seed=task.seed)]
     truth, said = _diagnose_plan(task, rows)
     rivals = [name for name in said["ambiguity_set"] if name != truth["name"]]
-    if said["missing"] in (None, "unknown") or not rivals or truth["name"] not in said["ambiguity_set"]:
+    if said["missing"] in (None, "unknown", "noise") or not rivals or truth["name"] not in said["ambiguity_set"]:
         return Outcome(task, task.names, said["missing"], error="not ambiguous to begin with")
     fixed, here, more = with_size(task, truth, 1.0), said, list(rows)
     count = 0

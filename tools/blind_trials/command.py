@@ -15,6 +15,7 @@ from blind_trials.confusion import confusion, save_picture
 from blind_trials.criteria import is_failure
 from blind_trials.failures import keep, save_failures
 from blind_trials.figures import figures
+from blind_trials.reliability import save_reliability
 from blind_trials.report import markdown, report
 from blind_trials.schedule import tasks, thin
 from blind_trials.task import FAMILIES, Task
@@ -56,6 +57,7 @@ from blind_trials.workers import play_trials
 @click.option("--markdown", "page", type=click.Path(path_type=Path), help="Write the tables as Markdown.")
 @click.option("--out", type=click.Path(path_type=Path), help="Write all outcomes and figures as JSON.")
 @click.option("--picture", type=click.Path(path_type=Path), help="Draw the confusion matrix, PNG or SVG.")
+@click.option("--reliability", type=click.Path(path_type=Path), help="Draw the reliability diagram, PNG or SVG.")
 @click.option(
     "--failures", type=click.Path(path_type=Path), help="Write what went wrong, with commands that repeat it."
 )
@@ -74,6 +76,7 @@ def main(
     page: Path | None,
     out: Path | None,
     picture: Path | None,
+    reliability: Path | None,
     failures: Path | None,
     kept: Path | None,
 ) -> None:
@@ -104,6 +107,8 @@ def main(
         page.write_text(markdown(outcomes), encoding="utf-8")
     if picture:
         save_picture(outcomes, picture)
+    if reliability:
+        save_reliability(outcomes, reliability)
     if failures:
         save_failures(outcomes, failures)
     if kept:

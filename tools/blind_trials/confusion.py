@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from blind_trials.outcome import Outcome
+from blind_trials.task import OUTSIDE
 
 
 def confusion(outcomes: Sequence[Outcome], figure: str | None = None) -> dict[str, Counter[str]]:
@@ -19,11 +20,11 @@ def confusion(outcomes: Sequence[Outcome], figure: str | None = None) -> dict[st
     out = dict[str, Counter[str]]()
     for each in outcomes:
         judged = each.refused or not each.error
-        if not judged or len(each.truth) > 1 or each.task.family not in ("noise", "name", "unstated", "outside"):
+        if not judged or len(each.truth) > 1 or each.task.family not in ("noise", "name", "unstated", *OUTSIDE):
             continue
         if figure in (None, each.task.figure):
             true = each.truth[0] if each.truth else "(nothing)"
-            right = each.right or (each.task.family == "outside" and each.first == "unknown")
+            right = each.right or (each.task.family in OUTSIDE and each.outside_right)
             said = true if right else "(refused)" if each.refused else each.first or "(nothing)"
             out.setdefault(true, Counter())[said] += 1
     return out

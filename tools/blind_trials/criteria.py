@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from blind_trials.outcome import Outcome
+from blind_trials.task import OUTSIDE
 
 APART = 0.7  # overlap below which two effects are expected to be told apart
 
@@ -37,8 +38,9 @@ def is_failure(each: Outcome) -> bool:
         return each.refused
     if family in ("noise", "plans", "benches") and not each.truth:
         return is_alarm(each)
-    if family == "outside":
-        return not close and not (each.first == "unknown" and is_driver_right(each))
+    if family in OUTSIDE:
+        told = each.outside_right and (each.first != "unknown" or is_driver_right(each))
+        return not close and not told
     return {
         "name": not each.right, "unstated": not each.right, "plans": each.wrong, "benches": each.wrong,
         "power": False, "understated": is_named_without_doubt(each),

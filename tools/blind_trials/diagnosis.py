@@ -6,16 +6,20 @@ import dataclasses
 import itertools
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from blind_trials.catalogue import known_kinds, largest_size
 from blind_trials.columns import candidates, scan_columns
-from blind_trials.equivalence import equivalent_names
-from blind_trials.outcome import Outcome
+from blind_trials.equivalence import equivalent_names, exact_sets
+from blind_trials.outcome import Hypothesis, Outcome
+from blind_trials.physical_families import families_of
 from blind_trials.program import cpu_time, run_command
 from blind_trials.recording import simulate_trial
 from blind_trials.task import LARGE, Task
+
+_UNLIKELY = 1e-3  # probability of an explanation below which it does not matter what its names mean
 
 
 def diagnose_trial(task: Task) -> Outcome:
@@ -25,13 +29,17 @@ def diagnose_trial(task: Task) -> Outcome:
     with cpu_time(times, "diagnose"):
         said = run_command("diagnose", str(path), "--json")
     missing = said["missing"]
-    names = tuple(said.get("all_missing") or ([missing] if missing and missing != "unknown" else []))
-    known = tuple(effect["name"] for effect in effects)
+    names = tuple(said.get("all_missing") or ([missing] if missing not in (None, "unknown", "noise") else []))
+    hypotheses = _hypotheses(said)
+    likely = [each.effects for each in hypotheses if each.probability > _UNLIKELY]
+    outside = [effect for effect in effects if not effect["in_catalogue"]]
     with cpu_time(times, "judge"):
-        same = equivalent_names(task, path, effects, {*names, *said["ambiguity_set"]})
+        given = {*names, *said["ambiguity_set"], *itertools.chain.from_iterable(likely)}
+        same = equivalent_names(task, path, effects, given)
+        alike = exact_sets(task, outside[0], [*likely, names]) if len(effects) == len(outside) == 1 else ()
     return Outcome(
-        task, known, missing, names, tuple(said["ambiguity_set"]), same, said["consistent"], said["p_value"],
-        tuple(said["invisible"]),
+        task, tuple(effect["name"] for effect in effects), missing, names, tuple(said["ambiguity_set"]), same,
+        said["consistent"], said["p_value"], tuple(said["invisible"]),
         {
             "verdict": said["verdict"],
             "driver": (said["unknown"] or {}).get("driver"),
@@ -39,8 +47,18 @@ def diagnose_trial(task: Task) -> Outcome:
             "true_drivers": [effect["driver"] for effect in effects],
             "sizes": [effect["size_sigma"] for effect in effects],
         },
-        times,
+        times, alike=alike, outside=tuple(effect["name"] for effect in outside),
+        true_families=families_of(path, effects, same), hypotheses=hypotheses,
+        families=tuple((each["family"], each["probability"]) for each in said.get("families", [])),
     )  # fmt: skip
+
+
+def _hypotheses(said: dict[str, Any]) -> tuple[Hypothesis, ...]:
+    """Return the explanations that the program weighed."""
+    return tuple(
+        Hypothesis(tuple(each["effects"]), each["formula"] or "", tuple(each["families"]), each["probability"])
+        for each in said.get("hypotheses", [])
+    )
 
 
 def diagnose_outside(task: Task) -> Outcome:
@@ -50,7 +68,7 @@ def diagnose_outside(task: Task) -> Outcome:
     although the means of the dwells show less where the effect changes within dwells. The noise is that of the truth,
     because so large an effect spoils the estimate of it.
     """
-    large = dataclasses.replace(task, hidden=tuple(f"{name}={LARGE}sigma" for name in task.names))
+    large = dataclasses.replace(task.stated, hidden=tuple(f"{name}={LARGE}sigma" for name in task.names))
     truth = simulate_trial(large, Path("large.mcap"))
     spaces, residual = scan_columns(Path("large.mcap"), None, truth["noise"]["white_mps2"])
     falls = {name: max(float(np.sum((each.basis.T @ residual) ** 2)) for each in own) for name, own in spaces.items()}

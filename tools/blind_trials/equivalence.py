@@ -44,6 +44,29 @@ def equivalent_names(
     return tuple(sorted(pairs))
 
 
+def exact_sets(task: Task, effect: dict[str, Any], given: Iterable[Sequence[str]]) -> tuple[tuple[str, ...], ...]:
+    """Return the sets of names, each in order, that together explain an effect outside the catalogue to a hundredth.
+
+    It is large and alone, in stated noise; each name has the constant at which it explains most. So two errors of a
+    gimbal are what an effect is that makes both.
+    """
+    path, sets = Path("alone.mcap"), sorted({tuple(sorted(names)) for names in given if names})
+    if not sets or not effect["size_sigma"]:
+        return ()
+    noise = simulate_trial(with_size(task.stated, effect, _ALONE_SIGMA / effect["size_sigma"]), path)["noise"]
+    spaces, residual = scan_columns(path, None, noise["white_mps2"])
+    best = {name: max(own, key=lambda each: np.sum((each.basis.T @ residual) ** 2)) for name, own in spaces.items()}
+
+    def left(names: Sequence[str]) -> float:
+        """Return what the columns of all names leave of the sum of squares, beside the noise."""
+        columns = np.hstack([best[name].basis for name in names])
+        unexplained = residual - columns @ np.linalg.lstsq(columns, residual, rcond=None)[0]
+        return float(np.sum(unexplained**2)) - len(residual)
+
+    most = (_LEFT * _ALONE_SIGMA) ** 2
+    return tuple(names for names in sets if best.keys() >= set(names) and left(names) < most)
+
+
 def _exact_mimics(task: Task, effect: dict[str, Any], others: Sequence[str]) -> list[str]:
     """Return the names that explain a hidden effect to a hundredth of its size, where it is large and alone."""
     path = Path("alone.mcap")

@@ -17,7 +17,7 @@ from blind_trials.visible_effects import confusable, visible_effects
 COUNTS: dict[str, float] = {
     "noise@white": 500, "noise": 60, "name": 1, "unstated": 0.25, "power": 4, "invisible": 0.2, "outside": 2,
     "pair": 40, "plans@nothing": 8, "plans": 0.2, "improve": 0.4, "advice": 1, "ideal": 2, "benches": 30,
-    "understated": 15,
+    "understated": 15, "unstated-outside": 1,
 }  # fmt: skip
 """Trials for each unit of ``--runs``: in all, or for each hidden effect (and size, and plan); at least one."""
 _BESIDE_THE_TWELVE = {"magnetic": ";up=0"}
@@ -130,13 +130,19 @@ def _one(
         yield Row(str(size), (f"{name}={size}sigma{(endings or {}).get(name, '')}",), options)
 
 
+def _outside_of(asked: Request) -> list[str]:
+    """Return the effects in no catalogue, or those of them that are asked for."""
+    every = outside_effects()
+    return [name for name in every if name in asked.effects] or every
+
+
 ROWS: dict[str, Callable[[Request], Iterator[Row]]] = {
     "noise": _noise,
     "name": partial(_one, sizes_sigma=SIZES_SIGMA),
     "unstated": partial(_one, sizes_sigma=(10, FAR_SIGMA), options=NOISES["unstated"]),
     "power": _power,
     "invisible": _invisible,
-    "outside": partial(_one, sizes_sigma=(15,), hidden=lambda _: outside_effects()),
+    "outside": partial(_one, sizes_sigma=(15,), hidden=_outside_of),
     "pair": _pair,
     "plans": _plans,
     "improve": partial(_one, sizes_sigma=(15,), endings=_BESIDE_THE_TWELVE),
@@ -144,5 +150,6 @@ ROWS: dict[str, Callable[[Request], Iterator[Row]]] = {
     "ideal": _ideal,
     "benches": _benches,
     "understated": _understated,
+    "unstated-outside": partial(_one, sizes_sigma=(15,), hidden=_outside_of, options=NOISES["unstated"]),
 }
 """How the trials of each family are made."""

@@ -14,7 +14,9 @@ from scipy.stats import chi2
 from blind_trials.criteria import APART, is_alarm, is_driver_right, is_named_without_doubt, overlap_of
 from blind_trials.figure import ENOUGH_TRIALS, Figure, rate
 from blind_trials.ideal import SCATTER_ALLOWED, WALK
-from blind_trials.outcome import Outcome
+from blind_trials.outcome import NONE, Outcome
+from blind_trials.scores import score_figures
+from blind_trials.statements import probability_of_truth
 from blind_trials.task import FAMILIES, SIZES_SIGMA
 from kf_calib.design.next_orientation import ENOUGH
 
@@ -36,7 +38,7 @@ def figures(outcomes: Sequence[Outcome]) -> list[Figure]:
     blind = [each.named not in each.invisible for each in done if each.named]
     if blind:
         out.append(rate("a name that is given is not of an effect it calls invisible", blind, least=1.0))
-    return out
+    return [*out, *score_figures(done)]
 
 
 def _noise(which: str, own: list[Outcome]) -> Iterator[Figure]:
@@ -65,6 +67,19 @@ def _name(which: str, own: list[Outcome]) -> Iterator[Figure]:
         size, (low, high) = float(np.median(sizes)), np.percentile(sizes, [2.5, 97.5])
         yield Figure(f"median size of the set, n = {which}{stated}", size, low, high, len(sizes), "1", size == 1.0)
     yield rate(f"wrong name, n = {which}{stated}", [each.wrong for each in own])
+    if any(each.families for each in own):
+        yield rate(f"family right, n = {which}{stated}", [each.family_right for each in own], 0.98)
+    if any(each.hypotheses for each in own):
+        shares, least = [probability_of_truth(each) for each in own], 0.90 if which == "10" else None
+        yield _mean_share(f"probability of the truth, n = {which}{stated}, mean", shares, least)
+
+
+def _mean_share(name: str, shares: Sequence[float], least: float | None) -> Figure:
+    """Return the mean of probabilities, and the range of 95 % of the trials."""
+    mean, low, high = _mean_and_range(shares)
+    bar = "" if least is None else f">= {least:.2f}"
+    meets = None if least is None or len(shares) < ENOUGH_TRIALS else mean >= least
+    return Figure(name, mean, low, high, len(shares), bar, meets)
 
 
 def _understated(which: str, own: list[Outcome]) -> Iterator[Figure]:
@@ -72,6 +87,7 @@ def _understated(which: str, own: list[Outcome]) -> Iterator[Figure]:
     said = f"{which} stated too small"
     yield rate(f"{said}: noticed", [each.consistent is False for each in own])
     yield rate(f"{said}: a name", [each.named is not None for each in own])
+    yield rate(f"{said}: called noise", [each.first == "noise" for each in own])
     yield rate(
         f"{said}: a name without saying that it may be scatter",
         [is_named_without_doubt(each) for each in own],
@@ -116,17 +132,25 @@ def _invisible(which: str, own: list[Outcome]) -> Iterator[Figure]:
 
 def _outside(which: str, every: list[Outcome]) -> Iterator[Figure]:
     """Yield the figures of runs with an effect that is in no catalogue."""
+    stated = every[0].task.family == "outside"
+    said, least = ("outside the catalogue", 0.90) if stated else ("nothing stated, outside the catalogue", 0.85)
     own = [each for each in every if overlap_of(each) < APART]
-    hits = [each.first == "unknown" for each in own]
-    yield rate(f"outside the catalogue, n = {which}: unknown", hits, 0.90)
+    yield rate(f"{said}, n = {which}: unknown", [each.outside_right for each in own], least)
     if own:
-        lowest, hits = _worst((each.truth[0], each.first == "unknown") for each in own)
-        yield rate(f"outside the catalogue: unknown, worst effect: {lowest}", hits)
-    yield rate("outside the catalogue: a wrong name", [each.named is not None for each in own], most=0.05)
+        lowest, hits = _worst((each.truth[0], each.outside_right) for each in own)
+        yield rate(f"{said}: unknown, worst effect: {lowest}", hits)
+    wrong = [each.named is not None and not each.outside_right for each in own]
+    yield rate(f"{said}: a wrong name", wrong, most=0.05)
     answers = [each for each in own if each.first == "unknown" or each.refused]
-    yield rate("outside the catalogue: driver right, of unknown", [is_driver_right(each) for each in answers], 0.80)
-    near = [each.first == "unknown" for each in every if overlap_of(each) >= APART]
-    yield rate(f"outside, but overlap >= {APART}: unknown", near)
+    yield rate(f"{said}: driver right, of unknown", [is_driver_right(each) for each in answers], 0.80)
+    near = [each.outside_right for each in every if overlap_of(each) >= APART]
+    yield rate(f"{said}, but overlap >= {APART}: unknown", near)
+    if any(each.families for each in every):
+        classed = [each for each in every if each.true_families != (NONE,)]
+        yield rate(f"{said}: family right, of those that belong to one", [e.family_right for e in classed], 0.95)
+        if classed:
+            lowest, hits = _worst((each.truth[0], each.family_right) for each in classed)
+            yield rate(f"{said}: family right, worst effect: {lowest}", hits)
 
 
 def _pair(which: str, every: list[Outcome]) -> Iterator[Figure]:
@@ -225,6 +249,7 @@ def _mean_and_range(values: Sequence[float]) -> tuple[float, float, float]:
 
 _FIGURES: dict[str, Callable[[str, list[Outcome]], Iterator[Figure]]] = {
     "noise": _noise, "name": _name, "unstated": _name, "power": _power, "invisible": _invisible, "outside": _outside,
+    "unstated-outside": _outside,
     "pair": _pair, "plans": _plans, "improve": _improve, "advice": _advice, "ideal": _ideal,
     "benches": _plans, "understated": _understated,
 }  # fmt: skip

@@ -19,7 +19,8 @@ from kf_calib.errors import KfCalibError
 from kf_calib.sources.simulation.injected import NoSizeError
 
 PLAYS: dict[str, Callable[[Task], Outcome]] = {
-    "diagnose": diagnose_trial, "outside": diagnose_outside, "pair": diagnose_pair, "power": notice_stated_size,
+    "diagnose": diagnose_trial, "outside": diagnose_outside, "unstated-outside": diagnose_outside,
+    "pair": diagnose_pair, "power": notice_stated_size,
     "invisible": compare_invisible, "improve": improve_trial, "advice": compare_advice, "ideal": compute_ideal,
 }  # fmt: skip
 

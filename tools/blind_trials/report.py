@@ -13,13 +13,14 @@ from blind_trials.confusion import confusion
 from blind_trials.criteria import APART, overlap_of
 from blind_trials.figures import figures
 from blind_trials.outcome import Outcome
-from blind_trials.task import FAR_SIGMA
+from blind_trials.reliability import reliability_rows
+from blind_trials.task import FAR_SIGMA, OUTSIDE
 
 
 def report(outcomes: Sequence[Outcome]) -> Group:
     """Return the figures, then the names given for each effect in rows: a matrix of forty columns fits no terminal."""
     tables = list[Table]()
-    for title, rows in (("Figures", figure_rows(outcomes)), ("Hidden, and what was named", effect_rows(outcomes))):
+    for title, rows in _tables(outcomes).items():
         if len(rows) == 1:
             continue
         tables.append(Table(*rows[0], title=title, title_justify="left"))
@@ -32,10 +33,19 @@ def markdown(outcomes: Sequence[Outcome]) -> str:
     """Return the same tables in Markdown, for docs/blind_trial.md."""
     tables = [
         "\n".join("| " + " | ".join(row) + " |" for row in (rows[0], ["---"] * len(rows[0]), *rows[1:]))
-        for rows in (figure_rows(outcomes), effect_rows(outcomes))
+        for rows in _tables(outcomes).values()
         if len(rows) > 1
     ]
     return "\n\n".join([*tables, *notes(outcomes)]) + "\n"
+
+
+def _tables(outcomes: Sequence[Outcome]) -> dict[str, list[list[str]]]:
+    """Return the rows of each table by its title, the heads first."""
+    return {
+        "Figures": figure_rows(outcomes),
+        "What was stated, and how often it was true": reliability_rows(outcomes),
+        "Hidden, and what was named": effect_rows(outcomes),
+    }
 
 
 def figure_rows(outcomes: Sequence[Outcome]) -> list[list[str]]:
@@ -58,15 +68,14 @@ def effect_rows(outcomes: Sequence[Outcome]) -> list[list[str]]:
         "unstated@10": "nothing stated, 10",
         f"unstated@{FAR_SIGMA}": f"nothing stated, {FAR_SIGMA}",
         "outside@15": "unknown",
+        "unstated-outside@15": "unknown, nothing stated",
     }
     rows = [["hidden", *(f"right, {head}" for head in heads.values()), "set holds it", "power", "named instead"]]
-    said = confusion([each for each in judged if each.task.family != "outside" or overlap_of(each) < APART])
+    said = confusion([each for each in judged if each.task.family not in OUTSIDE or overlap_of(each) < APART])
     for true in dict.fromkeys(each.truth[0] for each in judged):
         own = [each for each in judged if each.truth[0] == true]
         named = {figure: [each for each in own if each.task.figure == figure] for figure in heads}
-        right = [
-            [e.first == "unknown" if e.task.family == "outside" else e.right for e in each] for each in named.values()
-        ]
+        right = [[e.outside_right if e.task.family in OUTSIDE else e.right for e in each] for each in named.values()]
         given = [each.held for each in own if each.task.family in ("name", "unstated") and each.ambiguity]
         noticed = [each.consistent is False for each in own if each.task.family == "power"]
         others = [f"{name} {count}" for name, count in said.get(true, Counter()).most_common() if name != true]

@@ -21,7 +21,7 @@ def tasks(
     runs: the scale of ``COUNTS``. seed: of the whole trial. effects: hide only these (empty: all that the run shows).
     setting: setting error of an orientation, deg.
     """
-    needed = set(families) - {"noise", "invisible", "outside"}
+    needed = set(families) - {"noise", "invisible", "outside", "unstated-outside"}
     visible = list(effects) or (visible_effects() if needed else [])
     return [task for each in families for task in _family_tasks(each, runs, seed, effects, visible, setting)]
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 FAMILIES = (
     "noise", "name", "unstated", "power", "invisible", "outside", "pair", "plans", "improve", "advice", "ideal",
-    "benches", "understated",
+    "benches", "understated", "unstated-outside",
 )  # fmt: skip
+OUTSIDE = ("outside", "unstated-outside")
+"""Families of trials of effects that are in no catalogue."""
 # Few readings, but half an hour of them, so that drifts and time constants show; computed in about a second.
 BENCH = (
     "--dwell-s", "60", "--sample-hz", "6", "--angle-hz", "4", "--slew-degps", "20", "--gravity", "9.81",
@@ -71,6 +73,11 @@ class Task:
     def names(self) -> tuple[str, ...]:
         """Names of the hidden effects."""
         return tuple(text.partition("=")[0] for text in self.hidden)
+
+    @property
+    def stated(self) -> Task:
+        """The same with all noise stated in the recording."""
+        return replace(self, options=tuple(each for each in self.options if each != "--unstated"))
 
     @property
     def plan(self) -> str:

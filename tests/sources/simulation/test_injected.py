@@ -75,6 +75,7 @@ def test_the_registry_holds_the_catalogue_and_others():
     assert sum(not kind.known for kind in kinds.values()) >= 6
     assert {family.__name__.rsplit(".", 1)[1] for family in FAMILIES} >= {"sensor", "thermal", "gimbal", "outside"}
     for kind in kinds.values():
+        assert bool(kind.family) == bool(kind.driver) == (not kind.known), kind.name
         assert kind.title and kind.physics.endswith("."), kind.name
         for grade in ("paper", "navigation", "mems"):
             least, greatest = kind.typical(grade)
@@ -165,6 +166,19 @@ def test_thermal_misalignment_turns_the_input_axis():
     assert kept[0, 0] == pytest.approx(G * math.cos(math.atan(0.01)), abs=1e-12)
 
 
+def test_thermal_hysteresis_lags_behind_every_turn_by_its_play():
+    """Temperature 4 sin: with a play of 1 K the sensor stays at 0 up to 1, goes 1 behind up to 3, and waits there."""
+    swing = Ambient(swing_c=4.0, period_s=360.0)
+    found = contribution("thermal-hysteresis=1e-3,0,0;play=1", [(0, 0, 0)], dwell_s=720.0, ambient=swing)[:, 0]
+    true = 4.0 * np.sin(np.radians(np.arange(720.0)))
+    rising, falling = np.arange(15, 91), np.arange(151, 271)
+    np.testing.assert_allclose(found[:14], 0.0, atol=1e-12)
+    np.testing.assert_allclose(found[rising], 1e-3 * (true[rising] - 1.0), atol=1e-12)
+    np.testing.assert_allclose(found[90:150], 1e-3 * 3.0, atol=1e-12)
+    np.testing.assert_allclose(found[falling], 1e-3 * (true[falling] + 1.0), atol=1e-12)
+    np.testing.assert_allclose(found[271:329], 1e-3 * -3.0, atol=1e-12)
+
+
 def test_thermal_rate_follows_the_derivative():
     ambient = Ambient(swing_c=3.0, period_s=400.0, warm_up_c=5.0, warm_up_s=100.0)
     found = contribution("thermal-rate=2,0,0", [(0, 0, 0)], dwell_s=500.0, ambient=ambient)
@@ -197,6 +211,8 @@ TIMED = {
     "power-warm-up=1e-3,0,0;tau=10": lambda t: 1e-3 * (1 + t / 10) ** -0.5,
     "chirp=1e-3,0,0;frequency=0.01;chirp=1e-4": lambda t: 1e-3 * np.sin(2 * np.pi * (0.01 + 0.5e-4 * t) * t),
     "bias-jump=1e-3,0,0;share=0.25": lambda t: 1e-3 * (t >= 50),
+    "double-warm-up=1e-3,0,0;tau=10;slow=100;share=0.3": lambda t: 0.7e-3 * np.exp(-t / 10) + 0.3e-3 * np.exp(-t / 100),
+    "creep-and-walk=1e-3,0,0;tau=20;share=1e-20": lambda t: 1e-3 * np.log(1 + t / 20),
 }
 
 
@@ -242,6 +258,27 @@ def test_telegraph_has_two_levels_and_its_time():
     assert set(np.unique(found.round(9))) == {-1e-3, 1e-3}
     switches = np.abs(np.diff(np.sign(found), axis=0)).sum() / 2
     assert switches / 3 / 40_000 == pytest.approx((1 - math.exp(-0.1)) / 2, rel=0.06)
+
+
+def test_creep_gives_way_to_a_walk():
+    """The walk: variance share^2 t / tau about the creep."""
+    text = "creep-and-walk=1e-3,1e-3,1e-3;tau=10;share=0.5"
+    paths = np.hstack([contribution(text, [(0, 0, 0)], dwell_s=401.0, seed=seed) for seed in range(100)])
+    for t in (100, 400):
+        assert paths[t].mean() == pytest.approx(1e-3 * math.log(1 + t / 10), abs=3e-3 * 0.5 * math.sqrt(t / 10 / 300))
+        assert paths[t].std() == pytest.approx(1e-3 * 0.5 * math.sqrt(t / 10), rel=0.15)
+
+
+def test_the_output_of_one_accelerometer_steps_once():
+    channels, instants = set[int](), list[int]()
+    for seed in range(20):
+        found = contribution("output-step=1e-3", [(0, 0, 0)], dwell_s=100.0, seed=seed)
+        (channel,) = np.flatnonzero(found[-1])
+        instants.append(int(np.argmax(found[:, channel] != 0.0)))
+        np.testing.assert_allclose(found[:, channel], found[-1, channel] * (np.arange(100) >= instants[-1]), atol=1e-15)
+        assert not np.delete(found, channel, axis=1).any() and abs(found[-1, channel]) == pytest.approx(1e-3)
+        channels.add(int(channel))
+    assert channels == {0, 1, 2} and 20 <= min(instants) < 40 and 60 < max(instants) <= 80
 
 
 # -- history --
@@ -358,6 +395,38 @@ def test_flexure_is_the_bend_under_the_torque_it_leaves():
     bent = readings("flexure=2e-3,0,0", [(0, 0, 0)])
     np.testing.assert_allclose(bent, [[-G * math.sin(phi), G * math.cos(phi), 0]], atol=1e-9)
     np.testing.assert_allclose(readings("flexure=0,2e-3,0", [(0, 0, 0)]), [[0, G, 0]], atol=1e-12)
+
+
+def test_uneven_flexure_gives_way_about_each_axis_by_its_own_compliance():
+    """y up: the torque about z leaves z's compliance in the bend, and without it nothing bends."""
+    phi = brentq(lambda phi: phi - 3 * 2e-3 * G * math.cos(phi), 0, 0.1)
+    bent = readings("uneven-flexure=2e-3,0,0;cx=1e-9;cy=1e-9;cz=3", [(0, 0, 0)])
+    np.testing.assert_allclose(bent, [[-G * math.sin(phi), G * math.cos(phi), 0]], atol=1e-9)
+    stiff = readings("uneven-flexure=2e-3,0,0;cx=3;cy=3;cz=1e-12", [(0, 0, 0)])
+    np.testing.assert_allclose(stiff, [[0, G, 0]], atol=1e-9)
+    poses = [POSES["xyz"], (0, 20, 30)]
+    even = contribution("uneven-flexure=2e-3,1e-3,-1e-3;cx=1;cy=1;cz=1", poses)
+    np.testing.assert_array_equal(even, contribution("flexure=2e-3,1e-3,-1e-3", poses))
+
+
+def test_a_loose_mount_mostly_lies_where_gravity_pulls_it():
+    """About x it follows gravity along y: with y up, down and level the turn of z by y tells the angle."""
+    poses = [(0, 0, 0), (0, 0, 180), (0, 0, 90)] * 200
+    found = readings("loose-mount=1e-3,0,0", poses)
+    up, down, level = (found[k::3] for k in range(3))
+    angles = np.column_stack([-up[:, 2], down[:, 2], -level[:, 1]]) / G  # the platform turned about x
+    assert np.abs(angles).max() <= 1e-3 and np.ptp(angles[:, 2]) > 1.9e-3
+    assert not np.abs(up[:, 0]).max() and np.abs(up[:, 1] - G).max() < 1e-5
+    # where gravity lies along y the mean is that of clip(1 + z, -1, 1), 0.6095, z standard normal
+    assert angles.mean(axis=0) == pytest.approx([0.61e-3, -0.61e-3, 0.0], abs=0.15e-3)
+
+
+@pytest.mark.parametrize("pose", [(10, 40, -70), (0, 0, 0)])
+def test_an_eccentric_bearing_is_two_errors_with_one_coefficient(pose):
+    together = readings("eccentric-bearing:z=1e-2,2e-2;share=0.5", [pose])
+    apart = readings("encoder-harmonic-1:z=1e-2,2e-2 axis-nonorthogonality:z=5e-3,1e-2", [pose])
+    np.testing.assert_allclose(together, apart, atol=1e-12)
+    assert np.abs(together - readings("", [pose])).max() > 1e-3
 
 
 def test_lever_arms_in_a_turn_about_the_vertical():
@@ -541,6 +610,7 @@ def test_truth_tells_and_the_recording_does_not(tmp_path):
     assert (first["name"], first["unit"], first["in_catalogue"]) == ("second-order", "1/(m/s^2)", True)
     assert {key: abs(value) for key, value in first["sizes"].items()} == {"1": 4e-5, "2": 4e-5, "3": 4e-5}
     assert (second["name"], second["sizes"]) == ("encoder-harmonic-2:z", {"s": 2e-5, "c": 1e-5})
+    assert (first["family"], parse(["bias-jump=1"], BENCH.axes)[0].truth["family"]) == ("", "bias in time")
     assert third["inner"] == {"tau": {"value": 600.0, "unit": "s"}}
 
 

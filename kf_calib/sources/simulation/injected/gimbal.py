@@ -139,11 +139,16 @@ def platform_drift(rate: Floats, rig: Rig) -> Step:
 def flexure(offset: Floats, rig: Rig) -> Step:
     """Flexure: the platform gives way by the rotation vector f x d, the torque of gravity on a mass off the centre
     times compliance; d is compliance x mass x offset, and f is felt by the bent platform (Hooke's law)."""
+    return bending(offset, np.ones(3))
+
+
+def bending(offset: Floats, compliance: Floats) -> Step:
+    """The step that turns the platform by f x offset, each part times the compliance (3,) about its axis."""
 
     def step(state: State) -> None:
         bent = Rotation.identity()
         for _ in range(_ROUNDS):
-            bent = Rotation.from_rotvec(np.cross(rotate(bent.inv(), state.force_mps2), offset))
+            bent = Rotation.from_rotvec(compliance * np.cross(rotate(bent.inv(), state.force_mps2), offset))
         state.force_mps2, state.attitude = rotate(bent.inv(), state.force_mps2), state.attitude * bent
 
     return step

@@ -58,12 +58,17 @@ class Inner:
 
 INNER: Mapping[str, Inner] = {
     "tau": Inner("s"),
+    "slow": Inner("s"),
     "period": Inner("s"),
     "frequency": Inner("Hz"),
     "chirp": Inner("Hz/s"),
     "rms": Inner("m/s^2"),
     "rate": Inner("1"),
     "share": Inner("1"),
+    "cx": Inner("1"),
+    "cy": Inner("1"),
+    "cz": Inner("1"),
+    "play": Inner("K", free=False),
     "phase": Inner("rad", positive=False),
     "threshold": Inner("m/s^2", free=False),
     "reference": Inner("degC", positive=False, free=False),
@@ -83,7 +88,8 @@ class Kind:
     in units of data sheets. make: (coefficients, rig, gimbal axis where ``per_axis``, inner constants) -> step.
     signed: false where a coefficient cannot be negative. known: it is in the catalogue of the diagnosis. counted: makes
     the part that counts to its size in sigma, where something comes with the effect whatever its size. driver: of an
-    effect outside the catalogue, the quantity it goes with.
+    effect outside the catalogue, the quantity it goes with. family: of an effect outside the catalogue, the physical
+    class to which it belongs; that of an effect of the catalogue is told there.
     """
 
     name: str
@@ -101,6 +107,7 @@ class Kind:
     known: bool = True
     counted: Callable[..., Step] | None = field(default=None, repr=False)
     driver: str = ""
+    family: str = ""
 
     def typical(self, grade: str) -> tuple[float, float]:
         """Typical sizes, least and greatest, in SI; the paper's sensors are of navigation grade."""
@@ -132,6 +139,7 @@ class Hidden:
             "name": self.name,
             "in_catalogue": self.kind.known,
             "driver": self.kind.driver,
+            "family": self.kind.family,
             "unit": self.kind.unit,
             "sizes": dict(zip(self.kind.coefficients, self.sizes, strict=True)),
             "inner": {name: {"value": value, "unit": INNER[name].unit} for name, value in self._inner.items()},
@@ -188,6 +196,7 @@ def made(
     known: bool = True,
     counted: Callable[..., Step] | None = None,
     driver: str = "",
+    family: str = "",
 ) -> Callable[[Callable[..., Step]], Callable[..., Step]]:
     """Registers a maker of steps. Its docstring is "Title: physics (source)."; its keyword-only arguments are the inner
     constants with their usual values."""
@@ -200,7 +209,7 @@ def made(
         typical = navigation, mems or navigation
         _KINDS[name] = Kind(
             name, unit, stage, coefficients, *typical, make, inner, title, physics, signed, per_axis, known,
-            counted, driver,
+            counted, driver, family,
         )  # fmt: skip
         return make
 
@@ -215,6 +224,7 @@ def added(
     *,
     known: bool = True,
     driver: str = "",
+    family: str = "",
 ) -> Callable[[Callable[..., Floats]], Callable[..., Floats]]:
     """Registers what adds to each reading, a function of three coefficients, the state and inner constants."""
 
@@ -224,7 +234,7 @@ def added(
 
         make.__doc__ = contribution.__doc__
         make.__signature__ = inspect.signature(contribution)  # shows the inner constants
-        made(name, unit, navigation, mems, known=known, driver=driver)(make)
+        made(name, unit, navigation, mems, known=known, driver=driver, family=family)(make)
         return contribution
 
     return register

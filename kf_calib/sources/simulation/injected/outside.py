@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import math
+from itertools import accumulate
+
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.sources.simulation.injected.gimbal import base_turning, harmonic
+from kf_calib.sources.simulation.gimbal_motion import attitude
+from kf_calib.sources.simulation.injected.gimbal import axis_nonorthogonality, base_turning, bending, harmonic
 from kf_calib.sources.simulation.injected.kinds import Rig, added, made
 from kf_calib.sources.simulation.injected.terms import above, adding, column, output, pendulous
-from kf_calib.sources.simulation.physics import State, Step
+from kf_calib.sources.simulation.noise_processes import FirstOrder
+from kf_calib.sources.simulation.physics import SettingError, State, Step, carried_by_earth, rotate
+
+NO_FAMILY = "none of the known"
+"""The family of what belongs to no physical class of the catalogue's effects."""
 
 made(
     "encoder-harmonic-3", "rad", ("10urad", "200urad"), ("0.5mrad", "10mrad"),
-    stage="angles", coefficients=("s", "c"), per_axis=True, known=False, driver="angle",
+    stage="angles", coefficients=("s", "c"), per_axis=True, known=False, driver="angle", family="gimbal and encoder",
 )(harmonic(3))  # fmt: skip
 
 
 @made(
     "thermal-tilt", "rad/K", ("5urad/K", "50urad/K"), ("0.1mrad/K", "1mrad/K"),
-    stage="attitude", coefficients=("N", "E"), known=False, driver="temperature",
+    stage="attitude", coefficients=("N", "E"), known=False, driver="temperature", family="temperature",
 )  # fmt: skip
 def thermal_tilt(delta: Floats, rig: Rig, *, reference: float = 25.0) -> Step:
     """Thermal tilt of the pier: the base is turned by T (delta N about North, delta E about East)."""
@@ -32,6 +40,7 @@ def thermal_tilt(delta: Floats, rig: Rig, *, reference: float = 25.0) -> Step:
     ("2mg/g^5", "20mg/g^5"),
     known=False,
     driver="specific force",
+    family="nonlinearity",
 )
 def fifth_order(k: Floats, state: State) -> Floats:
     """Fifth-order nonlinearity: K5 a_i^5."""
@@ -45,20 +54,37 @@ def fifth_order(k: Floats, state: State) -> Floats:
     ("2mg/g^3", "20mg/g^3"),
     known=False,
     driver="specific force",
+    family="cross-axis",
 )
 def triple_product(k: Floats, state: State) -> Floats:
     """Triple product: K_ipo a_i a_p a_o."""
     return k * state.input_mps2 * pendulous(state) * output(state)
 
 
-@added("fourth-harmonic", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="specific force")
+@added(
+    "fourth-harmonic",
+    "m/s^2",
+    ("5ug", "100ug"),
+    ("2mg", "20mg"),
+    known=False,
+    driver="specific force",
+    family=NO_FAMILY,
+)
 def fourth_harmonic(k: Floats, state: State) -> Floats:
     """Spherical harmonic of degree 4: H (35 u^4 - 30 u^2 + 3) / 8, u the cosine of input axis and specific force."""
     squares = (state.input_mps2 / np.linalg.norm(state.force_mps2, axis=1, keepdims=True)) ** 2
     return k * (35.0 * squares**2 - 30.0 * squares + 3.0) / 8.0
 
 
-@added("third-cosine", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="specific force")
+@added(
+    "third-cosine",
+    "m/s^2",
+    ("5ug", "100ug"),
+    ("2mg", "20mg"),
+    known=False,
+    driver="specific force",
+    family=NO_FAMILY,
+)
 def third_cosine(k: Floats, state: State) -> Floats:
     """Cosine of thrice the direction: H s^3 cos(3 psi), psi and s the angle about the output axis and the sine of the
     angle from it of the specific force (spherical harmonic of degree 3)."""
@@ -73,33 +99,34 @@ def third_cosine(k: Floats, state: State) -> Floats:
     ("20ppm/K^2", "200ppm/K^2"),
     known=False,
     driver="temperature",
+    family="temperature",
 )
 def thermal_scale_2(k: Floats, state: State, *, reference: float = 25.0) -> Floats:
     """Thermal curvature of the scale factor: alpha_s2 T^2 a_i."""
     return k * above(state, reference) ** 2 * state.input_mps2
 
 
-@made("bias-jump", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="time")
+@made("bias-jump", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="time", family="bias in time")
 def bias_jump(k: Floats, rig: Rig, *, share: float = 0.4) -> Step:
     """Jump of the bias: constant from ``share`` of the run on, where something in the sensor has given way."""
     start_s = share * rig.duration_s
     return adding(lambda state: k * column(np.where(state.time_s >= start_s, 1.0, 0.0)))
 
 
-@added("power-warm-up", "m/s^2", ("20ug", "200ug"), ("2mg", "20mg"), known=False, driver="time")
+@added("power-warm-up", "m/s^2", ("20ug", "200ug"), ("2mg", "20mg"), known=False, driver="time", family="bias in time")
 def power_warm_up(k: Floats, state: State, *, tau: float = 120.0) -> Floats:
     """Warm-up by a power law: B / sqrt(1 + t / tau), as heat spreads into a thick base (diffusion)."""
     return k / np.sqrt(1.0 + column(state.time_s) / tau)
 
 
-@added("chirp", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="time")
+@added("chirp", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="time", family=NO_FAMILY)
 def chirp(k: Floats, state: State, *, frequency: float = 2e-3, chirp: float = 1e-5) -> Floats:
     """Periodic bias of rising frequency: A sin(2 pi (f t + chirp t^2 / 2)), as from a fan that speeds up."""
     t = column(state.time_s)
     return k * np.sin(2.0 * np.pi * (frequency * t + 0.5 * chirp * t**2))
 
 
-@made("telegraph", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="time")
+@made("telegraph", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="time", family="bias in time")
 def telegraph(k: Floats, rig: Rig, *, tau: float = 200.0) -> Step:
     """Telegraph noise: each bias switches between -k and +k, staying tau on average (burst or popcorn noise)."""
     chance = -0.5 * np.expm1(-2.0 * rig.period_s / tau)
@@ -115,14 +142,104 @@ def telegraph(k: Floats, rig: Rig, *, tau: float = 200.0) -> Step:
     return adding(contribution)
 
 
-@made("previous-pose", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="previous orientation")
+@made(
+    "previous-pose",
+    "m/s^2",
+    ("5ug", "100ug"),
+    ("2mg", "20mg"),
+    known=False,
+    driver="previous orientation",
+    family="memory",
+)
 def previous_pose(k: Floats, rig: Rig) -> Step:
     """Memory of the previous pose: k sin of the innermost angle of the dwell before; zero in the first dwell."""
     sines = np.concatenate([[0.0], np.sin(rig.motion.angles_rad[:-1, -1])])
     return adding(lambda state: k * sines[state.dwell])
 
 
-@made("cable-torque", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="angle")
+@made("cable-torque", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="angle", family=NO_FAMILY)
 def cable_torque(k: Floats, rig: Rig) -> Step:
     """Torque of a wound-up cable: k times the square of the innermost angle, as it was commanded, in half turns."""
     return adding(lambda state: k * (state.angles_rad[:, -1:] / np.pi) ** 2)
+
+
+# -- like real sensors and benches --
+
+
+@added("double-warm-up", "m/s^2", ("10ug", "200ug"), ("1mg", "10mg"), known=False, driver="time", family="bias in time")
+def double_warm_up(k: Floats, state: State, *, tau: float = 120.0, slow: float = 1500.0, share: float = 0.4) -> Floats:
+    """Warm-up of two time constants: B ((1 - share) exp(-t / tau) + share exp(-t / slow)), as the electronics and then
+    the block come to their temperatures."""
+    t = column(state.time_s)
+    return k * ((1.0 - share) * np.exp(-t / tau) + share * np.exp(-t / slow))
+
+
+@made("creep-and-walk", "m/s^2", ("5ug", "100ug"), ("1mg", "10mg"), known=False, driver="time", family="bias in time")
+def creep_and_walk(k: Floats, rig: Rig, *, tau: float = 60.0, share: float = 0.3) -> Step:
+    """Creep of the bias after power-on, then a random walk: k (ln(1 + t / tau) + share W), W a random walk whose
+    variance is t / tau; the creep is the faster at first, the walk later on."""
+    walk = FirstOrder(rig.generator("creep-and-walk"), 1.0, math.sqrt(rig.period_s / tau), 0.0)
+    return adding(lambda state: k * (np.log1p(column(state.time_s) / tau) + share * walk(len(state.time_s))))
+
+
+@made("output-step", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), coefficients=("step",), known=False, driver="time",
+      family="bias in time")  # fmt: skip
+def output_step(size: Floats, rig: Rig) -> Step:
+    """Step of one accelerometer's output: constant from an instant on; which one, and when between a fifth and four
+    fifths of the run, is drawn from the seed."""
+    rng = rig.generator("output-step")
+    steps, start_s = size * np.eye(3)[rng.integers(3)], rng.uniform(0.2, 0.8) * rig.duration_s
+    return adding(lambda state: steps * column(np.where(state.time_s >= start_s, 1.0, 0.0)))
+
+
+@made("thermal-hysteresis", "m/s^2/K", ("5ug/K", "30ug/K"), ("0.15mg/K", "1mg/K"), known=False, driver="temperature",
+      family="temperature")  # fmt: skip
+def thermal_hysteresis(alpha: Floats, rig: Rig, *, play: float = 2.0, reference: float = 25.0) -> Step:
+    """Temperature sensitivity with hysteresis: alpha times a temperature that follows the true one with a play of so
+    many K, up and down each, as glued and clamped parts do (Prandtl's play operator); without history at first."""
+    followed_c: float | None = None
+
+    def contribution(state: State) -> Floats:
+        nonlocal followed_c
+        true_c = state.temperature_c.tolist()
+        start_c = true_c[0] if followed_c is None else followed_c
+        followed = list(accumulate(true_c, lambda own, true: min(max(own, true - play), true + play), initial=start_c))
+        followed_c = followed[-1]
+        return alpha * column(np.array(followed[1:]) - reference)
+
+    return adding(contribution)
+
+
+@made("uneven-flexure", "rad/(m/s^2)", ("5urad/g", "100urad/g"), ("0.1mrad/g", "3mrad/g"), stage="force",
+      coefficients=("x", "y", "z"), known=False, driver="specific force", family="base and platform")  # fmt: skip
+def uneven_flexure(offset: Floats, rig: Rig, *, cx: float = 2.0, cy: float = 0.1, cz: float = 0.7) -> Step:
+    """Flexure of different stiffness about each axis: the platform gives way by (cx, cy, cz) times the three parts of
+    f x d, its compliances about its axes, each of them as part of the mean one (Hooke's law)."""
+    return bending(offset, np.array([cx, cy, cz]))
+
+
+@made("loose-mount", "rad", ("2urad", "50urad"), ("0.1mrad", "5mrad"), stage="attitude", coefficients=("x", "y", "z"),
+      signed=False, known=False, driver="specific force", family="unstated noise")  # fmt: skip
+def loose_mount(play: Floats, rig: Rig) -> Step:
+    """Loose mount: in each dwell the platform is turned in itself by play_j clip(u_k + z, -1, 1) about axis j, u_k
+    the part of gravity's direction along the axis that follows j, z a standard normal number, the friction: it rests
+    between two stops, mostly near the one that gravity pulls it to."""
+    angles_rad, count = rig.motion.angles_rad, len(rig.motion.angles_rad)
+    upward = carried_by_earth(rig.bench, np.array([[0.0, 1.0, 0.0]]), np.multiply(rig.motion.arrive_ns, 1e-9))
+    pull = rotate(attitude(rig.axes, angles_rad, rig.bench.up).inv(), upward)[:, [1, 2, 0]]
+    friction = rig.generator("loose-mount").standard_normal((count, 3))
+    return SettingError(play * np.clip(pull + friction, -1.0, 1.0))
+
+
+@made("eccentric-bearing", "rad", ("5urad", "50urad"), ("0.1mrad", "5mrad"), stage="angles", coefficients=("s", "c"),
+      per_axis=True, known=False, driver="angle", family="gimbal and encoder")  # fmt: skip
+def eccentric_bearing(size: Floats, rig: Rig, axis: int, *, share: float = 1.0) -> Step:
+    """Eccentric bearing of a gimbal: its encoder errs by s sin q + c cos q, and its axis is tilted in its parent by
+    share s and share c, as with encoder-harmonic-1 and axis-nonorthogonality, because its shaft is off its centre."""
+    parts = harmonic(1)(size, rig, axis), axis_nonorthogonality(share * size, rig, axis)
+
+    def step(state: State) -> None:
+        for part in parts:
+            part(state)
+
+    return step
