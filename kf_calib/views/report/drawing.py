@@ -55,11 +55,12 @@ class Drawing:
         self.markup = _element(self.figure, self.prefix, self.on_white)
 
     def with_points_as_picture(self) -> None:
-        """Draw again, the points of each kind as a picture where there are many."""
-        for axes in self.figure.axes:
-            for artist in axes.get_children():
-                artist.set_rasterized(_is_of_many_points(artist))
-        self.markup = _element(self.figure, self.prefix, self.on_white)
+        """Draw again, the points of each kind as a picture, where there are many."""
+        many = [each for axes in self.figure.axes for each in axes.get_children() if _is_of_many_points(each)]
+        for each in many:
+            each.set_rasterized(True)
+        if many:
+            self.markup = _element(self.figure, self.prefix, self.on_white)
 
     def as_picture(self) -> None:
         """Draw again, all of it as a picture, on white in the dark, too."""
