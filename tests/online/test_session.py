@@ -149,7 +149,7 @@ def test_candidates_are_tried_again_only_where_that_may_say_something_else(monke
     diagnosed = list[int]()
     monkeypatch.setattr(status, "diagnose", lambda result: diagnosed.append(len(result.visits)) or diagnose(result))
     monkeypatch.setattr(status, "assess_candidates", lambda *_: pytest.fail("nobody has asked"))
-    judgements = judged_one_by_one(bench("second-order=15sigma", orientations=24))
+    judgements = judged_one_by_one(bench("second-order=15sigma", orientations=20))
     alarmed = [k for k, each in judgements.items() if each.watch is not None and each.watch.alarmed is not None]
     assert 5 < alarmed[0], (alarmed, diagnosed)
     assert alarmed[0] == diagnosed[0] and len(diagnosed) < len(alarmed) - 3
@@ -482,7 +482,7 @@ def test_a_terminal_that_is_closed_costs_the_screen_only(tmp_path: Path, how: si
 
 
 def test_nobody_reading_ends_a_run_that_is_not_recorded() -> None:
-    with live(SLOW) as process:
+    with live(SLOW.replace("orientations=20", "orientations=10")) as process:
         assert process.stdout is not None and process.stdout.readline()
         process.stdout.close()
         assert process.wait(timeout=120) == 0
@@ -498,10 +498,9 @@ def test_nobody_reading_ends_a_run_that_is_not_recorded() -> None:
         (["--with", "nonsense"], "nonsense"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_sentence(words: list[str], sentence: str) -> None:
-    with live(URL, *words) as process:
-        said, errors = process.communicate(timeout=60)
-    assert process.returncode == 2 and not said
+def test_what_cannot_be_is_refused_in_a_sentence(run: Any, words: list[str], sentence: str) -> None:
+    code, said, errors = run("live", URL, *words)
+    assert code == 2 and not said
     assert sentence in errors and len(errors.strip().splitlines()) == 1
 
 
