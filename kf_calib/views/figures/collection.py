@@ -136,6 +136,5 @@ def _pages(what: Figures) -> bytes:
             figure = draw()
             if title:
                 figure.suptitle(title, x=0.01, ha="left")
-            style.arrange(figure)
             pages.savefig(figure)
     return memory.getvalue()

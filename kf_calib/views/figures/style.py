@@ -83,7 +83,6 @@ def content_of(figure: Figure, kind: str, dpi: float = DPI) -> bytes:
                "png": {"Software": None}}  # fmt: skip
     memory = io.BytesIO()
     with styled():
-        arrange(figure)
         figure.savefig(memory, format=kind, dpi=dpi, metadata=nothing[kind])
     return memory.getvalue()
 
