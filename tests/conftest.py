@@ -69,6 +69,17 @@ def ferraris() -> Path:
 
 
 @pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures of a page are blank: to draw them takes most of the time, and tests/views/test_report.py does."""
+    from matplotlib.figure import Figure
+
+    from kf_calib.views.report import drawing
+
+    drawn = drawing.content_of
+    monkeypatch.setattr(drawing, "content_of", lambda _, kind, dpi: drawn(Figure((1.0, 1.0)), kind, dpi))
+
+
+@pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     """The command line: exit code, what it prints, what it prints to the error stream."""
 

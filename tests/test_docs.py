@@ -20,7 +20,6 @@ import kf_calib
 pytest.importorskip("sphinx", reason="Sphinx is not there: the documentation is not built")
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-pytestmark = pytest.mark.xdist_group("docs")  # built once
 
 
 class Page(HTMLParser):

@@ -175,7 +175,7 @@ JSON_VALUES = st.recursive(
 )  # fmt: skip
 
 
-@settings(max_examples=1500, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=500, deadline=None, database=None, suppress_health_check=list(HealthCheck))
 @example({"nominal": {"\n": None}})
 @given(st.dictionaries(st.sampled_from(sorted(KEYS)), JSON_VALUES | st.sampled_from(["y z x", "9.81", "1,2,3", "z"])))
 def test_whatever_values_say_is_a_bench_or_a_sentence(values: dict[str, object]) -> None:

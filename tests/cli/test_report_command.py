@@ -20,6 +20,7 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_report_says_its_verdict_and_how_it_was_made(run) -> None:
     code, out, err = run("report", HIDDEN, "--settle-s", 1.5, "--no-gate")
     assert (code, err) == (0, "") and out.endswith("saved report.html\n")
@@ -32,6 +33,7 @@ def test_a_report_says_its_verdict_and_how_it_was_made(run) -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_name_of_a_file_is_text(run) -> None:
     name = Path("<img src=x onerror=alert(1)>.mcap")
     name.write_bytes(CLEAN.read_bytes())
@@ -48,6 +50,7 @@ def test_what_is_there_stays_without_overwrite(run) -> None:
     assert Path("report.html").read_text() == "mine"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_strict_tells_by_the_exit_code(run) -> None:
     assert run("report", HIDDEN, "--strict", "--json")[0] == 1
     assert Path("report.html").exists()

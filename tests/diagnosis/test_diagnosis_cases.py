@@ -70,7 +70,6 @@ def test_two_accelerometers_with_different_effects() -> None:
     assert all((sigmas[symbol] > 8.0) == (symbol in {"K2_1", "h3"}) for symbol in sigmas), sigmas
 
 
-@pytest.mark.xdist_group("walking")
 @pytest.mark.parametrize("seed", [1, 2, *slow(3, 4)])
 def test_a_walk_is_not_taken_for_a_drift(seed: int) -> None:
     """Straight lines and exponentials follow a random walk well; a wrong name is worse than several."""
@@ -225,7 +224,6 @@ def test_a_walk_and_another_effect_are_both_found(name: str) -> None:
     assert found.after is not None and found.after.consistency.consistent
 
 
-@pytest.mark.xdist_group("walking")
 @pytest.mark.parametrize("seeds", [range(1, 3), *slow(range(5))])
 def test_a_walk_that_explains_all_gets_no_companion_by_chance(seeds: range) -> None:
     found = [walking(seed) for seed in seeds]
@@ -326,7 +324,6 @@ def test_what_comes_back_is_described_as_such() -> None:
     assert said is not None and "back within about" in said.driver and said.formula == "bias-walk"
 
 
-@pytest.mark.xdist_group("walking")
 def test_a_walk_that_may_come_back_is_said_to() -> None:
     """Telegraph noise that is not unlikely enough for a walk to be none."""
     found = diagnose(source("telegraph=15sigma;tau=30", seed=21, dwells=24))

@@ -5,15 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.altered import Altered, mistyped, short_run
+from helpers.long_runs import slow
 
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.settings import Settings
 
+OPTIONS = [{}, {"unstated": True}, {"setting_sigma_deg": 0.01}, {"grade": "mems"}]
+ERRORS = [(7, 1, 10.0), (1, 2, -90.0), (4, 2, 1.0), (24, 1, 0.5)]
+LARGEST_AND_LEAST = [(options, *ERRORS[k]) for options in OPTIONS for k in (1, 3)]
+OTHERS = [(options, *ERRORS[k]) for options in OPTIONS for k in (0, 2)]
 
-@pytest.mark.parametrize("options", [{}, {"unstated": True}, {"setting_sigma_deg": 0.01}, {"grade": "mems"}], ids=str)
-@pytest.mark.parametrize(("number", "gimbal", "error_deg"), [(7, 1, 10.0), (1, 2, -90.0), (4, 2, 1.0), (24, 1, 0.5)])
+
+@pytest.mark.parametrize(("options", "number", "gimbal", "error_deg"), [*LARGEST_AND_LEAST, *slow(*OTHERS)], ids=str)
 def test_a_mistyped_pose_is_named_and_mended(options, number: int, gimbal: int, error_deg: float) -> None:
     run = short_run(**options)
     typed = np.array(run.plan[number - 1].gimbal_deg)

@@ -67,9 +67,9 @@ def test_each_of_47_wrong_wirings_is_refused_and_its_mending_mends(channels: tup
         result = calibrate(source)
         assert result.consistency.consistent
     source.bench = replace(run.bench, channels=channels)
+    found = calibrate(source).parameters
     for symbol, expected in run.sensors.parameters.items():
-        found = calibrate(source).parameters[symbol]
-        assert found.value == pytest.approx(expected, abs=6 * found.sigma)
+        assert found[symbol].value == pytest.approx(expected, abs=6 * found[symbol].sigma)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.calibrations import BENCH, SENSORS, simulated
+from helpers.long_runs import slow
 from scipy import stats
 
 import kf_calib
@@ -19,7 +20,6 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.sources.simulation.injected import parse
 
 FORCE = np.array([[0.0, 9.81, 0.0], [5.0, -6.0, 5.8], [-9.81, 0.0, 0.0], [3.0, 4.0, 8.4], [0.1, -0.2, 0.05]])
-REPETITIONS = 200
 
 
 def true_readings(force: np.ndarray, second_order: float = 0.0) -> np.ndarray:
@@ -78,15 +78,16 @@ def calibrated(seed: int) -> kf_calib.Calibration:
     return kf_calib.calibrate(simulated(seed, 10, hidden=hidden), kf_calib.Settings(effects="second-order"))
 
 
-def test_sigma_covers_the_true_specific_force() -> None:
+@pytest.mark.parametrize("runs", [100, *slow(400)])
+def test_sigma_covers_the_true_specific_force(runs: int) -> None:
     scores = []
-    for seed in range(REPETITIONS):
+    for seed in range(runs):
         found = calibrated(seed).apply(true_readings(FORCE, 4e-6))
         scores.append((found.force_mps2 - FORCE) / found.sigma_mps2)
     inside = np.sum(np.abs(scores) < 1.96, axis=0)
-    low, high = stats.binom.ppf([1e-4, 1.0 - 1e-4], REPETITIONS, 0.95)  # of each of fifteen
+    low, high = stats.binom.ppf([1e-4, 1.0 - 1e-4], runs, 0.95)  # of each of fifteen
     assert (inside >= low).all() and (inside <= high).all()
-    assert 0.93 < inside.mean() / REPETITIONS < 0.97
+    assert 0.93 < inside.mean() / runs < 0.97
 
 
 def test_noise_of_a_reading_is_that_of_the_bench() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.hidden_effects import noisy_run, run
+from helpers.long_runs import slow
 from helpers.paths import ROOT
 from helpers.synthetic import Run
 from matplotlib.axes import Axes
@@ -42,7 +43,9 @@ def hysteresis() -> Diagnosis:
 
 
 def panels(figure: Figure) -> list[Axes]:
-    figure.canvas.draw()
+    """Arranged and with its words in their places, without a pixel drawn; what has been so stays so."""
+    if figure.stale:
+        figure.draw_without_rendering()
     return figure.get_axes()
 
 
@@ -62,8 +65,8 @@ def axes_of(figure: Figure, title: str) -> Axes:
 
 
 @pytest.mark.parametrize("hidden", [
-    (), ("second-order=15sigma",), ("bias-drift=15sigma",), ("triple-product=25sigma",), ("sinusoid=30sigma",),
-    ("second-order=15sigma", "hysteresis=15sigma"),
+    (), ("triple-product=25sigma",), ("sinusoid=30sigma",), ("second-order=15sigma", "hysteresis=15sigma"),
+    *slow((("second-order=15sigma",),), (("bias-drift=15sigma",),)),
 ])  # fmt: skip
 def test_every_figure_of_a_diagnosis_has_ink_in_every_panel(hidden: tuple[str, ...]) -> None:
     for title, draw in plot.figures(found(*hidden)).items():

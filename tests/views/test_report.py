@@ -29,7 +29,6 @@ from kf_calib.views.report.parts import Table, parts_of
 HIDDEN = ROOT / "recordings" / "hidden.mcap"
 EVIL = "<script>document.title='evil'</script>"
 MORE_EVIL = "</script><img src=x onerror=\"document.title='evil'\">"
-pytestmark = pytest.mark.xdist_group("report")
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from PIL import Image
 
-from kf_calib.views.figures.style import content_of
+from kf_calib.views.figures.style import arrange, content_of, styled
 
 _MOST = 1_200_000  # characters of all figures of a page
 _MANY = 60  # points of one kind in a panel that are
@@ -52,14 +52,17 @@ class Drawing:
                             for each in axes.get_children())  # fmt: skip
         for patch in (self.figure.patch, *(axes.patch for axes in self.figure.axes)):
             patch.set_visible(False)
+        with styled():
+            arrange(self.figure)
         self.markup = _element(self.figure, self.prefix, self.on_white)
 
     def with_points_as_picture(self) -> None:
-        """Draw again, the points of each kind as a picture where there are many."""
-        for axes in self.figure.axes:
-            for artist in axes.get_children():
-                artist.set_rasterized(_is_of_many_points(artist))
-        self.markup = _element(self.figure, self.prefix, self.on_white)
+        """Draw again, the points of each kind as a picture, where there are many."""
+        many = [each for axes in self.figure.axes for each in axes.get_children() if _is_of_many_points(each)]
+        for each in many:
+            each.set_rasterized(True)
+        if many:
+            self.markup = _element(self.figure, self.prefix, self.on_white)
 
     def as_picture(self) -> None:
         """Draw again, all of it as a picture, on white in the dark, too."""
