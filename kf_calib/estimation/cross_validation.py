@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -81,7 +81,7 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
     The fit without an orientation is found by merging the factors of the orientations before it and after it.
     """
     carried, noise, around = fitted.carried, fitted.noise.judging, fitted.carried.model.nominal_state()
-    noise = replace(noise, setting_rad=0.0) if noise.free else noise
+    noise = noise.of_readings
     rows = fitted.rows(fitted.noise.judging.weights)
     extra, own = (
         considered_information(noise, carried.means, carried.state),
@@ -120,7 +120,7 @@ def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | Non
     """
     carried, noise, steps = fitted.carried, fitted.noise.judging, fitted.steps
     rows, means, around = fitted.all_rows(noise.weights), carried.means, carried.model.nominal_state()
-    errors, spreads = np.zeros((len(rows), 3)), mean_covariances(noise, means, carried.state)
+    errors, spreads = np.zeros((len(rows), 3)), mean_covariances(noise.of_readings, means, carried.state)
     spreads += (steps[:, 1] / 12.0)[:, None, None] * np.eye(3)  # variance of a path's mean about the mean of its ends
     alone, ways = _passes(rows, steps, ()), dict[int, list[tuple[int, Floats]]]()
     for group in groups:

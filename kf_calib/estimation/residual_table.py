@@ -52,7 +52,7 @@ class Run(Protocol):
 def mean_sigmas(result: Run) -> Floats:
     """Sigma (D, 3) of the mean of each dwell under the noise model, as the misfit is judged, m/s^2."""
     means = result.carried.means
-    return np.sqrt(np.einsum("dii->di", mean_covariances(result.noise.judging, means, result.carried.state)))
+    return np.sqrt(np.einsum("dii->di", mean_covariances(result.noise.judging.of_readings, means, result.carried.state)))
 
 
 def quantity_means(result: Run, names: list[str]) -> dict[str, Floats]:

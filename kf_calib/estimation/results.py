@@ -331,8 +331,9 @@ class Calibration:
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """Symbols of the twelve parameters and of the coefficients of effects that the run does not determine."""
-        states = {*paper_parameters.SYMBOLS, *(each.symbol for each in self.model.coefficients)}
+        """Symbols of the twelve parameters and of the coefficients of effects that the run does not determine; those
+        that are fixed are known."""
+        states = {*paper_parameters.SYMBOLS, *(each.symbol for each in self.model.coefficients)} - set(self.fixed)
         return tuple(p.symbol for p in self.parameters.values() if p.symbol in states and p.sigma is None)
 
     def considering(self, state: Floats, covariance: Floats) -> Estimate:
