@@ -198,21 +198,21 @@ def fit(
     for number in range(_most_passes(model)):
         if number == 1 and model.unknowns:
             model, searching = _placed(fitted), True
-            fitted = _linearised(fitted, model, fitted.carried.state)
+            fitted = replace(fitted, carried=linearised(fitted.carried, model, fitted.carried.state))
         if number and model.stepped:
             model, spreads = _averaged(fitted)
-            fitted = replace(_linearised(fitted, model, fitted.carried.state), spreads=spreads)
+            fitted = replace(fitted, carried=linearised(fitted.carried, model, fitted.carried.state), spreads=spreads)
         state, moved = _solved(fitted)
         if not (bench.angles or _sensible(state)):
             break  # the linearisation before is as good as any
         reach, left = _reach(fitted), _left_to_settle(fitted, state)
         if searching:
             model = model.moved(np.clip(moved, -reach, reach))
-        before, fitted = fitted, _linearised(fitted, model, state)
+        carried = linearised(fitted.carried, model, state)
         stated = _setting_deg(dwells, bench), bench.scatter_sigma_mps2
-        noise, sizes = with_dwell_parts(within, fitted.carried.means, state, *stated, walks=model.walks, near=sizes)
-        noise = replace(noise, slew_sigma_mps2=_slew_sigma(before, state) if slews else None)
-        fitted = replace(fitted, noise=noise)
+        noise, sizes = with_dwell_parts(within, carried.means, state, *stated, walks=model.walks, near=sizes)
+        noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
+        fitted = replace(fitted, carried=carried, noise=noise)
         if model.walks:
             own = within_dwells(dwells, noise.walk_mps2_per_sqrt_s)
             within = replace(within, sigma_mps2=own.sigma_mps2, inflation=own.inflation)
@@ -230,9 +230,7 @@ def _most_passes(model: Model) -> int:
     return _PASSES if model.bench.angles else _TURNS
 
 
-def _begun(
-    dwells: list[DwellFactor], model: Model, slews: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float
-) -> Fit:
+def _begun(dwells: list[DwellFactor], model: Model, slews: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float) -> Fit:
     """Return the fit from which estimation begins: with angles at the nominal state, without at that of the nine
     parameters alone, or of six with square axes where the poses do not tell the rest.
 
@@ -247,24 +245,33 @@ def _begun(
         scatter_mps2=np.full(3, stated or 0.0), scatter_stated=stated is not None,
     )  # fmt: skip
     bare = Model(model.bench, square=True)
-    first = _linearised(Fit(Carried(dwells, bare, bare.nominal_state()), noise), bare, bare.nominal_state())
-    free_attitude.refuse_poses(first.carried, noise)
-    settled = _settled(first)
-    if free_attitude.tells_angles(settled.carried, noise):
-        settled = _settled(_linearised(settled, Model(model.bench), settled.carried.state))
-    state = np.append(settled.carried.state, np.zeros(model.count - STATE_COUNT))
-    return _linearised(settled, replace(model, square=settled.carried.model.square), state)
+    carried = carried_at(dwells, bare, bare.nominal_state())
+    free_attitude.refuse_poses(carried, noise)
+    settled = _settled(Fit(carried, noise)).carried
+    if free_attitude.tells_angles(settled, noise):
+        carried = linearised(settled, Model(model.bench), settled.state)
+        settled = _settled(Fit(carried, noise)).carried
+    state = np.append(settled.state, np.zeros(model.count - STATE_COUNT))
+    return Fit(linearised(settled, replace(model, square=settled.model.square), state), noise)
 
 
-def _linearised(fitted: Fit, model: Model, state: Floats) -> Fit:
-    """Return the fit with a model linearised at a state; where no angles are used, the dwells have the specific force
-    that their readings show there."""
-    carried, dwells = fitted.carried, fitted.dwells
+def carried_at(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> Carried:
+    """Dwells with the columns of a model at a state, with the specific force that their readings show there if no
+    angles are used; what effects add to it is found in turn."""
+    carried = Carried(dwells, model, state)
+    for _ in range(0 if model.bench.angles else _PASSES if model.effects else 1):
+        carried = linearised(carried, model, state)
+    return carried
+
+
+def linearised(carried: Carried, model: Model, state: Floats) -> Carried:
+    """The dwells with the columns of a model at a state; if no angles are used, with the specific force that their
+    readings show there, less what effects add by the columns so far."""
+    dwells, own = carried.dwells, carried.means.design[:, :, STATE_COUNT:]
     if not model.bench.angles:
-        own = carried.means.design[:, :, STATE_COUNT:]
         added = own @ state[STATE_COUNT:] if own.shape[2] == len(state) - STATE_COUNT else None
         dwells = free_attitude.turned(dwells, state, model.bench.gravity_mps2, added)
-    return replace(fitted, carried=Carried(dwells, model, state, carried.slews))
+    return Carried(dwells, model, state, carried.slews)
 
 
 def _settled(fitted: Fit) -> Fit:
@@ -274,7 +281,7 @@ def _settled(fitted: Fit) -> Fit:
         if not _sensible(state):
             break
         left = _left_to_settle(fitted, state)
-        fitted = _linearised(fitted, fitted.carried.model, state)
+        fitted = replace(fitted, carried=linearised(fitted.carried, fitted.carried.model, state))
         if left < _SETTLED:
             return fitted
     raise UnobservableError(

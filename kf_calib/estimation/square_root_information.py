@@ -236,13 +236,13 @@ class MisfitColumns:
 
 
 def with_frame(rows: list[Floats], model: Model, noise: Noise, first: int = 0) -> list[Floats]:
-    """The rows [H | W | z] with one more for each state that the model fixes at zero, which has no column: a reading of
-    that state times g. They join the rows at index ``first``."""
+    """The rows [S | H | W | z] with one more for each state that the model fixes at zero, which has no column: a
+    reading of that state times g. They join the rows at index ``first``."""
     if not model.fixed:
         return rows
-    own = np.zeros((len(model.fixed), rows[first].shape[1]))
+    own, inside = np.zeros((len(model.fixed), rows[first].shape[1])), 3 if noise.walk_mps2_per_sqrt_s else 0
     for k, place in enumerate(model.fixed):
-        own[k, place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2[k % 3]
+        own[k, inside + place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2[k % 3]
     return [*rows[:first], np.vstack([own, rows[first]]), *rows[first + 1 :]]
 
 
