@@ -223,11 +223,13 @@ class Calibration:
     """The dwell that alone does not fit, or several if any one of them could be the cause."""
 
     @cached_property
-    def fixed(self) -> dict[str, str]:
+    def fixed(self) -> dict[str, Literal["frame", "square"]]:
         """Parameters that are not estimated because no angles are used, and what fixes each: the ``frame`` of the
         sensors, or axes that are taken for ``square``."""
-        both = {"frame": ("theta1", "phi1", "nu2"), "square": ("nu1", "theta3", "phi3") if self.model.square else ()}
-        return {} if self.bench.angles else {symbol: name for name, own in both.items() for symbol in own}
+        if self.bench.angles:
+            return {}
+        square = dict.fromkeys(("nu1", "theta3", "phi3") if self.model.square else (), "square")
+        return {**dict.fromkeys(("theta1", "phi1", "nu2"), "frame"), **square}
 
     @cached_property
     def held_out(self) -> HeldOut | None:
