@@ -15,6 +15,7 @@ from kf_calib.diagnosis.detectability import Detectable
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
 from kf_calib.diagnosis.within_dwell_trend import Trend
+from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.results import format_p
 from kf_calib.support.printing import printed
 from kf_calib.support.units import shown

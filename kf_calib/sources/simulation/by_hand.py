@@ -9,7 +9,6 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.sources.simulation.simulator import Simulation
 
-
 _ANY_DEG = 1e3  # a setting error that leaves the size of f alone, and rounding far below the noise
 
 
