@@ -228,8 +228,8 @@ class Calibration:
         sensors, or axes that are taken for ``square``."""
         if self.bench.angles:
             return {}
-        square = dict.fromkeys(("nu1", "theta3", "phi3") if self.model.square else (), "square")
-        return {**dict.fromkeys(("theta1", "phi1", "nu2"), "frame"), **square}
+        out: dict[str, Literal["frame", "square"]] = {"theta1": "frame", "phi1": "frame", "nu2": "frame"}
+        return out | ({"nu1": "square", "theta3": "square", "phi3": "square"} if self.model.square else {})
 
     @cached_property
     def held_out(self) -> HeldOut | None:

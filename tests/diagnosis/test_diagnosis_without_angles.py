@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
 
 import numpy as np
 import pytest
 from helpers.by_hand import by_hand
+from helpers.paths import RECORDINGS
 from scipy.stats import binom
 
 import kf_calib
@@ -36,14 +38,15 @@ def test_an_effect_of_ten_sigma_is_named_or_among_its_equals(name: str) -> None:
     assert found.after.held_out.rms_mps2 < 0.8 * found.before.held_out.rms_mps2
 
 
-def test_improve_adds_what_was_hidden_and_ends_consistent() -> None:
-    state = kf_calib.improve(by_hand("hysteresis=30sigma", stated=False))
-    assert state.effects == ("hysteresis",) and state.because == "consistent"
-    size = [p for symbol, p in state.result.parameters.items() if symbol in ("h1", "h2", "h3")]
-    assert all(p.value is not None and p.sigma is not None and abs(p.value) > 5.0 * p.sigma for p in size)
-    assert [p.value is None for p in state.result.parameters.values()][:12] == [
-        symbol in ("theta1", "phi1", "nu2") for symbol in list(state.result.parameters)[:12]
-    ]
+def test_the_board_in_recordings_is_improved_by_what_its_truth_says() -> None:
+    truth = json.loads((RECORDINGS / "hand.truth.json").read_text())["effects"][0]
+    state = kf_calib.improve(kf_calib.open_recording(RECORDINGS / "hand.mcap", angles=False))
+    assert state.effects == (truth["name"],) and state.because == "consistent"
+    assert state.start.suspects[0].statistic == pytest.approx(truth["size_sigma"] ** 2, rel=0.15)
+    parameters = state.result.parameters
+    assert [symbol for symbol, p in parameters.items() if p.value is None] == ["theta1", "phi1", "nu2"]
+    sizes = [abs(p.value) for p in list(parameters.values())[12:] if p.value is not None]
+    assert sizes == pytest.approx([abs(size) for size in truth["sizes"].values()], rel=0.15)
 
 
 def test_a_walk_of_the_biases_is_found_by_its_likelihood() -> None:
