@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.by_hand import by_hand
+from helpers.long_runs import slow
 from helpers.paths import RECORDINGS
 from scipy.stats import binom
 
@@ -29,7 +30,7 @@ def clean() -> kf_calib.Calibration:
     return kf_calib.calibrate(by_hand())
 
 
-@pytest.mark.parametrize("name", ["second-order", "scale-asymmetry", "bias-drift"])
+@pytest.mark.parametrize("name", ["second-order", *slow("scale-asymmetry", "thermal-bias", "bias-drift", "hysteresis")])
 def test_an_effect_of_ten_sigma_is_named_or_among_its_equals(name: str) -> None:
     found = kf_calib.diagnose(kf_calib.calibrate(by_hand(f"{name}=10sigma")))
     assert found.test.consistent is False
