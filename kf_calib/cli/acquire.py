@@ -154,10 +154,12 @@ class _Recorded(NamedTuple):
 
 def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], None]) -> _Recorded:
     """Write a source to a recording as it is, a chunk closed at the end of each dwell."""
+    from kf_calib.dwells.rest_in_readings import RestSegmenter
     from kf_calib.dwells.segmenter import Segmenter
     from kf_calib.sources.files.recorder import Recorder
 
-    readings, first_ns, last_ns, segmenter = 0, None, 0, Segmenter(source.bench)
+    segmenter = (Segmenter if source.bench.angles else RestSegmenter)(source.bench)
+    readings, first_ns, last_ns = 0, None, 0
     interrupt = Interrupter()
     with answered(interrupt), Recorder(out, source.bench, overwrite=overwrite) as recorder:
         for batch in source:
@@ -186,20 +188,25 @@ def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], 
 )
 @click.argument("out", type=OutputFile())
 @simulation_options
+@click.option("--no-angles", is_flag=True, panel="Run", help="Record no angles, as of a board that is turned by hand.")
 @bench_options
 @overwrite_option
 @click.option("--large", is_flag=True, panel=OUTPUT, help="Begin even where the disk would not hold the recording.")
 @json_option
-def simulate(out: Path, overwrite: bool, large: bool, as_json: bool, **options: Any) -> None:
+def simulate(
+    out: Path, no_angles: bool, overwrite: bool, large: bool, as_json: bool, **options: Any
+) -> None:  # fmt: skip
     """Record a simulated bench run to OUT; its truth goes to a side file that no estimator opens."""
+    from kf_calib.sources.simulation.by_hand import ByHand
     from kf_calib.sources.simulation.options import simulation
     from kf_calib.sources.simulation.truth import truth_file, write_truth
 
     claimed([Path(options["plan"])], {"OUT, whose truth goes there": truth_file(out)}, overwrite)
+    options["no_angles"] = no_angles
     source = simulation(options, overrides(options), begin=partial(_foresee, out=out, large=large))
     with progress(f"simulating {out.name}", as_json) as tick:
-        made = _record(source, out, overwrite, tick)
-    truth = write_truth(source, out)
+        made = _record(ByHand(source) if no_angles else source, out, overwrite, tick)
+    truth = write_truth(source, out, not no_angles)
     if as_json:
         print_json({"recording": str(out), "truth": str(truth), **made.keys})
     else:

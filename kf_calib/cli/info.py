@@ -66,6 +66,7 @@ def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json:
     if dwells is not None and not dwells:
         missing[""] = "a stretch in which the platform stands still: --still-deg says what counts as standing still"
     words = [*_given(ctx, inventory), *_fields(inventory), *(_NAMED[key][0] for key in missing if key in _NAMED)]
+    words += ["--no-angles"] if _by_hand(inventory) and not options["no_angles"] else []
     found = Overview(inventory, bench, dwells, list(missing.values()), _command(inventory, words), warnings)
     if as_json:
         print_json(overview_object(found))
@@ -75,7 +76,7 @@ def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json:
 
 def _lacking(inventory: Inventory, bench: Mapping[str, str]) -> dict[str, str]:
     """What the bench's description lacks, by the key."""
-    keys = {"axes": inventory.has_angles is not False and not bench.get("axes"),
+    keys = {"axes": inventory.has_angles is not False and not bench.get("axes") and not _by_hand(inventory),
             "gravity_mps2": not bench.get("gravity_mps2") and not bench.get("latitude_deg")}  # fmt: skip
     return {key: _NAMED[key][1] for key, lacks in keys.items() if lacks}
 
@@ -123,6 +124,12 @@ def _fields(inventory: Inventory) -> list[str]:
     accel = [] if inventory.has_readings else ["--field accel=TOPIC:X,Y,Z@TIME"]
     angles = [] if inventory.has_angles is not None else ["--field angles=TOPIC:OUTER,MIDDLE,INNER@TIME"]
     return accel + angles
+
+
+def _by_hand(inventory: Inventory) -> bool:
+    """Whether a recording has readings and nothing that could be angles, as that of a board turned by hand."""
+    angles = inventory.has_angles is not None or any(topic.paths for topic in inventory.topics)
+    return inventory.has_readings and not (inventory.is_lines or angles)
 
 
 def _command(inventory: Inventory, words: list[str]) -> str:

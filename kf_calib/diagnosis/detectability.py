@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kf_calib.diagnosis.candidate_tests import LEVEL, SHARE, CandidateTests
-from kf_calib.effects import Coefficient, Effect, Stimulus
+from kf_calib.effects import Coefficient, Effect, FrameEffect, Stimulus
 from kf_calib.effects.effect import Grade, Typical
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.fit import Fit
@@ -78,6 +78,8 @@ def unseen(fitted: Fit, test: CandidateTests) -> list[Unseen]:
 def _reason(effect: Effect, stimulus: Stimulus) -> str:
     """Return why nothing of an effect is seen in dwells."""
     columns = effect_columns([effect], stimulus)
+    if not stimulus.bench.angles and not columns.any() and _needs_angles(effect, stimulus):
+        return "depends on how the platform stands, which is not known without angles"
     for quantity, words in _CONDITIONS.items():
         values = np.nan_to_num(getattr(stimulus, quantity))
         ramp = np.arange(len(values), dtype=float).reshape(-1, *[1] * (values.ndim - 1)) / len(values)
@@ -88,6 +90,14 @@ def _reason(effect: Effect, stimulus: Stimulus) -> str:
     if not columns.any():
         return "adds nothing to a reading in these orientations"
     return effect.degeneracy(stimulus.bench) or "adds to every dwell what the model adds already"
+
+
+def _needs_angles(effect: Effect, stimulus: Stimulus) -> bool:
+    """Tell whether an effect would have columns if some attitude were known."""
+    if isinstance(effect, FrameEffect):
+        return True
+    poses = np.random.default_rng(1).normal(size=stimulus.pose.shape)
+    return bool(effect_columns([effect], replace(stimulus, pose=poses, previous_pose=poses)).any())
 
 
 def sensor_grade(fitted: Fit) -> Grade:

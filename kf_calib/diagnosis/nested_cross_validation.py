@@ -12,8 +12,8 @@ from kf_calib.diagnosis.stepwise_selection import improve
 from kf_calib.dwells.sufficient_statistics import dwells_without
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.calibration import evaluate
-from kf_calib.estimation.cross_validation import orientations
-from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.cross_validation import orientations, told_of
+from kf_calib.estimation.fit import carried_at
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.threads import one_blas_thread
@@ -65,14 +65,16 @@ def nested_cross_validation(
 
 
 def _prediction_errors(start: Calibration, result: Calibration, left: list[int]) -> tuple[Floats, Floats]:
-    """Return the squared errors of the held-out dwell means and the variances that noise gives; (3 len(left),) each."""
+    """Return the squared errors of the held-out dwell means and the variances that noise gives; (3 len(left),) each, or
+    (len(left),) of the size of f where no angles are used."""
     if result.estimate.undetermined.size:
         raise UnobservableError(
             "the orientations without those held out do not determine the model: the honest held-out error needs a "
             "run of more orientations."
         )
-    means = Carried(start.fit.dwells, result.model, result.carried.state).means[left]
+    noise, state = result.noise.judging, result.carried.state
+    means = carried_at(start.fit.dwells, result.model, state).means[left]
     spread = means.design @ result.estimate.covariance @ np.swapaxes(means.design, 1, 2)
-    spread = spread + mean_covariances(result.noise.judging, means, result.carried.state)
-    residuals = means.readings - means.design @ result.estimate.state
-    return (residuals**2).ravel(), np.einsum("dii->di", spread).ravel()
+    spread = spread + mean_covariances(noise.of_readings, means, state)
+    told = told_of(means.readings - means.design @ result.estimate.state, spread, means, state, noise.free)
+    return (told.errors_mps2**2).ravel(), np.einsum("dii->di", told.covariance).ravel()

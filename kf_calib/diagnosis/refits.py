@@ -13,7 +13,6 @@ from kf_calib.effects import Effect
 from kf_calib.estimation.calibration import calibrate, evaluate_fit
 from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.estimation.observability import refuse_without_angles
 from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import Frame
@@ -86,13 +85,8 @@ class Refits:
 def calibration_of(
     run: Calibration | Source | str | PathLike[str], refits: Refits | None = None
 ) -> tuple[Calibration, Refits]:
-    """A calibration, or that of a recording, source or path, and its refits: those given or new ones.
-
-    Raises InputError if it was made without angles.
-    """
+    """A calibration, or that of a recording, source or path, and its refits: those given or new ones."""
     if isinstance(run, Calibration):
-        refuse_without_angles(run.bench)
         return run, refits or Refits()
     source = opened(run)
-    refuse_without_angles(source.bench)
     return calibrate(source), refits or Refits(source)

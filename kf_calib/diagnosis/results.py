@@ -91,7 +91,7 @@ class Diagnosis:
     def residual_ratios(self) -> Floats:
         """Residuals of the dwell means (D, 3), over their sigma."""
         carried = self.before.carried
-        spread = mean_covariances(self.before.noise.judging, carried.means, carried.state)
+        spread = mean_covariances(self.before.noise.judging.of_readings, carried.means, carried.state)
         return self.before.residuals_mps2 / np.sqrt(np.einsum("dii->di", spread))
 
     @cached_property

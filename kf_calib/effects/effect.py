@@ -246,8 +246,12 @@ class SensorEffect(Effect):
 class FrameEffect(Effect):
     """The platform stands otherwise than its angles say; ``rotations`` (m, q, 3), rad per unit, in the platform frame.
 
-    A rotation alpha turns the specific force by alpha x f, and reading i changes by s_i . (alpha x f).
+    A rotation alpha turns the specific force by alpha x f, and reading i changes by s_i . (alpha x f). Where no angles
+    are used, nothing is said of how the platform stands, and it has no columns.
     """
+
+    def shows_in(self, s: Stimulus) -> bool:
+        return s.bench.angles and super().shows_in(s)
 
     @abstractmethod
     def rotations(self, s: Stimulus) -> Floats: ...

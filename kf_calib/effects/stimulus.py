@@ -56,7 +56,8 @@ class Stimulus:
     """The state of the bench at m instants of dwells.
 
     elapsed_s, since_arrival_s, temperature_c: (m,); force_mps2: specific force in the platform frame, (m, 3), and pose,
-    (m, k), each of the dwell before, too; sensitivity (3, 3): rows K_i E_i at which small rotations are linearised;
+    (m, k), NaN where it is not known, each of the dwell before, too; sensitivity (3, 3): rows K_i E_i at which small
+    rotations are linearised;
     variance_mps2_2: variance of the readings about here, (m, 3). rate_radps, rate_change_radps2: omega of the platform
     in its own frame and its derivative there, (m, 3), zero where it stands. half_s, within: half the length of the
     piece of a dwell an instant belongs to, and where in it that is, from -1 to 1, (m,); zeros where it is of no piece.

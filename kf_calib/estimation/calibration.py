@@ -236,7 +236,7 @@ def _visits(
 ) -> tuple[Visit, ...]:
     """Return for each dwell its innovation, its residual and the estimate after it."""
     carried, means, around = fitted.carried, fitted.carried.means, fitted.carried.model.nominal_state()
-    own, walked = mean_covariances(fitted.noise, means, carried.state), to_mean(fitted.steps)
+    own, walked = mean_covariances(fitted.noise.of_readings, means, carried.state), to_mean(fitted.steps)
     first, extra = (
         square_root_information.start(settings.prior, carried.model),
         np.concatenate([0.0 * extra[:1], extra]),

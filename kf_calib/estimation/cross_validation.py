@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import random_walk, square_root_information
+from kf_calib.estimation.dwell_columns import Means
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.free_attitude import weights_of_size
 from kf_calib.estimation.noise_model import considered_information, lift_rounding, mean_covariances
@@ -67,12 +68,19 @@ def held_out(fitted: Fit) -> HeldOut | None:
     Slews are not left out of any fit. Without angles the errors are those of |f|, one a dwell.
     """
     predicted = (_beside if fitted.noise.walk_mps2_per_sqrt_s else _without)(fitted, orientations(fitted.dwells))
-    if predicted is not None and fitted.noise.free:
-        errors, covariance = predicted
-        across = weights_of_size(fitted.carried.means, fitted.carried.state)
-        errors, covariance = across[:, None] @ errors[:, :, None], across[:, None] @ covariance @ across[:, :, None]
-        return HeldOut(errors[:, :, 0], covariance)
-    return None if predicted is None else HeldOut(*predicted)
+    if predicted is None:
+        return None
+    return told_of(*predicted, fitted.carried.means, fitted.carried.state, fitted.noise.free)
+
+
+def told_of(errors_mps2: Floats, covariance: Floats, means: Means, state: Floats, free: bool) -> HeldOut:
+    """The errors (D, 3) of dwells that were held out, and their covariance; where attitudes are ``free``, those of the
+    size of f."""
+    if not free:
+        return HeldOut(errors_mps2, covariance)
+    across = weights_of_size(means, state)
+    sizes = across[:, None] @ errors_mps2[:, :, None]
+    return HeldOut(sizes[:, :, 0], across[:, None] @ covariance @ across[:, :, None])
 
 
 def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | None:
@@ -81,15 +89,13 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
     The fit without an orientation is found by merging the factors of the orientations before it and after it.
     """
     carried, noise, around = fitted.carried, fitted.noise.judging, fitted.carried.model.nominal_state()
-    noise = replace(noise, setting_rad=0.0) if noise.free else noise
+    noise = noise.of_readings
     rows = fitted.rows(fitted.noise.judging.weights)
     extra, own = (
         considered_information(noise, carried.means, carried.state),
         mean_covariances(noise, carried.means, carried.state),
     )
-    empty = square_root_information.start(Prior(), carried.model)
-    for place in carried.model.fixed:  # held at zero, whichever orientation is left out
-        empty[place, place] = carried.model.bench.gravity_mps2 / noise.effective_sigma_mps2.min()
+    empty = _frame(fitted)
     slews = square_root_information.update(empty, np.concatenate(fitted.following))[0] if carried.slews else empty
     heads, tails = [slews], [empty]
     for group in groups[:-1]:
@@ -120,11 +126,12 @@ def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | Non
     """
     carried, noise, steps = fitted.carried, fitted.noise.judging, fitted.steps
     rows, means, around = fitted.all_rows(noise.weights), carried.means, carried.model.nominal_state()
-    errors, spreads = np.zeros((len(rows), 3)), mean_covariances(noise, means, carried.state)
+    errors, spreads = np.zeros((len(rows), 3)), mean_covariances(noise.of_readings, means, carried.state)
     spreads += (steps[:, 1] / 12.0)[:, None, None] * np.eye(3)  # variance of a path's mean about the mean of its ends
-    alone, ways = _passes(rows, steps, ()), dict[int, list[tuple[int, Floats]]]()
+    first = _frame(fitted)
+    alone, ways = _passes(first, rows, steps, ()), dict[int, list[tuple[int, Floats]]]()
     for group in groups:
-        heads, tails = alone if len(group) == 1 else _passes(rows, steps, group)
+        heads, tails = alone if len(group) == 1 else _passes(first, rows, steps, group)
         for k in group:
             upper, count = random_walk.advance(heads[k], steps[k], np.hstack([np.zeros((len(around), 3)), tails[k]]))
             order = [*range(count, upper.shape[1] - 1), *range(count), upper.shape[1] - 1]
@@ -143,11 +150,22 @@ def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | Non
     return errors, spreads
 
 
-def _passes(rows: Sequence[Floats], steps: Floats, left_out: Sequence[int]) -> tuple[list[Floats], list[Floats]]:
-    """Return the factors before each dwell from the dwells before it, and those at its end from the dwells after it."""
-    width = rows[0].shape[1] - 4
+def _frame(fitted: Fit) -> Floats:
+    """Return the factor that knows nothing but the states that are fixed at zero, whichever orientation is left out."""
+    model, noise = fitted.carried.model, fitted.noise
+    out = square_root_information.start(Prior(), model)
+    for place in model.fixed:
+        out[place, place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2.min()
+    return out
+
+
+def _passes(
+    first: Floats, rows: Sequence[Floats], steps: Floats, left_out: Sequence[int]
+) -> tuple[list[Floats], list[Floats]]:
+    """Return the factors before each dwell from ``first`` and the dwells before it, and those at its end from the
+    dwells after it."""
     known = [own[:0] if k in left_out else own for k, own in enumerate(rows)]
-    heads, tails = [np.zeros((width, width + 1))], [np.zeros((width, width + 1))]
+    width, heads, tails = len(first), [first], [np.zeros_like(first)]
     for own, variances in zip(known[:-1], steps, strict=False):
         upper, count = random_walk.advance(heads[-1], variances, own)
         heads.append(upper[count : count + width, count:])

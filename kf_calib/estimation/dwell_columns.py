@@ -22,8 +22,11 @@ _VIBRATING = 15.0  # mean squared deviation of the variances in units of sigma; 
 
 def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> Stimulus:
     """The conditions at the nodes of all pieces of all dwells and slews, in order; rotations are linearised at
-    ``state``."""
-    return Stimulus(bench=bench, sensitivity=state[:12].reshape(3, 4)[:, :3], **_conditions(tuple(dwells)))
+    ``state``. Poses are NaN where no angles are used."""
+    known = _conditions(tuple(dwells))
+    if not bench.angles:
+        known = known | {key: np.full_like(known[key], np.nan) for key in ("pose", "previous_pose")}
+    return Stimulus(bench=bench, sensitivity=state[:12].reshape(3, 4)[:, :3], **known)
 
 
 @lru_cache(maxsize=2)

@@ -21,10 +21,10 @@ from kf_calib.bench.bench import Bench
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect
-from kf_calib.errors import InputError, UnobservableError
+from kf_calib.errors import UnobservableError
 from kf_calib.estimation import free_attitude, square_root_information
 from kf_calib.estimation.dwell_columns import Carried, Means, candidate_columns, stimulus_of
-from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, steps, within_dwells
 from kf_calib.estimation.reml import Part, gain_of, misfit, restoring_gain, with_dwell_parts, with_slow_scatter
 from kf_calib.estimation.score_test import falls
@@ -191,86 +191,117 @@ def fit(
     - walk_mps2_per_sqrt_s: stated intensity of the random walk of the biases, m/s^2/s^(1/2).
     - slews: the slews; used only if the model has effects that show in slews only.
     """
-    if not model.bench.angles:
-        return _without_angles(dwells, model, walk_mps2_per_sqrt_s)
-    within, bench = within_dwells(dwells, walk_mps2_per_sqrt_s), model.bench
-    within = replace(within, walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
     slews = [slew for slew in slews if slew.number >= dwells[0].number] if model.dynamic else []
-    fitted = Fit(Carried(dwells, model, model.nominal_state(), slews), within)
+    fitted = _begun(dwells, model, slews, walk_mps2_per_sqrt_s)
+    model, within, bench = fitted.carried.model, fitted.noise, model.bench
     searching, sizes = False, None
-    for number in range(_PASSES_WITH_UNKNOWNS if model.unknowns or model.stepped else _PASSES):
+    for number in range(_most_passes(model)):
         if number == 1 and model.unknowns:
             model, searching = _placed(fitted), True
-            fitted = replace(fitted, carried=Carried(dwells, model, fitted.carried.state, slews))
+            fitted = replace(fitted, carried=linearised(fitted.carried, model, fitted.carried.state))
         if number and model.stepped:
             model, spreads = _averaged(fitted)
-            fitted = replace(fitted, carried=Carried(dwells, model, fitted.carried.state, slews), spreads=spreads)
+            fitted = replace(fitted, carried=linearised(fitted.carried, model, fitted.carried.state), spreads=spreads)
         state, moved = _solved(fitted)
-        reach = _reach(fitted)
+        if not (bench.angles or _sensible(state)):
+            break  # the linearisation before is as good as any
+        reach, left = _reach(fitted), _left_to_settle(fitted, state)
         if searching:
             model = model.moved(np.clip(moved, -reach, reach))
-        carried = Carried(dwells, model, state, slews)
+        carried = linearised(fitted.carried, model, state)
         stated = _setting_deg(dwells, bench), bench.scatter_sigma_mps2
         noise, sizes = with_dwell_parts(within, carried.means, state, *stated, walks=model.walks, near=sizes)
         noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
         fitted = replace(fitted, carried=carried, noise=noise)
         if model.walks:
-            within = within_dwells(dwells, noise.walk_mps2_per_sqrt_s)
+            own = within_dwells(dwells, noise.walk_mps2_per_sqrt_s)
+            within = replace(within, sigma_mps2=own.sigma_mps2, inflation=own.inflation)
         # a constant without a derivative holds the input axes near their linearisation, so that convergence is slow
-        if number >= _PASSES - 1 and (np.abs(moved) <= _STILL * reach).all() and not model.stepped:
+        still = (np.abs(moved) <= _STILL * reach).all() and left < _SETTLED and not model.stepped
+        if number >= _PASSES - 1 and still:
             break
     return fitted
 
 
-def _without_angles(dwells: list[DwellFactor], model: Model, walk_mps2_per_sqrt_s: float) -> Fit:
-    """Fit nine parameters where only |f| = g is known, or six with square axes where the poses do not tell the rest.
+def _most_passes(model: Model) -> int:
+    """Return how often noise, linearisation and constants are estimated in turn at most."""
+    if model.unknowns or model.stepped:
+        return _PASSES_WITH_UNKNOWNS
+    return _PASSES if model.bench.angles else _TURNS
 
-    Raises InputError for a model with effects or a walk, and UnobservableError if the poses tell too little.
+
+def _begun(dwells: list[DwellFactor], model: Model, slews: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float) -> Fit:
+    """Return the fit from which estimation begins: with angles at the nominal state, without at that of the nine
+    parameters alone, or of six with square axes where the poses do not tell the rest.
+
+    Raises UnobservableError if the poses tell too little.
     """
-    if model.effects or walk_mps2_per_sqrt_s:
-        raise InputError(
-            "without angles (--no-angles) the model has scale factors, biases and the angles between the axes only: "
-            "leave out effects (--with, --model) and --bias-walk, or record the angles."
-        )
+    within = replace(within_dwells(dwells, walk_mps2_per_sqrt_s), walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
+    if model.bench.angles:
+        return Fit(Carried(dwells, model, model.nominal_state(), slews), within)
     stated = model.bench.scatter_sigma_mps2
     noise = replace(
-        within_dwells(dwells), setting_rad=free_attitude.UNBOUNDED_RAD, setting_stated=True, free=True,
+        within, setting_rad=free_attitude.UNBOUNDED_RAD, setting_stated=True, free=True,
         scatter_mps2=np.full(3, stated or 0.0), scatter_stated=stated is not None,
     )  # fmt: skip
-    square = replace(model, square=True)
-    free_attitude.refuse_poses(_turned(dwells, square, square.nominal_state(), noise).carried, noise)
-    fitted = _settled(_turned(dwells, square, square.nominal_state(), noise))
-    if free_attitude.tells_angles(fitted.carried, noise):
-        fitted = _settled(_turned(dwells, model, fitted.carried.state, noise))
-    if stated is None:
-        for _ in range(_PASSES):
-            carried = fitted.carried
-            noise = free_attitude.with_scatter(noise, carried.means, carried.state, carried.model.square)
-            fitted = _settled(replace(fitted, noise=noise))
-    return fitted
+    bare = Model(model.bench, square=True)
+    carried = carried_at(dwells, bare, bare.nominal_state())
+    free_attitude.refuse_poses(carried, noise)
+    settled = _settled(Fit(carried, noise)).carried
+    if free_attitude.tells_angles(settled, noise):
+        carried = linearised(settled, Model(model.bench), settled.state)
+        settled = _settled(Fit(carried, noise)).carried
+    state = np.append(settled.state, np.zeros(model.count - STATE_COUNT))
+    return Fit(linearised(settled, replace(model, square=settled.model.square), state), noise)
 
 
-def _turned(dwells: Sequence[DwellFactor], model: Model, state: Floats, noise: Noise) -> Fit:
-    """Return the fit linearised at a state and at the forces that the dwells have there."""
-    own = free_attitude.turned(dwells, state, model.bench.gravity_mps2)
-    return Fit(Carried(own, model, state), noise)
+def carried_at(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> Carried:
+    """Dwells with the columns of a model at a state, with the specific force that their readings show there if no
+    angles are used; what effects add to it is found in turn."""
+    carried = Carried(dwells, model, state)
+    for _ in range(0 if model.bench.angles else _PASSES if model.effects else 1):
+        carried = linearised(carried, model, state)
+    return carried
+
+
+def linearised(carried: Carried, model: Model, state: Floats) -> Carried:
+    """The dwells with the columns of a model at a state; if no angles are used, with the specific force that their
+    readings show there, less what effects add by the columns so far."""
+    dwells, own = carried.dwells, carried.means.design[:, :, STATE_COUNT:]
+    if not model.bench.angles:
+        added = own @ state[STATE_COUNT:] if own.shape[2] == len(state) - STATE_COUNT else None
+        dwells = free_attitude.turned(dwells, state, model.bench.gravity_mps2, added)
+    return Carried(dwells, model, state, carried.slews)
 
 
 def _settled(fitted: Fit) -> Fit:
-    """Return the fit with forces and state found in turn until neither moves."""
-    unit = np.tile([1.0, 1.0, 1.0, fitted.carried.model.bench.gravity_mps2], 3)
+    """Return the fit of the nine parameters with forces and state found in turn until neither moves."""
     for _ in range(_TURNS):
         state = fitted.state
-        if not (np.isfinite(state).all() and np.linalg.cond(state.reshape(3, 4)[:, :3]) < _SINGULAR):
+        if not _sensible(state):
             break
-        moved = np.abs((state - fitted.carried.state) / unit).max()
-        fitted = _turned(fitted.dwells, fitted.carried.model, state, fitted.noise)
-        if moved < _SETTLED:
+        left = _left_to_settle(fitted, state)
+        fitted = replace(fitted, carried=linearised(fitted.carried, fitted.carried.model, state))
+        if left < _SETTLED:
             return fitted
     raise UnobservableError(
         "the sizes of the readings at rest lead to no sensible set of scale factors, biases and angles: check the unit "
         "of the readings (--accel-unit) and gravity, and turn it to more sides."
     )
+
+
+def _sensible(state: Floats) -> bool:
+    """Tell whether a state (p,) tells the specific force from the readings."""
+    sensitivity = state[:STATE_COUNT].reshape(3, 4)[:, :3]
+    return bool(np.isfinite(state).all() and np.linalg.cond(sensitivity) < _SINGULAR)
+
+
+def _left_to_settle(fitted: Fit, state: Floats) -> float:
+    """Return by how much the parameters move, relative to g, from where the fit has its forces; 0 with angles."""
+    if fitted.carried.model.bench.angles:
+        return 0.0
+    unit = np.tile([1.0, 1.0, 1.0, fitted.carried.model.bench.gravity_mps2], 3)
+    return float(np.abs((state - fitted.carried.state)[:STATE_COUNT] / unit).max())
 
 
 def _setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:

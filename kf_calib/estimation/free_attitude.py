@@ -1,9 +1,10 @@
 """Calibration without angles: of each dwell only the size of the specific force is known, |f| = g.
 
 The setting error of a dwell is then unbounded: two rotations, about axes across f, are nuisance states of any size. At
-the current state the specific force of a dwell is f = g unit(S^-1 (z - b)), where S holds the sensitivities in its
-rows, b the biases and z the mean readings; the rows are linearised there, and of a dwell's three readings the one
-combination n = S^-T f / g is left that no rotation changes. Force and state are found in turn (``settled``).
+the current state the specific force of a dwell is f = g unit(S^-1 (z - b - e)), where S holds the sensitivities in its
+rows, b the biases, z the mean readings and e what effects add to these; the rows are linearised there, and of a dwell's
+three readings the one combination n = S^-T f / g is left that no rotation changes. Force and state are found in turn
+(``fit``). Within a dwell the block does not turn, so that changes of all three readings are left.
 
 A common rotation of all axes shows in no |f|. The frame is therefore that of the sensors: accelerometer 1 is its x
 axis, accelerometer 2 lies in its plane of x and y. Nine parameters are left: three scale factors, three biases, and
@@ -20,13 +21,11 @@ from dataclasses import replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.dwell_columns import Carried, Means, Samples
 from kf_calib.estimation.measurement_model import FRAME, SQUARE, STATE_COUNT
 from kf_calib.estimation.noise_model import Noise
-from kf_calib.support.tail_probabilities import chi_squared_tail
 
 UNBOUNDED_RAD = 10.0
 """Prior sigma of a rotation in the engines that need a finite one: what it tells is 1e-8 of a reading or less."""
@@ -40,10 +39,7 @@ DIRECTIONS: dict[str, Floats] = {
 """Faces, edges and corners of a cube by the axes that point up."""
 
 _NINE = [k for k in range(STATE_COUNT) if k not in FRAME]
-_SIX = [k for k in _NINE if k not in SQUARE]
-_FEWEST = 6  # degrees of freedom; with fewer no scatter is estimated
 _HOPELESS_SCALE, _HOPELESS_MPS2 = 0.2, 2.0
-_CHARGE = 2.7  # log-likelihood that scatter has to gain: 1 % point of the likelihood ratio
 
 
 def tangents(force: Floats) -> Floats:
@@ -61,14 +57,22 @@ def felt(readings: Floats, state: Floats) -> Floats:
     return np.asarray(np.linalg.solve(affine[:, :3], (readings - affine[:, 3]).T).T, float)
 
 
-def turned(dwells: Sequence[DwellFactor], state: Floats, gravity_mps2: float) -> list[DwellFactor]:
+def turned(
+    dwells: Sequence[DwellFactor], state: Floats, gravity_mps2: float, added_mps2: Floats | None = None
+) -> list[DwellFactor]:
     """The dwells with the specific force that their readings show at ``state``, of size g, and a pose that has it up.
 
-    The heading of such a pose is arbitrary.
+    The heading of such a pose is arbitrary. added_mps2 (D, 3): what effects add to the mean readings.
     """
-    raw = felt(np.array([dwell.means[4:] for dwell in dwells]), state)
+    means = np.array([dwell.means[4:] for dwell in dwells])
+    raw = felt(means if added_mps2 is None else means - added_mps2, state)
     unit = raw / np.linalg.norm(raw, axis=1, keepdims=True)
-    return [_with_force(dwell, gravity_mps2 * own, _pose(own)) for dwell, own in zip(dwells, unit, strict=True)]
+    out = [_with_force(dwell, gravity_mps2 * own, _pose(own)) for dwell, own in zip(dwells, unit, strict=True)]
+    left = [k for k, dwell in enumerate(out) if dwell.came_from is not None]
+    before = turned([each for each in (out[k].came_from for k in left) if each], state, gravity_mps2) if left else []
+    for k, last in zip(left, before, strict=True):
+        out[k] = replace(out[k], came_from=last)
+    return out
 
 
 def _with_force(dwell: DwellFactor, force: Floats, pose: Floats) -> DwellFactor:
@@ -96,50 +100,12 @@ def weights_of_size(means: Means, state: Floats) -> Floats:
     return np.asarray(np.linalg.solve(sensitivity.T, unit.T).T, float)
 
 
-def radial(means: Means, state: Floats) -> tuple[Floats, Floats, Floats]:
-    """What no rotation changes: design (D, p), residual (D,) in m/s^2 of |f|, and the weights (D, 3) of the channels in
-    it."""
-    across = weights_of_size(means, state)
-    residual = np.einsum("di,di->d", across, means.readings - means.design @ state)
-    return np.einsum("di,dip->dp", across, means.design), residual, across
-
-
 def regressors_of(means: Means) -> Floats:
     """The columns (D, 3, 12) of all twelve states, those that are fixed as well."""
     out = np.zeros((len(means.counts), 3, STATE_COUNT))
     for i in range(3):
         out[:, i, 4 * i : 4 * i + 3], out[:, i, 4 * i + 3] = means.force_mps2, 1.0
     return out
-
-
-def with_scatter(noise: Noise, means: Means, state: Floats, square: bool) -> Noise:
-    """The noise with scatter from dwell to dwell, one size for all accelerometers, if the sizes of f need it.
-
-    It is estimated by restricted likelihood, like that of a run with angles (``reml``), and with the same charge.
-    """
-    design, residual, across = radial(means, state)
-    own = ((across * noise.effective_sigma_mps2) ** 2).sum(axis=1) / means.counts
-    shape, columns = (across**2).sum(axis=1), design[:, _SIX if square else _NINE]
-    scale = np.linalg.norm(columns, axis=0)
-    columns = columns / np.where(scale > 0, scale, 1.0)
-
-    def cost(variance: float) -> tuple[float, float]:
-        """Return the cost of a variance, less a constant, and the misfit at it."""
-        sigma = np.sqrt(own + variance * shape)
-        upper = triangle(np.column_stack([columns, residual]) / sigma[:, None])
-        misfit = float(upper[-1, -1] ** 2)
-        return float(np.log(sigma).sum() + np.log(np.abs(np.diag(upper))[:-1]).sum() + 0.5 * misfit), misfit
-
-    free = len(residual) - columns.shape[1]
-    if free < _FEWEST or chi_squared_tail(free, cost(0.0)[1]) > 0.1:
-        return replace(noise, scatter_mps2=np.zeros(3))
-    best, reach = 0.5 * np.log(np.sum(residual**2) / free), 5.0
-    for _ in range(4):  # ever finer grids of ln(sigma)
-        grid = best + np.linspace(-reach, reach, 41)
-        best, reach = grid[np.argmin([cost(float(np.exp(2.0 * each)))[0] for each in grid])], reach / 10.0
-    if cost(0.0)[0] - cost(float(np.exp(2.0 * best)))[0] < _CHARGE:
-        return replace(noise, scatter_mps2=np.zeros(3))
-    return replace(noise, scatter_mps2=np.full(3, np.exp(best)))
 
 
 def covariance_of(carried: Carried, noise: Noise, square_rad: float = 1.0) -> Floats:

@@ -190,8 +190,9 @@ def effect_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
         if not effect.shows_in(stimulus):
             continue
         own, scales = effect.columns(stimulus), np.array([coefficient.scale for coefficient in effect.coefficients])
-        # set to zero what even a large coefficient would not raise above rounding, as for the tilt of a vertical axis
-        columns[:, :, end - count : end] = np.where(np.abs(own) * scales < _ROUNDING_MPS2, 0.0, own)
+        # set to zero what even a large coefficient would not raise above rounding, as for the tilt of a vertical axis,
+        # and what depends on an attitude that is not known (NaN), of which nothing can be seen
+        columns[:, :, end - count : end] = np.where(np.abs(own) * scales >= _ROUNDING_MPS2, own, 0.0)
     return columns
 
 

@@ -34,6 +34,7 @@ TOO_SHORT = 4.0
 _AVERAGES = 60  # least number of averages of a block from which their own correlation is estimated
 _WANDER = 6
 _ROUNDING = 1e-14  # relative to a dwell's variance
+_TURNED = 1e4  # sigmas of a mean reading: what an attitude that is not known may change it by
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,11 @@ class Noise:
         if not moving or self.slew_sigma_mps2 is None:
             return self
         return replace(self, sigma_mps2=self.slew_sigma_mps2, inflation=np.ones(3), walk_mps2_per_sqrt_s=0.0)
+
+    @property
+    def of_readings(self) -> Noise:
+        """The noise without an unknown attitude, which the readings themselves show; with angles, all of it."""
+        return replace(self, setting_rad=0.0, free=False) if self.free else self
 
     @property
     def dwell_sigmas(self) -> Floats:
@@ -227,10 +233,13 @@ def mean_covariances(noise: Noise, means: Means, state: Floats) -> Floats:
 
       diag(kappa sigma_w^2 / n + sigma_s^2) + sigma_alpha^2 S (|f|^2 I - f f^T) S^T
 
-    S holds the sensitivities of the accelerometers in its rows, f is the specific force.
+    S holds the sensitivities of the accelerometers in its rows, f is the specific force. An attitude that is not known
+    counts as a sigma_alpha so large that it leaves the size of f alone.
     """
     own = noise.effective_sigma_mps2**2 / means.counts[:, None] + noise.scatter_mps2**2
-    return own[:, :, None] * np.eye(3) + noise.setting_rad**2 * setting_covariances(means, state)
+    size = np.linalg.norm(means.force_mps2, axis=1).max()
+    setting_rad = _TURNED * np.sqrt(own.max()) / size if noise.free else noise.setting_rad
+    return own[:, :, None] * np.eye(3) + setting_rad**2 * setting_covariances(means, state)
 
 
 def lift_rounding(covariances: Floats) -> Floats:

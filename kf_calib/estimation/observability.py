@@ -13,9 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.bench.bench import Bench
 from kf_calib.effects import Coefficient, Effect, effect_named, names
-from kf_calib.errors import InputError
 from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
@@ -85,20 +83,9 @@ class Visibility:
         return f" with {unknown.symbol} at {shown(unknown).text(self.effect.value)}"
 
 
-def refuse_without_angles(bench: Bench) -> None:
-    """Raise InputError if no angles are used: which effect bends the readings is told from the attitude."""
-    if not bench.angles:
-        raise InputError(
-            "naming an effect needs the angles, because what depends on the attitude cannot be told from |f| alone: "
-            "leave out --no-angles, or see with replay whether the nine parameters fit (p-value)."
-        )
-
-
 def visibility_of(fitted: Fit, effects: Sequence[Effect]) -> list[Visibility]:
     """The visibility of each effect beside the model without it; an unknown constant is at the value at which the
-    effect shows best. Raises InputError for a fit without angles."""
-    if effects:
-        refuse_without_angles(fitted.carried.model.bench)
+    effect shows best."""
     with one_blas_thread():
         model = fitted.carried.model
         inside = [each for each in effects if str(each) in model.parts]

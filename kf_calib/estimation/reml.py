@@ -79,7 +79,8 @@ def with_dwell_parts(
     accelerometers or one for each), the one with the largest restricted likelihood is taken, less a charge per number:
     the 1 % point of its likelihood ratio against zero. The intensity of a walk has a smaller charge. Nothing is
     estimated with fewer than 6 degrees of freedom between dwells. If there are too few orientations to tell a setting
-    error from scatter, the whole misfit counts as scatter.
+    error from scatter, the whole misfit counts as scatter. Where attitudes are not known, a dwell tells one number,
+    and scatter has one size for all accelerometers.
 
     - within: the noise within dwells.
     - means: the dwells' means; state (p,): where they are linearised.
@@ -91,17 +92,21 @@ def with_dwell_parts(
     """
     stated = replace(
         within,
-        setting_rad=float(np.radians(angle_sigma_deg or 0.0)),
         scatter_mps2=np.full(3, scatter_mps2 or 0.0),
-        setting_stated=angle_sigma_deg is not None,
         scatter_stated=scatter_mps2 is not None,
-        checked=scatter_mps2 is not None or _setting_is_checked(means.force_mps2),
         walk_mps2_per_sqrt_s=0.0 if walks else within.walk_mps2_per_sqrt_s,
     )
+    if not within.free:
+        stated = replace(
+            stated,
+            setting_rad=float(np.radians(angle_sigma_deg or 0.0)),
+            setting_stated=angle_sigma_deg is not None,
+            checked=scatter_mps2 is not None or _setting_is_checked(means.force_mps2),
+        )
     if stated.setting_stated and stated.scatter_stated and not walks:
         return stated, {}
     means, _ = _reduce(means)
-    free = means.readings.size - means.design.shape[2]
+    free = (len(means.readings) if within.free else means.readings.size) - means.design.shape[2]
     if free < FEWEST:
         return stated, {}
     combinations = _combinations(stated, walks)
@@ -116,7 +121,7 @@ def _combinations(stated: Noise, walks: bool) -> list[Parts]:
     """Return the combinations of parts that may be estimated; the last one contains all others."""
     settings: list[Parts] = [()] if stated.setting_stated or not stated.checked else [(), ("setting",)]
     scatters: list[Parts] = [()] if stated.scatter_stated else [(), ("common",)]
-    if stated.checked and not stated.scatter_stated:
+    if stated.checked and not (stated.scatter_stated or stated.free):
         scatters.append(("scatter",))
     walking: list[Parts] = [(), ("walk",)] if walks else [()]
     return [setting + scatter + walk for walk, setting, scatter in product(walking, settings, scatters)][1:]

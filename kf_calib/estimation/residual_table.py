@@ -51,8 +51,8 @@ class Run(Protocol):
 
 def mean_sigmas(result: Run) -> Floats:
     """Sigma (D, 3) of the mean of each dwell under the noise model, as the misfit is judged, m/s^2."""
-    means = result.carried.means
-    return np.sqrt(np.einsum("dii->di", mean_covariances(result.noise.judging, means, result.carried.state)))
+    means, noise = result.carried.means, result.noise.judging.of_readings
+    return np.sqrt(np.einsum("dii->di", mean_covariances(noise, means, result.carried.state)))
 
 
 def quantity_means(result: Run, names: list[str]) -> dict[str, Floats]:

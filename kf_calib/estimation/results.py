@@ -223,11 +223,13 @@ class Calibration:
     """The dwell that alone does not fit, or several if any one of them could be the cause."""
 
     @cached_property
-    def fixed(self) -> dict[str, str]:
+    def fixed(self) -> dict[str, Literal["frame", "square"]]:
         """Parameters that are not estimated because no angles are used, and what fixes each: the ``frame`` of the
         sensors, or axes that are taken for ``square``."""
-        both = {"frame": ("theta1", "phi1", "nu2"), "square": ("nu1", "theta3", "phi3") if self.model.square else ()}
-        return {} if self.bench.angles else {symbol: name for name, own in both.items() for symbol in own}
+        if self.bench.angles:
+            return {}
+        out: dict[str, Literal["frame", "square"]] = {"theta1": "frame", "phi1": "frame", "nu2": "frame"}
+        return out | ({"nu1": "square", "theta3": "square", "phi3": "square"} if self.model.square else {})
 
     @cached_property
     def held_out(self) -> HeldOut | None:
@@ -331,8 +333,9 @@ class Calibration:
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """Symbols of the twelve parameters and of the coefficients of effects that the run does not determine."""
-        states = {*paper_parameters.SYMBOLS, *(each.symbol for each in self.model.coefficients)}
+        """Symbols of the twelve parameters and of the coefficients of effects that the run does not determine; those
+        that are fixed are known."""
+        states = {*paper_parameters.SYMBOLS, *(each.symbol for each in self.model.coefficients)} - set(self.fixed)
         return tuple(p.symbol for p in self.parameters.values() if p.symbol in states and p.sigma is None)
 
     def considering(self, state: Floats, covariance: Floats) -> Estimate:

@@ -96,9 +96,8 @@ def _weighted(
     ``columns`` is (d, pieces, K, 3, p). The rows of the three channels follow one another; the rows of the priors come
     last.
     """
-    sigma, sigmas = noise.effective_sigma_mps2, noise.dwell_sigmas
-    used, slow = np.flatnonzero(sigmas > 0), 0 if flicker_mps2 is None else len(_SLOW)
-    priors = np.append([np.inf, np.inf], sigmas[3:][sigmas[3:] > 0]) if noise.free else sigmas[used]
+    sigma, priors = noise.effective_sigma_mps2, _dwell_priors(noise)
+    used, slow = np.flatnonzero(noise.dwell_sigmas > 0), 0 if flicker_mps2 is None else len(_SLOW)
     offsets = len(priors)
     if flicker_mps2 is not None:
         priors = np.append(priors, np.outer(np.maximum(flicker_mps2, FLOOR_MPS2), 1.0 / np.sqrt(_SLOW)))
@@ -135,6 +134,14 @@ def _weighted(
                 own[:] = dwell.walk.whiten(own, float(noise.walk_mps2_per_sqrt_s / sigma[i]))
     rows[:, 3 * size :, :count] = np.diag(1.0 / priors)
     return rows, count
+
+
+def _dwell_priors(noise: Noise) -> Floats:
+    """Return the prior sigmas of a dwell's nuisance states, its rotations and offsets; where its attitude is not known,
+    two rotations across the force have none."""
+    sigmas = noise.dwell_sigmas
+    rotations = np.full(2, np.inf) if noise.free else sigmas[:3]
+    return np.concatenate([rotations[rotations > 0], sigmas[3:][sigmas[3:] > 0]])
 
 
 def _less(rows: Floats, count: int) -> Floats:
@@ -195,7 +202,7 @@ class MisfitColumns:
     def __init__(self, dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> None:
         self._sigma, slow = noise.effective_sigma_mps2, len(slow_scatter(dwells, noise)[1])
         flicker = flicker_sigma(noise, len(dwells)) if slow else None
-        priors = int((noise.dwell_sigmas > 0).sum()) + (3 * len(_SLOW) if slow else 0)
+        priors = len(_dwell_priors(noise)) + (3 * len(_SLOW) if slow else 0)
         counts = np.array([len(dwell.pieces) for dwell in dwells])
         lengths = 3 * counts * [dwell.width for dwell in dwells] + priors
         self._groups, self.ends = list[_Alike](), slow + np.cumsum([0, *lengths])
@@ -229,13 +236,13 @@ class MisfitColumns:
 
 
 def with_frame(rows: list[Floats], model: Model, noise: Noise, first: int = 0) -> list[Floats]:
-    """The rows [H | W | z] with one more for each state that the model fixes at zero, which has no column: a reading of
-    that state times g. They join the rows at index ``first``."""
+    """The rows [S | H | W | z] with one more for each state that the model fixes at zero, which has no column: a
+    reading of that state times g. They join the rows at index ``first``."""
     if not model.fixed:
         return rows
-    own = np.zeros((len(model.fixed), rows[first].shape[1]))
+    own, inside = np.zeros((len(model.fixed), rows[first].shape[1])), 3 if noise.walk_mps2_per_sqrt_s else 0
     for k, place in enumerate(model.fixed):
-        own[k, place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2[k % 3]
+        own[k, inside + place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2[k % 3]
     return [*rows[:first], np.vstack([own, rows[first]]), *rows[first + 1 :]]
 
 

@@ -15,13 +15,14 @@ import os
 import platform
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from kf_calib import effects
 from kf_calib.bench import paper_parameters
@@ -63,7 +64,9 @@ AFFINE = tuple(f"{name}{i}" for i in (1, 2, 3) for name in ("sx", "sy", "sz", "b
 class SavedCalibration(Part):
     """The content of a calibration file.
 
-    not_seen: effects of the catalogue that the orientations could not show, and which may thus be present.
+    not_seen: effects of the catalogue that the orientations could not show, and which may thus be present. fixed:
+    parameters that were not estimated because no angles were used, and what fixes each: the frame of the sensors, or
+    axes that are taken for square.
     """
 
     format: Literal["kf_calib.calibration"]
@@ -76,6 +79,7 @@ class SavedCalibration(Part):
     not_seen: list[Text]
     conditions: SavedConditions
     provenance: SavedProvenance
+    fixed: dict[Text, Literal["frame", "square"]] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> SavedCalibration:
@@ -108,7 +112,8 @@ class SavedCalibration(Part):
     @property
     def bench(self) -> Bench:
         """The bench of the run."""
-        return Bench.from_metadata(dict(self.provenance.bench), "axes" in self.provenance.bench)
+        bench = Bench.from_metadata(dict(self.provenance.bench), "axes" in self.provenance.bench)
+        return replace(bench, angles=False) if self.fixed else bench
 
     @property
     def twelve(self) -> tuple[Floats, Floats]:
@@ -136,7 +141,7 @@ class SavedCalibration(Part):
         """
         origin, bench = origin or Path(FORMAT), bench or self.bench
         self.model_file(origin).load(named, trust)
-        model = Model(bench)
+        model = Model(bench, square="square" in self.fixed.values())
         for own in self.effects:
             effect = effects.effect_named(own.text, bench)
             model += effect if own.constant is None else effect.at(own.constant)
@@ -176,7 +181,8 @@ def saved(
         noise=SavedNoise(
             sigma_mps2=noise.sigma_mps2.tolist(), inflation=noise.inflation.tolist(),
             dwell_sigma_mps2=noise.scatter_mps2.tolist(), dwell_sigma_stated=noise.scatter_stated,
-            angle_sigma_deg=math.degrees(noise.setting_rad), angle_sigma_stated=noise.setting_stated,
+            angle_sigma_deg=0.0 if noise.free else math.degrees(noise.setting_rad),
+            angle_sigma_stated=noise.setting_stated and not noise.free,
             walk_mps2_per_sqrt_s=float(noise.walk_mps2_per_sqrt_s),
         ),
         consistency=SavedConsistency(
@@ -187,6 +193,7 @@ def saved(
         not_seen=_not_seen(result),
         conditions=_conditions(result, first_ns),
         provenance=_provenance(result, recording, sha256),
+        fixed=result.fixed,
     )  # fmt: skip
 
 
@@ -272,7 +279,8 @@ def now() -> str:
 
 def write(path: Path, content: SavedCalibration) -> None:
     """Write a calibration file, wholly or not at all; raises InputError if it cannot be written."""
-    write_whole(path, (json.dumps(content.model_dump(mode="json"), indent=1, allow_nan=False) + "\n").encode())
+    table = content.model_dump(mode="json", exclude=None if content.fixed else {"fixed"})
+    write_whole(path, (json.dumps(table, indent=1, allow_nan=False) + "\n").encode())
 
 
 def read(path: str | Path) -> SavedCalibration:

@@ -95,7 +95,7 @@ class History:
 def history(calibrations: Sequence[SavedCalibration], tolerances: Mapping[str, float] | None = None) -> History:
     """The history of calibrations of one block, in any order; tolerances: of parameters by symbol, SI.
 
-    Raises InputError for fewer than two, for different blocks, or for two of the same date.
+    Raises InputError for fewer than two, for different blocks or frames, or for two of the same date.
     """
     if len(calibrations) < FEWEST:
         raise InputError(f"a history needs at least {FEWEST} calibrations, {len(calibrations)} is given: save more.")
@@ -103,6 +103,11 @@ def history(calibrations: Sequence[SavedCalibration], tolerances: Mapping[str, f
     serials = {each.provenance.bench.get("block_serial", "") for each in ordered} - {""}
     if len(serials) > 1:
         raise InputError(f"the calibrations are of different blocks ({', '.join(sorted(serials))}): give those of one.")
+    if len({bool(each.fixed) for each in ordered}) > 1:
+        raise InputError(
+            "some of the calibrations were made without angles, in the frame of the sensors, others in that of the "
+            "platform: give those of one kind."
+        )
     dates = tuple(map(date_of, ordered))
     twice = next((one for one, other in itertools.pairwise(dates) if one == other), None)
     if twice is not None:

@@ -5,9 +5,10 @@ The dwell means z of the new run are predicted by the old state x1 with its cova
     min_x  |R^(-1/2) (z - H x)|^2 + |P1^(-1/2) (x - x1)|^2
 
 is chi-squared distributed with one degree of freedom a mean reading if nothing has changed, however few the dwells;
-R is the noise of the means. Where the new run determines a parameter by itself, its difference from the old value is
-tested too, the smallest of all p-values being corrected for their number. Effects that belong to the course of a run
-or to the platform may differ: their coefficients are free.
+R is the noise of the means, and leaves one degree of freedom a dwell, the size of f, where no angles are used. Where
+the new run determines a parameter by itself, its difference from the old value is tested too, the smallest of all
+p-values being corrected for their number. Effects that belong to the course of a run or to the platform may differ:
+their coefficients are free.
 """
 
 from __future__ import annotations
@@ -19,16 +20,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Source
 from kf_calib.effects import Effect
 from kf_calib.effects.inputs import beyond_force_and_temperature
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
-from kf_calib.errors import UnobservableError
+from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import evaluate_fit
 from kf_calib.estimation.correction import Correction
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
-from kf_calib.estimation.fit import Fit, fit
-from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.fit import Fit, carried_at, fit
+from kf_calib.estimation.measurement_model import SQUARE, Model
 from kf_calib.estimation.noise_model import Noise, mean_covariances
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
@@ -99,7 +101,11 @@ def verify(
     settings: Settings | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> Verification:
-    """Compare a calibration with a new recording; model: that of the calibration (``saved.model()``)."""
+    """Compare a calibration with a new recording; model: that of the calibration (``saved.model()``).
+
+    Raises InputError if one of the two was made without angles.
+    """
+    refuse_other_frame(saved, source.bench)
     settings = replace(settings or Settings(), effects=())
     passed = Pass(source, settings)
     dwells = passed.fold(on_progress)
@@ -108,7 +114,7 @@ def verify(
         fitted = fit(dwells, Model(source.bench, model.effects))
         free = tuple(str(each) for each in model.effects if beyond_force_and_temperature(each, source.bench))
         statistic, rms = _misfit(saved, fitted, _noise(saved, fitted), free)
-        dof = 3 * len(dwells) - _free_count(model, free)
+        dof = (1 if fitted.noise.free else 3) * len(dwells) - _free_count(model, free)
         p_value = chi_squared_tail(dof, statistic)
         new = evaluate_fit(fitted, settings)
         seen = None if new.estimate.unseen.any() else new
@@ -139,11 +145,12 @@ def _free_count(model: Model, free: Sequence[str]) -> int:
 
 def _misfit(saved: SavedCalibration, fitted: Fit, noise: Noise, free: Sequence[str]) -> tuple[float, float]:
     """Return the normalised misfit of the new means, and the rms of their residuals by the old state, m/s^2."""
-    means, model = fitted.carried.means, fitted.carried.model
+    old, model = np.array(saved.state.values), fitted.carried.model
+    means = carried_at(fitted.dwells, model, old).means if noise.free else fitted.carried.means
     kept = [
         k for k in range(model.count) if not any(k in range(*model.parts[name].indices(model.count)) for name in free)
     ]
-    old, covariance = np.array(saved.state.values), np.array(saved.state.covariance)[np.ix_(kept, kept)]
+    covariance = (np.array(saved.state.covariance) + _square(saved))[np.ix_(kept, kept)]
     lower = np.linalg.inv(np.linalg.cholesky(mean_covariances(noise, means, fitted.carried.state)))
     residuals = means.readings - means.design @ old
     rows = (lower @ means.design).reshape(-1, model.count)
@@ -155,6 +162,14 @@ def _misfit(saved: SavedCalibration, fitted: Fit, noise: Noise, free: Sequence[s
     scale = np.maximum(np.linalg.norm(stacked, axis=0), 1e-300)
     left = target - stacked @ (np.linalg.lstsq(stacked / scale, target, rcond=None)[0] / scale)
     return float(left @ left), float(np.sqrt(np.mean(residuals**2)))
+
+
+def _square(saved: SavedCalibration) -> Floats:
+    """Return the covariance (p, p) of how square the axes are where they were taken for square."""
+    out, places = np.zeros((len(saved.state.values),) * 2), list(SQUARE)
+    if "square" in saved.fixed.values():
+        out[places, places] = saved.bench.square_rad**2
+    return out
 
 
 def _root(covariance: Floats) -> Floats:
@@ -240,6 +255,20 @@ def _warnings(saved: SavedCalibration, source: Source, new: Calibration) -> list
     if was and now and was != now:
         out.append(f"the block is {now}, the calibration is of {was}.")
     return out
+
+
+def refuse_other_frame(saved: SavedCalibration, bench: Bench) -> None:
+    """Raise InputError if one of calibration and new run is made with angles and the other without."""
+    if saved.fixed and bench.angles:
+        raise InputError(
+            "the calibration was made without angles, in the frame of its sensors: verify it without them, too "
+            "(--no-angles)."
+        )
+    if not (saved.fixed or bench.angles):
+        raise InputError(
+            "the calibration was made with angles, in the frame of the platform: verify it with them, too (leave out "
+            "--no-angles)."
+        )
 
 
 def refuse_incomplete(saved: SavedCalibration) -> None:

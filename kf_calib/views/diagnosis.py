@@ -19,6 +19,7 @@ from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.diagnosis.within_dwell_trend import Trend
+from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.results import format_p
 from kf_calib.support.printing import printed
 from kf_calib.support.units import shown
@@ -258,14 +259,23 @@ def _suspect_table(found: Diagnosis) -> Table:
 def _dwell_table(found: Diagnosis) -> Table:
     """Return the table of the dwells that disagree most: their residuals over the sigma of their means."""
     table = Table(title="Where it fails: residual / σ of the dwell's mean", title_justify="left")
-    for heading in ("dwell", "at s", "gimbals, deg", "1", "2", "3"):
+    place = "gimbals, deg" if found.before.bench.axes else "up, in its axes"
+    for heading in ("dwell", "at s", place, "1", "2", "3"):
         table.add_column(heading, justify="right")
     ratios = found.residual_ratios
     for k in np.argsort(-np.abs(ratios).max(axis=1))[:5].tolist():
         dwell = found.before.visits[k].dwell
-        angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(dwell.recorded_pose))
-        table.add_row(str(dwell.number), f"{dwell.start_s:.0f}", angles, *(f"{ratio:+.1f}" for ratio in ratios[k]))
+        own = _place(dwell, bool(found.before.bench.axes))
+        table.add_row(str(dwell.number), f"{dwell.start_s:.0f}", own, *(f"{ratio:+.1f}" for ratio in ratios[k]))
     return table
+
+
+def _place(dwell: DwellFactor, gimbals: bool) -> str:
+    """Return the angles of the gimbals in a dwell, or the direction that was up in the axes of the block."""
+    if gimbals:
+        return ", ".join(f"{angle:.1f}" for angle in np.degrees(dwell.recorded_pose))
+    force = dwell.means[1:4]
+    return ", ".join(f"{part:+.2f}" for part in force / np.linalg.norm(force))
 
 
 def _detectable_table(sizes: list[Detectable]) -> Table:

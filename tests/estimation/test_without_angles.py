@@ -216,16 +216,6 @@ def test_readings_that_never_rest_are_refused() -> None:
         kf_calib.calibrate(run)
 
 
-def test_effects_are_refused_in_one_sentence() -> None:
-    run = without_angles(Run(1, 12, 60, poses=hand_poses(1, 12)))
-    with pytest.raises(InputError, match="leave out effects"):
-        kf_calib.calibrate(run, Settings(effects="second-order"))
-    with pytest.raises(InputError, match="needs the angles"):
-        kf_calib.diagnose(kf_calib.calibrate(run))
-    with pytest.raises(InputError, match="needs the angles"):
-        kf_calib.improve(kf_calib.calibrate(run))
-
-
 def test_a_recording_needs_no_angles_and_standard_gravity_is_used_where_none_is_stated(tmp_path: Path) -> None:
     source = kf_calib.open_recording(RECORDINGS / "navigation_24.mcap", angles=False)
     assert source.bench.gravity_mps2 != 9.80665 and not any("standard" in said for said in source.warnings)

@@ -10,6 +10,7 @@ from datetime import UTC, date, datetime, timedelta
 from typing import Literal
 
 from kf_calib.bench import paper_parameters
+from kf_calib.errors import InputError
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.calibration_file import SavedCalibration, SavedParameter
@@ -87,7 +88,15 @@ class Certificate:
 def certificate(
     saved: SavedCalibration, model: Model, own: Statement, before: tuple[SavedCalibration, Model] | None = None
 ) -> Certificate:
-    """The certificate of a calibration with its model, and of a statement; before: the same before an adjustment."""
+    """The certificate of a calibration with its model, and of a statement; before: the same before an adjustment.
+
+    Raises InputError for a calibration without angles.
+    """
+    if saved.fixed or (before is not None and before[0].fixed):
+        raise InputError(
+            "a certificate states the angles of the axes in the frame of the platform, and this calibration was made "
+            "without angles, in the frame of its sensors: calibrate on a bench that records angles."
+        )
     found = budgets.budget(saved, model, own.uncertainty)
     begun, ended = _dates(saved)
     return Certificate(

@@ -12,6 +12,7 @@ from urllib.parse import parse_qsl
 
 from kf_calib.bench.bench import Bench, Vector, parse_axes
 from kf_calib.errors import InputError
+from kf_calib.sources.simulation.by_hand import without_angles
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.physics import Ambient
@@ -80,8 +81,9 @@ def simulation(
         ambient=ambient, seed=options["seed"], grade=options["grade"], batch_samples=batch_samples,
     )  # fmt: skip
     begin(run)
+    judged = without_angles(run) if options.get("no_angles") else run
     return run.hiding(
-        parse(options["hidden"], axes, seed=options["seed"], grade=options["grade"], sized=partial(sized, run))
+        parse(options["hidden"], axes, seed=options["seed"], grade=options["grade"], sized=partial(sized, judged))
     )
 
 

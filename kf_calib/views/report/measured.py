@@ -48,7 +48,7 @@ def _facts(measured: Measured, result: Calibration) -> Iterator[tuple[str, str]]
     yield "Dwells", f"{len(dwells)} in {len(orientations(dwells))} orientations, over {_duration(last)}"
     yield "Gimbals", _gimbals(result)
     yield "Gravity", f"{bench.gravity_mps2:.7g} m/s²"
-    yield "Setting of angles", _stated(bench.angle_sigma_deg, "deg")
+    yield "Setting of angles", _stated(bench.angle_sigma_deg, "deg") if bench.angles else ""
     yield "Scatter from dwell to dwell", _stated(bench.scatter_sigma_mps2, "m/s²")
     yield "Model", result.model.sum
 
@@ -61,6 +61,8 @@ def _duration(seconds: float) -> str:
 
 def _gimbals(result: Calibration) -> str:
     bench = result.bench
+    if not bench.angles:
+        return "no angles are used; the frame is that of the sensors"
     said = bench.to_metadata()
     axes = f"axes {said['axes']}, outer to inner" if bench.axes else "attitude recorded"
     held = "held in inertial space" if bench.reference == "inertial" else "angles relative to the bench"

@@ -1,0 +1,91 @@
+"""What a calibration without angles is good for once it is saved."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.by_hand import by_hand
+from helpers.paths import RECORDINGS
+
+import kf_calib
+from kf_calib.errors import InputError
+from kf_calib.estimation.settings import Settings
+from kf_calib.exchange import calibration_file
+from kf_calib.exchange.certificate import content, statement
+from kf_calib.exchange.exports import TARGETS, exported
+from kf_calib.exchange.history import history
+from kf_calib.exchange.verification import verify
+
+FRAME = ["theta1", "phi1", "nu2"]
+
+
+@cache
+def result() -> kf_calib.Calibration:
+    return kf_calib.calibrate(by_hand("thermal-bias=0.4mg/K"), Settings(effects=("thermal-bias",)))
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("saved") / "cal.json"
+    calibration_file.write(out, calibration_file.saved(result()))
+    return out
+
+
+def test_it_is_saved_with_its_frame_and_read_as_it_was(path: Path) -> None:
+    saved = calibration_file.read(path)
+    assert saved.fixed == dict.fromkeys(FRAME, "frame")
+    assert saved.state.undetermined == [] and not saved.bench.angles
+    assert [p.symbol for p in saved.parameters if p.value is None] == FRAME
+    assert {"flexure", "cross-talk", "base-tilt", "latency"} <= set(saved.not_seen)
+    assert saved.model(path).fixed == result().model.fixed
+
+
+def test_it_corrects_readings_to_the_size_of_gravity(path: Path) -> None:
+    correction, means = calibration_file.read(path).correction(path), result().carried.means
+    warmth = np.array([np.mean(dwell.nodes.temperature_c) for dwell in result().fit.dwells])
+    found = correction(means.readings, warmth)
+    sigma = np.sqrt(np.mean(result().noise.sigma_mps2 ** 2) / means.counts.min())
+    assert np.abs(np.linalg.norm(found, axis=1) - result().bench.gravity_mps2).max() < 5.0 * sigma
+    assert correction.matrix[0, 1:] == pytest.approx(0.0, abs=1e-12)  # x is the axis of accelerometer 1
+
+
+def test_it_holds_for_a_run_of_the_same_block_and_not_for_another(path: Path) -> None:
+    saved = calibration_file.read(path)
+    same = by_hand("thermal-bias=0.4mg/K", poses=16)
+    found = verify(saved, saved.model(path, bench=same.bench), same)
+    assert found.holds and found.dof == 16 and {move.symbol for move in found.moves}.isdisjoint(FRAME)
+    other = by_hand("thermal-bias=0.4mg/K", seed=2, poses=16)
+    assert not verify(saved, saved.model(path, bench=other.bench), other).holds
+
+
+def test_it_is_not_mixed_with_calibrations_in_the_frame_of_a_platform(path: Path) -> None:
+    saved, recording = calibration_file.read(path), kf_calib.open_recording(RECORDINGS / "mems_faces.mcap")
+    with pytest.raises(InputError, match="without angles, in the frame of its sensors: verify it without them"):
+        verify(saved, saved.model(path), recording)
+    platform = calibration_file.saved(kf_calib.calibrate(recording))
+    with pytest.raises(InputError, match="leave out --no-angles"):
+        verify(platform, platform.model(), by_hand(poses=8))
+    with pytest.raises(InputError, match="give those of one kind"):
+        history([saved, platform])
+    with pytest.raises(InputError, match="calibrate on a bench that records angles"):
+        content.certificate(saved, saved.model(path), statement.read(None))
+
+
+def test_six_faces_are_saved_with_axes_taken_for_square(tmp_path: Path) -> None:
+    six = kf_calib.calibrate(kf_calib.open_recording(RECORDINGS / "mems_faces.mcap", angles=False))
+    calibration_file.write(tmp_path / "six.json", calibration_file.saved(six))
+    saved = calibration_file.read(tmp_path / "six.json")
+    assert set(saved.fixed.values()) == {"frame", "square"} and saved.model().square
+    assert np.isfinite(saved.correction()(np.array([[0.0, 9.81, 0.0]]), 25.0)).all()
+
+
+@pytest.mark.parametrize("to", sorted(TARGETS))
+def test_it_is_exported_to_every_program(path: Path, to: str) -> None:
+    saved = calibration_file.read(path)
+    target = exported(saved, saved.correction(path), to, lossy=True)
+    numbers = [float(each) for each in re.findall(r"-?\d+\.\d+(?:e[-+]\d+)?", target.text())]
+    assert len(numbers) >= 6 and np.isfinite(numbers).all()
