@@ -23,10 +23,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.dwells.blocks import Block, Tally
 from kf_calib.dwells.dwell_events import SECOND_NS, carry_on
 from kf_calib.dwells.segmenter import BLOCK_SAMPLES, Segmenter
+from kf_calib.dwells.stationarity import Stillness
 
 _WINDOW_NS = SECOND_NS // 4
 _FEWEST = 4  # readings of a window
@@ -235,6 +237,14 @@ class RestSegmenter(Segmenter):
         if len(self._accel):
             oldest = int(np.searchsorted(self._temperature.time_ns, self._accel.time_ns[0]))
             self._temperature = self._temperature[max(oldest - 2, 0) :]
+
+
+def segmenter_of(
+    bench: Bench, stillness: Stillness | None = None, tally: Tally | None = None, slews: bool = False
+) -> Segmenter:
+    """The segmenter of a bench: by its angles, or by the readings alone where no angles are used."""
+    kind = Segmenter if bench.angles else RestSegmenter
+    return kind(bench, stillness or Stillness(), tally or Tally(), slews and bench.angles)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Source
 from kf_calib.dwells import tabulated, window_average
 from kf_calib.dwells.blocks import LARGEST_RAD, Block, Tally
-from kf_calib.dwells.rest_in_readings import RestSegmenter
+from kf_calib.dwells.rest_in_readings import segmenter_of
 from kf_calib.dwells.rows import Rows, model_rows
 from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
 from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder, dwells_without
@@ -43,9 +43,7 @@ class Pass:
 
     def segmenter(self) -> Segmenter:
         """The segmenter for this source, which also returns slews if the model has effects that show in slews only."""
-        if not self.source.bench.angles:
-            return RestSegmenter(self.source.bench, self.settings.stillness, self.tally)
-        return Segmenter(self.source.bench, self.settings.stillness, self.tally, bool(self.model.dynamic))
+        return segmenter_of(self.source.bench, self.settings.stillness, self.tally, bool(self.model.dynamic))
 
     def rows(self) -> Iterator[Rows]:
         """Rows of all blocks of the source; of a table, with every reading at its mean."""
