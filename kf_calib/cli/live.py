@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping
 from contextvars import copy_context
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,7 @@ from kf_calib.cli.options import (
     filter_options,
     json_line,
     json_option,
+    no_angles_option,
     overrides,
     overwrite_option,
     pair,
@@ -47,9 +49,11 @@ from kf_calib.support.plain_text import sentence
 if TYPE_CHECKING:
     from kf_calib.bench.streams import Source
     from kf_calib.estimation.settings import Settings
+    from kf_calib.online.hand_session import HandSession
+    from kf_calib.online.hand_status import HandJudgement, HandStanding
     from kf_calib.online.session import Session
-    from kf_calib.online.status import Judgement
-    from kf_calib.sources.live import LiveSource
+    from kf_calib.online.status import Judgement, Standing
+    from kf_calib.sources.live import LiveSource, Status
     from kf_calib.views.rerun.growing import GrowingView
 
 RUNNING = "While it runs"
@@ -60,6 +64,7 @@ _REFRESH_S = 0.25
     epilog=examples(
         "live /dev/ttyUSB0 --bench bench.toml --record run.mcap --target theta=1arcsec --target K=2ppm --rerun",
         'live "sim://?speed=10&hide=second-order=4e-6" --target K=0.1ppm',
+        "live /dev/ttyACM0 --no-angles --record hand.mcap --target K=500ppm",
     )
 )
 @click.argument("source", metavar="SOURCE")
@@ -88,6 +93,7 @@ _REFRESH_S = 0.25
     metavar="ADDRESS",
     help="Address a viewer that is opened listens on.",
 )
+@no_angles_option
 @columns_option
 @click.option(
     "--header", default="", metavar="NAMES", panel=INPUT, help="Names of the columns of CSV rows that come without any."
@@ -123,6 +129,7 @@ def live(
     source: str,
     record: Path | None,
     overwrite: bool,
+    no_angles: bool,
     columns: tuple[str, ...],
     header: str,
     give_up_s: float,
@@ -142,6 +149,7 @@ def live(
     """Evaluate a bench while it runs: sigmas, verdict and the next orientation as they stand; record it.
 
     SOURCE: a serial port, socket://HOST:PORT, rfc2217://HOST:PORT, - (standard input), a file that grows, or sim://.
+    With --no-angles it is a sensor in the hand, and what is shown is which side to turn up next.
     Ctrl-C ends the run: the recording is finished and the summary printed.
     """
     from kf_calib.bench.targets import targets_of
@@ -149,16 +157,17 @@ def live(
 
     outputs = claimed(files_of(source), overwrite=overwrite)
     settings, wanted = settings_of(options), targets_of(targets)
-    _refuse(settings)
+    _refuse(settings, auto and no_angles)
     opening = open_live(
         source, overrides(options), record, overwrite, columns=dict(map(pair, columns)), header=header,
-        give_up_s=give_up_s, idle_s=idle_s,
+        give_up_s=give_up_s, idle_s=idle_s, angles=not no_angles,
     )  # fmt: skip
     with opening as opened:
-        run = _Run(opened, settings, wanted, auto, record, not sys.stdout.isatty() or as_json)
+        begin = _by_hand(settings, wanted) if no_angles else _on_bench(settings, wanted, auto)
+        run = _Run(opened, begin, record, not sys.stdout.isatty() or as_json)
         view = _view(rrd, rerun_port if with_viewer else None, rerun_bind)
         if view is not None:
-            run.listeners.append(lambda judgement: view.offer(judgement.result, judgement))
+            run.listeners.append(partial(_offer, view))
         with answered(run.handle_signal):  # until all is written: who closes a terminal sends several
             _follow(run, source, record, as_json)
             if view is not None:
@@ -167,13 +176,13 @@ def live(
             final = _outcome(run, as_json)
             for said in [*_of_the_view(view), *run.troubles]:
                 complain(said)
-            if final is not None:
+            if final is not None and final.result is not None:
                 if rrd and view is not None and view.began:
                     outputs.own(rrd)
                 with delivery(outputs, as_json or run.print.lost > 0) as deliver:
                     deliver.calibration(save, final.result, run.recording() or opened)
                     deliver.model(save_model, final.result)
-                    deliver.file(rrd, lambda path: save_view(final.result, path))  # by the noise of the whole run
+                    deliver.file(rrd, partial(save_view, final.result))  # by the noise of the whole run
     if run.troubles:
         ctx.exit(2)
     if strict and final is not None and final.consistent is False:
@@ -189,21 +198,19 @@ class _Run:
     def __init__(
         self,
         source: LiveSource,
-        settings: Settings,
-        wanted: Mapping[str, float],
-        auto: bool,
+        begin: Callable[[LiveSource, bool, Callable[[], Source | None]], Session | HandSession],
         record: Path | None,
         every: bool,
     ) -> None:
         self.source, self.stopped, self.unshown = source, False, 0
         self.print, self._is_warned = Printer(), False
-        self.session: Session | None = None
-        self.final: Judgement | None = None
+        self.session: Session | HandSession | None = None
+        self.final: Judgement | HandJudgement | None = None
         self.error: BaseException | None = None
-        self.listeners: list[Callable[[Judgement], None]] = [self._keep]
-        self.judgements = queue.Queue["Judgement"](256)
-        self._record = record
-        work = self._work, settings, wanted, auto, every
+        self.listeners: list[Callable[[Judgement | HandJudgement], None]] = [self._keep]
+        self.judgements = queue.Queue["Judgement | HandJudgement"](256)
+        self._record, self._begin = record, begin
+        work = self._work, every
         self._thread = threading.Thread(target=copy_context().run, args=work, daemon=True)  # in the units chosen
 
     def start(self) -> None:
@@ -241,8 +248,10 @@ class _Run:
 
     def accept(self) -> None:
         """The effect that is missing, as it stands."""
+        from kf_calib.online.status import Judgement
+
         judgement = self.session.standing.judgement if self.session else None
-        if self.session is None or judgement is None:
+        if self.session is None or not isinstance(judgement, Judgement):
             return
         try:
             if not (judgement.alarm and judgement.found.missing):
@@ -255,23 +264,45 @@ class _Run:
         """What was recorded of the run; None where nothing was, or not all."""
         from kf_calib.sources.files.recording import Recording
 
-        return Recording(self._record) if self._record and not self.source.status.recording_trouble else None
+        return (
+            Recording(self._record, angles=self.source.bench.angles)
+            if self._record and not self.source.status.recording_trouble
+            else None
+        )
 
-    def _work(self, settings: Settings, wanted: Mapping[str, float], auto: bool, every: bool) -> None:
-        from kf_calib.online.session import Session
-
+    def _work(self, every: bool) -> None:
         try:
-            self.session = Session(self.source, settings, wanted, every=every, auto=auto, again=self.recording)
-            self.session.listeners += self.listeners
+            self.session = self._begin(self.source, every, self.recording)
+            for listener in self.listeners:
+                self.session.listeners.append(listener)
             self.final = self.session.run()
         except BaseException as error:  # for the main thread to tell
             self.error = error
 
-    def _keep(self, judgement: Judgement) -> None:
+    def _keep(self, judgement: Judgement | HandJudgement) -> None:
         try:
             self.judgements.put_nowait(judgement)
         except queue.Full:
             self.unshown += 1
+
+
+def _on_bench(settings: Settings, wanted: Mapping[str, float], auto: bool) -> Callable[..., Session]:
+    from kf_calib.online.session import Session
+
+    return lambda source, every, again: Session(source, settings, wanted, every=every, auto=auto, again=again)
+
+
+def _by_hand(settings: Settings, wanted: Mapping[str, float]) -> Callable[..., HandSession]:
+    from kf_calib.online.hand_session import HandSession
+
+    return lambda source, every, again: HandSession(source, settings, wanted, every=every, again=again)
+
+
+def _offer(view: GrowingView, judgement: Judgement | HandJudgement) -> None:
+    from kf_calib.online.status import Judgement
+
+    if judgement.result is not None:
+        view.offer(judgement.result, judgement if isinstance(judgement, Judgement) else None)
 
 
 def _follow(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
@@ -297,22 +328,43 @@ def _follow(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
 
 def _urgent_messages(run: _Run) -> dict[str, str]:
     """What a user must know at once, about what: said again where it changes."""
+    from kf_calib.online.hand_status import HandStanding
+
     standing, status = run.session.standing if run.session else None, run.source.status
     return {
+        "task": standing.task if isinstance(standing, HandStanding) else "",
         "evaluation": (standing.problem or standing.notice) if standing else "",
         "link": "the link is lost, and tried again" if status.link == "lost" else "",
         "clock": status.clock_trouble,
     }
 
 
-def _print(run: _Run, judgement: Judgement, as_json: bool) -> None:
-    from kf_calib.views import live as views
-
+def _print(run: _Run, judgement: Judgement | HandJudgement, as_json: bool) -> None:
     assert run.session is not None
     if as_json:
-        _echo(run, json_line(views.live_object(judgement, run.session.standing, run.source.status)))
+        _echo(run, json_line(_object(judgement, run.session.standing, run.source.status)))
     elif not judgement.final:
-        _echo(run, sentence(views.line(judgement)))
+        _echo(run, sentence(_line(judgement)))
+
+
+def _object(judgement: Judgement | HandJudgement, standing: Standing | HandStanding, status: Status) -> dict[str, Any]:
+    from kf_calib.online.status import Judgement, Standing
+    from kf_calib.views.live import live_object
+    from kf_calib.views.live_hand import hand_object
+
+    if isinstance(judgement, Judgement):
+        assert isinstance(standing, Standing)
+        return live_object(judgement, standing, status)
+    assert not isinstance(standing, Standing)
+    return hand_object(judgement, standing, status)
+
+
+def _line(judgement: Judgement | HandJudgement) -> str:
+    from kf_calib.online.status import Judgement
+    from kf_calib.views.live import line
+    from kf_calib.views.live_hand import hand_line
+
+    return line(judgement) if isinstance(judgement, Judgement) else hand_line(judgement)
 
 
 def _echo(run: _Run, text: str) -> None:
@@ -329,8 +381,10 @@ def _echo(run: _Run, text: str) -> None:
 def _on_screen(run: _Run, name: str, record: Path | None) -> None:
     from rich.live import Live
 
+    from kf_calib.online.hand_status import HandStanding
     from kf_calib.online.status import Standing
     from kf_calib.views.live import screen
+    from kf_calib.views.live_hand import hand_screen
     from kf_calib.views.terminal import PlainConsole
 
     display = Live(console=PlainConsole(), auto_refresh=False, transient=True, redirect_stderr=sys.stderr.isatty())
@@ -340,8 +394,13 @@ def _on_screen(run: _Run, name: str, record: Path | None) -> None:
                 run.judgements.get_nowait()
             run.warn()
             standing = run.session.standing if run.session else Standing()
-            hint = "ending ..." if run.stopped else "a: accept what is missing   q: end the run"
-            display.update(screen(standing, run.source.status, name, str(record or ""), hint), refresh=True)
+            if isinstance(standing, HandStanding):
+                hint = "ending ..." if run.stopped else "q: end the run"
+                shown = hand_screen(standing, run.source.status, name, str(record or ""), hint)
+            else:
+                hint = "ending ..." if run.stopped else "a: accept what is missing   q: end the run"
+                shown = screen(standing, run.source.status, name, str(record or ""), hint)
+            display.update(shown, refresh=True)
             key = pressed(_REFRESH_S)
             if key == "a":
                 run.accept()
@@ -349,7 +408,7 @@ def _on_screen(run: _Run, name: str, record: Path | None) -> None:
                 run.stop()
 
 
-def _outcome(run: _Run, as_json: bool) -> Judgement | None:
+def _outcome(run: _Run, as_json: bool) -> Judgement | HandJudgement | None:
     """The last judgement, after its summary; None where a run that was ended had nothing to evaluate yet."""
     if run.error is not None:
         if not (run.stopped and isinstance(run.error, KfCalibError)):
@@ -363,14 +422,19 @@ def _outcome(run: _Run, as_json: bool) -> Judgement | None:
     final = run.final
     assert final is not None
     if not as_json:
-        from rich.console import Group
+        from rich.console import Group, RenderableType
         from rich.text import Text
 
+        from kf_calib.online.status import Judgement
         from kf_calib.views import diagnosis
         from kf_calib.views.console import summary
 
-        style = {True: "bold green", False: "bold yellow", None: "bold"}[final.consistent]
-        run.print(rendered(Group(summary(final.result), Text(diagnosis.verdict(final.found), style=style))), end=False)
+        assert final.result is not None
+        parts: list[RenderableType] = [summary(final.result)]
+        if isinstance(final, Judgement):
+            style = {True: "bold green", False: "bold yellow", None: "bold"}[final.consistent]
+            parts.append(Text(diagnosis.verdict(final.found), style=style))
+        run.print(rendered(Group(*parts)), end=False)
     return final
 
 
@@ -389,7 +453,9 @@ def _of_the_view(view: GrowingView | None) -> list[str]:
     return [said for said in (view.trouble, late) if said]
 
 
-def _refuse(settings: Settings) -> None:
+def _refuse(settings: Settings, accepts_by_hand: bool) -> None:
+    if accepts_by_hand:
+        raise click.UsageError("--auto accepts effects, which need the angles: leave out --auto or --no-angles.")
     if settings.engine != "block":
         raise click.UsageError(
             "live evaluates folded dwells, as the block engine does: leave out --engine, and check the recording with "

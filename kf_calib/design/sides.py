@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.fit import Fit
@@ -24,49 +25,46 @@ _TILTS_DEG = {2: 45, 3: 55}  # of an edge and of a corner from the nearest face
 class Sides:
     """The sides of some poses.
 
-    up (D, 3): unit vector that points up in each. side: number of the side of each, counted from 0. missing: scale
-    factors and biases that the poses do not determine. following: the axes that should point up next, as ``+x +y``.
+    numbers: of their dwells. up (D, 3): unit vector that points up in each. side: number of the side of each, from 0.
+    missing: scale factors and biases that the poses do not determine. following: the axes that should point up next, as
+    ``+x +y``.
     """
 
+    numbers: tuple[int, ...]
     up: Floats
     side: tuple[int, ...]
     missing: tuple[str, ...]
     following: str
 
     @classmethod
-    def of(cls, dwells: Sequence[DwellFactor], model: Model, fitted: Fit | None = None) -> Sides:
-        """The sides of dwells; fitted: what they gave, None where they do not determine it."""
-        if fitted is None:
-            model, state = Model(model.bench, square=True), model.nominal_state()
-            carried = Carried(turned(dwells, state, model.bench.gravity_mps2), model, state)
-            noise = within_dwells(dwells)
-        else:
-            carried, noise, state = fitted.carried, fitted.noise, fitted.carried.state
-        covariance = covariance_of(carried, noise, model.bench.square_rad)
-        up = directions(np.array([dwell.means[4:] for dwell in dwells]), state)
-        following = most_informative(covariance, state, model.bench.gravity_mps2)
-        return cls(up, _grouped(up), tuple(undetermined(covariance)), following)
+    def of(cls, dwells: Sequence[DwellFactor], bench: Bench, fitted: Fit | None = None) -> Sides:
+        """The sides of dwells; fitted: to these or fewer dwells, None where they do not determine it."""
+        model = Model(bench)
+        state = model.nominal_state() if fitted is None else fitted.carried.state
+        noise = within_dwells(dwells) if fitted is None else fitted.noise
+        covariance = covariance_of(Carried(turned(dwells, state, bench.gravity_mps2), model, state), noise,
+                                   bench.square_rad)  # fmt: skip
+        force = felt(np.array([dwell.means[4:] for dwell in dwells]), state)
+        up = force / np.linalg.norm(force, axis=1, keepdims=True)
+        following = most_informative(covariance, state, bench.gravity_mps2)
+        numbers = tuple(dwell.number for dwell in dwells)
+        return cls(numbers, up, _grouped(up), tuple(undetermined(covariance)), following)
 
     @property
     def count(self) -> int:
         """Number of different sides."""
         return len(set(self.side))
 
-    def like(self, up: Floats) -> int | None:
-        """Index of the first of the poses that is on the same side as this direction (3,); None for a new side."""
-        near = np.flatnonzero(self.up @ up > np.cos(np.radians(SAME_SIDE_DEG)))
-        return int(near[0]) if near.size else None
+    @property
+    def repeats(self) -> int | None:
+        """Number of the earlier dwell on the side of the last one; None where that side is new."""
+        first = self.side.index(self.side[-1])
+        return self.numbers[first] if first < len(self.side) - 1 else None
 
-
-def directions(readings: Floats, state: Floats) -> Floats:
-    """The unit vectors (D, 3) that point up, by mean readings (D, 3)."""
-    force = felt(readings, state)
-    return np.asarray(force / np.linalg.norm(force, axis=1, keepdims=True))
-
-
-def nearest(up: Floats) -> str:
-    """The face, edge or corner of a cube that is nearest to a direction (3,), as ``+x +y``."""
-    return max(DIRECTIONS, key=lambda name: float(DIRECTIONS[name] @ up))
+    @property
+    def last(self) -> str:
+        """The face, edge or corner of a cube that points up in the last pose, nearly, as ``+x +y``."""
+        return max(DIRECTIONS, key=lambda name: float(DIRECTIONS[name] @ self.up[-1]))
 
 
 def turn_in_words(up: str) -> str:

@@ -25,6 +25,9 @@ from kf_calib.estimation.signal_quality import ReadingsMonitor
 from kf_calib.sources.tables.table import Table
 from kf_calib.support.units import WORDS
 
+LEAST_READINGS = 8
+"""Of a dwell that is used: fewer do not show their own noise."""
+
 
 @dataclass
 class Pass:
@@ -85,7 +88,7 @@ class Pass:
     def dwells(self) -> list[DwellFactor]:
         """The usable dwells so far: not left out by the settings and, but for those of a table, of at least 8 readings,
         since fewer do not show their own noise."""
-        left_out, least = self.settings.left_out, 1 if isinstance(self.source, Table) else 8
+        left_out, least = self.settings.left_out, 1 if isinstance(self.source, Table) else LEAST_READINGS
         if not left_out:
             return [dwell for dwell in self.folder.dwells if dwell.count >= least]
         unused = {k for k, each in enumerate(self.folder.dwells) if each.count < least or each.number in left_out}

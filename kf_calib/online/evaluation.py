@@ -19,7 +19,7 @@ from kf_calib.bench.streams import Batch, Source
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.progress import Progress, targets
 from kf_calib.support.threads import one_blas_thread
@@ -197,7 +197,7 @@ class Evaluation(ABC, Generic[J, S]):
         aside = replace(self._passed, tally=Tally(), folder=folder)
         for rows in aside.rows_of(self._segmenter.waiting()):
             folder.add(rows)
-        if not folder.dwells or folder.dwells[-1].count < 8:
+        if not folder.dwells or folder.dwells[-1].count < LEAST_READINGS:
             return
         self._looked_s = elapsed_s - arrival_s
         here = self._seen(folder.dwells[-1])

@@ -10,24 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-import numpy as np
-
 from kf_calib.bench.streams import Source
+from kf_calib.design.sides import Sides
 from kf_calib.dwells.rest_in_readings import RestSegmenter
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.errors import InputError
-from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.evaluation import Evaluation
-from kf_calib.online.hand_status import (
-    ENOUGH_S,
-    HandJudgement,
-    HandStanding,
-    Held,
-    held,
-    judge_all_poses,
-    judge_poses,
-)
+from kf_calib.online.hand_status import ENOUGH_S, HandJudgement, HandStanding, Held, judge_all_poses, judge_poses
 
 
 class HandSession(Evaluation[HandJudgement, HandStanding]):
@@ -65,7 +56,20 @@ class HandSession(Evaluation[HandJudgement, HandStanding]):
     def _judged_whole(self, passed: Pass, before: HandJudgement | None, again: Source | None) -> HandJudgement:
         return judge_all_poses(passed, self.wanted, before.looks if before else 0, again)
 
+    def _judged_next(self, judgement: HandJudgement) -> None:
+        self._show_sides(judgement.sides)
+
     def _seen(self, dwell: DwellFactor) -> Held:
+        closed = [each for each in self._passed.folder.dwells[: self._closed] if each.count >= LEAST_READINGS]
         judgement = self.standing.judgement
-        known = None if judgement is None or judgement.result is None else judgement.result.estimate.state
-        return held(dwell, judgement, self._passed.model.nominal_state() if known is None else np.asarray(known))
+        fitted = None if judgement is None or judgement.result is None else judgement.result.fit
+        sides = Sides.of([*closed, dwell], self.source.bench, fitted)
+        self._show_sides(sides)
+        return Held(dwell.number, dwell.count, sides.last)
+
+    def _show_sides(self, sides: Sides) -> None:
+        """Show the sides of these poses, unless those of more poses are shown: a judgement takes its time."""
+        with self._lock:
+            shown = self.standing.sides
+            if shown is None or len(shown.numbers) <= len(sides.numbers):
+                self._publish(sides=sides)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
-from kf_calib.design.sides import Sides, directions, nearest, turn_in_words
+from kf_calib.design.sides import Sides, turn_in_words
 from kf_calib.diagnosis.candidate_tests import LEVEL
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.errors import UnobservableError
@@ -62,10 +61,10 @@ class HandJudgement:
         Of all tests of a run together the probability of a false alarm is that of one: the k-th has 1 / (k (k + 1)) of
         it.
         """
-        if self.result is None or self.result.consistency.p_value is None:
-            return None
-        if self.final:
+        if self.final and self.result is not None:
             return self.result.consistency.consistent
+        if self.result is None or self.result.consistency.p_value is None or self.result.model.square:
+            return None
         return self.result.consistency.p_value >= LEVEL / (self.looks * (self.looks + 1))
 
     @property
@@ -73,82 +72,57 @@ class HandJudgement:
         """What the poses tell, in a few words."""
         if self.result is None:
             return f"{', '.join(self.sides.missing)} not determined yet"
+        if self.result.model.square:
+            return "the angles between the axes are not told yet: they are taken for square"
         if self.consistent is None:
             return "too few poses to test them by each other"
         if self.consistent:
             return "the sizes of gravity agree"
         return "the sizes of gravity differ by more than noise: was it held still?"
 
-    @cached_property
-    def repeats(self) -> int | None:
-        """Number of the earlier pose on the side of the last one; None where that side is new."""
-        if len(self.dwells) < 2:
-            return None
-        own = self.sides.side[-1]
-        return next((dwell.number for dwell, side in zip(self.dwells[:-1], self.sides.side, strict=False)
-                     if side == own), None)  # fmt: skip
-
-    @property
-    def up(self) -> str:
-        """The axes that point up in the last pose, as ``+x +y``."""
-        return nearest(self.sides.up[-1])
-
 
 @dataclass(frozen=True)
 class Held:
-    """The pose that it is held in now.
-
-    number: of the dwell. readings, seconds: number and duration of those used. up: the axes that point up. repeats:
-    number of the earlier pose on this side; None for a new side.
-    """
+    """The pose that it is held in: number of the dwell, readings used so far, and the axes that point up."""
 
     number: int
     readings: int
-    seconds: float
     up: str
-    repeats: int | None
 
 
 @dataclass(frozen=True)
 class HandStanding(Progress):
     """What is known of a calibration by hand at a moment; see ``Progress``.
 
-    current: the pose that it is held in. judgement: the latest judgement. rest_s: for how long it has rested by now,
-    with the time of settling; 0 while it moves. enough_s: for how long it is to rest.
+    current: the pose that it is held in. judgement: the latest judgement. sides: those of the poses so far, with that
+    of the pose it is held in. rest_s: for how long it has rested by now, with the time of settling; 0 while it moves.
+    enough_s: for how long it is to rest.
     """
 
     current: Held | None = None
     judgement: HandJudgement | None = None
+    sides: Sides | None = None
     rest_s: float = 0.0
     enough_s: float = ENOUGH_S
 
     @property
-    def turn(self) -> str:
-        """What to do after this pose."""
-        if self.judgement is None:
-            return "turn it to a new side"
-        if self.judgement.reached:
-            return "every target is reached: end the run, or go on"
-        return f"turn it to a new side: {turn_in_words(self.judgement.sides.following)}"
-
-    @property
     def task(self) -> str:
         """What to do now."""
-        if not self.rest_s:
-            return f"{self.turn if self.judgement else 'lay it on any side'}, and hold it still"
+        if self.sides is None:
+            return f"hold still for {self.enough_s:g} s" if self.rest_s else "lay it on any side and hold it still"
+        turn = f"turn it to a new side: {turn_in_words(self.sides.following)}"
         if self.rest_s >= self.enough_s:
-            return f"enough: {self.turn}"
-        if self.current is not None and self.current.repeats is not None:
-            return f"on this side it was in pose {self.current.repeats}, which tells little more: {self.turn}"
-        return f"hold still: {self.enough_s:g} s in all"
+            return self._over(f"enough: {turn}")
+        if not self.rest_s:
+            return self._over(f"{turn}; then hold it still")
+        if self.current is not None and self.sides.repeats is not None:
+            return f"on this side it was in pose {self.sides.repeats}, which tells little more: {turn}"
+        return f"hold still for {self.enough_s:g} s"
 
-
-def held(dwell: DwellFactor, judgement: HandJudgement | None, state: Floats) -> Held:
-    """The pose that it is held in; state (12,): by which readings are turned into directions."""
-    up = directions(dwell.means[None, 4:], state)[0]
-    like = None if judgement is None else judgement.sides.like(up)
-    repeats = None if like is None or judgement is None else judgement.dwells[like].number
-    return Held(dwell.number, dwell.count, dwell.end_s - dwell.start_s, nearest(up), repeats)
+    def _over(self, otherwise: str) -> str:
+        """Return that the run may end, where every target is reached, or else what to do."""
+        done = self.judgement is not None and self.judgement.reached
+        return "every target is reached: end the run, or go on with more sides" if done else otherwise
 
 
 def judge_poses(passed: Pass, wanted: Floats, before: HandJudgement | None = None) -> HandJudgement:
@@ -163,8 +137,8 @@ def judge_poses(passed: Pass, wanted: Floats, before: HandJudgement | None = Non
             result = with_remarks(evaluate_fit(fit(dwells, model, settings.walk_mps2_per_sqrt_s), settings), passed)
         except UnobservableError:
             result = None
-        sides = Sides.of(dwells, model, None if result is None else result.fit)
-    tested = result is not None and result.consistency.p_value is not None
+        sides = Sides.of(dwells, passed.source.bench, None if result is None else result.fit)
+    tested = result is not None and result.consistency.p_value is not None and not result.model.square
     return HandJudgement(result, dwells, sides, wanted, (before.looks if before else 0) + tested)
 
 
@@ -172,5 +146,5 @@ def judge_all_poses(passed: Pass, wanted: Floats, looks: int, again: Source | No
     """The final judgement: what ``replay`` of the recording gives. Raises KfCalibError as that does."""
     with one_blas_thread():
         result = conclude(passed, again)
-        sides = Sides.of(passed.dwells, passed.model, result.fit)
+        sides = Sides.of(passed.dwells, passed.source.bench, result.fit)
     return HandJudgement(result, passed.dwells, sides, wanted, looks, final=True)
