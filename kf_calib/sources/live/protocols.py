@@ -14,7 +14,7 @@ from kf_calib.sources.files.lines import Cutter
 from kf_calib.sources.live.feed import nothing
 from kf_calib.sources.live.frames import FrameReader
 
-_FEWEST_CELLS = 4  # time and readings; one more with angles
+_FEWEST_CELLS = 5  # time, readings and an angle
 _MOST_LINES = 2000  # without a beginning among them
 _MOST_BYTES = 1 << 23
 _HELD_BYTES = 1 << 16
@@ -86,6 +86,14 @@ class LineProtocol:
                 self._account.refuse(self._account.lines, "it is neither a JSON object nor a header of CSV")
         return []
 
+    def _has_readings(self, header: str) -> bool:
+        """Whether a header lacks nothing but angles."""
+        try:
+            CsvLines(header, self._columns, Account(), angles=False)
+        except InputError:
+            return False
+        return True
+
     def _begins(self, text: str) -> bool:
         if text[0] == "{":
             try:
@@ -96,12 +104,14 @@ class LineProtocol:
             return True
         cells = text.split(max(",;\t", key=text.count))
         if (
-            len(cells) < _FEWEST_CELLS + self._angles
+            len(cells) < _FEWEST_CELLS - 1
             or not text.isprintable()
             or not all(cell.strip(' "')[:1].isalpha() for cell in cells)
         ):
             return False
         try:
+            if self._angles and len(cells) < _FEWEST_CELLS and not self._has_readings(text):
+                return False
             self.reader, self._header = CsvLines(text, self._columns, self._account, self._angles), text
         except InputError as error:
             raise InputError(f"{self._name}: {error}") from None
