@@ -5,20 +5,17 @@ from __future__ import annotations
 import contextlib
 import math
 import queue
-import signal
 import sys
-import threading
-from collections.abc import Callable, Mapping
-from contextvars import copy_context
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
-from kf_calib.cli.echo import Printer, complain
+from kf_calib.cli.echo import complain
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.live_keys import pressed_keys
+from kf_calib.cli.live_run import LiveRun, by_hand, on_bench
 from kf_calib.cli.numbers import NOT_NEGATIVE, POSITIVE
 from kf_calib.cli.options import (
     INPUT,
@@ -43,17 +40,14 @@ from kf_calib.cli.options import (
     units_option,
 )
 from kf_calib.cli.signals import answered
-from kf_calib.errors import InputError, KfCalibError
+from kf_calib.errors import KfCalibError
 from kf_calib.support.plain_text import sentence
 
 if TYPE_CHECKING:
-    from kf_calib.bench.streams import Source
     from kf_calib.estimation.settings import Settings
-    from kf_calib.online.hand_session import HandSession
     from kf_calib.online.hand_status import HandJudgement, HandStanding
-    from kf_calib.online.session import Session
     from kf_calib.online.status import Judgement, Standing
-    from kf_calib.sources.live import LiveSource, Status
+    from kf_calib.sources.live import Status
     from kf_calib.views.rerun.growing import GrowingView
 
 RUNNING = "While it runs"
@@ -163,8 +157,8 @@ def live(
         give_up_s=give_up_s, idle_s=idle_s, angles=not no_angles,
     )  # fmt: skip
     with opening as opened:
-        begin = _by_hand(settings, wanted) if no_angles else _on_bench(settings, wanted, auto)
-        run = _Run(opened, begin, record, not sys.stdout.isatty() or as_json)
+        begin = by_hand(settings, wanted) if no_angles else on_bench(settings, wanted, auto)
+        run = LiveRun(opened, begin, record, not sys.stdout.isatty() or as_json)
         view = _view(rrd, rerun_port if with_viewer else None, rerun_bind)
         if view is not None:
             run.listeners.append(partial(_offer, view))
@@ -189,115 +183,6 @@ def live(
         ctx.exit(1)
 
 
-class _Run:
-    """A session in a thread of its own: the main thread has the screen, the keys and the signals.
-
-    judgements: those not shown yet. stopped: by a key or a signal. print: to standard output.
-    """
-
-    def __init__(
-        self,
-        source: LiveSource,
-        begin: Callable[[LiveSource, bool, Callable[[], Source | None]], Session | HandSession],
-        record: Path | None,
-        every: bool,
-    ) -> None:
-        self.source, self.stopped, self.unshown = source, False, 0
-        self.print, self._is_warned = Printer(), False
-        self.session: Session | HandSession | None = None
-        self.final: Judgement | HandJudgement | None = None
-        self.error: BaseException | None = None
-        self.listeners: list[Callable[[Judgement | HandJudgement], None]] = [self._keep]
-        self.judgements = queue.Queue["Judgement | HandJudgement"](256)
-        self._record, self._begin = record, begin
-        work = self._work, every
-        self._thread = threading.Thread(target=copy_context().run, args=work, daemon=True)  # in the units chosen
-
-    def start(self) -> None:
-        self._thread.start()
-
-    @property
-    def going(self) -> bool:
-        return self._thread.is_alive() or not self.judgements.empty()
-
-    def stop(self) -> None:
-        self.stopped = True
-        self.source.stop()
-        if self.session is not None:
-            self.session.hurry()
-
-    def handle_signal(self, number: signal.Signals) -> None:
-        """To end, by a signal, as its end would; a second Ctrl-C does not wait for it."""
-        if number == signal.SIGINT and (self.stopped or not self.going):
-            raise KeyboardInterrupt
-        self.stop()
-
-    def warn(self) -> None:
-        """Say at once, and once, that nothing is recorded any more."""
-        trouble = self.source.status.recording_trouble
-        if trouble and not self._is_warned:
-            complain(f"RECORDING HAS STOPPED: {trouble}")
-            self._is_warned = True
-
-    @property
-    def troubles(self) -> list[str]:
-        """What failed, though the run went on to its end: it is no success then."""
-        trouble, lost = self.source.status.recording_trouble, self.print.lost
-        unheard = f"{lost} output{'s' * (lost != 1)} could not be written to standard output: they are lost."
-        return [f"the run was not recorded to its end: {trouble}"] * bool(trouble) + [unheard] * bool(lost)
-
-    def accept(self) -> None:
-        """The effect that is missing, as it stands."""
-        from kf_calib.online.status import Judgement
-
-        judgement = self.session.standing.judgement if self.session else None
-        if self.session is None or not isinstance(judgement, Judgement):
-            return
-        try:
-            if not (judgement.alarm and judgement.found.missing):
-                raise InputError("no effect is known to be missing: nothing to accept.")
-            self.session.accept(*judgement.found.missing)
-        except InputError as error:
-            self.session.say(str(error))
-
-    def recording(self) -> Source | None:
-        """What was recorded of the run; None where nothing was, or not all."""
-        from kf_calib.sources.files.recording import Recording
-
-        return (
-            Recording(self._record, angles=self.source.bench.angles)
-            if self._record and not self.source.status.recording_trouble
-            else None
-        )
-
-    def _work(self, every: bool) -> None:
-        try:
-            self.session = self._begin(self.source, every, self.recording)
-            for listener in self.listeners:
-                self.session.listeners.append(listener)
-            self.final = self.session.run()
-        except BaseException as error:  # for the main thread to tell
-            self.error = error
-
-    def _keep(self, judgement: Judgement | HandJudgement) -> None:
-        try:
-            self.judgements.put_nowait(judgement)
-        except queue.Full:
-            self.unshown += 1
-
-
-def _on_bench(settings: Settings, wanted: Mapping[str, float], auto: bool) -> Callable[..., Session]:
-    from kf_calib.online.session import Session
-
-    return lambda source, every, again: Session(source, settings, wanted, every=every, auto=auto, again=again)
-
-
-def _by_hand(settings: Settings, wanted: Mapping[str, float]) -> Callable[..., HandSession]:
-    from kf_calib.online.hand_session import HandSession
-
-    return lambda source, every, again: HandSession(source, settings, wanted, every=every, again=again)
-
-
 def _offer(view: GrowingView, judgement: Judgement | HandJudgement) -> None:
     from kf_calib.online.status import Judgement
 
@@ -305,7 +190,7 @@ def _offer(view: GrowingView, judgement: Judgement | HandJudgement) -> None:
         view.offer(judgement.result, judgement if isinstance(judgement, Judgement) else None)
 
 
-def _follow(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
+def _follow(run: LiveRun, name: str, record: Path | None, as_json: bool) -> None:
     """The run to its end, with a screen, lines or objects."""
     run.start()
     if not as_json and sys.stdout.isatty():
@@ -326,7 +211,7 @@ def _follow(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
         told = now
 
 
-def _urgent_messages(run: _Run) -> dict[str, str]:
+def _urgent_messages(run: LiveRun) -> dict[str, str]:
     """What a user must know at once, about what: said again where it changes."""
     from kf_calib.online.hand_status import HandStanding
 
@@ -339,7 +224,7 @@ def _urgent_messages(run: _Run) -> dict[str, str]:
     }
 
 
-def _print(run: _Run, judgement: Judgement | HandJudgement, as_json: bool) -> None:
+def _print(run: LiveRun, judgement: Judgement | HandJudgement, as_json: bool) -> None:
     assert run.session is not None
     if as_json:
         _echo(run, json_line(_object(judgement, run.session.standing, run.source.status)))
@@ -367,7 +252,7 @@ def _line(judgement: Judgement | HandJudgement) -> str:
     return line(judgement) if isinstance(judgement, Judgement) else hand_line(judgement)
 
 
-def _echo(run: _Run, text: str) -> None:
+def _echo(run: LiveRun, text: str) -> None:
     """Where nobody reads any more, a run that is recorded goes on in silence; another ends."""
     was_heard = run.print.is_heard
     run.print(text)
@@ -378,7 +263,7 @@ def _echo(run: _Run, text: str) -> None:
             complain("nobody reads this output any more; the recording goes on.")
 
 
-def _on_screen(run: _Run, name: str, record: Path | None) -> None:
+def _on_screen(run: LiveRun, name: str, record: Path | None) -> None:
     from rich.live import Live
 
     from kf_calib.online.hand_status import HandStanding
@@ -408,7 +293,7 @@ def _on_screen(run: _Run, name: str, record: Path | None) -> None:
                 run.stop()
 
 
-def _outcome(run: _Run, as_json: bool) -> Judgement | HandJudgement | None:
+def _outcome(run: LiveRun, as_json: bool) -> Judgement | HandJudgement | None:
     """The last judgement, after its summary; None where a run that was ended had nothing to evaluate yet."""
     if run.error is not None:
         if not (run.stopped and isinstance(run.error, KfCalibError)):

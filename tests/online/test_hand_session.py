@@ -99,7 +99,8 @@ def angles(*names: str) -> np.ndarray:
 @cache
 def twelve() -> Told:
     spread = Rotation.random(5, np.random.default_rng(5)).as_euler("YZX")
-    return followed(Board(np.concatenate([angles("+y", "+y", "-y", "+x", "-x", "+z", "-z"), spread])), {"K1": 1e-3, "nu1": 1e-3})
+    faces = angles("+y", "+y", "-y", "+x", "-x", "+z", "-z")
+    return followed(Board(np.concatenate([faces, spread])), {"K1": 1e-3, "nu1": 1e-3})
 
 
 def test_the_end_is_that_of_replay_and_each_pose_is_judged() -> None:
