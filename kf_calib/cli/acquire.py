@@ -22,6 +22,7 @@ from kf_calib.cli.options import (
     columns_option,
     examples,
     json_option,
+    no_angles_option,
     overrides,
     overwrite_option,
     pair,
@@ -154,12 +155,10 @@ class _Recorded(NamedTuple):
 
 def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], None]) -> _Recorded:
     """Write a source to a recording as it is, a chunk closed at the end of each dwell."""
-    from kf_calib.dwells.rest_in_readings import RestSegmenter
-    from kf_calib.dwells.segmenter import Segmenter
+    from kf_calib.dwells.rest_in_readings import segmenter_of
     from kf_calib.sources.files.recorder import Recorder
 
-    segmenter = (Segmenter if source.bench.angles else RestSegmenter)(source.bench)
-    readings, first_ns, last_ns = 0, None, 0
+    readings, first_ns, last_ns, segmenter = 0, None, 0, segmenter_of(source.bench)
     interrupt = Interrupter()
     with answered(interrupt), Recorder(out, source.bench, overwrite=overwrite) as recorder:
         for batch in source:
@@ -238,19 +237,20 @@ def _size(count: int) -> str:
 )
 @click.argument("out", type=OutputFile())
 @click.argument("lines", type=click.Path(path_type=Path, allow_dash=True), default="-")
+@no_angles_option
 @columns_option
 @bench_options
 @overwrite_option
 @json_option
 def record(
-    out: Path, lines: Path, columns: tuple[str, ...], overwrite: bool, as_json: bool, **options: Any
+    out: Path, lines: Path, no_angles: bool, columns: tuple[str, ...], overwrite: bool, as_json: bool, **options: Any
 ) -> None:  # fmt: skip
     """Record CSV or JSON LINES (a file, or - for standard input) to the MCAP file OUT."""
     from kf_calib.sources.files.lines import Lines
 
     claimed(overwrite=overwrite)
     renamed = dict(pair(text) for text in columns)
-    source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, overrides(options), renamed)
+    source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, overrides(options), renamed, angles=not no_angles)
     with progress(f"recording {out.name}", as_json or str(lines) == "-") as tick:
         made = _record(source, out, overwrite, tick)
     warnings = [*source.warnings, *made.notes]

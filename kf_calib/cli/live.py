@@ -5,19 +5,17 @@ from __future__ import annotations
 import contextlib
 import math
 import queue
-import signal
 import sys
-import threading
-from collections.abc import Callable, Mapping
-from contextvars import copy_context
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
-from kf_calib.cli.echo import Printer, complain
+from kf_calib.cli.echo import complain
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.live_keys import pressed_keys
+from kf_calib.cli.live_run import LiveRun, by_hand, on_bench
 from kf_calib.cli.numbers import NOT_NEGATIVE, POSITIVE
 from kf_calib.cli.options import (
     INPUT,
@@ -27,6 +25,7 @@ from kf_calib.cli.options import (
     filter_options,
     json_line,
     json_option,
+    no_angles_option,
     overrides,
     overwrite_option,
     pair,
@@ -41,15 +40,14 @@ from kf_calib.cli.options import (
     units_option,
 )
 from kf_calib.cli.signals import answered
-from kf_calib.errors import InputError, KfCalibError
+from kf_calib.errors import KfCalibError
 from kf_calib.support.plain_text import sentence
 
 if TYPE_CHECKING:
-    from kf_calib.bench.streams import Source
     from kf_calib.estimation.settings import Settings
-    from kf_calib.online.session import Session
-    from kf_calib.online.status import Judgement
-    from kf_calib.sources.live import LiveSource
+    from kf_calib.online.hand_status import HandJudgement, HandStanding
+    from kf_calib.online.status import Judgement, Standing
+    from kf_calib.sources.live import Status
     from kf_calib.views.rerun.growing import GrowingView
 
 RUNNING = "While it runs"
@@ -60,6 +58,7 @@ _REFRESH_S = 0.25
     epilog=examples(
         "live /dev/ttyUSB0 --bench bench.toml --record run.mcap --target theta=1arcsec --target K=2ppm --rerun",
         'live "sim://?speed=10&hide=second-order=4e-6" --target K=0.1ppm',
+        "live /dev/ttyACM0 --no-angles --record hand.mcap --target K=500ppm",
     )
 )
 @click.argument("source", metavar="SOURCE")
@@ -88,6 +87,7 @@ _REFRESH_S = 0.25
     metavar="ADDRESS",
     help="Address a viewer that is opened listens on.",
 )
+@no_angles_option
 @columns_option
 @click.option(
     "--header", default="", metavar="NAMES", panel=INPUT, help="Names of the columns of CSV rows that come without any."
@@ -123,6 +123,7 @@ def live(
     source: str,
     record: Path | None,
     overwrite: bool,
+    no_angles: bool,
     columns: tuple[str, ...],
     header: str,
     give_up_s: float,
@@ -142,6 +143,7 @@ def live(
     """Evaluate a bench while it runs: sigmas, verdict and the next orientation as they stand; record it.
 
     SOURCE: a serial port, socket://HOST:PORT, rfc2217://HOST:PORT, - (standard input), a file that grows, or sim://.
+    With --no-angles it is a sensor in the hand, and what is shown is which side to turn up next.
     Ctrl-C ends the run: the recording is finished and the summary printed.
     """
     from kf_calib.bench.targets import targets_of
@@ -149,16 +151,17 @@ def live(
 
     outputs = claimed(files_of(source), overwrite=overwrite)
     settings, wanted = settings_of(options), targets_of(targets)
-    _refuse(settings)
+    _refuse(settings, auto and no_angles)
     opening = open_live(
         source, overrides(options), record, overwrite, columns=dict(map(pair, columns)), header=header,
-        give_up_s=give_up_s, idle_s=idle_s,
+        give_up_s=give_up_s, idle_s=idle_s, angles=not no_angles,
     )  # fmt: skip
     with opening as opened:
-        run = _Run(opened, settings, wanted, auto, record, not sys.stdout.isatty() or as_json)
+        begin = by_hand(settings, wanted) if no_angles else on_bench(settings, wanted, auto)
+        run = LiveRun(opened, begin, record, not sys.stdout.isatty() or as_json)
         view = _view(rrd, rerun_port if with_viewer else None, rerun_bind)
         if view is not None:
-            run.listeners.append(lambda judgement: view.offer(judgement.result, judgement))
+            run.listeners.append(partial(_offer, view))
         with answered(run.handle_signal):  # until all is written: who closes a terminal sends several
             _follow(run, source, record, as_json)
             if view is not None:
@@ -167,114 +170,27 @@ def live(
             final = _outcome(run, as_json)
             for said in [*_of_the_view(view), *run.troubles]:
                 complain(said)
-            if final is not None:
+            if final is not None and final.result is not None:
                 if rrd and view is not None and view.began:
                     outputs.own(rrd)
                 with delivery(outputs, as_json or run.print.lost > 0) as deliver:
                     deliver.calibration(save, final.result, run.recording() or opened)
                     deliver.model(save_model, final.result)
-                    deliver.file(rrd, lambda path: save_view(final.result, path))  # by the noise of the whole run
+                    deliver.file(rrd, partial(save_view, final.result))  # by the noise of the whole run
     if run.troubles:
         ctx.exit(2)
     if strict and final is not None and final.consistent is False:
         ctx.exit(1)
 
 
-class _Run:
-    """A session in a thread of its own: the main thread has the screen, the keys and the signals.
+def _offer(view: GrowingView, judgement: Judgement | HandJudgement) -> None:
+    from kf_calib.online.status import Judgement
 
-    judgements: those not shown yet. stopped: by a key or a signal. print: to standard output.
-    """
-
-    def __init__(
-        self,
-        source: LiveSource,
-        settings: Settings,
-        wanted: Mapping[str, float],
-        auto: bool,
-        record: Path | None,
-        every: bool,
-    ) -> None:
-        self.source, self.stopped, self.unshown = source, False, 0
-        self.print, self._is_warned = Printer(), False
-        self.session: Session | None = None
-        self.final: Judgement | None = None
-        self.error: BaseException | None = None
-        self.listeners: list[Callable[[Judgement], None]] = [self._keep]
-        self.judgements = queue.Queue["Judgement"](256)
-        self._record = record
-        work = self._work, settings, wanted, auto, every
-        self._thread = threading.Thread(target=copy_context().run, args=work, daemon=True)  # in the units chosen
-
-    def start(self) -> None:
-        self._thread.start()
-
-    @property
-    def going(self) -> bool:
-        return self._thread.is_alive() or not self.judgements.empty()
-
-    def stop(self) -> None:
-        self.stopped = True
-        self.source.stop()
-        if self.session is not None:
-            self.session.hurry()
-
-    def handle_signal(self, number: signal.Signals) -> None:
-        """To end, by a signal, as its end would; a second Ctrl-C does not wait for it."""
-        if number == signal.SIGINT and (self.stopped or not self.going):
-            raise KeyboardInterrupt
-        self.stop()
-
-    def warn(self) -> None:
-        """Say at once, and once, that nothing is recorded any more."""
-        trouble = self.source.status.recording_trouble
-        if trouble and not self._is_warned:
-            complain(f"RECORDING HAS STOPPED: {trouble}")
-            self._is_warned = True
-
-    @property
-    def troubles(self) -> list[str]:
-        """What failed, though the run went on to its end: it is no success then."""
-        trouble, lost = self.source.status.recording_trouble, self.print.lost
-        unheard = f"{lost} output{'s' * (lost != 1)} could not be written to standard output: they are lost."
-        return [f"the run was not recorded to its end: {trouble}"] * bool(trouble) + [unheard] * bool(lost)
-
-    def accept(self) -> None:
-        """The effect that is missing, as it stands."""
-        judgement = self.session.standing.judgement if self.session else None
-        if self.session is None or judgement is None:
-            return
-        try:
-            if not (judgement.alarm and judgement.found.missing):
-                raise InputError("no effect is known to be missing: nothing to accept.")
-            self.session.accept(*judgement.found.missing)
-        except InputError as error:
-            self.session.say(str(error))
-
-    def recording(self) -> Source | None:
-        """What was recorded of the run; None where nothing was, or not all."""
-        from kf_calib.sources.files.recording import Recording
-
-        return Recording(self._record) if self._record and not self.source.status.recording_trouble else None
-
-    def _work(self, settings: Settings, wanted: Mapping[str, float], auto: bool, every: bool) -> None:
-        from kf_calib.online.session import Session
-
-        try:
-            self.session = Session(self.source, settings, wanted, every=every, auto=auto, again=self.recording)
-            self.session.listeners += self.listeners
-            self.final = self.session.run()
-        except BaseException as error:  # for the main thread to tell
-            self.error = error
-
-    def _keep(self, judgement: Judgement) -> None:
-        try:
-            self.judgements.put_nowait(judgement)
-        except queue.Full:
-            self.unshown += 1
+    if judgement.result is not None:
+        view.offer(judgement.result, judgement if isinstance(judgement, Judgement) else None)
 
 
-def _follow(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
+def _follow(run: LiveRun, name: str, record: Path | None, as_json: bool) -> None:
     """The run to its end, with a screen, lines or objects."""
     run.start()
     if not as_json and sys.stdout.isatty():
@@ -295,27 +211,48 @@ def _follow(run: _Run, name: str, record: Path | None, as_json: bool) -> None:
         told = now
 
 
-def _urgent_messages(run: _Run) -> dict[str, str]:
+def _urgent_messages(run: LiveRun) -> dict[str, str]:
     """What a user must know at once, about what: said again where it changes."""
+    from kf_calib.online.hand_status import HandStanding
+
     standing, status = run.session.standing if run.session else None, run.source.status
     return {
+        "task": standing.task if isinstance(standing, HandStanding) else "",
         "evaluation": (standing.problem or standing.notice) if standing else "",
         "link": "the link is lost, and tried again" if status.link == "lost" else "",
         "clock": status.clock_trouble,
     }
 
 
-def _print(run: _Run, judgement: Judgement, as_json: bool) -> None:
-    from kf_calib.views import live as views
-
+def _print(run: LiveRun, judgement: Judgement | HandJudgement, as_json: bool) -> None:
     assert run.session is not None
     if as_json:
-        _echo(run, json_line(views.live_object(judgement, run.session.standing, run.source.status)))
+        _echo(run, json_line(_object(judgement, run.session.standing, run.source.status)))
     elif not judgement.final:
-        _echo(run, sentence(views.line(judgement)))
+        _echo(run, sentence(_line(judgement)))
 
 
-def _echo(run: _Run, text: str) -> None:
+def _object(judgement: Judgement | HandJudgement, standing: Standing | HandStanding, status: Status) -> dict[str, Any]:
+    from kf_calib.online.status import Judgement, Standing
+    from kf_calib.views.live import live_object
+    from kf_calib.views.live_hand import hand_object
+
+    if isinstance(judgement, Judgement):
+        assert isinstance(standing, Standing)
+        return live_object(judgement, standing, status)
+    assert not isinstance(standing, Standing)
+    return hand_object(judgement, standing, status)
+
+
+def _line(judgement: Judgement | HandJudgement) -> str:
+    from kf_calib.online.status import Judgement
+    from kf_calib.views.live import line
+    from kf_calib.views.live_hand import hand_line
+
+    return line(judgement) if isinstance(judgement, Judgement) else hand_line(judgement)
+
+
+def _echo(run: LiveRun, text: str) -> None:
     """Where nobody reads any more, a run that is recorded goes on in silence; another ends."""
     was_heard = run.print.is_heard
     run.print(text)
@@ -326,11 +263,13 @@ def _echo(run: _Run, text: str) -> None:
             complain("nobody reads this output any more; the recording goes on.")
 
 
-def _on_screen(run: _Run, name: str, record: Path | None) -> None:
+def _on_screen(run: LiveRun, name: str, record: Path | None) -> None:
     from rich.live import Live
 
+    from kf_calib.online.hand_status import HandStanding
     from kf_calib.online.status import Standing
     from kf_calib.views.live import screen
+    from kf_calib.views.live_hand import hand_screen
     from kf_calib.views.terminal import PlainConsole
 
     display = Live(console=PlainConsole(), auto_refresh=False, transient=True, redirect_stderr=sys.stderr.isatty())
@@ -340,8 +279,13 @@ def _on_screen(run: _Run, name: str, record: Path | None) -> None:
                 run.judgements.get_nowait()
             run.warn()
             standing = run.session.standing if run.session else Standing()
-            hint = "ending ..." if run.stopped else "a: accept what is missing   q: end the run"
-            display.update(screen(standing, run.source.status, name, str(record or ""), hint), refresh=True)
+            if isinstance(standing, HandStanding):
+                hint = "ending ..." if run.stopped else "q: end the run"
+                shown = hand_screen(standing, run.source.status, name, str(record or ""), hint)
+            else:
+                hint = "ending ..." if run.stopped else "a: accept what is missing   q: end the run"
+                shown = screen(standing, run.source.status, name, str(record or ""), hint)
+            display.update(shown, refresh=True)
             key = pressed(_REFRESH_S)
             if key == "a":
                 run.accept()
@@ -349,7 +293,7 @@ def _on_screen(run: _Run, name: str, record: Path | None) -> None:
                 run.stop()
 
 
-def _outcome(run: _Run, as_json: bool) -> Judgement | None:
+def _outcome(run: LiveRun, as_json: bool) -> Judgement | HandJudgement | None:
     """The last judgement, after its summary; None where a run that was ended had nothing to evaluate yet."""
     if run.error is not None:
         if not (run.stopped and isinstance(run.error, KfCalibError)):
@@ -363,14 +307,19 @@ def _outcome(run: _Run, as_json: bool) -> Judgement | None:
     final = run.final
     assert final is not None
     if not as_json:
-        from rich.console import Group
+        from rich.console import Group, RenderableType
         from rich.text import Text
 
+        from kf_calib.online.status import Judgement
         from kf_calib.views import diagnosis
         from kf_calib.views.console import summary
 
-        style = {True: "bold green", False: "bold yellow", None: "bold"}[final.consistent]
-        run.print(rendered(Group(summary(final.result), Text(diagnosis.verdict(final.found), style=style))), end=False)
+        assert final.result is not None
+        parts: list[RenderableType] = [summary(final.result)]
+        if isinstance(final, Judgement):
+            style = {True: "bold green", False: "bold yellow", None: "bold"}[final.consistent]
+            parts.append(Text(diagnosis.verdict(final.found), style=style))
+        run.print(rendered(Group(*parts)), end=False)
     return final
 
 
@@ -389,7 +338,9 @@ def _of_the_view(view: GrowingView | None) -> list[str]:
     return [said for said in (view.trouble, late) if said]
 
 
-def _refuse(settings: Settings) -> None:
+def _refuse(settings: Settings, accepts_by_hand: bool) -> None:
+    if accepts_by_hand:
+        raise click.UsageError("--auto accepts effects, which need the angles: leave out --auto or --no-angles.")
     if settings.engine != "block":
         raise click.UsageError(
             "live evaluates folded dwells, as the block engine does: leave out --engine, and check the recording with "

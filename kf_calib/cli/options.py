@@ -93,6 +93,12 @@ def pair(text: str) -> tuple[str, str]:
     return theirs, ours
 
 
+no_angles_option = click.option(
+    "--no-angles", is_flag=True, panel=INPUT,
+    help="Use no platform angles: only the size of gravity is known, nine parameters are left.",
+)  # fmt: skip
+
+
 def recording_options(command: F) -> F:
     """How to read a recording: the bench, unit of the readings, and topics."""
     options = [
@@ -102,8 +108,7 @@ def recording_options(command: F) -> F:
                      help="Size of one count, in the unit of the readings.", panel=INPUT),
         click.option("--angle-unit", type=click.Choice(_ANGLE_UNITS), show_default="rad; in a table, as its header or "
                      "its numbers tell", help="Unit of the gimbal angles.", panel=INPUT),
-        click.option("--no-angles", is_flag=True, panel=INPUT,
-                     help="Use no platform angles: only the size of gravity is known, nine parameters are left."),
+        no_angles_option,
         click.option("--g-unit", metavar="M/S^2", default="9.80665", show_default=True,
                      help="What 1 g stands for in a table of orientations; local: gravity of the bench.",
                      panel=INPUT),

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench.streams import Source
-from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
+from kf_calib.dwells.rest_in_readings import segmenter_of
+from kf_calib.dwells.segmenter import dwell_blocks
 from kf_calib.dwells.stationarity import Stillness
 
 
@@ -31,7 +32,7 @@ def dwells_found(
 ) -> list[DwellFound]:
     """The dwells of a source, which is read to its end; raises what reading it raises."""
     found = dict[int, DwellFound]()
-    segmenter = Segmenter(source.bench, stillness or Stillness())
+    segmenter = segmenter_of(source.bench, stillness)
     for block in dwell_blocks(source, segmenter):
         on_progress(source.fraction)
         if not len(block.elapsed_s) or block.curve is not None:

@@ -1,28 +1,40 @@
-"""Dwells found in the readings alone, where no angles are used: stretches in which neither their scatter nor their mean
-shows a motion.
+"""Dwells found in the readings alone, as they come: stretches in which neither their scatter nor their mean shows a
+motion.
 
-The readings are cut into windows of a quarter of a second. The noise is that of the quiet windows: the lower quartile
-of their variances, which are chi-squared distributed where the sensor rests. A window is still if its variance is
-within what that noise leaves to chance, and a dwell goes on as long as the mean differs from that of the still window
-before by no more than six sigma and the tolerance of ``Stillness``. One window that is not still, as by an outlier,
-does not end a dwell.
+The readings are cut into windows of a quarter of a second. The noise is that of the quiet windows of the last five
+minutes: the lower quartile of their variances, which are chi-squared distributed where the sensor rests. A window is
+still if its variance is within what that noise leaves to chance. A dwell begins with a second of still windows of one
+mean, within six sigma and the tolerance of ``Stillness``, and goes on as long as the windows agree with the one before
+and with the mean so far. One window that is not still, as by an outlier, does not end a dwell.
+
+Nothing is decided with readings that come later than half a second, so that a live run and the replay of its recording
+find the same dwells, however the readings are divided into batches.
 """
 
 from __future__ import annotations
 
+import copy
+import math
+from bisect import bisect_left, insort
+from collections import deque
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Ints
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.dwells.blocks import Block
+from kf_calib.dwells.blocks import Block, Tally
 from kf_calib.dwells.dwell_events import SECOND_NS, carry_on
 from kf_calib.dwells.segmenter import BLOCK_SAMPLES, Segmenter
+from kf_calib.dwells.stationarity import Stillness
 
 _WINDOW_NS = SECOND_NS // 4
 _FEWEST = 4  # readings of a window
+_PERIODS = 32  # intervals between the first readings, whose median tells how many readings a window has
 _LEAST_WINDOWS = 4  # of a dwell
+_REMEMBERED = 1200  # windows whose variances tell the noise: five minutes
 _ALLOWED = 1.5  # correlated noise has fewer degrees of freedom than readings
 _SIGMAS = 6.0
 _LEAST_G, _MOST_G = 1e-5, 0.05  # scatter that is never, and always, called a motion, in g
@@ -30,84 +42,283 @@ _UP = np.array([[0.0, 0.0, 0.0, 1.0]])  # stands for an attitude that is not kno
 
 
 class RestSegmenter(Segmenter):
-    """Cuts readings into dwells by themselves; as the noise is that of the whole run, ``finish`` yields all blocks."""
+    """Cuts readings into dwells by themselves; poses are not looked at."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._size = 0  # readings of a window; 0 while it is not known
+        self._gone = 0  # readings that were released: the place of the first one that waits
+        self._seen = 0  # place of the first reading that is in no window yet
+        self._quiet: _Quiet | None = None
+        self._run: _Run | None = None
 
     def push(self, batch: Batch) -> Iterator[Block]:
-        """Keep the readings of a batch until the end."""
+        """Yield the blocks that are complete once this batch is known."""
         self._take(Batch(batch.accel, Stream.empty(4), batch.temperature))
-        yield from ()
+        yield from self._judged(final=False)
 
     def finish(self) -> Iterator[Block]:
-        """Yield the blocks of all dwells."""
+        """Yield the blocks that are still open at the end of the readings."""
         accel, _, temperature = (order.flush() for order in self._orders)
         self._take(Batch(accel, Stream.empty(4), temperature), final=True)
-        accel, done = self._accel, 0
-        for begin, end in self._dwells(accel):
-            used = self._settled(accel, begin, end)
-            self.tally.moving += begin - done
-            self.tally.settling += used.start - begin + end - used.stop
-            self.dwell_count += 1
-            yield from self._blocks(accel, begin, used)
-            done = end
-        self.tally.moving += len(accel) - done
+        yield from self._judged(final=True)
+        if self._run is not None:
+            yield from self._closed(self._run, left=self._run.end < self._gone + len(self._accel))
+        self._pass(self._gone + len(self._accel))
 
-    def _dwells(self, accel: Stream) -> Iterator[tuple[int, int]]:
-        """Yield the first reading of each dwell and the one after its last."""
-        edges = _window_edges(accel)
-        if len(edges) < _LEAST_WINDOWS + 1:
+    @property
+    def standing(self) -> int | None:
+        """Number of the open dwell; None while it moves or is not yet known to rest."""
+        return None if self._run is None else self._run.number
+
+    @property
+    def arrival_s(self) -> float:
+        """Time of arrival in the open dwell, s since the first reading; NaN if no dwell is open."""
+        if self._run is None or self._run.number is None:
+            return math.nan
+        return self._elapsed_s(self._run.arrival_ns)
+
+    @property
+    def rest_s(self) -> float:
+        """For how long it has rested by now, s; 0 while it moves."""
+        if self._run is None or self._run.number is None:
+            return 0.0
+        return (self._run.end_ns - self._run.arrival_ns) / SECOND_NS
+
+    def waiting(self) -> list[Block]:
+        """The readings of the open dwell that are in no block yet, as blocks; the segmenter is not changed."""
+        if self._run is None or self._run.number is None:
+            return []
+        aside = copy.copy(self)
+        aside.tally = Tally()
+        return list(aside._closed(copy.copy(self._run), left=True))
+
+    def _judged(self, final: bool) -> Iterator[Block]:
+        """Judge the windows that are whole by now and yield the blocks that become complete.
+
+        At the end the last window takes the readings that are left; so it waits until the one after it is whole, too.
+        """
+        for begin, end, mean, variance in self._windows(final):
+            window = _Window(begin, end, mean, variance)
+            assert self._quiet is not None
+            self._quiet.add(variance)
+            yield from self._followed(window, *self._quiet.bounds(end - begin))
+        run = self._run
+        if run is not None and run.number is not None:
+            yield from self._whole_blocks(run)
+        self._pass(self._seen if run is None else min(run.begin, self._seen))
+        self._forget_temperatures()
+
+    def _windows(self, final: bool) -> Iterator[tuple[int, int, Floats, float]]:
+        """Yield place of the first reading, of the one after the last, mean (3,) and variance of each new window."""
+        if not self._size and not self._sized(final):
             return
-        means, variances, counts = _moments(accel.values, edges)
-        least = (_LEAST_G * self.bench.gravity_mps2) ** 2
-        most, freedom = (_MOST_G * self.bench.gravity_mps2) ** 2, 3 * (int(counts[0]) - 1)
-        noise = min(np.quantile(variances.sum(axis=1), 0.25) / _chi_squared(-0.674, freedom), most) + least
-        still = variances.sum(axis=1) <= _ALLOWED * _chi_squared(5.0, freedom) * noise
-        allowed = _SIGMAS * np.sqrt(noise / counts) + self.stillness.tolerance_rad * self.bench.gravity_mps2
-        for first, last in _runs(np.flatnonzero(still), means, np.sqrt(2.0) * allowed):
-            inside = np.arange(first, last)
-            near = np.linalg.norm(means[inside] - np.median(means[inside], axis=0), axis=1) <= 2.0 * allowed[inside]
-            kept = inside[near]
-            if near.mean() > 0.5 and len(kept) >= _LEAST_WINDOWS:
-                yield int(edges[kept[0]]), int(edges[kept[-1] + 1])
+        values = self._accel.values[self._seen - self._gone :]
+        size, whole = self._size, len(values) // self._size - 1
+        if whole > 0:
+            parts = values[: whole * size].reshape(whole, size, 3)
+            means, variances = parts.mean(axis=1), parts.var(axis=1, ddof=1).sum(axis=1)
+            for k in range(whole):
+                begin, self._seen = self._seen, self._seen + size
+                yield begin, self._seen, means[k], float(variances[k])
+        if final and whole >= 0:
+            rest, begin = values[whole * size :], self._seen
+            self._seen += len(rest)
+            yield begin, self._seen, rest.mean(axis=0), float(rest.var(axis=0, ddof=1).sum())
 
-    def _settled(self, accel: Stream, begin: int, end: int) -> slice:
-        """Return the readings of a dwell that are used, those within its margins left out."""
-        begin_ns, end_ns = int(accel.time_ns[begin]), int(accel.time_ns[end - 1])
-        length_ns = end_ns - begin_ns
-        settle_ns = min(self.stillness.settle_ns, length_ns // 3) if begin else 0
-        if begin and settle_ns < self.stillness.settle_ns:
+    def _sized(self, final: bool) -> bool:
+        """Settle how many readings a window has; tell whether that is known by now."""
+        if len(self._accel) <= _PERIODS and not (final and len(self._accel) >= 2 * _FEWEST):
+            return False
+        period_ns = float(np.median(np.diff(self._accel.time_ns[: _PERIODS + 1])))
+        self._size = max(_FEWEST, round(_WINDOW_NS / max(period_ns, 1.0)))
+        self._quiet = _Quiet(self.bench.gravity_mps2, 3 * (self._size - 1), self.stillness.tolerance_rad)
+        return True
+
+    def _followed(self, window: _Window, most: float, allowed: float) -> Iterator[Block]:
+        """Take one more window into the run of still windows, or end that run and yield its last blocks."""
+        run, still = self._run, window.variance <= most
+        if run is not None and still and run.agrees(window, allowed):
+            run.add(window, self._stamp(window.end - 1))
+            if run.number is None and run.count >= _LEAST_WINDOWS:
+                self._begin(run, window, most)
+        elif still or run is None or run.interrupted:
+            if run is not None and run.number is not None:
+                yield from self._closed(run, left=True)
+            self._run = self._run_of(window) if still else None
+        else:
+            run.interrupted = True
+
+    def _begin(self, run: _Run, latest: _Window, most: float) -> None:
+        """Begin a dwell, unless its first windows are not still by what is known of the noise now."""
+        if run.loudest > most:
+            self._run = self._run_of(latest)
+            return
+        self._pass(run.begin)
+        self.dwell_count += 1
+        run.number = self.dwell_count
+
+    def _run_of(self, first: _Window) -> _Run:
+        """Return a run of one window."""
+        stamps = self._stamp(first.begin), self._stamp(first.end - 1)
+        return _Run(first.begin, first.end, *stamps, first.mean, first.mean, first.variance)
+
+    def _whole_blocks(self, run: _Run) -> Iterator[Block]:
+        """Yield the whole blocks of the open dwell that no departure can take back."""
+        settle_ns = self.stillness.settle_ns if run.begin else 0
+        if run.end_ns - run.arrival_ns < 3 * settle_ns:
+            return
+        self._settle(run, settle_ns)
+        end = self._place(run.end_ns - self.stillness.lead_ns)
+        while end - self._gone >= BLOCK_SAMPLES:
+            yield self._released(run, BLOCK_SAMPLES)
+
+    def _closed(self, run: _Run, left: bool) -> Iterator[Block]:
+        """Yield the blocks of a dwell that are not out yet; left: whether it was left, not cut by the end."""
+        self._run = None
+        if run.number is None:
+            return
+        length_ns = run.end_ns - run.arrival_ns
+        settle_ns = min(self.stillness.settle_ns, length_ns // 3) if run.begin else 0
+        if run.begin and settle_ns < self.stillness.settle_ns:
             self.tally.short_dwells += 1
             self.tally.least_settling_s = min(self.tally.least_settling_s, settle_ns / SECOND_NS)
-        lead_ns = min(self.stillness.lead_ns, length_ns // 10) if end < len(accel) else -1
-        first, last = np.searchsorted(accel.time_ns, (begin_ns + settle_ns, end_ns - lead_ns)).tolist()
-        return slice(first, last)
+        self._settle(run, settle_ns)
+        end = self._place(run.end_ns - min(self.stillness.lead_ns, length_ns // 10)) if left else run.end
+        while self._gone < end:
+            yield self._released(run, min(BLOCK_SAMPLES, end - self._gone))
+        self.tally.settling += run.end - self._gone
+        self._release(run.end - self._gone)
 
-    def _blocks(self, accel: Stream, begin: int, used: slice) -> Iterator[Block]:
-        """Yield the blocks of one dwell, whose attitude is not known."""
+    def _settle(self, run: _Run, settle_ns: int) -> None:
+        """Release the readings of the margin after the arrival, once."""
+        if run.settled:
+            return
+        run.settled = True
+        count = self._place(run.arrival_ns + settle_ns) - self._gone
+        self.tally.settling += count
+        self._release(count)
+
+    def _released(self, run: _Run, count: int) -> Block:
+        """Make a block of the next readings of a dwell, whose attitude is not known."""
+        assert run.number is not None and self.first_ns is not None
+        part = self._accel[:count]
+        self._release(count)
+        self.tally.used += count
+        elapsed_s = (part.time_ns - self.first_ns) / SECOND_NS
+        warm = carry_on(self._temperature, part.time_ns)
+        return Block(run.number, self._elapsed_s(run.arrival_ns), elapsed_s, part.values, _UP, warm)
+
+    def _pass(self, place: int) -> None:
+        """Release and count the readings before a place that are in no dwell."""
+        run = self._run
+        if run is None or run.number is None:
+            self.tally.moving += max(place - self._gone, 0)
+            self._release(max(place - self._gone, 0))
+
+    def _release(self, count: int) -> None:
+        """Drop the first readings that wait."""
+        self._accel, self._gone = self._accel[count:], self._gone + count
+
+    def _place(self, stamp_ns: int) -> int:
+        """Return the place of the first reading at or after a stamp."""
+        return self._gone + int(np.searchsorted(self._accel.time_ns, stamp_ns))
+
+    def _stamp(self, place: int) -> int:
+        """Return the stamp of a reading that waits."""
+        return int(self._accel.time_ns[place - self._gone])
+
+    def _elapsed_s(self, stamp_ns: int) -> float:
         assert self.first_ns is not None
-        arrival_s = (int(accel.time_ns[begin]) - self.first_ns) / SECOND_NS
-        for first in range(used.start, used.stop, BLOCK_SAMPLES):
-            part = accel[first : min(first + BLOCK_SAMPLES, used.stop)]
-            self.tally.used += len(part)
-            elapsed_s = (part.time_ns - self.first_ns) / SECOND_NS
-            warm = carry_on(self._temperature, part.time_ns)
-            yield Block(self.dwell_count, arrival_s, elapsed_s, part.values, _UP, warm)
+        return (stamp_ns - self.first_ns) / SECOND_NS
+
+    def _forget_temperatures(self) -> None:
+        """Drop the temperatures that no waiting reading needs."""
+        if len(self._accel):
+            oldest = int(np.searchsorted(self._temperature.time_ns, self._accel.time_ns[0]))
+            self._temperature = self._temperature[max(oldest - 2, 0) :]
 
 
-def _window_edges(accel: Stream) -> Ints:
-    """Return the index of the first reading of each window, and at last the number of readings; the last is longer."""
-    if len(accel) < 2 * _FEWEST:
-        return np.zeros(0, np.int64)
-    period_ns = float(np.median(np.diff(accel.time_ns)))
-    size = max(_FEWEST, round(_WINDOW_NS / max(period_ns, 1.0)))
-    return np.append(np.arange(len(accel) // size) * size, len(accel))
+def segmenter_of(
+    bench: Bench, stillness: Stillness | None = None, tally: Tally | None = None, slews: bool = False
+) -> Segmenter:
+    """The segmenter of a bench: by its angles, or by the readings alone where no angles are used."""
+    kind = Segmenter if bench.angles else RestSegmenter
+    return kind(bench, stillness or Stillness(), tally or Tally(), slews and bench.angles)
 
 
-def _moments(values: Floats, edges: Ints) -> tuple[Floats, Floats, Ints]:
-    """Return means (m, 3) and variances (m, 3) of the readings in each window, and their numbers (m,)."""
-    counts = np.diff(edges)
-    means = np.add.reduceat(values, edges[:-1], axis=0) / counts[:, None]
-    squares = np.add.reduceat((values - np.repeat(means, counts, axis=0)) ** 2, edges[:-1], axis=0)
-    return means, squares / (counts - 1)[:, None], counts
+@dataclass(frozen=True)
+class _Window:
+    """Places of the first reading and of the one after the last, their mean (3,), and the sum of their variances."""
+
+    begin: int
+    end: int
+    mean: Floats
+    variance: float
+
+
+@dataclass
+class _Run:
+    """A run of still windows; a dwell once it has a number.
+
+    begin, end: places of its first reading and of the one after its last. last, total (3,): mean of its last window,
+    and sum of all means. loudest: the largest variance of its windows. interrupted: whether the window after it is not
+    still. settled: whether the margin after the arrival is released.
+    """
+
+    begin: int
+    end: int
+    arrival_ns: int
+    end_ns: int
+    last: Floats
+    total: Floats
+    loudest: float
+    count: int = 1
+    number: int | None = None
+    interrupted: bool = False
+    settled: bool = False
+
+    def agrees(self, window: _Window, allowed: float) -> bool:
+        """Whether the mean of a window is near that of the window before, and near that of the run."""
+        moved, apart = window.mean - self.last, window.mean - self.total / self.count
+        return bool(moved @ moved <= 2.0 * allowed**2 and apart @ apart <= 4.0 * allowed**2)
+
+    def add(self, window: _Window, end_ns: int) -> None:
+        """Add the next still window."""
+        self.end, self.end_ns, self.last, self.interrupted = window.end, end_ns, window.mean, False
+        self.total, self.count = self.total + window.mean, self.count + 1
+        self.loudest = max(self.loudest, window.variance)
+
+
+@dataclass
+class _Quiet:
+    """The noise of a sensor at rest, by the variances of the latest windows.
+
+    freedom: degrees of freedom of a window's variance.
+    """
+
+    gravity_mps2: float
+    freedom: int
+    tolerance_rad: float
+    latest: deque[float] = field(default_factory=deque[float])
+    ordered: list[float] = field(default_factory=list[float])
+
+    def add(self, variance: float) -> None:
+        """Take the variance of one more window, and forget the oldest."""
+        self.latest.append(variance)
+        insort(self.ordered, variance)
+        if len(self.latest) > _REMEMBERED:
+            del self.ordered[bisect_left(self.ordered, self.latest.popleft())]
+
+    def bounds(self, count: int) -> tuple[float, float]:
+        """The largest variance of a window that is still, and by how much its mean of ``count`` readings may move."""
+        place = 0.25 * (len(self.ordered) - 1)
+        low, high = self.ordered[math.floor(place)], self.ordered[math.ceil(place)]
+        quartile = low + (place - math.floor(place)) * (high - low)
+        least, most = (_LEAST_G * self.gravity_mps2) ** 2, (_MOST_G * self.gravity_mps2) ** 2
+        noise = min(quartile / _chi_squared(-0.674, self.freedom), most) + least
+        allowed = _SIGMAS * math.sqrt(noise / count) + self.tolerance_rad * self.gravity_mps2
+        return _ALLOWED * _chi_squared(5.0, self.freedom) * noise, allowed
 
 
 def _chi_squared(normal: float, freedom: int) -> float:
@@ -115,13 +326,3 @@ def _chi_squared(normal: float, freedom: int) -> float:
     Hilferty)."""
     spread = 2.0 / (9.0 * freedom)
     return (1.0 - spread + normal * spread**0.5) ** 3
-
-
-def _runs(still: Ints, means: Floats, allowed: Floats) -> Iterator[tuple[int, int]]:
-    """Yield first and last + 1 of each run of ``still`` windows, with at most one other between two of them, whose
-    means move by no more than is ``allowed``."""
-    if not still.size:
-        return
-    apart = np.linalg.norm(np.diff(means[still], axis=0), axis=1) > allowed[still[1:]]
-    for own in np.split(still, np.flatnonzero(apart | (np.diff(still) > 2)) + 1):
-        yield int(own[0]), int(own[-1]) + 1

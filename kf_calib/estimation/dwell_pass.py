@@ -13,7 +13,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Source
 from kf_calib.dwells import tabulated, window_average
 from kf_calib.dwells.blocks import LARGEST_RAD, Block, Tally
-from kf_calib.dwells.rest_in_readings import RestSegmenter
+from kf_calib.dwells.rest_in_readings import segmenter_of
 from kf_calib.dwells.rows import Rows, model_rows
 from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
 from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder, dwells_without
@@ -24,6 +24,9 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import ReadingsMonitor
 from kf_calib.sources.tables.table import Table
 from kf_calib.support.units import WORDS
+
+LEAST_READINGS = 8
+"""Of a dwell that is used: fewer do not show their own noise."""
 
 
 @dataclass
@@ -43,9 +46,7 @@ class Pass:
 
     def segmenter(self) -> Segmenter:
         """The segmenter for this source, which also returns slews if the model has effects that show in slews only."""
-        if not self.source.bench.angles:
-            return RestSegmenter(self.source.bench, self.settings.stillness, self.tally)
-        return Segmenter(self.source.bench, self.settings.stillness, self.tally, bool(self.model.dynamic))
+        return segmenter_of(self.source.bench, self.settings.stillness, self.tally, bool(self.model.dynamic))
 
     def rows(self) -> Iterator[Rows]:
         """Rows of all blocks of the source; of a table, with every reading at its mean."""
@@ -87,7 +88,7 @@ class Pass:
     def dwells(self) -> list[DwellFactor]:
         """The usable dwells so far: not left out by the settings and, but for those of a table, of at least 8 readings,
         since fewer do not show their own noise."""
-        left_out, least = self.settings.left_out, 1 if isinstance(self.source, Table) else 8
+        left_out, least = self.settings.left_out, 1 if isinstance(self.source, Table) else LEAST_READINGS
         if not left_out:
             return [dwell for dwell in self.folder.dwells if dwell.count >= least]
         unused = {k for k, each in enumerate(self.folder.dwells) if each.count < least or each.number in left_out}

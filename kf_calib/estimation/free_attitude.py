@@ -159,13 +159,17 @@ def square_changes(carried: Carried) -> list[Floats]:
     return out
 
 
+def undetermined(covariance: Floats) -> list[str]:
+    """The scale factors and biases that are not determined at all, by the covariance (12, 12)."""
+    sigma = np.sqrt(covariance.diagonal()).reshape(3, 4)
+    poor = [f"K{i + 1}" for i in range(3) if sigma[i, i] > _HOPELESS_SCALE]
+    return poor + [f"b{i + 1}" for i in range(3) if sigma[i, 3] > _HOPELESS_MPS2]
+
+
 def refuse_poses(carried: Carried, noise: Noise) -> None:
     """Raise UnobservableError if the poses do not determine every scale factor and bias, and say which is missing."""
     covariance = covariance_of(carried, noise, carried.model.bench.square_rad)
-    sigma = np.sqrt(covariance.diagonal()).reshape(3, 4)
-    poor = [f"K{i + 1}" for i in range(3) if sigma[i, i] > _HOPELESS_SCALE]
-    poor += [f"b{i + 1}" for i in range(3) if sigma[i, 3] > _HOPELESS_MPS2]
-    if poor:
+    if poor := undetermined(covariance):
         dwells = len(carried.dwells)
         up = most_informative(covariance, carried.state, carried.model.bench.gravity_mps2)
         raise UnobservableError(

@@ -8,7 +8,6 @@ result may have changed. The final judgement is that of ``diagnose``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -30,6 +29,7 @@ from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.oscillation_carrier import fitted_to
 from kf_calib.estimation.results import Calibration, format_p
+from kf_calib.online.progress import Progress
 from kf_calib.online.sequential_test import Watch
 from kf_calib.support.threads import one_blas_thread
 
@@ -243,23 +243,14 @@ class Current:
 
 
 @dataclass(frozen=True)
-class Standing:
-    """What is known of a run at a moment.
+class Standing(Progress):
+    """What is known of a run on a bench at a moment; see ``Progress``.
 
-    samples: number of readings. elapsed_s: bench time of the last of them. dwells: number of closed dwells. current:
-    the open dwell. judgement: the latest judgement. judged_s: bench time of that judgement. problem: why there is none.
-    notice: the latest action, such as an effect that was accepted or refused. model: effects in the model.
+    current: the open dwell. judgement: the latest judgement.
     """
 
-    samples: int = 0
-    elapsed_s: float = 0.0
-    dwells: int = 0
     current: Current | None = None
     judgement: Judgement | None = None
-    judged_s: float = 0.0
-    problem: str = ""
-    notice: str = ""
-    model: Sequence[str] = ()
 
     @property
     def sigma(self) -> Floats:
@@ -275,11 +266,6 @@ class Standing:
             return np.full(12, np.nan)
         going = np.maximum(self.judgement.left_s - (self.elapsed_s - self.judged_s), 0.0)
         return going if self.current is None else np.fmin(going, self.current.stay_s)
-
-
-def targets(texts: Mapping[str, float]) -> Floats:
-    """Targets (12,) of the sigmas in SI, from numbers by symbol; NaN where there is none."""
-    return np.array([texts.get(symbol, np.nan) for symbol in paper_parameters.SYMBOLS])
 
 
 def judge_so_far(passed: Pass, wanted: Floats, before: Judgement | None = None) -> Judgement:
@@ -385,4 +371,4 @@ def _saturated(before: Floats, now: Floats, doubled: Floats) -> bool | None:
     return bool(further.max() < _LITTLE * gained.max())
 
 
-__all__ = ["LEVEL", "Current", "Judgement", "Standing", "current", "judge_so_far", "judge_whole_run", "targets"]
+__all__ = ["LEVEL", "Current", "Judgement", "Standing", "current", "judge_so_far", "judge_whole_run"]

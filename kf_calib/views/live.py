@@ -12,6 +12,7 @@ from rich.text import Text
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.online.progress import Progress
 from kf_calib.online.status import Judgement, Standing
 from kf_calib.support.plain_text import sentence
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2, shown
@@ -93,7 +94,7 @@ def screen(standing: Standing, status: Status | None, name: str, recording: str 
     that is written. hint: line at the bottom.
     """
     judgement = standing.judgement
-    parts: list[RenderableType] = [_link(standing, status, name, recording), _here(standing), _sigmas(standing)]
+    parts: list[RenderableType] = [link(standing, status, name, recording), _here(standing), _sigmas(standing)]
     if judgement is not None:
         parts += [_fit(judgement), Text(judgement.verdict, style=_style(judgement))]
         if _set(judgement).any() and (standing.sigma <= judgement.wanted)[_set(judgement)].all():
@@ -117,7 +118,7 @@ def _style(judgement: Judgement) -> str:
     return {True: "bold green", False: "bold yellow", None: "bold"}[judgement.consistent]
 
 
-def _link(standing: Standing, status: Status | None, name: str, recording: str) -> Text:
+def link(standing: Progress, status: Status | None, name: str, recording: str) -> Text:
     """Return the lines about the source and the recording."""
     if status is None:
         return Text(f"{name}: {standing.samples} readings")
@@ -175,12 +176,12 @@ def _sigmas(standing: Standing) -> RenderableType:
             unit.label,
             target,
             span(left) if left else "",
-            _bar(float(sigma), float(wanted[k]), k),
+            bar(float(sigma), float(wanted[k]), k),
         )
     return table
 
 
-def _bar(sigma: float, wanted: float, k: int) -> Bar:
+def bar(sigma: float, wanted: float, k: int) -> Bar:
     """Return a bar for a sigma, in decades above its target; without one, in decades above a small sigma."""
     if math.isfinite(wanted):
         share = math.log10(max(sigma / wanted, 1e-9)) / _TARGET_DECADES

@@ -135,7 +135,8 @@ class CsvLines(LineReader):
         if not set(names) <= set(self._names):
             raise InputError(
                 "no columns give the platform's angles with their unit: name them outer_deg, inner_deg ... or "
-                f"outer_rad ..., outer gimbal first (or the attitude qx, qy, qz, qw), not {self._seen}."
+                f"outer_rad ..., outer gimbal first (or the attitude qx, qy, qz, qw), not {self._seen}; or use "
+                "none (--no-angles)."
             )
         return self._found(names)
 

@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import BinaryIO, Protocol
 
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.gravity_alone import bench_without_angles, without_poses
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.csv_lines import CsvLines
@@ -32,7 +33,8 @@ class Lines:
 
     source: path of a file, or a binary stream, which is read as data arrive. overrides: bench metadata keys that win
     over those on the first line. columns: our name for each foreign column or key, for example
-    ``{"acc_x[g]": "ax_g"}``. name: what messages call a stream. Raises InputError where the lines cannot be used.
+    ``{"acc_x[g]": "ax_g"}``. name: what messages call a stream. angles: False to do without platform angles; poses that
+    come are then left out. Raises InputError where the lines cannot be used.
     """
 
     def __init__(
@@ -41,10 +43,13 @@ class Lines:
         overrides: Mapping[str, str] = MappingProxyType({}),
         columns: Mapping[str, str] = MappingProxyType({}),
         name: str = "standard input",
+        *,
+        angles: bool = True,
     ) -> None:
         self._path = Path(source) if isinstance(source, str | PathLike) else None
         self._stream = None if isinstance(source, str | PathLike) else source
         self.name = str(self._path) if self._path else name
+        self._angles, self._said = angles, list[str]()
         self._overrides, self._columns = overrides, {**as_columns(overrides.get("joints", "")), **columns}
         self._bench: Bench | None = None
         self._waiting: _Passage | None = None  # begun to learn of the bench, not yet iterated
@@ -62,7 +67,7 @@ class Lines:
     @property
     def warnings(self) -> list[str]:
         account = self._latest.account if self._latest else Account()
-        return [f"{self.name}: {sentence}" for sentence in account.sentences()]
+        return [*self._said, *(f"{self.name}: {sentence}" for sentence in account.sentences())]
 
     @property
     def fraction(self) -> float:
@@ -70,7 +75,7 @@ class Lines:
 
     def __iter__(self) -> Iterator[Batch]:
         _ = self.bench  # so that a bench that cannot be used is told first
-        return self.batches()
+        return self.batches() if self._angles else map(without_poses, self.batches())
 
     def batches(self) -> Iterator[Batch]:
         """What the lines hold, whatever the bench may be."""
@@ -92,13 +97,16 @@ class Lines:
                 raise InputError(f"{self.name} can be read only once: record it to a file to read it again.")
         except OSError as error:
             raise InputError(f"{self.name}: cannot be read ({error.strerror}).") from None
-        self._latest = _Passage(self.name, stream, size, self._columns)
+        self._latest = _Passage(self.name, stream, size, self._columns, self._angles)
         with self._latest.closed_on_failure():
             self._latest.survey()
         return self._latest
 
     def _describe_bench(self, passage: _Passage) -> Bench:
-        return bench_of(self.name, passage.parser, self._overrides)
+        if self._angles:
+            return bench_of(self.name, passage.parser, self._overrides)
+        bench, self._said = bench_without_angles(self.name, {**passage.parser.metadata, **self._overrides})
+        return bench
 
 
 class Described(Protocol):
@@ -174,8 +182,8 @@ class _Passage:
 
     parser: LineReader
 
-    def __init__(self, name: str, stream: BinaryIO, size: int | None, columns: Mapping[str, str]) -> None:
-        self.account = Account()
+    def __init__(self, name: str, stream: BinaryIO, size: int | None, columns: Mapping[str, str], angles: bool) -> None:
+        self.account, self._angles = Account(), angles
         self.fraction = 0.0 if size else math.nan
         self._name, self._columns, self._size, self._stream = name, columns, size, stream
         self._is_ours = size is not None  # a file opened here
@@ -194,9 +202,9 @@ class _Passage:
             raise
 
     def survey(self) -> None:
-        """Reads up to the first pose and keeps what it has read."""
+        """Reads up to the first pose, if there must be one, and keeps what it has read."""
         self._open_parser()
-        while not self.parser.pose_width:
+        while self._angles and not self.parser.pose_width:
             batch = self._next_batch()
             if batch is None or self.account.lines > _SURVEY_LINES:
                 raise self._unusable("platform angles")
@@ -207,7 +215,8 @@ class _Passage:
             yield self._ahead.pop(0)
         while (batch := self._next_batch()) is not None:
             yield batch
-        for what, is_met in (("readings", self._has_accel), ("platform angles", self._has_pose)):
+        met = {"readings": self._has_accel, "platform angles": self._has_pose or not self._angles}
+        for what, is_met in met.items():
             if not is_met:
                 raise self._unusable(what)
 
@@ -225,7 +234,7 @@ class _Passage:
         """Chooses the parser by the first line and has it read the rest of the first block."""
         self.account.lines += before
         try:
-            self.parser = reader_for(first, self._columns, self.account)
+            self.parser = reader_for(first, self._columns, self.account, self._angles)
         except InputError as error:
             raise InputError(f"{self._name}: {error}") from None
         rows = lines[1:]

@@ -96,7 +96,7 @@ class Recorder:
         with self._storing():
             self._writer.start(profile="ros2")
             self._writer.add_metadata(BENCH_RECORD, self._described)
-            for channel in self._channels[: 1 + bench.angles]:  # so that even one without samples says what it is
+            for channel in self._channels[: 1 + bench.angles]:  # even a recording without samples says what it is
                 channel.register(self._writer)
             self._sync()
         self._head = self._repeated_at = self.size

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -20,6 +20,7 @@ from mcap.records import Metadata
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.gravity_alone import bench_without_angles
 from kf_calib.bench.streams import Batch, Source, Stream
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.bags import files_of
@@ -44,7 +45,6 @@ from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, Record
 from kf_calib.sources.files.packed_messages import are_packed, unpacked
 from kf_calib.sources.files.record_files import RecordFile, open_record_file
 from kf_calib.sources.tables.opening import is_table, open_table
-from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
 GAP_RECORD = "kf_calib.gap"
@@ -215,7 +215,9 @@ class Recording:
         if is_damaged:
             self.warnings.append(f"{damage}: only what options give is used.")
         if self._pose is None:
-            return self._bench_without_angles({**recorded, **overrides})
+            bench, said = bench_without_angles(str(self.path), {**recorded, **overrides})
+            self.warnings += said
+            return bench
         has_angles = self._parts.having(self._pose).has_angles(self._pose)
         if not has_angles and self._angle_scale != 1.0:
             raise InputError(
@@ -226,23 +228,6 @@ class Recording:
         except BenchError as error:
             where = f"{damage}, so give it by options" if is_damaged else str(self.path)
             raise BenchError(f"{where}: {error}") from error
-
-    def _bench_without_angles(self, stated: dict[str, str]) -> Bench:
-        """The bench of a recording whose angles are not used: where gravity is not stated, it is the standard one."""
-        if not {"gravity_mps2", "latitude_deg"} & stated.keys():
-            stated["gravity_mps2"] = str(STANDARD_GRAVITY_MPS2)
-            self.warnings.append(
-                f"gravity is taken as the standard {STANDARD_GRAVITY_MPS2} m/s^2; the local value differs by up to "
-                "0.3 %, and every scale factor with it: state it by --gravity or --latitude."
-            )
-        try:
-            bench = Bench.from_metadata(stated, has_angles=False)
-        except BenchError as error:
-            raise BenchError(f"{self.path}: {error}") from error
-        square = {"theta1": 0.0, "theta3": 0.0}
-        return replace(
-            bench, angles=False, reference="base", angle_sigma_deg=None, nominal=square | dict(bench.nominal)
-        )
 
 
 def _look_up_bench(file: RecordFile, contents: Contents, position: int) -> None:

@@ -39,6 +39,7 @@ def open_live(
     idle_s: float = math.inf,
     silent_s: float = 60.0,
     queued: int = QUEUED,
+    angles: bool = True,
 ) -> LiveSource:
     """A bench while it runs: a serial port, ``socket://host:port``, ``-``, a growing file, ``sim://?speed=20``.
 
@@ -46,6 +47,7 @@ def open_live(
     each foreign column or key. header: of CSV rows that come without one. give_up_s: how long a lost link is tried
     again. idle_s: ends the source where nothing has come for so long. silent_s: a connection over a network on which
     nothing more has come for so long is opened again. queued: samples that may wait for the consumer.
+    angles: False to do without platform angles: readings only are taken and recorded.
     Raises InputError where it cannot be opened.
     """
     Outputs({"--record": record}, files_of(url), overwrite)
@@ -54,14 +56,14 @@ def open_live(
     silent_s = query.pop("silent", silent_s)
     scheme = url.partition("://")[0] if "://" in url else ""
     if scheme == "sim":
-        feed = _simulated_feed(url.partition("://")[2], overrides or {})
+        feed = _simulated_feed(url.partition("://")[2], overrides or {}, angles)
     elif (path := _bag(address)) is not None:
-        feed = BagFeed(path, lambda path: Recording(path, overrides or {}), idle_s)
+        feed = BagFeed(path, lambda path: Recording(path, overrides or {}, angles=angles), idle_s)
     else:
         link = _link(address)
         name = "standard input" if address == "-" else address.removeprefix("tail:")
         columns = {**as_columns((overrides or {}).get("joints", "")), **columns}
-        feed = StreamedFeed(name, link, overrides or {}, columns, header, give_up_s, idle_s, silent_s)
+        feed = StreamedFeed(name, link, overrides or {}, columns, header, give_up_s, idle_s, silent_s, angles=angles)
     return LiveSource(feed, record, overwrite, queued)
 
 
@@ -144,7 +146,7 @@ def _tcp(address: str) -> Tcp:
     return Tcp(host, port)
 
 
-def _simulated_feed(rest: str, overrides: Mapping[str, str]) -> Feed:
+def _simulated_feed(rest: str, overrides: Mapping[str, str], angles: bool) -> Feed:
     from kf_calib.sources.live.simulated import SimulatedFeed, batch_samples
     from kf_calib.sources.simulation.options import DEFAULTS, options_from_query, simulation
 
@@ -153,7 +155,7 @@ def _simulated_feed(rest: str, overrides: Mapping[str, str]) -> Feed:
     speed = _positive("speed", speeds[-1]) if speeds else 1.0
     options = options_from_query(urlencode([pair for pair in pairs if pair[0] != "speed"]))
     size = batch_samples(options.get("sample_hz", DEFAULTS["sample_hz"]), speed)
-    return SimulatedFeed(simulation(options, overrides, size), speed)
+    return SimulatedFeed(simulation(options, overrides, size), speed, angles)
 
 
 def _positive(name: str, text: str) -> float:

@@ -14,7 +14,7 @@ from kf_calib.sources.files.lines import Cutter
 from kf_calib.sources.live.feed import nothing
 from kf_calib.sources.live.frames import FrameReader
 
-_FEWEST_CELLS = 5
+_FEWEST_CELLS = 5  # time, readings and an angle
 _MOST_LINES = 2000  # without a beginning among them
 _MOST_BYTES = 1 << 23
 _HELD_BYTES = 1 << 16
@@ -23,14 +23,17 @@ _HELD_BYTES = 1 << 16
 class LineProtocol:
     """JSON or CSV lines as bytes come, from wherever in a line they begin.
 
-    header: of CSV rows that come without one. Raises InputError for a header that does not say what is needed.
+    header: of CSV rows that come without one. angles: whether poses must come. Raises InputError for a header that does
+    not say what is needed.
     """
 
-    def __init__(self, name: str, columns: Mapping[str, str], header: str, account: Account) -> None:
-        self._name, self._columns, self._account = name, columns, account
+    def __init__(self, name: str, columns: Mapping[str, str], header: str, account: Account, angles: bool) -> None:
+        self._name, self._columns, self._account, self._angles = name, columns, account, angles
         self._cutter = Cutter(account)
         self._header = header.strip()
-        self.reader: LineReader | None = CsvLines(self._header, columns, account) if self._header else None
+        self.reader: LineReader | None = None
+        if self._header:
+            self.reader = CsvLines(self._header, columns, account, angles)
         self._is_first = False
 
     def push(self, block: bytes) -> Batch:
@@ -46,7 +49,8 @@ class LineProtocol:
         if self._header and self._header in lines:  # a logger that begins again sends its header again
             lines = ["" if line == self._header else line for line in lines]
         elif isinstance(self.reader, JsonLines):
-            lines = ["" if line.startswith('{"bench"') and self.reader.pose_width else line for line in lines]
+            is_known = bool(self.reader.pose_width or self.reader.metadata)
+            lines = ["" if line.startswith('{"bench"') and is_known else line for line in lines]
         batch = self.reader.read(lines, self._account.lines + 1)
         self._account.lines += len(lines)
         return batch
@@ -82,6 +86,14 @@ class LineProtocol:
                 self._account.refuse(self._account.lines, "it is neither a JSON object nor a header of CSV")
         return []
 
+    def _has_readings(self, header: str) -> bool:
+        """Whether a header lacks nothing but angles."""
+        try:
+            CsvLines(header, self._columns, Account(), angles=False)
+        except InputError:
+            return False
+        return True
+
     def _begins(self, text: str) -> bool:
         if text[0] == "{":
             try:
@@ -92,13 +104,15 @@ class LineProtocol:
             return True
         cells = text.split(max(",;\t", key=text.count))
         if (
-            len(cells) < _FEWEST_CELLS
+            len(cells) < _FEWEST_CELLS - 1
             or not text.isprintable()
             or not all(cell.strip(' "')[:1].isalpha() for cell in cells)
         ):
             return False
         try:
-            self.reader, self._header = CsvLines(text, self._columns, self._account), text
+            if self._angles and len(cells) < _FEWEST_CELLS and not self._has_readings(text):
+                return False
+            self.reader, self._header = CsvLines(text, self._columns, self._account, self._angles), text
         except InputError as error:
             raise InputError(f"{self._name}: {error}") from None
         self._account.lines += 1
@@ -109,10 +123,10 @@ class LineProtocol:
 class Protocol:
     """Finds out what the bytes are, then reads them."""
 
-    def __init__(self, name: str, columns: Mapping[str, str], header: str) -> None:
+    def __init__(self, name: str, columns: Mapping[str, str], header: str, angles: bool = True) -> None:
         self.account = Account()
         self._name = name
-        self._lines: LineProtocol | None = LineProtocol(name, columns, header, self.account)
+        self._lines: LineProtocol | None = LineProtocol(name, columns, header, self.account, angles)
         self._frames: FrameReader | None = None
         self._held = b""
         self._seen = 0

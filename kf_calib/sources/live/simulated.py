@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.gravity_alone import bench_without_angles, without_poses
 from kf_calib.bench.streams import Batch
 from kf_calib.sources.live.feed import Feed, nothing
 from kf_calib.sources.simulation.simulator import Simulation
@@ -18,17 +19,21 @@ _NAP_S = 0.1
 
 
 class SimulatedFeed(Feed):
-    """A simulated run at ``speed`` times real time (infinity: as fast as it can be made)."""
+    """A simulated run at ``speed`` times real time (infinity: as fast as it can be made).
+
+    angles: False for its readings only.
+    """
 
     patient = True
 
-    def __init__(self, run: Simulation, speed: float) -> None:
+    def __init__(self, run: Simulation, speed: float, angles: bool = True) -> None:
         super().__init__("the simulated bench")
-        self._run, self._speed = run, speed
+        self._run, self._speed, self._angles = run, speed, angles
+        self._bench = run.bench if angles else bench_without_angles(self.name, run.bench.to_metadata())[0]
 
     def begin(self) -> Bench:
         self.link = "live"
-        return self._run.bench
+        return self._bench
 
     def __iter__(self) -> Iterator[Batch]:
         started_s, first_ns = time.monotonic(), None
@@ -39,11 +44,11 @@ class SimulatedFeed(Feed):
             while not self.stopping and (left_s := due_s - time.monotonic()) > 0.0:
                 time.sleep(min(left_s, _NAP_S))
                 if left_s > _NAP_S:
-                    yield nothing(self._run.bench.pose_width)
+                    yield nothing(self._bench.pose_width)
             if self.stopping:
                 return
             self.fraction = self._run.fraction
-            yield batch
+            yield batch if self._angles else without_poses(batch)
         self.fraction = 1.0
 
 

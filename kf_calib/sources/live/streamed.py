@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.gravity_alone import bench_without_angles, without_poses
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.lines import bench_of
@@ -49,6 +50,7 @@ class _Outage:
 class StreamedFeed(Feed):
     """give_up_s: how long a lost link is tried again. idle_s: ends where nothing came for so long. silent_s: a link
     that can break without a sign is opened again where nothing came for so long; before anything came it is left alone.
+    angles: False to do without platform angles; poses that come are then left out.
 
     Raises InputError where the link cannot be opened.
     """
@@ -63,16 +65,19 @@ class StreamedFeed(Feed):
         give_up_s: float,
         idle_s: float,
         silent_s: float = math.inf,
+        *,
+        angles: bool = True,
     ) -> None:
         super().__init__(name)
+        self._angles, self._said = angles, list[str]()
         self.patient = link.patient
         self._link, self._overrides = link, overrides
         self._give_up_s, self._idle_s = give_up_s, idle_s
         self._silent_s = silent_s if link.breaks_unseen else math.inf
         self._came_s = self._stopped_s = math.inf
         self._outage: _Outage | None = None
-        self._left_bytes = 0
-        self._protocol = Protocol(name, columns, header)
+        self._left_bytes = self._poses_left_out = 0
+        self._protocol = Protocol(name, columns, header, angles)
         self._ahead = deque[Batch | Lost | Regained]()
         self._inbox = deque[bytes | Lost | Regained | _Ended]()
         self._inbox_bytes = 0
@@ -101,13 +106,23 @@ class StreamedFeed(Feed):
             reader = self._protocol.reader
             if reader is None:
                 continue
+            if not self._angles:
+                if ahead:
+                    return self._bench_without_angles(reader.metadata)
+                continue
             if not reader.pose_width and time.monotonic() - first_s > _POSE_WAIT_S:
                 reader.pose_width = self._stated_width(reader.metadata)
             if reader.pose_width:
                 return bench_of(self.name, reader, self._overrides)
             if ahead > _MOST_AHEAD:
                 break
-        raise self._protocol.unusable("no platform angles")
+        raise self._protocol.unusable(
+            "no platform angles (--no-angles does without them)" if self._angles else "no readings"
+        )
+
+    def _bench_without_angles(self, metadata: Mapping[str, str]) -> Bench:
+        bench, self._said = bench_without_angles(self.name, {**metadata, **self._overrides})
+        return bench
 
     def _stated_width(self, metadata: Mapping[str, str]) -> int:
         """How many angles a pose will have, by the axes that are stated; 0 where they are not."""
@@ -120,15 +135,25 @@ class StreamedFeed(Feed):
         reader = self._protocol.reader
         width = reader.pose_width if reader else 0
         while self._ahead:
-            item = self._ahead.popleft()
-            yield _with_pose_width(item, width) if isinstance(item, Batch) else item
+            yield self._fitting(self._ahead.popleft(), width)
         for item in self._items:
-            yield _with_pose_width(item, width) if isinstance(item, Batch) else item
+            yield self._fitting(item, width)
+
+    def _fitting(self, item: Batch | Lost | Regained, width: int) -> Batch | Lost | Regained:
+        """What is handed on: batches with poses of this width, or none where no angles are used."""
+        if not isinstance(item, Batch):
+            return item
+        if self._angles:
+            return _with_pose_width(item, width)
+        self._poses_left_out += len(item.pose)
+        return without_poses(item)
 
     @property
     def warnings(self) -> list[str]:
         left = f"{self.name}: {self._left_bytes} bytes that came shortly before the end were not read any more."
-        return super().warnings + [left] * bool(self._left_bytes)
+        unused = f"{self.name}: {self._poses_left_out} poses came too and are neither used nor recorded (--no-angles)."
+        said = [unused] * bool(self._poses_left_out) + [left] * bool(self._left_bytes)
+        return [*self._said, *super().warnings, *said]
 
     def close(self) -> None:
         self.stopping = True

@@ -1,0 +1,134 @@
+"""A live run in a thread of its own, beside the screen, the keys and the signals."""
+
+from __future__ import annotations
+
+import queue
+import signal
+import threading
+from collections.abc import Callable, Mapping
+from contextvars import copy_context
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kf_calib.cli.echo import Printer, complain
+from kf_calib.errors import InputError
+
+if TYPE_CHECKING:
+    from kf_calib.bench.streams import Source
+    from kf_calib.estimation.settings import Settings
+    from kf_calib.online.hand_session import HandSession
+    from kf_calib.online.hand_status import HandJudgement
+    from kf_calib.online.session import Session
+    from kf_calib.online.status import Judgement
+    from kf_calib.sources.live import LiveSource
+
+
+def on_bench(settings: Settings, wanted: Mapping[str, float], auto: bool) -> Callable[..., Session]:
+    """How the session of a bench is begun."""
+    from kf_calib.online.session import Session
+
+    return lambda source, every, again: Session(source, settings, wanted, every=every, auto=auto, again=again)
+
+
+def by_hand(settings: Settings, wanted: Mapping[str, float]) -> Callable[..., HandSession]:
+    """How the session of a sensor in the hand is begun."""
+    from kf_calib.online.hand_session import HandSession
+
+    return lambda source, every, again: HandSession(source, settings, wanted, every=every, again=again)
+
+
+class LiveRun:
+    """A session in a thread of its own: the main thread has the screen, the keys and the signals.
+
+    judgements: those not shown yet. stopped: by a key or a signal. print: to standard output.
+    """
+
+    def __init__(
+        self,
+        source: LiveSource,
+        begin: Callable[[LiveSource, bool, Callable[[], Source | None]], Session | HandSession],
+        record: Path | None,
+        every: bool,
+    ) -> None:
+        self.source, self.stopped, self.unshown = source, False, 0
+        self.print, self._is_warned = Printer(), False
+        self.session: Session | HandSession | None = None
+        self.final: Judgement | HandJudgement | None = None
+        self.error: BaseException | None = None
+        self.listeners: list[Callable[[Judgement | HandJudgement], None]] = [self._keep]
+        self.judgements = queue.Queue["Judgement | HandJudgement"](256)
+        self._record, self._begin = record, begin
+        work = self._work, every
+        self._thread = threading.Thread(target=copy_context().run, args=work, daemon=True)  # in the units chosen
+
+    def start(self) -> None:
+        self._thread.start()
+
+    @property
+    def going(self) -> bool:
+        return self._thread.is_alive() or not self.judgements.empty()
+
+    def stop(self) -> None:
+        self.stopped = True
+        self.source.stop()
+        if self.session is not None:
+            self.session.hurry()
+
+    def handle_signal(self, number: signal.Signals) -> None:
+        """To end, by a signal, as its end would; a second Ctrl-C does not wait for it."""
+        if number == signal.SIGINT and (self.stopped or not self.going):
+            raise KeyboardInterrupt
+        self.stop()
+
+    def warn(self) -> None:
+        """Say at once, and once, that nothing is recorded any more."""
+        trouble = self.source.status.recording_trouble
+        if trouble and not self._is_warned:
+            complain(f"RECORDING HAS STOPPED: {trouble}")
+            self._is_warned = True
+
+    @property
+    def troubles(self) -> list[str]:
+        """What failed, though the run went on to its end: it is no success then."""
+        trouble, lost = self.source.status.recording_trouble, self.print.lost
+        unheard = f"{lost} output{'s' * (lost != 1)} could not be written to standard output: they are lost."
+        return [f"the run was not recorded to its end: {trouble}"] * bool(trouble) + [unheard] * bool(lost)
+
+    def accept(self) -> None:
+        """The effect that is missing, as it stands."""
+        from kf_calib.online.status import Judgement
+
+        judgement = self.session.standing.judgement if self.session else None
+        if self.session is None or not isinstance(judgement, Judgement):
+            return
+        try:
+            if not (judgement.alarm and judgement.found.missing):
+                raise InputError("no effect is known to be missing: nothing to accept.")
+            self.session.accept(*judgement.found.missing)
+        except InputError as error:
+            self.session.say(str(error))
+
+    def recording(self) -> Source | None:
+        """What was recorded of the run; None where nothing was, or not all."""
+        from kf_calib.sources.files.recording import Recording
+
+        return (
+            Recording(self._record, angles=self.source.bench.angles)
+            if self._record and not self.source.status.recording_trouble
+            else None
+        )
+
+    def _work(self, every: bool) -> None:
+        try:
+            self.session = self._begin(self.source, every, self.recording)
+            for listener in self.listeners:
+                self.session.listeners.append(listener)
+            self.final = self.session.run()
+        except BaseException as error:  # for the main thread to tell
+            self.error = error
+
+    def _keep(self, judgement: Judgement | HandJudgement) -> None:
+        try:
+            self.judgements.put_nowait(judgement)
+        except queue.Full:
+            self.unshown += 1

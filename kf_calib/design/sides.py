@@ -1,0 +1,82 @@
+"""The sides on which a sensor has lain, by the direction of gravity in its readings, and the one to turn up next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.free_attitude import DIRECTIONS, covariance_of, felt, most_informative, turned, undetermined
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.noise_model import within_dwells
+
+SAME_SIDE_DEG = 10.0
+"""Poses whose directions of gravity differ by less than this are of one side: the second tells little that is new."""
+_TILTS_DEG = {2: 45, 3: 55}  # of an edge and of a corner from the nearest face
+
+
+@dataclass(frozen=True)
+class Sides:
+    """The sides of some poses.
+
+    numbers: of their dwells. up (D, 3): unit vector that points up in each. side: number of the side of each, from 0.
+    missing: scale factors and biases that the poses do not determine. following: the axes that should point up next, as
+    ``+x +y``.
+    """
+
+    numbers: tuple[int, ...]
+    up: Floats
+    side: tuple[int, ...]
+    missing: tuple[str, ...]
+    following: str
+
+    @classmethod
+    def of(cls, dwells: Sequence[DwellFactor], bench: Bench, fitted: Fit | None = None) -> Sides:
+        """The sides of dwells; fitted: to these or fewer dwells, None where they do not determine it."""
+        model = Model(bench)
+        state = model.nominal_state() if fitted is None else fitted.carried.state
+        noise = within_dwells(dwells) if fitted is None else fitted.noise
+        covariance = covariance_of(Carried(turned(dwells, state, bench.gravity_mps2), model, state), noise,
+                                   bench.square_rad)  # fmt: skip
+        force = felt(np.array([dwell.means[4:] for dwell in dwells]), state)
+        up = force / np.linalg.norm(force, axis=1, keepdims=True)
+        following = most_informative(covariance, state, bench.gravity_mps2)
+        numbers = tuple(dwell.number for dwell in dwells)
+        return cls(numbers, up, _grouped(up), tuple(undetermined(covariance)), following)
+
+    @property
+    def count(self) -> int:
+        """Number of different sides."""
+        return len(set(self.side))
+
+    @property
+    def repeats(self) -> int | None:
+        """Number of the earlier dwell on the side of the last one; None where that side is new."""
+        first = self.side.index(self.side[-1])
+        return self.numbers[first] if first < len(self.side) - 1 else None
+
+    @property
+    def last(self) -> str:
+        """The face, edge or corner of a cube that points up in the last pose, nearly, as ``+x +y``."""
+        return max(DIRECTIONS, key=lambda name: float(DIRECTIONS[name] @ self.up[-1]))
+
+
+def turn_in_words(up: str) -> str:
+    """How to hold it so that these axes point up alike: ``+x points up, tilted 45 deg toward +y``."""
+    first, *others = up.split()
+    tilt = f", tilted {_TILTS_DEG[len(others) + 1]} deg toward {' and '.join(others)}" if others else ""
+    return f"{first} points up{tilt}"
+
+
+def _grouped(up: Floats) -> tuple[int, ...]:
+    """Return the number of the side of each direction (D, 3): that of the first direction near it."""
+    near = up @ up.T > np.cos(np.radians(SAME_SIDE_DEG))
+    firsts = near.argmax(axis=1).tolist()
+    numbers = {first: k for k, first in enumerate(dict.fromkeys(firsts))}
+    return tuple(numbers[first] for first in firsts)

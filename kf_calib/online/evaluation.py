@@ -1,0 +1,247 @@
+"""What every evaluation of a run has while the run goes on: two threads, neither of which waits for the other.
+
+The thread that calls ``run`` folds the readings as they come, and looks at the open dwell after 1, 2, 4 ... s. A second
+thread judges the dwells that have closed. Nobody who shows the results holds either up. The readings are folded as a
+replay of the recording folds them.
+"""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextvars import copy_context
+from dataclasses import dataclass, replace
+from typing import Any, Generic, TypeVar
+
+from kf_calib.bench.streams import Batch, Source
+from kf_calib.dwells.blocks import Tally
+from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder
+from kf_calib.errors import InputError, KfCalibError
+from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass
+from kf_calib.estimation.settings import Settings
+from kf_calib.online.progress import Progress, targets
+from kf_calib.support.threads import one_blas_thread
+
+_FIRST_LOOK_S = 1.0
+
+
+J = TypeVar("J")
+S = TypeVar("S", bound=Progress)
+
+
+@dataclass(frozen=True)
+class _Closed:
+    """A state to be judged: the pass when a dwell closed, and the time of that moment in s."""
+
+    passed: Pass
+    elapsed_s: float
+
+
+class Evaluation(ABC, Generic[J, S]):
+    """The evaluation of a source as its readings come, with judgements of type J and a standing of type S.
+
+    source: of the readings. settings: of the calibration. wanted: targets of sigmas by symbol, SI. every: judge after
+    each dwell, even where dwells close faster than they are judged; False: judge the newest only. again: gives the
+    readings once more when the source has ended, from its recording; None where there is none.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        settings: Settings | None,
+        wanted: Mapping[str, float] | None,
+        standing: S,
+        *,
+        every: bool = True,
+        again: Callable[[], Source | None] | None = None,
+    ) -> None:
+        self.source, self.settings, self.wanted = source, settings or Settings(), targets(wanted or {})
+        self.every, self.again = every, again
+        self.listeners = list[Callable[[J], None]]()
+        self.standing = standing
+        self._passed = Pass(source, self.settings)
+        self._segmenter = self._passed.segmenter()
+        self._closed, self._looked_s = 0, 0.0
+        self._lock = threading.Condition()
+        self._waiting, self._ended, self._hurried = deque[_Closed](), False, False
+        self._last: _Closed | None = None
+        self._before: J | None = None
+
+    @abstractmethod
+    def accept(self, *names: str) -> None:
+        """Add effects (names or formulas) to the model from now on; raises InputError where one cannot be added."""
+
+    @abstractmethod
+    def _judged(self, passed: Pass, before: J | None) -> J:
+        """Return the judgement of the dwells so far; raises KfCalibError where there can be none."""
+
+    @abstractmethod
+    def _judged_whole(self, passed: Pass, before: J | None, again: Source | None) -> J:
+        """Return the judgement of the whole run; raises KfCalibError where there can be none."""
+
+    @abstractmethod
+    def _seen(self, dwell: DwellFactor) -> Any:
+        """Return what the open dwell shows so far, for ``current`` of the standing."""
+
+    def _judged_next(self, judgement: J) -> None:
+        """Do what a judgement asks for, once it is published."""
+
+    def _progress(self) -> Mapping[str, object]:
+        """Return further parts of the standing that change with every batch."""
+        return {}
+
+    def run(self) -> J:
+        """Evaluate the source to its end and return the final judgement.
+
+        Raises KfCalibError where the readings allow no judgement.
+        """
+        failure: Exception | None = None
+        with one_blas_thread():  # for both threads: setting it in one would change the other's
+            judge = threading.Thread(target=copy_context().run, args=(self._judge,), name="judge", daemon=True)
+            judge.start()
+            try:
+                for batch in self.source:  # read to its end even after a failure, as the source may be recording
+                    try:
+                        if failure is None:
+                            self._take(batch)
+                    except Exception as error:
+                        failure = error
+                        self.say(f"the evaluation stopped: {error}")
+                if failure is None:
+                    self._finish()
+            finally:
+                with self._lock:
+                    self._ended = True
+                    self._lock.notify_all()
+                judge.join()
+            if failure is not None:
+                raise failure
+            return self._conclude()
+
+    def hurry(self) -> None:
+        """Skip all judgements but the final one, because the run is to end."""
+        with self._lock:
+            self._hurried = True
+            self._waiting.clear()
+            self._lock.notify_all()
+
+    def say(self, notice: str) -> None:
+        """Show a sentence to the user."""
+        with self._lock:
+            self._publish(notice=notice)
+
+    def _refuse_engine(self) -> None:
+        """Raise InputError for an engine that does not work on folded dwells."""
+        if self.settings.engine != "block":
+            raise InputError(
+                "a live run is evaluated from folded dwells, as the block engine does: leave out --engine, and check "
+                "the recording with replay --engine filterpy."
+            )
+
+    def _take(self, batch: Batch) -> None:
+        """Fold a batch, hand over the dwells that it closes, and evaluate the open dwell when that is due."""
+        passed, segmenter = self._passed, self._segmenter
+        for rows in passed.rows_of(segmenter.push(batch)):
+            passed.add(rows)
+        elapsed_s = self.standing.elapsed_s
+        if len(batch.accel) and segmenter.first_ns is not None:
+            elapsed_s = max(elapsed_s, float(batch.accel.time_ns[-1] - segmenter.first_ns) / 1e9)
+        standing, folded = segmenter.standing, passed.folder.dwells
+        closed = sum(1 for dwell in folded[self._closed :] if standing is None or dwell.number < standing)
+        with self._lock:
+            self._publish(samples=passed.tally.read, elapsed_s=elapsed_s, **self._progress())
+        self._close_next(closed, elapsed_s)
+        self._look(standing, elapsed_s)
+
+    def _finish(self) -> None:
+        """Fold the last readings and hand over the dwells that are left."""
+        passed = self._passed
+        for rows in passed.rows_of(self._segmenter.finish()):
+            passed.add(rows)
+        self._close_next(len(passed.folder.dwells) - self._closed, self.standing.elapsed_s)
+        with self._lock:
+            self._publish(samples=passed.tally.read, current=None)
+
+    def _close_next(self, count: int, elapsed_s: float) -> None:
+        """Hand over the next closed dwells, one by one."""
+        for _ in range(count):
+            self._closed += 1
+            self._close(elapsed_s)
+
+    def _close(self, elapsed_s: float) -> None:
+        """Hand the dwells that have closed to the judging thread; they do not change any more."""
+        passed, folder = self._passed, Folder()
+        folder.dwells, folder.slews = passed.folder.dwells[: self._closed], list(passed.folder.slews)
+        closed = _Closed(replace(passed, tally=replace(passed.tally), folder=folder), elapsed_s)
+        with self._lock:
+            self._last = closed
+            if not self.every:
+                self._waiting.clear()
+            if not self._hurried:
+                self._waiting.append(closed)
+            self._looked_s = 0.0
+            self._publish(dwells=self._closed, current=None)
+            self._lock.notify_all()
+
+    def _look(self, standing: int | None, elapsed_s: float) -> None:
+        """Evaluate a copy of the open dwell when it has lasted 1, 2, 4 ... s."""
+        if standing is None:
+            return
+        folder, open_dwells = Folder(), self._passed.folder.dwells[self._closed :]
+        folder.dwells = list(open_dwells[-1:])
+        arrival_s = self._segmenter.arrival_s
+        if elapsed_s - arrival_s < max(2.0 * self._looked_s, _FIRST_LOOK_S):
+            return
+        aside = replace(self._passed, tally=Tally(), folder=folder)
+        for rows in aside.rows_of(self._segmenter.waiting()):
+            folder.add(rows)
+        if not folder.dwells or folder.dwells[-1].count < LEAST_READINGS:
+            return
+        self._looked_s = elapsed_s - arrival_s
+        here = self._seen(folder.dwells[-1])
+        with self._lock:
+            self._publish(current=here)
+
+    def _judge(self) -> None:
+        """Judge dwells as they close, in order; this is what the judging thread runs."""
+        while (closed := self._next()) is not None:
+            with self._lock:
+                settings = self.settings
+            try:
+                judgement = self._judged(replace(closed.passed, settings=settings), self._before)
+            except KfCalibError as error:
+                with self._lock:
+                    self._publish(problem=str(error))
+                continue
+            except Exception as error:  # the run goes on; its end is judged from the start
+                self.say(f"a dwell could not be judged: {error!r}")
+                continue
+            self._before = judgement
+            self._publish_judgement(judgement, closed.elapsed_s)
+            self._judged_next(judgement)
+
+    def _next(self) -> _Closed | None:
+        """Wait for the next state to be judged; None after the end."""
+        with self._lock:
+            self._lock.wait_for(lambda: self._waiting or self._ended)
+            return self._waiting.popleft() if self._waiting else None
+
+    def _publish_judgement(self, judgement: J, elapsed_s: float) -> None:
+        """Publish a judgement and pass it to the listeners."""
+        with self._lock:
+            self._publish(judgement=judgement, judged_s=elapsed_s, problem="")
+        for listener in list(self.listeners):
+            listener(judgement)
+
+    def _conclude(self) -> J:
+        """Return the final judgement of the whole run."""
+        passed = replace(self._passed, settings=self.settings)
+        final = self._judged_whole(passed, self._before, None if self.again is None else self.again())
+        self._publish_judgement(final, self.standing.elapsed_s)
+        return final
+
+    def _publish(self, **changed: object) -> None:
+        """Replace parts of the standing; to be called with the lock held."""
+        self.standing = replace(self.standing, **changed)

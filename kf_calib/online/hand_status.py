@@ -1,0 +1,150 @@
+"""Status of a calibration by hand while it goes on: what the poses so far give, and what to do now."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.streams import Source
+from kf_calib.design.sides import Sides, turn_in_words
+from kf_calib.diagnosis.candidate_tests import LEVEL
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.errors import UnobservableError
+from kf_calib.estimation.calibration import conclude, evaluate_fit, with_remarks
+from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
+from kf_calib.estimation.fit import fit
+from kf_calib.estimation.results import Calibration
+from kf_calib.online.progress import Progress
+from kf_calib.support.threads import one_blas_thread
+
+ENOUGH_S = 4.0
+"""Time at rest, beside that of settling, that a pose is to be held."""
+
+
+@dataclass(frozen=True)
+class HandJudgement:
+    """What is known of a calibration by hand after a pose.
+
+    result: the calibration; None while the poses do not determine it. dwells: the poses so far. sides: their sides, and
+    the one to turn up next. wanted (12,): target of each sigma, SI; NaN where there is none. looks: how often the sizes
+    of f have been tested. final: whether the run has ended.
+    """
+
+    result: Calibration | None
+    dwells: list[DwellFactor]
+    sides: Sides
+    wanted: Floats
+    looks: int = 0
+    final: bool = False
+
+    @property
+    def sigma(self) -> Floats:
+        """One sigma (12,), SI; NaN where a parameter is not determined or is fixed by the frame."""
+        if self.result is None:
+            return np.full(12, np.nan)
+        fixed = [symbol in self.result.fixed for symbol in paper_parameters.SYMBOLS]
+        return np.where(fixed, np.nan, self.result.estimate.sigma)
+
+    @property
+    def reached(self) -> bool:
+        """Whether there are targets of parameters that are left without angles, and every one is reached."""
+        aimed = np.isfinite(self.wanted) & ~np.isin(paper_parameters.SYMBOLS, ("theta1", "phi1", "nu2"))
+        return bool(aimed.any() and (self.sigma <= self.wanted)[aimed].all())
+
+    @property
+    def consistent(self) -> bool | None:
+        """Whether the sizes of f agree; None while there is nothing to judge by.
+
+        Of all tests of a run together the probability of a false alarm is that of one: the k-th has 1 / (k (k + 1)) of
+        it.
+        """
+        if self.final and self.result is not None:
+            return self.result.consistency.consistent
+        if self.result is None or self.result.consistency.p_value is None or self.result.model.square:
+            return None
+        return self.result.consistency.p_value >= LEVEL / (self.looks * (self.looks + 1))
+
+    @property
+    def verdict(self) -> str:
+        """What the poses tell, in a few words."""
+        if self.result is None:
+            return f"{', '.join(self.sides.missing)} not determined yet"
+        if self.result.model.square:
+            return "the angles between the axes are not told yet: they are taken for square"
+        if self.consistent is None:
+            return "too few poses to test them by each other"
+        if self.consistent:
+            return "the sizes of gravity agree"
+        return "the sizes of gravity differ by more than noise: was it held still?"
+
+
+@dataclass(frozen=True)
+class Held:
+    """The pose that it is held in: number of the dwell, readings used so far, and the axes that point up."""
+
+    number: int
+    readings: int
+    up: str
+
+
+@dataclass(frozen=True)
+class HandStanding(Progress):
+    """What is known of a calibration by hand at a moment; see ``Progress``.
+
+    current: the pose that it is held in. judgement: the latest judgement. sides: those of the poses so far, with that
+    of the pose it is held in. rest_s: for how long it has rested by now, with the time of settling; 0 while it moves.
+    enough_s: for how long it is to rest.
+    """
+
+    current: Held | None = None
+    judgement: HandJudgement | None = None
+    sides: Sides | None = None
+    rest_s: float = 0.0
+    enough_s: float = ENOUGH_S
+
+    @property
+    def task(self) -> str:
+        """What to do now."""
+        if self.sides is None:
+            return f"hold still for {self.enough_s:g} s" if self.rest_s else "lay it on any side and hold it still"
+        turn = f"turn it to a new side: {turn_in_words(self.sides.following)}"
+        if self.rest_s >= self.enough_s:
+            return self._over(f"enough: {turn}")
+        if not self.rest_s:
+            return self._over(f"{turn}; then hold it still")
+        if self.current is not None and self.sides.repeats is not None:
+            return f"on this side it was in pose {self.sides.repeats}, which tells little more: {turn}"
+        return f"hold still for {self.enough_s:g} s"
+
+    def _over(self, otherwise: str) -> str:
+        """Return that the run may end, where every target is reached, or else what to do."""
+        done = self.judgement is not None and self.judgement.reached
+        return "every target is reached: end the run, or go on with more sides" if done else otherwise
+
+
+def judge_poses(passed: Pass, wanted: Floats, before: HandJudgement | None = None) -> HandJudgement:
+    """The judgement of the poses so far; before: that of fewer poses.
+
+    Raises InputError where the readings cannot be used as they are.
+    """
+    dwells, model, settings = passed.dwells, passed.model, passed.settings
+    with one_blas_thread():
+        refuse_unusable(dwells, passed.tally, passed.source.bench)
+        try:
+            result = with_remarks(evaluate_fit(fit(dwells, model, settings.walk_mps2_per_sqrt_s), settings), passed)
+        except UnobservableError:
+            result = None
+        sides = Sides.of(dwells, passed.source.bench, None if result is None else result.fit)
+    tested = result is not None and result.consistency.p_value is not None and not result.model.square
+    return HandJudgement(result, dwells, sides, wanted, (before.looks if before else 0) + tested)
+
+
+def judge_all_poses(passed: Pass, wanted: Floats, looks: int, again: Source | None) -> HandJudgement:
+    """The final judgement: what ``replay`` of the recording gives. Raises KfCalibError as that does."""
+    with one_blas_thread():
+        result = conclude(passed, again)
+        sides = Sides.of(passed.dwells, passed.source.bench, result.fit)
+    return HandJudgement(result, passed.dwells, sides, wanted, looks, final=True)

@@ -1,0 +1,87 @@
+"""Dwells found in the readings alone, as they come."""
+
+from __future__ import annotations
+
+from dataclasses import astuple
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+from helpers.paths import RECORDINGS
+
+import kf_calib
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Batch, Stream
+from kf_calib.dwells.blocks import Block, Tally
+from kf_calib.dwells.rest_in_readings import RestSegmenter
+
+BENCH = Bench((), 9.81, angles=False)
+
+
+def found(accel: Stream, warm: Stream, cuts: np.ndarray) -> tuple[list[Block], Tally, int]:
+    """Blocks, counts, and the most readings that waited, of readings cut before these places."""
+    segmenter, out, most = RestSegmenter(BENCH), list[Block](), 0
+    edges = [0, *cuts.tolist(), len(accel)]
+    for begin, end in pairwise(edges):
+        part = accel[begin:end]
+        around = np.searchsorted(warm.time_ns, [accel.time_ns[begin] if begin else 0, part.time_ns[-1] + 1])
+        until = len(warm) if end == len(accel) else int(around[1])
+        out += segmenter.push(Batch(part, Stream.empty(4), warm[int(around[0]) : until]))
+        most = max(most, len(segmenter._accel))
+    return [*out, *segmenter.finish()], segmenter.tally, most
+
+
+@cache
+def streams() -> tuple[Stream, Stream]:
+    batches = list(kf_calib.open_recording(RECORDINGS / "hidden.mcap", angles=False))
+    accel, warm = (Stream.joined([getattr(each, name) for each in batches]) for name in ("accel", "temperature"))
+    return accel[:6000], warm[warm.time_ns < accel.time_ns[6000]]
+
+
+def test_blocks_are_the_same_to_the_bit_however_the_readings_are_cut() -> None:
+    accel, warm = streams()
+    whole, tally, _ = found(accel, warm, np.array([], int))
+    assert len({block.dwell for block in whole}) > 8
+    rng = np.random.default_rng(3)
+    for count in rng.integers(1, 150, 50):
+        blocks, counts, waited = found(accel, warm, np.sort(rng.choice(np.arange(1, len(accel)), count, replace=False)))
+        assert counts == tally and waited <= len(accel)
+        for one, other in zip(blocks, whole, strict=True):
+            assert (one.dwell, one.arrival_s) == (other.dwell, other.arrival_s)
+            for name in ("elapsed_s", "accel_mps2", "temperature_c"):
+                np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert tally.used + tally.moving + tally.settling == tally.read, astuple(tally)
+
+
+def at_rest(seconds: float, level: tuple[float, float, float], rng: np.random.Generator, sigma: float) -> np.ndarray:
+    return np.array(level) + sigma * rng.normal(size=(round(100 * seconds), 3))
+
+
+def test_a_rest_is_known_while_it_lasts_and_memory_is_that_of_one_block() -> None:
+    rng = np.random.default_rng(1)
+    turn = np.cumsum(rng.normal(size=(150, 3)), axis=0)
+    values = np.concatenate([at_rest(4.0, (0, 9.8, 0), rng, 0.02), turn, at_rest(300.0, (9.8, 0, 0), rng, 0.02)])
+    accel = Stream(10_000_000 * np.arange(len(values), dtype=np.int64), values)
+    segmenter, standing, blocks, most = RestSegmenter(BENCH), list[int | None](), list[Block](), 0
+    for begin in range(0, len(accel), 25):
+        blocks += segmenter.push(Batch(accel[begin : begin + 25], Stream.empty(4)))
+        standing.append(segmenter.standing)
+        most = max(most, len(segmenter._accel))
+    assert standing[8] == 1 and standing[19] is None and standing[40] == 2  # after 2 s, amid the turn, at rest again
+    assert segmenter.rest_s > 295.0 and most < 4200
+    waiting = segmenter.waiting()
+    assert [len(block.elapsed_s) for block in blocks if block.dwell == 2] == [4000] * 7
+    assert sum(len(block.elapsed_s) for block in waiting) > 1500
+    rest = list(segmenter.finish())
+    assert waiting[0].elapsed_s[0] == rest[0].elapsed_s[0] and segmenter.standing is None
+
+
+def test_one_outlier_does_not_end_a_rest_and_noise_of_a_loud_start_is_unlearnt() -> None:
+    rng = np.random.default_rng(2)
+    values = np.concatenate([at_rest(30.0, (0, 0, 9.8), rng, 0.4), at_rest(20.0, (0, 9.8, 0), rng, 0.01)])
+    values[4000, 1] += 5.0
+    accel = Stream(10_000_000 * np.arange(len(values), dtype=np.int64), values)
+    blocks, _, _ = found(accel, Stream.empty(1), np.array([], int))
+    quiet = [block for block in blocks if block.elapsed_s[0] > 30.0]
+    assert len({block.dwell for block in quiet}) == 1
+    assert quiet[0].elapsed_s[0] < 32.0 and quiet[-1].elapsed_s[-1] > 49.0
