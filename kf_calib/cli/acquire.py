@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -244,7 +245,7 @@ def record(
     claimed(overwrite=overwrite)
     renamed = dict(pair(text) for text in columns)
     source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, overrides(options), renamed)
-    with progress(f"recording {out.name}", as_json or str(lines) == "-") as tick:
+    with progress(f"recording {out.name}", as_json or str(lines) == "-") as tick, _told_if_table(lines):
         made = _record(source, out, overwrite, tick)
     warnings = [*source.warnings, *made.notes]
     if as_json:
@@ -253,6 +254,26 @@ def record(
     echo(f"{out}: {made}")
     for warning in warnings:
         echo(f"Note: {sentence(warning)}")
+
+
+@contextmanager
+def _told_if_table(path: Path) -> Iterator[None]:
+    """Where lines cannot be recorded because they are a table of orientations, say so."""
+    from kf_calib.sources.tables.opening import is_table
+    from kf_calib.sources.tables.survey import survey
+
+    try:
+        yield
+    except InputError:
+        found = None
+        with suppress(InputError):
+            found = survey(path) if is_table(path) else None
+        if found is not None and found.rows:
+            raise InputError(
+                f"{path} is a table of orientations, with a row a dwell, and is evaluated as it is: kf-calib replay "
+                f"{path}."
+            ) from None
+        raise
 
 
 def _folder() -> str:
