@@ -38,6 +38,8 @@ from kf_calib.support.output_files import Outputs, write_whole
 from kf_calib.support.plain_text import sentence
 
 if TYPE_CHECKING:
+    from importlib.resources.abc import Traversable
+
     from rich.console import RenderableType
 
     from kf_calib.bench.streams import Source
@@ -300,16 +302,12 @@ def _copy_recordings(folder: Path, as_json: bool) -> None:
     """The recordings that come with the package, and their truths; those that are in the folder already stay."""
     from importlib.resources import files
 
-    own = {
-        folder / file.name: file.read_bytes()
-        for file in sorted(files("kf_calib").joinpath("recordings").iterdir(), key=lambda file: file.name)
-        if file.name.endswith((".mcap", ".json", ".csv"))
-    }
+    own = {folder / name: file.read_bytes() for name, file in _files_in(files("kf_calib").joinpath("recordings"))}
     for path, content in own.items():
         if path.exists() and path.read_bytes() != content:
             raise InputError(f"{path} is there, and is not the tutorial's: move it away, or name another FOLDER.")
-    folder.mkdir(parents=True, exist_ok=True)
     for path, content in own.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists():
             write_whole(path, content)
     recordings = [str(path) for path in own if path.suffix == ".mcap"]
@@ -318,6 +316,15 @@ def _copy_recordings(folder: Path, as_json: bool) -> None:
     else:
         echo(f"{', '.join(recordings)}: there, each with its truth beside it.")
         echo(f"Begin with: kf-calib replay {folder / 'hidden.mcap'}")
+
+
+def _files_in(folder: Traversable) -> Iterator[tuple[str, Traversable]]:
+    """Files of a folder but for its description, and those of bags in it, with their paths."""
+    for file in sorted(folder.iterdir(), key=lambda file: file.name):
+        if file.is_dir():
+            yield from ((f"{file.name}/{name}", each) for name, each in _files_in(file))
+        elif not file.name.endswith(".md"):
+            yield file.name, file
 
 
 def _do_main_job(folder: Path, as_json: bool) -> None:

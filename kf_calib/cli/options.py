@@ -116,7 +116,7 @@ def recording_options(command: F) -> F:
         click.option("--pose-topic", metavar="TOPIC", help="Topic of the platform's angles or attitude.", panel=INPUT),
         click.option("--temperature-topic", metavar="TOPIC", help="Topic of the temperature.", panel=INPUT),
         click.option("--field", "fields", multiple=True, metavar="WHAT=TOPIC:PATHS", panel=INPUT,
-                     help="Where numbers are in JSON or protobuf messages, for example accel=/imu:acc.x,acc.y,acc.z; "
+                     help="Where numbers are in messages of another type, for example accel=/imu:acc.x,acc.y,acc.z; "
                      "repeatable, for angles, attitude and temperature too."),
         click.option("--max-chunk-mb", type=POSITIVE, default=256, show_default=True, metavar="MB", panel=INPUT,
                      help="Chunks of the file that unpack to more are passed over, and told."),

@@ -37,7 +37,10 @@ class RecordFile(Protocol):
 
 
 def open_record_file(path: Path, max_chunk: int, usable: frozenset[str]) -> RecordFile:
-    """The MCAP or .db3 file at ``path``. usable: types of messages wanted. Raises InputError where it is neither."""
+    """The MCAP or .db3 file at ``path``. usable: types of messages wanted, and topics.
+
+    Raises InputError where it is neither.
+    """
     place = path
     if _head(path).startswith(_ZSTD):
         place = _unpacked(path)

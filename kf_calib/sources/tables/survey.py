@@ -122,7 +122,8 @@ def _columns(found: Columns, by_size: Mapping[int, str], stated: set[str]) -> li
         number = f" {found.angles.index(k) + 1}" if own.ours == "angle" else ""
         first = next((cell for cell in found.grid.column(k) if cell is not None), "")
         unit = by_size.get(k) or own.unit if own.ours else ""
-        out.append(ColumnFound(header, str(first), own.ours + number, unit, told_by if own.ours else ""))
+        first = f"{first:.10g}" if isinstance(first, float) else str(first)
+        out.append(ColumnFound(header, first, own.ours + number, unit, told_by if own.ours else ""))
     return out
 
 
