@@ -21,6 +21,7 @@ from kf_calib.support.extras import MissingExtraError
 ENCODINGS = ("json", "protobuf")
 """Those in which messages are told by their fields, whatever their type; in CDR only where fields are stated."""
 CDR = "cdr"
+_ANEW = "record it anew, or name another topic"
 _LOG_TIME = struct.Struct("<Q")
 _LOG_TIME_BEFORE = 16  # bytes from a record's log time to its message
 _Parse = Callable[[bytes], Any]
@@ -114,7 +115,7 @@ def _of_json(data: bytes) -> Any:
     try:
         return json.loads(data)
     except (ValueError, RecursionError):
-        raise _UnreadError(f"a message is not JSON, it begins with {data[:20]!r}") from None
+        raise _UnreadError(f"a message is not JSON, it begins with {data[:20]!r}: {_ANEW}") from None
 
 
 def _of_protobuf(schema: Schema | None) -> _Parse:
@@ -150,7 +151,7 @@ def _of_protobuf(schema: Schema | None) -> _Parse:
         try:
             return kind.FromString(data)
         except DecodeError:
-            raise _UnreadError(f"a message is no {name} in protobuf") from None
+            raise _UnreadError(f"a message is no {name} in protobuf: {_ANEW}") from None
 
     return parse
 
@@ -187,6 +188,6 @@ def _of_cdr(schema: Schema | None) -> _Parse:
         try:
             return decode(data)
         except Exception:  # likewise, for the bytes may be any
-            raise _UnreadError(f"a message is no {name} in CDR") from None
+            raise _UnreadError(f"a message is no {name} in CDR: {_ANEW}") from None
 
     return parse

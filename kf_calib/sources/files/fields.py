@@ -163,7 +163,10 @@ def _time_of_text(text: str, path: str) -> int:
     except ValueError:
         stamp = np.datetime64("NaT")
     if np.isnat(stamp):
-        raise FieldError(f"{path} in a message is {text[:40]!r}, not a time such as 2026-05-04T12:00:00.25Z (in UTC)")
+        raise FieldError(
+            f"{path} in a message is {text[:40]!r}, not a time such as 2026-05-04T12:00:00.25Z (in UTC): name another "
+            f"by @, or the time of receipt, @{LOG_TIME}"
+        )
     return int(stamp.astype(np.int64))
 
 

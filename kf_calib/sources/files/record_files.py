@@ -81,7 +81,9 @@ def _unpacked(path: Path) -> Path:
     descriptor, name = tempfile.mkstemp(prefix="kf_calib_", suffix=Path(path.stem).suffix)
     try:
         with os.fdopen(descriptor, "wb") as target, path.open("rb") as packed:
-            zstandard.ZstdDecompressor().copy_stream(packed, target)
+            _, written = zstandard.ZstdDecompressor().copy_stream(packed, target)
+            if not written:
+                raise zstandard.ZstdError("it ends before anything of it can be unpacked")
     except BaseException as error:
         Path(name).unlink()
         if isinstance(error, zstandard.ZstdError):

@@ -206,7 +206,10 @@ class Recording:
     def _require(self, role: Role, advice: str) -> str:
         topic = self._parts.choose(role, self._wanted[role])
         if topic is None:
-            state = " and is not whole" if any(file.trouble for file in self._parts.files) else ""
+            is_whole = not any(file.trouble for file in self._parts.files)
+            state = "" if is_whole else " and is not whole"
+            if not is_whole and not any(contents.channels for contents in self._parts.contents):
+                advice = "nothing of it can be used, so copy it anew from where it was recorded"
             raise InputError(
                 f"{self.path} has no {role.quantity} topic ({role.schemas}), it has {self._parts}{state}: {advice}."
             )

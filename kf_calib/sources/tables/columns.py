@@ -18,6 +18,7 @@ READINGS, SPREADS, QUATERNION = ("ax", "ay", "az"), ("sx", "sy", "sz"), ("qx", "
 _OPTIONAL = ("time", "count", "temperature", "sd", *SPREADS)
 _SEVERAL = ("angle", "time", "")
 _ALIKE = 1.3  # of the norms of readings at rest, largest to smallest
+_MOST = 0.6  # of the cells of a column of readings: a bad one is told later
 HOW = "--column THEIRS=OURS says what a column is"
 KNOWN = "ax_g (ay_mps2, az_mg), sx_g or sd_g, outer_deg (middle_rad, inner_deg), qx, face, time_s, count, temperature_c"
 
@@ -115,10 +116,10 @@ class Columns:
         if self.places(*READINGS):
             return
         left = [k for k in range(len(self.meanings)) if not self.meanings[k].ours and k not in stated]
-        numeric = [k for k in left if self._are_numbers(k)]
-        if len(numeric) == 3:
-            norms = np.linalg.norm([self.values(k) for k in numeric], axis=0)
-            if norms.min() > 0 and norms.max() < _ALIKE * norms.min():
+        if len(numeric := [k for k in left if self._are_numbers(k, _MOST)]) == 3:
+            whole = np.array([all(self.is_number(row[k]) for k in numeric) for row in self.grid.rows])
+            norms = np.linalg.norm([self.values(k, only=whole)[whole] for k in numeric], axis=0)
+            if norms.size and 0 < norms.max() < _ALIKE * norms.min():
                 for k, ours in zip(numeric, READINGS, strict=True):
                     self._guess(k, ours)
 
@@ -135,12 +136,10 @@ class Columns:
         except InputError:
             return False
 
-    def _are_numbers(self, place: int) -> bool:
-        try:
-            self.values(place)
-        except InputError:
-            return False
-        return True
+    def _are_numbers(self, place: int, share: float = 1.0) -> bool:
+        """Whether at least this share of the cells of a column are numbers."""
+        cells = self.grid.column(place)
+        return sum(map(self.is_number, cells)) >= share * len(cells)
 
     def _refuse_doubles(self) -> None:
         kinds = [own.ours for own in self.meanings]
