@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Set
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import rich_click as click
@@ -24,6 +25,7 @@ from kf_calib.cli.options import (
     units_of,
 )
 from kf_calib.errors import BenchError, InputError, KfCalibError
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 if TYPE_CHECKING:
     from kf_calib.bench.streams import Source
@@ -128,8 +130,13 @@ def _show_table(ctx: click.Context, table: Survey, options: Mapping[str, Any], a
     missing = [*([table.trouble] if table.trouble else []), *(_NAMED[key][1] for key in lacking)]
     if table.count < least:
         missing.append(f"orientations: {table.count} rows are there, and {least} are the least")
+    scale = list[str]()
+    if table.rows and not table.has_unit:
+        missing.append("the size of one count of the readings: --accel-scale, in m/s^2 or what --accel-unit says")
+        level = median(row.norm_mps2 for row in table.rows)
+        scale.append(f"--accel-scale {STANDARD_GRAVITY_MPS2 / level:.3g}")
     words = [*_given(ctx, {name for name in options if name != "as_json"} | {"columns"}),
-             *(_NAMED[key][0] for key in lacking)]  # fmt: skip
+             *(_NAMED[key][0] for key in lacking), *scale]  # fmt: skip
     command = " ".join(["kf-calib replay", _quoted(str(table.path)), *words])
     found = TableOverview(table, bench, missing, command)
     if as_json:

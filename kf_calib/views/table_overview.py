@@ -63,13 +63,13 @@ def table_report(found: TableOverview) -> RenderableType:
     """What ``info`` prints of a table."""
     own = found.survey
     parts: list[RenderableType] = [
-        Text(f"{own.path}: a table of orientations, {own.count} rows"),
+        Text(f"{own.path}: a table of orientations, {_counted(own.count, 'row')}"),
         _column_table(own.columns),
     ]
     bench = ", ".join(f"{key} = {value}" for key, value in found.bench.items())
     parts.append(Text(f"Bench: {bench or 'nothing is said of it'}"))
     if own.rows:
-        parts += [Text(f"{len(own.rows)} orientations:"), _row_table(own)]
+        parts += [Text(f"{_counted(len(own.rows), 'orientation')}:"), _row_table(own)]
         if len(own.rows) > _SHOWN:
             parts.append(Text(f"and {len(own.rows) - _SHOWN} more, all of them by --json"))
     parts += [note(said) for said in own.warnings]
@@ -83,6 +83,10 @@ def table_report(found: TableOverview) -> RenderableType:
     parts += [Text(f"Missing: {said}") for said in found.missing]
     parts.append(Text(f"{'Then try' if found.missing else 'Try'}: {found.command}"))
     return Group(*parts)
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'s' * (count != 1)}"
 
 
 def _column_table(columns: Sequence[ColumnFound]) -> Table:

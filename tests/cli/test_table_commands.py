@@ -132,6 +132,19 @@ def test_info_of_a_table_says_what_was_taken_for_what(run, tmp_path: Path) -> No
     assert code == 0 and "Missing: " in out and "row 6, column 'Kanal C' is 'foo'" in " ".join(out.split())
 
 
+def test_counts_get_a_size_to_try(run, tmp_path: Path) -> None:
+    path = tmp_path / "counts.csv"
+    path.write_text("face,raw_x,raw_y,raw_z\n+x,16420,30,-20\n-x,-16350,20,10\n+y,20,16400,20\n-y,30,-16330,10\n"
+                    "+z,15,25,16390\n-z,25,20,-16360\n")  # fmt: skip
+    _, out, _ = run("info", path, "--gravity", "9.81", "--json")
+    found = json.loads(out)
+    assert [said.partition(":")[0] for said in found["missing"]] == ["the size of one count of the readings"]
+    code, out, err = run(*found["command"].split()[1:], "--json")
+    assert (code, err) == (0, "")
+    (value,) = [each["value"] for each in json.loads(out)["parameters"] if each["symbol"] == "K1"]
+    assert value == pytest.approx(1.0, abs=0.01)
+
+
 @pytest.mark.parametrize("name", ["twelve_poses.csv", "six_faces.xlsx"])
 def test_the_examples_lack_nothing_but_their_bench(name: str, run) -> None:
     if name.endswith("xlsx"):

@@ -91,11 +91,12 @@ def open_table(
 
 class Opening:
     """One opening of a table; ``said`` collects what was taken for what, ``by_size`` units of columns that the size of
-    their numbers told."""
+    their numbers told; has_unit: whether it is known what the readings are in."""
 
     def __init__(self, columns: Columns, overrides: Mapping[str, str], units: Units) -> None:
         self.columns, self.grid, self.said = columns, columns.grid, list[str]()
         self.overrides, self.units, self.by_size = overrides, units, dict[int, str]()
+        self.has_unit = True
         self.warnings = [f"{self.grid.name}: {remark}." for remark in self.grid.remarks]
 
     def table(self) -> Table:
@@ -251,13 +252,14 @@ class Opening:
         stated = self.units.accel
         self._refuse_other_unit(places, named, stated, "accel")
         size = float(np.median(np.linalg.norm(values, axis=1))) * self.units.accel_scale
-        by_size = next((unit for unit, low, high in _UNIT_BY_SIZE if low < size < high), "m/s2")
+        by_size = next((unit for unit, low, high in _UNIT_BY_SIZE if low < size < high), "count")
+        self.has_unit = bool(stated) or self.units.accel_scale != 1.0 or "count" not in (by_size, *named)
         units = [unit if unit not in ("", "count") else stated or ("m/s2" if unit else by_size) for unit in named]
         factors = np.array([ACCEL[unit] * (self._g(bench) / STANDARD_GRAVITY_MPS2 if unit.endswith("g") else 1.0)
                             for unit in units])  # fmt: skip
         guessed = any(unit == "" for unit in named) and not stated
         self.by_size |= {place: units[k] for k, place in enumerate(places) if not named[k] and not stated}
-        words = " and ".join(dict.fromkeys(unit.replace("m/s2", "m/s^2") for unit in units))
+        words = " and ".join(dict.fromkeys({"m/s2": "m/s^2", "count": "counts"}.get(unit, unit) for unit in units))
         if self.units.accel_scale != 1.0 or "count" in named:
             words = f"counts of {self.units.accel_scale:g} {words}"
         words += " by their size (--accel-unit)" * guessed

@@ -62,6 +62,7 @@ class Survey:
 
     orientation: ``angles``, ``attitude`` or ``face``; empty where no column tells it. trouble: why it cannot be
     evaluated; empty if it can, else there are no rows. has_sigma: whether the noise is written down.
+    has_unit: whether it is known what the readings are in.
     """
 
     path: Path
@@ -70,6 +71,7 @@ class Survey:
     orientation: str
     rows: list[RowFound]
     has_sigma: bool
+    has_unit: bool
     trouble: str
     warnings: list[str]
 
@@ -99,7 +101,7 @@ def survey(
     has_sigma = table is not None and table.orientations[0].sigma_mps2 is not None
     rows = _rows(table, found) if table else []
     own = _columns(found, opening.by_size, set(columns))
-    return Survey(path, own, len(grid.rows), kind, rows, has_sigma, trouble, list(opening.warnings))
+    return Survey(path, own, len(grid.rows), kind, rows, has_sigma, opening.has_unit, trouble, list(opening.warnings))
 
 
 def _complete(overrides: Mapping[str, str], angles: int) -> dict[str, str]:

@@ -38,6 +38,7 @@ class Times:
         said, start_ns = f"time from {columns.named(places)}", None
         are_numbers = len(places) == 1 and all(cell is None or columns.is_number(cell) for cell in cells)
         if are_numbers or (len(places) == 1 and unit in TIME):
+            said += f" in {unit or 's'}"
             elapsed_s = TIME[unit or "s"] * columns.values(places[0], "a time", optional=True)
         else:
             stamps = _stamps(columns, places)
