@@ -64,8 +64,11 @@ def test_the_recordings_of_the_tutorial_come_with_the_package(run, tmp_path: Pat
     monkeypatch.chdir(tmp_path)
     code, out, err = run("demo", "--tutorial")
     assert (code, err) == (0, "") and "kf-calib replay recordings/hidden.mcap" in out
-    copies = {path.name: path.read_bytes() for path in Path("recordings").iterdir()}
-    assert copies == {path.name: path.read_bytes() for path in RECORDINGS.iterdir() if path.suffix != ".md"}
+    copies, own = (
+        {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+        for folder in (Path("recordings"), RECORDINGS)
+    )
+    assert copies == {name: content for name, content in own.items() if not name.endswith(".md")}
     Path("recordings/hidden.mcap").unlink()  # the others stay as they are
     code, out, _ = run("demo", "--tutorial", "--json")
     assert code == 0 and json.loads(out)["recordings"][0] == "recordings/hidden.mcap"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -38,6 +39,8 @@ from kf_calib.support.output_files import Outputs, write_whole
 from kf_calib.support.plain_text import sentence
 
 if TYPE_CHECKING:
+    from importlib.resources.abc import Traversable
+
     from rich.console import RenderableType
 
     from kf_calib.bench.streams import Source
@@ -251,7 +254,7 @@ def record(
     claimed(overwrite=overwrite)
     renamed = dict(pair(text) for text in columns)
     source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, overrides(options), renamed, angles=not no_angles)
-    with progress(f"recording {out.name}", as_json or str(lines) == "-") as tick:
+    with progress(f"recording {out.name}", as_json or str(lines) == "-") as tick, _told_if_table(lines):
         made = _record(source, out, overwrite, tick)
     warnings = [*source.warnings, *made.notes]
     if as_json:
@@ -260,6 +263,26 @@ def record(
     echo(f"{out}: {made}")
     for warning in warnings:
         echo(f"Note: {sentence(warning)}")
+
+
+@contextmanager
+def _told_if_table(path: Path) -> Iterator[None]:
+    """Where lines cannot be recorded because they are a table of orientations, say so."""
+    from kf_calib.sources.tables.opening import is_table
+    from kf_calib.sources.tables.survey import survey
+
+    try:
+        yield
+    except InputError:
+        found = None
+        with suppress(InputError):
+            found = survey(path) if is_table(path) else None
+        if found is not None and found.rows:
+            raise InputError(
+                f"{path} is a table of orientations, with a row a dwell, and is evaluated as it is: kf-calib replay "
+                f"{path}."
+            ) from None
+        raise
 
 
 def _folder() -> str:
@@ -286,16 +309,12 @@ def _copy_recordings(folder: Path, as_json: bool) -> None:
     """The recordings that come with the package, and their truths; those that are in the folder already stay."""
     from importlib.resources import files
 
-    own = {
-        folder / file.name: file.read_bytes()
-        for file in sorted(files("kf_calib").joinpath("recordings").iterdir(), key=lambda file: file.name)
-        if file.name.endswith((".mcap", ".json", ".csv"))
-    }
+    own = {folder / name: file.read_bytes() for name, file in _files_in(files("kf_calib").joinpath("recordings"))}
     for path, content in own.items():
         if path.exists() and path.read_bytes() != content:
             raise InputError(f"{path} is there, and is not the tutorial's: move it away, or name another FOLDER.")
-    folder.mkdir(parents=True, exist_ok=True)
     for path, content in own.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists():
             write_whole(path, content)
     recordings = [str(path) for path in own if path.suffix == ".mcap"]
@@ -304,6 +323,15 @@ def _copy_recordings(folder: Path, as_json: bool) -> None:
     else:
         echo(f"{', '.join(recordings)}: there, each with its truth beside it.")
         echo(f"Begin with: kf-calib replay {folder / 'hidden.mcap'}")
+
+
+def _files_in(folder: Traversable) -> Iterator[tuple[str, Traversable]]:
+    """Files of a folder but for its description, and those of bags in it, with their paths."""
+    for file in sorted(folder.iterdir(), key=lambda file: file.name):
+        if file.is_dir():
+            yield from ((f"{file.name}/{name}", each) for name, each in _files_in(file))
+        elif not file.name.endswith(".md"):
+            yield file.name, file
 
 
 def _do_main_job(folder: Path, as_json: bool) -> None:

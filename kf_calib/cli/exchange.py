@@ -32,7 +32,7 @@ from kf_calib.cli.options import (
     used_of,
 )
 from kf_calib.cli.pictures import Pictures, figure_options, figures_of
-from kf_calib.errors import KfCalibError
+from kf_calib.errors import InputError, KfCalibError
 
 if TYPE_CHECKING:
     from kf_calib.estimation.correction import Correction
@@ -70,8 +70,15 @@ def apply(calibration: Path, recording: Path, out: Path | None, overwrite: bool,
     if out is None or columns:
         raise click.UsageError("a recording is corrected to a copy: name it by -o OUT.mcap, and leave out --column.")
     from kf_calib.exchange.corrected_file import apply_to_file
+    from kf_calib.sources.tables.opening import is_table
     from kf_calib.views import exchange as views
 
+    if is_table(recording):
+        raise InputError(
+            f"{recording} is no recording of samples: apply corrects MCAP files, bags, and lines of samples from "
+            "standard input (apply CAL - < LINES); mean readings are corrected in Python, by "
+            "kf_calib.open_calibration(CAL).correction()(readings)."
+        )
     outputs = claimed(overwrite=overwrite)
     saved, correction = _correction(calibration, options)
     options["gravity_mps2"] = options["gravity_mps2"] or saved.bench.gravity_mps2

@@ -7,12 +7,14 @@ import io
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import rich_click as click
+from click import get_current_context  # rich_click declares that there may be none
+from click.core import ParameterSource
 
 from kf_calib.cli.echo import complain, echo, echo_drawn
 from kf_calib.cli.files import output_option
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from kf_calib.estimation.results import Calibration
     from kf_calib.estimation.settings import Settings
     from kf_calib.sources.files.recording import Recording
+    from kf_calib.sources.tables.opening import Units
     from kf_calib.sources.tables.table import Table
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -118,7 +121,7 @@ def recording_options(command: F) -> F:
         click.option("--pose-topic", metavar="TOPIC", help="Topic of the platform's angles or attitude.", panel=INPUT),
         click.option("--temperature-topic", metavar="TOPIC", help="Topic of the temperature.", panel=INPUT),
         click.option("--field", "fields", multiple=True, metavar="WHAT=TOPIC:PATHS", panel=INPUT,
-                     help="Where numbers are in JSON or protobuf messages, for example accel=/imu:acc.x,acc.y,acc.z; "
+                     help="Where numbers are in messages of another type, for example accel=/imu:acc.x,acc.y,acc.z; "
                      "repeatable, for angles, attitude and temperature too."),
         click.option("--max-chunk-mb", type=POSITIVE, default=256, show_default=True, metavar="MB", panel=INPUT,
                      help="Chunks of the file that unpack to more are passed over, and told."),
@@ -251,20 +254,35 @@ def recording_of(path: Path, options: Mapping[str, Any]) -> Recording | Table:
 
     columns = dict(map(pair, options["columns"]))
     if is_table(path):
-        if options["no_angles"]:
-            raise InputError(f"{path}: a table of orientations has them: leave out --no-angles.")
-        return open_table(
-            path,
-            overrides(options),
-            columns=columns,
-            accel_unit=options["accel_unit"],
-            accel_scale=options["accel_scale"],
-            angle_unit=options["angle_unit"],
-            g_unit=options["g_unit"],
-        )
-    if columns:
-        raise InputError(f"{path}: is no table (.csv, .xlsx), so it has no columns to be named by --column.")
+        _refuse_given(_OF_SAMPLES, f"{path} is a table of mean readings")
+        stated = {name: options[name] for name in ("accel_unit", "accel_scale", "angle_unit", "g_unit")}
+        return open_table(path, overrides(options), columns=columns, **stated)
+    _refuse_given(_OF_TABLES, f"{path} is no table (.csv, .xlsx)")
     return messages_of(path, options, not options["no_angles"])
+
+
+_OF_TABLES = ("columns", "g_unit")
+_OF_SAMPLES = (
+    "no_angles", "joints", "accel_topic", "pose_topic", "temperature_topic", "fields", "max_chunk_mb", "settle_s",
+    "still_deg", "gate", "gate_sigma",
+)  # fmt: skip
+"""Options that act on tables of orientations only, and on recordings of samples only."""
+
+
+def _refuse_given(names: Sequence[str], what: str) -> None:
+    """Raise InputError for the first of these options that the command line has."""
+    ctx = get_current_context()
+    for param in ctx.command.params:
+        if param.name in names and ctx.get_parameter_source(param.name) is ParameterSource.COMMANDLINE:
+            name = [*param.opts, *param.secondary_opts][-1 if ctx.params[param.name] is False else 0]
+            raise InputError(f"{what}, on which {name} has nothing to act: leave it out.")
+
+
+def units_of(options: Mapping[str, Any]) -> Units:
+    """Units of a table, as the options state them."""
+    from kf_calib.sources.tables.opening import Units
+
+    return Units(options["accel_unit"], options["accel_scale"], options["angle_unit"], options["g_unit"])
 
 
 def messages_of(path: Path, options: Mapping[str, Any], angles: bool) -> Recording:

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from kf_calib.design.orientation_plan import Plan
     from kf_calib.design.predicted_information import Prospect
 
+_USUAL_DWELL_S = 30.0
 _AIM = "What to aim at"
 _CRITERIA = ("D", "A", "E", "minimax", "condition")
 
@@ -77,7 +78,7 @@ def _plan_options(command: F) -> F:
                      "shortest below it."),
         reach_option("--seed", type=int, metavar="N", default=0, show_default=True,
                      help="Seed of the order of visits."),
-        dwell_option("--dwell-s", type=POSITIVE, help="Seconds in each orientation; 30, or as in the recording."),
+        dwell_option("--dwell-s", type=POSITIVE, help="Seconds in each orientation; as in the recording, or 30."),
         dwell_option("--sample-hz", type=POSITIVE, default=100.0, show_default=True, help="Rate of the readings."),
         dwell_option("--readings", type=POSITIVE, help="Readings of a dwell that are used, in place of the two above."),
         dwell_option("--white", "white_mps2", type=POSITIVE, default=1e-4, show_default=True,
@@ -198,7 +199,7 @@ def _plan_by_hand(options: Mapping[str, Any], as_json: bool) -> None:
     else:
         keys = {"gravity_mps2": "9.80665", **overrides(options)}
         bench = replace(Bench.from_metadata(keys, has_angles=False), angles=False, nominal={"theta1": 0, "theta3": 0})
-        readings = options["readings"] or max((options["dwell_s"] or 30.0) * options["sample_hz"], 1.0)
+        readings = options["readings"] or max((options["dwell_s"] or _USUAL_DWELL_S) * options["sample_hz"], 1.0)
         made = HandPlan.of(options["count"] or 12, Model(bench), options["white_mps2"] / math.sqrt(readings))
     if as_json:
         print_json(views.hand_plan_object(made))
@@ -215,23 +216,44 @@ def _prospect(options: Mapping[str, Any], quiet: bool) -> Prospect:
     keys = {"axes": "y z x", **overrides(options)}
     if "latitude_deg" not in keys:
         keys.setdefault("gravity_mps2", "9.81")
-    dwell_s = options["dwell_s"] or 30.0
+    dwell_s = options["dwell_s"] or _USUAL_DWELL_S
     made = Prospect.of_bench(Bench.from_metadata(keys), options["white_mps2"], 1.0, dwell_s)
     return replace(made, readings=options["readings"] or max(made.still_s * options["sample_hz"], 1.0))
 
 
 def _after(recording: Path, options: Mapping[str, Any], quiet: bool) -> Prospect:
+    import numpy as np
+
     from kf_calib.design.predicted_information import Prospect
     from kf_calib.estimation.calibration import calibrate
+    from kf_calib.estimation.measurement_model import Model
+    from kf_calib.sources.tables.table import Table
 
     source, settings = opened(recording, options)
-    if not source.bench.axes:
-        raise InputError(f"{recording} has an attitude and no gimbal angles, so no angles can be planned: give --axes.")
+    gimbals = source.bench if source.bench.axes else _with_gimbals(recording, source.bench, options)
     with progress(f"reading {recording.name}", quiet) as tick:
         result = calibrate(source, settings, tick)
     made = Prospect.after(result.fit, settings.prior)
+    if gimbals is not source.bench and made.last is not None:  # where these gimbals stand is not known: at zero
+        last = replace(made.last, pose=np.zeros(len(gimbals.axes)))
+        made = replace(made, model=Model(gimbals, made.model.effects), last=last)
+    if isinstance(source, Table):  # how long its dwells took is not known
+        made = replace(made, dwell_s=options["dwell_s"] or _USUAL_DWELL_S)
     longer = (options["dwell_s"] or made.dwell_s) / made.dwell_s
     return replace(made, dwell_s=longer * made.dwell_s, readings=options["readings"] or longer * made.readings)
+
+
+def _with_gimbals(recording: Path, bench: Bench, options: Mapping[str, Any]) -> Bench:
+    """A bench that a run describes by attitudes or faces, with the gimbals that are to be planned for."""
+    from kf_calib.bench.bench import parse_axes
+
+    stated = overrides(options).get("axes", "")
+    if not stated.strip():
+        raise InputError(
+            f"{recording} has attitudes or faces and no gimbal angles: say which gimbals are to be turned, for example "
+            '--axes "y z x".'
+        )
+    return replace(bench, axes=parse_axes(stated))
 
 
 def _reach(bench: Bench, options: Mapping[str, Any]) -> Reach:

@@ -64,7 +64,7 @@ def _solution(rows: Floats, scale: Floats, around: Floats) -> tuple[Floats, Floa
     """Return state (p,) and covariance (p, p) from whitened rows [H | z] (n, p + 1), columns divided by ``scale``."""
     design, readings = rows[:, :-1], rows[:, -1]
     left, upper = np.linalg.qr(design / scale)
-    rotated, singular, right = np.linalg.svd(upper)
+    rotated, singular, right = np.linalg.svd(upper, full_matrices=False)  # fewer rows than columns at first
     seen = singular > _SEEN * singular[0]
     inverse = (right[seen].T / singular[seen]) / scale[:, None]
     solution = around + inverse @ (rotated[:, seen].T @ (left.T @ (readings - design @ around)))

@@ -98,7 +98,8 @@ class Periodogram:
         - along_model (N, 6, p): products of the waves with an orthonormal basis of the model's columns.
         - along_left (N, 6): products of the waves with the residual of the readings.
         """
-        sizes = np.sqrt(np.maximum(np.einsum("nii->ni", self._squares), 1e-300))
+        sizes = np.sqrt(np.maximum(np.einsum("nii->ni", self._squares), 0.0))
+        sizes[sizes <= _NEW * sizes.max(initial=0.0)] = np.inf  # a sine that is zero at all (equidistant) dwells
         gram = self._squares - along_model @ np.swapaxes(along_model, 1, 2)
         gram, along = gram / (sizes[:, :, None] * sizes[:, None, :]), along_left / sizes
         inverse = np.linalg.pinv(gram, rcond=_SEEN, hermitian=True)

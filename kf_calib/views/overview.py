@@ -113,15 +113,19 @@ def _dwell_parts(dwells: Sequence[DwellFound]) -> list[RenderableType]:
         table.add_column(heading, justify="right")
     for dwell in dwells[:_SHOWN]:
         table.add_row(
-            str(dwell.number), f"{dwell.arrival_s:.2f}", f"{dwell.lasts_s:.2f}", str(dwell.readings), _pose(dwell.pose)
-        )
+            str(dwell.number),
+            f"{dwell.arrival_s:.2f}",
+            f"{dwell.lasts_s:.2f}",
+            str(dwell.readings),
+            pose_text(dwell.pose),
+        )  # fmt: skip
     parts.append(table)
     if len(dwells) > _SHOWN:
         parts.append(Text(f"and {len(dwells) - _SHOWN} more, all of them by --json"))
     return parts
 
 
-def _pose(pose: tuple[float, ...]) -> str:
+def pose_text(pose: tuple[float, ...]) -> str:
     """Gimbal angles in degrees; an attitude as it is."""
     if len(pose) == 4:
         return " ".join(f"{each:.4f}" for each in pose)

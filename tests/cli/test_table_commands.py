@@ -6,10 +6,14 @@ import json
 from pathlib import Path
 
 import pytest
-from helpers.paths import ROOT
+from helpers.paths import RECORDINGS, ROOT
 
 TWELVE = ROOT / "recordings" / "twelve_poses.csv"
 OPTIONS = (TWELVE, "--axes", "y z x", "--gravity", "9.8123")
+GAPS = "Lage;Kanal A;Kanal B;Kanal C;Temp;n\n" + "".join(
+    f"{line};\n" for line in ("+x;1003;4;-2;24,1", "-x;-998;1;2;", "+y;3;1001;1;24,5", "-y;1;-996;0;24,4",
+                              "+z;0;3;999;-", "-z;3;2;-998;24,6")
+)  # fmt: skip
 FACES = "face,A,B,C\n+x,1,0,0\n-x,-1,0,0.001\n+y,0,1.002,0\n-y,0,-1,0.001\n+z,0.001,0,1\n-z,0,0.001,-1\n"
 
 
@@ -55,3 +59,114 @@ def test_samples_are_to_be_recorded_first(run, tmp_path: Path) -> None:
 def test_a_recording_has_no_columns(run) -> None:
     code, _, err = run("replay", ROOT / "recordings" / "hidden.mcap", "--column", "a=ax_g")
     assert code == 2 and "is no table (.csv, .xlsx)" in err
+
+
+OF_SAMPLES = [("--settle-s", "1"), ("--still-deg", "1"), ("--no-gate",), ("--gate-sigma", "5"), ("--accel-topic", "/a"),
+              ("--pose-topic", "/a"), ("--temperature-topic", "/a"), ("--field", "accel=/a:b"), ("--max-chunk-mb", "9"),
+              ("--joints", "a b c"), ("--no-angles",)]  # fmt: skip
+
+
+@pytest.mark.parametrize("option", OF_SAMPLES, ids=lambda option: option[0])
+def test_options_of_samples_are_refused_for_a_table(option: tuple[str, ...], run) -> None:
+    code, out, err = run("replay", *OPTIONS, *option)
+    assert (code, out) == (2, "")
+    assert f"is a table of mean readings, on which {option[0]} has nothing to act: leave it out." in err
+
+
+def test_what_1_g_is_does_not_act_on_a_recording(run) -> None:
+    code, _, err = run("replay", RECORDINGS / "hidden.mcap", "--g-unit", "local")
+    assert code == 2 and "is no table (.csv, .xlsx), on which --g-unit has nothing to act" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("record", "made.mcap", TWELVE), "is a table of orientations, with a row a dwell, and is evaluated as it is"),
+        (("apply", "cal.json", TWELVE, "-o", "made.mcap"), "mean readings are corrected in Python, by kf_calib.open_"),
+        (("plan", "--recording", "faces.csv", "--gravity", "9.81"), "say which gimbals are to be turned, for example"),
+        (("replay", *OPTIONS, "--angle-unit", "rad"), "'außen [°]' is in deg by its name, and --angle-unit is rad"),
+        (("replay", "faces.csv", "--gravity", "9.81", "--angle-unit", "rad"), "has no gimbal angles, so leave out"),
+        (("replay", *OPTIONS, "--with", "vibration-rectification"), "needs the readings themselves"),
+    ],
+)
+def test_what_a_table_cannot_do_is_told(words: tuple[object, ...], says: str, run, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("faces.csv").write_text(FACES.replace("A,B,C", "ax,ay,az"))
+    code, out, err = run(*words)
+    assert (code, out) == (2, "") and says in err and err.count("\n") == 1
+
+
+def test_means_without_sigma_are_compared_planned_from_and_verified(run, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("faces.csv").write_text(FACES.replace("A,B,C", "ax,ay,az"))
+    own = ("faces.csv", "--gravity", "9.81")
+    code, out, err = run("compare", *own, "--json")
+    assert (code, err) == (0, "") and json.loads(out)["max_difference_sigma"] < 1e-5
+    code, out, err = run("plan", "--recording", *own, "--axes", "y z x", "--json")
+    planned = json.loads(out)
+    assert (code, err) == (0, "") and planned["duration_s"] > 30.0
+    assert all(planned["sigma"][name] < before for name, before in planned["sigma_before"].items())
+    assert run("replay", *own, "--save", "cal.json")[0] == 0
+    code, out, err = run("verify", "cal.json", *own, "--json")
+    assert (code, err) == (0, "") and json.loads(out)["holds"]
+
+
+def test_info_of_a_table_says_what_was_taken_for_what(run, tmp_path: Path) -> None:
+    path = tmp_path / "gaps.csv"
+    path.write_text(GAPS)
+    code, out, err = run("info", path, "--json")
+    found = json.loads(out)
+    assert (code, err) == (0, "")
+    told = {own["header"]: (own["meaning"], own["unit"], own["told_by"]) for own in found["columns"]}
+    assert told == {"Lage": ("face", "", "name"), "Kanal A": ("ax", "mg", "content and size"),
+                    "Kanal B": ("ay", "mg", "content and size"), "Kanal C": ("az", "mg", "content and size"),
+                    "Temp": ("temperature", "", "name"), "n": ("", "", "")}  # fmt: skip
+    assert [row["face"] for row in found["dwells"]] == ["+x", "-x", "+y", "-y", "+z", "-z"]
+    assert [row["temperature_c"] for row in found["dwells"]] == pytest.approx([24.1, 24.3, 24.5, 24.4, 24.5, 24.6])
+    assert [said.partition(":")[0] for said in found["missing"]] == ["local gravity"]
+    assert any("has no temperature in rows 3, 6: it is interpolated in time" in said for said in found["warnings"])
+    code, out, err = run(*found["command"].split()[1:], "--json")
+    assert (code, err) == (0, "") and json.loads(out)["dwells"] == 6
+    path.write_text(GAPS.replace("999", "foo"))
+    code, out, _ = run("info", path)
+    assert code == 0 and "Missing: " in out and "row 6, column 'Kanal C' is 'foo'" in " ".join(out.split())
+
+
+def test_counts_get_a_size_to_try(run, tmp_path: Path) -> None:
+    path = tmp_path / "counts.csv"
+    path.write_text("face,raw_x,raw_y,raw_z\n+x,16420,30,-20\n-x,-16350,20,10\n+y,20,16400,20\n-y,30,-16330,10\n"
+                    "+z,15,25,16390\n-z,25,20,-16360\n")  # fmt: skip
+    _, out, _ = run("info", path, "--gravity", "9.81", "--json")
+    found = json.loads(out)
+    assert [said.partition(":")[0] for said in found["missing"]] == ["the size of one count of the readings"]
+    code, out, err = run(*found["command"].split()[1:], "--json")
+    assert (code, err) == (0, "")
+    (value,) = [each["value"] for each in json.loads(out)["parameters"] if each["symbol"] == "K1"]
+    assert value == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("name", ["twelve_poses.csv", "six_faces.xlsx"])
+def test_the_examples_lack_nothing_but_their_bench(name: str, run) -> None:
+    if name.endswith("xlsx"):
+        pytest.importorskip("openpyxl", reason="openpyxl is not there")
+    code, out, _ = run("info", RECORDINGS / name)
+    assert code == 0 and "Missing: local gravity" in out and f"Then try: kf-calib replay {RECORDINGS / name}" in out
+    bench = ("--axes", "y z x", "--gravity", "9.81")
+    code, out, _ = run("info", RECORDINGS / name, *bench, "--json")
+    found = json.loads(out)
+    assert found["missing"] == [] and found["orientation"] == ("face" if name.endswith("xlsx") else "angles")
+
+
+def test_the_spreadsheet_of_a_run_gives_what_the_run_does(run) -> None:
+    """All of it was rounded to what a display shows."""
+    pytest.importorskip("openpyxl", reason="openpyxl is not there")
+    _, out, _ = run("info", RECORDINGS / "mems_faces.mcap", "--json")
+    bench = json.loads(out)["bench"]
+    _, out, _ = run("replay", RECORDINGS / "mems_faces.mcap", "--json")
+    stated = ("--gravity", "9.81", "--angle-sigma", bench["angle_sigma_deg"], "--scatter-sigma",
+              bench["scatter_sigma_mps2"])  # fmt: skip
+    code, written, err = run("replay", RECORDINGS / "six_faces.xlsx", *stated, "--json")
+    assert code == 0, err
+    for one, other in zip(json.loads(out)["parameters"], json.loads(written)["parameters"], strict=True):
+        assert abs(one["value"] - other["value"]) < 0.02 * one["sigma"]
+        assert other["sigma"] == pytest.approx(one["sigma"], rel=0.01)

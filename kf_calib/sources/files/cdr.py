@@ -27,6 +27,7 @@ _FRAME = 12  # byte offset of frame_id in every message that starts with a std_m
 _HEAD = np.dtype([("kind", "<u4"), ("sec", "<i4"), ("nanosec", "<u4"), ("frame", "<u4")])
 _NS_PER_S = 1_000_000_000
 _MAX_PADDING = 7
+_ANEW = "the messages are not of the type that the topic has, so record it anew, or choose another topic"
 
 
 class CdrError(ValueError):
@@ -98,7 +99,7 @@ def _uint32(message: bytes, offset: int) -> int:
 def _after_string(message: bytes, offset: int) -> int:
     end = offset + 4 + _uint32(message, offset)
     if end > len(message):
-        raise CdrError(f"a string of the message ends at byte {end} of {len(message)}")
+        raise CdrError(f"a string of the message ends at byte {end} of {len(message)}: {_ANEW}")
     return end
 
 
@@ -314,6 +315,8 @@ class Decoder:
         return at[kept], Stream(time_ns[kept], values[kept])
 
     def _layout(self, message: bytes) -> Layout:
+        if len(message) < len(_LITTLE_ENDIAN):
+            raise CdrError(f"a {self.kind.name} does not fit in its {len(message)} bytes: {_ANEW}")
         if message[:2] != _LITTLE_ENDIAN[:2]:
             raise CdrError(
                 f"its encapsulation is {message[:2].hex(' ')}, only 00 01 (little-endian CDR) can be read: convert it"
@@ -321,9 +324,9 @@ class Decoder:
         try:
             layout = self.kind.layout(message)
         except struct.error:
-            raise CdrError(f"a {self.kind.name} does not fit in its {len(message)} bytes") from None
+            raise CdrError(f"a {self.kind.name} does not fit in its {len(message)} bytes: {_ANEW}") from None
         if not layout.size <= len(message) <= layout.size + _MAX_PADDING:
-            raise CdrError(f"a {self.kind.name} takes {layout.size} bytes, the message has {len(message)}")
+            raise CdrError(f"a {self.kind.name} takes {layout.size} bytes, the message has {len(message)}: {_ANEW}")
         return layout
 
     def _columns(self, layout: Layout) -> tuple[int, ...] | None:
@@ -338,7 +341,10 @@ class Decoder:
     def _values(self, numbers: NDArray[np.void], layout: Layout, columns: tuple[int, ...]) -> Floats:
         table = numbers.view("<f8").reshape(len(numbers), -1)
         if layout.flagged and np.any(table[:, layout.width] == -1.0):
-            raise CdrError("linear_acceleration is marked as not measured (-1 in its covariance)")
+            raise CdrError(
+                "linear_acceleration is marked as not measured (-1 in its covariance): choose another topic by "
+                "--accel-topic"
+            )
         if columns == tuple(range(self.width)):
             return table[:, : self.width]
         return table[:, columns]

@@ -12,7 +12,7 @@ from mcap.records import Channel, Metadata, Schema
 
 from kf_calib.errors import InputError
 from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, Decoder, MessageType
-from kf_calib.sources.files.field_messages import ENCODINGS, FieldDecoder
+from kf_calib.sources.files.field_messages import CDR, ENCODINGS, FieldDecoder
 from kf_calib.sources.files.fields import FieldError, Fields, known_fields
 from kf_calib.sources.files.joints import Joints
 from kf_calib.sources.files.mcap_chunks import DamagedError, parse
@@ -148,7 +148,7 @@ class Contents:
     def has_angles(self, topic: str) -> bool:
         """Whether a chosen topic gives the platform's angles, not its attitude."""
         channel = self.channels[self.ids(topic)[0]]
-        if channel.message_encoding in ENCODINGS:
+        if channel.message_encoding in ENCODINGS or POSES in self.stated:
             fields = self._fields(POSES, channel)
             return fields is not None and fields.quantity == "angles"
         return POSES.kind(self._schema(channel)) is JOINT_STATE
@@ -157,15 +157,16 @@ class Contents:
         """Raises InputError where nothing reads the messages of a chosen topic."""
         channel = self.channels[self.ids(topic)[0]]
         schema = self.schemas.get(channel.schema_id)
-        is_ros = channel.message_encoding == "cdr" and schema and schema.encoding in ("ros2msg", "ros2idl")
-        if channel.message_encoding not in ENCODINGS and (role in self.stated or not is_ros):
-            raise InputError(self._unreadable(role, channel))
+        is_ros = channel.message_encoding == CDR and schema and schema.encoding in ("ros2msg", "ros2idl")
+        if channel.message_encoding not in ENCODINGS and not is_ros:
+            raise InputError(self._unreadable(channel))
 
     def decoder(self, role: Role, topic: str, width: int, joints: Joints | None, warn: Warn) -> Decoder | FieldDecoder:
         """What reads the messages of a chosen topic. Raises InputError where nothing does."""
         self.refuse_unreadable(role, topic)
         channel = self.channels[self.ids(topic)[0]]
-        if kind := role.kind(self._schema(channel)) if channel.message_encoding not in ENCODINGS else None:
+        has_fields = channel.message_encoding in ENCODINGS or role in self.stated
+        if kind := None if has_fields else role.kind(self._schema(channel)):
             return Decoder(kind, width, joints)
         fields = self._fields(role, channel)
         assert fields  # else the topic would not have been chosen
@@ -177,12 +178,10 @@ class Contents:
         except FieldError as error:
             raise InputError(f"{said} cannot be used: {error}.") from None
 
-    def _unreadable(self, role: Role, channel: Channel) -> str:
+    def _unreadable(self, channel: Channel) -> str:
         schema = self.schemas.get(channel.schema_id)
         said = f"{self.path}: topic {channel.topic} has {channel.message_encoding!r} messages with "
         said += f"a schema {schema.name} in {schema.encoding!r}" if schema else "no schema"
-        if role in self.stated:
-            return f"{said}, and --field is for messages in 'json' and 'protobuf': leave it out."
         return f"{said}, only 'cdr' with 'ros2msg', 'json' and 'protobuf' can be read: convert the file to ROS 2 first."
 
     @property
@@ -226,7 +225,7 @@ class Parts:
         if wanted is not None:
             raise InputError(
                 f"{self.path} has no {role.quantity} topic {wanted!r}, it has {self}: give one of schema "
-                f"{role.schemas} by {role.option}, or of another in JSON or protobuf by --field."
+                f"{role.schemas} by {role.option}, or of another type by --field."
             )
         candidates = [topic for topic in candidates if topic != CALIBRATED_TOPIC] or candidates
         if len(candidates) > 1:

@@ -1,25 +1,32 @@
-"""Samples from JSON and protobuf messages, one after the other."""
+"""Samples from messages in JSON, protobuf, or CDR of any type that the file defines, one after the other."""
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 from collections.abc import Callable
+from contextlib import redirect_stderr
 from typing import Any
 
 import numpy as np
 from mcap.records import Schema
 
 from kf_calib.bench.streams import Stream
-from kf_calib.sources.files.cdr import Offsets
+from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, Offsets
 from kf_calib.sources.files.fields import LOG_TIME, FieldError, Fields, time_ns
 from kf_calib.sources.files.joints import Joints, JointsError
 from kf_calib.support.extras import MissingExtraError
 
 ENCODINGS = ("json", "protobuf")
+"""Those in which messages are told by their fields, whatever their type; in CDR only where fields are stated."""
+CDR = "cdr"
+_ANEW = "record it anew, or name another topic"
 _LOG_TIME = struct.Struct("<Q")
 _LOG_TIME_BEFORE = 16  # bytes from a record's log time to its message
 _Parse = Callable[[bytes], Any]
+_DEFINED = {name: kind.schema.encode() for kind in (IMU, JOINT_STATE, QUATERNION, TEMPERATURE) for name in kind.names}
+"""Definitions of types that bags may leave out."""
 
 
 class _UnreadError(FieldError):
@@ -29,8 +36,8 @@ class _UnreadError(FieldError):
 class FieldDecoder:
     """Samples from messages of one topic, ``width`` numbers each, taken from where ``fields`` says.
 
-    encoding: of ``ENCODINGS``. joints: finds the gimbals among numbers that have names. warn: is told once where the
-    messages have no time of their own. Raises FieldError where the schema does not say what the messages are.
+    encoding: of ``ENCODINGS``, or ``CDR``. joints: finds the gimbals among numbers that have names. warn: is told once
+    where the messages have no time of their own. Raises FieldError where the schema does not say what the messages are.
     """
 
     def __init__(
@@ -98,7 +105,9 @@ class FieldDecoder:
 
 
 def parser_of(encoding: str, schema: Schema | None) -> Callable[[bytes], Any]:
-    """What makes an object of a message in one of ``ENCODINGS``; raises FieldError, as this does."""
+    """What makes an object of a message in one of ``ENCODINGS`` or ``CDR``; raises FieldError, as this does."""
+    if encoding == CDR:
+        return _of_cdr(schema)
     return _of_protobuf(schema) if encoding == "protobuf" else _of_json
 
 
@@ -106,7 +115,7 @@ def _of_json(data: bytes) -> Any:
     try:
         return json.loads(data)
     except (ValueError, RecursionError):
-        raise _UnreadError(f"a message is not JSON, it begins with {data[:20]!r}") from None
+        raise _UnreadError(f"a message is not JSON, it begins with {data[:20]!r}: {_ANEW}") from None
 
 
 def _of_protobuf(schema: Schema | None) -> _Parse:
@@ -142,6 +151,43 @@ def _of_protobuf(schema: Schema | None) -> _Parse:
         try:
             return kind.FromString(data)
         except DecodeError:
-            raise _UnreadError(f"a message is no {name} in protobuf") from None
+            raise _UnreadError(f"a message is no {name} in protobuf: {_ANEW}") from None
+
+    return parse
+
+
+def _of_cdr(schema: Schema | None) -> _Parse:
+    """What reads messages of ROS 2 whose definition is in the file, or is one of those known here."""
+    try:
+        from mcap_ros2.decoder import DecoderFactory
+    except ImportError:
+        raise MissingExtraError(
+            "reading messages of this type needs mcap-ros2-support, which is not installed: pip install "
+            "'kf_calib[bags]'."
+        ) from None
+    name, text = (schema.name, schema.data) if schema else ("without a name", b"")
+    encoding = schema.encoding if schema else "ros2msg"
+    text = text or _DEFINED.get(name, b"")
+    if not text:
+        raise FieldError(
+            f"the file does not define its messages, {name}: convert it to MCAP, which does, by `ros2 bag convert` on "
+            "a computer that knows them"
+        )
+    try:
+        with redirect_stderr(io.StringIO()):  # it prints what it cannot read
+            decode = DecoderFactory().decoder_for(CDR, Schema(id=1, name=name, encoding=encoding, data=text))
+    except Exception:  # of many kinds, for the definition may say anything
+        raise FieldError(f"the definition of its messages, {name}, cannot be read: record it anew") from None
+    if decode is None:
+        raise FieldError(
+            f"its messages, {name}, are defined in {encoding!r} and can be read if defined in 'ros2msg': convert the "
+            "file by `ros2 bag convert`"
+        )
+
+    def parse(data: bytes) -> Any:
+        try:
+            return decode(data)
+        except Exception:  # likewise, for the bytes may be any
+            raise _UnreadError(f"a message is no {name} in CDR: {_ANEW}") from None
 
     return parse

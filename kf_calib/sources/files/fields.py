@@ -1,4 +1,4 @@
-"""Where the numbers of a quantity are in JSON or protobuf messages, by the names that lead to them.
+"""Where the numbers of a quantity are in messages of any type, by the names that lead to them.
 
 Written ``QUANTITY=TOPIC:PATH,PATH,...@TIME``: ``accel=/imu:acc.x,acc.y,acc.z@header.stamp``. A path is of names and, in
 lists, of places from 0 on, with dots between: ``acc.0``. It may lead to a list of numbers, ``acc``, or go through a
@@ -137,7 +137,7 @@ def paths_of(message: Any, before: str = "") -> Iterator[str]:
     if not _is_object(message):
         yield from [before] if before else []
         return
-    for name in message if isinstance(message, Mapping) else message.DESCRIPTOR.fields_by_name:
+    for name in _names_in(message):
         value = message[name] if isinstance(message, Mapping) else getattr(message, name)
         yield from paths_of(value, f"{before}.{name}" if before else str(name))
 
@@ -163,7 +163,10 @@ def _time_of_text(text: str, path: str) -> int:
     except ValueError:
         stamp = np.datetime64("NaT")
     if np.isnat(stamp):
-        raise FieldError(f"{path} in a message is {text[:40]!r}, not a time such as 2026-05-04T12:00:00.25Z (in UTC)")
+        raise FieldError(
+            f"{path} in a message is {text[:40]!r}, not a time such as 2026-05-04T12:00:00.25Z (in UTC): name another "
+            f"by @, or the time of receipt, @{LOG_TIME}"
+        )
     return int(stamp.astype(np.int64))
 
 
@@ -204,7 +207,7 @@ def _at(value: Any, steps: Sequence[str], path: str) -> Any:
 def _part(value: Any, step: str) -> Any:
     if _is_list(value):
         return value[int(step)]
-    if step not in value.DESCRIPTOR.fields_by_name:  # a protobuf message
+    if step not in _names_in(value):
         raise KeyError(step)
     return getattr(value, step)
 
@@ -222,12 +225,21 @@ def _is_list(value: Any) -> bool:
 
 
 def _is_object(value: Any) -> bool:
-    return isinstance(value, Mapping) or hasattr(value, "DESCRIPTOR")
+    return isinstance(value, Mapping) or hasattr(value, "DESCRIPTOR") or hasattr(value, "_full_text")
+
+
+def _names_in(value: Any) -> list[str]:
+    """The names of what an object has: of JSON, of protobuf, or of ROS; none of anything else."""
+    if isinstance(value, Mapping):
+        return [str(name) for name in value]
+    if hasattr(value, "DESCRIPTOR"):
+        return list(value.DESCRIPTOR.fields_by_name)
+    return list(value.__slots__) if _is_object(value) else []
 
 
 def _names(value: Any) -> str:
     """What an object has, or what it is."""
     if not _is_object(value):
         return f"a list of {len(value)} there" if _is_list(value) else f"{value!r:.40} there"
-    names = [str(name) for name in (value if isinstance(value, Mapping) else value.DESCRIPTOR.fields_by_name)]
+    names = _names_in(value)
     return ", ".join(names[:_SHOWN]) + " ..." * (len(names) > _SHOWN) or "nothing"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from kf_calib.errors import InputError
 from kf_calib.sources.files.bags import files_of
 from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, fields_by_role
-from kf_calib.sources.files.field_messages import ENCODINGS, parser_of
+from kf_calib.sources.files.field_messages import CDR, ENCODINGS, parser_of
 from kf_calib.sources.files.fields import FieldError, paths_of
 from kf_calib.sources.files.foreign import HEAD_BYTES, is_lines
 from kf_calib.sources.files.lines import Lines
@@ -39,7 +39,8 @@ class Topic:
 
     first_ns, last_ns: the earliest and the latest. gaps: intervals of more than five times the usual one;
     longest_gap_s, longest_gap_at_s: the longest, and when it began, from the first on. backward: times before the one
-    that precedes them. paths: what a message holds, of JSON and protobuf.
+    that precedes them. paths: what a message holds, of JSON, protobuf, and types in CDR that are not known.
+    is_looked_into: whether any message was looked into for that.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Topic:
     longest_gap_at_s: float = 0.0
     backward: int = 0
     paths: tuple[str, ...] = ()
+    is_looked_into: bool = False
     _waiting: list[Times] = field(default_factory=list[Times])  # until it is known what is usual
     _latest_ns: int | None = None  # of those that were looked at
     _usual_ns: float = 0.0
@@ -177,6 +179,8 @@ def _count(file: RecordFile, contents: Contents, topics: dict[str, Topic], warn:
         contents.channels = {channel.id: channel for channel in file.summary.channels}
     for channel in contents.channels.values():
         _topic(channel, contents, topics)
+        if isinstance(file, SqliteBag):
+            _look_into(file.first(channel.id), channel.id, contents, topics)
     stray = 0
     for number, times in _receipts(file, contents, topics, warn):
         channel = contents.channels.get(number)
@@ -223,13 +227,21 @@ def _from_blocks(
             _look_into(first, number, contents, topics)
 
 
+def _is_told_by_fields(channel: Channel, contents: Contents) -> bool:
+    """Whether what a message holds has to be looked up: it is of no type in CDR that is known."""
+    schema = contents.schemas.get(channel.schema_id)
+    is_foreign = channel.message_encoding == CDR and bool(schema) and schema.name not in USABLE_SCHEMAS
+    return channel.message_encoding in ENCODINGS or is_foreign
+
+
 def _look_into(message: bytes, number: int, contents: Contents, topics: dict[str, Topic]) -> None:
     """Takes note of what a message holds, of the first one."""
     channel = contents.channels.get(number)
-    if channel is None or channel.message_encoding not in ENCODINGS:
+    if channel is None or not _is_told_by_fields(channel, contents):
         return
     topic = _topic(channel, contents, topics)
-    if not topic.paths:
+    if not topic.is_looked_into:
+        topic.is_looked_into = True
         try:
             parse = parser_of(channel.message_encoding, contents.schemas.get(channel.schema_id))
             topic.paths = tuple(paths_of(parse(message)))

@@ -37,7 +37,10 @@ class RecordFile(Protocol):
 
 
 def open_record_file(path: Path, max_chunk: int, usable: frozenset[str]) -> RecordFile:
-    """The MCAP or .db3 file at ``path``. usable: types of messages wanted. Raises InputError where it is neither."""
+    """The MCAP or .db3 file at ``path``. usable: types of messages wanted, and topics.
+
+    Raises InputError where it is neither.
+    """
     place = path
     if _head(path).startswith(_ZSTD):
         place = _unpacked(path)
@@ -78,7 +81,9 @@ def _unpacked(path: Path) -> Path:
     descriptor, name = tempfile.mkstemp(prefix="kf_calib_", suffix=Path(path.stem).suffix)
     try:
         with os.fdopen(descriptor, "wb") as target, path.open("rb") as packed:
-            zstandard.ZstdDecompressor().copy_stream(packed, target)
+            _, written = zstandard.ZstdDecompressor().copy_stream(packed, target)
+            if not written:
+                raise zstandard.ZstdError("it ends before anything of it can be unpacked")
     except BaseException as error:
         Path(name).unlink()
         if isinstance(error, zstandard.ZstdError):

@@ -62,7 +62,7 @@ class Recording:
     accel_scale: factor on the readings, one for all or one a sensor (9.80665 for a file in g). angle_scale: factor on
     the gimbal angles (0.017453 for a file in degrees).
     accel_topic, pose_topic, temperature_topic: which to use where the file has several of the kind.
-    fields: where the numbers are in JSON or protobuf messages, for example ``"accel=/imu:acc.x,acc.y,acc.z"``
+    fields: where the numbers are in messages of another type, for example ``"accel=/imu:acc.x,acc.y,acc.z"``
     (docs/bags.md).
     max_chunk_mb: chunks that unpack to more are passed over, and told.
     angles: False to do without angles and attitudes; the file may then have none, and the batches have none.
@@ -90,17 +90,21 @@ class Recording:
         wanted = {READINGS: accel_topic, POSES: pose_topic, TEMPERATURES: temperature_topic}
         self._wanted = wanted | {role: stated.topic for role, stated in self._stated.items()}
         self._limit = int(max_chunk_mb * (1 << 20))
-        files = [open_record_file(file, self._limit, USABLE_SCHEMAS) for file in files_of(self.path)]
+        usable = USABLE_SCHEMAS | {stated.topic for stated in self._stated.values()}
+        files = [open_record_file(file, self._limit, usable) for file in files_of(self.path)]
         self._parts = Parts(self.path, files)
         self.warnings = [file.trouble for file in self._parts.files if file.trouble]
         self._parts.contents = [self._survey(file) for file in self._parts.files]
         self._accel = self._require(
-            READINGS, "convert the readings to sensor_msgs/msg/Imu, or name them in JSON or protobuf by --field"
+            READINGS, "convert the readings to sensor_msgs/msg/Imu, or say where they are by --field"
         )
         self._pose = None
         if angles:
-            advice = "record the angles too, as sensor_msgs/msg/JointState by the same clock"
-            self._pose = self._require(POSES, f"{advice}, or do without them (--no-angles)")
+            advice = (
+                "record the angles too, as sensor_msgs/msg/JointState by the same clock, say where they are by "
+                "--field, or do without them (--no-angles)"
+            )
+            self._pose = self._require(POSES, advice)
         self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])  # optional, but not to be guessed
         self.bench = self._describe_bench(overrides)
         self._opening_warnings = len(self.warnings)
@@ -202,7 +206,10 @@ class Recording:
     def _require(self, role: Role, advice: str) -> str:
         topic = self._parts.choose(role, self._wanted[role])
         if topic is None:
-            state = " and is not whole" if any(file.trouble for file in self._parts.files) else ""
+            is_whole = not any(file.trouble for file in self._parts.files)
+            state = "" if is_whole else " and is not whole"
+            if not is_whole and not any(contents.channels for contents in self._parts.contents):
+                advice = "nothing of it can be used, so copy it anew from where it was recorded"
             raise InputError(
                 f"{self.path} has no {role.quantity} topic ({role.schemas}), it has {self._parts}{state}: {advice}."
             )

@@ -30,8 +30,8 @@ _Row = tuple[int, int, int, bytes | None]  # id, topic, time of receipt, message
 class SqliteBag:
     """A .db3 file on disk; ``summary`` has its topics.
 
-    place: where the file lies, if not at ``path``, which messages name. usable: types of messages to be read; all
-    others (pictures, say) stay in the file.
+    place: where the file lies, if not at ``path``, which messages name. usable: types of messages to be read, and
+    names of topics; all others (pictures, say) stay in the file.
     """
 
     trouble = ""
@@ -43,6 +43,7 @@ class SqliteBag:
         try:
             with closing(self._connect()) as base:
                 topics = base.execute("SELECT id, name, type, serialization_format FROM topics ORDER BY id").fetchall()
+                definitions = _definitions(base)
                 self._last = base.execute("SELECT max(id) FROM messages").fetchone()[0] or 0
         except sqlite3.Error as error:
             raise InputError(
@@ -52,7 +53,8 @@ class SqliteBag:
         self._topics = {topic: k + 1 for k, (topic, *_) in enumerate(topics)}
         self.summary = Summary(0)
         for k, (_, name, kind, encoding) in enumerate(topics, 1):
-            self.summary.schemas.append(Schema(k, b"", "ros2msg", str(kind)))
+            language, text = definitions.get(kind, ("ros2msg", ""))
+            self.summary.schemas.append(Schema(k, str(text).encode(), str(language), str(kind)))
             self.summary.channels.append(Channel(k, str(name), str(encoding), {}, k))
 
     def blocks(self, warn: Warn, growing: bool = False) -> Iterator[RecordBlock]:
@@ -80,6 +82,17 @@ class SqliteBag:
         except sqlite3.Error as error:
             warn(f"{self.path} is damaged ({error}): what lies behind that is not counted.")
 
+    def first(self, channel: int) -> bytes:
+        """The first message of a channel; nothing where there is none, or none that can be read."""
+        topic = next(topic for topic, k in self._topics.items() if k == channel)
+        query = "SELECT CAST(data AS BLOB) FROM messages WHERE topic_id = ? ORDER BY id LIMIT 1"
+        try:
+            with closing(self._connect()) as base:
+                found = base.execute(query, (topic,)).fetchone()
+        except sqlite3.Error:  # told where the messages are read
+            found = None
+        return (found[0] if found else None) or b""
+
     def record_at(self, position: int, opcode: int) -> bytes:
         raise DamagedError(f"an SQLite file has no record of kind {opcode} at byte {position}")
 
@@ -94,7 +107,8 @@ class SqliteBag:
 
     def _pages(self, base: sqlite3.Connection, damaged: list[str]) -> Iterator[tuple[list[_Row], int]]:
         """Rows of usable topics, and the id up to which the table has been read; what fails is put in ``damaged``."""
-        wanted = [topic for topic, k in self._topics.items() if self.summary.schemas[k - 1].name in self._usable]
+        own = zip(self._topics, self.summary.schemas, self.summary.channels, strict=True)
+        wanted = [topic for topic, schema, channel in own if {schema.name, channel.topic} & self._usable]
         query = (
             "SELECT id, topic_id, CAST(timestamp AS INTEGER), CAST(data AS BLOB) FROM messages "
             f"WHERE id > ? AND topic_id IN ({','.join('?' * len(wanted))}) ORDER BY id LIMIT {_ROWS}"
@@ -121,3 +135,12 @@ class SqliteBag:
         starts = np.cumsum([0, *map(len, records)])[:-1].astype(np.int64)
         data = b"".join(records)
         return RecordBlock(data, (len(data),), starts, self.size * after // max(self._last, 1))
+
+
+def _definitions(base: sqlite3.Connection) -> dict[str, tuple[str, str]]:
+    """Language and text of the definition of each type, as newer bags have them."""
+    try:
+        rows = base.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")
+        return {kind: (language, text) for kind, language, text in rows.fetchall()}
+    except sqlite3.Error:
+        return {}

@@ -7,16 +7,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.errors import InputError
-from kf_calib.sources.tables.grid import Grid
+from kf_calib.sources.tables.grid import Cell, Grid
 from kf_calib.sources.tables.numbers import Numbers, stamps_of
 from kf_calib.sources.tables.words import Meaning, face_of, meaning_of
 from kf_calib.support.plain_text import cut
 
 READINGS, SPREADS, QUATERNION = ("ax", "ay", "az"), ("sx", "sy", "sz"), ("qx", "qy", "qz", "qw")
+_OPTIONAL = ("time", "count", "temperature", "sd", *SPREADS)
 _SEVERAL = ("angle", "time", "")
 _ALIKE = 1.3  # of the norms of readings at rest, largest to smallest
+_MOST = 0.6  # of the cells of a column of readings: a bad one is told later
 HOW = "--column THEIRS=OURS says what a column is"
 KNOWN = "ax_g (ay_mps2, az_mg), sx_g or sd_g, outer_deg (middle_rad, inner_deg), qx, face, time_s, count, temperature_c"
 
@@ -37,6 +39,7 @@ class Columns:
     def of(cls, grid: Grid, stated: Mapping[str, str], numbers: Numbers) -> Columns:
         """The columns of a grid; ``stated`` are those that the user names, theirs to ours. Raises InputError."""
         columns = cls(grid, numbers, _meanings(grid, stated))
+        columns._leave_out_empty(set(stated))
         columns._recognise_contents({k for k, name in enumerate(grid.header) if name in stated})
         columns._refuse_doubles()
         return columns
@@ -63,16 +66,41 @@ class Columns:
         """Indices of the columns that mean nothing here."""
         return [k for k, own in enumerate(self.meanings) if not own.ours and self.grid.header[k]]
 
-    def values(self, place: int, wanted: str = "a number") -> Floats:
-        """The numbers (n,) of a column; raises InputError for the first cell that holds none."""
-        out = np.empty(len(self.grid.rows))
+    def to_leave_out(self, place: int) -> str:
+        """What to do where a column is of no use."""
+        return f"leave the column out by --column {self.grid.header[place] + '=-'!r}"
+
+    def values(self, place: int, wanted: str = "a number", optional: bool = False, only: Mask | None = None) -> Floats:
+        """The numbers (n,) of a column; raises InputError for the first cell that holds none.
+
+        optional: whether the table would do without the column. only (n,): rows whose cells count, NaN for others.
+        """
+        out = np.full(len(self.grid.rows), np.nan)
         for row, cell in enumerate(self.grid.column(place)):
+            if only is not None and not only[row]:
+                continue
             try:
                 out[row] = self.numbers.value(cell)
             except (ValueError, OverflowError):
-                wanted_now = f"write {wanted} such as {self.numbers.example}"
+                else_ = self.to_leave_out(place) if optional else "remove the row" if cell is None else ""
+                wanted_now = f"write {wanted} such as {self.numbers.example}{f', or {else_}' if else_ else ''}"
                 raise self.grid.refuse(row, self.grid.header[place], cell, wanted_now) from None
         return out
+
+    def is_number(self, cell: Cell) -> bool:
+        """Whether a cell holds a number."""
+        try:
+            self.numbers.value(cell)
+        except (ValueError, OverflowError):
+            return False
+        return True
+
+    def _leave_out_empty(self, stated: set[str]) -> None:
+        """Take columns that a template has and nobody filled as if they were not there."""
+        for k, name in enumerate(self.grid.header):
+            is_optional = self.meanings[k].ours in _OPTIONAL and name not in stated
+            if is_optional and all(cell is None for cell in self.grid.column(k)):
+                self.meanings[k] = Meaning("", "")
 
     def _recognise_contents(self, stated: set[int]) -> None:
         """Find faces, stamps and readings by what stands in columns whose names say nothing."""
@@ -88,10 +116,10 @@ class Columns:
         if self.places(*READINGS):
             return
         left = [k for k in range(len(self.meanings)) if not self.meanings[k].ours and k not in stated]
-        numeric = [k for k in left if self._are_numbers(k)]
-        if len(numeric) == 3:
-            norms = np.linalg.norm([self.values(k) for k in numeric], axis=0)
-            if norms.min() > 0 and norms.max() < _ALIKE * norms.min():
+        if len(numeric := [k for k in left if self._are_numbers(k, _MOST)]) == 3:
+            whole = np.array([all(self.is_number(row[k]) for k in numeric) for row in self.grid.rows])
+            norms = np.linalg.norm([self.values(k, only=whole)[whole] for k in numeric], axis=0)
+            if norms.size and 0 < norms.max() < _ALIKE * norms.min():
                 for k, ours in zip(numeric, READINGS, strict=True):
                     self._guess(k, ours)
 
@@ -108,12 +136,10 @@ class Columns:
         except InputError:
             return False
 
-    def _are_numbers(self, place: int) -> bool:
-        try:
-            self.values(place)
-        except InputError:
-            return False
-        return True
+    def _are_numbers(self, place: int, share: float = 1.0) -> bool:
+        """Whether at least this share of the cells of a column are numbers."""
+        cells = self.grid.column(place)
+        return sum(map(self.is_number, cells)) >= share * len(cells)
 
     def _refuse_doubles(self) -> None:
         kinds = [own.ours for own in self.meanings]

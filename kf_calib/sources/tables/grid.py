@@ -22,7 +22,7 @@ ZIP, MCAP = b"PK\x03\x04", b"\x89MCAP"
 TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
 EXCEL_SUFFIXES = (".xlsx", ".xlsm")
 OLD_SUFFIXES = (".xls", ".ods")
-_LARGEST = 50_000_000
+_LARGEST = (5_000_000, 50_000_000)  # bytes, of text and of a spreadsheet, which may hold pictures
 _DELIMITERS = ";\t,|"
 
 
@@ -61,9 +61,13 @@ def grid_of(table: Any) -> Grid:
             raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
         if path.suffix.lower() in OLD_SUFFIXES:
             raise InputError(f"{path}: files of the kind {path.suffix} are not read: save it as .xlsx or .csv.")
-        if path.stat().st_size > _LARGEST:
-            raise InputError(f"{path}: is larger than a table of orientations can be: kf-calib record reads samples.")
-        return _of_excel(path) if start.startswith(ZIP) else _of_text(path)
+        is_excel = start.startswith(ZIP)
+        if path.stat().st_size > _LARGEST[is_excel]:
+            raise InputError(
+                f"{path}: is larger than a table of orientations can be: if it holds samples, make a recording of "
+                f"them, kf-calib record run.mcap {path.with_suffix('.csv')} (docs/own_csv.md)."
+            )
+        return _of_excel(path) if is_excel else _of_text(path)
     return _of_columns(table)
 
 

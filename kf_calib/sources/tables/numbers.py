@@ -84,14 +84,18 @@ def _decimal_of(cell: str) -> str:
     return "" if may_be_thousands else sign
 
 
-def stamps_of(grid: Grid, name: str, cells: list[Cell]) -> list[datetime]:
-    """The stamps in a column: ISO 8601, or local with day or month first, whichever all of them allow."""
+def stamps_of(grid: Grid, name: str, cells: list[Cell], or_else: str = "") -> list[datetime]:
+    """The stamps in a column: ISO 8601, or local with day or month first, whichever all of them allow.
+
+    Raises InputError for a cell that is none; or_else: what else to do then.
+    """
     texts = [cell for cell in cells if isinstance(cell, str)]
     parts = [found.groups() for text in texts if (found := _LOCAL.fullmatch(text))]
     month_first = any(int(part[1]) > 12 for part in parts) or (
         any(part[7] for part in parts) and not any(int(part[0]) > 12 for part in parts if len(part[0]) <= 2)
     )
     wanted = "write a stamp such as 2026-05-04T13:45:00+02:00 or 04.05.2026 13:45:00, or seconds"
+    wanted += f", or {or_else}" if or_else else ""
     out = list[datetime]()
     for row, cell in enumerate(cells):
         try:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from datetime import UTC, datetime
+from dataclasses import dataclass
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -16,16 +17,32 @@ from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.tables.columns import HOW, KNOWN, QUATERNION, READINGS, SPREADS, Columns
 from kf_calib.sources.tables.grid import EXCEL_SUFFIXES, MCAP, OLD_SUFFIXES, TEXT_SUFFIXES, ZIP, grid_of
-from kf_calib.sources.tables.numbers import Numbers, stamps_of
+from kf_calib.sources.tables.numbers import Numbers
 from kf_calib.sources.tables.orientation import Orientation
 from kf_calib.sources.tables.table import Table
-from kf_calib.sources.tables.words import ACCEL, ANGLE, TIME, face_of
+from kf_calib.sources.tables.times import Times
+from kf_calib.sources.tables.words import ACCEL, ANGLE, face_of
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
-_USUAL_PAUSE_S = 60.0
 _UNIT_BY_SIZE = (("g", 0.5, 2.0), ("m/s2", 5.0, 20.0), ("mg", 500.0, 2000.0))
 _SAMPLES, _FAST_S = 50, 1.0
+_NOTHING = ("-", "–", "—", "n/a", "na", "nan", "#n/a", "null", "none", "?")
+"""What people write where there is no temperature."""
+_SHOWN = 6  # rows in a message
 _UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units where the header names none; None: guessed from the numbers.
+
+    accel_scale: size of one count, in ``accel`` (m/s^2 if that is None). g: m/s^2 that 1 g stands for, or ``local``.
+    """
+
+    accel: str | None = None
+    accel_scale: float = 1.0
+    angle: str | None = None
+    g: str | float = STANDARD_GRAVITY_MPS2
 
 
 def is_table(path: str | PathLike[str]) -> bool:
@@ -36,7 +53,13 @@ def is_table(path: str | PathLike[str]) -> bool:
     with own.open("rb") as file:
         start = file.read(8)
     suffixes = (*TEXT_SUFFIXES, *EXCEL_SUFFIXES, *OLD_SUFFIXES)
-    return start.startswith(ZIP) or (own.suffix.lower() in suffixes and not start.startswith(MCAP))
+    is_other = start.startswith(MCAP) or start.lstrip(b"\xef\xbb\xbf \r\n").startswith((b"{", b"["))  # JSON lines
+    return start.startswith(ZIP) or (own.suffix.lower() in suffixes and not is_other)
+
+
+def is_text(path: str | PathLike[str]) -> bool:
+    """Whether a table is no spreadsheet, by its name."""
+    return Path(path).suffix.lower() not in (*EXCEL_SUFFIXES, *OLD_SUFFIXES)
 
 
 def open_table(
@@ -63,31 +86,25 @@ def open_table(
     grid = grid_of(table)
     numbers = Numbers.of(grid)
     found = Columns.of(grid, columns, numbers)
-    return _Opening(found, overrides, accel_unit, accel_scale, angle_unit, g_unit).table()
+    return Opening(found, overrides, Units(accel_unit, accel_scale, angle_unit, g_unit)).table()
 
 
-class _Opening:
-    """One opening of a table; ``said`` collects what was taken for what."""
+class Opening:
+    """One opening of a table; ``said`` collects what was taken for what, ``by_size`` units of columns that the size of
+    their numbers told; has_unit: whether it is known what the readings are in."""
 
-    def __init__(
-        self,
-        columns: Columns,
-        overrides: Mapping[str, str],
-        accel_unit: str | None,
-        accel_scale: float,
-        angle_unit: str | None,
-        g_unit: str | float,
-    ) -> None:
+    def __init__(self, columns: Columns, overrides: Mapping[str, str], units: Units) -> None:
         self.columns, self.grid, self.said = columns, columns.grid, list[str]()
-        self.accel_unit, self.accel_scale, self.angle_unit = accel_unit, accel_scale, angle_unit
-        self.overrides, self.g_unit = overrides, g_unit
+        self.overrides, self.units, self.by_size = overrides, units, dict[int, str]()
+        self.has_unit = True
         self.warnings = [f"{self.grid.name}: {remark}." for remark in self.grid.remarks]
 
     def table(self) -> Table:
         """The table; what is read first is what is most often missing."""
-        elapsed_s, start_ns = self._times()
-        self._refuse_samples(elapsed_s)
+        elapsed_s = self.times.elapsed_s
+        self._refuse_samples()
         self._refuse_missing()
+        self._say_times()
         pose = self._poses()
         bench = self._bench()
         means = self._readings(bench)
@@ -101,66 +118,45 @@ class _Opening:
             self.said.append(f"not used: {self.columns.named(unused)}")
         by = f" ({self._quoted(self.columns.guessed)} by what stands there)" if self.columns.guessed else ""
         told = f"{self.grid.name}: {'; '.join(self.said)}{by}. {HOW}."
-        return Table(self.grid.name, bench, rows, [*self.warnings, told], start_ns)
+        return Table(self.grid.name, bench, rows, [*self.warnings, told], self.times.start_ns)
 
     def _quoted(self, names: list[str]) -> str:
         return ", ".join(map(repr, names))
 
-    def _times(self) -> tuple[Floats, int | None]:
-        """Return the times of the rows since the first, s, and the stamp of the first where it has a date."""
-        places, count = self.columns.places("time"), len(self.grid.rows)
-        if not places:
-            self.warnings.append(
-                f"{self.grid.name}: no column gives the time: the rows are taken to follow each other by a minute, so "
-                "sizes of drifts are by row rather than by time."
-            )
-            return _USUAL_PAUSE_S * np.arange(count, dtype=np.float64), None
-        unit = self.columns.meanings[places[0]].unit
-        if len(places) == 1 and (unit in TIME or all(isinstance(cell, float) for cell in self.grid.column(places[0]))):
-            elapsed_s, start_ns = TIME[unit or "s"] * self.columns.values(places[0], "a time"), None
-        else:
-            elapsed_s, start_ns = self._stamps(places)
-        self.said.append(f"time from {self.columns.named(places)}")
-        self._refuse_disorder(elapsed_s, places[0])
-        return elapsed_s - elapsed_s[0], start_ns
+    @cached_property
+    def times(self) -> Times:
+        """When the rows were measured."""
+        return Times.of(self.columns)
 
-    def _stamps(self, places: list[int]) -> tuple[Floats, int | None]:
-        """Return times from stamps, of which date and time may stand in two columns, or from numbers of seconds."""
-        if len(places) == 1 and all(_is_number(self.columns, cell) for cell in self.grid.column(places[0])):
-            return self.columns.values(places[0], "a time"), None
-        cells = self.grid.column(places[0])
-        if len(places) > 1:
-            parts = zip(*(self.grid.column(place) for place in places), strict=True)
-            cells = [" ".join(_date_or_time(cell) for cell in own if cell is not None) for own in parts]
-        stamps = stamps_of(self.grid, self.grid.header[places[0]], list(cells))
-        zero = stamps[0]
-        elapsed_s = np.array([(stamp - zero).total_seconds() for stamp in stamps])
-        start = zero.astimezone(UTC) if zero.tzinfo else None
-        start_ns = None if start is None else round((start - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds()) * 10**9
-        return elapsed_s, start_ns
+    @property
+    def are_samples(self) -> bool:
+        """Whether the rows are a time series, which has to be recorded first."""
+        if self.columns.has("count") or self.columns.has("face") or self.columns.places("sd", *SPREADS):
+            return False
+        return len(self.grid.rows) > _SAMPLES and self._step_s < _FAST_S
 
-    def _refuse_disorder(self, elapsed_s: Floats, place: int) -> None:
-        back = np.flatnonzero(np.diff(elapsed_s) <= 0)
-        if back.size:
-            row = int(back[0]) + 1
-            cell = self.grid.rows[row][place]
-            name = self.grid.header[place]
-            raise self.grid.refuse(
-                row, name, cell, f"the row before is not earlier: sort the rows by time, or leave the time out by "
-                f"--column {name + '=-'!r}"
-            )  # fmt: skip
+    @property
+    def _step_s(self) -> float:
+        return float(np.median(np.diff(self.times.elapsed_s)))
 
-    def _refuse_samples(self, elapsed_s: Floats) -> None:
-        """Raise InputError for a time series, which has to be recorded first."""
-        known = self.columns.has("count") or self.columns.has("face") or self.columns.places("sd", *SPREADS)
-        if known or len(elapsed_s) <= _SAMPLES:
-            return
-        if (step_s := float(np.median(np.diff(elapsed_s)))) < _FAST_S:
+    def _refuse_samples(self) -> None:
+        if self.are_samples:
+            save = "" if is_text(self.grid.name) else "save them as CSV, and "
+            name = str(Path(self.grid.name).with_suffix(".csv"))
             raise InputError(
-                f"{self.grid.name}: its {len(elapsed_s)} rows are samples, {step_s:.3g} s apart, and no table with "
-                "a row a dwell: make a recording of them, kf-calib record run.mcap "
-                f"{self.grid.name} (docs/own_csv.md), and evaluate that."
+                f"{self.grid.name}: its {len(self.grid.rows)} rows are samples, {self._step_s:.3g} s apart, and no "
+                f"table with a row a dwell: {save}make a recording of them, kf-calib record run.mcap {name} "
+                "(docs/own_csv.md), and evaluate that."
             )
+
+    def _say_times(self) -> None:
+        if self.times.said:
+            self.said.append(self.times.said)
+            return
+        self.warnings.append(
+            f"{self.grid.name}: no column gives the time: the rows are taken to follow each other by a minute, so "
+            "sizes of drifts are by row rather than by time."
+        )
 
     def _refuse_missing(self) -> None:
         columns, header = self.columns, ", ".join(map(repr, self.grid.header))
@@ -181,6 +177,8 @@ class _Opening:
     def _poses(self) -> Floats:
         """Return angles in rad (n, k), or quaternions (n, 4) of attitudes or faces."""
         columns = self.columns
+        if self.units.angle and not columns.angles:
+            raise InputError(f"{self.grid.name}: has no gimbal angles, so leave out --angle-unit.")
         if columns.has("face"):
             return self._faces()
         if columns.has(*QUATERNION):
@@ -220,9 +218,11 @@ class _Opening:
                 "in one unit."
             )
         guess = "deg" if np.abs(values).max() > 2.0 * np.pi or np.array_equal(values, np.rint(values)) else "rad"
-        unit = next(iter(units), None) or self.angle_unit or guess
-        how = "" if units or self.angle_unit else " by their size (--angle-unit)"
+        self._refuse_other_unit(places, [columns.meanings[place].unit for place in places], self.units.angle, "angle")
+        unit = next(iter(units), None) or self.units.angle or guess
+        how = "" if units or self.units.angle else " by their size (--angle-unit)"
         self.said.append(f"gimbal angles, outer to inner, from {columns.named(places)} in {unit}{how}")
+        self.by_size |= {place: unit for place in places} if how else {}
         return ANGLE[unit] * values
 
     def _bench(self) -> Bench:
@@ -249,37 +249,43 @@ class _Opening:
     def _accel_factors(self, places: list[int], values: Floats, bench: Bench) -> tuple[Floats, str]:
         """Return the factors (3,) from columns of readings to m/s^2, and the unit in words."""
         named = [self.columns.meanings[place].unit for place in places]
-        stated = self.accel_unit
-        for place, unit in zip(places, named, strict=True):
-            if stated and unit not in ("", "count", stated):
-                raise InputError(
-                    f"{self.grid.name}: column {self.grid.header[place]!r} is in {unit} by its name, and --accel-unit "
-                    f"is {stated}: leave out --accel-unit, or rename the column by --column."
-                )
-        size = float(np.median(np.linalg.norm(values, axis=1))) * self.accel_scale
-        by_size = next((unit for unit, low, high in _UNIT_BY_SIZE if low < size < high), "m/s2")
+        stated = self.units.accel
+        self._refuse_other_unit(places, named, stated, "accel")
+        size = float(np.median(np.linalg.norm(values, axis=1))) * self.units.accel_scale
+        by_size = next((unit for unit, low, high in _UNIT_BY_SIZE if low < size < high), "count")
+        self.has_unit = bool(stated) or self.units.accel_scale != 1.0 or "count" not in (by_size, *named)
         units = [unit if unit not in ("", "count") else stated or ("m/s2" if unit else by_size) for unit in named]
         factors = np.array([ACCEL[unit] * (self._g(bench) / STANDARD_GRAVITY_MPS2 if unit.endswith("g") else 1.0)
                             for unit in units])  # fmt: skip
         guessed = any(unit == "" for unit in named) and not stated
-        words = " and ".join(dict.fromkeys(unit.replace("m/s2", "m/s^2") for unit in units))
-        if self.accel_scale != 1.0 or "count" in named:
-            words = f"counts of {self.accel_scale:g} {words}"
+        self.by_size |= {place: units[k] for k, place in enumerate(places) if not named[k] and not stated}
+        words = " and ".join(dict.fromkeys({"m/s2": "m/s^2", "count": "counts"}.get(unit, unit) for unit in units))
+        if self.units.accel_scale != 1.0 or "count" in named:
+            words = f"counts of {self.units.accel_scale:g} {words}"
         words += " by their size (--accel-unit)" * guessed
         if any(unit.endswith("g") for unit in units):
             words += f", 1 g = {self._g(bench):.7g} m/s^2 (--g-unit)"
-        return factors * self.accel_scale, words
+        return factors * self.units.accel_scale, words
+
+    def _refuse_other_unit(self, places: list[int], named: list[str], stated: str | None, what: str) -> None:
+        """Raise InputError if an option states another unit than the name of a column."""
+        for place, unit in zip(places, named, strict=True):
+            if stated and unit not in ("", "count", stated):
+                raise InputError(
+                    f"{self.grid.name}: column {self.grid.header[place]!r} is in {unit} by its name, and --{what}-unit "
+                    f"is {stated}: leave out --{what}-unit, or rename the column by --column."
+                )
 
     def _g(self, bench: Bench) -> float:
         """Return what 1 g stands for, m/s^2."""
-        if self.g_unit == "local":
+        if self.units.g == "local":
             return bench.gravity_mps2
         try:
-            size = float(self.g_unit)
+            size = float(self.units.g)
         except ValueError:
             size = 0.0
         if not 9.0 < size < 10.0:
-            raise InputError(f"--g-unit is {self.g_unit!r}: give m/s^2 from 9 to 10, such as 9.80665, or local.")
+            raise InputError(f"--g-unit is {self.units.g!r}: give m/s^2 from 9 to 10, such as 9.80665, or local.")
         return size
 
     def _spreads(self, bench: Bench) -> tuple[Floats | None, list[int]]:
@@ -298,7 +304,7 @@ class _Opening:
             return None, [1] * rows
         self.said.append(f"standard deviations from {columns.named(list(dict.fromkeys(places)))}, "
                          f"of as many readings as {columns.named(columns.places('count'))} says")  # fmt: skip
-        values = np.column_stack([columns.values(place, "a standard deviation") for place in places])
+        values = np.column_stack([columns.values(place, "a standard deviation", optional=True) for place in places])
         for row, k in np.argwhere(values < 0.0):
             place = places[int(k)]
             raise self.grid.refuse(int(row), self.grid.header[place], self.grid.rows[row][place],
@@ -314,20 +320,33 @@ class _Opening:
 
     def _counts(self) -> list[int]:
         (place,) = self.columns.places("count")
-        values = self.columns.values(place, "a number of readings")
+        values = self.columns.values(place, "a number of readings", optional=True)
         for row in np.flatnonzero((values < 2) | (values != np.rint(values)) | (values > 1e9)):
             raise self.grid.refuse(int(row), self.grid.header[place], self.grid.rows[row][place],
                                    "write how many readings were averaged, a whole number of at least 2")  # fmt: skip
         return [int(value) for value in values]
 
     def _temperatures(self) -> Floats:
-        places = self.columns.places("temperature")
+        """Return the temperatures of the rows; between those where it was measured, as that of a recording is."""
+        places, rows = self.columns.places("temperature"), len(self.grid.rows)
         if not places:
-            return np.full(len(self.grid.rows), np.nan)
+            return np.full(rows, np.nan)
+        cells = self.grid.column(places[0])
+        known = np.array([cell is not None and str(cell).lower() not in _NOTHING for cell in cells])
+        if not known.any():
+            return np.full(rows, np.nan)
         unit = self.columns.meanings[places[0]].unit
-        values = self.columns.values(places[0], "a temperature")
         self.said.append(f"temperature from {self.columns.named(places)} in {(unit or 'c').upper()}")
-        return {"k": values - 273.15, "f": (values - 32.0) / 1.8}.get(unit, values)
+        values = self.columns.values(places[0], "a temperature", optional=True, only=known)
+        values = {"k": values - 273.15, "f": (values - 32.0) / 1.8}.get(unit, values)
+        if not known.all():
+            empty = ", ".join(str(self.grid.numbers[row]) for row in np.flatnonzero(~known)[:_SHOWN])
+            more = " ..." * (rows - int(known.sum()) > _SHOWN)
+            self.warnings.append(
+                f"{self.grid.name}: has no temperature in rows {empty}{more}: it is interpolated in time there."
+            )
+        elapsed_s = self.times.elapsed_s
+        return np.interp(elapsed_s, elapsed_s[known], values[known])
 
 
 def _attitude(axis: int, sign: int, up: str) -> Floats:
@@ -341,19 +360,6 @@ def _attitude(axis: int, sign: int, up: str) -> Floats:
     if not turned.any():
         turned = np.append(np.roll(np.abs(own), 1), 0.0)  # half a turn about any axis across
     return turned / np.linalg.norm(turned)
-
-
-def _is_number(columns: Columns, cell: object) -> bool:
-    try:
-        columns.numbers.value(cell)  # type: ignore[arg-type]  # a cell of the grid
-    except ValueError:
-        return False
-    return True
-
-
-def _date_or_time(cell: object) -> str:
-    """Return the cell of one of two columns for date and time, which a spreadsheet gives as a stamp at midnight."""
-    return cell.strftime("%Y-%m-%d") if isinstance(cell, datetime) else str(cell)
 
 
 def _left_over(columns: Columns) -> str:

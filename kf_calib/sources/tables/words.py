@@ -113,9 +113,14 @@ def _unit_of(name: str) -> tuple[str, str]:
         return found[1], _OF_WORD[found[2]]
     for pattern in (r"(.+)\s+in\s+(\S+)", r"(.+?)\s*,\s*(\S+)", r"(.+)[_ ](\S+)", r"(.+?)\s*/\s*(\S+)"):
         found = re.fullmatch(pattern, name)
-        if found and found[2] in _OF_WORD:
+        if found and found[2] in _OF_WORD and _is_unit_of(found[2], found[1]):
             return found[1], _OF_WORD[found[2]]
     return name, ""
+
+
+def _is_unit_of(letter: str, name: str) -> bool:
+    """Whether the end of a name is a unit: C, K and F are units of temperatures only, since channels have letters."""
+    return letter not in TEMPERATURE or bool(_TEMPERATURE & set(_tokens(name)))
 
 
 def _tokens(text: str) -> list[str]:

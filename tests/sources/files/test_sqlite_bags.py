@@ -5,14 +5,12 @@ from __future__ import annotations
 import sqlite3
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zstandard
 from helpers.recordings import ACCEL, ANGLES, BATCH, BENCH, HEAT, Topic, assert_equal, read, record, write_db3
 
 from kf_calib.bench.streams import Stream
-from kf_calib.errors import KfCalibError
 from kf_calib.sources.files.recording import Recording
 
 KEYS = BENCH.to_metadata()
@@ -117,40 +115,6 @@ def _longer(stream: Stream) -> Stream:
     """Fifty times the stream, one after the other."""
     step = int(stream.time_ns[-1] - stream.time_ns[0]) + 10_000_000
     return sum((Stream(stream.time_ns + k * step, stream.values) for k in range(1, 50)), stream)
-
-
-def _cut(path: Path, share: float) -> None:
-    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
-
-
-BROKEN: dict[str, tuple[Any, str]] = {
-    "no tables": (lambda path: altered(path, "DROP TABLE messages"), "cannot be read as a ROS 2 bag .no such table"),
-    "other tables": (lambda path: altered(path, "ALTER TABLE topics RENAME COLUMN type TO k"), "no such column: type"),
-    "head only": (lambda path: path.write_bytes(path.read_bytes()[:100]), "cannot be read as a ROS 2 bag"),
-    "cut to a page": (lambda path: _cut(path, 0.01), "cannot be read as a ROS 2 bag|malformed"),
-    "no topics": (lambda path: altered(path, "DELETE FROM topics"), "no accelerometer topic .*no topics"),
-    "no accelerometer": (lambda path: altered(path, "DELETE FROM topics WHERE id=1"), "no accelerometer topic"),
-    "no angles": (lambda path: altered(path, "UPDATE topics SET type='nav_msgs/msg/Path' WHERE id=2"),
-                  "no angle or attitude topic .*/platform/angles .nav_msgs/msg/Path.*record the angles too"),
-    "another serialisation": (lambda path: altered(path, "UPDATE topics SET serialization_format='cbor'"), "'cbor'"),
-    "messages of another type": (lambda path: altered(path, "UPDATE topics SET type='sensor_msgs/msg/Imu' WHERE id=3",
-                                                      "DELETE FROM topics WHERE id=1"), "cannot be used: "),
-    "short messages": (lambda path: altered(path, "UPDATE messages SET data=substr(data, 1, 30)"), "cannot be used: "),
-    "no bytes": (lambda path: altered(path, "UPDATE messages SET data=zeroblob(0)"), "cannot be used: "),
-    "text for bytes": (lambda path: altered(path, "UPDATE messages SET data='nothing'"), "cannot be used: "),
-    "big-endian": (lambda path: altered(path, "UPDATE messages SET data=CAST(x'00000000' || substr(data, 5) AS BLOB)"),
-                   "only 00 01 .little-endian CDR"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("broken", BROKEN)
-def test_a_broken_bag_is_told_in_one_sentence(tmp_path: Path, broken: str) -> None:
-    breaks, says = BROKEN[broken]
-    path = write_db3(tmp_path / "run.db3")
-    breaks(path)
-    with pytest.raises(KfCalibError, match=says) as refused:
-        read(Recording(path, KEYS))
-    assert str(path) in str(refused.value) and "\n" not in str(refused.value)
 
 
 def test_messages_that_do_not_decompress_are_told(tmp_path: Path) -> None:

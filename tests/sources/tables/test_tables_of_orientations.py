@@ -252,6 +252,13 @@ def test_a_missing_effect_is_found_in_a_table() -> None:
     assert found.verdict.split(":")[0].split("(")[0] == expected.verdict.split(":")[0].split("(")[0]
 
 
+def test_rows_equally_apart_are_searched_for_oscillations_too() -> None:
+    """At some frequencies the sine is zero in all of them."""
+    table = kf_calib.open_table(TWELVE, BENCH)
+    some = [row for k, row in enumerate(table.orientations) if k % 6]
+    assert kf_calib.diagnose(kf_calib.calibrate(Table("some", table.bench, some))).test.consistent
+
+
 def test_what_needs_readings_says_so() -> None:
     table = kf_calib.open_table(TWELVE, BENCH)
     with pytest.raises(InputError, match="vibration-rectification needs the readings themselves"):

@@ -1,0 +1,140 @@
+"""What is in a table before it is evaluated: what each column was taken for and why, and the orientations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from kf_calib.errors import InputError
+from kf_calib.sources.tables.columns import QUATERNION, Columns
+from kf_calib.sources.tables.grid import grid_of
+from kf_calib.sources.tables.numbers import Numbers
+from kf_calib.sources.tables.opening import Opening, Units
+from kf_calib.sources.tables.table import Table
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2
+
+LEAST = 4
+"""Orientations that twelve parameters need: each accelerometer has four, and reads once in each."""
+LEAST_WITHOUT_SIGMA = 6
+"""The same where the noise has to come from the misfit."""
+
+
+@dataclass(frozen=True)
+class ColumnFound:
+    """A column as it was understood.
+
+    header, first: as they stand in the table. meaning: of ``words.Meaning``, gimbal angles with their number, outer to
+    inner; empty if it is not used. unit: of its numbers. told_by: ``name``, ``content``, ``size`` (the unit, by its
+    numbers), ``content and size`` or ``--column``.
+    """
+
+    header: str
+    first: str
+    meaning: str
+    unit: str
+    told_by: str
+
+
+@dataclass(frozen=True)
+class RowFound:
+    """An orientation: its dwell's number, its row in the table, its middle since the first, and what was written down.
+
+    pose: gimbal angles in rad, or attitude. readings: how many were averaged; None where it is not known.
+    """
+
+    number: int
+    row: int
+    at_s: float
+    face: str | None
+    pose: tuple[float, ...]
+    norm_mps2: float
+    readings: int | None
+    temperature_c: float
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What is in a table.
+
+    orientation: ``angles``, ``attitude`` or ``face``; empty where no column tells it. trouble: why it cannot be
+    evaluated; empty if it can, else there are no rows. has_sigma: whether the noise is written down.
+    has_unit: whether it is known what the readings are in.
+    """
+
+    path: Path
+    columns: list[ColumnFound]
+    count: int
+    orientation: str
+    rows: list[RowFound]
+    has_sigma: bool
+    has_unit: bool
+    trouble: str
+    warnings: list[str]
+
+
+def survey(
+    path: Path,
+    overrides: Mapping[str, str] = MappingProxyType({}),
+    columns: Mapping[str, str] = MappingProxyType({}),
+    units: Units | None = None,
+) -> Survey | None:
+    """What is in a table; None where its rows are samples. What is not stated of the bench does not matter here.
+
+    Raises InputError where not even the columns can be understood.
+    """
+    units = units or Units()
+    grid = grid_of(path)
+    found = Columns.of(grid, columns, Numbers.of(grid))
+    opening = Opening(found, _complete(overrides, len(found.angles)), units)
+    if opening.are_samples:
+        return None
+    table, trouble = None, ""
+    try:
+        table = opening.table()
+    except InputError as error:
+        trouble = str(error)
+    kind = "face" if found.has("face") else "attitude" if found.has(*QUATERNION) else "angles" if found.angles else ""
+    has_sigma = table is not None and table.orientations[0].sigma_mps2 is not None
+    rows = _rows(table, found) if table else []
+    own = _columns(found, opening.by_size, set(columns))
+    return Survey(path, own, len(grid.rows), kind, rows, has_sigma, opening.has_unit, trouble, list(opening.warnings))
+
+
+def _complete(overrides: Mapping[str, str], angles: int) -> dict[str, str]:
+    """The bench with any gravity and any axes where none are stated: cells are read alike on every bench."""
+    stated = dict(overrides)
+    if not {"gravity_mps2", "latitude_deg"} & stated.keys():
+        stated["gravity_mps2"] = str(STANDARD_GRAVITY_MPS2)
+    if angles and not stated.get("axes"):
+        stated["axes"] = " ".join("yzx"[k % 3] for k in range(angles))
+    return stated
+
+
+def _columns(found: Columns, by_size: Mapping[int, str], stated: set[str]) -> list[ColumnFound]:
+    """The columns in their order; ``by_size``: units that the size of the numbers told."""
+    out = list[ColumnFound]()
+    for k, (header, own) in enumerate(zip(found.grid.header, found.meanings, strict=True)):
+        told_by = "--column" if header in stated else "content" if header in found.guessed else "name"
+        if k in by_size and told_by != "--column":
+            told_by = {"name": "size", "content": "content and size"}[told_by]
+        number = f" {found.angles.index(k) + 1}" if own.ours == "angle" else ""
+        first = next((cell for cell in found.grid.column(k) if cell is not None), "")
+        unit = by_size.get(k) or own.unit if own.ours else ""
+        first = f"{first:.10g}" if isinstance(first, float) else str(first)
+        out.append(ColumnFound(header, first, own.ours + number, unit, told_by if own.ours else ""))
+    return out
+
+
+def _rows(table: Table, found: Columns) -> list[RowFound]:
+    faces = found.grid.column(found.places("face")[0]) if found.has("face") else [None] * len(found.grid.rows)
+    return [
+        RowFound(
+            k + 1, row, own.elapsed_s, None if face is None else str(face), tuple(map(float, own.pose)),
+            float(np.linalg.norm(own.mean_mps2)), None if own.sigma_mps2 is None else own.count, own.temperature_c,
+        )
+        for k, (row, face, own) in enumerate(zip(found.grid.numbers, faces, table.orientations, strict=True))
+    ]  # fmt: skip

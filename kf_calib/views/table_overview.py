@@ -1,0 +1,125 @@
+"""What is in a table of orientations, as tables and as a JSON object."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from kf_calib.sources.tables.survey import ColumnFound, RowFound, Survey
+from kf_calib.support.plain_text import cut
+from kf_calib.views.json import clean
+from kf_calib.views.overview import pose_text
+from kf_calib.views.tables import Table
+from kf_calib.views.terminal import note
+
+_SHOWN = 40  # orientations
+_ORIENTATIONS = {"angles": "gimbal angles", "attitude": "attitude", "face": "axis up"}
+_QUANTITIES = {
+    "a": "mean", "s": "standard deviation", "angle": "gimbal angle", "face": "axis that points up",
+    "time": "time", "count": "number of readings", "temperature": "temperature", "q": "attitude",
+}  # fmt: skip
+_TOLD = {
+    "name": "by its name", "content": "by what stands in it", "size": "by its name, the unit by its numbers",
+    "content and size": "by what stands in it, the unit by its numbers", "--column": "by --column", "": "",
+}  # fmt: skip
+_UNITS = {"c": "°C", "k": "K", "f": "°F", "count": "counts", "m/s2": "m/s^2"}
+
+
+@dataclass(frozen=True)
+class TableOverview:
+    """What is in a table, what it lacks to be evaluated, and the command that evaluates it then. bench: its keys as
+    options state them."""
+
+    survey: Survey
+    bench: dict[str, str]
+    missing: list[str]
+    command: str
+
+
+def table_object(found: TableOverview) -> dict[str, Any]:
+    """One JSON object."""
+    own = found.survey
+    return clean(
+        {
+            "recording": str(own.path), "format": "table", "files": [str(own.path)], "bytes": own.path.stat().st_size,
+            "topics": [], "columns": [vars(column) for column in own.columns], "orientation": own.orientation or None,
+            "bench": found.bench, "dwells": [_row_object(row) for row in own.rows], "missing": found.missing,
+            "command": found.command, "warnings": own.warnings,
+        }
+    )  # fmt: skip
+
+
+def _row_object(row: RowFound) -> dict[str, Any]:
+    return vars(row) | {"pose": list(row.pose)}
+
+
+def table_report(found: TableOverview) -> RenderableType:
+    """What ``info`` prints of a table."""
+    own = found.survey
+    parts: list[RenderableType] = [
+        Text(f"{own.path}: a table of orientations, {_counted(own.count, 'row')}"),
+        _column_table(own.columns),
+    ]
+    bench = ", ".join(f"{key} = {value}" for key, value in found.bench.items())
+    parts.append(Text(f"Bench: {bench or 'nothing is said of it'}"))
+    if own.rows:
+        parts += [Text(f"{_counted(len(own.rows), 'orientation')}:"), _row_table(own)]
+        if len(own.rows) > _SHOWN:
+            parts.append(Text(f"and {len(own.rows) - _SHOWN} more, all of them by --json"))
+    parts += [note(said) for said in own.warnings]
+    if own.rows and not own.has_sigma:
+        parts.append(
+            note(
+                "no standard deviation with a number of readings is given, so that the noise will be taken from the "
+                "misfit, and the misfit cannot be judged."
+            )
+        )
+    parts += [Text(f"Missing: {said}") for said in found.missing]
+    parts.append(Text(f"{'Then try' if found.missing else 'Try'}: {found.command}"))
+    return Group(*parts)
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
+def _column_table(columns: Sequence[ColumnFound]) -> Table:
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for heading in ("column", "first cell", "taken for", "unit", "told"):
+        table.add_column(heading, justify="left")
+    for own in columns:
+        unit = _UNITS.get(own.unit, own.unit)
+        table.add_row(cut(own.header, 40), cut(own.first, 24), _quantity(own.meaning), unit, _TOLD[own.told_by])
+    return table
+
+
+def _quantity(meaning: str) -> str:
+    """What ``words.Meaning`` and a number call a quantity, in words."""
+    if not meaning:
+        return "not used"
+    if meaning[:1] in "asq" and len(meaning) == 2:
+        name, component = _QUANTITIES[meaning[0]], meaning[1]
+        if meaning[0] == "q":
+            return f"{name} {component}"
+        return name if component == "d" else f"accelerometer {'xyz'.index(component) + 1}, {name}"
+    name, _, number = meaning.partition(" ")
+    return f"{_QUANTITIES[name]}{' ' * bool(number)}{number}"
+
+
+def _row_table(own: Survey) -> Table:
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for heading in ("dwell", "row", "at s", _ORIENTATIONS[own.orientation], "norm m/s^2", "readings", "°C"):
+        table.add_column(heading, justify="right")
+    for row in own.rows[:_SHOWN]:
+        table.add_row(
+            str(row.number), str(row.row), f"{row.at_s:g}", row.face or pose_text(row.pose), f"{row.norm_mps2:.4f}",
+            "" if row.readings is None else str(row.readings),
+            "" if math.isnan(row.temperature_c) else f"{row.temperature_c:.2f}",
+        )  # fmt: skip
+    return table
