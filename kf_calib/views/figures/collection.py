@@ -8,7 +8,6 @@ from functools import singledispatch
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
 from kf_calib.design.orientation_plan import Plan
@@ -130,6 +129,8 @@ def save(what: Figure | Figures, path: str | Path, kind: str = "", width_px: int
 
 def _pages(what: Figures) -> bytes:
     """Return a PDF with a figure a page, its title above it."""
+    from matplotlib.backends.backend_pdf import PdfPages  # with all its fonts it takes 0.2 s to load
+
     memory = io.BytesIO()
     with style.styled(), PdfPages(memory, metadata={"CreationDate": None, "Creator": None, "Producer": None}) as pages:
         for title, draw in what.items():

@@ -26,6 +26,7 @@ from kf_calib.views.rerun.explorer import (
     Log,
     at_step,
     bounds,
+    drawn_values,
     driver_charts,
     forever,
     log_spheres,
@@ -34,7 +35,6 @@ from kf_calib.views.rerun.explorer import (
     points,
     reach_of,
     say,
-    shown,
     spheres,
     title_of,
 )
@@ -78,7 +78,7 @@ class View:
                 title = f"accelerometer {i + 1}: residual / σ" if name == "before" else ""
                 below, own = title_of(driver) if i == 2 else "", wide if name == "effect" else reach
                 path, place = f"explorer/{name}/{channel}", (i, column)
-                out[name].append(panel(path, shown(driver), below, own, title, place, size, i))
+                out[name].append(panel(path, drawn_values(driver), below, own, title, place, size, i))
         return out
 
 
@@ -106,7 +106,7 @@ def _log_explorer(view: View, stream: rr.RecordingStream) -> None:
     if not view.drivers:
         return say(stream, "explorer/none", "Nothing that was recorded varies in this run.")
     driver = view.drivers[0]
-    charts, x, standing = view.charts(driver), shown(driver), forever(stream)
+    charts, x, standing = view.charts(driver), drawn_values(driver), forever(stream)
     everything = [each for column in charts.values() for each in column]
     frames(stream, "explorer", everything)
     for chart in everything:
@@ -124,7 +124,7 @@ def _log_explorer(view: View, stream: rr.RecordingStream) -> None:
 
 def _log_explanation(view: View, charts: dict[str, list[Chart]], driver: Driver, each: Explanation, log: Log) -> None:
     """One explanation: the effect as a curve with its 1 sigma where it goes with this driver alone, and the rest."""
-    x, (own, readings) = shown(driver), view.effect(each)
+    x, (own, readings) = drawn_values(driver), view.effect(each)
     spread = each.contribution_sigma_mps2 / view.sigmas
     alone = is_function_of(each.contribution_mps2, driver)
     for i, (effect, left) in enumerate(zip(charts["effect"], charts["left"], strict=True)):
@@ -156,9 +156,9 @@ def _log_drivers(view: View, stream: rr.RecordingStream) -> None:
     for driver, charts in zip(drivers, _driver_charts(view), strict=True):
         for chart in charts:
             bounds(chart, forever(stream))
-        points(charts[0], shown(driver), view.before, forever(stream))
+        points(charts[0], drawn_values(driver), view.before, forever(stream))
         for rank, each in _ranked(view):
-            points(charts[1], shown(driver), each.left_ratios, at_step(stream, EXPLANATION, rank))
+            points(charts[1], drawn_values(driver), each.left_ratios, at_step(stream, EXPLANATION, rank))
 
 
 def _driver_charts(view: View) -> list[list[Chart]]:
