@@ -12,12 +12,11 @@ from scipy.stats import binom, chi2, f
 
 from kf_calib.diagnosis.detectability import QUIET, sensor_grade
 from kf_calib.diagnosis.effect_pairs import overlap_matrix
+from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.residual_drivers import (
-    Explanation,
     drivers_of,
-    explanations,
     is_function_of,
     unexplained_mps2,
     unexplained_rms_mps2,
@@ -77,7 +76,7 @@ def test_nothing_has_a_share_where_the_model_fits() -> None:
 
 
 def test_what_an_explanation_predicts_is_the_difference_of_the_predictions() -> None:
-    best = explanations(found("second-order=15sigma"))[0]
+    best = found("second-order=15sigma").explanations[0]
     before, after = best.before.carried, best.after.carried
     predicted = [np.einsum("dip,p->di", each.means.design, state) for each, state in (
         (before, best.before.estimate.state), (after, best.after.estimate.state))]  # fmt: skip
@@ -176,4 +175,4 @@ def test_usual_sizes_are_those_of_the_simulator_where_the_unit_is_the_same() -> 
 
 
 def test_where_nothing_is_missing_there_is_no_explanation() -> None:
-    assert explanations(found()) == []
+    assert found().explanations == []

@@ -18,7 +18,6 @@ import kf_calib
 from kf_calib import plot
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
-from kf_calib.diagnosis.residual_drivers import explanations
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, begin, extend, improve, undone
 from kf_calib.errors import InputError
@@ -73,7 +72,7 @@ def test_every_figure_of_a_diagnosis_has_ink_in_every_panel(hidden: tuple[str, .
 
 
 def test_bars_of_suspects_are_their_shares_and_those_that_do_not_fit_are_hatched() -> None:
-    explained = explanations(hysteresis())
+    explained = hysteresis().explanations
     figure = plot.suspects(hysteresis())
     axes = axes_of(figure, "What each explains")
     bars = [bar for container in axes.containers if isinstance(container, BarContainer) for bar in container]

@@ -14,7 +14,7 @@ from helpers.paths import ROOT
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.missing_effect import diagnose
-from kf_calib.diagnosis.residual_drivers import drivers_of, explanations
+from kf_calib.diagnosis.residual_drivers import drivers_of
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, improve
 from kf_calib.estimation.calibration import calibrate
@@ -170,7 +170,7 @@ def test_a_diagnosis_shows_what_each_explanation_leaves(found: Diagnosis, tmp_pa
     before = content(path, "Points2D:positions")
     after = content(path, "Points2D:positions", diagnosis.EXPLANATION)
     charts = made.charts(driver)
-    assert driver.symbol == "da" and explanations(found)[0].name == "hysteresis"
+    assert driver.symbol == "da" and found.explanations[0].name == "hysteresis"
     for i, channel in enumerate(("a1", "a2", "a3")):
         place = before[f"/explorer/before/{channel}/residuals"][None]
         np.testing.assert_allclose(values_at(charts["before"][i], place),

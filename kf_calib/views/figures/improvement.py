@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase, SubFigure
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.residual_drivers import Driver, drivers_of, unexplained_mps2, unexplained_rms_mps2
+from kf_calib.diagnosis.residual_drivers import Driver, unexplained_mps2, unexplained_rms_mps2
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, SelectionStep
 from kf_calib.estimation.residual_table import mean_sigmas
@@ -206,7 +206,7 @@ def residuals_of_steps(state: Improvement) -> Figure:
     accelerometer."""
     with styled():
         figure = blank(11.0, 7.0)
-        draw_residuals_of_steps(figure, state, drivers_of(state.start.before))
+        draw_residuals_of_steps(figure, state, state.start.drivers)
     return figure
 
 

@@ -10,12 +10,10 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.ticker import MaxNLocator
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.residual_drivers import (
     Driver,
-    Explanation,
     channel_rms_mps2,
-    drivers_of,
-    explanations,
     is_function_of,
 )
 from kf_calib.diagnosis.results import Diagnosis
@@ -51,7 +49,7 @@ def residuals(found: Diagnosis, driver: str | None = None) -> Figure:
     """
     with styled():
         figure = blank(11.0, 7.0)
-        draw_residuals(figure, found, drivers_of(found.before), driver)
+        draw_residuals(figure, found, found.drivers, driver)
     return figure
 
 
@@ -60,7 +58,7 @@ def draw_residuals(figure: FigureBase, found: Diagnosis, drivers: Sequence[Drive
     driver = driver_to_show([each for each in drivers if symbol in (None, each.symbol)])
     if driver is None:
         return say(figure, f"{symbol or 'Nothing that was recorded'} does not vary in this run.")
-    others = explanations(found)
+    others = found.explanations
     panels = figure.subplots(3, 3 if others else 1, sharex=True, sharey="row", squeeze=False)
     label, scale = driver_axis(driver)
     sigmas = mean_sigmas(found.before)
@@ -147,13 +145,13 @@ def what_they_go_with(found: Diagnosis) -> Figure:
     """Residuals over their sigma against everything that varies in the run, and what the best explanation leaves."""
     with styled():
         figure = blank(11.0, 7.0)
-        draw_drivers(figure, found, drivers_of(found.before))
+        draw_drivers(figure, found, found.drivers)
     return figure
 
 
 def draw_drivers(figure: FigureBase, found: Diagnosis, drivers: Sequence[Driver]) -> None:
     """The same on a part of a figure: a column a driver, those that explain most first."""
-    drawn, others = drivers[:_PANELS], explanations(found)[:1]
+    drawn, others = drivers[:_PANELS], found.explanations[:1]
     if not drawn:
         return say(figure, "Nothing that was recorded varies in this run.")
     wide = min(4, len(drawn))

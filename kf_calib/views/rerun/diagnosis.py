@@ -15,7 +15,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.residual_drivers import Driver, Explanation, drivers_of, explanations, is_function_of
+from kf_calib.diagnosis.explanation import Explanation
+from kf_calib.diagnosis.residual_drivers import Driver, is_function_of
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import format_p
@@ -51,8 +52,8 @@ class View:
     """A diagnosis with what is drawn of it, computed once."""
 
     def __init__(self, found: Diagnosis) -> None:
-        self.found, self.drivers = found, drivers_of(found.before)
-        self.explanations = explanations(found)[:_MOST]
+        self.found, self.drivers = found, found.drivers
+        self.explanations = found.explanations[:_MOST]
         self.sigmas = mean_sigmas(found.before)
 
     @cached_property

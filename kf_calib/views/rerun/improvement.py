@@ -15,7 +15,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
+from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, SelectionStep
 from kf_calib.estimation.residual_table import mean_sigmas
@@ -60,7 +60,7 @@ class View:
     def of(cls, state: Improvement) -> View:
         found = (state.start, *(step.found for step in state.steps))
         ratios = tuple(each.before.residuals_mps2 / mean_sigmas(state.start.before) for each in found)
-        return cls(state, found, ratios, tuple(drivers_of(state.start.before)))
+        return cls(state, found, ratios, tuple(state.start.drivers))
 
     @property
     def results(self) -> list[Calibration]:
