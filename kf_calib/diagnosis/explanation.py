@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.residual_drivers import misfit_beyond_noise, unexplained_mps2, walk_path
-from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration
 
@@ -77,26 +76,6 @@ class Explanation:
         model, known = self.after.model, self.before.model.parts
         added = (part for name, part in model.parts.items() if name not in known)
         return np.array([place for part in added for place in range(*part.indices(model.count))], int)
-
-    @cached_property
-    def predicted_sigma_mps2(self) -> Floats:
-        """Sigma (D, 3) of what it predicts: that of its coefficients, seen through the model that had none of them.
-
-        With the design H of the model before, the columns G of the additional effects, and the weight W of the means,
-        G is projected, M = G - H (H^T W H)^-1 H^T W G, and the covariance of M c is M C M^T.
-        """
-        own = self._own
-        means, design = self.after.carried.means, self.after.carried.means.design
-        if not len(own):
-            return np.zeros((len(design), 3))
-        spread = mean_covariances(self.after.noise.judging, means, self.after.carried.state)
-        lower = np.linalg.inv(np.linalg.cholesky(spread))
-        kept = np.setdiff1d(np.arange(design.shape[2]), own)
-        rows = (lower @ design).reshape(-1, design.shape[2])
-        found = np.linalg.lstsq(rows[:, kept], rows[:, own], rcond=None)[0]
-        left = design[:, :, own] - design[:, :, kept] @ found
-        covariance = self.after.estimate.covariance[np.ix_(own, own)]
-        return np.sqrt(np.maximum(np.einsum("dip,pq,diq->di", left, covariance, left), 0.0))
 
 
 def _share(fall: float, dof: int, excess: float) -> float:

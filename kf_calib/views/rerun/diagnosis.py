@@ -196,11 +196,12 @@ def _layout(view: View) -> rrb.Blueprint:
         Chart("explorer", Axis(0.0, 1.0), Axis(0.0, 1.0))]  # fmt: skip
     drivers = [chart for column in _driver_charts(view) for chart in column]
     named = view.drivers[0].words if view.drivers else "nothing varies"
+    fails = view.found.test.consistent is False
     first = rrb.Horizontal(
         sheet("explorer", f"{view.found.before.model.sum}: residuals over σ against the {named}", charts, above=64.0),
         rrb.Vertical(spheres("spheres", 2 if view.explanations else 1),
                      rrb.TextDocumentView(origin="summary", name="verdict"), row_shares=[5, 5]),
-        column_shares=[6, 4], name="Where the model fails",
+        column_shares=[6, 4], name="Where the model fails" if fails else "What the model leaves",
     )  # fmt: skip
     tabs: Sequence[rrb.View | rrb.Container] = [first]
     tabs = [*tabs, sheet("drivers", "All that varies", drivers)] if drivers else tabs

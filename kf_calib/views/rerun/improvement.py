@@ -258,7 +258,7 @@ def _layout(view: View) -> rrb.Blueprint:
         sheet("explorer", f"residuals (grey: first model) against the {named}", explorer),
         rrb.Vertical(spheres("spheres", 1), rrb.TextDocumentView(origin="summary", name="this step"),
                      row_shares=[2, 3]),
-        column_shares=[4, 4, 4], name="The error falls",
+        column_shares=[4, 4, 4], name="The error falls" if view.state.steps else "The error of the model",
     )  # fmt: skip
     charts = _coefficient_charts(view)
     tabs = [first, *([sheet("coefficients", "Coefficients", charts)] if charts else [])]
