@@ -23,6 +23,7 @@ from kf_calib.diagnosis.stepwise_selection import Improvement, begin, extend, im
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_readings import readings_of, worst_dwell
+from kf_calib.support.units import shown_in
 from kf_calib.views.figures.log_axis import label_axis, plain
 from kf_calib.views.figures.words import rounded_number, wrapped
 
@@ -124,9 +125,13 @@ def test_what_could_hide_names_every_effect_once() -> None:
             assert ends[k] == pytest.approx(min(usual[1] / each.minimum, 1000.0))
 
 
-def test_residuals_of_single_dwells_are_drawn_in_micro_g() -> None:
+def test_residuals_of_single_dwells_are_drawn_in_micro_g_or_si() -> None:
     diagnosis = hysteresis()
     figure = plot.residuals(diagnosis)
+    with shown_in("si"):
+        words = panels(plot.residuals(diagnosis))
+    assert (words[0].get_ylabel(), words[-1].get_xlabel()) == (
+        "accelerometer 1, m/s^2", "last step along the input axis, m/s^2")  # fmt: skip
     first = panels(figure)[0]
     drawn = first.containers[0].lines[0].get_ydata()  # type: ignore[union-attr]
     assert np.asarray(drawn) == pytest.approx(diagnosis.before.residuals_mps2[:, 0] / MICRO_G)
