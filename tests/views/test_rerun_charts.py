@@ -29,7 +29,7 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.views import rerun as view
 from kf_calib.views.rerun import comparison, diagnosis, improvement, residuals
 from kf_calib.views.rerun.chart import Axis, Chart, number
-from kf_calib.views.rerun.explorer import shown, signed
+from kf_calib.views.rerun.explorer import drawn_values, signed
 from kf_calib.views.rerun.file import new_stream
 from kf_calib.views.rerun.growing import GrowingView
 from kf_calib.views.rerun.names import per_si
@@ -174,7 +174,7 @@ def test_a_diagnosis_shows_what_each_explanation_leaves(found: Diagnosis, tmp_pa
     for i, channel in enumerate(("a1", "a2", "a3")):
         place = before[f"/explorer/before/{channel}/residuals"][None]
         np.testing.assert_allclose(values_at(charts["before"][i], place),
-                                   np.column_stack([shown(driver)[:, i], (found.before.residuals_mps2 / sigmas)[:, i]]),
+                                   np.column_stack([drawn_values(driver)[:, i], (found.before.residuals_mps2 / sigmas)[:, i]]),
                                    atol=1e-3)  # fmt: skip
         for rank, each in enumerate(made.explanations, 1):
             place = after[f"/explorer/left/{channel}/residuals"][rank]
