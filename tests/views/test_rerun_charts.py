@@ -173,9 +173,9 @@ def test_a_diagnosis_shows_what_each_explanation_leaves(found: Diagnosis, tmp_pa
     assert driver.symbol == "da" and found.explanations[0].name == "hysteresis"
     for i, channel in enumerate(("a1", "a2", "a3")):
         place = before[f"/explorer/before/{channel}/residuals"][None]
-        np.testing.assert_allclose(values_at(charts["before"][i], place),
-                                   np.column_stack([drawn_values(driver)[:, i], (found.before.residuals_mps2 / sigmas)[:, i]]),
-                                   atol=1e-3)  # fmt: skip
+        ratios = found.before.residuals_mps2 / sigmas
+        drawn = np.column_stack([drawn_values(driver)[:, i], ratios[:, i]])
+        np.testing.assert_allclose(values_at(charts["before"][i], place), drawn, atol=1e-3)
         for rank, each in enumerate(made.explanations, 1):
             place = after[f"/explorer/left/{channel}/residuals"][rank]
             np.testing.assert_allclose(values_at(charts["left"][i], place)[:, 1], each.left_ratios[:, i], atol=1e-3)
