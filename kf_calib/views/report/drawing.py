@@ -23,6 +23,7 @@ from kf_calib.views.figures.style import content_of, styled
 _MOST = 1_200_000  # characters of all figures of a page
 _MANY = 60  # points of one kind in a panel that are
 _PICTURE_DPI = 150
+_LAYOUT_DPI = 600  # letters are as wide as in SVG, not moved to whole pixels
 _COLOUR = re.compile(r"\b(fill|stroke|stop-color): #([0-9a-f]{6})\b")
 _PICTURE = re.compile(r"(?<=data:image/png;base64,)[\w+/=\s]+")
 _SHADES = 64  # of a picture of points, which are few colours and their edges
@@ -88,7 +89,10 @@ def _arrange(figure: Figure) -> None:
     engine = figure.get_layout_engine()
     with styled():
         if engine is not None:
+            dpi = figure.get_dpi()
+            figure.set_dpi(_LAYOUT_DPI)
             engine.execute(figure)
+            figure.set_dpi(dpi)
         figure.set_layout_engine(None)
 
 
