@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import minimize
 
 from kf_calib.bench.arrays import Floats, Ints, Mask
 from kf_calib.design import optimality_criteria
@@ -223,6 +222,8 @@ class Search:
 
     def polish(self, poses: Floats) -> Floats:
         """The orientations moved within their bounds to a local minimum of the cost."""
+        from scipy.optimize import minimize  # takes 0.4 s to load, which figures of a plan need not wait for
+
         shape, rooms = poses.shape, self._rooms(poses)
         for power in self.aim.powers:
             found = minimize(
@@ -260,6 +261,8 @@ class Search:
     def variance_function(self, rows: Floats, poses: Floats) -> tuple[float, float]:
         """tr(M0 M^-1) and the largest tr(I(x) M^-1) that can be reached, where M is the information of the design
         ``rows`` (n, r, p)."""
+        from scipy.optimize import minimize
+
         inverse = np.linalg.inv(self.factor(rows))
 
         def at(poses: Floats) -> Floats:

@@ -135,7 +135,7 @@ class Evidence:
                 np.sum(0.5 * np.log(2.0 * np.pi / np.maximum(curves, 2.0 * np.pi / _RANGE**2)) - math.log(_RANGE))
             )
         log += float(size_evidence(dof, fall)) if dof else 0.0
-        beyond = tuple(part for part in parts if part != "walk")
+        beyond: Parts = tuple(part for part in parts if part != "walk")
         return Weighed(beyond, log, tuple(sizes.tolist()), fall, dof)
 
     def _log_prior(self, parts: Parts) -> float:

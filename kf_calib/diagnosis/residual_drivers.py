@@ -1,26 +1,20 @@
-"""What the residuals of a run go with, and what an explanation predicts of them.
+"""What the residuals of a run go with.
 
 A driver is a quantity of the bench, such as a gimbal angle, the temperature, or the last step of the specific force.
 Smooth functions of each driver are tested together, projected off the model as effects are; the share of the misfit
-that they explain orders the drivers. An explanation is a model with more in it: what it predicts of the residuals is
-the difference between the two models' predictions.
+that they explain orders the drivers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.refits import Refits
-from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.effects.formula import formula, quantities
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.residual_table import mean_sigmas, quantity_means
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import falls_together
@@ -90,11 +84,6 @@ def misfit_beyond_noise(result: Calibration) -> float:
     return misfit.statistic - misfit.dof if misfit.consistent is False else 0.0
 
 
-def _share(fall: float, dof: int, excess: float) -> float:
-    """Return the part of the misfit beyond noise that a fall of chi-squared beyond its degrees of freedom explains."""
-    return float(np.clip((fall - dof) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0
-
-
 def _beyond_chance(fall: float, dof: int, result: Calibration) -> tuple[float, float]:
     """Return the share of a driver and its p-value.
 
@@ -149,93 +138,9 @@ def is_function_of(values: Floats, driver: Driver) -> bool:
     return True
 
 
-@dataclass(frozen=True, eq=False)
-class Explanation:
-    """A model with more in it than the one whose residuals are looked at.
-
-    names: what it has in addition, formulas without the name that they were given. before, after: the two
-    calibrations. fits: whether it fits the run. p_value: the family-wise p-value of a single effect of the catalogue;
-    None of anything else.
-    """
-
-    names: tuple[str, ...]
-    before: Calibration
-    after: Calibration
-    fits: bool
-    p_value: float | None = None
-
-    @property
-    def name(self) -> str:
-        """The effects, as a sum."""
-        return " + ".join(self.names)
-
-    @property
-    def share(self) -> float | None:
-        """Part of the misfit beyond noise that it explains, 0 to 1: the decrease of chi-squared from refit to refit,
-        less the degrees of freedom that it takes; None if the means of the dwells agree without it."""
-        excess, own, rest = misfit_beyond_noise(self.before), self.before.consistency, self.after.consistency
-        return _share(own.statistic - rest.statistic, own.dof - rest.dof, excess) if excess > 0.0 else None
-
-    @cached_property
-    def left_mps2(self) -> Floats:
-        """What it leaves of the residuals (D, 3)."""
-        return unexplained_mps2(self.after)
-
-    @cached_property
-    def left_ratios(self) -> Floats:
-        """The same over the sigma of the means."""
-        return self.left_mps2 / mean_sigmas(self.before)
-
-    @cached_property
-    def predicted_mps2(self) -> Floats:
-        """What it predicts of the residuals (D, 3): the difference of the two models' predictions."""
-        return self.before.residuals_mps2 - self.left_mps2
-
-    @cached_property
-    def contribution_mps2(self) -> Floats:
-        """What its effects add to the mean readings (D, 3), before the other parameters take up a part of it."""
-        own = self._own
-        added = np.einsum("dip,p->di", self.after.carried.means.design[:, :, own], self.after.estimate.state[own])
-        return added + _walk_path(self.after)
-
-    @cached_property
-    def contribution_sigma_mps2(self) -> Floats:
-        """Sigma (D, 3) of the contribution, from the covariance of its coefficients."""
-        own = self._own
-        design, covariance = self.after.carried.means.design[:, :, own], self.after.estimate.covariance
-        return np.sqrt(np.einsum("dip,pq,diq->di", design, covariance[np.ix_(own, own)], design))
-
-    @cached_property
-    def _own(self) -> NDArray[np.intp]:
-        """Return the places of its coefficients in the state; a walk has none, its path is no coefficient."""
-        model, known = self.after.model, self.before.model.parts
-        added = (part for name, part in model.parts.items() if name not in known)
-        return np.array([place for part in added for place in range(*part.indices(model.count))], int)
-
-    @cached_property
-    def predicted_sigma_mps2(self) -> Floats:
-        """Sigma (D, 3) of what it predicts: that of its coefficients, seen through the model that had none of them.
-
-        With the design H of the model before, the columns G of the additional effects, and the weight W of the means,
-        G is projected, M = G - H (H^T W H)^-1 H^T W G, and the covariance of M c is M C M^T.
-        """
-        own = self._own
-        means, design = self.after.carried.means, self.after.carried.means.design
-        if not len(own):
-            return np.zeros((len(design), 3))
-        spread = mean_covariances(self.after.noise.judging, means, self.after.carried.state)
-        lower = np.linalg.inv(np.linalg.cholesky(spread))
-        kept = np.setdiff1d(np.arange(design.shape[2]), own)
-        rows = (lower @ design).reshape(-1, design.shape[2])
-        found = np.linalg.lstsq(rows[:, kept], rows[:, own], rcond=None)[0]
-        left = design[:, :, own] - design[:, :, kept] @ found
-        covariance = self.after.estimate.covariance[np.ix_(own, own)]
-        return np.sqrt(np.maximum(np.einsum("dip,pq,diq->di", left, covariance, left), 0.0))
-
-
 def unexplained_mps2(result: Calibration) -> Floats:
     """Residuals (D, 3) less the path of the biases where these walk, m/s^2."""
-    return result.residuals_mps2 - _walk_path(result)
+    return result.residuals_mps2 - walk_path(result)
 
 
 def channel_rms_mps2(residuals_mps2: Floats) -> Floats:
@@ -250,8 +155,8 @@ def unexplained_rms_mps2(result: Calibration) -> float:
     return float(np.sqrt(np.mean(unexplained_mps2(result) ** 2)))
 
 
-def _walk_path(result: Calibration) -> Floats:
-    """Return the path of the biases (D, 3), less where it ends, m/s^2; zeros if they do not walk.
+def walk_path(result: Calibration) -> Floats:
+    """The path of the biases (D, 3), less where it ends, m/s^2; zeros if they do not walk.
 
     The best linear prediction K (K + R)^-1 r from the residuals r by the final state, where K = q^2 min(T - s, T - t)
     is the covariance of a random walk that is known at its end T, and R that of the means.
@@ -264,23 +169,3 @@ def _walk_path(result: Calibration) -> Floats:
     path = [covariance @ np.linalg.solve(covariance + np.diag(sigma**2), residual)
             for sigma, residual in zip(mean_sigmas(result).T, result.residuals_mps2.T, strict=True)]  # fmt: skip
     return np.array(path).T
-
-
-def explanations(found: Diagnosis, refits: Refits | None = None) -> list[Explanation]:
-    """The explanations of a diagnosis, the best first: what is missing, or the formula that describes an unknown
-    misfit; then the other suspects.
-
-    refits: of the run, if there are any.
-    """
-    out = list[Explanation]()
-    if found.missing and found.after is not None:
-        alone = found.test.p_values.get(found.missing[0]) if len(found.missing) == 1 else None
-        out.append(Explanation(found.missing, found.before, found.after, True, alone))
-    elif found.description is not None:
-        formulas = found.description.formulas
-        names = tuple(text.partition("=")[2].strip() or text for text in formulas)
-        after = (refits or Refits()).with_effects(found.before, formulas)
-        out.append(Explanation(names, found.before, after, after.consistency.consistent is not False))
-    rest = [each for each in found.suspects if (each.name,) != found.missing]
-    rest.sort(key=lambda each: not each.fits)  # stable: those that fit, by significance, before those that do not
-    return [*out, *(Explanation((each.name,), found.before, each.refit, each.fits, each.p_value) for each in rest)]

@@ -12,7 +12,10 @@ from kf_calib.design import next_orientation as advise
 from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.detectability import Detectable, Unseen, detectable, sensor_grade, unseen
+from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.hypotheses import SURE, Hypothesis, Table
+from kf_calib.diagnosis.refits import Refits
+from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe, explained_share
 from kf_calib.effects.effect import Grade
 from kf_calib.estimation.noise_model import mean_covariances
@@ -111,6 +114,35 @@ class Diagnosis:
         if self.table is None or self.test.consistent is not False:
             return None
         return self.table.first
+
+    @cached_property
+    def drivers(self) -> list[Driver]:
+        """The quantities that vary in the run, those that explain most of the misfit first."""
+        return drivers_of(self.before)
+
+    @cached_property
+    def explanations(self) -> list[Explanation]:
+        """What could be added to the model, the best first: what is missing, or the formula that describes an unknown
+        misfit, which is fitted here; then the other suspects, of which those that fit come first."""
+        best = self._best_explanation
+        rest = [each for each in self.suspects if (each.name,) != self.missing]
+        rest.sort(key=lambda each: not each.fits)  # stable: by significance
+        others = [Explanation((each.name,), self.before, each.refit, each.fits, each.p_value) for each in rest]
+        return others if best is None else [best, *others]
+
+    @property
+    def _best_explanation(self) -> Explanation | None:
+        if self.missing and self.after is not None:
+            alone = self.test.p_values.get(self.missing[0]) if len(self.missing) == 1 else None
+            return Explanation(self.missing, self.before, self.after, True, alone)
+        if self.description is None:
+            return None
+        formulas = self.description.formulas
+        names = tuple(text.partition("=")[2].strip() or text for text in formulas)
+        first = self.likeliest
+        after = first.refit if first and first.formulas else None
+        after = after or Refits().with_effects(self.before, formulas)
+        return Explanation(names, self.before, after, after.consistency.consistent is not False)
 
     @cached_property
     def detectable(self) -> list[Detectable]:

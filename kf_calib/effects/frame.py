@@ -16,7 +16,7 @@ class BaseTilt(FrameEffect):
     """A base turned by (delta_N, delta_E): the specific force turns the other way in it."""
 
     family = "base and platform"
-    name, title, source = "base-tilt", "tilt of the base", "IEEE Std 836, base motion"
+    name, title, source = "base-tilt", "tilt of the base", "geometry of the bench"
     confused_with = "about the outer axis it is the outer encoder's zero"
     typical = Typical((5e-6, 500e-6))
 
@@ -53,7 +53,7 @@ class PlatformDrift(FrameEffect):
     """The platform turned by omega_d t, three rates in its own frame."""
 
     family = "base and platform"
-    name, title, source = "platform-drift", "drift of the platform", "IEEE Std 836"
+    name, title, source = "platform-drift", "drift of the platform", "geometry of the bench"
     typical = Typical((np.radians(0.01) / 3600, np.radians(1.0) / 3600))
 
     @property
@@ -71,7 +71,7 @@ class EarthRotation(FrameEffect):
     """
 
     family = "base and platform"
-    name, title, source = "earth-rotation", "rotation of the Earth", "IEEE Std 836; WGS 84 rate"
+    name, title, source = "earth-rotation", "rotation of the Earth", "WGS 84, rate of the Earth"
     confused_with = "platform-drift"
     typical = Typical((1.0, 1.0), (1.0, 1.0))
 
@@ -87,7 +87,7 @@ class Flexure(FrameEffect):
     """The platform turns by f x d under the torque of gravity, d the compliance times the offset of its mass."""
 
     family = "base and platform"
-    name, title, source = "flexure", "bending under the torque of gravity", "IEEE Std 836"
+    name, title, source = "flexure", "bending under the torque of gravity", "linear elasticity"
     confused_with = "encoder-harmonic-1, cross-coupling"
     typical = Typical((5e-6 / STANDARD_GRAVITY_MPS2, 100e-6 / STANDARD_GRAVITY_MPS2))
 
@@ -144,7 +144,7 @@ class _GimbalEffect(FrameEffect):
 class EncoderOffset(_GimbalEffect):
     """q_k + epsilon_k."""
 
-    name, title, source = "encoder-offset", "zero of an encoder", "IEEE Std 836, positioning errors"
+    name, title, source = "encoder-offset", "zero of an encoder", "geometry of the bench"
     confused_with = "innermost: a misalignment; outermost: base-tilt"
 
     @property
@@ -163,7 +163,7 @@ class EncoderOffset(_GimbalEffect):
 class EncoderScale(_GimbalEffect):
     """q_k (1 + epsilon_k)."""
 
-    name, title, source = "encoder-scale", "scale of an encoder", "IEEE Std 836, positioning errors"
+    name, title, source = "encoder-scale", "scale of an encoder", "geometry of the bench"
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -176,7 +176,7 @@ class EncoderScale(_GimbalEffect):
 class EncoderHarmonic1(_GimbalEffect):
     """s sin q_k + c cos q_k on the angle."""
 
-    name, title, source = "encoder-harmonic-1", "eccentricity of an encoder", "IEEE Std 836, positioning errors"
+    name, title, source = "encoder-harmonic-1", "eccentricity of an encoder", "geometry of the bench"
     order = 1
     typical = Typical((1e-6, 100e-6))
 
@@ -200,7 +200,7 @@ class EncoderHarmonic2(EncoderHarmonic1):
 class AxisNonorthogonality(_GimbalEffect):
     """Gimbal axis k tilted in its parent by tau: the child turns by tau - R^T tau, R the gimbal's own rotation."""
 
-    name, title, source = "axis-nonorthogonality", "tilt of a gimbal axis", "IEEE Std 836, positioning errors"
+    name, title, source = "axis-nonorthogonality", "tilt of a gimbal axis", "geometry of the bench"
     typical = Typical((5e-6, 50e-6))
 
     @property
@@ -219,7 +219,7 @@ class GravityError(Effect):
     """epsilon f in all channels: always a common scale factor, and so always invisible."""
 
     family = "base and platform"
-    name, title, source = "gravity-error", "wrong local gravity", "IEEE Std 836"
+    name, title, source = "gravity-error", "wrong local gravity", "size of the reference"
     confused_with = "a common scale factor, always"
     typical = Typical((10e-6, 700e-6))
 

@@ -244,18 +244,6 @@ def misfit(noise: Noise, means: Means, state: Floats, prior: Floats | None = Non
     return _likelihood(noise, (), means, state, prior).without().misfit
 
 
-def restricted_log_likelihood(
-    noise: Noise, means: Means, state: Floats, prior: Floats | None = None, held_s: float = math.inf
-) -> float:
-    """Restricted log-likelihood of the dwells' means, up to a constant.
-
-    ``prior`` is as in ``misfit``; ``held_s`` is the time constant with which a walk of the biases reverts to its mean,
-    infinite for a random walk.
-    """
-    means, prior = _reduce(means, prior)
-    return -_likelihood(noise, (), means, state, prior, held_s).without().cost
-
-
 def _reduce(means: Means, prior: Floats | None = None) -> tuple[Means, Floats]:
     """Return the means with an orthonormal basis (D, 3, r) in place of the columns without a prior, and the prior's
     rows.

@@ -229,7 +229,9 @@ class Calibration:
         if self.bench.angles:
             return {}
         out: dict[str, Literal["frame", "square"]] = {"theta1": "frame", "phi1": "frame", "nu2": "frame"}
-        return out | ({"nu1": "square", "theta3": "square", "phi3": "square"} if self.model.square else {})
+        if self.model.square:
+            out |= {"nu1": "square", "theta3": "square", "phi3": "square"}
+        return out
 
     @cached_property
     def held_out(self) -> HeldOut | None:

@@ -8,6 +8,11 @@ run it varies by the repeatability r, which is what handling, mounting and switc
 sigma being that of the calibration. A Kalman filter with diffuse level and drift gives level, drift, and the restricted
 likelihood of q and r. Few calibrations tell little of q and r, and a single best pair would make sigmas too small: all
 pairs of a grid are weighted by likelihood and prior, flat in ln q and ln r up to the scatter found, falling beyond.
+
+A dozen calibrations cannot tell a walk from poor repeatability, and each of the two makes sure of what the other leaves
+open: a walk of the level, repeatability of the drift. Averaged over both, intervals of 95 % cover the next value in 94
+to 98 % of simulated histories of whichever kind; the drift in 86 to 94 % where all scatter is a walk, and in every one
+where all is repeatability.
 """
 
 from __future__ import annotations

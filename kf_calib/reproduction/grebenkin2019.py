@@ -15,16 +15,18 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, permutations
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.estimation import kalman_filterpy
 from kf_calib.estimation.prior import PRIORS
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 GRAVITY_MPS2 = 9.81
 NOISE_MPS2 = 1e-4
@@ -214,6 +216,8 @@ def nonoptimal(conditions: Conditions, earth_turns: bool = True) -> OrientationS
 
 def attitudes(turns: Turns) -> Floats:
     """Quaternions (4, 4), platform -> bench."""
+    from scipy.spatial.transform import Rotation  # takes 0.2 s to load: for those alone who run the experiment
+
     return Rotation.from_euler("YZY", TURNS[turns], degrees=True).as_quat()
 
 
@@ -222,6 +226,8 @@ def optimal(conditions: Conditions | None = None, turned_after: bool = True) -> 
 
     turned_after: under ``conditions`` every orientation points at gravity as it stands on arrival, else as at first.
     """
+    from scipy.spatial.transform import Rotation
+
     along = paper_parameters.optimal_directions(paper_parameters.nominal())
     bench, period_s, carried = FIXED, 0.0, Rotation.identity(4)
     if conditions is not None:
@@ -237,6 +243,8 @@ def optimal(conditions: Conditions | None = None, turned_after: bool = True) -> 
 
 def _pointing(directions: Floats) -> Rotation:
     """Attitudes in which the platform sees the bench's vertical along ``directions`` (n, 3)."""
+    from scipy.spatial.transform import Rotation
+
     return Rotation.concatenate([Rotation.align_vectors([[0.0, 1.0, 0.0]], [each])[0] for each in directions])
 
 

@@ -84,6 +84,15 @@ _FIELD = {
 }
 """SI unit -> unit of the field. One unit for all sizes: a bias is in µg, be it of a quartz accelerometer or a chip."""
 
+_WHOLE = {
+    "rad": [(math.inf, Unit("deg", math.degrees(1.0)))],
+    "m/s^2": [(math.inf, Unit("g", 1.0 / _G))],
+    "s": [(300.0, Unit("s", 1.0)), (math.inf, Unit("min", 1.0 / 60.0))],
+    "K": [(0.5, Unit("mK", 1e3))],
+    "K/s": [(math.inf, Unit("K/h", 3600.0))],
+}
+"""SI unit -> units of quantities themselves, each for what is up to a size in SI."""
+
 System = Literal["field", "si"]
 _system: ContextVar[System] = ContextVar("units", default="field")
 
@@ -114,9 +123,14 @@ def shown(of: str | Quantity) -> Unit:
     return Unit(of.unit, 1.0) if _system.get() == "si" else Unit(of.shown_unit, of.per_si)
 
 
-def shown_angle() -> Unit:
-    """The unit of an angle that is not small, such as that between an axis and where it should be: deg, or rad."""
-    return Unit("rad", 1.0) if _system.get() == "si" else Unit("deg", math.degrees(1.0))
+def shown_whole(unit: str, largest: float = math.inf) -> Unit:
+    """The unit in which people are shown a quantity itself, not an error of it: a gimbal's angle in deg, force in g.
+
+    largest: the greatest size that is shown, in SI; what is small is in a smaller unit.
+    """
+    if _system.get() == "si":
+        return Unit(unit, 1.0)
+    return next((own for bound, own in _WHOLE.get(unit, ()) if largest <= bound), Unit(unit, 1.0))
 
 
 def significant(value: float, digits: int = 3) -> str:

@@ -18,7 +18,7 @@ from kf_calib.estimation.remarks import beyond_stated
 from kf_calib.estimation.reml import FEWEST, degrees_of_freedom
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Parameter, format_p
 from kf_calib.support.printing import printed
-from kf_calib.support.units import rounded, shown, shown_angle
+from kf_calib.support.units import rounded, shown, shown_whole
 from kf_calib.views.tables import Table
 from kf_calib.views.terminal import PlainConsole, note
 
@@ -41,7 +41,7 @@ def whole_value(parameter: Parameter) -> str:
     assert parameter.value is not None and parameter.sigma is not None
     if parameter.unit == "1":
         return rounded(parameter.value, parameter.sigma)[0]
-    unit = shown_angle() if parameter.unit == "rad" else shown(parameter)
+    unit = shown_whole("rad") if parameter.unit == "rad" else shown(parameter)
     return f"{unit.rounded(parameter.value, parameter.sigma)[0]} {unit.label}"
 
 

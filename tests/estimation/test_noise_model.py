@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.long_runs import slow
+from helpers.restricted import restricted_log_likelihood
 from helpers.synthetic import Run, plan_of
 from scipy.signal import lfilter
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.dwells.sufficient_statistics import Autocovariance, less_curve
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.reml import restricted_log_likelihood
 from kf_calib.sources.simulation.noise_processes import TrueNoise as SimulatedNoise
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation

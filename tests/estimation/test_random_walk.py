@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.long_runs import slow
+from helpers.restricted import restricted_log_likelihood
 from helpers.synthetic import Run
 from scipy.stats import chi2, multivariate_normal
 
@@ -17,7 +18,6 @@ from kf_calib.estimation import random_walk, square_root_information
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.cross_validation import held_out
 from kf_calib.estimation.noise_model import mean_covariances, steps
-from kf_calib.estimation.reml import restricted_log_likelihood
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 

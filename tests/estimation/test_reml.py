@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.restricted import restricted_log_likelihood
 from helpers.synthetic import Run
 
 from kf_calib.bench.arrays import Floats
@@ -13,7 +14,7 @@ from kf_calib.estimation import banded
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_columns import Means
 from kf_calib.estimation.noise_model import Noise
-from kf_calib.estimation.reml import restricted_log_likelihood, with_dwell_parts
+from kf_calib.estimation.reml import with_dwell_parts
 from kf_calib.estimation.restricted_likelihood import Restricted
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings

@@ -12,7 +12,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.effects import effect_named, names
 from kf_calib.errors import InputError
 from kf_calib.support import units
-from kf_calib.support.units import Unit, field_unit, quantity, rounded, shown, shown_angle, shown_in, si, significant
+from kf_calib.support.units import Unit, field_unit, quantity, rounded, shown, shown_in, shown_whole, si, significant
 
 G = 9.80665  # m/s^2, by definition
 ARCSEC = math.pi / 180 / 3600
@@ -64,10 +64,12 @@ def test_a_size_as_it_is_printed_is_read_back(symbol: str) -> None:
 
 def test_people_are_shown_the_field_s_units_or_si() -> None:
     qb = QUANTITIES["qb"]
-    assert (shown("m/s^2").label, shown(qb).label, shown_angle()) == ("µg", "µg/√s", Unit("deg", math.degrees(1.0)))
+    assert (shown("m/s^2").label, shown(qb).label) == ("µg", "µg/√s")
+    assert shown_whole("rad") == Unit("deg", math.degrees(1.0)) and shown_whole("K/s") == Unit("K/h", 3600.0)
+    assert [shown_whole("s", each).label for each in (299.0, 301.0)] == ["s", "min"]
     with shown_in("si"):
         assert shown("m/s^2") == Unit("m/s^2", 1.0) and shown(qb) == Unit(qb.unit, 1.0)
-        assert shown_angle() == Unit("rad", 1.0)
+        assert shown_whole("rad") == Unit("rad", 1.0) and shown_whole("s") == Unit("s", 1.0)
         said = list[str]()
         other = threading.Thread(target=copy_context().run, args=(lambda: said.append(shown("rad").label),))
         other.start()

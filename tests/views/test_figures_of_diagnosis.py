@@ -19,12 +19,12 @@ import kf_calib
 from kf_calib import plot
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
-from kf_calib.diagnosis.residual_drivers import explanations
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, begin, extend, improve, undone
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_readings import readings_of, worst_dwell
+from kf_calib.support.units import shown_in
 from kf_calib.views.figures.log_axis import label_axis, plain
 from kf_calib.views.figures.words import rounded_number, wrapped
 
@@ -76,7 +76,7 @@ def test_every_figure_of_a_diagnosis_has_ink_in_every_panel(hidden: tuple[str, .
 
 
 def test_bars_of_suspects_are_their_shares_and_those_that_do_not_fit_are_hatched() -> None:
-    explained = explanations(hysteresis())
+    explained = hysteresis().explanations
     figure = plot.suspects(hysteresis())
     axes = axes_of(figure, "What each explains")
     bars = [bar for container in axes.containers if isinstance(container, BarContainer) for bar in container]
@@ -128,9 +128,13 @@ def test_what_could_hide_names_every_effect_once() -> None:
             assert ends[k] == pytest.approx(min(usual[1] / each.minimum, 1000.0))
 
 
-def test_residuals_of_single_dwells_are_drawn_in_micro_g() -> None:
+def test_residuals_of_single_dwells_are_drawn_in_micro_g_or_si() -> None:
     diagnosis = hysteresis()
     figure = plot.residuals(diagnosis)
+    with shown_in("si"):
+        words = panels(plot.residuals(diagnosis))
+    assert (words[0].get_ylabel(), words[-1].get_xlabel()) == (
+        "accelerometer 1, m/s^2", "last step along the input axis, m/s^2")  # fmt: skip
     first = panels(figure)[0]
     drawn = first.containers[0].lines[0].get_ydata()  # type: ignore[union-attr]
     assert np.asarray(drawn) == pytest.approx(diagnosis.before.residuals_mps2[:, 0] / MICRO_G)

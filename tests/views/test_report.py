@@ -89,7 +89,7 @@ def test_figures_are_light_on_dark_and_dark_on_light(shown: Any, told: list[str]
     )
     assert abs(_brightness(ground) - _brightness(ink)) > 200
     ways = shown.evaluate(
-        "[...document.querySelectorAll('.drawing:not(.card) svg g[id*=text] g')]"
+        "[...document.querySelectorAll('.drawing:not(.card) svg g[transform*=scale]')]"
         ".map(each => getComputedStyle(each).fill)"
     )
     apart = [abs(_brightness(each) - _brightness(ground)) > 120 for each in ways]
@@ -209,6 +209,7 @@ def test_figures_of_many_points_stay_small_and_have_greys_of_the_page() -> None:
     assert len(many) < 400_000 and "data:image/png" in many and many.startswith("<svg")
     assert "var(--ink)" in many and "stroke: #6b6b6b" not in many and 'id="many-' in many
     assert "data:image" not in small and small.count("<use") >= 3 and "#009e73 var(--keep)" in small
+    assert "\n" not in small
 
 
 def test_what_is_still_too_large_is_a_picture() -> None:

@@ -14,7 +14,7 @@ from helpers.paths import ROOT
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.missing_effect import diagnose
-from kf_calib.diagnosis.residual_drivers import drivers_of, explanations
+from kf_calib.diagnosis.residual_drivers import drivers_of
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, improve
 from kf_calib.estimation.calibration import calibrate
@@ -29,7 +29,7 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.views import rerun as view
 from kf_calib.views.rerun import comparison, diagnosis, improvement, residuals
 from kf_calib.views.rerun.chart import Axis, Chart, number
-from kf_calib.views.rerun.explorer import shown, signed
+from kf_calib.views.rerun.explorer import drawn_values, signed
 from kf_calib.views.rerun.file import new_stream
 from kf_calib.views.rerun.growing import GrowingView
 from kf_calib.views.rerun.names import per_si
@@ -170,12 +170,12 @@ def test_a_diagnosis_shows_what_each_explanation_leaves(found: Diagnosis, tmp_pa
     before = content(path, "Points2D:positions")
     after = content(path, "Points2D:positions", diagnosis.EXPLANATION)
     charts = made.charts(driver)
-    assert driver.symbol == "da" and explanations(found)[0].name == "hysteresis"
+    assert driver.symbol == "da" and found.explanations[0].name == "hysteresis"
     for i, channel in enumerate(("a1", "a2", "a3")):
         place = before[f"/explorer/before/{channel}/residuals"][None]
-        np.testing.assert_allclose(values_at(charts["before"][i], place),
-                                   np.column_stack([shown(driver)[:, i], (found.before.residuals_mps2 / sigmas)[:, i]]),
-                                   atol=1e-3)  # fmt: skip
+        ratios = found.before.residuals_mps2 / sigmas
+        drawn = np.column_stack([drawn_values(driver)[:, i], ratios[:, i]])
+        np.testing.assert_allclose(values_at(charts["before"][i], place), drawn, atol=1e-3)
         for rank, each in enumerate(made.explanations, 1):
             place = after[f"/explorer/left/{channel}/residuals"][rank]
             np.testing.assert_allclose(values_at(charts["left"][i], place)[:, 1], each.left_ratios[:, i], atol=1e-3)

@@ -8,7 +8,6 @@ from functools import singledispatch
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
 from kf_calib.design.orientation_plan import Plan
@@ -47,10 +46,11 @@ def figures(result: Any) -> Figures:
 
 @figures.register
 def _(found: Diagnosis) -> Figures:
+    fails = found.test.consistent is False
     return {
-        "Where the model fails": lambda: residuals(found),
+        "Where the model fails" if fails else "What the model leaves": lambda: residuals(found),
         "What the residuals go with": lambda: what_they_go_with(found),
-        "Which effect is missing": lambda: suspects(found),
+        "Which effect is missing" if fails else "Whether an effect is missing": lambda: suspects(found),
         "What could hide here": lambda: detection_limits(found),
         "Residuals by the direction of gravity": lambda: on_the_sphere(found),
     }
@@ -58,10 +58,11 @@ def _(found: Diagnosis) -> Figures:
 
 @figures.register
 def _(state: Improvement) -> Figures:
+    fails = state.start.test.consistent is False
     return {
-        "The error falls": lambda: improvement(state),
+        "The error falls" if state.steps else "The error of the model": lambda: improvement(state),
         "Residuals of each step": lambda: residuals_of_steps(state),
-        "Where the first model fails": lambda: residuals(state.start),
+        "Where the first model fails" if fails else "What the first model leaves": lambda: residuals(state.start),
         "What could still hide": lambda: detection_limits(state.found),
     }
 
@@ -130,6 +131,8 @@ def save(what: Figure | Figures, path: str | Path, kind: str = "", width_px: int
 
 def _pages(what: Figures) -> bytes:
     """Return a PDF with a figure a page, its title above it."""
+    from matplotlib.backends.backend_pdf import PdfPages  # with all its fonts it takes 0.2 s to load
+
     memory = io.BytesIO()
     with style.styled(), PdfPages(memory, metadata={"CreationDate": None, "Creator": None, "Producer": None}) as pages:
         for title, draw in what.items():

@@ -81,7 +81,7 @@ def _bars(axes: Axes, sizes: Sequence[Detectable], rows: int, grade: Grade, firs
     axes.set_xlabel("usual size / smallest size that would be found")
     if first:
         numbers = f"beside: smallest size found in 9 of 10 such runs (usual sizes, {GRADES[grade]})"
-        axes.set_title(f"Left of 1, dotted: usual sizes that could hide in this run\n{numbers}", fontsize=9.0)
+        axes.set_title(f"Left of 1, hatched: usual sizes that could hide in this run\n{numbers}", fontsize=9.0)
 
 
 def _bar(axes: Axes, k: int, low: float, high: float) -> None:
@@ -92,7 +92,7 @@ def _bar(axes: Axes, k: int, low: float, high: float) -> None:
         return
     low, high = max(low, _LOW), min(max(high, 1.1 * low), _HIGH)
     if low < 1.0:
-        axes.barh(k, min(high, 1.0) - low, left=low, color=_HIDDEN, height=0.62, hatch="....", edgecolor="white",
+        axes.barh(k, min(high, 1.0) - low, left=low, color=_HIDDEN, height=0.62, hatch="////", edgecolor="white",
                   linewidth=0.0)  # fmt: skip
     if high > 1.0:
         axes.barh(k, high - max(low, 1.0), left=max(low, 1.0), color=_SEEN, height=0.62)

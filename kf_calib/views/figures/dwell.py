@@ -9,7 +9,7 @@ from matplotlib.figure import Figure, FigureBase
 from kf_calib.bench.streams import Source
 from kf_calib.estimation.dwell_readings import DwellReadings, readings_of
 from kf_calib.estimation.results import Calibration
-from kf_calib.views.figures.residuals import MICRO_G
+from kf_calib.support.units import shown
 from kf_calib.views.figures.style import ACCELEROMETERS, BEST, GREY, blank, styled
 
 
@@ -30,31 +30,33 @@ def draw_dwell(figure: FigureBase, readings: DwellReadings, model: str) -> None:
     for i, (each, near) in enumerate(panels):
         _readings(each, readings, i)
         _mean(near, readings, i)
-        each.set_ylabel(f"accelerometer {i + 1}\nreading − model, µg")
+        each.set_ylabel(f"accelerometer {i + 1}\nreading − model, {shown('m/s^2').label}")
     some = "" if readings.every == 1 else f"; one of {readings.every} readings is drawn"
     panels[0, 0].set_title(f"Dwell {readings.number}, reading by reading, less the model: {model}{some}")
     panels[0, 1].set_title(f"Mean of its {readings.count} readings, ± 1σ and 2σ")
     panels[-1, 0].set_xlabel("time since the first reading of the run, s")
-    panels[-1, 1].set_xlabel("mean − model, µg")
+    panels[-1, 1].set_xlabel(f"mean − model, {shown('m/s^2').label}")
 
 
 def _readings(axes: Axes, readings: DwellReadings, i: int) -> None:
     """Draw the readings of one accelerometer with zero, which is the model, and their mean."""
-    axes.plot(readings.time_s, readings.differences_mps2[:, i] / MICRO_G, ".", color=ACCELEROMETERS[i], markersize=2.0,
+    per_si = shown("m/s^2").per_si
+    axes.plot(readings.time_s, readings.differences_mps2[:, i] * per_si, ".", color=ACCELEROMETERS[i], markersize=2.0,
               alpha=0.55)  # fmt: skip
     axes.axhline(0.0, color=GREY, linewidth=1.0)
-    axes.axhline(readings.mean_mps2[i] / MICRO_G, color=BEST, linewidth=1.4, linestyle="--")
+    axes.axhline(readings.mean_mps2[i] * per_si, color=BEST, linewidth=1.4, linestyle="--")
 
 
 def _mean(axes: Axes, readings: DwellReadings, i: int) -> None:
     """Draw the mean of one accelerometer with its sigma on an axis of its own size."""
-    mean, sigma = readings.mean_mps2[i] / MICRO_G, readings.sigma_mps2[i] / MICRO_G
+    unit = shown("m/s^2")
+    mean, sigma = readings.mean_mps2[i] * unit.per_si, readings.sigma_mps2[i] * unit.per_si
     axes.axvline(0.0, color=GREY, linewidth=1.0)
     axes.errorbar([mean], [0.0], xerr=[2.0 * sigma], fmt="none", color=ACCELEROMETERS[i], elinewidth=1.0, capsize=4.0)
     axes.errorbar([mean], [0.0], xerr=[sigma], fmt="o", color=ACCELEROMETERS[i], elinewidth=4.0, markersize=8.0)
     times = mean / sigma if sigma > 0.0 else np.nan
-    axes.annotate(f"{mean:+.3g} ± {sigma:.2g} µg: {times:+.1f} σ", (mean, 0.0), (0, 12), textcoords="offset points",
-                  ha="center")  # fmt: skip
+    found = f"{mean:+.3g} ± {sigma:.2g} {unit.label}: {times:+.1f} σ"
+    axes.annotate(found, (mean, 0.0), (0, 12), textcoords="offset points", ha="center")
     axes.set_ylim(-1.0, 1.0)
     axes.set_yticks([])
     axes.margins(x=0.35)

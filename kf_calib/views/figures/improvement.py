@@ -11,14 +11,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase, SubFigure
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.residual_drivers import Driver, drivers_of, unexplained_mps2, unexplained_rms_mps2
+from kf_calib.diagnosis.residual_drivers import Driver, unexplained_mps2, unexplained_rms_mps2
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, SelectionStep
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
+from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
 from kf_calib.views.figures.log_axis import label_axis
-from kf_calib.views.figures.residuals import MICRO_G, driver_axis, driver_to_show
+from kf_calib.views.figures.residuals import driver_axis, driver_to_show
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
     BEST,
@@ -102,9 +103,9 @@ def _label(step: SelectionStep) -> str:
 def _errors(axes: Axes, points: Sequence[_Point], floor_mps2: float | None) -> None:
     """Draw the errors of all models over the noise floor of the last, and the p-value of the run below each."""
     places, kept = np.arange(len(points)), np.array([each.kind == "step" for each in points])
-    held_out = _micro_g([each.result.held_out_rms_mps2 for each in points])
-    fitted = _micro_g([unexplained_rms_mps2(each.result) for each in points])
-    floor = _micro_g([floor_mps2])
+    held_out = _in_unit([each.result.held_out_rms_mps2 for each in points])
+    fitted = _in_unit([unexplained_rms_mps2(each.result) for each in points])
+    floor = _in_unit([floor_mps2])
     if floor_mps2:
         axes.axhline(floor[0], color=GREY, linestyle="--", linewidth=1.2, label="what noise alone gives")
     for values, name, marker, colour in ((held_out, "left out of", "o", BEST), (fitted, "in", "s", "#0072b2")):
@@ -116,7 +117,7 @@ def _errors(axes: Axes, points: Sequence[_Point], floor_mps2: float | None) -> N
     axes.set_yscale("log")
     axes.set_ylim(low, high)
     label_axis(axes.yaxis, low, high)
-    axes.set_ylabel("rms error, µg")
+    axes.set_ylabel(f"rms error, {shown('m/s^2').label}")
     axes.set_xlim(-0.5, len(points) - 0.5)
     axes.set_xticks(places, [_tick(k, each) for k, each in enumerate(points)])
     axes.set_title("The error of the model over the steps; below each, the p-value of the run with it")
@@ -129,9 +130,9 @@ def _tick(number: int, point: _Point) -> str:
     return f"{wrapped(f'{number}: {point.label}', _NAME)}{p_value}"
 
 
-def _micro_g(values: Sequence[float | None]) -> Floats:
-    """Return values in µg; NaN where there is none."""
-    return np.array([np.nan if value is None else value for value in values]) / MICRO_G
+def _in_unit(values_mps2: Sequence[float | None]) -> Floats:
+    """Return errors in the unit that they are drawn in; NaN where there is none."""
+    return np.array([np.nan if value is None else value for value in values_mps2]) * shown("m/s^2").per_si
 
 
 def _beside(axes: Axes, values: Floats, points: Sequence[_Point], marker: str) -> None:
@@ -153,12 +154,12 @@ def _write_ratios(axes: Axes, errors: Floats, floor: float) -> None:
 
 def _coefficients(figure: SubFigure, points: Sequence[_Point], effects: Sequence[str]) -> None:
     """Draw the coefficients of each effect, with 1 sigma, at every model that has the effect."""
-    shown = effects[:_COEFFICIENTS]
-    rows = -(-len(shown) // _WIDE)
-    panels = figure.subplots(rows, -(-len(shown) // rows), squeeze=False).ravel()
-    for axes, name in zip(panels, shown, strict=False):
+    drawn = effects[:_COEFFICIENTS]
+    rows = -(-len(drawn) // _WIDE)
+    panels = figure.subplots(rows, -(-len(drawn) // rows), squeeze=False).ravel()
+    for axes, name in zip(panels, drawn, strict=False):
         _of_effect(axes, name, points)
-    for axes in panels[len(shown) :]:
+    for axes in panels[len(drawn) :]:
         axes.set_axis_off()
 
 
@@ -167,10 +168,10 @@ def _of_effect(axes: Axes, name: str, points: Sequence[_Point]) -> None:
     having = [(x, _parameters(each.result, name)) for x, each in enumerate(points)]
     having = [(x, own) for x, own in having if own]
     symbols = list(dict.fromkeys(p.symbol for _, own in having for p in own))
-    unit = having[0][1][0].shown_unit
+    unit = shown(having[0][1][0])
     for k, each in enumerate(symbols):
         shift = 0.5 * (k - 0.5 * (len(symbols) - 1)) / max(len(symbols), 1)
-        values = [(x + shift, p.value * p.per_si, p.sigma * p.per_si) for x, own in having for p in own
+        values = [(x + shift, p.value * unit.per_si, p.sigma * unit.per_si) for x, own in having for p in own
                   if p.symbol == each and p.value is not None and p.sigma is not None]  # fmt: skip
         if values:
             places, middles, sigmas = zip(*values, strict=True)
@@ -182,7 +183,7 @@ def _of_effect(axes: Axes, name: str, points: Sequence[_Point]) -> None:
     axes.set_xlim(-0.5, len(points) - 0.5)
     axes.set_xticks(range(len(points)))
     axes.set_xlabel("number of the model above", fontsize=8.0)
-    axes.set_ylabel(f"coefficient ± 1σ, {unit}")
+    axes.set_ylabel(f"coefficient ± 1σ, {unit.label}")
     axes.set_title(wrapped(name, 30))
     axes.legend(fontsize=8.0, handletextpad=0.2, borderpad=0.1)
 
@@ -205,21 +206,21 @@ def residuals_of_steps(state: Improvement) -> Figure:
     accelerometer."""
     with styled():
         figure = blank(11.0, 7.0)
-        draw_residuals_of_steps(figure, state, drivers_of(state.start.before))
+        draw_residuals_of_steps(figure, state, state.start.drivers)
     return figure
 
 
 def draw_residuals_of_steps(figure: FigureBase, state: Improvement, drivers: Sequence[Driver]) -> None:
     """The same on a part of a figure; drivers: of the residuals of the first model."""
     steps = [("start", state.start), *((_label(step), step.found) for step in state.steps)]
-    shown = steps if len(steps) <= _COLUMNS else [steps[0], *steps[-(_COLUMNS - 1) :]]
+    drawn = steps if len(steps) <= _COLUMNS else [steps[0], *steps[-(_COLUMNS - 1) :]]
     driver = driver_to_show(drivers)
     if driver is None:
         return say(figure, "Nothing that was recorded varies in this run.")
     unit, scale = driver_axis(driver)
     sigmas = mean_sigmas(state.start.before)
-    panels = figure.subplots(3, len(shown), sharex=True, sharey=True, squeeze=False)
-    for column, (words, found) in enumerate(shown):
+    panels = figure.subplots(3, len(drawn), sharex=True, sharey=True, squeeze=False)
+    for column, (words, found) in enumerate(drawn):
         ratios = unexplained_mps2(found.before) / sigmas
         panels[0, column].set_title(
             f"{wrapped(words, 28)}\n{_fate(found, state.result.held_out_floor_mps2)}", fontsize=8.5
@@ -231,8 +232,8 @@ def draw_residuals_of_steps(figure: FigureBase, state: Improvement, drivers: Seq
             if not column:
                 axes.set_ylabel(f"accelerometer {i + 1}\nresidual / σ")
         panels[-1, column].set_xlabel(f"{driver.words}, {unit}", fontsize=8.0)
-    if len(shown) < len(steps):
-        letter(panels[0, 1], f"{len(steps) - len(shown)} steps before it are left out")
+    if len(drawn) < len(steps):
+        letter(panels[0, 1], f"{len(steps) - len(drawn)} steps before it are left out")
 
 
 def _fate(found: Diagnosis, floor_mps2: float | None) -> str:

@@ -10,17 +10,16 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.ticker import MaxNLocator
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.residual_drivers import (
     Driver,
-    Explanation,
     channel_rms_mps2,
-    drivers_of,
-    explanations,
     is_function_of,
 )
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import format_p
+from kf_calib.support.units import Unit, shown, shown_whole
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
     BAND,
@@ -34,10 +33,6 @@ from kf_calib.views.figures.style import (
 )
 from kf_calib.views.figures.words import rounded_number, wrapped
 
-MICRO_G = 9.80665e-6  # m/s^2
-_UNITS = {"rad": ("deg", 180.0 / np.pi), "m/s^2": ("g", 1.0 / 9.80665), "s": ("min", 1.0 / 60.0),
-          "K": ("K", 1.0), "K/s": ("K/h", 3600.0)}  # fmt: skip
-_SMALLER = {"s": ("s", 1.0, 300.0), "K": ("mK", 1e3, 0.5)}  # units for values whose greatest is below the last, SI
 _SIGNIFICANT, _SOME = 0.01, 0.005  # p-value and share above and below which a driver explains nothing
 _TITLE = 36  # letters in a line of a title
 _PANELS = 8  # drivers in small panels
@@ -54,7 +49,7 @@ def residuals(found: Diagnosis, driver: str | None = None) -> Figure:
     """
     with styled():
         figure = blank(11.0, 7.0)
-        draw_residuals(figure, found, drivers_of(found.before), driver)
+        draw_residuals(figure, found, found.drivers, driver)
     return figure
 
 
@@ -63,7 +58,7 @@ def draw_residuals(figure: FigureBase, found: Diagnosis, drivers: Sequence[Drive
     driver = driver_to_show([each for each in drivers if symbol in (None, each.symbol)])
     if driver is None:
         return say(figure, f"{symbol or 'Nothing that was recorded'} does not vary in this run.")
-    others = explanations(found)
+    others = found.explanations
     panels = figure.subplots(3, 3 if others else 1, sharex=True, sharey="row", squeeze=False)
     label, scale = driver_axis(driver)
     sigmas = mean_sigmas(found.before)
@@ -71,7 +66,7 @@ def draw_residuals(figure: FigureBase, found: Diagnosis, drivers: Sequence[Drive
         x = driver.values[:, i] * scale
         _points(row[0], x, found.before.residuals_mps2[:, i], sigmas[:, i], i)
         _rms(row[0], found.before.residuals_mps2, i)
-        row[0].set_ylabel(f"accelerometer {i + 1}, µg")
+        row[0].set_ylabel(f"accelerometer {i + 1}, {shown('m/s^2').label}")
         if others:
             best = others[0]
             for explanation, colour, marker in zip(others[:2], (BEST, RUNNER_UP), "_x", strict=False):
@@ -99,12 +94,9 @@ def driver_to_show(drivers: Sequence[Driver]) -> Driver | None:
     return next((each for each in drivers if each.symbol == "t"), drivers[0] if drivers else None)
 
 
-def driver_axis(driver: Driver) -> tuple[str, float]:
-    """The unit in which a quantity is drawn, and how many of it make one SI unit."""
-    unit, scale, least = _SMALLER.get(driver.unit, ("", 1.0, 0.0))
-    if np.abs(driver.values).max() < least:
-        return unit, scale
-    return _UNITS.get(driver.unit, (driver.unit, 1.0))
+def driver_axis(driver: Driver) -> Unit:
+    """The unit in which a quantity is drawn."""
+    return shown_whole(driver.unit, float(np.abs(driver.values).max()))
 
 
 def _explains(driver: Driver) -> bool:
@@ -116,29 +108,32 @@ def _points(axes: Axes, x: Floats, values_mps2: Floats, sigmas_mps2: Floats, i: 
     """Draw means of dwells with their sigma and the line at zero."""
     many = len(x) > _MANY
     axes.axhline(0.0, color=GREY, linewidth=0.8)
-    bars = None if many else sigmas_mps2 / MICRO_G
-    axes.errorbar(x, values_mps2 / MICRO_G, bars, fmt=MARKERS[i], color=ACCELEROMETERS[i], zorder=3, elinewidth=0.9,
+    per_si = shown("m/s^2").per_si
+    bars = None if many else sigmas_mps2 * per_si
+    axes.errorbar(x, values_mps2 * per_si, bars, fmt=MARKERS[i], color=ACCELEROMETERS[i], zorder=3, elinewidth=0.9,
                   markersize=2.0 if many else 4.5, markeredgewidth=0.0)  # fmt: skip
 
 
 def _rms(axes: Axes, residuals_mps2: Floats, i: int) -> None:
     """Write the rms of the residuals of one accelerometer above its panel: on axes of large ones small ones cannot be
     read."""
-    rms = rounded_number(channel_rms_mps2(residuals_mps2)[i] / MICRO_G, 2)
-    axes.set_title(f"rms {rms} µg", loc="right", fontsize=8.0, color=GREY)
+    unit = shown("m/s^2")
+    rms = rounded_number(channel_rms_mps2(residuals_mps2)[i] * unit.per_si, 2)
+    axes.set_title(f"rms {rms} {unit.label}", loc="right", fontsize=8.0, color=GREY)
 
 
 def _predictions(axes: Axes, x: Floats, explanation: Explanation, i: int, colour: str, marker: str) -> None:
     """Draw what an explanation predicts of the residual of each dwell."""
-    axes.plot(x, explanation.predicted_mps2[:, i] / MICRO_G, marker=marker, markersize=9 if marker == "_" else 4,
+    predicted = explanation.predicted_mps2[:, i] * shown("m/s^2").per_si
+    axes.plot(x, predicted, marker=marker, markersize=9 if marker == "_" else 4,
               linestyle="none", color=colour, label=f"what {explanation.name} predicts of it")  # fmt: skip
 
 
 def _curve(axes: Axes, x: Floats, explanation: Explanation, i: int, is_function: bool) -> None:
     """Draw what an explanation adds to the readings, with its 1 sigma: a curve if it depends on this quantity alone."""
-    order = np.argsort(x)
-    middle = explanation.contribution_mps2[order, i] / MICRO_G
-    sigma = explanation.contribution_sigma_mps2[order, i] / MICRO_G
+    order, per_si = np.argsort(x), shown("m/s^2").per_si
+    middle = explanation.contribution_mps2[order, i] * per_si
+    sigma = explanation.contribution_sigma_mps2[order, i] * per_si
     if is_function:
         axes.plot(x[order], middle, color=BEST)
         axes.fill_between(x[order], middle - sigma, middle + sigma, color=BAND, linewidth=0.0)
@@ -150,20 +145,20 @@ def what_they_go_with(found: Diagnosis) -> Figure:
     """Residuals over their sigma against everything that varies in the run, and what the best explanation leaves."""
     with styled():
         figure = blank(11.0, 7.0)
-        draw_drivers(figure, found, drivers_of(found.before))
+        draw_drivers(figure, found, found.drivers)
     return figure
 
 
 def draw_drivers(figure: FigureBase, found: Diagnosis, drivers: Sequence[Driver]) -> None:
     """The same on a part of a figure: a column a driver, those that explain most first."""
-    shown, others = drivers[:_PANELS], explanations(found)[:1]
-    if not shown:
+    drawn, others = drivers[:_PANELS], found.explanations[:1]
+    if not drawn:
         return say(figure, "Nothing that was recorded varies in this run.")
-    wide = min(4, len(shown))
-    high = -(-len(shown) // wide) * (1 + len(others))
+    wide = min(4, len(drawn))
+    high = -(-len(drawn) // wide) * (1 + len(others))
     panels = figure.subplots(high, wide, sharey=True, squeeze=False)
     before = found.before.residuals_mps2 / mean_sigmas(found.before)
-    for k, driver in enumerate(shown):
+    for k, driver in enumerate(drawn):
         row, column = divmod(k, wide)
         unit, scale = driver_axis(driver)
         values = [before, *(each.left_ratios for each in others)]

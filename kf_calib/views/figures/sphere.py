@@ -9,7 +9,6 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure, FigureBase
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.residual_drivers import explanations
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.residual_table import mean_sigmas, quantity_means
 from kf_calib.views.figures.style import GREY, blank, styled
@@ -28,7 +27,7 @@ def on_the_sphere(found: Diagnosis) -> Figure:
     colours.
     """
     with styled():
-        figure = blank(11.0, 7.5) if explanations(found) else blank(11.0, 2.8)
+        figure = blank(11.0, 7.5) if found.explanations else blank(11.0, 2.8)
         draw_on_the_sphere(figure, found)
     return figure
 
@@ -38,7 +37,7 @@ def draw_on_the_sphere(figure: FigureBase, found: Diagnosis) -> None:
     force = quantity_means(found.before, ["fx", "fy", "fz"])
     directions = np.stack([force[f"f{axis}"][:, 0] for axis in "xyz"], axis=1)
     columns = {found.before.model.sum: found.before.residuals_mps2 / mean_sigmas(found.before)}
-    columns |= {f"with {each.name}": each.left_ratios for each in explanations(found)[:1]}
+    columns |= {f"with {each.name}": each.left_ratios for each in found.explanations[:1]}
     most = max(_LEAST, *(float(np.percentile(np.abs(ratios), 99.0)) for ratios in columns.values()))
     shape = (3, 2) if len(columns) > 1 else (1, 3)
     panels = figure.subplots(*shape, squeeze=False, subplot_kw={"projection": "mollweide"})

@@ -70,13 +70,6 @@ def blank(width_in: float = 11.0, height_in: float = 7.0) -> Figure:
     return figure
 
 
-def arrange(figure: Figure) -> None:
-    """Give the panels their places, once: matplotlib does so for every file, and draws a figure in vain to do it."""
-    if (engine := figure.get_layout_engine()) is not None:
-        engine.execute(figure)
-        figure.set_layout_engine(None)
-
-
 def content_of(figure: Figure, kind: str, dpi: float = DPI) -> bytes:
     """A figure as the bytes of a file of this kind: png, svg or pdf; without date, program or user."""
     nothing = {"svg": {"Date": None, "Creator": None}, "pdf": {"CreationDate": None, "Creator": None, "Producer": None},

@@ -11,7 +11,8 @@ from matplotlib.ticker import MaxNLocator
 
 from kf_calib.design.next_orientation import ENOUGH, Advice
 from kf_calib.diagnosis.candidate_tests import overlap_matrix
-from kf_calib.diagnosis.residual_drivers import Driver, Explanation, drivers_of, explanations
+from kf_calib.diagnosis.explanation import Explanation
+from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.results import format_p
 from kf_calib.views.figures.style import BEST, GREY, PALE, RUNNER_UP, blank, say, styled
@@ -33,13 +34,13 @@ def suspects(found: Diagnosis) -> Figure:
     """
     with styled():
         figure = blank(11.0, 7.0)
-        draw_suspects(figure, found, drivers_of(found.before))
+        draw_suspects(figure, found, found.drivers)
     return figure
 
 
 def draw_suspects(figure: FigureBase, found: Diagnosis, drivers: Sequence[Driver]) -> None:
     """The same on a part of a figure; drivers: of the residuals."""
-    explained = explanations(found)[:_MOST]
+    explained = found.explanations[:_MOST]
     if not explained:
         return say(figure, wrapped(found.verdict, 90))
     rows, names = figure.add_gridspec(2, 1, height_ratios=(1.5, 1.0)), _alike(found)

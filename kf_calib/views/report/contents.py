@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import RenderableType
 
-from kf_calib.diagnosis.residual_drivers import Explanation, explanations
+from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.side_by_side import SideBySide, differences
 from kf_calib.diagnosis.stepwise_selection import Improvement
@@ -142,7 +142,7 @@ def _drawn(title: str, result: object, prefix: str) -> Section:
 
 def _explorer_of(found: Diagnosis) -> Explorer:
     """Return the explorer of a diagnosed run, with what its explanations leave."""
-    offered = explanations(found)[:_EXPLORED]
+    offered = found.explanations[:_EXPLORED]
     return explorer(found.before, {f"with {each.name}": each.left_mps2 for each in offered})
 
 

@@ -18,16 +18,22 @@ from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from PIL import Image
 
-from kf_calib.views.figures.style import arrange, content_of, styled
+from kf_calib.views.figures.style import content_of, styled
 
 _MOST = 1_200_000  # characters of all figures of a page
 _MANY = 60  # points of one kind in a panel that are
 _PICTURE_DPI = 150
+_LAYOUT_DPI = 600  # letters are as wide as in SVG, not moved to whole pixels
 _COLOUR = re.compile(r"\b(fill|stroke|stop-color): #([0-9a-f]{6})\b")
 _PICTURE = re.compile(r"(?<=data:image/png;base64,)[\w+/=\s]+")
 _SHADES = 64  # of a picture of points, which are few colours and their edges
+_BETWEEN = re.compile(r"<metadata>.*?</metadata>|<!--.*?-->|\s*\n\s*", re.DOTALL)
+_GROUP = re.compile(r'<g id="[^"]*"')  # nothing refers to the name of a group
 _NAME = re.compile(r'(\bid="|href="#|url\(#)')
 _PLACES = re.compile(r' (?:d|x|y)="[^"]*"')
+_LETTER = re.compile(r'(<use href="#[^"]*") transform="translate\(([-\d.]+) 0\)"')
+_MARKS = re.compile(r'<g([^>]*)>((?:<use [^>]* style="[^"]*"/>)+)</g>')
+_STYLE = re.compile(r' style="[^"]*"')
 _DECIMALS = re.compile(r"(\d\.\d\d)\d+")  # more than a screen or printer shows; not of scales, which multiply
 
 
@@ -52,17 +58,15 @@ class Drawing:
                             for each in axes.get_children())  # fmt: skip
         for patch in (self.figure.patch, *(axes.patch for axes in self.figure.axes)):
             patch.set_visible(False)
-        with styled():
-            arrange(self.figure)
+        _arrange(self.figure)
         self.markup = _element(self.figure, self.prefix, self.on_white)
 
     def with_points_as_picture(self) -> None:
-        """Draw again, the points of each kind as a picture, where there are many."""
-        many = [each for axes in self.figure.axes for each in axes.get_children() if _is_of_many_points(each)]
-        for each in many:
-            each.set_rasterized(True)
-        if many:
-            self.markup = _element(self.figure, self.prefix, self.on_white)
+        """Draw again, the points of each kind as a picture where there are many."""
+        for axes in self.figure.axes:
+            for artist in axes.get_children():
+                artist.set_rasterized(_is_of_many_points(artist))
+        self.markup = _element(self.figure, self.prefix, self.on_white)
 
     def as_picture(self) -> None:
         """Draw again, all of it as a picture, on white in the dark, too."""
@@ -80,17 +84,41 @@ def fit(drawings: Sequence[Drawing], most: int = _MOST) -> None:
             smaller(each)
 
 
+def _arrange(figure: Figure) -> None:
+    """Give the panels their places once: else each time that it is saved, which draws all of it twice."""
+    engine = figure.get_layout_engine()
+    with styled():
+        if engine is not None:
+            dpi = figure.get_dpi()
+            figure.set_dpi(_LAYOUT_DPI)
+            engine.execute(figure)
+            figure.set_dpi(dpi)
+        figure.set_layout_engine(None)
+
+
 def _element(figure: Figure, prefix: str, on_white: bool) -> str:
     """Return the ``svg`` element, as wide as its place, with the colours that it uses defined in its style."""
-    text = content_of(figure, "svg", _PICTURE_DPI).decode()
-    text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :].strip(), flags=re.DOTALL)
-    text = re.sub(r' (width|height)="[\d.]+pt"', "", text, count=2).replace("xlink:href", "href")
+    text = _short(content_of(figure, "svg", _PICTURE_DPI).decode())
     colours = sorted({colour for _, colour in _COLOUR.findall(text)})
     mixed = "; ".join(f"--c{colour}: {f'#{colour}' if on_white else _mixture(colour)}" for colour in colours)
     mixed += "; fill: #000000" * on_white
     text = _NAME.sub(rf"\g<1>{prefix}-", _COLOUR.sub(r"\1: var(--c\2)", text))
-    text = _PICTURE.sub(_smaller, _PLACES.sub(lambda found: _DECIMALS.sub(r"\1", found[0]), text))
-    return text.replace("<svg", f'<svg style="{mixed}"', 1)
+    return _PICTURE.sub(_smaller, text).replace("<svg", f'<svg style="{mixed}"', 1)
+
+
+def _short(text: str) -> str:
+    """Return the ``svg`` element of a file of matplotlib's with all that is seen, in half as many characters."""
+    text = _GROUP.sub("<g", _BETWEEN.sub("", text[text.index("<svg") :]))
+    text = re.sub(r' (width|height)="[\d.]+pt"', "", text, count=2).replace("xlink:href", "href")
+    text = _LETTER.sub(r'\1 x="\2"', text.replace("DejaVuSans-", ""))
+    return _MARKS.sub(_with_one_style, _PLACES.sub(lambda found: _DECIMALS.sub(r"\1", found[0]), text))
+
+
+def _with_one_style(found: re.Match[str]) -> str:
+    """Return a group of marks that look alike with their style said once."""
+    group, marks = found.groups()
+    styles = set(_STYLE.findall(marks))
+    return f"<g{group}{styles.pop()}>{_STYLE.sub('', marks)}</g>" if len(styles) == 1 else found[0]
 
 
 def _smaller(found: re.Match[str]) -> str:

@@ -12,11 +12,9 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration
-from kf_calib.support.units import shown
+from kf_calib.support.units import shown, shown_whole
 from kf_calib.views.json import clean
 
-_UNITS = {"rad": ("deg", 180.0 / np.pi), "m/s^2": ("g", 1.0 / 9.80665), "s": ("min", 1.0 / 60.0),
-          "K/s": ("K/h", 3600.0)}  # fmt: skip
 _DIGITS = 5  # significant ones, which a page needs
 
 
@@ -49,10 +47,10 @@ def explorer(first: Calibration, others: Mapping[str, Floats]) -> Explorer:
 
 def _driver(each: Driver) -> dict[str, Any]:
     """Return a driver with its values in the unit in which people read them."""
-    unit, scale = _UNITS.get(each.unit, (each.unit, 1.0))
+    unit = shown_whole(each.unit, float(np.abs(each.values).max()))
     explains = f"explains {each.share:.0%}" if each.share >= 0.005 and each.p_value <= 0.01 else ""
     of_all = each.values[:, 0] if np.ptp(each.values, axis=1).max() == 0.0 else each.values  # such as an angle
-    return {"name": each.words, "unit": unit, "explains": explains, "values": of_all * scale}
+    return {"name": each.words, "unit": unit.label, "explains": explains, "values": of_all * unit.per_si}
 
 
 def _short(value: Any) -> Any:

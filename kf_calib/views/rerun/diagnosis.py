@@ -15,7 +15,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.residual_drivers import Driver, Explanation, drivers_of, explanations, is_function_of
+from kf_calib.diagnosis.explanation import Explanation
+from kf_calib.diagnosis.residual_drivers import Driver, is_function_of
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import format_p
@@ -26,6 +27,7 @@ from kf_calib.views.rerun.explorer import (
     Log,
     at_step,
     bounds,
+    drawn_values,
     driver_charts,
     forever,
     log_spheres,
@@ -34,7 +36,6 @@ from kf_calib.views.rerun.explorer import (
     points,
     reach_of,
     say,
-    shown,
     spheres,
     title_of,
 )
@@ -51,8 +52,8 @@ class View:
     """A diagnosis with what is drawn of it, computed once."""
 
     def __init__(self, found: Diagnosis) -> None:
-        self.found, self.drivers = found, drivers_of(found.before)
-        self.explanations = explanations(found)[:_MOST]
+        self.found, self.drivers = found, found.drivers
+        self.explanations = found.explanations[:_MOST]
         self.sigmas = mean_sigmas(found.before)
 
     @cached_property
@@ -78,7 +79,7 @@ class View:
                 title = f"accelerometer {i + 1}: residual / σ" if name == "before" else ""
                 below, own = title_of(driver) if i == 2 else "", wide if name == "effect" else reach
                 path, place = f"explorer/{name}/{channel}", (i, column)
-                out[name].append(panel(path, shown(driver), below, own, title, place, size, i))
+                out[name].append(panel(path, drawn_values(driver), below, own, title, place, size, i))
         return out
 
 
@@ -106,7 +107,7 @@ def _log_explorer(view: View, stream: rr.RecordingStream) -> None:
     if not view.drivers:
         return say(stream, "explorer/none", "Nothing that was recorded varies in this run.")
     driver = view.drivers[0]
-    charts, x, standing = view.charts(driver), shown(driver), forever(stream)
+    charts, x, standing = view.charts(driver), drawn_values(driver), forever(stream)
     everything = [each for column in charts.values() for each in column]
     frames(stream, "explorer", everything)
     for chart in everything:
@@ -124,7 +125,7 @@ def _log_explorer(view: View, stream: rr.RecordingStream) -> None:
 
 def _log_explanation(view: View, charts: dict[str, list[Chart]], driver: Driver, each: Explanation, log: Log) -> None:
     """One explanation: the effect as a curve with its 1 sigma where it goes with this driver alone, and the rest."""
-    x, (own, readings) = shown(driver), view.effect(each)
+    x, (own, readings) = drawn_values(driver), view.effect(each)
     spread = each.contribution_sigma_mps2 / view.sigmas
     alone = is_function_of(each.contribution_mps2, driver)
     for i, (effect, left) in enumerate(zip(charts["effect"], charts["left"], strict=True)):
@@ -156,9 +157,9 @@ def _log_drivers(view: View, stream: rr.RecordingStream) -> None:
     for driver, charts in zip(drivers, _driver_charts(view), strict=True):
         for chart in charts:
             bounds(chart, forever(stream))
-        points(charts[0], shown(driver), view.before, forever(stream))
+        points(charts[0], drawn_values(driver), view.before, forever(stream))
         for rank, each in _ranked(view):
-            points(charts[1], shown(driver), each.left_ratios, at_step(stream, EXPLANATION, rank))
+            points(charts[1], drawn_values(driver), each.left_ratios, at_step(stream, EXPLANATION, rank))
 
 
 def _driver_charts(view: View) -> list[list[Chart]]:
@@ -195,11 +196,12 @@ def _layout(view: View) -> rrb.Blueprint:
         Chart("explorer", Axis(0.0, 1.0), Axis(0.0, 1.0))]  # fmt: skip
     drivers = [chart for column in _driver_charts(view) for chart in column]
     named = view.drivers[0].words if view.drivers else "nothing varies"
+    fails = view.found.test.consistent is False
     first = rrb.Horizontal(
         sheet("explorer", f"{view.found.before.model.sum}: residuals over σ against the {named}", charts, above=64.0),
         rrb.Vertical(spheres("spheres", 2 if view.explanations else 1),
                      rrb.TextDocumentView(origin="summary", name="verdict"), row_shares=[5, 5]),
-        column_shares=[6, 4], name="Where the model fails",
+        column_shares=[6, 4], name="Where the model fails" if fails else "What the model leaves",
     )  # fmt: skip
     tabs: Sequence[rrb.View | rrb.Container] = [first]
     tabs = [*tabs, sheet("drivers", "All that varies", drivers)] if drivers else tabs

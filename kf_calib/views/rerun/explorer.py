@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.estimation.results import Calibration
+from kf_calib.support.units import Unit, shown_whole
 from kf_calib.views.rerun.chart import LEFT, RIGHT, TOP, Axis, Chart, thin, write
 from kf_calib.views.rerun.names import ACCELEROMETERS, GREY, WHITE
 from kf_calib.views.rerun.sigmas import ROOM
 
 BOUND = 2.0
 """Lines are drawn at so many sigma."""
-UNITS = {"rad": ("deg", 180.0 / np.pi), "m/s^2": ("g", 1.0 / 9.80665), "s": ("min", 1.0 / 60.0), "K": ("K", 1.0),
-         "K/s": ("K/h", 3600.0)}  # fmt: skip
 NEGATIVE, POSITIVE, NONE = np.array([70, 140, 255]), np.array([255, 110, 50]), np.array([150, 150, 155])
 _FULL = 4.0  # sigma at which the colour of a residual is full
 _APART, _BELOW = 2.6, 2.5  # between the middles of spheres
@@ -47,14 +46,19 @@ def at_step(stream: rr.RecordingStream, timeline: str, number: int) -> Log:
     return send
 
 
-def shown(driver: Driver) -> Floats:
-    """The values (D, 3) of a driver in the unit of the field."""
-    return driver.values * UNITS.get(driver.unit, (driver.unit, 1.0))[1]
+def unit_of(driver: Driver) -> Unit:
+    """The unit in which a driver is drawn."""
+    return shown_whole(driver.unit, float(np.abs(driver.values).max()))
+
+
+def drawn_values(driver: Driver) -> Floats:
+    """The values (D, 3) of a driver in its unit."""
+    return driver.values * unit_of(driver).per_si
 
 
 def title_of(driver: Driver) -> str:
     """What a driver is, with its unit."""
-    return f"{driver.words}, {UNITS.get(driver.unit, (driver.unit, 1.0))[0]}"
+    return f"{driver.words}, {unit_of(driver).label}"
 
 
 def panel(
@@ -142,9 +146,9 @@ def driver_charts(drivers: Sequence[Driver], reach: float, rows: int) -> list[li
     for k, driver in enumerate(drivers):
         row, column = divmod(k, 4)
         titles = [f"{driver.words}: {of_share(driver)}", *["what the explanation leaves"] * (rows - 1)]
-        units = [*[""] * (rows - 1), f"{driver.symbol}, {UNITS.get(driver.unit, (driver.unit, 1.0))[0]}"]
+        units = [*[""] * (rows - 1), f"{driver.symbol}, {unit_of(driver).label}"]
         out.append([
-            panel(f"drivers/{driver.symbol}/{below}", shown(driver), units[below], reach, titles[below],
+            panel(f"drivers/{driver.symbol}/{below}", drawn_values(driver), units[below], reach, titles[below],
                   (rows * row + below, column), size) for below in range(rows)
         ])  # fmt: skip
     return out

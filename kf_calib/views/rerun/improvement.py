@@ -15,7 +15,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
+from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, SelectionStep
 from kf_calib.estimation.residual_table import mean_sigmas
@@ -26,13 +26,13 @@ from kf_calib.views.rerun.chart import LEFT, RIGHT, TOP, Axis, Chart, frames, sh
 from kf_calib.views.rerun.explorer import (
     at_step,
     bounds,
+    drawn_values,
     forever,
     log_spheres,
     panel,
     points,
     reach_of,
     say,
-    shown,
     spheres,
     title_of,
 )
@@ -60,7 +60,7 @@ class View:
     def of(cls, state: Improvement) -> View:
         found = (state.start, *(step.found for step in state.steps))
         ratios = tuple(each.before.residuals_mps2 / mean_sigmas(state.start.before) for each in found)
-        return cls(state, found, ratios, tuple(drivers_of(state.start.before)))
+        return cls(state, found, ratios, tuple(state.start.drivers))
 
     @property
     def results(self) -> list[Calibration]:
@@ -174,18 +174,19 @@ def _coefficient_charts(view: View) -> list[Chart]:
         known = [each for each in values if each is not None and each.value is not None and each.sigma is not None]
         ends = [(each.value or 0.0) + sign * (each.sigma or 0.0) for each in known for sign in (-1.0, 1.0)]
         own = next(each for each in values if each is not None)
-        axis = Axis.around(np.array([0.0, *ends]) * own.per_si)
+        axis = Axis.around(np.array([0.0, *ends]) * units.shown(own).per_si)
         corner = (column * (300.0 + LEFT + RIGHT), row * (200.0 + TOP + ROOM))
-        title = printable(f"{symbol} ± σ, {own.shown_unit}")
+        title = printable(f"{symbol} ± σ, {units.shown(own).label}")
         out.append(Chart(f"coefficients/{k}", view.across, axis, title, corner, 300.0, 200.0))
     return out
 
 
 def _log_coefficient(chart: Chart, values: list[Parameter | None], stream: rr.RecordingStream) -> None:
     stream.log(f"{chart.path}/zero", rr.LineStrips2D([chart.level(0.0)], colors=GREY, radii=thin(0.8)), static=True)
-    rows = [(float(step), each.value * each.per_si, each.sigma * each.per_si) for step, each in enumerate(values)
-            if each is not None and each.value is not None and each.sigma is not None]  # fmt: skip
-    x, value, sigma = np.array(rows).reshape(-1, 3).T
+    known = [(step, each.value, each.sigma, units.shown(each).per_si) for step, each in enumerate(values)
+             if each is not None and each.value is not None and each.sigma is not None]  # fmt: skip
+    x, value, sigma, per_si = np.array(known, float).reshape(-1, 4).T
+    value, sigma = value * per_si, sigma * per_si
     bars = [chart.at(np.array([a, a]), np.array([b - c, b + c])) for a, b, c in zip(x, value, sigma, strict=True)]
     stream.log(f"{chart.path}/sigma", rr.LineStrips2D(bars, colors=[MAUVE] * len(bars), radii=thin(1.2)), static=True)
     points = rr.Points2D(chart.at(x, value), colors=MAUVE, radii=thin(4.0))
@@ -195,7 +196,7 @@ def _log_coefficient(chart: Chart, values: list[Parameter | None], stream: rr.Re
 def _explorer(view: View) -> list[Chart]:
     """Residuals of each accelerometer, on the same axes in all steps."""
     driver, reach = view.drivers[0], reach_of(view.ratios)
-    return [panel(f"explorer/{channel}", shown(driver), title_of(driver) if i == 2 else "", reach,
+    return [panel(f"explorer/{channel}", drawn_values(driver), title_of(driver) if i == 2 else "", reach,
                   f"accelerometer {i + 1}: residual / σ", (i, 0), _SIZE, i)
             for i, channel in enumerate(CHANNELS)]  # fmt: skip
 
@@ -207,14 +208,14 @@ def _log_steps(view: View, stream: rr.RecordingStream) -> None:
     for chart in charts:
         bounds(chart, forever(stream))
     for i, chart in enumerate(charts):
-        first = chart.at(shown(view.drivers[0])[:, i], view.ratios[0][:, i])
+        first = chart.at(drawn_values(view.drivers[0])[:, i], view.ratios[0][:, i])
         stream.log(f"{chart.path}/first", rr.Points2D(first, colors=GREY, radii=thin(2.2)), static=True)
     if not charts:
         say(stream, "explorer/none", "Nothing that was recorded varies in this run.")
     for number, (result, ratios) in enumerate(zip(view.results, view.ratios, strict=True)):
         log = at_step(stream, STEP, number)
         for i, chart in enumerate(charts):
-            points(chart, shown(view.drivers[0])[:, i], ratios[:, i], log, i)
+            points(chart, drawn_values(view.drivers[0])[:, i], ratios[:, i], log, i)
         log_spheres(result, ratios, "spheres", 0, stream, log)
         log("summary", rr.TextDocument(printable(_summary(view, number)), media_type=rr.MediaType.MARKDOWN))
 
@@ -225,7 +226,8 @@ def _summary(view: View, number: int) -> str:
     blocks = [f"**Step {number}**: {_done(view.state.steps[number - 1])}" if number else "**Step 0**: the first model"]
     blocks.append(f"Model: {result.model.sum}; p {format_p(found.test.p_value)}")
     rows = [
-        f"| {symbol} | {_value(each)} | {each.shown_unit} |" for symbol, each in list(result.parameters.items())[12:]
+        f"| {symbol} | {_value(each)} | {units.shown(each).label} |"
+        for symbol, each in list(result.parameters.items())[12:]
     ]
     if rows:
         blocks.append("\n".join(["| coefficient | value ± σ | |", "|:--|--:|:--|", *rows]))
@@ -244,7 +246,8 @@ def _done(step: SelectionStep) -> str:
 def _value(each: Parameter) -> str:
     if each.value is None or each.sigma is None:
         return "not determined"
-    return f"{each.value * each.per_si:.3g} ± {each.sigma * each.per_si:.2g}"
+    unit = units.shown(each)
+    return f"{each.value * unit.per_si:.3g} ± {each.sigma * unit.per_si:.2g}"
 
 
 def _layout(view: View) -> rrb.Blueprint:
@@ -255,7 +258,7 @@ def _layout(view: View) -> rrb.Blueprint:
         sheet("explorer", f"residuals (grey: first model) against the {named}", explorer),
         rrb.Vertical(spheres("spheres", 1), rrb.TextDocumentView(origin="summary", name="this step"),
                      row_shares=[2, 3]),
-        column_shares=[4, 4, 4], name="The error falls",
+        column_shares=[4, 4, 4], name="The error falls" if view.state.steps else "The error of the model",
     )  # fmt: skip
     charts = _coefficient_charts(view)
     tabs = [first, *([sheet("coefficients", "Coefficients", charts)] if charts else [])]

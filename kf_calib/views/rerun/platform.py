@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.results import Calibration, Estimate
+from kf_calib.support.units import shown
 from kf_calib.views.rerun.chart import number, power, thin
 from kf_calib.views.rerun.names import ACCELEROMETERS, GOLD, GREY, RED, WHITE
 from kf_calib.views.rerun.series import above, crowd, ends, nis_band, times
@@ -25,7 +26,6 @@ THINNEST = 0.008  # thinner ones could not be seen
 LARGEST = 0.7  # larger ones would hide the scene
 BAR = 0.6  # at most so long is the bar that shows the scale
 FLOOR = -1.35  # height at which it lies
-_ARCSEC = float(np.degrees(3600.0))
 
 Ellipsoid = tuple[int, Floats, Floats]
 """Accelerometer, sigmas (3,) of its sensitivity, and their directions (3, 3) as columns."""
@@ -146,12 +146,14 @@ def _fields(own: list[Ellipsoid], tips: Floats, factor: float) -> dict[str, Any]
 
 def _log_bar(stream: rr.RecordingStream, factor: float, words: str) -> None:
     """A bar of a round angle, magnified as the ellipsoids are."""
-    arcsec = rounded(BAR / factor * _ARCSEC)
-    half = 0.5 * factor * arcsec / _ARCSEC
+    angle, ratio = shown("rad"), shown("1")
+    length = rounded(BAR / factor * angle.per_si)
+    half = 0.5 * factor * length / angle.per_si
     bar = rr.LineStrips3D([[(-half, FLOOR, 0.0), (half, FLOOR, 0.0)]], colors=WHITE, radii=0.012)
     stream.log("platform/scale", bar, static=True)
-    ppm = number(float(f"{arcsec / _ARCSEC * 1e6:.2g}"))
-    text, place = f"{number(arcsec)} arcsec, {ppm} ppm{words}", (0.0, FLOOR - 0.04, 0.0)
+    same = number(float(f"{length / angle.per_si * ratio.per_si:.2g}"))
+    text = f"{number(length)} {angle.label}, {same} {ratio.label if ratio.label != '1' else 'of K'}{words}"
+    place = (0.0, FLOOR - 0.04, 0.0)
     label = rr.Points3D([place], labels=[text], radii=0.0, colors=WHITE, show_labels=True)
     stream.log("platform/scale/label", label, static=True)
 
