@@ -109,10 +109,12 @@ class Evidence:
     def _free(self, dwells: int) -> Iterator[Parts]:
         """Yield the sets of parts of the noise from dwell to dwell that may be free."""
         yield ()
-        if 3 * dwells <= self._fit.carried.model.count:
+        if (1 if self.noise.free else 3) * dwells <= self._fit.carried.model.count:
+            return
+        yield ("common",)
+        if self.noise.free:  # a rotation of the dwells has no limit anyway
             return
         yield ("setting",)
-        yield ("common",)
         if not (self.noise.setting_stated and self.noise.scatter_stated):
             yield "setting", "common"
 
@@ -174,7 +176,7 @@ def _within(carried: Carried, noise: Noise, state: Floats) -> Floats:
 
     The mean of each dwell is left out: it is as if scatter had no limit.
     """
-    free = replace(noise, scatter_mps2=np.full(3, _FREE_MPS2), setting_rad=0.0, walk_mps2_per_sqrt_s=0.0)
+    free = replace(noise, scatter_mps2=np.full(3, _FREE_MPS2), setting_rad=0.0, free=False, walk_mps2_per_sqrt_s=0.0)
     columns = [own[..., STATE_COUNT:] for own in carried.columns]
     rows = np.concatenate(whiten(carried.dwells, columns, free, state, reduced=False))
     lacking = max(rows.shape[1] - len(rows), 0)
