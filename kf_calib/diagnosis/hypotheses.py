@@ -200,7 +200,7 @@ class Hypotheses:
 
     def _log_share_of(self, name: str, fall: float) -> float:
         test = self.test
-        own = values_of(test.scan, name)
+        own = self._values[name]
         tried = max(len(own), *(test.scan.candidates[k].tried for k in own))
         falls = test.scan.statistics[own]
         relative = min(1.0, fall / max(float(falls.max()), 1e-9))
@@ -237,20 +237,29 @@ class Hypotheses:
         """Return the log Bayes factors of pairs by the linear tests: each effect at the value of its constant that is
         best alone, and the other at any value."""
         test, out = self.test, dict[tuple[str, str], float]()
-        seen = [k for k, each in enumerate(test.scan.candidates) if each.dof]
-        for name in screened:
-            if name not in test.best:
-                continue
-            falls, alone = test.scan.beside(test.best[name]), self._screen(name, self._fall(name))
-            for k in seen:
-                other, dof = str(test.scan.candidates[k].effect), test.scan.candidates[k].dof
-                if other == name or falls[k] <= 0.0:
+        for name in filter(test.best.__contains__, screened):
+            falls, alone = test.scan.beside(test.best[name]) / self.inflation, self._screen(name, self._fall(name))
+            logs = self._evidence(falls)
+            for other, own in self._values.items():
+                k = own[int(np.argmax(logs[own]))]
+                if other == name or not falls[k] > 0.0:
                     continue
-                fall = falls[k] / self.inflation
-                log = alone + float(size_evidence(dof, fall)) + self._log_share_of(other, fall)
                 both = (name, other) if screened[name] >= screened[other] else (other, name)
+                log = alone + float(logs[k]) + self._log_share_of(other, float(falls[k]))
                 out[both] = max(out.get(both, -math.inf), log)
         return out
+
+    def _evidence(self, falls: Floats) -> Floats:
+        """Return the log Bayes factors (n,) of all candidates of the linear tests from their falls of chi-squared."""
+        dofs, out = np.array([each.dof for each in self.test.scan.candidates]), np.full(len(falls), -math.inf)
+        for dof in set(dofs[dofs > 0].tolist()):
+            out[dofs == dof] = size_evidence(dof, falls[dofs == dof])
+        return out
+
+    @cached_property
+    def _values(self) -> dict[str, list[int]]:
+        """Numbers of the candidates of each visible effect: one for each value of its constant."""
+        return {name: own for name in self.test.best if (own := values_of(self.test.scan, name))}
 
     def _formulas(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
         """Yield the rows of formulas that are no known effect, the likeliest of each driver."""
