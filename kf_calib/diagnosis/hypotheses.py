@@ -290,8 +290,7 @@ class Hypotheses:
             share = float(np.logaddexp.reduce(logs[driver]) - logs[driver][first]) - math.log(len(logs[driver]))
             formulas = drivers[driver][first].formulas_beside(taken)
             row = self._row((), self._prior("formula", len(drivers)) + share, formulas)
-            family = drivers[driver][first].family
-            yield replace(row, driver=driver, families=(family, NONE) if family else (NONE,))
+            yield replace(row, driver=driver, families=(drivers[driver][first].family or NONE,))
 
     def _over_members(self, own: Sequence[Formulas]) -> Floats:
         """Return the log Bayes factors of the formulas of one driver by the linear tests."""
