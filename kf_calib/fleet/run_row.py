@@ -13,7 +13,9 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.run_factor import RunFactor
 
 _WORDS = pa.list_(pa.string())
-_PARAMETER = pa.struct({"symbol": pa.string(), "value": pa.float64(), "sigma": pa.float64(), "unit": pa.string()})
+_PARAMETER = pa.struct({
+    "symbol": pa.string(), "value": pa.float64(), "sigma": pa.float64(), "unit": pa.string(), "nominal": pa.float64(),
+})  # fmt: skip
 _HYPOTHESIS = pa.struct({"effects": _WORDS, "formula": pa.string(), "probability": pa.float64()})
 _FAMILY = pa.struct({"family": pa.string(), "probability": pa.float64()})
 _FACTOR = pa.struct({

@@ -27,7 +27,7 @@ _SMALL, _LARGE = "part", "runs"
 _MOST_SMALL = 256
 """Small files that are merged while a fleet is being evaluated."""
 
-_AT_ONCE = 64
+AT_ONCE = 64
 """Rows that are in memory together where factors are among their columns: these make a row some 60 kB large."""
 
 _MANY = 8192
@@ -50,6 +50,11 @@ class Store:
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "runs"
         self._written = 0
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is a table."""
+        return bool(self._files(_LARGE) or self._files(_SMALL))
 
     @contextmanager
     def taken(self) -> Iterator[None]:
@@ -115,7 +120,7 @@ class Store:
 
     def _merge(self, files: Sequence[Path]) -> None:
         with whole(self._new(_LARGE)) as part, pq.ParquetWriter(part, SCHEMA, compression="zstd") as out:
-            for batch in self._newest(files, SCHEMA.names, _AT_ONCE):
+            for batch in self._newest(files, SCHEMA.names, AT_ONCE):
                 out.write_batch(batch)
         for file in files:
             file.unlink()
