@@ -89,10 +89,10 @@ _SHOWING = ("views.notebook",)
 """What prints the results of these, and shows them in notebooks."""
 
 __all__ = [
-    "Bench", "Calibration", "Corrected", "Correction", "Diagnosis", "Fleet", "Improvement", "InputError", "KfCalibError",
-    "Parameter", "Recorder", "Refits", "Running", "SavedCalibration", "Session", "Settings", "UnobservableError",
-    "Watch", "calibrate", "compare", "diagnose", "improve", "open_calibration", "open_fleet", "open_recording", "open_table",
-    "plot", "save_calibration", "save_view", "shown_in",
+    "Bench", "Calibration", "Corrected", "Correction", "Diagnosis", "Fleet", "Improvement", "InputError",
+    "KfCalibError", "Parameter", "Recorder", "Refits", "Running", "SavedCalibration", "Session", "Settings",
+    "UnobservableError", "Watch", "calibrate", "compare", "diagnose", "improve", "open_calibration", "open_fleet",
+    "open_recording", "open_table", "plot", "save_calibration", "save_view", "shown_in",
 ]  # fmt: skip
 
 

@@ -115,7 +115,9 @@ def fleet(
     for package in _PACKAGES:
         need(package, "fleet", "kf-calib fleet")
     if workers is not None and scheduler is not None:
-        raise click.UsageError("--workers are processes of this machine, --scheduler has workers of its own: choose one.")
+        raise click.UsageError(
+            "--workers are processes of this machine, --scheduler has workers of its own: choose one."
+        )
     from kf_calib.fleet.results import Fleet, populations
     from kf_calib.fleet.run_list import runs_of
     from kf_calib.views import fleet as views
@@ -139,7 +141,7 @@ def _checked(options: Mapping[str, Any]) -> SingleCommands:
 def _evaluated(
     commands: SingleCommands, runs: Sequence[Run], out: Path, workers: int | None, scheduler: str | None, quiet: bool
 ) -> Progress:
-    """Evaluate the runs that are not in the table; where a user or the system stops it, all that is done is kept."""
+    """Evaluate the runs that are not in the table yet; where it is stopped, all that is done is kept."""
     import dask.system
 
     from kf_calib.fleet.batch import evaluate_all
@@ -147,19 +149,17 @@ def _evaluated(
     from kf_calib.fleet.evaluation import Evaluation
     from kf_calib.fleet.store import Store
 
-    store = Store(out)
-    last: list[Progress] = []
-    with store.taken(), answered(Interrupter()), progress(f"{len(runs)} runs", quiet) as tick:
+    store, interrupt = Store(out), Interrupter()
+    with store.taken(), answered(interrupt), progress(f"{len(runs)} runs", quiet) as tick:
 
         def tell(now: Progress) -> None:
-            last[:] = [now]
-            stage.say(f"{now.done} done, {now.failed} failed")
-            tick(now.done / now.total)
+            with interrupt.finished_first():  # where it takes effect, too, if it came while Python was cleaning up
+                stage.say(f"{now.done} done, {now.failed} failed")
+                tick(now.done / now.total)
 
         try:
             with cluster(workers or dask.system.CPU_COUNT, scheduler) as client:
                 return evaluate_all(client, Evaluation(commands, commands.checksum), runs, store, tell)
         except KeyboardInterrupt:
-            done = last[0].done if last else 0
-            complain(f"stopped: {done} of {len(runs)} runs are in {out}, and the same command goes on from there.")
+            complain(f"stopped: {out} has {len(store.known())} runs so far, and the same command goes on from there.")
             raise

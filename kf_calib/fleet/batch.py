@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 from distributed import Client, Future, KilledWorker, as_completed
 
@@ -101,6 +100,7 @@ def _row(future: Future, run: Run, settings: str) -> Row | None:
     if error is None:
         return future.result()
     if isinstance(error, KilledWorker):
-        said = f"{run.place}: the process that evaluated it was ended {error.allowed_failures + 1} times: give workers more memory."
+        times = error.allowed_failures + 1
+        said = f"{run.place}: the process that evaluated it was ended {times} times: give the workers more memory."
         return begun(run, settings) | {"error": said}
     raise KfCalibError(f"{run.place}: no worker could evaluate it ({' '.join(str(error).split())}).") from error

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import dask
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, Worker, WorkerPlugin
 
 from kf_calib.errors import InputError
 
@@ -15,6 +16,13 @@ _CONFIG = {
     "distributed.scheduler.allowed-failures": 3,  # so often may a run take its process with it
     "distributed.comm.timeouts.connect": "10s",
 }
+
+
+class _LeftToTheClient(WorkerPlugin):
+    """Ctrl-C reaches all processes of a terminal; workers go on until the client, which stops for it, ends them."""
+
+    def setup(self, worker: Worker) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager
@@ -25,11 +33,12 @@ def cluster(workers: int, scheduler: str | None = None) -> Iterator[Client]:
         if scheduler is None:
             with (
                 LocalCluster(
-                    n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address=None,
-                    silence_logs=logging.CRITICAL,
+                    n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0,
+                    dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,
                 ) as local,
                 Client(local) as client,
             ):  # fmt: skip
+                client.register_plugin(_LeftToTheClient())
                 yield client
             return
         try:

@@ -155,5 +155,7 @@ def _date(word: str, line: Mapping[str, str]) -> datetime | None:
     try:
         found = datetime.fromisoformat(text)
     except ValueError:
-        raise InputError(f"{word}: {text!r} of {line['run']} is no date: write it as 2026-05-31 or with the time.") from None
+        raise InputError(
+            f"{word}: {text!r} of {line['run']} is no date: write it as 2026-05-31 or with the time."
+        ) from None
     return found if found.tzinfo else found.replace(tzinfo=UTC)

@@ -65,7 +65,9 @@ class Store:
             self.folder.mkdir(parents=True, exist_ok=True)
             with held.open("ab") as file:
                 if not lock(file):
-                    raise InputError(f"{self.folder.parent} is being written by {writer(held) or 'another run'}: wait for it.")
+                    raise InputError(
+                        f"{self.folder.parent} is being written by {writer(held) or 'another run'}: wait for it."
+                    )
                 yield
         except OSError as error:
             raise InputError(f"{self.folder}: {error.strerror}: give another folder (-o).") from None
