@@ -57,6 +57,13 @@ def at_once(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "cluster", running)
 
 
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    own = Store(tmp_path / "fleet")
+    with own.taken():
+        yield own
+
+
 def evaluation(**given: Any) -> Evaluation:
     usual = replay.make_context("replay", ["run.mcap"]).params
     own = ("recording", "overwrite", "strict", "as_json", "save", "save_model")
@@ -85,9 +92,9 @@ def test_each_run_has_the_numbers_that_it_has_alone(campaign: Path, run: Any, tm
 
 
 def test_a_run_is_evaluated_again_only_if_it_or_the_settings_changed(
-    campaign: Path, client: Client, tmp_path: Path
+    campaign: Path, client: Client, store: Store, tmp_path: Path
 ) -> None:
-    own, store = shutil.copytree(campaign, tmp_path / "runs"), Store(tmp_path / "fleet")
+    own = shutil.copytree(campaign, tmp_path / "runs")
     first = evaluate_all(client, evaluation(), runs_of([str(own)]), store)
     assert (first.evaluated, first.kept) == (4, 0)
     some, other, *_ = sorted(own.rglob("*.mcap"))
@@ -104,8 +111,8 @@ def test_a_run_is_evaluated_again_only_if_it_or_the_settings_changed(
     assert len(list((tmp_path / "fleet" / "runs").glob("*.parquet"))) == 1
 
 
-def test_what_could_not_be_fetched_is_tried_again(campaign: Path, client: Client, tmp_path: Path) -> None:
-    store, gone = Store(tmp_path / "fleet"), Run(str(tmp_path / "gone.mcap"))
+def test_what_could_not_be_fetched_is_tried_again(campaign: Path, client: Client, store: Store, tmp_path: Path) -> None:
+    gone = Run(str(tmp_path / "gone.mcap"))
     progress = evaluate_all(client, evaluation(), [gone], store)
     assert progress.failed == 1
     assert "cannot be read" in kf_calib.open_fleet(tmp_path / "fleet").failures()[gone.place]
@@ -114,9 +121,11 @@ def test_what_could_not_be_fetched_is_tried_again(campaign: Path, client: Client
     assert kf_calib.open_fleet(tmp_path / "fleet").failures() == {}
 
 
-def test_finished_runs_are_in_the_table_before_the_end(campaign: Path, client: Client, tmp_path: Path) -> None:
+def test_finished_runs_are_in_the_table_before_the_end(
+    campaign: Path, client: Client, store: Store, tmp_path: Path
+) -> None:
     """A client that is killed loses nothing that was finished."""
-    store, seen = Store(tmp_path / "fleet"), list[int]()
+    seen = list[int]()
 
     def killed(progress: Any) -> None:
         seen.append(progress.evaluated)
@@ -143,8 +152,11 @@ class _Deadly(SingleCommands):
         return super().replay(path)
 
 
-def test_a_run_that_ends_its_process_is_tried_again_and_stops_no_other(campaign: Path, tmp_path: Path) -> None:
-    own, store = shutil.copytree(campaign, tmp_path / "runs"), Store(tmp_path / "fleet")
+@pytest.mark.slow
+def test_a_run_that_ends_its_process_is_tried_again_and_stops_no_other(
+    campaign: Path, store: Store, tmp_path: Path
+) -> None:
+    own = shutil.copytree(campaign, tmp_path / "runs")
     normal = evaluation()
     deadly = Evaluation(_Deadly(normal.commands.options), normal.settings)
     runs = runs_of([str(path) for path in sorted(own.rglob("*.mcap"))[:2]])
@@ -152,4 +164,4 @@ def test_a_run_that_ends_its_process_is_tried_again_and_stops_no_other(campaign:
         progress = evaluate_all(client, deadly, runs, store)
     assert (progress.evaluated, progress.failed) == (2, 1)
     ((place, said),) = kf_calib.open_fleet(tmp_path / "fleet").failures().items()
-    assert place.endswith("run-000001.mcap") and "the process that evaluated it was ended 4 times" in said
+    assert place.endswith("run-000001.mcap") and "the process that evaluated it was ended 3 times" in said
