@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ from kf_calib.fleet.evaluation import Evaluation
 from kf_calib.fleet.run_list import Run, runs_of
 from kf_calib.fleet.store import Store
 
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "fleet.md"
 pytestmark = pytest.mark.xdist_group("fleet")  # recorded once
 
 
@@ -150,6 +152,20 @@ class _Deadly(SingleCommands):
             mark.touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return super().replay(path)
+
+
+def test_the_questions_of_the_page_have_answers(
+    campaign: Path, client: Client, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    duckdb = pytest.importorskip("duckdb", reason="duckdb is not there: the table is asked nothing")
+    evaluate_all(client, evaluation(), runs_of([str(campaign)]), store)
+    monkeypatch.chdir(tmp_path)
+    queries = re.findall(r"^```sql\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
+    months, scales, _, parts = (duckdb.sql(query).to_arrow_table().to_pylist() for query in queries)
+    assert sum(row["runs"] for row in months) == len(parts) == 4
+    assert [(row["unit"], row["symbol"], row["runs"]) for row in scales] == [
+        (f"unit-000{unit}", f"K{i}", 2) for unit in (1, 2) for i in (1, 2, 3)
+    ]
 
 
 @pytest.mark.slow
