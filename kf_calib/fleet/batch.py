@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from distributed import Client, Future, KilledWorker, as_completed
 
@@ -74,7 +75,7 @@ def _evaluated(
     client: Client, evaluation: Evaluation, waiting: deque[Run], known: dict[str, Known]
 ) -> Iterator[tuple[list[Row], int]]:
     """Yield rows as they come, with the number of runs whose content turned out to be the same as before."""
-    under_way, ready = dict[Future, Run](), as_completed(with_results=False)
+    under_way, ready = dict[Future[Any], Run](), as_completed(with_results=False)
 
     def begin() -> None:
         run = waiting.popleft()
@@ -84,7 +85,8 @@ def _evaluated(
         under_way[future] = run
         ready.add(future)
 
-    most = _AHEAD * max(sum(client.nthreads().values()), 1)
+    threads: Any = client.nthreads()
+    most = _AHEAD * max(sum(threads.values()), 1)
     while waiting and len(under_way) < most:
         begin()
     for futures in ready.batches():
@@ -94,9 +96,9 @@ def _evaluated(
         yield [row for row in rows if row is not None], sum(row is None for row in rows)
 
 
-def _row(future: Future, run: Run, settings: str) -> Row | None:
+def _row(future: Future[Any], run: Run, settings: str) -> Row | None:
     """Return what a worker found; where it was lost with its process, a row that says so."""
-    error = future.exception()
+    error: Any = future.exception()
     if error is None:
         return future.result()
     if isinstance(error, KilledWorker):

@@ -7,7 +7,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import dask
+import dask.config
 from distributed import Client, LocalCluster, Worker, WorkerPlugin
 
 from kf_calib.errors import InputError

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
+import pyarrow.compute
 
 from kf_calib.errors import InputError
 from kf_calib.fleet.run_factor import RunFactor
@@ -19,6 +19,7 @@ from kf_calib.fleet.run_row import SCHEMA, factor_of
 from kf_calib.fleet.store import AT_ONCE, Store
 from kf_calib.support.extras import need
 
+pc: Any = pyarrow.compute  # its functions are made when it is imported, which no type checker sees
 _HEAVY = ("replay", "diagnosis", "factor")
 _SIXTY_EIGHT = (0.1587, 0.5, 0.8413)
 _IDENTITY = ("run", "unit", "bench", "date")

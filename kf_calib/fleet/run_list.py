@@ -139,7 +139,11 @@ def _of_list(word: str, files: Any, path: str, lines: list[dict[str, str]]) -> I
             continue
         if "://" not in name and not name.startswith("/"):
             name = f"{folder}/{name}"
-        stated = {"unit": line.get("unit") or None, "bench": line.get("bench") or None, "date": _date(word, line)}
+        stated: dict[str, Any] = {
+            "unit": line.get("unit") or None,
+            "bench": line.get("bench") or None,
+            "date": _date(word, line),
+        }
         if name == word or name.endswith(".txt"):
             raise InputError(f"{word}: names the list {name}: a list names recordings, folders and globs only.")
         try:
