@@ -7,6 +7,7 @@ machine. alone: replay and diagnose with their JSON documents, in one process, a
 same with all that makes it a row of the table (checksum, factor, columns), in the same process, run by run beside it.
 workers: the same runs through the command's own code on so many processes. client: rows of the usual size, computed
 before and only handed over by the workers, through scheduler, client and table, to see how many these bear.
+scheduler: tasks that do nothing.
 """
 
 from __future__ import annotations
@@ -103,6 +104,16 @@ def cost_of_the_client(run: Run, rows: int) -> dict[str, float]:
     }  # fmt: skip
 
 
+def cost_of_a_task(tasks: int) -> dict[str, float]:
+    """What client and scheduler take for a task that does nothing."""
+    with cluster(1) as client:
+        client.submit(int, 0).result()
+        begun_s, cpu_s = time.monotonic(), time.process_time()
+        client.gather(client.map(int, range(1, tasks + 1)))
+        elapsed_s, cpu_s = time.monotonic() - begun_s, time.process_time() - cpu_s
+    return {"tasks": tasks, "cpu_s_a_task": cpu_s / tasks, "tasks_a_second": tasks / elapsed_s}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder")
@@ -115,6 +126,7 @@ def main() -> None:
     runs = every[:: max(len(every) // max(options.runs, 1), 1)][: options.runs]
     found: dict[str, Any] = {}
     if options.rows:
+        found["scheduler"] = cost_of_a_task(options.rows)
         found["client"] = cost_of_the_client(every[0], options.rows)
     if runs:
         found["one process"] = cost_of_a_row(runs)
