@@ -49,7 +49,7 @@ def fleet_report(fleet: Fleet, populations: Sequence[Population], done: Progress
         Text(f"{done.evaluated} evaluated now{each}; {done.kept} were there already."),
         *([_population_table(populations)] if populations else []),
     ]
-    parts += [note(f"{run}: {error.removeprefix(f'{run}: ')}") for run, error in [*failures.items()][:_SHOWN]]
+    parts += [note(error if run in error else f"{run}: {error}") for run, error in [*failures.items()][:_SHOWN]]
     if len(failures) > _SHOWN:
         parts.append(note(f"{len(failures) - _SHOWN} more runs failed: the column error of the table says why"))
     return Group(*parts)
