@@ -106,6 +106,7 @@ class Effect(ABC):
     force and temperature alone: of a, p, o (along its axes), before, after (readings of the two other accelerometers,
     in their order), T and the constant. Empty where it cannot be written so.
     typical: usual sizes of its coefficients.
+    of_the_bench: it belongs to the bench, so that all sensors on it usually have the same coefficients.
     """
 
     name: ClassVar[str]
@@ -121,6 +122,7 @@ class Effect(ABC):
     step: ClassVar[float] = 1e-4
     formulas: ClassVar[tuple[str, ...]] = ()
     typical: ClassVar[Typical] = Typical()
+    of_the_bench: ClassVar[bool] = False
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""
     value: float = 0.0
@@ -247,6 +249,8 @@ class FrameEffect(Effect):
 
     A rotation alpha turns the specific force by alpha x f, and reading i changes by s_i . (alpha x f).
     """
+
+    of_the_bench = True
 
     @abstractmethod
     def rotations(self, s: Stimulus) -> Floats: ...

@@ -214,6 +214,7 @@ class GravityError(Effect):
 
     name, title, source = "gravity-error", "wrong local gravity", "IEEE Std 836"
     confused_with = "a common scale factor, always"
+    of_the_bench = True
     typical = Typical((10e-6, 700e-6))
 
     @property
