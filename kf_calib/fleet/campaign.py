@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,9 @@ from kf_calib.fleet.run_factor import RunFactor, column_name
 _TOGETHER = 64  # runs whose matrices are computed at once
 _SEEN = 1e-6  # of a column's norm: what is less beside the run's own parameters is rounding
 _LARGE = 64.0  # sigmas of one run, up to which sizes are expected where the catalogue knows no usual ones
+
+_Part = tuple[str, str, int, int, Floats, Floats]
+"""Label, unit, bench, rank, information and score of a block."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +61,13 @@ class Group:
 class Blocks:
     """What runs, or units with all their runs on a bench, tell of all coefficients, these in units of ``Group.sigma``.
 
-    - labels: names of runs or units. bench (n,), rank (n,): number of the bench; rank by date of the first run.
+    - labels: names of runs or units. units: names of their units.
+    - bench (n,), rank (n,): number of the bench; rank by date of the first run.
     - info (n, q, q), score (n, q): information of the coefficients and the right side of the normal equations.
     """
 
     labels: Sequence[str]
+    units: Sequence[str]
     bench: NDArray[np.intp]
     rank: NDArray[np.intp]
     info: Floats
@@ -107,9 +111,9 @@ class Campaign:
 
     def runs(self) -> Iterator[Blocks]:
         """Blocks of runs, in the order in which they are read."""
-        part = list[tuple[str, int, int, Floats, Floats]]()
+        part = list[_Part]()
         for key, info, score in self._each():
-            part.append((key.run, self.benches.index(key.bench), key.rank, info, score))
+            part.append((key.run, key.unit, self.benches.index(key.bench), key.rank, info, score))
             if len(part) == _TOGETHER:
                 yield _stacked(part)
                 part = []
@@ -122,18 +126,17 @@ class Campaign:
 
         Memory is small if the runs of a unit are read one after another.
         """
-        part, open_ = list[tuple[str, int, int, Floats, Floats]](), dict[Hashable, list[Any]]()
+        part, begun = list[_Part](), dict[Hashable, _Part]()
         left = Counter(self._unit_key(key, repairs) for key in self.keys)
         for key, info, score in self._each():
-            own = self._unit_key(key, repairs)
-            if own in open_:
-                known = open_[own]
-                known[2:] = min(known[2], key.rank), known[3] + info, known[4] + score
-            else:
-                open_[own] = [key.unit, self.benches.index(key.bench), key.rank, info, score]
+            own, rank = self._unit_key(key, repairs), key.rank
+            if own in begun:
+                *_, first, known, along = begun[own]
+                rank, info, score = min(first, rank), known + info, along + score
+            begun[own] = key.unit, key.unit, self.benches.index(key.bench), rank, info, score
             left[own] -= 1
             if not left[own]:
-                part.append(tuple(open_.pop(own)))
+                part.append(begun.pop(own))
             if len(part) == _TOGETHER:
                 yield _stacked(part)
                 part = []
@@ -210,6 +213,6 @@ def _usual(effect: Effect | None) -> float:
     return max((high for _, high in filter(None, grades)), default=0.0)
 
 
-def _stacked(part: Sequence[tuple[str, int, int, Floats, Floats]]) -> Blocks:
-    labels, benches, ranks, infos, scores = zip(*part, strict=True)
-    return Blocks(labels, np.array(benches), np.array(ranks), np.array(infos), np.array(scores))
+def _stacked(part: Sequence[_Part]) -> Blocks:
+    labels, units, benches, ranks, infos, scores = zip(*part, strict=True)
+    return Blocks(labels, units, np.array(benches), np.array(ranks), np.array(infos), np.array(scores))

@@ -1,0 +1,133 @@
+"""Evidence of coefficients that all runs of a bench have in common, or that change once when the bench is repaired."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.fleet.campaign import Blocks, Campaign, Group
+from kf_calib.fleet.evidence import log_evidence, log_mean, sizes
+from kf_calib.fleet.pooled_terms import Common, PooledTerms, shares_of
+
+_SLOTS = 48  # at most as many parts of a campaign between which a repair is looked for at first
+_LEAST = 0.5  # sigma of all runs together: the smallest size that is expected
+_COARSE = 4.0  # ratio of the sizes of a coefficient that changes
+
+
+@dataclass(frozen=True)
+class BenchEvidence:
+    """Log evidence of a common coefficient, averaged over what is not known, and where it is largest.
+
+    - log_odds: against no such term. size: of the prior, in ``Group.sigma``.
+    - repair: number of the bench and first rank after the repair, if there is one.
+    """
+
+    log_odds: float
+    size: float
+    repair: tuple[int, int] | None = None
+
+
+class DatedSums:
+    """What runs tell, summed over parts of the campaign between dates, each of one bench: memory does not grow with
+    the number of runs."""
+
+    def __init__(self, campaign: Campaign, terms: PooledTerms) -> None:
+        self._campaign, self._terms = campaign, terms
+        self._first = [self._firsts(bench) for bench in range(len(campaign.benches))]
+        starts = np.cumsum([0, *(len(own) for own in self._first)])
+        count = campaign.groups[-1].columns.stop
+        self._starts = starts
+        self._slots = Blocks(
+            [""] * int(starts[-1]), [""] * int(starts[-1]),
+            np.repeat(np.arange(len(self._first)), [len(own) for own in self._first]), np.concatenate(self._first),
+            np.zeros((starts[-1], count, count)), np.zeros((starts[-1], count)),
+        )  # fmt: skip
+
+    def _firsts(self, bench: int) -> Floats:
+        """Return the rank of the first run of each part: equal numbers of runs, and a new part at each repair."""
+        name = self._campaign.benches[bench]
+        ranks = np.sort([key.rank for key in self._campaign.keys if key.bench == name])
+        chosen = ranks[np.unique(np.linspace(0, len(ranks), min(_SLOTS, len(ranks)), endpoint=False).astype(int))]
+        return np.unique([*chosen, *(first for where, first in self._terms.repairs if where == bench)])
+
+    def add(self, blocks: Blocks) -> None:
+        """Add runs, of which what is their own has been eliminated."""
+        for k, (bench, rank) in enumerate(zip(blocks.bench, blocks.rank, strict=True)):
+            place = self._starts[bench] + np.searchsorted(self._first[bench], rank, side="right") - 1
+            self._slots.info[place] += blocks.info[k]
+            self._slots.score[place] += blocks.score[k]
+
+    def constant(self, group: Group) -> BenchEvidence:
+        """The evidence that the runs of each bench have one coefficient vector."""
+        tried = self._sizes(group, 2.0)
+        more = [Common(k, 1.0, bench) for bench in range(len(self._first)) for k in _range(group)]
+        found = self._terms.sums(self._slots, more)
+        logs = log_evidence(found.info, found.score, self._priors(tried, len(more))) - self._nothing()
+        return BenchEvidence(float(log_mean(logs)), float(tried[np.argmax(logs)]))
+
+    def repaired(self, group: Group) -> BenchEvidence | None:
+        """The evidence that on one bench it is another vector from some run on; None if no bench has two runs."""
+        tried, logs, places = self._sizes(group, _COARSE), list[Floats](), list[tuple[int, int]]()
+        for bench, firsts in enumerate(self._first):
+            if len(firsts) > 1:
+                logs.append(self._with_repairs(group, bench, tried))
+                places += [(bench, int(first)) for first in firsts[1:]]
+        if not logs:
+            return None
+        benches = [log_mean(own, axis=0) for own in logs]
+        best = np.unravel_index(np.argmax(np.concatenate(logs)), (len(places), len(tried)))
+        return BenchEvidence(float(log_mean(np.array(benches))), float(tried[best[1]]), places[best[0]])
+
+    def _with_repairs(self, group: Group, bench: int, tried: Floats) -> Floats:
+        """Return the log evidence (k, t) of a repair of one bench before each of its parts but the first."""
+        others = [Common(k, 1.0, other) for other in range(len(self._first)) if other != bench for k in _range(group)]
+        fixed = [*self._terms.common, *others]
+        whole = self._terms.sums(self._slots, others)
+        part = slice(self._starts[bench], self._starts[bench + 1])
+        slots = Blocks((), (), self._slots.bench[part], self._slots.rank[part], self._slots.info[part], self._slots.score[part])
+        own, columns, shares = list(_range(group)), [each.column for each in fixed], shares_of(fixed, slots)
+        inner = np.cumsum(slots.info[:, own][:, :, own], axis=0)
+        across = np.cumsum(slots.info[:, columns][:, :, own] * shares[:, :, None], axis=0)
+        along = np.cumsum(slots.score[:, own], axis=0)
+        before, after = (inner[:-1], across[:-1], along[:-1]), (inner[-1:] - inner[:-1], across[-1:] - across[:-1], along[-1:] - along[:-1])
+        infos, scores = _joined(whole.info, whole.score, before, after)
+        priors = self._priors(tried, len(others) + 2 * len(own))
+        return log_evidence(infos[:, None], scores[:, None], priors[None]) - self._nothing()
+
+    def _nothing(self) -> float:
+        """Return the log evidence of the terms alone."""
+        found = self._terms.sums(self._slots)
+        return float(log_evidence(found.info, found.score, self._terms.prior))
+
+    def _sizes(self, group: Group, step: float) -> Floats:
+        return sizes(_LEAST / np.sqrt(len(self._campaign.keys)), group.largest, step)
+
+    def _priors(self, tried: Floats, count: int) -> Floats:
+        """Return the standard deviations (t, j) of the terms' coefficients and of ``count`` more."""
+        known = np.broadcast_to(self._terms.prior, (len(tried), len(self._terms.prior)))
+        return np.concatenate([known, np.repeat(tried[:, None], count, axis=1)], axis=1)
+
+
+def _range(group: Group) -> range:
+    return range(group.columns.start, group.columns.stop)
+
+
+_Side = tuple[Floats, Floats, Floats]
+
+
+def _joined(info: Floats, score: Floats, before: _Side, after: _Side) -> tuple[Floats, Floats]:
+    """Return information and score (k, ...) of fixed coefficients and of those before and after each possible date.
+
+    Each side is the information (k, q, q) of its coefficients, that with the fixed ones (k, j, q), and the score.
+    """
+    many, fixed, own = before[1].shape
+    infos = np.zeros((many, fixed + 2 * own, fixed + 2 * own))
+    infos[:, :fixed, :fixed] = info
+    for k, (inner, across, _) in enumerate((before, after)):
+        part = slice(fixed + k * own, fixed + (k + 1) * own)
+        infos[:, part, part], infos[:, :fixed, part] = inner, across
+        infos[:, part, :fixed] = np.swapaxes(across, 1, 2)
+    scores = np.concatenate([np.broadcast_to(score, (many, fixed)), before[2], after[2]], axis=1)
+    return infos, scores
