@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.campaign import Blocks, Campaign, Group
-from kf_calib.fleet.evidence import log_evidence, log_mean, sizes
+from kf_calib.fleet.evidence import log_evidence, log_mean, sizes, weights
 from kf_calib.fleet.pooled_terms import Common, PooledTerms, shares_of
 
 _SLOTS = 48  # at most as many parts of a campaign between which a repair is looked for at first
@@ -33,8 +35,9 @@ class DatedSums:
     """What runs tell, summed over parts of the campaign between dates, each of one bench: memory does not grow with
     the number of runs."""
 
-    def __init__(self, campaign: Campaign, terms: PooledTerms) -> None:
-        self._campaign, self._terms = campaign, terms
+    def __init__(self, campaign: Campaign, terms: PooledTerms, parted: Sequence[tuple[int, int]] = ()) -> None:
+        """parted: benches and first ranks of further parts."""
+        self._campaign, self._terms, self._parted = campaign, terms, [*terms.repairs, *parted]
         self._first = [self._firsts(bench) for bench in range(len(campaign.benches))]
         starts = np.cumsum([0, *(len(own) for own in self._first)])
         count = campaign.groups[-1].columns.stop
@@ -45,12 +48,12 @@ class DatedSums:
             np.zeros((starts[-1], count, count)), np.zeros((starts[-1], count)),
         )  # fmt: skip
 
-    def _firsts(self, bench: int) -> Floats:
+    def _firsts(self, bench: int) -> NDArray[np.intp]:
         """Return the rank of the first run of each part: equal numbers of runs, and a new part at each repair."""
         name = self._campaign.benches[bench]
         ranks = np.sort([key.rank for key in self._campaign.keys if key.bench == name])
         chosen = ranks[np.unique(np.linspace(0, len(ranks), min(_SLOTS, len(ranks)), endpoint=False).astype(int))]
-        return np.unique([*chosen, *(first for where, first in self._terms.repairs if where == bench)])
+        return np.unique([*chosen, *(first for where, first in self._parted if where == bench)])
 
     def add(self, blocks: Blocks) -> None:
         """Add runs, of which what is their own has been eliminated."""
@@ -69,16 +72,21 @@ class DatedSums:
 
     def repaired(self, group: Group) -> BenchEvidence | None:
         """The evidence that on one bench it is another vector from some run on; None if no bench has two runs."""
-        tried, logs, places = self._sizes(group, _COARSE), list[Floats](), list[tuple[int, int]]()
-        for bench, firsts in enumerate(self._first):
-            if len(firsts) > 1:
-                logs.append(self._with_repairs(group, bench, tried))
-                places += [(bench, int(first)) for first in firsts[1:]]
-        if not logs:
+        tried = self._sizes(group, _COARSE)
+        benches = [k for k, firsts in enumerate(self._first) if len(firsts) > 1]
+        if not benches:
             return None
-        benches = [log_mean(own, axis=0) for own in logs]
-        best = np.unravel_index(np.argmax(np.concatenate(logs)), (len(places), len(tried)))
-        return BenchEvidence(float(log_mean(np.array(benches))), float(tried[best[1]]), places[best[0]])
+        logs = {bench: self._with_repairs(group, bench, tried) for bench in benches}
+        bench = max(benches, key=lambda k: float(logs[k].max()))
+        place, size = np.unravel_index(np.argmax(logs[bench]), logs[bench].shape)
+        mean = log_mean(np.array([log_mean(own, axis=0) for own in logs.values()]))
+        return BenchEvidence(float(mean), float(tried[size]), (bench, int(self._first[bench][place + 1])))
+
+    def dates(self, group: Group, bench: int) -> tuple[NDArray[np.intp], Floats]:
+        """First ranks (k,) after a repair of a bench between its parts, and the probability of each."""
+        logs = log_mean(self._with_repairs(group, bench, self._sizes(group, _COARSE)), axis=1)
+        firsts = self._first[bench]
+        return firsts[1:], weights(logs + np.log(np.diff(firsts)))
 
     def _with_repairs(self, group: Group, bench: int, tried: Floats) -> Floats:
         """Return the log evidence (k, t) of a repair of one bench before each of its parts but the first."""
@@ -86,12 +94,14 @@ class DatedSums:
         fixed = [*self._terms.common, *others]
         whole = self._terms.sums(self._slots, others)
         part = slice(self._starts[bench], self._starts[bench + 1])
-        slots = Blocks((), (), self._slots.bench[part], self._slots.rank[part], self._slots.info[part], self._slots.score[part])
+        every = self._slots
+        slots = Blocks((), (), every.bench[part], every.rank[part], every.info[part], every.score[part])
         own, columns, shares = list(_range(group)), [each.column for each in fixed], shares_of(fixed, slots)
         inner = np.cumsum(slots.info[:, own][:, :, own], axis=0)
         across = np.cumsum(slots.info[:, columns][:, :, own] * shares[:, :, None], axis=0)
         along = np.cumsum(slots.score[:, own], axis=0)
-        before, after = (inner[:-1], across[:-1], along[:-1]), (inner[-1:] - inner[:-1], across[-1:] - across[:-1], along[-1:] - along[:-1])
+        before = [each[:-1] for each in (inner, across, along)]
+        after = [each[-1:] - each[:-1] for each in (inner, across, along)]
         infos, scores = _joined(whole.info, whole.score, before, after)
         priors = self._priors(tried, len(others) + 2 * len(own))
         return log_evidence(infos[:, None], scores[:, None], priors[None]) - self._nothing()
@@ -114,10 +124,7 @@ def _range(group: Group) -> range:
     return range(group.columns.start, group.columns.stop)
 
 
-_Side = tuple[Floats, Floats, Floats]
-
-
-def _joined(info: Floats, score: Floats, before: _Side, after: _Side) -> tuple[Floats, Floats]:
+def _joined(info: Floats, score: Floats, before: Sequence[Floats], after: Sequence[Floats]) -> tuple[Floats, Floats]:
     """Return information and score (k, ...) of fixed coefficients and of those before and after each possible date.
 
     Each side is the information (k, q, q) of its coefficients, that with the fixed ones (k, j, q), and the score.

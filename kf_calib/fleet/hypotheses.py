@@ -1,7 +1,8 @@
 """The table of hypotheses that compete to be the next term: every effect with every attribution, and none of them.
 
 Before the runs, none has a probability of one half. The other half is shared equally by the effects that the runs can
-show, and by each effect among its attributions, of which those that are usual for it have two thirds.
+show. Of the share of an effect, two thirds are for what it usually belongs to, the bench or the sensors, and one third
+is for the other; each part is shared equally, but a bench that was repaired is a quarter as likely as one that was not.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ from kf_calib.fleet.bench_coefficient import DatedSums
 from kf_calib.fleet.campaign import Campaign, Group
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
 from kf_calib.fleet.population import Own, OwnCoefficients
-from kf_calib.fleet.some_units import members
+from kf_calib.fleet.some_units import SomeUnits
 
 _USUAL = 2.0 / 3.0
 _HAS_IT = 0.5
+_RARELY = 0.25  # how much rarer a repair is than a bench that stays as it is
 
 
 @dataclass(frozen=True)
@@ -105,13 +107,15 @@ def _of_units(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -
         for group, own, part in zip(groups, sums, parts, strict=True):
             own.add(rest)
             part.append(Own.of(group, terms, means, rest))
-    out = [_drawn(group, Attribution.SENSORS, own) for group, own in zip(groups, sums, strict=True)]
-    for group, part in zip(groups, parts, strict=True):
-        every = Own.joined(part)
-        found = members(group, every)
-        having = frozenset(unit for unit, share in zip(every.units, found.probabilities, strict=True) if share > 0.5)
-        term = Term(group, Attribution.SOME, found.size, units=having)
-        out.append(Hypothesis(term, found.log_odds, 0.0))
+    out = list[Hypothesis]()
+    for group, own, part in zip(groups, sums, parts, strict=True):
+        units = Own.joined(part)
+        some, every = SomeUnits(group, units), _drawn(group, Attribution.SENSORS, own)
+        shapes = float(np.logaddexp(every.log_odds, some.log_odds_of_all) - np.log(2.0))
+        out.append(replace(every, log_odds=shapes))
+        has = zip(units.units, some.probabilities > _HAS_IT, strict=True)
+        term = Term(group, Attribution.SOME, some.size, units=frozenset(unit for unit, held in has if held))
+        out.append(Hypothesis(term, some.log_odds, 0.0))
     return out
 
 
@@ -122,8 +126,8 @@ def _drawn(group: Group, attribution: Attribution, own: OwnCoefficients) -> Hypo
 
 def _log_prior(term: Term, tried: set[Attribution], groups: int) -> float:
     """Return the log of the probability of a term before the runs."""
-    usual = {each for each in tried if each.common == term.group.of_the_bench}
-    part, share = (usual, _USUAL) if term.attribution in usual else (tried - usual, 1.0 - _USUAL)
-    return float(np.log((1.0 - _HAS_IT) / groups * share / len(part)))
-
-
+    alike = {each: _RARELY if each is Attribution.REPAIRED else 1.0 for each in tried}
+    usual = term.group.of_the_bench == term.attribution.common
+    total = sum(part for each, part in alike.items() if each.common == term.attribution.common)
+    share = (_USUAL if usual else 1.0 - _USUAL) * alike[term.attribution] / total
+    return float(np.log((1.0 - _HAS_IT) / groups * share))

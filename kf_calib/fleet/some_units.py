@@ -7,7 +7,7 @@ both are as likely before, and the evidence is averaged over the size.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -24,36 +24,56 @@ _DRAWS = 4000
 _LIKELY = 1e-4  # weights below this are left out of the draws
 
 
-@dataclass(frozen=True)
-class Members:
-    """Which units have an effect.
+class SomeUnits:
+    """The likelihood of who has an effect, from what each unit tells of its coefficients beside all else."""
 
-    - log_odds: log evidence that some have it, each its own, against that none has it.
-    - probabilities (n,): that each unit has it. share: their share, with its 95 % interval, among these units.
-    - size: likeliest spread of the coefficients of a unit that has it, in ``Group.sigma``.
-    """
+    def __init__(self, group: Group, own: Own) -> None:
+        self._sizes = sizes(_LEAST, group.largest)
+        values, along, _ = modes(own.info, own.score)
+        shapes = [_normal(values, along, self._sizes), _of_one_size(values, along, self._sizes)]
+        self._ratios = np.stack(shapes, axis=1)  # (units, shapes, sizes), logs
+        self._odds = np.logaddexp(
+            np.log(_SHARES)[:, None] + self._ratios[:, :, None, :], np.log1p(-_SHARES)[:, None]
+        )  # (units, shapes, shares, sizes)
 
-    log_odds: float
-    probabilities: Floats
-    share: float
-    interval: tuple[float, float]
-    size: float
+    @cached_property
+    def _logs(self) -> Floats:
+        return self._odds.sum(axis=0)
 
+    @property
+    def log_odds(self) -> float:
+        """Log evidence that some units have it, each its own, against that none has it."""
+        return float(log_mean(self._logs))
 
-def members(group: Group, own: Own) -> Members:
-    """Which units have the effect, from what each tells of its coefficients beside all else."""
-    tried = sizes(_LEAST, group.largest)
-    values, along, _ = modes(own.info, own.score)
-    ratios = np.stack([_normal(values, along, tried), _of_one_size(values, along, tried)], axis=1)  # (n, 2, t)
-    with np.errstate(over="ignore"):
-        odds = np.logaddexp(np.log(_SHARES)[:, None] + ratios[:, :, None, :], np.log1p(-_SHARES)[:, None])
-    logs = odds.sum(axis=0)  # (2, shares, t)
-    weight = weights(logs)
-    each = np.exp(np.log(_SHARES)[:, None] + ratios[:, :, None, :] - odds)  # (n, 2, shares, t)
-    probabilities = np.sum(each * weight, axis=(1, 2, 3))
-    size = float(tried[np.unravel_index(np.argmax(logs), logs.shape)[2]])
-    share, interval = _share(each.reshape(len(each), -1), weight.reshape(-1))
-    return Members(float(log_mean(logs)), probabilities, share, interval, size)
+    @property
+    def log_odds_of_all(self) -> float:
+        """The same that all units have it, of one size and each with a direction of its own."""
+        return float(log_mean(self._ratios[:, 1].sum(axis=0)))
+
+    @property
+    def size(self) -> float:
+        """The likeliest spread of the coefficients of a unit that has it, in ``Group.sigma``."""
+        return float(self._sizes[np.unravel_index(np.argmax(self._logs), self._logs.shape)[2]])
+
+    @cached_property
+    def _each(self) -> Floats:
+        """The probability that a unit has it under each hypothesis (units, hypotheses)."""
+        found = np.exp(np.log(_SHARES)[:, None] + self._ratios[:, :, None, :] - self._odds)
+        return found.reshape(len(found), -1)
+
+    @cached_property
+    def probabilities(self) -> Floats:
+        """The probability (n,) that each unit has it."""
+        return self._each @ weights(self._logs).reshape(-1)
+
+    def share(self) -> tuple[float, tuple[float, float]]:
+        """The share of these units that have it, with its 95 % interval, by draws of who has it."""
+        rng, weight = np.random.default_rng(0), weights(self._logs).reshape(-1)
+        kept = np.flatnonzero(weight > _LIKELY * weight.max())
+        chosen = rng.choice(kept, _DRAWS, p=weight[kept] / weight[kept].sum())
+        shares = np.mean(rng.random((len(self._each), _DRAWS)) < self._each[:, chosen], axis=0)
+        low, high = np.quantile(shares, [0.025, 0.975]).tolist()
+        return float(shares.mean()), (low, high)
 
 
 def _normal(values: Floats, along: Floats, tried: Floats) -> Floats:
@@ -71,16 +91,3 @@ def _of_one_size(values: Floats, along: Floats, tried: Floats) -> Floats:
         for k, size in enumerate(tried * np.sqrt(dof)):
             out[alike, k] = bayes_factor.log_odds(dof, squares[alike], float(size))
     return out
-
-
-def _share(each: Floats, weight: Floats) -> tuple[float, tuple[float, float]]:
-    """Return the mean share of the units that have it, and its 95 % interval, by draws of who has it.
-
-    each (n, h): probability of each unit under each hypothesis. weight (h,): of the hypotheses.
-    """
-    rng = np.random.default_rng(0)
-    kept = np.flatnonzero(weight > _LIKELY * weight.max())
-    chosen = rng.choice(kept, _DRAWS, p=weight[kept] / weight[kept].sum())
-    shares = np.mean(rng.random((len(each), _DRAWS)) < each[:, chosen], axis=0)
-    low, high = np.quantile(shares, [0.025, 0.975]).tolist()
-    return float(shares.mean()), (low, high)
