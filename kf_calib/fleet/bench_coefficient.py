@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.campaign import Blocks, Campaign, Group
-from kf_calib.fleet.evidence import log_evidence, log_mean, sizes, weights
-from kf_calib.fleet.pooled_terms import Common, PooledTerms, shares_of
+from kf_calib.fleet.evidence import FLAT, log_evidence, log_mean, posterior, sizes, weights
+from kf_calib.fleet.pooled_terms import Attribution, Common, PooledTerms, Term, commons_of, shares_of
 
 _SLOTS = 48  # at most as many parts of a campaign between which a repair is looked for at first
 _LEAST = 0.5  # sigma of all runs together: the smallest size that is expected
@@ -29,6 +29,16 @@ class BenchEvidence:
     log_odds: float
     size: float
     repair: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class BenchEstimate:
+    """Coefficients (q,) of a bench from the run of rank ``since`` on, with their covariance, in ``Group.sigma``."""
+
+    bench: int
+    since: int
+    mean: Floats
+    covariance: Floats
 
 
 class DatedSums:
@@ -61,6 +71,27 @@ class DatedSums:
             place = self._starts[bench] + np.searchsorted(self._first[bench], rank, side="right") - 1
             self._slots.info[place] += blocks.info[k]
             self._slots.score[place] += blocks.score[k]
+
+    @classmethod
+    def of(cls, campaign: Campaign, terms: PooledTerms, parted: Sequence[tuple[int, int]] = ()) -> DatedSums:
+        """The sums over all runs of a campaign."""
+        out = cls(campaign, terms, parted)
+        for blocks in campaign.runs():
+            out.add(terms.beside_own(blocks))
+        return out
+
+    def estimates(self, group: Group, repair: tuple[int, int] | None = None) -> list[BenchEstimate]:
+        """The coefficients of each bench beside the terms, with nothing known of them before."""
+        term = Term(group, Attribution.REPAIRED if repair else Attribution.BENCH, FLAT, repair=repair)
+        more = list(commons_of(term, len(self._first)))
+        found = self._terms.sums(self._slots, more)
+        prior = np.append(self._terms.prior, np.full(len(more), FLAT))
+        mean, covariance = posterior(found.info, found.score, prior)
+        count, out = len(_range(group)), list[BenchEstimate]()
+        for k in range(0, len(more), count):
+            own = slice(len(self._terms.prior) + k, len(self._terms.prior) + k + count)
+            out.append(BenchEstimate(more[k].bench, more[k].since, mean[own], covariance[own, own]))
+        return out
 
     def constant(self, group: Group) -> BenchEvidence:
         """The evidence that the runs of each bench have one coefficient vector."""

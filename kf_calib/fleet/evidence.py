@@ -18,6 +18,8 @@ from kf_calib.bench.arrays import Floats
 
 STEP = 2.0
 """Ratio of a size to the one before."""
+FLAT = 1e6
+"""Sigmas of one run: the prior of a coefficient of which nothing is known."""
 
 
 def sizes(low: float, high: float, step: float = STEP) -> Floats:

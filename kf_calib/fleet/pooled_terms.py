@@ -164,5 +164,3 @@ def _spreads(term: Term, blocks: Blocks) -> Floats:
         return np.full((len(blocks.units), count), term.size)
     has = np.array([unit in term.units for unit in blocks.units], float)
     return np.repeat(term.size * has[:, None], count, axis=1)
-
-

@@ -11,14 +11,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.fleet.campaign import Blocks, Group
-from kf_calib.fleet.evidence import log_evidence, log_evidence_of_modes, log_mean, modes, posterior, sizes, weights
+from kf_calib.fleet.evidence import (
+    FLAT,
+    log_evidence,
+    log_evidence_of_modes,
+    log_mean,
+    modes,
+    posterior,
+    sizes,
+    weights,
+)
 from kf_calib.fleet.pooled_terms import Common, PooledTerms, Sums, shares_of
 
 _LEAST = 0.25  # sigma of one run: the smallest spread that is expected
 _RATIOS = np.array([0.0, 1.0, 3.0])  # of the mean of a population to its spread
-_FLAT = 1e6  # sigmas of one run: the prior of a mean of which nothing is known
+_NARROW = 0.02  # sigma of one run: the smallest spread that is told from none
 _FINE = 1.05  # ratio of the spreads among which the likeliest is looked for
 
 
@@ -92,6 +101,11 @@ class Own:
         known = (blocks.info[:, own][:, :, columns] @ offsets[:, :, None])[:, :, 0]
         return cls(blocks.labels, blocks.info[:, own, own], blocks.score[:, own] - known)
 
+    def only(self, kept: Mask) -> Own:
+        """Some of them."""
+        units = [unit for unit, here in zip(self.units, kept.tolist(), strict=True) if here]
+        return Own(units, self.info[kept], self.score[kept])
+
     @classmethod
     def joined(cls, parts: Sequence[Own]) -> Own:
         """All of several parts."""
@@ -101,39 +115,36 @@ class Own:
 
 @dataclass(frozen=True)
 class Population:
-    """Mean (q,) of a population with its covariance (q, q), and the spread about it with its 95 % interval.
-
-    coefficients (n, q), covariances (n, q, q): of the units, given the population.
-    """
+    """Mean (q,) of a population with its covariance (q, q), and the spread about it with its 95 % interval."""
 
     mean: Floats
     covariance: Floats
     spread: float
     spread_interval: tuple[float, float]
-    coefficients: Floats
-    covariances: Floats
+
+    def coefficients(self, own: Own) -> list[tuple[Floats, Floats]]:
+        """The coefficients (q,) of each unit with their covariance (q, q), given that it is of this population."""
+        prior = np.full(len(self.mean), self.spread)
+        rows = zip(own.info, own.score - own.info @ self.mean, strict=True)
+        found = [posterior(info, score, prior) for info, score in rows]
+        return [(self.mean + departure, covariance) for departure, covariance in found]
 
 
 def population(own: Own, largest: float) -> Population:
     """The population from its units by restricted likelihood; largest: the largest spread that is tried."""
-    count = own.score.shape[1]
-    tried = np.concatenate([[0.0], sizes(0.02, largest, _FINE)])
+    tried, flat = np.concatenate([[0.0], sizes(_NARROW, largest, _FINE)]), np.full(own.score.shape[1], FLAT)
     values, along, turned = modes(own.info, own.score)
-    logs, flat = np.zeros(len(tried)), np.full(count, _FLAT)
-    for k, spread in enumerate(tried):
-        rest = _beside_spread(values, along, turned, spread)
-        logs[k] = log_evidence_of_modes(values, along, spread).sum() + log_evidence(rest.info, rest.score, flat)
-    best = float(tried[np.argmax(logs)])
-    rest = _beside_spread(values, along, turned, best)
-    mean, covariance = posterior(rest.info, rest.score, flat)
-    share = np.cumsum(weights(logs) * np.gradient(tried) / np.sum(weights(logs) * np.gradient(tried)))
-    low, high = (float(tried[min(np.searchsorted(share, level), len(tried) - 1)]) for level in (0.025, 0.975))
-    prior = np.full(count, best)
-    found = [posterior(info, score - info @ mean, prior) for info, score in zip(own.info, own.score, strict=True)]
-    return Population(
-        mean, covariance, best, (low, high), np.array([mean + each for each, _ in found]),
-        np.array([each for _, each in found]),
-    )  # fmt: skip
+    rests = [_beside_spread(values, along, turned, spread) for spread in tried.tolist()]
+    logs = np.array([
+        log_evidence_of_modes(values, along, spread).sum() + log_evidence(rest.info, rest.score, flat)
+        for spread, rest in zip(tried.tolist(), rests, strict=True)
+    ])  # fmt: skip
+    best = int(np.argmax(logs))
+    mean, covariance = posterior(rests[best].info, rests[best].score, flat)
+    share = np.cumsum(weights(logs) * np.gradient(tried))
+    places = np.searchsorted(share / share[-1], [0.025, 0.975])
+    low, high = tried[np.minimum(places, len(tried) - 1)].tolist()
+    return Population(mean, covariance, float(tried[best]), (low, high))
 
 
 def _beside_spread(values: Floats, along: Floats, turned: Floats, spread: float) -> Sums:
