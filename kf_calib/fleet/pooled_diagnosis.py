@@ -42,13 +42,13 @@ class BenchCoefficients:
     """Coefficients that all runs on a bench have in common, those from a repair on apart.
 
     since: date of the first run that has them, if it is not the first on that bench. covariance: of the coefficients,
-    SI; None where one of them is not determined.
+    SI; large where one of them is not determined.
     """
 
     bench: str
     since: str | None
     coefficients: tuple[Estimate, ...]
-    covariance: tuple[tuple[float, ...], ...] | None
+    covariance: tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -222,20 +222,16 @@ def _likeliest(name: str, tables: Sequence[Table]) -> dict[str, float]:
 def _bench_coefficients(campaign: Campaign, group: Group, found: BenchEstimate) -> BenchCoefficients:
     since = campaign.by_date[found.since].date if found.since else None
     values = _estimates(group, found.mean, found.covariance)
-    known = all(each.value is not None for each in values)
-    covariance = tuple(tuple(row) for row in (found.covariance * group.sigma**2).tolist()) if known else None
+    covariance = tuple(tuple(row) for row in (found.covariance * group.sigma**2).tolist())
     return BenchCoefficients(campaign.benches[found.bench], since, values, covariance)
 
 
 def _estimates(group: Group, mean: Floats, covariance: Floats) -> tuple[Estimate, ...]:
     """Return coefficients in SI."""
-    sigma, effect = np.sqrt(np.maximum(np.diag(covariance), 0.0)), described(group.name)
+    effect, out = described(group.name), list[Estimate]()
     units = {each.symbol: each.unit for each in effect.coefficients} if effect is not None else {}
-    known = sigma < 0.1 * FLAT
-    return tuple(
-        Estimate(
-            symbol, float(mean[k] * group.sigma) if known[k] else None, float(sigma[k] * group.sigma) if known[k] else None,
-            units.get(symbol, ""),
-        )
-        for k, symbol in enumerate(group.symbols)
-    )  # fmt: skip
+    sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+    for symbol, value, sigma in zip(group.symbols, mean.tolist(), sigmas, strict=True):
+        seen = (value * group.sigma, sigma * group.sigma) if sigma < 0.1 * FLAT else (None, None)
+        out.append(Estimate(symbol, *seen, units.get(symbol, "")))
+    return tuple(out)

@@ -1,4 +1,4 @@
-"""A unit whose scale factors are known from elsewhere, against which an error of the gravity that a bench uses shows."""
+"""A unit whose scale factors are known from elsewhere: against it, an error of the gravity that a bench uses shows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When a bench was repaired: the probability of each date between two runs at which its coefficients may have changed."""
+"""When a bench was repaired: the probability of each time between two runs at which its coefficients changed."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -61,7 +62,7 @@ def _reliability(outcomes: Sequence[dict[str, Any]]) -> Table:
 
 def _add_rows(out: Table, words: str, own: Iterable[tuple[float, bool]]) -> None:
     values = np.array([(chance, true) for chance, true in own], float).reshape(-1, 2)
-    for low, high in zip(_EDGES[:-1], _EDGES[1:], strict=True):
+    for low, high in itertools.pairwise(_EDGES):
         here = values[(values[:, 0] >= low) & ((values[:, 0] < high) | (high == 1.0))]
         if len(here):
             chance, true = here.mean(axis=0)
