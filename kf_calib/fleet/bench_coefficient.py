@@ -15,6 +15,7 @@ from kf_calib.fleet.pooled_terms import Attribution, Common, PooledTerms, Term, 
 
 _SLOTS = 48  # at most as many parts of a campaign between which a repair is looked for at first
 _LEAST = 0.5  # sigma of all runs together: the smallest size that is expected
+_SIDES = np.array([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0]])  # of a repair on which there is an error: both, or only one
 _COARSE = 4.0  # ratio of the sizes of a coefficient that changes
 
 
@@ -120,7 +121,10 @@ class DatedSums:
         return firsts[1:], weights(logs + np.log(np.diff(firsts)))
 
     def _with_repairs(self, group: Group, bench: int, tried: Floats) -> Floats:
-        """Return the log evidence (k, t) of a repair of one bench before each of its parts but the first."""
+        """Return the log evidence (k, t) of a repair of one bench before each of its parts but the first.
+
+        It is as likely that there is an error before and after it as that there is none before, or none after.
+        """
         others = [Common(k, 1.0, other) for other in range(len(self._first)) if other != bench for k in _range(group)]
         fixed = [*self._terms.common, *others]
         whole = self._terms.sums(self._slots, others)
@@ -134,8 +138,11 @@ class DatedSums:
         before = [each[:-1] for each in (inner, across, along)]
         after = [each[-1:] - each[:-1] for each in (inner, across, along)]
         infos, scores = _joined(whole.info, whole.score, before, after)
-        priors = self._priors(tried, len(others) + 2 * len(own))
-        return log_evidence(infos[:, None], scores[:, None], priors[None]) - self._nothing()
+        ends = np.repeat(_SIDES, len(own), axis=1)
+        kept = np.concatenate([np.ones((len(ends), len(fixed))), ends], axis=1)
+        priors = self._priors(tried, len(others) + 2 * len(own)) * kept[:, None]
+        logs = log_evidence(infos[:, None, None], scores[:, None, None], priors)
+        return log_mean(logs, axis=1) - self._nothing()
 
     def _nothing(self) -> float:
         """Return the log evidence of the terms alone."""

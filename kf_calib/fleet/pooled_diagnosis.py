@@ -78,13 +78,13 @@ class Finding:
     - rivals: other effects that may be there in its place, with their probabilities.
     - benches: the coefficients of each bench; empty if the effect is the sensors'.
     - population, units, share, share_interval: of the units; None or empty if it is the bench's. ``share`` is the share
-      of the units that have it, if the question is which.
+      of these units that have it; it is not given if the effect is each run's own.
     - repair: when it changed, if it did.
     """
 
     effect: str
     attribution: Attribution
-    probabilities: Mapping[str, float]
+    probabilities: Mapping[Attribution, float]
     rivals: Mapping[str, float]
     benches: tuple[BenchCoefficients, ...] = ()
     population: PopulationFigures | None = None
@@ -103,7 +103,7 @@ class EffectRow:
     """
 
     effect: str
-    probabilities: Mapping[str, float] | None
+    probabilities: Mapping[Attribution, float] | None
     no_one: float | None
     benches: tuple[BenchCoefficients, ...]
 
@@ -149,7 +149,7 @@ def _finding(campaign: Campaign, found: Attributed, number: int) -> Finding:
     """Return what is to be said of one term, from its table beside the others."""
     term, table = found.terms[number], found.tables[number]
     others = PooledTerms([each for each in found.terms if each is not term], len(campaign.benches))
-    shares = {str(each): share for each, share in table.of(term.group.name).items()}
+    shares = dict(table.of(term.group.name))
     rivals = {name: share for name, share in table.effects().items() if share > RIVAL and name != term.group.name}
     attribution = chosen(table).attribution
     if attribution.common:
@@ -167,15 +167,16 @@ def _of_units(campaign: Campaign, others: PooledTerms, term: Term, so_far: Findi
     group, means = term.group, others.solved(campaign)[0]
     level = campaign.runs() if term.attribution is Attribution.RUN else campaign.units(others.repairs)
     own = Own.joined([Own.of(group, others, means, others.beside_own(blocks)) for blocks in level])
-    if term.attribution is not Attribution.SOME:
+    if term.attribution is Attribution.RUN:
         people = population(own, group.largest)
-        return replace(
-            so_far, population=_figures(group, people), units=_units(group, own, people, np.ones(len(own.units)))
-        )
-    some = SomeUnits(group, own)
-    people = population(own.only(some.probabilities > 0.5), group.largest)
-    share, interval = some.share()
-    units = _units(group, own, people, some.probabilities)
+        units = _units(group, own, people, np.ones(len(own.units)))
+        return replace(so_far, population=_figures(group, people), units=units)
+    some, chance = SomeUnits(group, own), so_far.probabilities
+    every = chance[Attribution.SENSORS] / (chance[Attribution.SENSORS] + chance[Attribution.SOME])
+    has = every + (1.0 - every) * some.probabilities
+    people = population(own.only(has > 0.5), group.largest)
+    share, interval = some.share(every)
+    units = _units(group, own, people, has)
     return replace(so_far, population=_figures(group, people), units=units, share=share, share_interval=interval)
 
 
@@ -208,14 +209,14 @@ def _rows(campaign: Campaign, found: Attributed, findings: Mapping[str, Finding]
             yield EffectRow(group.name, shares, _rest(shares), benches)
 
 
-def _rest(shares: Mapping[str, float]) -> float:
+def _rest(shares: Mapping[Attribution, float]) -> float:
     """Return what probabilities leave of one."""
     return max(1.0 - sum(shares.values()), 0.0)
 
 
-def _likeliest(name: str, tables: Sequence[Table]) -> dict[str, float]:
+def _likeliest(name: str, tables: Sequence[Table]) -> dict[Attribution, float]:
     """Return the probabilities of an effect in the table in which it is likeliest."""
-    each = [{str(key): share for key, share in table.of(name).items()} for table in tables]
+    each = [dict(table.of(name)) for table in tables]
     return max(each, key=lambda shares: sum(shares.values()))
 
 

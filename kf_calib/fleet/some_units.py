@@ -63,15 +63,19 @@ class SomeUnits:
 
     @cached_property
     def probabilities(self) -> Floats:
-        """The probability (n,) that each unit has it."""
+        """The probability (n,) that each unit has it, if some have it and others do not."""
         return self._each @ weights(self._logs).reshape(-1)
 
-    def share(self) -> tuple[float, tuple[float, float]]:
-        """The share of these units that have it, with its 95 % interval, by draws of who has it."""
+    def share(self, all_have_it: float) -> tuple[float, tuple[float, float]]:
+        """The share of these units that have it, with its 95 % interval, by draws of who has it.
+
+        all_have_it: probability that all have it, rather than some.
+        """
         rng, weight = np.random.default_rng(0), weights(self._logs).reshape(-1)
         kept = np.flatnonzero(weight > _LIKELY * weight.max())
         chosen = rng.choice(kept, _DRAWS, p=weight[kept] / weight[kept].sum())
         shares = np.mean(rng.random((len(self._each), _DRAWS)) < self._each[:, chosen], axis=0)
+        shares[: round(all_have_it * _DRAWS)] = 1.0
         low, high = np.quantile(shares, [0.025, 0.975]).tolist()
         return float(shares.mean()), (low, high)
 
