@@ -6,6 +6,7 @@ parameters. The factors are read anew for each question and summed, so that memo
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -47,6 +48,7 @@ class Group:
     - sigma: what one run leaves uncertain of a coefficient beside its own parameters, SI; 0 where no run shows it.
     - largest: the largest size that is expected, in ``sigma``.
     - of_the_bench: whether it usually belongs to the bench.
+    - alone: whether only one unit shows it, so that nobody can tell whether it is the bench's.
     """
 
     name: str
@@ -55,6 +57,7 @@ class Group:
     sigma: float
     largest: float
     of_the_bench: bool
+    alone: bool = False
 
 
 @dataclass(frozen=True)
@@ -171,19 +174,22 @@ class Campaign:
 
     def _sized(self, symbols: Mapping[str, Sequence[str]]) -> list[Group]:
         """Return the effects with the sigma that one run leaves of their coefficients."""
-        total, seen = np.zeros(len(self._columns)), np.zeros(len(self._columns))
-        for _, info, _ in self._each():
-            total, seen = total + np.diag(info), seen + (np.diag(info) > 0.0)
-        groups, first = list[Group](), 0
-        for name, own in symbols.items():
-            part = slice(first, first + len(own))
-            first = part.stop
-            shown = seen[part] > 0.0
-            mean = float(np.mean(total[part][shown] / seen[part][shown])) if shown.any() else 0.0
-            sigma, effect = mean**-0.5 if mean else 0.0, described(name)
+        ends = np.cumsum([0, *map(len, symbols.values())]).tolist()
+        parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
+        total, runs = np.zeros(ends[-1]), np.zeros(ends[-1])
+        units = [set[str]() for _ in parts]
+        for key, info, _ in self._each():
+            own = np.diag(info)
+            total, runs = total + own, runs + (own > 0.0)
+            for part, shown_by in zip(parts, units, strict=True):
+                shown_by |= {key.unit} if own[part].any() else set()
+        groups = list[Group]()
+        for (name, own), part, shown_by in zip(symbols.items(), parts, units, strict=True):
+            seen, effect = runs[part] > 0.0, described(name)
+            sigma = float(np.mean(total[part][seen] / runs[part][seen])) ** -0.5 if seen.any() else 0.0
             largest = max(_LARGE, _usual(effect) / sigma) if sigma else _LARGE
-            of_bench = effect is not None and effect.of_the_bench
-            groups.append(Group(name, part, tuple(own), sigma, largest, of_bench))
+            of_bench, alone = effect is not None and effect.of_the_bench, len(shown_by) == 1 < len(self.keys)
+            groups.append(Group(name, part, tuple(own), sigma, largest, of_bench, alone))
         return groups
 
 

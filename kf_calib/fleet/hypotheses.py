@@ -72,12 +72,21 @@ class Table:
 def table(campaign: Campaign, terms: PooledTerms) -> Table:
     """The table of the hypotheses for one term more than ``terms``."""
     groups = [group for group in campaign.groups if group.sigma and group.name not in terms.names()]
-    every = [*_of_units(campaign, terms, groups), *_of_runs(campaign, terms, groups)]
+    every = [each for each in _every(campaign, terms, groups) if _can_be_told(each.term)]
     tried = {name: {each.attribution for each in every if each.name == name} for name in (g.name for g in groups)}
     rows = [replace(each, log_prior=_log_prior(each.term, tried[each.name], len(groups))) for each in every]
     logs = np.array([np.log(_HAS_IT), *(each.log_odds + each.log_prior for each in rows)])
     shares = np.exp(logs - np.logaddexp.reduce(logs))
     return Table(tuple(rows), shares[1:], float(shares[0]))
+
+
+def _every(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[Hypothesis]:
+    return [*_of_units(campaign, terms, groups), *_of_runs(campaign, terms, groups)]
+
+
+def _can_be_told(term: Term) -> bool:
+    """Tell whether the runs can speak for a term: what one unit alone shows is of what it usually belongs to."""
+    return not term.group.alone or term.attribution.common == term.group.of_the_bench
 
 
 def _of_runs(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[Hypothesis]:
