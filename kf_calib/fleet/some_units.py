@@ -19,6 +19,7 @@ from kf_calib.fleet.population import Own
 
 _SHARES = (np.arange(50) + 0.5) / 50.0
 _LEAST = 1.0  # sigma of one run: the smallest size that is expected
+_ONE_SIZE = sizes(_LEAST, 20.0, 1.2)  # of all units alike, closely since the units together tell it well
 _SEEN = 1e-6  # of the largest information of a unit: what is less counts as not seen
 _DRAWS = 4000
 _LIKELY = 1e-4  # weights below this are left out of the draws
@@ -28,37 +29,41 @@ class SomeUnits:
     """The likelihood of who has an effect, from what each unit tells of its coefficients beside all else."""
 
     def __init__(self, group: Group, own: Own) -> None:
-        self._sizes = sizes(_LEAST, group.largest)
+        normal = sizes(_LEAST, group.largest)
         values, along, _ = modes(own.info, own.score)
-        shapes = [_normal(values, along, self._sizes), _of_one_size(values, along, self._sizes)]
-        self._ratios = np.stack(shapes, axis=1)  # (units, shapes, sizes), logs
+        self._sizes = np.concatenate([normal, _ONE_SIZE])
+        self._alike = len(normal)
+        self._ratios = np.hstack([_normal(values, along, normal), _of_one_size(values, along)])  # (units, sizes), logs
+        priors = np.repeat([0.5 / len(normal), 0.5 / len(_ONE_SIZE)], [len(normal), len(_ONE_SIZE)])
+        self._priors = np.log(priors / len(_SHARES))
         self._odds = np.logaddexp(
-            np.log(_SHARES)[:, None] + self._ratios[:, :, None, :], np.log1p(-_SHARES)[:, None]
-        )  # (units, shapes, shares, sizes)
+            np.log(_SHARES)[:, None] + self._ratios[:, None, :], np.log1p(-_SHARES)[:, None]
+        )  # (units, shares, sizes)
 
     @cached_property
     def _logs(self) -> Floats:
-        return self._odds.sum(axis=0)
+        """The log of likelihood times prior (shares, sizes)."""
+        return self._odds.sum(axis=0) + self._priors
 
     @property
     def log_odds(self) -> float:
         """Log evidence that some units have it, each its own, against that none has it."""
-        return float(log_mean(self._logs))
+        return float(np.logaddexp.reduce(self._logs, axis=None))
 
     @property
     def log_odds_of_all(self) -> float:
         """The same that all units have it, of one size and each with a direction of its own."""
-        return float(log_mean(self._ratios[:, 1].sum(axis=0)))
+        return float(log_mean(self._ratios[:, self._alike :].sum(axis=0)))
 
     @property
     def size(self) -> float:
         """The likeliest spread of the coefficients of a unit that has it, in ``Group.sigma``."""
-        return float(self._sizes[np.unravel_index(np.argmax(self._logs), self._logs.shape)[2]])
+        return float(self._sizes[np.unravel_index(np.argmax(self._logs), self._logs.shape)[1]])
 
     @cached_property
     def _each(self) -> Floats:
         """The probability that a unit has it under each hypothesis (units, hypotheses)."""
-        found = np.exp(np.log(_SHARES)[:, None] + self._ratios[:, :, None, :] - self._odds)
+        found = np.exp(np.log(_SHARES)[:, None] + self._ratios[:, None, :] - self._odds)
         return found.reshape(len(found), -1)
 
     @cached_property
@@ -85,13 +90,13 @@ def _normal(values: Floats, along: Floats, tried: Floats) -> Floats:
     return log_evidence_of_modes(values[:, None], along[:, None], tried)
 
 
-def _of_one_size(values: Floats, along: Floats, tried: Floats) -> Floats:
+def _of_one_size(values: Floats, along: Floats) -> Floats:
     """Return the same for coefficients of one size in units of the noise, averaged over their directions."""
     seen = values > _SEEN * values.max(axis=1, keepdims=True)
     squares = np.sum(np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0), axis=1)
-    dofs, out = seen.sum(axis=1), np.zeros((len(values), len(tried)))
+    dofs, out = seen.sum(axis=1), np.zeros((len(values), len(_ONE_SIZE)))
     for dof in np.unique(dofs[dofs > 0]).tolist():
         alike = dofs == dof
-        for k, size in enumerate(tried * np.sqrt(dof)):
+        for k, size in enumerate(_ONE_SIZE * np.sqrt(dof)):
             out[alike, k] = bayes_factor.log_odds(dof, squares[alike], float(size))
     return out
