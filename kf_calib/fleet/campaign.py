@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,6 +27,9 @@ _LARGE = 64.0  # sigmas of one run, up to which sizes are expected where the cat
 
 _Part = tuple[str, str, int, int, Floats, Floats]
 """Label, unit, bench, rank, information and score of a block."""
+
+Factors = Iterable[RunFactor] | Callable[[], Iterable[RunFactor]]
+"""Factors of runs, or a function that reads them anew each time, so that memory does not grow with their number."""
 
 
 @dataclass(frozen=True)
@@ -80,16 +83,17 @@ class Blocks:
 class Campaign:
     """Runs in the order of their dates, which can be read as often as needed.
 
-    - factors: a list, or anything that can be iterated over several times, such as what reads them from files.
+    - factors: the factors, or a function that reads them anew each time.
     - reference: a unit whose scale factors are known.
 
     Raises InputError if there are no runs, or none of the reference unit.
     """
 
-    def __init__(self, factors: Iterable[RunFactor], reference: ReferenceUnit | None = None) -> None:
-        self._factors = tuple(factors) if isinstance(factors, Iterator) else factors
+    def __init__(self, factors: Factors, reference: ReferenceUnit | None = None) -> None:
+        held = factors if callable(factors) else tuple(factors)
+        self._read = held if callable(held) else lambda: held
         self._reference = reference
-        self.keys, symbols = _catalogue(self._factors)
+        self.keys, symbols = _catalogue(self._read())
         if not self.keys:
             raise InputError("there are no runs to diagnose together: give at least two.")
         if reference and reference.unit not in {key.unit for key in self.keys}:
@@ -152,7 +156,7 @@ class Campaign:
 
     def _each(self) -> Iterator[tuple[RunKey, Floats, Floats]]:
         """Yield information (q, q) and score (q,) of each run beside its own parameters."""
-        for key, factor in zip(self.keys, self._factors, strict=True):
+        for key, factor in zip(self.keys, self._read(), strict=True):
             upper = factor.factor
             if self._reference and key.unit == self._reference.unit:
                 upper = self._reference.known(factor)

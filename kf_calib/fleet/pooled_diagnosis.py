@@ -12,14 +12,13 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.effects import described
 from kf_calib.fleet.attribution import Attributed, attributed, chosen
 from kf_calib.fleet.bench_coefficient import BenchEstimate, DatedSums
-from kf_calib.fleet.campaign import Campaign, Group
+from kf_calib.fleet.campaign import Campaign, Factors, Group
 from kf_calib.fleet.evidence import FLAT
 from kf_calib.fleet.hypotheses import Table
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
 from kf_calib.fleet.population import Own, Population, population
 from kf_calib.fleet.reference_unit import ReferenceUnit
 from kf_calib.fleet.repair_date import RepairDate, repair_date
-from kf_calib.fleet.run_factor import RunFactor
 from kf_calib.fleet.some_units import SomeUnits
 from kf_calib.support.threads import one_blas_thread
 
@@ -124,11 +123,11 @@ class PooledDiagnosis:
         return asdict(self)
 
 
-def pooled_diagnosis(factors: Iterable[RunFactor], *, reference_unit: ReferenceUnit | None = None) -> PooledDiagnosis:
+def pooled_diagnosis(factors: Factors, *, reference_unit: ReferenceUnit | None = None) -> PooledDiagnosis:
     """Diagnose many runs together.
 
-    - factors: the reduced factors of the runs. They are read several times; an iterator is therefore read into memory
-      first, and what opens files anew each time keeps memory small.
+    - factors: the reduced factors of the runs, or a function that reads them anew each time it is called, such as
+      ``open_fleet("fleet").factors``, so that memory does not grow with their number.
     - reference_unit: a unit whose scale factors are known, so that an error of gravity can be seen.
 
     Raises InputError if there are no runs.

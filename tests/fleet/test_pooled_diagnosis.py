@@ -86,11 +86,11 @@ def test_report_and_document_say_what_was_found(both: PooledDiagnosis) -> None:
     assert sum(row["probabilities"].values()) + row["no_one"] == pytest.approx(1.0)
 
 
-def test_noise_alone_shows_nothing_and_an_iterator_is_as_good_as_a_list() -> None:
+def test_noise_alone_shows_nothing_however_the_runs_are_given() -> None:
     runs = campaign_of(20)
     found = pooled_diagnosis(runs)
     assert found.findings == () and found.no_more > 0.5
-    assert pooled_diagnosis(iter(runs)) == found
+    assert pooled_diagnosis(iter(runs)) == pooled_diagnosis(lambda: iter(runs)) == found
 
 
 def test_order_of_reading_changes_nothing() -> None:
