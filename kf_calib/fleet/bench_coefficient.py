@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.campaign import Blocks, Campaign, Group
-from kf_calib.fleet.evidence import FLAT, log_evidence, log_mean, posterior, sizes, weights
+from kf_calib.fleet.evidence import FLAT, STEP, log_evidence, log_mean, posterior, sizes, weights
 from kf_calib.fleet.pooled_terms import Attribution, Common, PooledTerms, Term, commons_of, shares_of
 
 _SLOTS = 48  # at most as many parts of a campaign between which a repair is looked for at first
@@ -50,13 +50,11 @@ class DatedSums:
         """parted: benches and first ranks of further parts."""
         self._campaign, self._terms, self._parted = campaign, terms, [*terms.repairs, *parted]
         self._first = [self._firsts(bench) for bench in range(len(campaign.benches))]
-        starts = np.cumsum([0, *(len(own) for own in self._first)])
-        count = campaign.groups[-1].columns.stop
-        self._starts = starts
+        counts = [len(own) for own in self._first]
+        self._starts, slots, columns = np.cumsum([0, *counts]), sum(counts), campaign.groups[-1].columns.stop
         self._slots = Blocks(
-            [""] * int(starts[-1]), [""] * int(starts[-1]),
-            np.repeat(np.arange(len(self._first)), [len(own) for own in self._first]), np.concatenate(self._first),
-            np.zeros((starts[-1], count, count)), np.zeros((starts[-1], count)),
+            (), (), np.repeat(np.arange(len(counts)), counts), np.concatenate(self._first),
+            np.zeros((slots, columns, columns)), np.zeros((slots, columns)),
         )  # fmt: skip
 
     def _firsts(self, bench: int) -> NDArray[np.intp]:
@@ -96,7 +94,7 @@ class DatedSums:
 
     def constant(self, group: Group) -> BenchEvidence:
         """The evidence that the runs of each bench have one coefficient vector."""
-        tried = self._sizes(group, 2.0)
+        tried = self._sizes(group, STEP)
         more = [Common(k, 1.0, bench) for bench in range(len(self._first)) for k in _range(group)]
         found = self._terms.sums(self._slots, more)
         logs = log_evidence(found.info, found.score, self._priors(tried, len(more))) - self._nothing()
@@ -138,8 +136,7 @@ class DatedSums:
         before = [each[:-1] for each in (inner, across, along)]
         after = [each[-1:] - each[:-1] for each in (inner, across, along)]
         infos, scores = _joined(whole.info, whole.score, before, after)
-        ends = np.repeat(_SIDES, len(own), axis=1)
-        kept = np.concatenate([np.ones((len(ends), len(fixed))), ends], axis=1)
+        kept = np.concatenate([np.ones((len(_SIDES), len(fixed))), np.repeat(_SIDES, len(own), axis=1)], axis=1)
         priors = self._priors(tried, len(others) + 2 * len(own)) * kept[:, None]
         logs = log_evidence(infos[:, None, None], scores[:, None, None], priors)
         return log_mean(logs, axis=1) - self._nothing()

@@ -96,6 +96,8 @@ class Campaign:
         self.keys, symbols = _catalogue(self._read())
         if not self.keys:
             raise InputError("there are no runs to diagnose together: give at least two.")
+        if not symbols:
+            raise InputError("the runs have no columns of effects: runs that are diagnosed together need angles.")
         if reference and reference.unit not in {key.unit for key in self.keys}:
             raise InputError(f"no run is of the reference unit {reference.unit}: name a unit that was measured.")
         self.benches = sorted({key.bench for key in self.keys})
@@ -173,7 +175,8 @@ class Campaign:
         if factor.columns not in self._places:
             places = {name: k for name, k in factor.places.items() if k >= factor.width}
             own = [k for k, name in enumerate(self._columns) if name in places]
-            self._places[factor.columns] = np.array(own), np.array([places[self._columns[k]] for k in own])
+            there = [places[self._columns[k]] for k in own]
+            self._places[factor.columns] = np.array(own, dtype=np.intp), np.array(there, dtype=np.intp)
         return self._places[factor.columns]
 
     def _sized(self, symbols: Mapping[str, Sequence[str]]) -> list[Group]:

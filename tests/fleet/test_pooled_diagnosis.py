@@ -156,5 +156,10 @@ def test_bench_model_holds_what_the_last_runs_have(both: PooledDiagnosis, tmp_pa
 def test_what_cannot_be_diagnosed_is_refused_in_words() -> None:
     with pytest.raises(InputError, match="there are no runs"):
         pooled_diagnosis([])
+    bare = [replace(run, columns=run.columns[:12], factor=run.factor[:13, :13]) for run in campaign_of(2)]
+    with pytest.raises(InputError, match="the runs have no columns of effects"):
+        pooled_diagnosis(bare)
+    mixed = pooled_diagnosis([*campaign_of(3), bare[0]])
+    assert mixed.runs == 4 and mixed.findings == ()
     with pytest.raises(InputError, match="no run is of the reference unit X"):
         pooled_diagnosis(campaign_of(2), reference_unit=ReferenceUnit("X", (1.0, 1.0, 1.0), (1e-6, 1e-6, 1e-6)))
