@@ -1,8 +1,9 @@
 """An effect that some units have and others do not: which, and what share of them.
 
-A unit has the effect with a probability p, the share, of which nothing is known before. The size of the effect in a
-unit that has it is either normal about zero, or the same in all of these in units of their noise with any direction;
-both are as likely before, and the evidence is averaged over the size.
+A unit has the effect with a probability p, the share, of which nothing is known before. To have it means a size that is
+clearly not zero: the same in all units that have it, or about the same, within a factor of two or so, in units of their
+noise and with any direction; where it is large against the noise, also normal about zero. These three are as likely
+before, and the evidence is averaged over the size.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from kf_calib.fleet.evidence import log_evidence_of_modes, log_mean, modes, size
 from kf_calib.fleet.population import Own
 
 _SHARES = (np.arange(50) + 0.5) / 50.0
-_LEAST = 1.0  # sigma of one run: the smallest size that is expected
-_ONE_SIZE = sizes(_LEAST, 20.0, 1.2)  # of all units alike, closely since the units together tell it well
+_SIZES = sizes(1.0, 64.0, 1.2)  # sigma of one run: of units that have it alike, closely, as all of them tell it
+_APART = 0.5  # standard deviation of the logarithm of sizes that are about the same
+_LARGE = 8.0  # sigma of one run, from which on normal coefficients are hardly ever near zero
 _SEEN = 1e-6  # of the largest information of a unit: what is less counts as not seen
 _DRAWS = 4000
 _LIKELY = 1e-4  # weights below this are left out of the draws
@@ -29,12 +31,14 @@ class SomeUnits:
     """The likelihood of who has an effect, from what each unit tells of its coefficients beside all else."""
 
     def __init__(self, group: Group, own: Own) -> None:
-        normal = sizes(_LEAST, group.largest)
+        large = sizes(_LARGE, max(group.largest, 2.0 * _LARGE))
         values, along, _ = modes(own.info, own.score)
-        self._sizes = np.concatenate([normal, _ONE_SIZE])
-        self._alike = len(normal)
-        self._ratios = np.hstack([_normal(values, along, normal), _of_one_size(values, along)])  # (units, sizes), logs
-        priors = np.repeat([0.5 / len(normal), 0.5 / len(_ONE_SIZE)], [len(normal), len(_ONE_SIZE)])
+        same = _of_one_size(values, along)
+        about = np.logaddexp.reduce(same[:, :, None] + _near(), axis=1)
+        parts = [same, about, log_evidence_of_modes(values[:, None], along[:, None], large)]
+        self._sizes, self._alike = np.concatenate([_SIZES, _SIZES, large]), 2 * len(_SIZES)
+        self._ratios = np.hstack(parts)  # (units, sizes), logs
+        priors = np.concatenate([np.full(part.shape[1], 1.0 / len(parts) / part.shape[1]) for part in parts])
         self._priors = np.log(priors / len(_SHARES))
         self._odds = np.logaddexp(
             np.log(_SHARES)[:, None] + self._ratios[:, None, :], np.log1p(-_SHARES)[:, None]
@@ -52,8 +56,8 @@ class SomeUnits:
 
     @property
     def log_odds_of_all(self) -> float:
-        """The same that all units have it, of one size and each with a direction of its own."""
-        return float(log_mean(self._ratios[:, self._alike :].sum(axis=0)))
+        """The same that all units have it, of about one size and each with a direction of its own."""
+        return float(log_mean(self._ratios[:, : self._alike].sum(axis=0)))
 
     @property
     def size(self) -> float:
@@ -85,18 +89,21 @@ class SomeUnits:
         return float(shares.mean()), (low, high)
 
 
-def _normal(values: Floats, along: Floats, tried: Floats) -> Floats:
-    """Return the log of the likelihood ratio (n, t) of normal coefficients of each size against none."""
-    return log_evidence_of_modes(values[:, None], along[:, None], tried)
+def _near() -> Floats:
+    """Return the log of the weights (sizes, sizes) of the sizes that are about as large as each."""
+    logs = np.log(_SIZES)
+    weight = -0.5 * ((logs[:, None] - logs) / _APART) ** 2
+    return weight - np.logaddexp.reduce(weight, axis=0)
 
 
 def _of_one_size(values: Floats, along: Floats) -> Floats:
-    """Return the same for coefficients of one size in units of the noise, averaged over their directions."""
+    """Return the log of the likelihood ratio (n, sizes) of coefficients of one size in units of the noise against none,
+    averaged over their directions."""
     seen = values > _SEEN * values.max(axis=1, keepdims=True)
     squares = np.sum(np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0), axis=1)
-    dofs, out = seen.sum(axis=1), np.zeros((len(values), len(_ONE_SIZE)))
+    dofs, out = seen.sum(axis=1), np.zeros((len(values), len(_SIZES)))
     for dof in np.unique(dofs[dofs > 0]).tolist():
         alike = dofs == dof
-        for k, size in enumerate(_ONE_SIZE * np.sqrt(dof)):
+        for k, size in enumerate(_SIZES * np.sqrt(dof)):
             out[alike, k] = bayes_factor.log_odds(dof, squares[alike], float(size))
     return out
