@@ -8,6 +8,7 @@ before, and the evidence is averaged over the size.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
@@ -24,6 +25,7 @@ _APART = 0.5  # standard deviation of the logarithm of sizes that are about the 
 _LARGE = 8.0  # sigma of one run, from which on normal coefficients are hardly ever near zero
 _SEEN = 1e-6  # of the largest information of a unit: what is less counts as not seen
 _DRAWS = 4000
+_TOGETHER = 64  # units at a time, to save memory
 _LIKELY = 1e-4  # weights below this are left out of the draws
 
 
@@ -40,14 +42,18 @@ class SomeUnits:
         self._ratios = np.hstack(parts)  # (units, sizes), logs
         priors = np.concatenate([np.full(part.shape[1], 1.0 / len(parts) / part.shape[1]) for part in parts])
         self._priors = np.log(priors / len(_SHARES))
-        self._odds = np.logaddexp(
-            np.log(_SHARES)[:, None] + self._ratios[:, None, :], np.log1p(-_SHARES)[:, None]
-        )  # (units, shares, sizes)
+
+    def _odds(self) -> Iterator[tuple[Floats, Floats]]:
+        """Yield the log of the likelihood (units, shares, sizes) of a few units at a time, whether or not they have it,
+        and of that part of it in which they have it."""
+        for first in range(0, len(self._ratios), _TOGETHER):
+            has = np.log(_SHARES)[:, None] + self._ratios[first : first + _TOGETHER, None, :]
+            yield np.logaddexp(has, np.log1p(-_SHARES)[:, None]), has
 
     @cached_property
     def _logs(self) -> Floats:
         """The log of likelihood times prior (shares, sizes)."""
-        return self._odds.sum(axis=0) + self._priors
+        return self._priors + sum(whole.sum(axis=0) for whole, _ in self._odds())
 
     @property
     def log_odds(self) -> float:
@@ -65,15 +71,10 @@ class SomeUnits:
         return float(self._sizes[np.unravel_index(np.argmax(self._logs), self._logs.shape)[1]])
 
     @cached_property
-    def _each(self) -> Floats:
-        """The probability that a unit has it under each hypothesis (units, hypotheses)."""
-        found = np.exp(np.log(_SHARES)[:, None] + self._ratios[:, None, :] - self._odds)
-        return found.reshape(len(found), -1)
-
-    @cached_property
     def probabilities(self) -> Floats:
         """The probability (n,) that each unit has it, if some have it and others do not."""
-        return self._each @ weights(self._logs).reshape(-1)
+        weight = weights(self._logs)
+        return np.concatenate([np.sum(np.exp(has - whole) * weight, axis=(1, 2)) for whole, has in self._odds()])
 
     def share(self, all_have_it: float) -> tuple[float, tuple[float, float]]:
         """The share of these units that have it, with its 95 % interval, by draws of who has it.
@@ -83,10 +84,13 @@ class SomeUnits:
         rng, weight = np.random.default_rng(0), weights(self._logs).reshape(-1)
         kept = np.flatnonzero(weight > _LIKELY * weight.max())
         chosen = rng.choice(kept, _DRAWS, p=weight[kept] / weight[kept].sum())
-        shares = np.mean(rng.random((len(self._each), _DRAWS)) < self._each[:, chosen], axis=0)
-        shares[: round(all_have_it * _DRAWS)] = 1.0
-        low, high = np.quantile(shares, [0.025, 0.975]).tolist()
-        return float(shares.mean()), (low, high)
+        counts = np.zeros(_DRAWS)
+        for whole, has in self._odds():
+            chances = np.exp(has - whole).reshape(len(whole), -1)[:, chosen]
+            counts += np.sum(rng.random(chances.shape) < chances, axis=0)
+        counts[: round(all_have_it * _DRAWS)] = len(self._ratios)
+        low, high = np.quantile(counts / len(self._ratios), [0.025, 0.975]).tolist()
+        return float(counts.mean()) / len(self._ratios), (low, high)
 
 
 def _near() -> Floats:

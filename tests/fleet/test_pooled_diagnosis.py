@@ -102,7 +102,11 @@ def test_order_of_reading_changes_nothing() -> None:
 
 def test_units_that_have_an_effect_are_told_from_those_that_have_not() -> None:
     having = set(np.random.default_rng(7).permutation(30)[:15].tolist())
-    found = pooled_diagnosis(campaign_of(30, lambda k: {"hysteresis": own_of(k) / 1.7 * 4.0} if k in having else {}))
+
+    def hidden(number: int) -> Mapping[str, Floats]:
+        return {"hysteresis": 6.0 * own_of(number) / np.linalg.norm(own_of(number))} if number in having else {}
+
+    found = pooled_diagnosis(campaign_of(30, hidden))
     (only,) = found.findings
     assert only.attribution is Attribution.SOME
     right = [(each.probability > 0.5) == (int(each.unit.removeprefix("unit")) in having) for each in only.units]
