@@ -122,10 +122,15 @@ def _of_units(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -
         some, every = SomeUnits(group, units), _drawn(group, Attribution.SENSORS, own)
         shapes = float(np.logaddexp(every.log_odds, some.log_odds_of_all) - np.log(2.0))
         out.append(replace(every, log_odds=shapes))
-        has = zip(units.units, some.probabilities > _HAS_IT, strict=True)
-        term = Term(group, Attribution.SOME, some.size, units=frozenset(unit for unit, held in has if held))
-        out.append(Hypothesis(term, some.log_odds, 0.0))
+        out.append(_of_some(group, units, some))
     return out
+
+
+def _of_some(group: Group, units: Own, some: SomeUnits) -> Hypothesis:
+    """Return the hypothesis that some units have it; which is asked only if it may be so."""
+    held = some.probabilities > _HAS_IT if some.log_odds > 0.0 else np.zeros(len(units.units), bool)
+    having = frozenset(unit for unit, here in zip(units.units, held.tolist(), strict=True) if here)
+    return Hypothesis(Term(group, Attribution.SOME, some.size, units=having), some.log_odds, 0.0)
 
 
 def _drawn(group: Group, attribution: Attribution, own: OwnCoefficients) -> Hypothesis:

@@ -99,7 +99,7 @@ class Own:
         own, columns = group.columns, [each.column for each in terms.common]
         offsets = shares_of(terms.common, blocks) * means
         known = (blocks.info[:, own][:, :, columns] @ offsets[:, :, None])[:, :, 0]
-        return cls(blocks.labels, blocks.info[:, own, own], blocks.score[:, own] - known)
+        return cls(blocks.labels, blocks.info[:, own, own].copy(), blocks.score[:, own] - known)  # no view of all
 
     def only(self, kept: Mask) -> Own:
         """Some of them."""
