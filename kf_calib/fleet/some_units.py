@@ -1,9 +1,9 @@
 """An effect that some units have and others do not: which, and what share of them.
 
 A unit has the effect with a probability p, the share, of which nothing is known before. To have it means a size that is
-clearly not zero: the same in all units that have it, or about the same, within a factor of two or so, in units of their
-noise and with any direction; where it is large against the noise, also normal about zero. These three are as likely
-before, and the evidence is averaged over the size.
+clearly not zero. Either all units that have it have one size in units of their noise, with any direction; or the
+coefficients c have a density in proportion to |c|^4 times a normal one, which vanishes at zero (a moment prior, V. E.
+Johnson and D. Rossell, 2010). Both are as likely before, and the evidence is averaged over the size.
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis import bayes_factor
 from kf_calib.fleet.campaign import Group
-from kf_calib.fleet.evidence import log_evidence_of_modes, log_mean, modes, sizes, weights
+from kf_calib.fleet.evidence import log_evidence_of_modes, modes, sizes, weights
 from kf_calib.fleet.population import Own
 
 _SHARES = (np.arange(50) + 0.5) / 50.0
-_SIZES = sizes(1.0, 64.0, 1.2)  # sigma of one run: of units that have it alike, closely, as all of them tell it
-_APART = 0.5  # standard deviation of the logarithm of sizes that are about the same
-_LARGE = 8.0  # sigma of one run, from which on normal coefficients are hardly ever near zero
+_SAME = sizes(1.0, 64.0, 1.2)  # sigma of one run: of units that have it alike, closely, as all of them tell it
+_LEAST, _STEP = 0.5, np.sqrt(2.0)  # sigma of one run: the smallest normal size; ratio of a size to the one before
 _SEEN = 1e-6  # of the largest information of a unit: what is less counts as not seen
 _DRAWS = 4000
 _TOGETHER = 64  # units at a time, to save memory
@@ -33,14 +32,12 @@ class SomeUnits:
     """The likelihood of who has an effect, from what each unit tells of its coefficients beside all else."""
 
     def __init__(self, group: Group, own: Own) -> None:
-        large = sizes(_LARGE, max(group.largest, 2.0 * _LARGE))
+        apart = sizes(_LEAST, group.largest, _STEP)
         values, along, _ = modes(own.info, own.score)
-        same = _of_one_size(values, along)
-        about = np.logaddexp.reduce(same[:, :, None] + _near(), axis=1)
-        parts = [same, about, log_evidence_of_modes(values[:, None], along[:, None], large)]
-        self._sizes, self._alike = np.concatenate([_SIZES, _SIZES, large]), 2 * len(_SIZES)
-        self._ratios = np.hstack(parts)  # (units, sizes), logs
-        priors = np.concatenate([np.full(part.shape[1], 1.0 / len(parts) / part.shape[1]) for part in parts])
+        parts = [_of_one_size(values, along), _apart_from_zero(values, along, apart)]
+        self._sizes, self._ratios = np.concatenate([_SAME, apart]), np.hstack(parts)  # (units, sizes), logs
+        priors = np.concatenate([np.full(part.shape[1], 0.5 / part.shape[1]) for part in parts])
+        self._shapes = np.log(priors)
         self._priors = np.log(priors / len(_SHARES))
 
     def _odds(self) -> Iterator[tuple[Floats, Floats]]:
@@ -62,8 +59,8 @@ class SomeUnits:
 
     @property
     def log_odds_of_all(self) -> float:
-        """The same that all units have it, of about one size and each with a direction of its own."""
-        return float(log_mean(self._ratios[:, : self._alike].sum(axis=0)))
+        """The same that all units have it."""
+        return float(np.logaddexp.reduce(self._shapes + self._ratios.sum(axis=0)))
 
     @property
     def size(self) -> float:
@@ -93,11 +90,18 @@ class SomeUnits:
         return float(counts.mean()) / len(self._ratios), (low, high)
 
 
-def _near() -> Floats:
-    """Return the log of the weights (sizes, sizes) of the sizes that are about as large as each."""
-    logs = np.log(_SIZES)
-    weight = -0.5 * ((logs[:, None] - logs) / _APART) ** 2
-    return weight - np.logaddexp.reduce(weight, axis=0)
+def _apart_from_zero(values: Floats, along: Floats, tried: Floats) -> Floats:
+    """Return the log of the likelihood ratio (n, t) of coefficients of a density |c|^4 N(c; 0, t^2) against none.
+
+    It is that of normal ones times the mean of |c|^4 after the readings over that before them.
+    """
+    count = values.shape[1]
+    spread = 1.0 / (tried[:, None] ** -2 + values[:, None])  # variances (n, t, q) after the readings
+    mean = spread * along[:, None]
+    squares = np.sum(mean**2 + spread, axis=2)
+    fourth = squares**2 + np.sum(2.0 * spread**2 + 4.0 * spread * mean**2, axis=2)
+    normal = log_evidence_of_modes(values[:, None], along[:, None], tried)
+    return normal + np.log(fourth / (count * (count + 2) * tried**4))
 
 
 def _of_one_size(values: Floats, along: Floats) -> Floats:
@@ -105,9 +109,9 @@ def _of_one_size(values: Floats, along: Floats) -> Floats:
     averaged over their directions."""
     seen = values > _SEEN * values.max(axis=1, keepdims=True)
     squares = np.sum(np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0), axis=1)
-    dofs, out = seen.sum(axis=1), np.zeros((len(values), len(_SIZES)))
+    dofs, out = seen.sum(axis=1), np.zeros((len(values), len(_SAME)))
     for dof in np.unique(dofs[dofs > 0]).tolist():
         alike = dofs == dof
-        for k, size in enumerate(_SIZES * np.sqrt(dof)):
+        for k, size in enumerate(_SAME * np.sqrt(dof)):
             out[alike, k] = bayes_factor.log_odds(dof, squares[alike], float(size))
     return out
