@@ -221,6 +221,7 @@ class GravityError(Effect):
     family = "base and platform"
     name, title, source = "gravity-error", "wrong local gravity", "size of the reference"
     confused_with = "a common scale factor, always"
+    of_the_bench = True
     typical = Typical((10e-6, 700e-6))
 
     @property

@@ -266,6 +266,7 @@ def _provenance(result: Calibration, recording: str, sha256: str | None) -> Save
             "engine": settings.engine, "gate_sigma": str(settings.gate_sigma), "prior": str(settings.prior),
             "walk_mps2_per_sqrt_s": str(settings.walk_mps2_per_sqrt_s), "stillness": str(settings.stillness),
             "left_out": " ".join(map(str, settings.left_out)),
+            **({"bench_model": str(settings.bench_model)} if settings.bench_model else {}),
         },
         programs=[SavedProgram(path=str(each.path), sha256=each.sha256)
                   for each in effects.programs_of(result.model.effects)],
