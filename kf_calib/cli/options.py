@@ -276,9 +276,12 @@ _OF_SAMPLES = (
 
 
 def _refuse_given(names: Sequence[str], what: str) -> None:
-    """Raise InputError for the first of these options that the command line has."""
-    ctx = get_current_context()
-    for param in ctx.command.params:
+    """Raise InputError for the first of these options that the command line has.
+
+    In a worker of a fleet there is no command line: of recordings of several kinds, an option acts on those it can.
+    """
+    ctx = get_current_context(silent=True)
+    for param in () if ctx is None else ctx.command.params:
         if param.name in names and ctx.get_parameter_source(param.name) is ParameterSource.COMMANDLINE:
             name = [*param.opts, *param.secondary_opts][-1 if ctx.params[param.name] is False else 0]
             raise InputError(f"{what}, on which {name} has nothing to act: leave it out.")
