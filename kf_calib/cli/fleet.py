@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -14,21 +15,28 @@ import rich_click as click
 
 from kf_calib.cli.echo import complain
 from kf_calib.cli.failures import sentence
+from kf_calib.cli.files import claimed, delivery
 from kf_calib.cli.options import (
+    MODEL,
     OUTPUT,
     examples,
     filter_options,
     json_option,
     opened,
     overrides,
+    overwrite_option,
     print_json,
     progress,
     recording_options,
     settings_of,
     show,
+    target_option,
     units_option,
 )
+from kf_calib.cli.pictures import Pictures, figure_options, figures_of
+from kf_calib.cli.report import commands_of, report_option
 from kf_calib.cli.signals import Interrupter, answered
+from kf_calib.errors import InputError
 from kf_calib.support import stage
 from kf_calib.support.extras import need
 
@@ -37,9 +45,13 @@ if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Diagnosis
     from kf_calib.estimation.results import Calibration
     from kf_calib.fleet.batch import Progress
+    from kf_calib.fleet.overview import FleetOverview
+    from kf_calib.fleet.reference_unit import ReferenceUnit
+    from kf_calib.fleet.results import Fleet
     from kf_calib.fleet.run_list import Run
 
 WORK = "Who does the work"
+_NOT_IN_NAMES = re.compile(r"[^\w.-]+|^\.+")  # of files, on any system
 _PACKAGES = ("distributed", "pyarrow", "fsspec")
 
 
@@ -99,36 +111,106 @@ def _content(value: Any) -> Any:
               help="Number of processes on this machine.")  # fmt: skip
 @click.option("--scheduler", metavar="URL", panel=WORK,
               help="A scheduler of Dask whose workers do it, for example tcp://host:8786.")  # fmt: skip
+@click.option("--pooled/--no-pooled", default=True, show_default=True, panel=MODEL,
+              help="Whether two runs or more are diagnosed together: errors of the bench, of sensors.")  # fmt: skip
+@click.option("--reference-unit", type=click.Path(path_type=Path), metavar="CAL.json", panel=MODEL,
+              help="A calibration from elsewhere of a unit among the runs: against its scale factors, an error of the "
+              "gravity of the bench shows.")  # fmt: skip
+@target_option(panel=OUTPUT)
+@report_option
+@figure_options
+@overwrite_option
 @recording_options
 @filter_options
 @units_option
 @json_option
 def fleet(
-    runs: tuple[str, ...], out: Path, workers: int | None, scheduler: str | None, as_json: bool, **options: Any
+    runs: tuple[str, ...],
+    out: Path,
+    workers: int | None,
+    scheduler: str | None,
+    pooled: bool,
+    reference_unit: Path | None,
+    targets: tuple[str, ...],
+    report: Path | None,
+    overwrite: bool,
+    as_json: bool,
+    **options: Any,
 ) -> None:
-    """Replay and diagnose many recordings, each by itself, on many processes; one table of all.
+    """Replay and diagnose many recordings, each by itself, on many processes, and then all of them together.
 
     RUNS are recordings, folders of them, globs, or lists (.txt with one of these a line, .csv with the columns run,
     unit, bench, date), here or at URLs such as s3://. A run that fails is a row that says why. The table is Parquet:
-    docs/fleet.md has its columns.
-    """  # fmt: skip
+    docs/fleet.md has its columns. Errors of a bench that all runs on it show become a bench model, in the folder of the
+    table.
+    """
     for package in _PACKAGES:
         need(package, "fleet", "kf-calib fleet")
     if workers is not None and scheduler is not None:
         raise click.UsageError(
             "--workers are processes of this machine, --scheduler has workers of its own: choose one."
         )
+    from kf_calib.bench.targets import targets_of
     from kf_calib.fleet.results import Fleet, populations
     from kf_calib.fleet.run_list import runs_of
     from kf_calib.views import fleet as views
 
+    outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
+    wanted, reference = targets_of(targets), _reference(reference_unit)
     commands = _checked(options)
     done = _evaluated(commands, runs_of(runs), out, workers, scheduler, as_json)
     found = Fleet(out)
+    with progress("diagnosing the runs together", as_json):
+        overview = found.overview(wanted, pooled=pooled, reference_unit=reference)
+    models = _save_bench_models(found, overview) if pooled else []
     if as_json:
-        print_json(views.fleet_object(found, populations(found), done))
+        print_json(views.fleet_object(found, populations(found), done, overview, models))
     else:
-        show(views.fleet_report(found, populations(found), done))
+        show(views.fleet_report(found, populations(found), done, overview, models))
+    commands_again = commands_of(click.get_current_context())
+    with delivery(outputs, as_json) as deliver, progress("drawing the figures", as_json):
+        deliver.file(report, lambda path: _save_page(overview, commands_again, path))
+        pictures.save_figures(deliver, figures_of(overview))
+
+
+def _save_page(overview: FleetOverview, commands: Sequence[str], path: Path) -> None:
+    from kf_calib.views.report.contents import page_of
+    from kf_calib.views.report.page import save
+
+    save(page_of(overview, (), commands), path)
+
+
+def _reference(path: Path | None) -> ReferenceUnit | None:
+    """The unit of a calibration, whose scale factors are taken for known."""
+    if path is None:
+        return None
+    from kf_calib.exchange import calibration_file
+    from kf_calib.fleet.reference_unit import ReferenceUnit
+
+    saved = calibration_file.read(path)
+    unit = saved.provenance.bench.get("block_serial")
+    if not unit:
+        raise InputError(f"{path} does not say of which unit it is: name one made from a run with a block_serial.")
+    own = {each.symbol: each for each in saved.parameters if each.symbol in ("K1", "K2", "K3")}
+    scale, sigma = ([getattr(each, part) for each in own.values()] for part in ("value", "sigma"))
+    if None in (*scale, *sigma):
+        raise InputError(f"{path} does not determine all three scale factors: name one that does.")
+    return ReferenceUnit(unit, (scale[0], scale[1], scale[2]), (sigma[0], sigma[1], sigma[2]))
+
+
+def _save_bench_models(fleet: Fleet, overview: FleetOverview) -> list[Path]:
+    """Write the bench model of each bench that has errors; those of before that no longer hold are removed."""
+    from kf_calib.fleet.bench_terms import bench_models
+
+    folder = fleet.path / "bench_models"
+    for old in folder.glob("*.toml"):
+        old.unlink()
+    made = list[Path]()
+    for bench, model in bench_models(overview.pooled).items() if overview.pooled else ():
+        folder.mkdir(exist_ok=True)
+        made.append(folder / f"{_NOT_IN_NAMES.sub('_', bench) or 'bench'}.toml")
+        model.write(made[-1])
+    return made
 
 
 def _checked(options: Mapping[str, Any]) -> SingleCommands:

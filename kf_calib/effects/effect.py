@@ -254,7 +254,6 @@ class FrameEffect(Effect):
 
     of_the_bench = True
 
-
     def shows_in(self, s: Stimulus) -> bool:
         return s.bench.angles and super().shows_in(s)
 

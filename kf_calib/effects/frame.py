@@ -131,6 +131,7 @@ class _GimbalEffect(FrameEffect):
     """An effect of one gimbal, named by its letter or number after the colon."""
 
     family = "gimbal and encoder"
+
     def __init__(self, gimbal: int, variant: str) -> None:
         self.gimbal, self.variant = gimbal, variant
 

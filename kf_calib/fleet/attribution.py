@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kf_calib.fleet.campaign import Campaign
-from kf_calib.fleet.hypotheses import Hypothesis, Table, table
+from kf_calib.fleet.hypotheses import AttributionHypothesis, AttributionTable, table
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
 
 NONE = 0.01
@@ -24,13 +24,13 @@ class Attributed:
     """The terms that were found, the table of each with all its rivals beside the others, and the last table."""
 
     terms: tuple[Term, ...]
-    tables: tuple[Table, ...]
-    rest: Table
+    tables: tuple[AttributionTable, ...]
+    rest: AttributionTable
 
 
 def attributed(campaign: Campaign) -> Attributed:
     """Find the terms of a campaign."""
-    benches, terms, tables = len(campaign.benches), list[Term](), list[Table]()
+    benches, terms, tables = len(campaign.benches), list[Term](), list[AttributionTable]()
     rest = table(campaign, PooledTerms(terms, benches))
     while rest.none < NONE and len(terms) < _MOST:
         before = _kinds(terms)
@@ -41,7 +41,7 @@ def attributed(campaign: Campaign) -> Attributed:
     return Attributed(tuple(terms), tuple(tables), rest)
 
 
-def chosen(found: Table) -> Hypothesis:
+def chosen(found: AttributionTable) -> AttributionHypothesis:
     """The likeliest attribution of the likeliest effect: first whether it is of the bench, then how."""
     name = next(iter(found.effects()))
     shares = found.of(name)
@@ -51,7 +51,9 @@ def chosen(found: Table) -> Hypothesis:
     return next(each for each in found.hypotheses if each.name == name and each.attribution is best)
 
 
-def _settled(campaign: Campaign, terms: list[Term], tables: list[Table]) -> tuple[list[Term], list[Table]]:
+def _settled(
+    campaign: Campaign, terms: list[Term], tables: list[AttributionTable]
+) -> tuple[list[Term], list[AttributionTable]]:
     """Decide each term anew beside the others until none changes; the last one was decided beside all others."""
     for _ in range(_ROUNDS if len(terms) > 1 else 0):
         before = _kinds(terms)

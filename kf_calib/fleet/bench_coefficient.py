@@ -14,6 +14,7 @@ from kf_calib.fleet.evidence import FLAT, STEP, log_evidence, log_mean, posterio
 from kf_calib.fleet.pooled_terms import Attribution, Common, PooledTerms, Term, commons_of, shares_of
 
 _SLOTS = 48  # at most as many parts of a campaign between which a repair is looked for at first
+_PERIODS = 12  # at most as many parts in which a coefficient is followed over time
 _LEAST = 0.5  # sigma of all runs together: the smallest size that is expected
 _SIDES = np.array([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0]])  # of a repair on which there is an error: both, or only one
 _COARSE = 4.0  # ratio of the sizes of a coefficient that changes
@@ -91,6 +92,22 @@ class DatedSums:
             own = slice(len(self._terms.prior) + k, len(self._terms.prior) + k + count)
             out.append(BenchEstimate(more[k].bench, more[k].since, mean[own], covariance[own, own]))
         return out
+
+    def over_time(self, group: Group, bench: int) -> list[BenchEstimate]:
+        """The coefficients of one bench in each of a few parts of the campaign, as if it were repaired between them."""
+        first = self._first[bench]
+        edges = first[np.unique(np.linspace(0, len(first), min(_PERIODS, len(first)), endpoint=False).astype(int))]
+        ends = [*edges[1:].tolist(), Common.until]
+        parts = [Common(k, FLAT, bench, since, until)
+                 for since, until in zip(edges.tolist(), ends, strict=True) for k in _range(group)]  # fmt: skip
+        others = [Common(k, FLAT, own) for own in range(len(self._first)) if own != bench for k in _range(group)]
+        found = self._terms.sums(self._slots, [*parts, *others])
+        prior = np.append(self._terms.prior, np.full(len(parts) + len(others), FLAT))
+        mean, covariance = posterior(found.info, found.score, prior)
+        begin, count = len(self._terms.prior), len(_range(group))
+        places = [slice(begin + k * count, begin + (k + 1) * count) for k in range(len(edges))]
+        return [BenchEstimate(bench, int(since), mean[own], covariance[own, own])
+                for since, own in zip(edges, places, strict=True)]  # fmt: skip
 
     def constant(self, group: Group) -> BenchEvidence:
         """The evidence that the runs of each bench have one coefficient vector."""

@@ -27,6 +27,17 @@ def bench_model(found: PooledDiagnosis, bench: str) -> BenchModel:
     return BenchModel(tuple(terms), bench, found.runs)
 
 
+def bench_models(found: PooledDiagnosis) -> dict[str, BenchModel]:
+    """The bench model of each bench that has errors which the runs determine, by its name."""
+    shown = {
+        each.bench
+        for finding in found.findings
+        for each in finding.benches
+        if any(own.value is not None for own in each.coefficients)
+    }
+    return {bench: bench_model(found, bench) for bench in found.benches if bench in shown}
+
+
 def _term(effect: str, own: BenchCoefficients) -> BenchTerm:
     kept = [k for k, each in enumerate(own.coefficients) if each.value is not None]
     values = tuple(each.value for each in own.coefficients if each.value is not None)

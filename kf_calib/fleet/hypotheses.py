@@ -25,7 +25,7 @@ _RARELY = 0.25  # how much rarer a repair is than a bench that stays as it is
 
 
 @dataclass(frozen=True)
-class Hypothesis:
+class AttributionHypothesis:
     """A term that may be the next: its log evidence against none, and the log of its probability before the runs."""
 
     term: Term
@@ -44,15 +44,15 @@ class Hypothesis:
 
 
 @dataclass(frozen=True)
-class Table:
+class AttributionTable:
     """All hypotheses with their probabilities (n,), and the probability that there is no further term."""
 
-    hypotheses: tuple[Hypothesis, ...]
+    hypotheses: tuple[AttributionHypothesis, ...]
     probabilities: Floats
     none: float
 
     @property
-    def best(self) -> Hypothesis:
+    def best(self) -> AttributionHypothesis:
         """The likeliest hypothesis."""
         return self.hypotheses[int(np.argmax(self.probabilities))]
 
@@ -69,7 +69,7 @@ class Table:
         return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 
-def table(campaign: Campaign, terms: PooledTerms) -> Table:
+def table(campaign: Campaign, terms: PooledTerms) -> AttributionTable:
     """The table of the hypotheses for one term more than ``terms``."""
     groups = [group for group in campaign.groups if group.sigma and group.name not in terms.names()]
     every = [each for each in _every(campaign, terms, groups) if _can_be_told(each.term)]
@@ -77,10 +77,10 @@ def table(campaign: Campaign, terms: PooledTerms) -> Table:
     rows = [replace(each, log_prior=_log_prior(each.term, tried[each.name], len(groups))) for each in every]
     logs = np.array([np.log(_HAS_IT), *(each.log_odds + each.log_prior for each in rows)])
     shares = np.exp(logs - np.logaddexp.reduce(logs))
-    return Table(tuple(rows), shares[1:], float(shares[0]))
+    return AttributionTable(tuple(rows), shares[1:], float(shares[0]))
 
 
-def _every(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[Hypothesis]:
+def _every(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[AttributionHypothesis]:
     return [*_of_units(campaign, terms, groups), *_of_runs(campaign, terms, groups)]
 
 
@@ -89,9 +89,9 @@ def _can_be_told(term: Term) -> bool:
     return not term.group.alone or term.attribution.common == term.group.of_the_bench
 
 
-def _of_runs(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[Hypothesis]:
+def _of_runs(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[AttributionHypothesis]:
     """Return the hypotheses of coefficients of benches and, if units were measured again, of single runs."""
-    dated, out = DatedSums(campaign, terms), list[Hypothesis]()
+    dated, out = DatedSums(campaign, terms), list[AttributionHypothesis]()
     sums = [OwnCoefficients(group, terms) for group in groups] if campaign.repeats else []
     for blocks in campaign.runs():
         rest = terms.beside_own(blocks)
@@ -100,14 +100,14 @@ def _of_runs(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) ->
             own.add(rest)
     for group in groups:
         one, two = dated.constant(group), dated.repaired(group)
-        out.append(Hypothesis(Term(group, Attribution.BENCH, one.size), one.log_odds, 0.0))
+        out.append(AttributionHypothesis(Term(group, Attribution.BENCH, one.size), one.log_odds, 0.0))
         if two is not None:
             term = Term(group, Attribution.REPAIRED, two.size, repair=two.repair)
-            out.append(Hypothesis(term, two.log_odds, 0.0))
+            out.append(AttributionHypothesis(term, two.log_odds, 0.0))
     return [*out, *(_drawn(group, Attribution.RUN, own) for group, own in zip(groups, sums, strict=False))]
 
 
-def _of_units(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[Hypothesis]:
+def _of_units(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[AttributionHypothesis]:
     """Return the hypotheses of coefficients that units have, all of them or some."""
     means, sums = terms.solved(campaign)[0], [OwnCoefficients(group, terms) for group in groups]
     parts = [list[Own]() for _ in groups]
@@ -116,7 +116,7 @@ def _of_units(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -
         for group, own, part in zip(groups, sums, parts, strict=True):
             own.add(rest)
             part.append(Own.of(group, terms, means, rest))
-    out = list[Hypothesis]()
+    out = list[AttributionHypothesis]()
     for group, own, part in zip(groups, sums, parts, strict=True):
         units = Own.joined(part)
         some, every = SomeUnits(group, units), _drawn(group, Attribution.SENSORS, own)
@@ -126,16 +126,16 @@ def _of_units(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -
     return out
 
 
-def _of_some(group: Group, units: Own, some: SomeUnits) -> Hypothesis:
+def _of_some(group: Group, units: Own, some: SomeUnits) -> AttributionHypothesis:
     """Return the hypothesis that some units have it; which is asked only if it may be so."""
     held = some.probabilities > _HAS_IT if some.log_odds > 0.0 else np.zeros(len(units.units), bool)
     having = frozenset(unit for unit, here in zip(units.units, held.tolist(), strict=True) if here)
-    return Hypothesis(Term(group, Attribution.SOME, some.size, units=having), some.log_odds, 0.0)
+    return AttributionHypothesis(Term(group, Attribution.SOME, some.size, units=having), some.log_odds, 0.0)
 
 
-def _drawn(group: Group, attribution: Attribution, own: OwnCoefficients) -> Hypothesis:
+def _drawn(group: Group, attribution: Attribution, own: OwnCoefficients) -> AttributionHypothesis:
     found = own.evidence()
-    return Hypothesis(Term(group, attribution, found.spread, found.mean_size), found.log_odds, 0.0)
+    return AttributionHypothesis(Term(group, attribution, found.spread, found.mean_size), found.log_odds, 0.0)
 
 
 def _log_prior(term: Term, tried: set[Attribution], groups: int) -> float:

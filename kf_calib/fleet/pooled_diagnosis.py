@@ -14,7 +14,7 @@ from kf_calib.fleet.attribution import Attributed, attributed, chosen
 from kf_calib.fleet.bench_coefficient import BenchEstimate, DatedSums
 from kf_calib.fleet.campaign import Campaign, Factors, Group
 from kf_calib.fleet.evidence import FLAT
-from kf_calib.fleet.hypotheses import Table
+from kf_calib.fleet.hypotheses import AttributionTable
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
 from kf_calib.fleet.population import Own, Population, population
 from kf_calib.fleet.reference_unit import ReferenceUnit
@@ -27,7 +27,7 @@ RIVAL = 0.01
 
 
 @dataclass(frozen=True)
-class Estimate:
+class PooledEstimate:
     """A coefficient: symbol, value and sigma in an SI unit; None where the runs do not tell."""
 
     symbol: str
@@ -46,7 +46,7 @@ class BenchCoefficients:
 
     bench: str
     since: str | None
-    coefficients: tuple[Estimate, ...]
+    coefficients: tuple[PooledEstimate, ...]
     covariance: tuple[tuple[float, ...], ...]
 
 
@@ -55,7 +55,7 @@ class PopulationFigures:
     """Mean of the coefficients over the units that have the effect, and their spread about it with its 95 % interval,
     SI."""
 
-    mean: tuple[Estimate, ...]
+    mean: tuple[PooledEstimate, ...]
     spread: float
     spread_interval: tuple[float, float]
 
@@ -66,7 +66,7 @@ class UnitFigures:
 
     unit: str
     probability: float
-    coefficients: tuple[Estimate, ...]
+    coefficients: tuple[PooledEstimate, ...]
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,7 @@ class Finding:
     - attribution: of what it is, most likely. probabilities: of every attribution of it.
     - rivals: other effects that may be there in its place, with their probabilities.
     - benches: the coefficients of each bench; empty if the effect is the sensors'.
+    - over_time: the same from the runs of one part of the campaign after another; ``since``: when the part begins.
     - population, units, share, share_interval: of the units; None or empty if it is the bench's. ``share`` is the share
       of these units that have it; it is not given if the effect is each run's own.
     - repair: when it changed, if it did.
@@ -86,6 +87,7 @@ class Finding:
     probabilities: Mapping[Attribution, float]
     rivals: Mapping[str, float]
     benches: tuple[BenchCoefficients, ...] = ()
+    over_time: tuple[BenchCoefficients, ...] = ()
     population: PopulationFigures | None = None
     units: tuple[UnitFigures, ...] = ()
     share: float | None = None
@@ -152,12 +154,17 @@ def _finding(campaign: Campaign, found: Attributed, number: int) -> Finding:
     rivals = {name: share for name, share in table.effects().items() if share > RIVAL and name != term.group.name}
     attribution = chosen(table).attribution
     if attribution.common:
-        estimates = DatedSums.of(campaign, others, [term.repair] if term.repair else []).estimates(
-            term.group, term.repair
+        sums = DatedSums.of(campaign, others, [term.repair] if term.repair else [])
+        benches = tuple(
+            _bench_coefficients(campaign, term.group, each) for each in sums.estimates(term.group, term.repair)
         )
-        benches = tuple(_bench_coefficients(campaign, term.group, each) for each in estimates)
+        followed = tuple(
+            replace(_bench_coefficients(campaign, term.group, each), since=campaign.by_date[each.since].date)
+            for bench in range(len(campaign.benches))
+            for each in sums.over_time(term.group, bench)
+        )
         when = repair_date(campaign, others, term) if term.repair else None
-        return Finding(term.group.name, attribution, shares, rivals, benches, repair=when)
+        return Finding(term.group.name, attribution, shares, rivals, benches, followed, repair=when)
     return _of_units(campaign, others, term, Finding(term.group.name, attribution, shares, rivals))
 
 
@@ -213,7 +220,7 @@ def _rest(shares: Mapping[Attribution, float]) -> float:
     return max(1.0 - sum(shares.values()), 0.0)
 
 
-def _likeliest(name: str, tables: Sequence[Table]) -> dict[Attribution, float]:
+def _likeliest(name: str, tables: Sequence[AttributionTable]) -> dict[Attribution, float]:
     """Return the probabilities of an effect in the table in which it is likeliest."""
     each = [dict(table.of(name)) for table in tables]
     return max(each, key=lambda shares: sum(shares.values()))
@@ -226,12 +233,12 @@ def _bench_coefficients(campaign: Campaign, group: Group, found: BenchEstimate) 
     return BenchCoefficients(campaign.benches[found.bench], since, values, covariance)
 
 
-def _estimates(group: Group, mean: Floats, covariance: Floats) -> tuple[Estimate, ...]:
+def _estimates(group: Group, mean: Floats, covariance: Floats) -> tuple[PooledEstimate, ...]:
     """Return coefficients in SI."""
-    effect, out = described(group.name), list[Estimate]()
+    effect, out = described(group.name), list[PooledEstimate]()
     units = {each.symbol: each.unit for each in effect.coefficients} if effect is not None else {}
     sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     for symbol, value, sigma in zip(group.symbols, mean.tolist(), sigmas, strict=True):
         seen = (value * group.sigma, sigma * group.sigma) if sigma < 0.1 * FLAT else (None, None)
-        out.append(Estimate(symbol, *seen, units.get(symbol, "")))
+        out.append(PooledEstimate(symbol, *seen, units.get(symbol, "")))
     return tuple(out)

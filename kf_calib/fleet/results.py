@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -14,14 +13,19 @@ import pyarrow as pa
 import pyarrow.compute
 
 from kf_calib.errors import InputError
+from kf_calib.fleet.overview import COLUMNS, FleetOverview, overview_of
+from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis, pooled_diagnosis
+from kf_calib.fleet.reference_unit import ReferenceUnit
 from kf_calib.fleet.run_factor import RunFactor
 from kf_calib.fleet.run_row import SCHEMA, factor_of
 from kf_calib.fleet.store import AT_ONCE, Store
+from kf_calib.fleet.weeks import counted
 from kf_calib.support.extras import need
 
 pc: Any = pyarrow.compute  # its functions are made when it is imported, which no type checker sees
 _HEAVY = ("replay", "diagnosis", "factor")
 _SIXTY_EIGHT = (0.1587, 0.5, 0.8413)
+_ALONE = "the runs were not diagnosed together"
 _IDENTITY = ("run", "unit", "bench", "date")
 
 
@@ -87,6 +91,43 @@ class Fleet:
                 if (found := factor_of(row)) is not None:
                     yield found
 
+    def pooled(self, *, reference_unit: ReferenceUnit | None = None) -> PooledDiagnosis:
+        """The diagnosis of all runs together: which effects they have, and whether each is the bench's or the units'.
+
+        reference_unit: a unit whose scale factors are known, so that an error of gravity shows. Raises InputError where
+        there are no runs to diagnose.
+        """
+        return pooled_diagnosis(self.factors, reference_unit=reference_unit)
+
+    def overview(
+        self,
+        targets: Mapping[str, float] | None = None,
+        *,
+        pooled: bool = True,
+        reference_unit: ReferenceUnit | None = None,
+    ) -> FleetOverview:
+        """What all runs come to, for ``kf_calib.plot.figures`` too.
+
+        targets: sigma wanted of parameters, in SI. pooled: whether two runs or more are diagnosed together. Raises
+        InputError where the reference unit was not measured.
+        """
+        found, remarks = self._pooled_or_why(reference_unit) if pooled and len(self) > 1 else (None, ())
+        return overview_of(str(self.path), self.rows(COLUMNS).to_pylist(), targets or {}, found, remarks)
+
+    def _pooled_or_why(self, reference: ReferenceUnit | None) -> tuple[PooledDiagnosis | None, tuple[str, ...]]:
+        """Return the diagnosis of all runs together, and what is to be said of it."""
+        table = self.rows(["unit", "error"])
+        units = table.filter(pc.is_null(table["error"]))["unit"]
+        if len(units) < 2:
+            return None, (f"{_ALONE}: that needs two that did not fail, and there are {len(units)}.",)
+        try:
+            found = self.pooled(reference_unit=reference)
+        except InputError as error:
+            if reference is not None:
+                raise
+            return None, (f"{_ALONE}: {error}",)
+        return found, (_unnamed(units.null_count),) if units.null_count else ()
+
     def distinct(self, column: str) -> int:
         """Number of different values of a column, what is not known left out."""
         return pc.count_distinct(self.rows([column])[column], mode="only_valid").as_py()
@@ -100,21 +141,14 @@ class Fleet:
         return f"{self.path}: {len(self)} runs ({counts})"
 
 
-def counted(rows: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """How many rows came to what verdict, the most frequent first."""
-    return dict(Counter(_verdict(row) for row in rows).most_common())
-
-
-def _verdict(row: Mapping[str, Any]) -> str:
-    if row["error"] is not None:
-        return "failed"
-    if row["consistent"] is None:
-        return "not judged"
-    return row["missing"] or ("consistent" if row["consistent"] else "inconsistent")
+def _unnamed(count: int) -> str:
+    one = "1 run has no unit, so it counts as a unit"
+    each = one if count == 1 else f"{count} runs have no unit, so each counts as a unit"
+    return f"{each} of its own: say which it is in a list of runs (.csv with the columns run and unit)."
 
 
 @dataclass(frozen=True)
-class Population:
+class ParameterPopulation:
     """One parameter over the runs of a fleet.
 
     - runs: number of runs that determine it. median: of their values. spread: half the width of the middle 68 % of
@@ -130,16 +164,16 @@ class Population:
     sigma: float
 
 
-def populations(fleet: Fleet) -> list[Population]:
+def populations(fleet: Fleet) -> list[ParameterPopulation]:
     """Each parameter over the runs that determine it, in the order of the first run."""
     table = fleet.parameters()
     table = table.filter(pc.is_valid(table["value"]))
-    out = list[Population]()
+    out = list[ParameterPopulation]()
     for symbol in dict.fromkeys(table["symbol"].to_pylist()):
         own = table.filter(pc.equal(table["symbol"], symbol))
         values, sigmas = own["value"].to_numpy(), own["sigma"].to_numpy()
         low, median, high = np.quantile(values, _SIXTY_EIGHT).tolist()
         unit, nominal = own["si_unit"][0].as_py(), own["nominal"][0].as_py()
         sigma = float(np.nanmedian(sigmas))
-        out.append(Population(symbol, unit, nominal, len(values), median, 0.5 * (high - low), sigma))
+        out.append(ParameterPopulation(symbol, unit, nominal, len(values), median, 0.5 * (high - low), sigma))
     return out

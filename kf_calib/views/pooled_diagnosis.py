@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib.fleet.pooled_diagnosis import BenchCoefficients, EffectRow, Estimate, Finding, PooledDiagnosis
+from kf_calib.fleet.pooled_diagnosis import BenchCoefficients, EffectRow, Finding, PooledDiagnosis, PooledEstimate
 from kf_calib.fleet.pooled_terms import Attribution
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
@@ -22,6 +23,43 @@ _OF = {
 }
 _LISTED = 12  # units that are named in a sentence
 _SHOWN = 0.01  # probability below which an effect that was not found is not shown
+
+
+_BORNE_BY = {
+    Attribution.BENCH: "bench",
+    Attribution.REPAIRED: "bench",
+    Attribution.SENSORS: "type",
+    Attribution.SOME: "units",
+    Attribution.RUN: "runs",
+}
+
+
+def pooled_objects(found: PooledDiagnosis) -> list[dict[str, Any]]:
+    """The JSON objects of a pooled diagnosis, one an effect; those that were found come first."""
+    findings = {each.effect: each for each in found.findings}
+    return [_pooled_object(row, findings.get(row.effect)) for row in found.effects]
+
+
+def _pooled_object(row: EffectRow, finding: Finding | None) -> dict[str, Any]:
+    shares, people = row.probabilities or {}, finding.population if finding else None
+    means = [("units", None, each) for each in (people.mean if people else ())]
+    own = [(each.bench, each.since, value) for each in row.benches for value in each.coefficients]
+    return {
+        "effect": row.effect,
+        "borne_by": _BORNE_BY[finding.attribution] if finding else None if row.no_one is None else "none",
+        "probability": shares[finding.attribution] if finding else row.no_one,
+        "probabilities": {each.value: share for each, share in shares.items()},
+        "rivals": dict(finding.rivals) if finding else {},
+        "coefficients": [{"of": of, "since": since, **vars(each)} for of, since, each in [*own, *means]],
+        "spread": people.spread if people else None,
+        "spread_interval": people.spread_interval if people else None,
+        "share": finding.share if finding else None,
+        "share_interval": finding.share_interval if finding else None,
+        "units": [{"unit": each.unit, "probability": each.probability,
+                   "coefficients": [vars(one) for one in each.coefficients]}
+                  for each in (finding.units if finding else ())],
+        "changed": [vars(each) for each in finding.repair.gaps] if finding and finding.repair else [],
+    }  # fmt: skip
 
 
 def pooled_report(found: PooledDiagnosis) -> RenderableType:
@@ -97,7 +135,7 @@ def _when(bench: BenchCoefficients) -> str:
     return f"{bench.bench or 'the bench'}, since {bench.since}" if bench.since else bench.bench or "the bench"
 
 
-def _add(table: Table, name: str, values: Sequence[Estimate]) -> None:
+def _add(table: Table, name: str, values: Sequence[PooledEstimate]) -> None:
     """Add a row for each coefficient."""
     for k, each in enumerate(values):
         cells = ("not seen", "")
