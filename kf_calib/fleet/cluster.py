@@ -15,7 +15,6 @@ from kf_calib.errors import InputError
 _CONFIG = {
     "distributed.scheduler.allowed-failures": 2,  # so often may a run take its process with it and be tried again
     "distributed.scheduler.worker-saturation": 1.0,  # no run waits at a process that another one takes with it
-    "distributed.comm.timeouts.connect": "10s",
 }
 
 

@@ -7,11 +7,15 @@ import os
 import re
 import shutil
 import signal
+import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import dask.config
 import pytest
 from distributed import Client, LocalCluster
 from fleet_generator import Campaign, record
@@ -181,3 +185,58 @@ def test_a_run_that_ends_its_process_is_tried_again_and_stops_no_other(
     assert (progress.evaluated, progress.failed) == (2, 1)
     ((place, said),) = kf_calib.open_fleet(tmp_path / "fleet").failures().items()
     assert place.endswith("run-000001.mcap") and "the process that evaluated it was ended 3 times" in said
+
+
+@contextmanager
+def running(*words: str) -> Iterator[None]:
+    """A process of its own, ended with the block."""
+    process = subprocess.Popen([sys.executable, "-m", *words], stderr=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(60)
+
+
+@pytest.mark.slow
+def test_a_scheduler_and_workers_elsewhere_read_an_object_store(
+    campaign: Path, run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Separate processes over TCP, which fetch from a server with the interface of S3; one of them is killed."""
+    moto, s3fs = pytest.importorskip("moto.server"), pytest.importorskip("s3fs")
+    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0)
+    server.start()
+    host, port = server.get_host_and_port()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "test")
+    s3fs.S3FileSystem.clear_instance_cache()
+    files = s3fs.S3FileSystem()
+    files.mkdir("lab")
+    files.put(str(campaign), "lab/runs", recursive=True)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        url = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    scheduler = ("distributed.cli.dask_scheduler", "--host", url, "--dashboard-address", "127.0.0.1:0")
+    worker = ("distributed.cli.dask_worker", url, "--nthreads", "1", "--dashboard-address", "127.0.0.1:0")
+    with running(*scheduler), running(*worker), running(*worker):
+        with Client(url, timeout=120) as client:
+            client.wait_for_workers(2, 120)
+            first, *_ = client.scheduler_info()["workers"]
+            doomed = client.submit(os.getpid, workers=[first]).result()
+            os.kill(doomed, signal.SIGKILL)
+        code, out, err = run("fleet", "s3://lab/runs", "-o", tmp_path / "fleet", "--scheduler", url, "--json")
+    server.stop()
+    s3fs.S3FileSystem.clear_instance_cache()
+    assert code == 0, err
+    printed = json.loads(out.splitlines()[-1])  # the server has a word to say before
+    assert (printed["runs"], printed["failed"]) == (4, 0)
+    rows = kf_calib.open_fleet(tmp_path / "fleet").rows(["run", "sha256"]).to_pylist()
+    assert {row["run"] for row in rows} == {
+        f"s3://lab/runs/{path.relative_to(campaign)}" for path in campaign.rglob("*.mcap")
+    }
+
+
+def test_a_scheduler_that_does_not_answer_is_one_sentence(campaign: Path, run: Any, tmp_path: Path) -> None:
+    with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
+        code, _, err = run("fleet", campaign, "-o", tmp_path / "fleet", "--scheduler", "tcp://127.0.0.1:9")
+    assert code == 2 and "no scheduler answers at tcp://127.0.0.1:9" in err and len(err.splitlines()) == 1
