@@ -89,8 +89,9 @@ def test_posterior_without_information_is_the_prior() -> None:
 def test_share_of_the_units_covers_the_truth_as_often_as_it_says() -> None:
     group, rng, inside = Campaign(campaign_of(2)).groups[0], np.random.default_rng(4), 0
     for _ in range(20):
-        has = rng.permutation(40) < rng.integers(4, 37)
-        scores = rng.standard_normal((40, 3)) + 2.0 * has[:, None] * rng.standard_normal((40, 3))
+        has, drawn = rng.permutation(40) < rng.integers(4, 37), rng.standard_normal((40, 3))
+        sizes = 4.0 * has[:, None] / np.linalg.norm(drawn, axis=1, keepdims=True)
+        scores = rng.standard_normal((40, 3)) + sizes * drawn
         some = SomeUnits(group, Own([""] * 40, np.tile(np.eye(3), (40, 1, 1)), scores))
         low, high = some.share(0.0)[1]
         inside += low <= has.mean() <= high
