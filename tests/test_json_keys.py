@@ -22,7 +22,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "compare": (HIDDEN,),
     "diagnose": (HIDDEN,),
     "improve": (HIDDEN, "--unattended"),
-    "fleet": (HIDDEN, "lines.csv", "-o", "table", "--workers", 1),
+    "fleet": (HIDDEN, HIDDEN.with_name("mems_faces.mcap"), "lines.csv", "-o", "table", "--workers", 1),
     "report": (HIDDEN, "--against", HIDDEN.with_name("navigation_24.mcap")),
     "certificate": ("cal.json", "-o", "certificate.pdf"),
     "live": ("sim://?speed=500&orientations=6&dwell_s=4&slew_degps=360&sample_hz=20",),

@@ -71,7 +71,7 @@ def _of_effects(pooled: PooledDiagnosis | None) -> list[_Reason]:
     """Return the units that have an effect which other units do not have."""
     findings = () if pooled is None else pooled.findings
     return [
-        (each.unit, 1.0 - each.probability, f"has {finding.effect}, which others have not")
+        (each.unit, max(1.0 - each.probability, 0.0), f"has {finding.effect}, which others have not")
         for finding in findings
         if finding.attribution is Attribution.SOME
         for each in finding.units

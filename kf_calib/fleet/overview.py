@@ -21,7 +21,8 @@ class FleetOverview:
     """The runs of a fleet together.
 
     - name: folder of the table. runs, failed, inconsistent: numbers of runs.
-    - units, benches: their names. first, last: dates of the runs.
+    - units, benches: their names. first, last: dates of the runs. A run that failed before it said of which unit it is
+      belongs to none.
     - tracks: each parameter over the runs. weeks: verdicts by week. looks: units that need another look first.
     - pooled: the diagnosis of all runs together; None where there is none. remarks: why, and what it lacks.
     """
@@ -50,8 +51,8 @@ def overview_of(
 ) -> FleetOverview:
     """The overview of the rows of a table with ``COLUMNS``; a run without a unit is a unit of its own."""
     rows = sorted(rows, key=lambda row: (row["date"] is None, row["date"], row["run"]))
-    rows = [{**row, "unit": row["unit"] or row["run"]} for row in rows]
-    units = tuple(sorted({row["unit"] for row in rows}))
+    units = tuple(sorted({_unit(row) for row in rows if row["unit"] or row["error"] is None}))
+    rows = [{**row, "unit": _unit(row)} for row in rows]
     own, dates = tracks(rows, units, targets), [row["date"] for row in rows if row["date"] is not None]
     return FleetOverview(
         name, len(rows), sum(row["error"] is not None for row in rows),
@@ -59,3 +60,7 @@ def overview_of(
         tuple(sorted({row["bench"] for row in rows if row["bench"]})), min(dates, default=None),
         max(dates, default=None), own, weeks_of(rows), looks(rows, units, own, pooled), pooled, remarks,
     )  # fmt: skip
+
+
+def _unit(row: Mapping[str, Any]) -> str:
+    return row["unit"] or row["run"]

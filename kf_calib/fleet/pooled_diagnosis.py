@@ -177,6 +177,7 @@ def _of_units(campaign: Campaign, others: PooledTerms, term: Term, so_far: Findi
         people = population(own, group.largest)
         units = _units(group, own, people, np.ones(len(own.units)))
         return replace(so_far, population=_figures(group, people), units=units)
+    own = own.by_unit()
     some, chance = SomeUnits(group, own), so_far.probabilities
     every = chance[Attribution.SENSORS] / (chance[Attribution.SENSORS] + chance[Attribution.SOME])
     has = every + (1.0 - every) * some.probabilities

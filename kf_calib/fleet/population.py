@@ -106,6 +106,16 @@ class Own:
         units = [unit for unit, here in zip(self.units, kept.tolist(), strict=True) if here]
         return Own(units, self.info[kept], self.score[kept])
 
+    def by_unit(self) -> Own:
+        """With one entry for each unit, where a repair of the bench has parted its runs."""
+        names = list(dict.fromkeys(self.units))
+        numbers = {unit: k for k, unit in enumerate(names)}
+        places = [numbers[unit] for unit in self.units]
+        info, score = np.zeros((len(names), *self.info.shape[1:])), np.zeros((len(names), *self.score.shape[1:]))
+        np.add.at(info, places, self.info)
+        np.add.at(score, places, self.score)
+        return Own(names, info, score)
+
     @classmethod
     def joined(cls, parts: Sequence[Own]) -> Own:
         """All of several parts."""

@@ -14,6 +14,7 @@ from kf_calib.fleet.overview import FleetOverview
 from kf_calib.fleet.results import Fleet, ParameterPopulation
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
+from kf_calib.views.fleet_words import chance_words, short_name
 from kf_calib.views.json import clean
 from kf_calib.views.pooled_diagnosis import pooled_objects, pooled_report
 from kf_calib.views.tables import Table
@@ -85,8 +86,7 @@ def look_table(overview: FleetOverview) -> Table:
         table.add_column(heading, justify="right" if heading == "chance by noise" else "left")
     for each in overview.looks[:_SHOWN]:
         more = [f"{len(each.reasons) - _REASONS} more"] if len(each.reasons) > _REASONS else []
-        chance = f"{each.chance:.1g}" if each.chance else "none"
-        table.add_row(each.unit, chance, "; ".join([*each.reasons[:_REASONS], *more]))
+        table.add_row(short_name(each.unit), chance_words(each.chance), "; ".join([*each.reasons[:_REASONS], *more]))
     if len(overview.looks) > _SHOWN:
         table.add_row(f"{len(overview.looks) - _SHOWN} more", "", "")
     return table

@@ -1,4 +1,4 @@
-"""The picture of a fleet: parameters over units and dates, sigmas achieved, verdicts, terms of the bench, units to see."""
+"""The picture of a fleet: parameters over units and dates, verdicts by week, errors of the bench, units to look at."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from kf_calib.fleet.pooled_diagnosis import BenchCoefficients, Finding
 from kf_calib.fleet.track import Track
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
+from kf_calib.views.figures.scales import log_scale
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
     ALARM,
@@ -25,12 +26,12 @@ from kf_calib.views.figures.style import (
     MARKERS,
     PALE,
     blank,
-    letter,
     say,
     styled,
 )
 from kf_calib.views.figures.symbols import plain
 from kf_calib.views.figures.words import wrapped
+from kf_calib.views.fleet_words import chance_words, short_name
 
 _WIDE = 4
 _OUTSIDE = 0.01  # chance below which a unit is an outlier
@@ -51,7 +52,7 @@ def units(found: FleetOverview) -> Figure:
         for axes in panels:
             axes.set_xlim(-0.7, len(found.units) - 0.3)
             if few:
-                names = [_short(name) for name in found.units]
+                names = [short_name(name) for name in found.units]
                 axes.set_xticks(range(len(names)), names, rotation=90, fontsize=6.0)
             else:
                 axes.set_xlabel("unit")
@@ -60,12 +61,14 @@ def units(found: FleetOverview) -> Figure:
 
 
 def _population(axes: Axes, names: Sequence[str], track: Track) -> None:
-    """Draw one parameter over the units, from the median of them."""
+    """Draw one parameter over the units, from its nominal value."""
     unit = shown(track.unit)
-    values, means = ((each - track.mean) * unit.per_si for each in (track.values, track.units))
-    spread = track.spread * unit.per_si
-    axes.axhspan(-2.0 * spread, 2.0 * spread, color=BAND, linewidth=0.0, label="median of the units ± 2 spreads")
-    axes.axhline(0.0, color=GREY, linewidth=0.8)
+    values, means = ((each - track.nominal) * unit.per_si for each in (track.values, track.units))
+    middle, spread = (track.mean - track.nominal) * unit.per_si, track.spread * unit.per_si
+    axes.axhspan(
+        middle - 2.0 * spread, middle + 2.0 * spread, color=BAND, linewidth=0.0, label="median of the units ± 2 spreads"
+    )
+    axes.axhline(middle, color=GREY, linewidth=0.8)
     axes.plot(track.places, values, ".", color=PALE, markersize=4.0, label="run")
     marker, colour = _own(track.symbol)
     axes.plot(range(len(means)), means, marker, color=colour, markersize=4.0, label="mean of a unit")
@@ -73,9 +76,9 @@ def _population(axes: Axes, names: Sequence[str], track: Track) -> None:
     axes.plot(outside, means[outside], "o", markersize=9.0, markerfacecolor="none", markeredgecolor=ALARM,
               label="outlier (1 % of all parameters together)")  # fmt: skip
     for k in outside.tolist():
-        axes.annotate(_short(names[k]), (k, means[k]), xytext=(6, 0), textcoords="offset points", color=ALARM,
+        axes.annotate(short_name(names[k]), (k, means[k]), xytext=(6, 0), textcoords="offset points", color=ALARM,
                       va="center", fontsize=7.0)  # fmt: skip
-    axes.set_title(f"{symbol(track.symbol)}, {unit.label} from {unit.number(track.mean, 6)}".replace("  ", " "))
+    axes.set_title(f"{symbol(track.symbol)} less nominal, {unit.label}".rstrip(", "))
 
 
 def charts(found: FleetOverview) -> Figure:
@@ -137,7 +140,7 @@ def _achieved(axes: Axes, own: Sequence[Track]) -> None:
             reached = int(np.sum(track.sigmas <= track.target))
             axes.annotate(f"{reached} of {len(track.sigmas)}", (k, wanted), xytext=(0, 3), textcoords="offset points",
                           ha="center", color=ALARM, fontsize=7.0)  # fmt: skip
-    axes.set_yscale("log")
+    log_scale(axes, [np.append(track.sigmas, track.target or track.sigmas[0]) * unit.per_si for track in own])
     axes.set_xticks(range(len(own)), [symbol(track.symbol) for track in own])
     axes.set_xlim(-0.7, len(own) - 0.3)
     axes.set_title(f"σ of a run, {unit.label}".rstrip(", "))
@@ -165,7 +168,7 @@ def verdicts(found: FleetOverview) -> Figure:
         axes.yaxis.get_major_locator().set_params(integer=True)
         _dated(axes)
         if weeks.undated:
-            letter(axes, f"{weeks.undated} runs without a date are not shown")
+            axes.set_title(f"without a date, not shown: {weeks.undated}", color=GREY)
         _legend(figure, [axes])
     return figure
 
@@ -248,8 +251,8 @@ def another_look(found: FleetOverview) -> Figure:
         for k, look in enumerate(shown_here):
             more = f"; {len(look.reasons) - 2} more" if len(look.reasons) > 2 else ""
             axes.text(0.0, k, f"{k + 1}", color=GREY, va="center")
-            axes.text(0.03, k, plain(_short(look.unit)), va="center", fontweight="bold")
-            axes.text(0.2, k, "none" if not look.chance else f"{look.chance:.1g}", va="center")
+            axes.text(0.03, k, plain(short_name(look.unit)), va="center", fontweight="bold")
+            axes.text(0.2, k, chance_words(look.chance), va="center")
             axes.text(0.32, k, plain(wrapped("; ".join(look.reasons[:2]) + more, 120)), va="center", fontsize=8.0)
         if len(found.looks) > len(shown_here):
             axes.text(0.03, len(shown_here) - 0.5, f"{len(found.looks) - len(shown_here)} more", color=GREY)
@@ -286,11 +289,6 @@ def _own(name: str) -> tuple[str, str]:
     """Return marker and colour of a parameter, those of its accelerometer."""
     place = int(name[-1]) - 1 if name[-1] in "123" else 0
     return MARKERS[place], ACCELEROMETERS[place]
-
-
-def _short(name: str) -> str:
-    """Return the name of a unit; of one that goes by its recording, the name of the file."""
-    return name.rsplit("/", 1)[-1]
 
 
 def _empty(text: str) -> Figure:
