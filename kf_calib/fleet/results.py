@@ -119,7 +119,7 @@ class Fleet:
         table = self.rows(["unit", "error"])
         units = table.filter(pc.is_null(table["error"]))["unit"]
         if len(units) < 2:
-            return None, (f"{_ALONE}: that needs two that did not fail, and there are {len(units)}.",)
+            return None, (f"{_ALONE}: that needs two that did not fail, and there {_are(len(units))}.",)
         try:
             found = self.pooled(reference_unit=reference)
         except InputError as error:
@@ -139,6 +139,10 @@ class Fleet:
     def __str__(self) -> str:
         counts = ", ".join(f"{count} {verdict}" for verdict, count in self.verdicts().items())
         return f"{self.path}: {len(self)} runs ({counts})"
+
+
+def _are(count: int) -> str:
+    return f"is {count}" if count == 1 else f"are {count}"
 
 
 def _unnamed(count: int) -> str:
