@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import rich_click as click
+from click import get_current_context  # rich_click declares that there may be none
 
 from kf_calib.cli.echo import complain
 from kf_calib.cli.failures import sentence
@@ -156,6 +157,8 @@ def fleet(
     from kf_calib.views import fleet as views
 
     outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
+    if report or pictures.png or pictures.svg or pictures.pdf:
+        import kf_calib.views.figures  # noqa: F401  # what is not installed is told before the work
     wanted, reference = targets_of(targets), _reference(reference_unit)
     commands = _checked(options)
     done = _evaluated(commands, runs_of(runs), out, workers, scheduler, as_json)
@@ -167,7 +170,7 @@ def fleet(
         print_json(views.fleet_object(found, populations(found), done, overview, models))
     else:
         show(views.fleet_report(found, populations(found), done, overview, models))
-    commands_again = commands_of(click.get_current_context())
+    commands_again = commands_of(get_current_context())
     with delivery(outputs, as_json) as deliver, progress("drawing the figures", as_json):
         deliver.file(report, lambda path: _save_page(overview, commands_again, path))
         pictures.save_figures(deliver, figures_of(overview))

@@ -281,7 +281,9 @@ def _refuse_given(names: Sequence[str], what: str) -> None:
     In a worker of a fleet there is no command line: of recordings of several kinds, an option acts on those it can.
     """
     ctx = get_current_context(silent=True)
-    for param in () if ctx is None else ctx.command.params:
+    if ctx is None:
+        return
+    for param in ctx.command.params:
         if param.name in names and ctx.get_parameter_source(param.name) is ParameterSource.COMMANDLINE:
             name = [*param.opts, *param.secondary_opts][-1 if ctx.params[param.name] is False else 0]
             raise InputError(f"{what}, on which {name} has nothing to act: leave it out.")

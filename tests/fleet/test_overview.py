@@ -49,7 +49,13 @@ def at_once() -> Iterator[None]:
 def bent(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six runs of six units on a bench that bends by more than each run alone could miss."""
     own = Campaign(
-        tmp_path_factory.mktemp("bent"), runs=6, units=6, benches=1, dwells=14, dwell_s=3.0, of_bench=("flexure=8sigma",)
+        tmp_path_factory.mktemp("bent"),
+        runs=6,
+        units=6,
+        benches=1,
+        dwells=14,
+        dwell_s=3.0,
+        of_bench=("flexure=8sigma",),
     )
     for run in range(own.runs):
         record(own, run)

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.overview import FleetOverview
@@ -165,7 +166,7 @@ def verdicts(found: FleetOverview) -> Figure:
             axes.bar(begins + 3.5, counts, width=6.0, bottom=bottom, color=colour, label=plain(label))
             bottom = bottom + counts
         axes.set_ylabel("runs a week")
-        axes.yaxis.get_major_locator().set_params(integer=True)
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
         _dated(axes)
         if weeks.undated:
             axes.set_title(f"without a date, not shown: {weeks.undated}", color=GREY)
