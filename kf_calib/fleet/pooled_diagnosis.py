@@ -77,7 +77,7 @@ class Finding:
     - rivals: other effects that may be there in its place, with their probabilities.
     - benches: the coefficients of each bench; empty if the effect is the sensors'.
     - over_time: the same from the runs of one part of the campaign after another; ``since``: when the part begins.
-    - population, units, share, share_interval: of the units; None or empty if it is the bench's. ``share`` is the share
+    - population, units, share, share_interval: of the units; None or empty if it is the bench's; no population of one. ``share`` is the share
       of these units that have it; it is not given if the effect is each run's own.
     - repair: when it changed, if it did.
     """
@@ -181,10 +181,12 @@ def _of_units(campaign: Campaign, others: PooledTerms, term: Term, so_far: Findi
     some, chance = SomeUnits(group, own), so_far.probabilities
     every = chance[Attribution.SENSORS] / (chance[Attribution.SENSORS] + chance[Attribution.SOME])
     has = every + (1.0 - every) * some.probabilities
-    people = population(own.only(has > 0.5), group.largest)
+    having = own.only(has > 0.5)
+    people = population(having, group.largest)
+    figures = _figures(group, people) if len(having.units) > 1 else None  # one unit has no spread
     share, interval = some.share(every)
     units = _units(group, own, people, has)
-    return replace(so_far, population=_figures(group, people), units=units, share=share, share_interval=interval)
+    return replace(so_far, population=figures, units=units, share=share, share_interval=interval)
 
 
 def _units(group: Group, own: Own, people: Population, chances: Floats) -> tuple[UnitFigures, ...]:
