@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated
-from kf_calib.diagnosis.hypotheses import NOISE, NONE, NOTHING, SURE, Hypothesis
+from kf_calib.diagnosis.hypotheses import IRREGULAR, NOISE, NONE, NOTHING, SURE, Hypothesis
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
@@ -75,7 +75,7 @@ def _named(found: Diagnosis, first: Hypothesis) -> str:
 
 def _unknown(found: Diagnosis, first: Hypothesis) -> str:
     """Return a sentence on a misfit that no known effect explains."""
-    what = "it changes irregularly" if not first.formulas else f"it goes with {first.driver}"
+    what = "it changes irregularly" if first.driver == IRREGULAR else f"it goes with {first.driver}"
     return f"Unknown: no known effect explains it, {what} ({format_probability(first.probability)}){_others(found)}."
 
 
@@ -104,7 +104,7 @@ def _in_words(found: Diagnosis, row: Hypothesis) -> str:
     if row.effects:
         return _effects_of(row)
     if row.driver:
-        return "no known effect, irregular" if not row.formulas else f"no known effect, goes with {row.driver}"
+        return "no known effect, irregular" if row.driver == IRREGULAR else f"no known effect, goes with {row.driver}"
     return f"scatter from dwell to dwell{' larger than stated' if dwell_noise_is_stated(found.before) else ''}"
 
 
