@@ -33,6 +33,6 @@ from kf_calib.views.figures.suspects import suspects  # noqa: E402
 __all__ = [
     "Figures", "allan_deviation", "convergence", "correlations", "detection_limits", "directions", "dwell", "estimates",
     "falling", "figures", "history", "hypotheses", "improvement", "information", "on_the_sphere", "plan",
-    "predicted_sigmas", "residuals", "residuals_of_steps", "save", "suspects", "table2", "three_ways", "what_they_go_with",
-    "whiteness",
+    "predicted_sigmas", "residuals", "residuals_of_steps", "save", "suspects", "table2", "three_ways",
+    "what_they_go_with", "whiteness",
 ]  # fmt: skip
