@@ -104,11 +104,12 @@ def explanations_in_words(found: Diagnosis) -> str:
     first = found.likeliest
     if first is None or found.table is None:
         return ""
+    share = found.table.probability(first.effects) if first.effects else first.probability
     if found.sure:
-        return f"missing: {' and '.join(found.missing)} {format_probability(found.table.probability(found.missing))}"
-    rows = (first, *found.table.rivals[: _TOLD - 1])
-    told = ", ".join(f"{_in_words(found, row)} {format_probability(row.probability)}" for row in rows)
-    return f"suspects {told}" if first.effects else told
+        return f"missing: {' and '.join(found.missing)} {format_probability(share)}"
+    told = [(first, share), *((row, row.probability) for row in found.table.rivals[: _TOLD - 1])]
+    text = ", ".join(f"{_in_words(found, row)} {format_probability(each)}" for row, each in told)
+    return f"suspects {text}" if first.effects else text
 
 
 def _in_words(found: Diagnosis, row: Hypothesis) -> str:
