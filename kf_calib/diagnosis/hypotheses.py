@@ -9,6 +9,7 @@ hundred formulas do not outvote one effect.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -38,6 +39,9 @@ SURE = 0.95
 
 HOLDS = 0.99
 """Probability of the set of explanations that is told."""
+
+TOLD = 0.01
+"""Least probability of an explanation that has a line of its own where the table is shown."""
 
 _KINDS = {"nothing": 0.4, "effect": 0.4, "pair": 0.1, "formula": 0.1}
 _NO_NOISE = {True: 0.6, False: 0.1}  # share of an unknown cause in more scatter, by whether noise was stated
@@ -96,6 +100,29 @@ class Table:
     def probability(self, effects: Sequence[str]) -> float:
         """Probability that all these effects are missing, alone or with others."""
         return sum(row.probability for row in self.rows if set(effects) <= set(row.effects))
+
+    def of_any(self, families: Iterable[str]) -> float:
+        """Probability that something of any of these families is missing."""
+        return sum(row.probability for row in self.rows if set(row.families) & set(families))
+
+    def of_added(self, text: str, name: str) -> float | None:
+        """Probability that what was added to a model is missing, alone or with others; None where no row has it.
+
+        text: the effect as it was added, which a formula is told by. name: its name.
+        """
+        rows = [row for row in self.rows if name in row.effects or text in row.formulas]
+        return sum(row.probability for row in rows) if rows else None
+
+    @cached_property
+    def log10_odds(self) -> tuple[float | None, ...]:
+        """Log10 of the odds of each row to the next; None of the last."""
+        logs = [row.log_evidence / math.log(10.0) for row in self.rows]
+        return (*(one - next_ for one, next_ in itertools.pairwise(logs)), None)
+
+    @property
+    def told(self) -> tuple[Hypothesis, ...]:
+        """The rows that have a line of their own where the table is shown: those of ``TOLD`` or more, and the first."""
+        return tuple(row for row in self.rows if row.probability >= TOLD or row is self.first)
 
     @property
     def first(self) -> Hypothesis:

@@ -62,6 +62,7 @@ class SelectionStep:
 
     added: the effect that was added, as it was written (None: no effect). dropped: effects that were taken out. by: who
     chose the step. found: the diagnosis of the model after the step. undone: whether the user took the step back.
+    probability: that with which the added effect was missing before the step (None: it was not weighed).
     """
 
     added: str | None
@@ -69,6 +70,7 @@ class SelectionStep:
     by: By
     found: Diagnosis
     undone: bool = False
+    probability: float | None = None
 
     @property
     def result(self) -> Calibration:
@@ -325,7 +327,9 @@ def take_step(
     while (weak := _next_out(result, kept, dropped, len(out))) is not None:
         result = refits.of(result, _less(result, weak.name))
         out.append(weak)
-    step = SelectionStep(added, tuple(out), by, diagnose(result, refits))
+    table = state.found.table
+    share = None if added is None or table is None else table.of_added(added, _name(added, result))
+    step = SelectionStep(added, tuple(out), by, diagnose(result, refits), probability=share)
     return _with_alternatives(replace(state, history=(*state.history, step)), refits)
 
 

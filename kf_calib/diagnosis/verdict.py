@@ -99,6 +99,19 @@ def _others(found: Diagnosis) -> str:
     return f"; or {', '.join(told)}" if told else ""
 
 
+def explanations_in_words(found: Diagnosis) -> str:
+    """The likeliest explanations with their probabilities, for a line; "" where there are none."""
+    first = found.likeliest
+    if first is None or found.table is None:
+        return ""
+    share = found.table.probability(first.effects) if first.effects else first.probability
+    if found.sure:
+        return f"missing: {' and '.join(found.missing)} {format_probability(share)}"
+    told = [(first, share), *((row, row.probability) for row in found.table.rivals[: _TOLD - 1])]
+    text = ", ".join(f"{_in_words(found, row)} {format_probability(each)}" for row, each in told)
+    return f"suspects {text}" if first.effects else text
+
+
 def _in_words(found: Diagnosis, row: Hypothesis) -> str:
     """Return an explanation in words."""
     if row.effects:
@@ -116,13 +129,9 @@ def _effects_of(row: Hypothesis) -> str:
 def format_probability(probability: float) -> str:
     """A probability in per cent as text, never rounded to certainty."""
     percent = 100.0 * probability
-    return (
-        "over 99.9 %"
-        if percent > 99.9
-        else f"{percent:.1f} %"
-        if percent > 99.0 or percent < 1.0
-        else f"{percent:.0f} %"
-    )
+    if percent > 99.9 or percent < 0.1:
+        return "over 99.9 %" if percent > 50.0 else "under 0.1 %"
+    return f"{percent:.1f} %" if percent > 99.0 or percent < 1.0 else f"{percent:.0f} %"
 
 
 def _returning(found: Diagnosis) -> str:
