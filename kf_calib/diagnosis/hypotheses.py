@@ -21,6 +21,7 @@ from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates
 from kf_calib.diagnosis.evidence import Evidence, Weighed, size_evidence
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.unknown_effect import Family as Formulas
+from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.effects import effect_named, walk_named
 from kf_calib.estimation.results import Calibration
 
@@ -36,7 +37,7 @@ HOLDS = 0.99
 _KINDS = {"nothing": 0.4, "effect": 0.4, "pair": 0.1, "formula": 0.1}
 _IRREGULAR = {True: 0.6, False: 0.1}  # share of an unknown cause in more scatter, by whether noise was stated
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
-_WITHIN = 12.0  # rows whose evidence is smaller by this many units of ln are not refitted
+_APART, _CURVED = 8.0, 0.02  # rows further behind, in ln and as a share of the evidence, are not refitted
 _MOST = {"effect": 8, "pair": 4, "walk": 3, "formula": 3}
 
 
@@ -122,9 +123,20 @@ def log_odds_of(p_value: float) -> float:
     return -math.log(-math.e * p_value * math.log(p_value)) if p_value < 1.0 / math.e else 0.0
 
 
+def _log_odds(found: Trend | None) -> float:
+    """Return the log odds that trends within dwells give against a model that has none."""
+    return log_odds_of(found.p_value) if found else 0.0
+
+
 def _sum(logs: Sequence[float]) -> float:
     """Return the log of a sum from the logs of its terms."""
     return float(np.logaddexp.reduce([-math.inf, *logs]))
+
+
+def _least(logs: Iterable[float]) -> float:
+    """Return the least evidence by the linear tests with which a row is refitted; large effects are not linear."""
+    best = max(logs, default=0.0)
+    return best - _APART - _CURVED * max(best, 0.0)
 
 
 class Hypotheses:
@@ -166,8 +178,7 @@ class Hypotheses:
         turned = _sum([own.log for own in found if own.parts == ("setting",)]) + prior
         spread = _sum([own.log for own in found if "common" in own.parts]) + prior
         share = _IRREGULAR[self.evidence.noise.scatter_stated and self.evidence.noise.setting_stated]
-        within = log_odds_of(self.test.trend.p_value) if self.test.trend else 0.0
-        either = _sum([spread + math.log(share), still + math.log(_SHORT)]) + within
+        either = _sum([spread + math.log(share), still + math.log(_SHORT)]) + _log_odds(self.test.trend)
         yield Hypothesis(families=(NOTHING,), log_evidence=still)
         yield Hypothesis(families=(NOISE,), log_evidence=_sum([turned, spread + math.log(1.0 - share)]))
         yield Hypothesis(driver="irregular", families=(NONE,), log_evidence=either)
@@ -200,7 +211,7 @@ class Hypotheses:
 
     def _log_share_of(self, name: str, fall: float) -> float:
         test = self.test
-        own = values_of(test.scan, name)
+        own = self._values[name]
         tried = max(len(own), *(test.scan.candidates[k].tried for k in own))
         falls = test.scan.statistics[own]
         relative = min(1.0, fall / max(float(falls.max()), 1e-9))
@@ -209,7 +220,7 @@ class Hypotheses:
     def _effects(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
         """Yield the rows of single effects."""
         columns = {name: log for name, log in screened.items() if name != self.walk}
-        least = max(columns.values(), default=0.0) - _WITHIN
+        least = _least(columns.values())
         chosen = [name for name, log in columns.items() if log > least][: _MOST["effect"]]
         for name in [*chosen, *([self.walk] if self.walk else [])]:
             yield self._row((name,), self._prior("effect", len(screened)))
@@ -221,8 +232,8 @@ class Hypotheses:
             return
         found = self._joint(screened)
         likely = sorted(found, key=lambda names: -found[names])[: _MOST["pair"]]
-        best = max(found.values(), default=0.0)
-        chosen = [names for names in likely if found[names] > best - _WITHIN]
+        least = _least(found.values())
+        chosen = [names for names in likely if found[names] > least]
         walk = self.walk
         if walk and self.before.fit.walk_gain > 0.0:
             walked = self._refit((walk,))
@@ -237,20 +248,29 @@ class Hypotheses:
         """Return the log Bayes factors of pairs by the linear tests: each effect at the value of its constant that is
         best alone, and the other at any value."""
         test, out = self.test, dict[tuple[str, str], float]()
-        seen = [k for k, each in enumerate(test.scan.candidates) if each.dof]
-        for name in screened:
-            if name not in test.best:
-                continue
-            falls, alone = test.scan.beside(test.best[name]), self._screen(name, self._fall(name))
-            for k in seen:
-                other, dof = str(test.scan.candidates[k].effect), test.scan.candidates[k].dof
-                if other == name or falls[k] <= 0.0:
+        for name in filter(test.best.__contains__, screened):
+            falls, alone = test.scan.beside(test.best[name]) / self.inflation, self._screen(name, self._fall(name))
+            logs = self._evidence(falls)
+            for other, own in self._values.items():
+                k = own[int(np.argmax(logs[own]))]
+                if other == name or not falls[k] > 0.0:
                     continue
-                fall = falls[k] / self.inflation
-                log = alone + float(size_evidence(dof, fall)) + self._log_share_of(other, fall)
                 both = (name, other) if screened[name] >= screened[other] else (other, name)
+                log = alone + float(logs[k]) + self._log_share_of(other, float(falls[k]))
                 out[both] = max(out.get(both, -math.inf), log)
         return out
+
+    def _evidence(self, falls: Floats) -> Floats:
+        """Return the log Bayes factors (n,) of all candidates of the linear tests from their falls of chi-squared."""
+        dofs, out = np.array([each.dof for each in self.test.scan.candidates]), np.full(len(falls), -math.inf)
+        for dof in set(dofs[dofs > 0].tolist()):
+            out[dofs == dof] = size_evidence(dof, falls[dofs == dof])
+        return out
+
+    @cached_property
+    def _values(self) -> dict[str, list[int]]:
+        """Numbers of the candidates of each visible effect: one for each value of its constant."""
+        return {name: own for name in self.test.best if (own := values_of(self.test.scan, name))}
 
     def _formulas(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
         """Yield the rows of formulas that are no known effect, the likeliest of each driver."""
@@ -261,17 +281,16 @@ class Hypotheses:
             if each.rank and not each.known:
                 drivers.setdefault(each.driver, []).append(each)
         logs = {driver: self._over_members(own) for driver, own in drivers.items()}
-        best = max([log for name, log in screened.items() if name != self.walk], default=0.0)
+        least = _least(log for name, log in screened.items() if name != self.walk)
         likely = sorted(drivers, key=lambda driver: -np.logaddexp.reduce(logs[driver]))[: _MOST["formula"]]
         for driver in likely:
-            if logs[driver].max() < best - _WITHIN:
+            if logs[driver].max() < least:
                 continue
             first = int(np.argmax(logs[driver]))
             share = float(np.logaddexp.reduce(logs[driver]) - logs[driver][first]) - math.log(len(logs[driver]))
             formulas = drivers[driver][first].formulas_beside(taken)
             row = self._row((), self._prior("formula", len(drivers)) + share, formulas)
-            family = drivers[driver][first].family
-            yield replace(row, driver=driver, families=(family, NONE) if family else (NONE,))
+            yield replace(row, driver=driver, families=(drivers[driver][first].family or NONE,))
 
     def _over_members(self, own: Sequence[Formulas]) -> Floats:
         """Return the log Bayes factors of the formulas of one driver by the linear tests."""
@@ -285,11 +304,10 @@ class Hypotheses:
             return Hypothesis(effects, formulas, log_evidence=-math.inf)
         logs = [own.log + self._log_share(effects, own.fall) for own in found]
         best: Weighed = found[int(np.argmax(logs))]
-        walks = self.walk in effects
-        return Hypothesis(
-            effects, formulas, "", self._families(effects), float(np.logaddexp.reduce(logs)) + log_prior, best.fall,
-            best.dof + walks, refit,
-        )  # fmt: skip
+        walks, log = self.walk in effects, float(np.logaddexp.reduce(logs)) + log_prior
+        if walks and self.test.trend:  # a walk goes on within dwells, where it has no column
+            log += _log_odds(self.test.trend) - _log_odds(trend(refit.fit))
+        return Hypothesis(effects, formulas, "", self._families(effects), log, best.fall, best.dof + walks, refit)
 
     def _families(self, effects: Sequence[str]) -> tuple[str, ...]:
         """Return the families of effects, each once."""

@@ -107,7 +107,8 @@ def test_a_missing_effect_is_told_while_the_run_goes_on_and_accepted_without_a_r
     found = judgements(session)
     alarmed = next(each for each in found if each.alarm)
     assert len(alarmed.result.visits) < 10 and "disagrees: accelerometer" in alarmed.verdict
-    going = alarmed.next_orientation
+    told = next(each for each in found if each.found.missing)
+    going = told.next_orientation
     assert going is not None and len(going[0]) == 3 and "separation" in going[1]
     after = [each for each in found if each.result.model.effects]
     assert after and not after[0].final and all(each.consistent for each in after)

@@ -68,7 +68,7 @@ def triple_product(k: Floats, state: State) -> Floats:
     ("2mg", "20mg"),
     known=False,
     driver="specific force",
-    family=NO_FAMILY,
+    family="nonlinearity",
 )
 def fourth_harmonic(k: Floats, state: State) -> Floats:
     """Spherical harmonic of degree 4: H (35 u^4 - 30 u^2 + 3) / 8, u the cosine of input axis and specific force."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from blind_trials.known_size import log_odds
+
+from kf_calib.diagnosis.bayes_factor import log_odds
 
 
 @pytest.mark.parametrize("dof", [1, 2, 3, 6])
