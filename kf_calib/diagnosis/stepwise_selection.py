@@ -202,7 +202,7 @@ class Improvement:
     @cached_property
     def reason(self) -> str:
         """The same in one or two sentences."""
-        verdict, names = self.found.verdict, ", ".join(each.name for each in self.alternatives)
+        verdict, names = self.found.verdict, " and ".join(each.name for each in self.alternatives)
         far = max(self.spreads, key=lambda spread: spread.sigmas, default=None)
         differ = f"; the twelve differ by up to {far.sigmas:.1f} sigma ({far.parameter.symbol})" if far else ""
         rivals = _rivals(self.found)
