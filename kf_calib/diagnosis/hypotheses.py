@@ -58,7 +58,8 @@ class Hypothesis:
     - driver: in words, what the formulas depend on; "irregular" for changes of an unknown cause that follow nothing.
     - families: the physical classes of the effects.
     - log_evidence: of the row with its prior, natural logarithm. probability: its share in all rows.
-    - statistic, dof: fall of chi-squared in the likeliest noise, and the number of coefficients.
+    - statistic, dof: fall of chi-squared in the likeliest noise, and the number of coefficients; of a random walk alone
+      twice its gain in likelihood.
     - refit: the calibration with it; None where none was made.
     """
 
@@ -354,7 +355,8 @@ class Hypotheses:
         walks, log = self.walk in effects, float(np.logaddexp.reduce(logs)) + log_prior
         if walks and self.test.trend:  # a walk goes on within dwells, where it has no column
             log += _log_odds(self.test.trend) - _log_odds(trend(refit.fit))
-        return Hypothesis(effects, formulas, "", self._families(effects), log, best.fall, best.dof + walks, refit)
+        fall = best.fall if best.dof else 2.0 * self.before.fit.walk_gain
+        return Hypothesis(effects, formulas, "", self._families(effects), log, fall, best.dof + walks, refit)
 
     def _families(self, effects: Sequence[str]) -> tuple[str, ...]:
         """Return the families of effects, each once."""

@@ -267,8 +267,9 @@ def _with_alternatives(state: Improvement, refits: Refits) -> Improvement:
 def _alternatives(state: Improvement, refits: Refits) -> tuple[Alternative, ...]:
     """Return the effects among which a run cannot decide: those of its diagnosis, or those of an earlier one."""
     found, result = state.found, state.result
-    if _rivals(found):
-        return tuple(Alternative(name, refits.with_effects(result, (name,))) for name in found.ambiguity)
+    if _rivals(found) and found.table is not None:
+        rows = [(row.effects, row.refit) for row in (found.table.first, *found.table.rivals) if row.effects]
+        return tuple(Alternative(" + ".join(names), refit) for names, refit in rows if refit is not None)
     out, inside = list[Alternative](), {str(effect): k for k, effect in enumerate(result.model.effects)}
     for before, step in zip([state.start, *(step.found for step in state.steps)], state.steps, strict=False):
         if step.name not in inside or step.name not in before.ambiguity:
