@@ -44,7 +44,7 @@ TOLD = 0.01
 """Least probability of an explanation that has a line of its own where the table is shown."""
 
 _KINDS = {"nothing": 0.4, "effect": 0.4, "pair": 0.1, "formula": 0.1}
-_NO_NOISE = {True: 0.6, False: 0.1}  # share of an unknown cause in more scatter, by whether noise was stated
+_NO_NOISE = {True: 0.4, False: 0.1}  # share of an unknown cause in more scatter, by whether noise was stated
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _APART, _CURVED = 8.0, 0.02  # rows further behind, in ln and as a share of the evidence, are not refitted
 _MOST = {"effect": 8, "pair": 4, "walk": 3, "formula": 3}
