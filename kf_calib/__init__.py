@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from kf_calib.estimation.settings import Settings
     from kf_calib.exchange.calibration_file import SavedCalibration, save_calibration
     from kf_calib.exchange.calibration_file import read as open_calibration
+    from kf_calib.fleet.results import Fleet
+    from kf_calib.fleet.results import Fleet as open_fleet
     from kf_calib.online.running_filter import Running
     from kf_calib.online.sequential_test import Watch
     from kf_calib.online.session import Session
@@ -63,6 +65,8 @@ _HOMES = {
     "SavedCalibration": ("exchange.calibration_file", "SavedCalibration"),
     "open_calibration": ("exchange.calibration_file", "read"),
     "save_calibration": ("exchange.calibration_file", "save_calibration"),
+    "Fleet": ("fleet.results", "Fleet"),
+    "open_fleet": ("fleet.results", "Fleet"),
     "Diagnosis": ("diagnosis.results", "Diagnosis"),
     "diagnose": ("diagnosis.missing_effect", "diagnose"),
     "Improvement": ("diagnosis.stepwise_selection", "Improvement"),
@@ -85,10 +89,10 @@ _SHOWING = ("views.notebook",)
 """What prints the results of these, and shows them in notebooks."""
 
 __all__ = [
-    "Bench", "Calibration", "Corrected", "Correction", "Diagnosis", "Improvement", "InputError", "KfCalibError",
-    "Parameter", "Recorder", "Refits", "Running", "SavedCalibration", "Session", "Settings", "UnobservableError",
-    "Watch", "calibrate", "compare", "diagnose", "improve", "open_calibration", "open_recording", "open_table",
-    "plot", "save_calibration", "save_view", "shown_in",
+    "Bench", "Calibration", "Corrected", "Correction", "Diagnosis", "Fleet", "Improvement", "InputError",
+    "KfCalibError", "Parameter", "Recorder", "Refits", "Running", "SavedCalibration", "Session", "Settings",
+    "UnobservableError", "Watch", "calibrate", "compare", "diagnose", "improve", "open_calibration", "open_fleet",
+    "open_recording", "open_table", "plot", "save_calibration", "save_view", "shown_in",
 ]  # fmt: skip
 
 

@@ -22,6 +22,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "compare": (HIDDEN,),
     "diagnose": (HIDDEN,),
     "improve": (HIDDEN, "--unattended"),
+    "fleet": (HIDDEN, HIDDEN.with_name("mems_faces.mcap"), "lines.csv", "-o", "table", "--workers", 1),
     "report": (HIDDEN, "--against", HIDDEN.with_name("navigation_24.mcap")),
     "certificate": ("cal.json", "-o", "certificate.pdf"),
     "live": ("sim://?speed=500&orientations=6&dwell_s=4&slew_degps=360&sample_hz=20",),
@@ -37,7 +38,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "verify": ("cal.json", HIDDEN),
     "history": ("cal.json", "later.json", "--tolerance", "K=20ppm"),
 }
-NEEDED = {"certificate": "typst"}
+NEEDED = {"certificate": "typst", "fleet": "distributed"}
 """Packages that a command needs and the machine may not have."""
 
 

@@ -19,6 +19,7 @@ SECTIONS = {
     "Evaluate a recording": {"replay": "evaluate.replay", "diagnose": "evaluate.diagnose",
                              "improve": "evaluate.improve", "compare": "evaluate.compare",
                              "report": "report.report"},
+    "Evaluate many": {"fleet": "fleet.fleet"},
     "Use a calibration": {"apply": "exchange.apply", "verify": "exchange.verify", "history": "exchange.history",
                           "export": "export.export", "certificate": "certificate.certificate"},
     "Run a bench": {"plan": "plan.plan", "record": "acquire.record", "live": "live.live"},

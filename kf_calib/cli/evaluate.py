@@ -16,6 +16,7 @@ from kf_calib.cli.options import (
     BENCH_OPTIONS,
     INPUT,
     OUTPUT,
+    bench_model_option,
     effects_of,
     examples,
     filter_options,
@@ -53,6 +54,7 @@ STEPS = "Steps"
 @click.argument("recording", type=click.Path(path_type=Path))
 @recording_options
 @filter_options
+@bench_model_option
 @picture_options
 @save_option
 @save_model_option
@@ -190,6 +192,7 @@ def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, option
 @click.argument("recording", type=click.Path(path_type=Path))
 @recording_options
 @filter_options
+@bench_model_option
 @picture_options
 @overwrite_option
 @strict_option

@@ -25,6 +25,7 @@ from kf_calib.support.units import shown_in, si
 if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Diagnosis
     from kf_calib.diagnosis.stepwise_selection import Improvement
+    from kf_calib.estimation.bench_model import BenchModel
     from kf_calib.estimation.engine_comparison import Comparison
     from kf_calib.estimation.results import Calibration
     from kf_calib.estimation.settings import Settings
@@ -193,6 +194,11 @@ def filter_options(command: F) -> F:
     return command
 
 
+bench_model_option = click.option(
+    "--bench-model", "bench_model", type=click.Path(path_type=Path), metavar="FILE.toml", panel=MODEL,
+    help="Errors of the bench that many runs have shown: they are subtracted, and their sigma is considered.",
+)  # fmt: skip
+
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print one JSON object, and nothing else.", panel=OUTPUT
 )
@@ -270,8 +276,13 @@ _OF_SAMPLES = (
 
 
 def _refuse_given(names: Sequence[str], what: str) -> None:
-    """Raise InputError for the first of these options that the command line has."""
-    ctx = get_current_context()
+    """Raise InputError for the first of these options that the command line has.
+
+    In a worker of a fleet there is no command line: of recordings of several kinds, an option acts on those it can.
+    """
+    ctx = get_current_context(silent=True)
+    if ctx is None:
+        return
     for param in ctx.command.params:
         if param.name in names and ctx.get_parameter_source(param.name) is ParameterSource.COMMANDLINE:
             name = [*param.opts, *param.secondary_opts][-1 if ctx.params[param.name] is False else 0]
@@ -312,8 +323,17 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
         prior=PRIORS[options["prior"]],
         walk_mps2_per_sqrt_s=options["bias_walk"],
         effects=effects_of(options),
+        bench_model=_bench_model_of(options),
         **used_of(options),
     )
+
+
+def _bench_model_of(options: Mapping[str, Any]) -> BenchModel | None:
+    if options.get("bench_model") is None:
+        return None
+    from kf_calib.estimation import bench_model
+
+    return bench_model.read(options["bench_model"])
 
 
 def used_of(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -333,7 +353,7 @@ def opened(path: Path, options: Mapping[str, Any]) -> tuple[Recording | Table, S
 
     settings = settings_of(options)
     source = recording_of(path, options)
-    Model.of(source.bench, settings.effects)
+    Model.of(source.bench, settings.effects, settings.bench_model)
     return source, settings
 
 

@@ -188,7 +188,8 @@ def commands_of(ctx: click.Context) -> list[str]:
 def _recordings(ctx: click.Context) -> list[Path]:
     against = ctx.params.get("against")
     others = [against] if against is not None and against.suffix != ".toml" else []
-    return [path for path in [ctx.params["recording"], *others] if path.is_file()]
+    named = [ctx.params["recording"]] if "recording" in ctx.params else []
+    return [path for path in [*named, *others] if path.is_file()]
 
 
 def _typed(ctx: click.Context, less: Sequence[str]) -> str:

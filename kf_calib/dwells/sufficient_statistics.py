@@ -119,6 +119,16 @@ class DwellFactor:
         """The number K of basis functions of a piece."""
         return self.pieces[0].triangle.shape[1] - 3
 
+    def less(self, added: Floats) -> DwellFactor:
+        """The same dwell with readings less what was added to them, by its coefficients on the basis functions of each
+        piece, (pieces, K, 3)."""
+        pieces = list[Piece]()
+        for piece, own in zip(self.pieces, added, strict=True):
+            upper = piece.triangle.copy()
+            upper[: self.width, self.width :] -= upper[: self.width, : self.width] @ own
+            pieces.append(replace(piece, triangle=upper))
+        return replace(self, pieces=tuple(pieces))
+
     @cached_property
     def triangles(self) -> Floats:
         """The triangles of the pieces, (pieces, K + 3, K + 3)."""

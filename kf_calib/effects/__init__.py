@@ -22,9 +22,9 @@ from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 
 __all__ = [
-    "Coefficient", "Effect", "FrameEffect", "SensorEffect", "Stimulus", "Unknown", "as_text", "effect_named",
-    "load_file", "loaded", "merged", "names", "of_the_users", "oscillation_of", "programs_of", "refuse_unfit",
-    "refuse_unknown", "register", "remarks_of", "slew_effects", "walk_named",
+    "Coefficient", "Effect", "FrameEffect", "SensorEffect", "Stimulus", "Unknown", "as_text", "described",
+    "effect_named", "load_file", "loaded", "merged", "names", "of_the_users", "oscillation_of", "programs_of",
+    "refuse_unfit", "refuse_unknown", "register", "remarks_of", "slew_effects", "walk_named",
 ]  # fmt: skip
 
 _PLAIN: dict[str, type[Effect]] = {
@@ -104,6 +104,16 @@ def effect_named(text: str, bench: Bench) -> Effect:
     if text in _registered:
         return _registered[text].kind()
     raise _unknown(text, names(bench))
+
+
+def described(text: str) -> Effect | None:
+    """The effect of that name without a bench: its coefficients, units and usual sizes hold on every bench, its columns
+    on none. None where no effect is known by that name, as for a formula."""
+    name, _, variant = text.partition(":")
+    _register_installed()
+    if name in _OF_A_GIMBAL:
+        return _OF_A_GIMBAL[name](0, variant)
+    return _PLAIN[name]() if name in _PLAIN else _registered[text].kind() if text in _registered else None
 
 
 def refuse_unknown(text: str) -> None:

@@ -106,6 +106,7 @@ class Effect(ABC):
     force and temperature alone: of a, p, o (along its axes), before, after (readings of the two other accelerometers,
     in their order), T and the constant. Empty where it cannot be written so.
     typical: usual sizes of its coefficients. family: the physical class to which it belongs.
+    of_the_bench: it belongs to the bench, so that all sensors on it usually have the same coefficients.
     """
 
     name: ClassVar[str]
@@ -122,6 +123,7 @@ class Effect(ABC):
     formulas: ClassVar[tuple[str, ...]] = ()
     typical: ClassVar[Typical] = Typical()
     family: ClassVar[str] = "none of the known"
+    of_the_bench: ClassVar[bool] = False
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""
     value: float = 0.0
@@ -249,6 +251,8 @@ class FrameEffect(Effect):
     A rotation alpha turns the specific force by alpha x f, and reading i changes by s_i . (alpha x f). Where no angles
     are used, nothing is said of how the platform stands, and it has no columns.
     """
+
+    of_the_bench = True
 
     def shows_in(self, s: Stimulus) -> bool:
         return s.bench.angles and super().shows_in(s)

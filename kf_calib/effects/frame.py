@@ -131,6 +131,7 @@ class _GimbalEffect(FrameEffect):
     """An effect of one gimbal, named by its letter or number after the colon."""
 
     family = "gimbal and encoder"
+
     def __init__(self, gimbal: int, variant: str) -> None:
         self.gimbal, self.variant = gimbal, variant
 
@@ -221,6 +222,7 @@ class GravityError(Effect):
     family = "base and platform"
     name, title, source = "gravity-error", "wrong local gravity", "size of the reference"
     confused_with = "a common scale factor, always"
+    of_the_bench = True
     typical = Typical((10e-6, 700e-6))
 
     @property

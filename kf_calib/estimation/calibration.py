@@ -120,6 +120,7 @@ def with_remarks(result: Calibration, passed: Pass) -> Calibration:
     misfit = misfit_remark(result.consistency, result.residuals_mps2, result.bench, result.noise)
     usual = [each for each in result.warnings if each != misfit or not (outlying or readings.saturation)]
     counted = [*passed.tally.sentences(), *passed.tally.unmet(passed.settings.stillness)]
+    notes += [f"{known.sentence}." for known in result.model.known]
     said = [*passed.source.warnings, *counted, *readings.warnings, *found, *usual, *notes]
     return replace(result, tally=passed.tally, readings=readings, warnings=tuple(said), outlying=outlying)
 
@@ -134,7 +135,11 @@ def evaluate(
 ) -> Calibration:
     """The calibration from sufficient statistics of dwells and, if effects show in them, of slews, without a pass over
     the data."""
-    return evaluate_fit(fit(dwells, Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s, slews), settings)
+    return evaluate_fit(fit(dwells, _model(bench, settings), settings.walk_mps2_per_sqrt_s, slews), settings)
+
+
+def _model(bench: Bench, settings: Settings) -> Model:
+    return Model.of(bench, settings.effects, settings.bench_model)
 
 
 def evaluate_fit(fitted: Fit, settings: Settings) -> Calibration:

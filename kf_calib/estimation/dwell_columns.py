@@ -82,6 +82,19 @@ def _varying(dwells: Sequence[DwellFactor]) -> Floats:
     return np.where(excess > _VIBRATING, at_nodes, mean)
 
 
+def without_known(dwells: list[DwellFactor], model: Model) -> list[DwellFactor]:
+    """The dwells with readings that no longer contain the known effects of a model.
+
+    A triangle [1 u u^2 ... | z] with z less the columns times the coefficients is the triangle times a unit matrix with
+    these in it, so that no second pass is needed. They are linearised at the nominal parameters.
+    """
+    if not model.known or not dwells:
+        return dwells
+    effects, sizes = [each.effect for each in model.known], np.concatenate([each.coefficients for each in model.known])
+    columns = candidate_columns(dwells, effects, model.bench, model.nominal_state())
+    return [dwell.less(on_basis(own @ sizes)) for dwell, own in zip(dwells, columns, strict=True)]
+
+
 def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[Floats]:
     """The model's columns at the nodes of each dwell, (pieces, K nodes, 3 channels, p)."""
     return _by_dwell(dwells, lambda s: model.columns(s, state), stimulus_of(dwells, model.bench, state))

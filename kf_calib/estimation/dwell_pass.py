@@ -19,6 +19,7 @@ from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
 from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder, dwells_without
 from kf_calib.errors import InputError
 from kf_calib.estimation import setup_blunders
+from kf_calib.estimation.dwell_columns import without_known
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import ReadingsMonitor
@@ -42,7 +43,7 @@ class Pass:
     @cached_property
     def model(self) -> Model:
         """The model with the effects that the settings name."""
-        return Model.of(self.source.bench, self.settings.effects)
+        return Model.of(self.source.bench, self.settings.effects, self.settings.bench_model)
 
     def segmenter(self) -> Segmenter:
         """The segmenter for this source, which also returns slews if the model has effects that show in slews only."""
@@ -87,12 +88,11 @@ class Pass:
     @property
     def dwells(self) -> list[DwellFactor]:
         """The usable dwells so far: not left out by the settings and, but for those of a table, of at least 8 readings,
-        since fewer do not show their own noise."""
+        since fewer do not show their own noise. Known errors of the bench are subtracted from their readings."""
         left_out, least = self.settings.left_out, 1 if isinstance(self.source, Table) else LEAST_READINGS
-        if not left_out:
-            return [dwell for dwell in self.folder.dwells if dwell.count >= least]
         unused = {k for k, each in enumerate(self.folder.dwells) if each.count < least or each.number in left_out}
-        return dwells_without(self.folder.dwells, unused)
+        used = [dwell for k, dwell in enumerate(self.folder.dwells) if k not in unused]
+        return without_known(dwells_without(self.folder.dwells, unused) if left_out else used, self.model)
 
 
 def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> None:

@@ -98,7 +98,8 @@ class Fit:
 
     @cached_property
     def considered(self) -> Floats:
-        """Contribution B (p, p) of the constants without a derivative to the covariance, which becomes P + P B P.
+        """Contribution B (p, p) of considered parameters to the covariance, which becomes P + P B P: constants without
+        a derivative, and known effects.
 
         B is the sum of b b^T with b = A^T W g, where A is the design, W the weights and g the change of the readings if
         the constant changes by 1 sigma. The constants are considered parameters: known to be uncertain, but not
@@ -107,6 +108,9 @@ class Fit:
         carried, out = self.carried, np.zeros((self.carried.model.count,) * 2)
         if carried.model.square:
             out += self._considered(free_attitude.square_changes(carried))
+        for known in carried.model.known:
+            columns = candidate_columns(carried.dwells, [known.effect], carried.model.bench, carried.state)
+            out += self._considered([own @ known.root for own in columns])
         for effect in carried.model.stepped:
             spread, part = self.spreads.get(str(effect), 0.0), carried.model.parts[str(effect)]
             ends = [effect.at(effect.value * math.exp(step)) for step in (spread, -spread)]

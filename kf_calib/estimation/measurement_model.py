@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,7 +20,11 @@ from kf_calib.bench.bench import Bench
 from kf_calib.dwells.rows import REGRESSORS
 from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named
 from kf_calib.errors import InputError
+from kf_calib.estimation.known_effect import KnownEffect
 from kf_calib.support.printing import printed
+
+if TYPE_CHECKING:  # a replay without a bench model does not import what reads one
+    from kf_calib.estimation.bench_model import BenchModel
 
 STATE_COUNT = 12
 _ROUNDING_MPS2 = 1e-13
@@ -40,11 +45,15 @@ class Model:
     effects: tuple[Effect, ...] = ()
     square: bool = False
     """Without angles: whether the input axes are taken for square to each other."""
+    known: tuple[KnownEffect, ...] = ()
+    """Effects whose coefficients are known, which the readings no longer contain (``without_known``)."""
 
     @classmethod
-    def of(cls, bench: Bench, names: Iterable[str] = ()) -> Model:
-        """The model with the effects of these names."""
-        model = cls(bench)
+    def of(cls, bench: Bench, names: Iterable[str] = (), errors: BenchModel | None = None) -> Model:
+        """The model with the effects of these names; errors: those of the bench that are known."""
+        if errors is not None and not bench.angles:
+            raise InputError("a bench model (--bench-model) is of angles, which --no-angles leaves out: omit one.")
+        model = cls(bench, known=() if errors is None else errors.on(bench))
         for name in names:
             model += effect_named(name, bench)
         return model

@@ -188,9 +188,7 @@ def degrees_of_freedom(means: Means) -> int:
     return means.readings.size - _reduce(means)[0].design.shape[2]
 
 
-def likelihood_of(
-    noise: Noise, parts: Collection[Part], means: Means, state: Floats, prior: Floats
-) -> Likelihood:
+def likelihood_of(noise: Noise, parts: Collection[Part], means: Means, state: Floats, prior: Floats) -> Likelihood:
     """The likelihood of the dwells' means in a noise to which these parts may be added.
 
     ``means`` and ``prior`` are those that ``with_slow_scatter`` returns; further rows may be added to ``prior``.

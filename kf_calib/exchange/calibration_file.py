@@ -233,7 +233,7 @@ def _conditions(result: Calibration, first_ns: int | None) -> SavedConditions:
     warmth = np.concatenate([dwell.nodes.temperature_c for dwell in dwells])
     known = bool(np.isfinite(warmth).any())
     return SavedConditions(
-        began=_date(first_ns),
+        began=_in_words(first_ns),
         duration_s=dwells[-1].end_s,
         temperature_min_c=float(np.nanmin(warmth)) if known else None,
         temperature_mean_c=float(np.nanmean(warmth)) if known else None,
@@ -243,11 +243,16 @@ def _conditions(result: Calibration, first_ns: int | None) -> SavedConditions:
     )  # fmt: skip
 
 
-def _date(first_ns: int | None) -> str | None:
-    """Return a stamp as a date in UTC; None for stamps that count from a start of a clock (before the year 2000)."""
+def date_of(first_ns: int | None) -> datetime | None:
+    """A stamp as a date in UTC; None for stamps that count from a start of a clock (before the year 2000)."""
     if first_ns is None or not 946_684_800 <= first_ns / 1e9 < 4_102_444_800:
         return None
-    return datetime.fromtimestamp(first_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+    return datetime.fromtimestamp(first_ns / 1e9, UTC)
+
+
+def _in_words(first_ns: int | None) -> str | None:
+    date = date_of(first_ns)
+    return None if date is None else date.isoformat(timespec="milliseconds")
 
 
 def _provenance(result: Calibration, recording: str, sha256: str | None) -> SavedProvenance:
@@ -261,6 +266,7 @@ def _provenance(result: Calibration, recording: str, sha256: str | None) -> Save
             "engine": settings.engine, "gate_sigma": str(settings.gate_sigma), "prior": str(settings.prior),
             "walk_mps2_per_sqrt_s": str(settings.walk_mps2_per_sqrt_s), "stillness": str(settings.stillness),
             "left_out": " ".join(map(str, settings.left_out)),
+            **({"bench_model": str(settings.bench_model)} if settings.bench_model else {}),
         },
         programs=[SavedProgram(path=str(each.path), sha256=each.sha256)
                   for each in effects.programs_of(result.model.effects)],

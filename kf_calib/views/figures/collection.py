@@ -17,9 +17,10 @@ from kf_calib.errors import InputError
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.results import Calibration
 from kf_calib.exchange.history import History
+from kf_calib.fleet.overview import FleetOverview
 from kf_calib.reproduction.grebenkin2019 import Experiment
 from kf_calib.support.output_files import write_whole
-from kf_calib.views.figures import style
+from kf_calib.views.figures import fleet, style
 from kf_calib.views.figures.convergence import convergence, estimates
 from kf_calib.views.figures.detection_limits import detection_limits
 from kf_calib.views.figures.directions import directions
@@ -45,7 +46,7 @@ PROBABILITIES = "What it may be, and with what probability"
 def figures(result: Any) -> Figures:
     """The figures of a result by title, the one that tells most first; nothing is drawn before it is called for."""
     raise TypeError(f"there is no figure of {type(result).__name__}: give the result of calibrate, diagnose, improve, "
-                    "compare, plan or history.")  # fmt: skip
+                    "compare, plan, history or a fleet.")  # fmt: skip
 
 
 @figures.register
@@ -112,6 +113,18 @@ def _(found: Experiment) -> Figures:
 @figures.register
 def _(found: History) -> Figures:
     return {"The calibrations over time": lambda: history(found)}
+
+
+@figures.register
+def _(found: FleetOverview) -> Figures:
+    return {
+        "Parameters over the units": lambda: fleet.units(found),
+        "Units that need another look first": lambda: fleet.another_look(found),
+        "Errors of the bench over time": lambda: fleet.bench_terms(found),
+        "Verdicts by week": lambda: fleet.verdicts(found),
+        "Control charts": lambda: fleet.charts(found),
+        "Sigma achieved": lambda: fleet.sigmas(found),
+    }
 
 
 def save(what: Figure | Figures, path: str | Path, kind: str = "", width_px: int | None = None) -> Path:

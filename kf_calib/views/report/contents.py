@@ -14,7 +14,8 @@ from kf_calib.diagnosis.side_by_side import SideBySide, differences
 from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.results import Calibration
-from kf_calib.views import console, diagnosis, improvement, side_by_side
+from kf_calib.fleet.overview import FleetOverview
+from kf_calib.views import console, diagnosis, improvement, pooled_diagnosis, side_by_side
 from kf_calib.views.figures import figures
 from kf_calib.views.figures.collection import PROBABILITIES
 from kf_calib.views.report.drawing import Drawing
@@ -117,6 +118,38 @@ def _(pair: SideBySide, measured: Sequence[Measured], commands: Sequence[str], r
             *(_run(name, each, f"found{k}-") for k, (name, each) in enumerate(zip(names, both, strict=True))),
         ), tuple(commands),
     )  # fmt: skip
+
+
+@page_of.register
+def _(found: FleetOverview, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
+    together = _in_text(pooled_diagnosis.pooled_report(found.pooled)) if found.pooled else ()
+    said = [each.text for each in together if isinstance(each, Paragraph)]
+    standing, headline = _standing_of(found)
+    return Page(
+        found.name, "Fleet report", standing, headline, (*said, *remarks),
+        (Facts("", tuple(_facts_of(found))),),
+        (
+            _drawn("The runs together", found, "fleet"),
+            Section("Effects that all runs show", tuple(each for each in together if not isinstance(each, Paragraph))),
+            _warnings(found.remarks),
+        ), tuple(commands),
+    )  # fmt: skip
+
+
+def _standing_of(found: FleetOverview) -> tuple[Standing, str]:
+    """Return whether models and measurements agree over a fleet, and in how many runs they do not."""
+    if not found.failed and not found.inconsistent:
+        return "agrees", f"{found.runs} runs agree with their models"
+    told = [f"{count} {word}" for count, word in ((found.inconsistent, "disagree"), (found.failed, "failed")) if count]
+    return "disagrees", f"Of {found.runs} runs {' and '.join(told)}"
+
+
+def _facts_of(found: FleetOverview) -> list[tuple[str, str]]:
+    """Return what was measured, a heading and words each."""
+    dates = f"{found.first:%Y-%m-%d} to {found.last:%Y-%m-%d}" if found.first and found.last else ""
+    every = [("Runs", str(found.runs)), ("Units", str(len(found.units))), ("Benches", ", ".join(found.benches)),
+             ("Dates", dates)]  # fmt: skip
+    return [each for each in every if each[1]]
 
 
 def _run(name: str, found: Diagnosis, prefix: str) -> Section:

@@ -1,0 +1,250 @@
+"""The command that evaluates many recordings: fleet."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import rich_click as click
+from click import get_current_context  # rich_click declares that there may be none
+
+from kf_calib.cli.echo import complain
+from kf_calib.cli.failures import sentence
+from kf_calib.cli.files import claimed, delivery
+from kf_calib.cli.options import (
+    MODEL,
+    OUTPUT,
+    examples,
+    filter_options,
+    json_option,
+    opened,
+    overrides,
+    overwrite_option,
+    print_json,
+    progress,
+    recording_options,
+    settings_of,
+    show,
+    target_option,
+    units_option,
+)
+from kf_calib.cli.pictures import Pictures, figure_options, figures_of
+from kf_calib.cli.report import commands_of, report_option
+from kf_calib.cli.signals import Interrupter, answered
+from kf_calib.errors import InputError
+from kf_calib.support import stage
+from kf_calib.support.extras import need
+
+if TYPE_CHECKING:
+    from kf_calib.bench.streams import Source
+    from kf_calib.diagnosis.results import Diagnosis
+    from kf_calib.estimation.results import Calibration
+    from kf_calib.fleet.batch import Progress
+    from kf_calib.fleet.overview import FleetOverview
+    from kf_calib.fleet.reference_unit import ReferenceUnit
+    from kf_calib.fleet.results import Fleet
+    from kf_calib.fleet.run_list import Run
+
+WORK = "Who does the work"
+_NOT_IN_NAMES = re.compile(r"[^\w.-]+|^\.+")  # of files, on any system
+_PACKAGES = ("distributed", "pyarrow", "fsspec")
+
+
+@dataclass(frozen=True)
+class SingleCommands:
+    """What ``replay`` and ``diagnose`` do with one recording and these options; sent to the workers."""
+
+    options: Mapping[str, Any]
+
+    def replay(self, path: Path) -> tuple[Source, Calibration]:
+        from kf_calib.estimation.calibration import calibrate
+
+        source, settings = opened(path, self.options)
+        return source, calibrate(source, settings)
+
+    def diagnose(self, source: Source, result: Calibration) -> Diagnosis:
+        from kf_calib.diagnosis.missing_effect import diagnose
+        from kf_calib.diagnosis.refits import Refits
+
+        return diagnose(result, Refits(source))
+
+    def replay_document(self, result: Calibration) -> dict[str, Any]:
+        from kf_calib.views.json import replay_object
+
+        return replay_object(result)
+
+    def diagnosis_document(self, found: Diagnosis) -> dict[str, Any]:
+        from kf_calib.views.diagnosis import diagnosis_object
+
+        return diagnosis_object(found)
+
+    def sentence(self, error: BaseException) -> str:
+        return sentence(error)
+
+    @property
+    def checksum(self) -> str:
+        """Of all that numbers depend on besides the recording: options, the files they name, and the program."""
+        told = {key: _content(value) for key, value in sorted(self.options.items())}
+        text = json.dumps(told | {"kf_calib": version("kf_calib")})
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _content(value: Any) -> Any:
+    """An option as it counts: a file by what is in it."""
+    if isinstance(value, Path):
+        return hashlib.sha256(value.read_bytes()).hexdigest()
+    return [_content(each) for each in value] if isinstance(value, tuple | list) else value
+
+
+@click.command(
+    epilog=examples("fleet campaign/ -o fleet", "fleet 's3://lab/2026/*.mcap' -o fleet --scheduler tcp://host:8786")
+)
+@click.argument("runs", nargs=-1, required=True)
+@click.option("-o", "--out", required=True, type=click.Path(file_okay=False, path_type=Path), metavar="FOLDER",
+              panel=OUTPUT, help="The table of runs; runs that are in it already are not evaluated again.")  # fmt: skip
+@click.option("--workers", type=click.IntRange(min=1), show_default="one a core", panel=WORK,
+              help="Number of processes on this machine.")  # fmt: skip
+@click.option("--scheduler", metavar="URL", panel=WORK,
+              help="A scheduler of Dask whose workers do it, for example tcp://host:8786.")  # fmt: skip
+@click.option("--pooled/--no-pooled", default=True, show_default=True, panel=MODEL,
+              help="Whether two runs or more are diagnosed together: errors of the bench, of sensors.")  # fmt: skip
+@click.option("--reference-unit", type=click.Path(path_type=Path), metavar="CAL.json", panel=MODEL,
+              help="A calibration from elsewhere of a unit among the runs: against its scale factors, an error of the "
+              "gravity of the bench shows.")  # fmt: skip
+@target_option(panel=OUTPUT)
+@report_option
+@figure_options
+@overwrite_option
+@recording_options
+@filter_options
+@units_option
+@json_option
+def fleet(
+    runs: tuple[str, ...],
+    out: Path,
+    workers: int | None,
+    scheduler: str | None,
+    pooled: bool,
+    reference_unit: Path | None,
+    targets: tuple[str, ...],
+    report: Path | None,
+    overwrite: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Replay and diagnose many recordings, each by itself, on many processes, and then all of them together.
+
+    RUNS are recordings, folders of them, globs, or lists (.txt with one of these a line, .csv with the columns run,
+    unit, bench, date), here or at URLs such as s3://. A run that fails is a row that says why. The table is Parquet:
+    docs/fleet.md has its columns. Errors of a bench that all runs on it show become a bench model, in the folder of the
+    table.
+    """
+    for package in _PACKAGES:
+        need(package, "fleet", "kf-calib fleet")
+    if workers is not None and scheduler is not None:
+        raise click.UsageError(
+            "--workers are processes of this machine, --scheduler has workers of its own: choose one."
+        )
+    from kf_calib.bench.targets import targets_of
+    from kf_calib.fleet.results import Fleet, populations
+    from kf_calib.fleet.run_list import runs_of
+    from kf_calib.views import fleet as views
+
+    outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
+    if report or pictures.png or pictures.svg or pictures.pdf:
+        import kf_calib.views.figures  # noqa: F401  # what is not installed is told before the work
+    wanted, reference = targets_of(targets), _reference(reference_unit)
+    commands = _checked(options)
+    done = _evaluated(commands, runs_of(runs), out, workers, scheduler, as_json)
+    found = Fleet(out)
+    with progress("diagnosing the runs together", as_json):
+        overview = found.overview(wanted, pooled=pooled, reference_unit=reference)
+    models = _save_bench_models(found, overview) if pooled else []
+    if as_json:
+        print_json(views.fleet_object(found, populations(found), done, overview, models))
+    else:
+        show(views.fleet_report(found, populations(found), done, overview, models))
+    commands_again = commands_of(get_current_context())
+    with delivery(outputs, as_json) as deliver, progress("drawing the figures", as_json):
+        deliver.file(report, lambda path: _save_page(overview, commands_again, path))
+        pictures.save_figures(deliver, figures_of(overview))
+
+
+def _save_page(overview: FleetOverview, commands: Sequence[str], path: Path) -> None:
+    from kf_calib.views.report.contents import page_of
+    from kf_calib.views.report.page import save
+
+    save(page_of(overview, (), commands), path)
+
+
+def _reference(path: Path | None) -> ReferenceUnit | None:
+    """The unit of a calibration, whose scale factors are taken for known."""
+    if path is None:
+        return None
+    from kf_calib.exchange import calibration_file
+    from kf_calib.fleet.reference_unit import ReferenceUnit
+
+    saved = calibration_file.read(path)
+    unit = saved.provenance.bench.get("block_serial")
+    if not unit:
+        raise InputError(f"{path} does not say of which unit it is: name one made from a run with a block_serial.")
+    own = {each.symbol: each for each in saved.parameters if each.symbol in ("K1", "K2", "K3")}
+    scale, sigma = ([getattr(each, part) for each in own.values()] for part in ("value", "sigma"))
+    if None in (*scale, *sigma):
+        raise InputError(f"{path} does not determine all three scale factors: name one that does.")
+    return ReferenceUnit(unit, (scale[0], scale[1], scale[2]), (sigma[0], sigma[1], sigma[2]))
+
+
+def _save_bench_models(fleet: Fleet, overview: FleetOverview) -> list[Path]:
+    """Write the bench model of each bench that has errors; those of before that no longer hold are removed."""
+    from kf_calib.fleet.bench_terms import bench_models
+
+    folder = fleet.path / "bench_models"
+    for old in folder.glob("*.toml"):
+        old.unlink()
+    made = list[Path]()
+    for bench, model in bench_models(overview.pooled).items() if overview.pooled else ():
+        folder.mkdir(exist_ok=True)
+        made.append(folder / f"{_NOT_IN_NAMES.sub('_', bench) or 'bench'}.toml")
+        model.write(made[-1])
+    return made
+
+
+def _checked(options: Mapping[str, Any]) -> SingleCommands:
+    """The commands; options that would fail in every run are refused at once."""
+    settings_of(options)
+    overrides(options)
+    return SingleCommands(options)
+
+
+def _evaluated(
+    commands: SingleCommands, runs: Sequence[Run], out: Path, workers: int | None, scheduler: str | None, quiet: bool
+) -> Progress:
+    """Evaluate the runs that are not in the table yet; where it is stopped, all that is done is kept."""
+    import dask.system
+
+    from kf_calib.fleet.batch import evaluate_all
+    from kf_calib.fleet.cluster import cluster
+    from kf_calib.fleet.evaluation import Evaluation
+    from kf_calib.fleet.store import Store
+
+    store, interrupt = Store(out), Interrupter()
+    with store.taken(), answered(interrupt), progress(f"{len(runs)} runs", quiet) as tick:
+
+        def tell(now: Progress) -> None:
+            with interrupt.finished_first():  # where it takes effect, too, if it came while Python was cleaning up
+                stage.say(f"{now.done} done, {now.failed} failed")
+                tick(now.done / now.total)
+
+        try:
+            with cluster(workers or dask.system.CPU_COUNT, scheduler) as client:
+                return evaluate_all(client, Evaluation(commands, commands.checksum), runs, store, tell)
+        except KeyboardInterrupt:
+            complain(f"stopped: {out} has {len(store.known())} runs so far, and the same command goes on from there.")
+            raise

@@ -1,0 +1,108 @@
+"""All runs of a fleet through the workers and into the table, with a bounded number of them under way."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from distributed import Client, Future, KilledWorker, as_completed
+
+from kf_calib.errors import KfCalibError
+from kf_calib.fleet.evaluation import Evaluation, begun
+from kf_calib.fleet.run_list import Run
+from kf_calib.fleet.run_row import Row
+from kf_calib.fleet.store import Known, Store
+
+_AHEAD = 4
+"""Runs under way for each process, so that none waits for its next one; what is under way bounds the memory."""
+
+
+@dataclass
+class Progress:
+    """How far a fleet has come.
+
+    total: runs named. kept: of these, runs that were in the table with the same content and settings. evaluated: runs
+    that were evaluated now, failed: those of them that failed. cpu_s: processor time that they took.
+    """
+
+    total: int
+    kept: int = 0
+    evaluated: int = 0
+    failed: int = 0
+    cpu_s: float = 0.0
+
+    @property
+    def done(self) -> int:
+        """Runs that need nothing more."""
+        return self.kept + self.evaluated
+
+
+def evaluate_all(
+    client: Client,
+    evaluation: Evaluation,
+    runs: Sequence[Run],
+    store: Store,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+) -> Progress:
+    """Evaluate the runs that are not in the table yet, and write their rows as they come.
+
+    Runs that failed because their file could not be fetched, or because their process ended, are tried again; others
+    would fail again.
+    """
+    known = store.known()
+    waiting = deque(run for run in runs if not _is_done(run, known.get(run.place), evaluation.settings))
+    progress = Progress(len(runs), kept=len(runs) - len(waiting))
+    on_progress(progress)
+    for rows, kept in _evaluated(client, evaluation, waiting, known):
+        store.append(rows)
+        progress.kept += kept
+        progress.evaluated += len(rows)
+        progress.failed += sum(row["error"] is not None for row in rows)
+        progress.cpu_s += sum(row["cpu_s"] or 0.0 for row in rows)
+        on_progress(progress)
+    store.compact()
+    return progress
+
+
+def _is_done(run: Run, known: Known | None, settings: str) -> bool:
+    """Tell without reading a run that its row in the table holds."""
+    return bool(known and known.sha256 and known.settings == settings and run.version and known.version == run.version)
+
+
+def _evaluated(
+    client: Client, evaluation: Evaluation, waiting: deque[Run], known: dict[str, Known]
+) -> Iterator[tuple[list[Row], int]]:
+    """Yield rows as they come, with the number of runs whose content turned out to be the same as before."""
+    under_way, ready = dict[Future[Any], Run](), as_completed(with_results=False)
+
+    def begin() -> None:
+        run = waiting.popleft()
+        before = known.get(run.place)
+        same = before.sha256 if before and before.settings == evaluation.settings else None
+        future = client.submit(evaluation, run, same, pure=False)
+        under_way[future] = run
+        ready.add(future)
+
+    threads: Any = client.nthreads()
+    most = _AHEAD * max(sum(threads.values()), 1)
+    while waiting and len(under_way) < most:
+        begin()
+    for futures in ready.batches():
+        rows = [_row(future, under_way.pop(future), evaluation.settings) for future in futures]
+        for _ in range(min(len(futures), len(waiting))):
+            begin()
+        yield [row for row in rows if row is not None], sum(row is None for row in rows)
+
+
+def _row(future: Future[Any], run: Run, settings: str) -> Row | None:
+    """Return what a worker found; where it was lost with its process, a row that says so."""
+    error: Any = future.exception()
+    if error is None:
+        return future.result()
+    if isinstance(error, KilledWorker):
+        times = error.allowed_failures + 1
+        said = f"{run.place}: the process that evaluated it was ended {times} times: give the workers more memory."
+        return begun(run, settings) | {"error": said}
+    raise KfCalibError(f"{run.place}: no worker could evaluate it ({' '.join(str(error).split())}).") from error

@@ -1,0 +1,231 @@
+"""Many runs as their reduced factors: who was measured where and when, and what each run tells of every effect.
+
+Of each factor [H | G | z] only what is left of G and z beside H is used: the rows below those of the run's own
+parameters. The factors are read anew for each question and summed, so that memory does not grow with their number.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.effects import Effect, described
+from kf_calib.errors import InputError
+from kf_calib.fleet.reference_unit import ReferenceUnit
+from kf_calib.fleet.run_factor import RunFactor, column_name
+
+_TOGETHER = 64  # runs whose matrices are computed at once
+_SEEN = 1e-6  # of a column's norm: what is less beside the run's own parameters is rounding
+_LARGE = 64.0  # sigmas of one run, up to which sizes are expected where the catalogue knows no usual ones
+
+_Part = tuple[str, str, int, int, Floats, Floats]
+"""Label, unit, bench, rank, information and score of a block."""
+
+Factors = Iterable[RunFactor] | Callable[[], Iterable[RunFactor]]
+"""Factors of runs, or a function that reads them anew each time, so that memory does not grow with their number."""
+
+
+@dataclass(frozen=True)
+class RunKey:
+    """One run: its name, its unit, its bench and its date; ``rank`` counts all runs by date."""
+
+    run: str
+    unit: str
+    bench: str
+    date: str
+    rank: int
+
+
+@dataclass(frozen=True)
+class Group:
+    """An effect's columns in the common order; unit: of the coefficients in SI is 1 / ``sigma``.
+
+    - name: of the effect. columns: their indices. symbols: of the coefficients.
+    - sigma: what one run leaves uncertain of a coefficient beside its own parameters, SI; 0 where no run shows it.
+    - largest: the largest size that is expected, in ``sigma``.
+    - of_the_bench: whether it usually belongs to the bench.
+    - alone: whether only one unit shows it, so that nobody can tell whether it is the bench's.
+    """
+
+    name: str
+    columns: slice
+    symbols: tuple[str, ...]
+    sigma: float
+    largest: float
+    of_the_bench: bool
+    alone: bool = False
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """What runs, or units with all their runs on a bench, tell of all coefficients, these in units of ``Group.sigma``.
+
+    - labels: names of runs or units. units: names of their units.
+    - bench (n,), rank (n,): number of the bench; rank by date of the first run.
+    - info (n, q, q), score (n, q): information of the coefficients and the right side of the normal equations.
+    """
+
+    labels: Sequence[str]
+    units: Sequence[str]
+    bench: NDArray[np.intp]
+    rank: NDArray[np.intp]
+    info: Floats
+    score: Floats
+
+
+class Campaign:
+    """Runs in the order of their dates, which can be read as often as needed.
+
+    - factors: the factors, or a function that reads them anew each time.
+    - reference: a unit whose scale factors are known.
+
+    Raises InputError if there are no runs, or none of the reference unit.
+    """
+
+    def __init__(self, factors: Factors, reference: ReferenceUnit | None = None) -> None:
+        held = factors if callable(factors) else tuple(factors)
+        self._read = held if callable(held) else lambda: held
+        self._reference = reference
+        self.keys, symbols = _catalogue(self._read())
+        if not self.keys:
+            raise InputError("there are no runs to diagnose together: give at least two.")
+        if not symbols:
+            raise InputError("the runs have no columns of effects: runs that are diagnosed together need angles.")
+        if reference and reference.unit not in {key.unit for key in self.keys}:
+            raise InputError(f"no run is of the reference unit {reference.unit}: name a unit that was measured.")
+        self.benches = sorted({key.bench for key in self.keys})
+        self._columns = [column_name(name, symbol) for name, own in symbols.items() for symbol in own]
+        self._places = dict[tuple[str, ...], tuple[NDArray[np.intp], NDArray[np.intp]]]()
+        self._units_si = np.ones(len(self._columns))
+        self.groups = self._sized(symbols)
+        for group in self.groups:
+            self._units_si[group.columns] = group.sigma
+
+    @cached_property
+    def by_date(self) -> list[RunKey]:
+        """The runs in the order of their dates."""
+        return sorted(self.keys, key=lambda key: key.rank)
+
+    @property
+    def repeats(self) -> bool:
+        """Whether a unit was measured more than once on a bench."""
+        return len({(key.unit, key.bench) for key in self.keys}) < len(self.keys)
+
+    def runs(self) -> Iterator[Blocks]:
+        """Blocks of runs, in the order in which they are read."""
+        part = list[_Part]()
+        for key, info, score in self._each():
+            part.append((key.run, key.unit, self.benches.index(key.bench), key.rank, info, score))
+            if len(part) == _TOGETHER:
+                yield _stacked(part)
+                part = []
+        if part:
+            yield _stacked(part)
+
+    def units(self, repairs: Sequence[tuple[int, int]] = ()) -> Iterator[Blocks]:
+        """Blocks of units, each the sum of its runs on one bench; repairs: bench and first rank after a repair, at
+        which the runs of a unit are parted.
+
+        Memory is small if the runs of a unit are read one after another.
+        """
+        part, begun = list[_Part](), dict[Hashable, _Part]()
+        left = Counter(self._unit_key(key, repairs) for key in self.keys)
+        for key, info, score in self._each():
+            own, rank = self._unit_key(key, repairs), key.rank
+            if own in begun:
+                *_, first, known, along = begun[own]
+                rank, info, score = min(first, rank), known + info, along + score
+            begun[own] = key.unit, key.unit, self.benches.index(key.bench), rank, info, score
+            left[own] -= 1
+            if not left[own]:
+                part.append(begun.pop(own))
+            if len(part) == _TOGETHER:
+                yield _stacked(part)
+                part = []
+        if part:
+            yield _stacked(part)
+
+    def _unit_key(self, key: RunKey, repairs: Sequence[tuple[int, int]]) -> Hashable:
+        bench = self.benches.index(key.bench)
+        return key.unit, bench, sum(key.rank >= first for where, first in repairs if where == bench)
+
+    def _each(self) -> Iterator[tuple[RunKey, Floats, Floats]]:
+        """Yield information (q, q) and score (q,) of each run beside its own parameters."""
+        for key, factor in zip(self.keys, self._read(), strict=True):
+            upper = factor.factor
+            if self._reference and key.unit == self._reference.unit:
+                upper = self._reference.known(factor)
+            own, places = self._found(factor)
+            rows = upper[factor.width :, places] * self._units_si[own]
+            rows[:, _hidden(upper, factor.width, places)] = 0.0
+            info, score = np.zeros((len(self._columns),) * 2), np.zeros(len(self._columns))
+            info[np.ix_(own, own)] = rows.T @ rows
+            score[own] = rows.T @ upper[factor.width :, -1]
+            yield key, info, score
+
+    def _found(self, factor: RunFactor) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return which of the common columns a run has, and where."""
+        if factor.columns not in self._places:
+            places = {name: k for name, k in factor.places.items() if k >= factor.width}
+            own = [k for k, name in enumerate(self._columns) if name in places]
+            there = [places[self._columns[k]] for k in own]
+            self._places[factor.columns] = np.array(own, dtype=np.intp), np.array(there, dtype=np.intp)
+        return self._places[factor.columns]
+
+    def _sized(self, symbols: Mapping[str, Sequence[str]]) -> list[Group]:
+        """Return the effects with the sigma that one run leaves of their coefficients."""
+        ends = np.cumsum([0, *map(len, symbols.values())]).tolist()
+        parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
+        total, runs = np.zeros(ends[-1]), np.zeros(ends[-1])
+        units = [set[str]() for _ in parts]
+        for key, info, _ in self._each():
+            own = np.diag(info)
+            total, runs = total + own, runs + (own > 0.0)
+            for part, shown_by in zip(parts, units, strict=True):
+                shown_by |= {key.unit} if own[part].any() else set()
+        groups = list[Group]()
+        for (name, own), part, shown_by in zip(symbols.items(), parts, units, strict=True):
+            seen, effect = runs[part] > 0.0, described(name)
+            sigma = float(np.mean(total[part][seen] / runs[part][seen])) ** -0.5 if seen.any() else 0.0
+            largest = max(_LARGE, _usual(effect) / sigma) if sigma else _LARGE
+            of_bench, alone = effect is not None and effect.of_the_bench, len(shown_by) == 1 < len(self.keys)
+            groups.append(Group(name, part, tuple(own), sigma, largest, of_bench, alone))
+        return groups
+
+
+def _catalogue(factors: Iterable[RunFactor]) -> tuple[list[RunKey], dict[str, list[str]]]:
+    """Return the keys of all runs in the order of reading, and the symbols of all effects."""
+    found, symbols = list[tuple[str, str, str, str]](), dict[str, list[str]]()
+    for factor in factors:
+        found.append((factor.run, factor.unit or factor.run, factor.bench or "", factor.date or ""))
+        for column in factor.columns[factor.width :]:
+            name, _, symbol = column.rpartition("/")
+            own = symbols.setdefault(name, [])
+            own += [symbol] if symbol not in own else []
+    order = sorted(range(len(found)), key=lambda k: found[k][3])
+    ranks = {place: rank for rank, place in enumerate(order)}
+    return [RunKey(*own, ranks[k]) for k, own in enumerate(found)], symbols
+
+
+def _hidden(upper: Floats, width: int, places: NDArray[np.intp]) -> Mask:
+    """Return which columns the run's own parameters explain but for rounding."""
+    left, whole = np.linalg.norm(upper[width:, places], axis=0), np.linalg.norm(upper[:, places], axis=0)
+    return np.asarray(left <= _SEEN * whole)
+
+
+def _usual(effect: Effect | None) -> float:
+    """Return the largest usual size of an effect, SI; 0 where none is known."""
+    grades = () if effect is None else (effect.typical.navigation, effect.typical.mems)
+    return max((high for _, high in filter(None, grades)), default=0.0)
+
+
+def _stacked(part: Sequence[_Part]) -> Blocks:
+    labels, units, benches, ranks, infos, scores = zip(*part, strict=True)
+    return Blocks(labels, units, np.array(benches), np.array(ranks), np.array(infos), np.array(scores))

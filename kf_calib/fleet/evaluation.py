@@ -1,0 +1,103 @@
+"""One run of a fleet on a worker: fetched, evaluated by the code of the single commands, and made a row."""
+
+from __future__ import annotations
+
+import platform
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Protocol
+
+from kf_calib.bench.streams import Source
+from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.estimation.results import Calibration
+from kf_calib.exchange.calibration_file import date_of
+from kf_calib.fleet import run_row
+from kf_calib.fleet.local_copy import local_copy
+from kf_calib.fleet.run_factor import run_factor
+from kf_calib.fleet.run_list import Run
+from kf_calib.fleet.run_row import Row
+from kf_calib.sources.files.bags import fingerprint
+from kf_calib.support.threads import one_blas_thread
+
+
+class Commands(Protocol):
+    """What the single commands do with a recording, and how they say what failed.
+
+    They are given to a fleet from above, because it knows neither their options nor their documents; they are sent to
+    the workers by pickle.
+    """
+
+    def replay(self, path: Path) -> tuple[Source, Calibration]: ...
+
+    def diagnose(self, source: Source, result: Calibration) -> Diagnosis: ...
+
+    def replay_document(self, result: Calibration) -> dict[str, Any]: ...
+
+    def diagnosis_document(self, found: Diagnosis) -> dict[str, Any]: ...
+
+    def sentence(self, error: BaseException) -> str: ...
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How each run of a fleet is evaluated; calling it evaluates one.
+
+    settings: checksum of all that the numbers depend on besides the recording.
+    """
+
+    commands: Commands
+    settings: str
+
+    def __call__(self, run: Run, known_sha256: str | None = None) -> Row | None:
+        """The row of a run; None if its content is the one that ``known_sha256`` belongs to. Whatever goes wrong is a
+        sentence in the row."""
+        row, begun_s = begun(run, self.settings), time.process_time()
+        try:
+            with local_copy(run) as path, one_blas_thread():
+                row["sha256"] = fingerprint(path)
+                if row["sha256"] == known_sha256:
+                    return None
+                try:
+                    self._evaluate(row, path)
+                except Exception as error:
+                    row["error"] = self.commands.sentence(error)
+                _call_by_place(row, path, run)
+        except Exception as error:  # could not be fetched
+            row["error"] = self.commands.sentence(error)
+        return row | {"cpu_s": time.process_time() - begun_s, "evaluated": datetime.now(UTC)}
+
+    def _evaluate(self, row: Row, path: Path) -> None:
+        """Fill in the row as far as the evaluation comes."""
+        source, result = self.commands.replay(path)
+        notes = result.bench.notes
+        row["unit"] = row["unit"] or notes.get("block_serial")
+        row["bench"] = row["bench"] or notes.get("bench")
+        row["date"] = row["date"] or _first_reading(source)
+        row |= run_row.of_replay(self.commands.replay_document(result))
+        row |= run_row.of_factor(run_factor(result.fit))
+        if result.bench.angles:  # without them there is no telling what depends on the attitude
+            found = self.commands.diagnosis_document(self.commands.diagnose(source, result))
+            row |= run_row.of_diagnosis(found)
+
+
+def begun(run: Run, settings: str) -> Row:
+    """The row of a run of which nothing is known yet."""
+    stated = {"run": run.place, "unit": run.unit, "bench": run.bench, "date": run.date}
+    told = {"bytes": run.size, "version": run.version, "settings": settings, "host": platform.node()}
+    return dict.fromkeys(run_row.SCHEMA.names) | stated | told | {"evaluated": datetime.now(UTC)}
+
+
+def _first_reading(source: Source) -> datetime | None:
+    """Return the date of the first reading; None where stamps count from the start of a clock."""
+    begin_ns = getattr(source, "begin_ns", None)
+    return date_of(begin_ns() if begin_ns else None)
+
+
+def _call_by_place(row: Row, path: Path, run: Run) -> None:
+    """Have all sentences call a recording by the name that it is known by, not by that of its copy here."""
+    for key in run_row.SENTENCES:
+        if isinstance(row[key], str):
+            row[key] = row[key].replace(str(path), run.place)
+    row["warnings"] = [each.replace(str(path), run.place) for each in row["warnings"] or ()]

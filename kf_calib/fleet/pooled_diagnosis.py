@@ -1,0 +1,247 @@
+"""The diagnosis of many runs together: which effects they have, and whether each is the bench's or the sensors'."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.effects import described
+from kf_calib.fleet.attribution import Attributed, attributed, chosen
+from kf_calib.fleet.bench_coefficient import BenchEstimate, DatedSums
+from kf_calib.fleet.campaign import Campaign, Factors, Group
+from kf_calib.fleet.evidence import FLAT
+from kf_calib.fleet.hypotheses import AttributionTable
+from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
+from kf_calib.fleet.population import Own, Population, population
+from kf_calib.fleet.reference_unit import ReferenceUnit
+from kf_calib.fleet.repair_date import RepairDate, repair_date
+from kf_calib.fleet.some_units import SomeUnits
+from kf_calib.support.threads import one_blas_thread
+
+RIVAL = 0.01
+"""Probability above which another effect is named as a rival."""
+
+
+@dataclass(frozen=True)
+class PooledEstimate:
+    """A coefficient: symbol, value and sigma in an SI unit; None where the runs do not tell."""
+
+    symbol: str
+    value: float | None
+    sigma: float | None
+    unit: str
+
+
+@dataclass(frozen=True)
+class BenchCoefficients:
+    """Coefficients that all runs on a bench have in common, those from a repair on apart.
+
+    since: date of the first run that has them, if it is not the first on that bench. covariance: of the coefficients,
+    SI; large where one of them is not determined.
+    """
+
+    bench: str
+    since: str | None
+    coefficients: tuple[PooledEstimate, ...]
+    covariance: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class PopulationFigures:
+    """Mean of the coefficients over the units that have the effect, and their spread about it with its 95 % interval,
+    SI."""
+
+    mean: tuple[PooledEstimate, ...]
+    spread: float
+    spread_interval: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class UnitFigures:
+    """What one unit has of an effect: the probability that it has it, and its coefficients if it does."""
+
+    unit: str
+    probability: float
+    coefficients: tuple[PooledEstimate, ...]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect that the runs have.
+
+    - attribution: of what it is, most likely. probabilities: of every attribution of it.
+    - rivals: other effects that may be there in its place, with their probabilities.
+    - benches: the coefficients of each bench; empty if the effect is the sensors'.
+    - over_time: the same from the runs of one part of the campaign after another; ``since``: when the part begins.
+    - population, units, share, share_interval: of the units; None or empty if it is the bench's; no population of one. ``share`` is the share
+      of these units that have it; it is not given if the effect is each run's own.
+    - repair: when it changed, if it did.
+    """
+
+    effect: str
+    attribution: Attribution
+    probabilities: Mapping[Attribution, float]
+    rivals: Mapping[str, float]
+    benches: tuple[BenchCoefficients, ...] = ()
+    over_time: tuple[BenchCoefficients, ...] = ()
+    population: PopulationFigures | None = None
+    units: tuple[UnitFigures, ...] = ()
+    share: float | None = None
+    share_interval: tuple[float, float] | None = None
+    repair: RepairDate | None = None
+
+
+@dataclass(frozen=True)
+class EffectRow:
+    """One effect of the catalogue: the probability of each attribution and that no run has it.
+
+    benches: what it would be as one of the bench, beside what was found. Probabilities are None where no run can show
+    the effect.
+    """
+
+    effect: str
+    probabilities: Mapping[Attribution, float] | None
+    no_one: float | None
+    benches: tuple[BenchCoefficients, ...]
+
+
+@dataclass(frozen=True)
+class PooledDiagnosis:
+    """The diagnosis of many runs together. no_more: probability that they have no effect besides those found."""
+
+    runs: int
+    units: int
+    benches: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    effects: tuple[EffectRow, ...]
+    no_more: float
+
+    def document(self) -> dict[str, Any]:
+        """The same as JSON; numbers are SI."""
+        return asdict(self)
+
+
+def pooled_diagnosis(factors: Factors, *, reference_unit: ReferenceUnit | None = None) -> PooledDiagnosis:
+    """Diagnose many runs together.
+
+    - factors: the reduced factors of the runs, or a function that reads them anew each time it is called, such as
+      ``open_fleet("fleet").factors``, so that memory does not grow with their number.
+    - reference_unit: a unit whose scale factors are known, so that an error of gravity can be seen.
+
+    Raises InputError if there are no runs.
+    """
+    with one_blas_thread():
+        campaign = Campaign(factors, reference_unit)
+        found = attributed(campaign)
+        names = [term.group.name for term in found.terms]
+        findings = [_finding(campaign, found, k) for k in range(len(names))]
+        rows = _rows(campaign, found, {each.effect: each for each in findings})
+    units = len({key.unit for key in campaign.keys})
+    return PooledDiagnosis(
+        len(campaign.keys), units, tuple(campaign.benches), tuple(findings), tuple(rows), found.rest.none
+    )
+
+
+def _finding(campaign: Campaign, found: Attributed, number: int) -> Finding:
+    """Return what is to be said of one term, from its table beside the others."""
+    term, table = found.terms[number], found.tables[number]
+    others = PooledTerms([each for each in found.terms if each is not term], len(campaign.benches))
+    shares = dict(table.of(term.group.name))
+    rivals = {name: share for name, share in table.effects().items() if share > RIVAL and name != term.group.name}
+    attribution = chosen(table).attribution
+    if attribution.common:
+        sums = DatedSums.of(campaign, others, [term.repair] if term.repair else [])
+        benches = tuple(
+            _bench_coefficients(campaign, term.group, each) for each in sums.estimates(term.group, term.repair)
+        )
+        followed = tuple(
+            replace(_bench_coefficients(campaign, term.group, each), since=campaign.by_date[each.since].date)
+            for bench in range(len(campaign.benches))
+            for each in sums.over_time(term.group, bench)
+        )
+        when = repair_date(campaign, others, term) if term.repair else None
+        return Finding(term.group.name, attribution, shares, rivals, benches, followed, repair=when)
+    return _of_units(campaign, others, term, Finding(term.group.name, attribution, shares, rivals))
+
+
+def _of_units(campaign: Campaign, others: PooledTerms, term: Term, so_far: Finding) -> Finding:
+    """Return the finding with population, units and share."""
+    group, means = term.group, others.solved(campaign)[0]
+    level = campaign.runs() if term.attribution is Attribution.RUN else campaign.units(others.repairs)
+    own = Own.joined([Own.of(group, others, means, others.beside_own(blocks)) for blocks in level])
+    if term.attribution is Attribution.RUN:
+        people = population(own, group.largest)
+        units = _units(group, own, people, np.ones(len(own.units)))
+        return replace(so_far, population=_figures(group, people), units=units)
+    own = own.by_unit()
+    some, chance = SomeUnits(group, own), so_far.probabilities
+    every = chance[Attribution.SENSORS] / (chance[Attribution.SENSORS] + chance[Attribution.SOME])
+    has = every + (1.0 - every) * some.probabilities
+    having = own.only(has > 0.5)
+    people = population(having, group.largest)
+    figures = _figures(group, people) if len(having.units) > 1 else None  # one unit has no spread
+    share, interval = some.share(every)
+    units = _units(group, own, people, has)
+    return replace(so_far, population=figures, units=units, share=share, share_interval=interval)
+
+
+def _units(group: Group, own: Own, people: Population, chances: Floats) -> tuple[UnitFigures, ...]:
+    rows = zip(own.units, chances.tolist(), people.coefficients(own), strict=True)
+    return tuple(UnitFigures(unit, chance, _estimates(group, *found)) for unit, chance, found in rows)
+
+
+def _figures(group: Group, people: Population) -> PopulationFigures:
+    low, high = people.spread_interval
+    return PopulationFigures(
+        _estimates(group, people.mean, people.covariance), people.spread * group.sigma,
+        (low * group.sigma, high * group.sigma),
+    )  # fmt: skip
+
+
+def _rows(campaign: Campaign, found: Attributed, findings: Mapping[str, Finding]) -> Iterable[EffectRow]:
+    """Yield a row for every effect, those found first."""
+    sums = DatedSums.of(campaign, PooledTerms(found.terms, len(campaign.benches)))
+    order = {name: k for k, name in enumerate(findings)}
+    for group in sorted(campaign.groups, key=lambda group: order.get(group.name, len(order))):
+        if group.name in findings:
+            own = findings[group.name]
+            yield EffectRow(group.name, own.probabilities, _rest(own.probabilities), own.benches)
+        elif not group.sigma:
+            yield EffectRow(group.name, None, None, ())
+        else:
+            shares = _likeliest(group.name, [found.rest, *found.tables])
+            benches = tuple(_bench_coefficients(campaign, group, each) for each in sums.estimates(group))
+            yield EffectRow(group.name, shares, _rest(shares), benches)
+
+
+def _rest(shares: Mapping[Attribution, float]) -> float:
+    """Return what probabilities leave of one."""
+    return max(1.0 - sum(shares.values()), 0.0)
+
+
+def _likeliest(name: str, tables: Sequence[AttributionTable]) -> dict[Attribution, float]:
+    """Return the probabilities of an effect in the table in which it is likeliest."""
+    each = [dict(table.of(name)) for table in tables]
+    return max(each, key=lambda shares: sum(shares.values()))
+
+
+def _bench_coefficients(campaign: Campaign, group: Group, found: BenchEstimate) -> BenchCoefficients:
+    since = campaign.by_date[found.since].date if found.since else None
+    values = _estimates(group, found.mean, found.covariance)
+    covariance = tuple(tuple(row) for row in (found.covariance * group.sigma**2).tolist())
+    return BenchCoefficients(campaign.benches[found.bench], since, values, covariance)
+
+
+def _estimates(group: Group, mean: Floats, covariance: Floats) -> tuple[PooledEstimate, ...]:
+    """Return coefficients in SI."""
+    effect, out = described(group.name), list[PooledEstimate]()
+    units = {each.symbol: each.unit for each in effect.coefficients} if effect is not None else {}
+    sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+    for symbol, value, sigma in zip(group.symbols, mean.tolist(), sigmas, strict=True):
+        seen = (value * group.sigma, sigma * group.sigma) if sigma < 0.1 * FLAT else (None, None)
+        out.append(PooledEstimate(symbol, *seen, units.get(symbol, "")))
+    return tuple(out)

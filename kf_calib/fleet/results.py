@@ -1,0 +1,183 @@
+"""The table of a fleet as a Python program has it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute
+
+from kf_calib.errors import InputError
+from kf_calib.fleet.overview import COLUMNS, FleetOverview, overview_of
+from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis, pooled_diagnosis
+from kf_calib.fleet.reference_unit import ReferenceUnit
+from kf_calib.fleet.run_factor import RunFactor
+from kf_calib.fleet.run_row import SCHEMA, factor_of
+from kf_calib.fleet.store import AT_ONCE, Store
+from kf_calib.fleet.weeks import counted
+from kf_calib.support.extras import need
+
+pc: Any = pyarrow.compute  # its functions are made when it is imported, which no type checker sees
+_HEAVY = ("replay", "diagnosis", "factor")
+_SIXTY_EIGHT = (0.1587, 0.5, 0.8413)
+_ALONE = "the runs were not diagnosed together"
+_IDENTITY = ("run", "unit", "bench", "date")
+
+
+class Fleet:
+    """The runs in the folder of ``kf-calib fleet``; what is asked for is read when it is asked for.
+
+        fleet = kf_calib.open_fleet("fleet")
+        fleet.verdicts()                            # {"consistent": 37, "second-order": 2, "failed": 1}
+        fleet.parameters(["K1", "b1"]).to_pandas()  # one line for each run and parameter
+        for factor in fleet.factors(): ...          # what each run tells of its parameters and of every effect
+
+    Raises InputError where the folder has no table.
+    """
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        self.path = Path(path)
+        self._store = Store(self.path)
+        if not self._store.exists:
+            raise InputError(f"{path} has no table of a fleet: name the folder that kf-calib fleet wrote (-o).")
+
+    def __len__(self) -> int:
+        """Number of runs."""
+        return self.rows(["run"]).num_rows
+
+    def rows(self, columns: Sequence[str] | None = None) -> pa.Table:
+        """A row for each run (docs/fleet.md). Without ``columns`` all but the factor and the whole documents."""
+        read = [name for name in SCHEMA.names if name not in _HEAVY] if columns is None else list(columns)
+        if unknown := sorted(set(read) - set(SCHEMA.names)):
+            raise InputError(f"the table has no column {unknown[0]}, it has {', '.join(SCHEMA.names)}.")
+        schema = pa.schema([SCHEMA.field(name) for name in read])
+        return pa.Table.from_batches(self._store.batches(read), schema)
+
+    def frame(self, columns: Sequence[str] | None = None) -> Any:
+        """The same as a DataFrame of pandas, which has to be installed."""
+        need("pandas", None, "a DataFrame")
+        return self.rows(columns).to_pandas()
+
+    def parameters(self, symbols: Sequence[str] = ()) -> pa.Table:
+        """A row for each run and parameter: run, unit, bench, date, symbol, value, sigma, si_unit and nominal.
+
+        symbols: of the parameters that are wanted; all where there are none. Values are null where a run does not
+        determine them.
+        """
+        table = self.rows([*_IDENTITY, "parameters"]).combine_chunks()
+        lists = pc.fill_null(table["parameters"], [])
+        inside = pc.list_flatten(lists).combine_chunks().flatten()
+        named = dict(zip(("symbol", "value", "sigma", "si_unit", "nominal"), inside, strict=True))
+        long = table.select(_IDENTITY).take(pc.list_parent_indices(lists))
+        for name, column in named.items():
+            long = long.append_column(name, column)
+        return long.filter(pc.is_in(long["symbol"], pa.array(symbols, pa.string()))) if symbols else long
+
+    def verdicts(self) -> dict[str, int]:
+        """How many runs came to what: ``consistent``, the effect that is missing, ``unknown``, ``not judged`` where
+        nothing was left to judge by, or ``failed``; the most frequent first."""
+        table = self.rows(["error", "consistent", "missing"])
+        return counted(table.to_pylist())
+
+    def factors(self) -> Iterator[RunFactor]:
+        """The reduced factor of each run that has one; one part of the table is in memory at a time."""
+        for batch in self._store.batches([*_IDENTITY, "factor"], AT_ONCE):
+            for row in batch.to_pylist():
+                if (found := factor_of(row)) is not None:
+                    yield found
+
+    def pooled(self, *, reference_unit: ReferenceUnit | None = None) -> PooledDiagnosis:
+        """The diagnosis of all runs together: which effects they have, and whether each is the bench's or the units'.
+
+        reference_unit: a unit whose scale factors are known, so that an error of gravity shows. Raises InputError where
+        there are no runs to diagnose.
+        """
+        return pooled_diagnosis(self.factors, reference_unit=reference_unit)
+
+    def overview(
+        self,
+        targets: Mapping[str, float] | None = None,
+        *,
+        pooled: bool = True,
+        reference_unit: ReferenceUnit | None = None,
+    ) -> FleetOverview:
+        """What all runs come to, for ``kf_calib.plot.figures`` too.
+
+        targets: sigma wanted of parameters, in SI. pooled: whether two runs or more are diagnosed together. Raises
+        InputError where the reference unit was not measured.
+        """
+        found, remarks = self._pooled_or_why(reference_unit) if pooled and len(self) > 1 else (None, ())
+        return overview_of(str(self.path), self.rows(COLUMNS).to_pylist(), targets or {}, found, remarks)
+
+    def _pooled_or_why(self, reference: ReferenceUnit | None) -> tuple[PooledDiagnosis | None, tuple[str, ...]]:
+        """Return the diagnosis of all runs together, and what is to be said of it."""
+        table = self.rows(["unit", "error"])
+        units = table.filter(pc.is_null(table["error"]))["unit"]
+        if len(units) < 2:
+            return None, (f"{_ALONE}: that needs two that did not fail, and there {_are(len(units))}.",)
+        try:
+            found = self.pooled(reference_unit=reference)
+        except InputError as error:
+            if reference is not None:
+                raise
+            return None, (f"{_ALONE}: {error}",)
+        return found, (_unnamed(units.null_count),) if units.null_count else ()
+
+    def distinct(self, column: str) -> int:
+        """Number of different values of a column, what is not known left out."""
+        return pc.count_distinct(self.rows([column])[column], mode="only_valid").as_py()
+
+    def failures(self) -> dict[str, str]:
+        """What was wrong with each run that failed, by its place."""
+        return {row["run"]: row["error"] for row in self.rows(["run", "error"]).to_pylist() if row["error"]}
+
+    def __str__(self) -> str:
+        counts = ", ".join(f"{count} {verdict}" for verdict, count in self.verdicts().items())
+        return f"{self.path}: {len(self)} runs ({counts})"
+
+
+def _are(count: int) -> str:
+    return f"is {count}" if count == 1 else f"are {count}"
+
+
+def _unnamed(count: int) -> str:
+    one = "1 run has no unit, so it counts as a unit"
+    each = one if count == 1 else f"{count} runs have no unit, so each counts as a unit"
+    return f"{each} of its own: say which it is in a list of runs (.csv with the columns run and unit)."
+
+
+@dataclass(frozen=True)
+class ParameterPopulation:
+    """One parameter over the runs of a fleet.
+
+    - runs: number of runs that determine it. median: of their values. spread: half the width of the middle 68 % of
+      them, 1 sigma of a normal population. sigma: median of the sigma that a run gives of it. All in ``unit`` (SI).
+    """
+
+    symbol: str
+    unit: str
+    nominal: float
+    runs: int
+    median: float
+    spread: float
+    sigma: float
+
+
+def populations(fleet: Fleet) -> list[ParameterPopulation]:
+    """Each parameter over the runs that determine it, in the order of the first run."""
+    table = fleet.parameters()
+    table = table.filter(pc.is_valid(table["value"]))
+    out = list[ParameterPopulation]()
+    for symbol in dict.fromkeys(table["symbol"].to_pylist()):
+        own = table.filter(pc.equal(table["symbol"], symbol))
+        values, sigmas = own["value"].to_numpy(), own["sigma"].to_numpy()
+        low, median, high = np.quantile(values, _SIXTY_EIGHT).tolist()
+        unit, nominal = own["si_unit"][0].as_py(), own["nominal"][0].as_py()
+        sigma = float(np.nanmedian(sigmas))
+        out.append(ParameterPopulation(symbol, unit, nominal, len(values), median, 0.5 * (high - low), sigma))
+    return out

@@ -1,0 +1,141 @@
+"""The table of a fleet on disk: files in one folder, of which the newest row of each run counts.
+
+Rows are appended as small Arrow files, which take a hundredth of the time of Parquet, and merged into Parquet from time
+to time and at the end. Every file is written beside its place and renamed when it is whole: whoever reads the folder,
+at any time and however the writer ended, finds whole files only, and all that was finished.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.dataset as ds
+import pyarrow.parquet as pq
+
+from kf_calib.errors import InputError
+from kf_calib.fleet.run_row import SCHEMA, Row
+from kf_calib.support.file_lock import lock, writer
+from kf_calib.support.output_files import whole
+
+_SMALL, _LARGE = "*.arrow", "*.parquet"
+_MOST_SMALL = 256
+"""Small files that are merged while a fleet is being evaluated."""
+
+AT_ONCE = 64
+"""Rows that are in memory together where factors are among their columns: these make a row some 60 kB large."""
+
+_MANY = 8192
+"""The same where they are not."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """What the table has of a run: when it was evaluated, and by what it is seen whether it has to be again."""
+
+    evaluated: datetime
+    version: str
+    sha256: str | None
+    settings: str
+
+
+class Store:
+    """The folder of a table; it may not exist yet."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / "runs"
+        self._written = 0
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is a table."""
+        return bool(self._files(_LARGE) or self._files(_SMALL))
+
+    @contextmanager
+    def taken(self) -> Iterator[None]:
+        """Keep everybody else from writing in the folder. Raises InputError where somebody does, or where it cannot be
+        made."""
+        held = self.folder / ".lock"
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with held.open("ab") as file:
+                if not lock(file):
+                    raise InputError(
+                        f"{self.folder.parent} is being written by {writer(held) or 'another run'}: wait for it."
+                    )
+                yield
+        except OSError as error:
+            raise InputError(f"{self.folder}: {error.strerror}: give another folder (-o).") from None
+
+    def append(self, rows: Sequence[Row]) -> None:
+        """Write rows; when this returns they are on disk."""
+        if rows:
+            with whole(self._new(_SMALL)) as part, pa.ipc.new_file(part, SCHEMA) as out:
+                out.write_table(pa.Table.from_pylist(list(rows), SCHEMA))
+        if len(small := self._files(_SMALL)) >= _MOST_SMALL:
+            self._merge(small)
+
+    def compact(self) -> None:
+        """Merge the small files into one; where rows were superseded, all files into one without them."""
+        if small := self._files(_SMALL):
+            self._merge(small)
+        large = self._files(_LARGE)
+        if sum(pq.read_metadata(file).num_rows for file in large) > len(self.known()):
+            self._merge(large)
+
+    def known(self) -> dict[str, Known]:
+        """What the table has of each run."""
+        out = dict[str, Known]()
+        for batch in _rows(self._every, ["run", "evaluated", "version", "sha256", "settings"], _MANY):
+            for row in batch.to_pylist():
+                if row["run"] not in out or out[row["run"]].evaluated <= row["evaluated"]:
+                    out[row["run"]] = Known(row["evaluated"], row["version"], row["sha256"], row["settings"])
+        return out
+
+    def batches(self, columns: Sequence[str], rows: int = _MANY) -> Iterator[pa.RecordBatch]:
+        """The newest row of each run, so many at a time; memory is that of one batch and the names of the runs."""
+        return _newest(self._every, columns, rows)
+
+    def _merge(self, files: Sequence[Path]) -> None:
+        with whole(self._new(_LARGE)) as part, pq.ParquetWriter(part, SCHEMA, compression="zstd") as out:
+            for batch in _newest(files, SCHEMA.names, AT_ONCE):
+                out.write_batch(batch)
+        for file in files:
+            file.unlink()
+
+    @property
+    def _every(self) -> list[Path]:
+        return [*self._files(_LARGE), *self._files(_SMALL)]
+
+    def _files(self, kind: str) -> list[Path]:
+        return sorted(file for file in self.folder.glob(kind) if not file.name.startswith("."))
+
+    def _new(self, kind: str) -> Path:
+        self._written += 1
+        return self.folder / kind.replace("*", f"runs-{time.time_ns():020d}-{self._written}")
+
+
+def _newest(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterator[pa.RecordBatch]:
+    """Yield the rows of some files that no other row among them supersedes."""
+    left = dict[str, datetime]()
+    for batch in _rows(files, ["run", "evaluated"], _MANY):
+        for run, evaluated in zip(*(column.to_pylist() for column in batch.columns), strict=True):
+            left[run] = max(evaluated, left.get(run, evaluated))
+    read = list(dict.fromkeys([*columns, "run", "evaluated"]))
+    for batch in _rows(files, read, rows):
+        pairs = zip(batch["run"].to_pylist(), batch["evaluated"].to_pylist(), strict=True)
+        kept = [left.get(run) == evaluated and bool(left.pop(run)) for run, evaluated in pairs]
+        yield batch.filter(pa.array(kept)).select(list(columns))
+
+
+def _rows(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterator[pa.RecordBatch]:
+    """Yield all rows of some files."""
+    for kind, form in ((_LARGE, "parquet"), (_SMALL, "ipc")):
+        if own := [str(file) for file in files if file.match(kind)]:
+            data = ds.dataset(own, schema=SCHEMA, format=form)
+            yield from data.to_batches(columns=list(columns), batch_size=rows, batch_readahead=1, fragment_readahead=1)

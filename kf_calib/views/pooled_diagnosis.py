@@ -1,0 +1,145 @@
+"""The diagnosis of many runs together, in words and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from kf_calib.fleet.pooled_diagnosis import BenchCoefficients, EffectRow, Finding, PooledDiagnosis, PooledEstimate
+from kf_calib.fleet.pooled_terms import Attribution
+from kf_calib.support.units import shown
+from kf_calib.views.console import symbol
+from kf_calib.views.tables import Table
+
+_OF = {
+    Attribution.BENCH: "of the bench",
+    Attribution.REPAIRED: "of the bench, changed once",
+    Attribution.SENSORS: "of the type of sensor",
+    Attribution.SOME: "of some units",
+    Attribution.RUN: "of each run",
+}
+_LISTED = 12  # units that are named in a sentence
+_SHOWN = 0.01  # probability below which an effect that was not found is not shown
+
+
+_BORNE_BY = {
+    Attribution.BENCH: "bench",
+    Attribution.REPAIRED: "bench",
+    Attribution.SENSORS: "type",
+    Attribution.SOME: "units",
+    Attribution.RUN: "runs",
+}
+
+
+def pooled_objects(found: PooledDiagnosis) -> list[dict[str, Any]]:
+    """The JSON objects of a pooled diagnosis, one an effect; those that were found come first."""
+    findings = {each.effect: each for each in found.findings}
+    return [_pooled_object(row, findings.get(row.effect)) for row in found.effects]
+
+
+def _pooled_object(row: EffectRow, finding: Finding | None) -> dict[str, Any]:
+    shares, people = row.probabilities or {}, finding.population if finding else None
+    means = [("units", None, each) for each in (people.mean if people else ())]
+    own = [(each.bench, each.since, value) for each in row.benches for value in each.coefficients]
+    return {
+        "effect": row.effect,
+        "borne_by": _BORNE_BY[finding.attribution] if finding else None if row.no_one is None else "none",
+        "probability": shares[finding.attribution] if finding else row.no_one,
+        "probabilities": {each.value: share for each, share in shares.items()},
+        "rivals": dict(finding.rivals) if finding else {},
+        "coefficients": [{"of": of, "since": since, **vars(each)} for of, since, each in [*own, *means]],
+        "spread": people.spread if people else None,
+        "spread_interval": people.spread_interval if people else None,
+        "share": finding.share if finding else None,
+        "share_interval": finding.share_interval if finding else None,
+        "units": [{"unit": each.unit, "probability": each.probability,
+                   "coefficients": [vars(one) for one in each.coefficients]}
+                  for each in (finding.units if finding else ())],
+        "changed": [vars(each) for each in finding.repair.gaps] if finding and finding.repair else [],
+    }  # fmt: skip
+
+
+def pooled_report(found: PooledDiagnosis) -> RenderableType:
+    """A pooled diagnosis for a console: what was found, the probabilities, and the coefficients."""
+    parts: list[RenderableType] = [Text(sentence) for sentence in [_summary(found), *map(_sentence, found.findings)]]
+    rows = [row for row in found.effects if row.no_one is not None and row.no_one < 1.0 - _SHOWN]
+    if rows:
+        parts.append(_probabilities(rows))
+    return Group(*parts, *(_coefficients(each) for each in found.findings))
+
+
+def _summary(found: PooledDiagnosis) -> str:
+    benches = f"{len(found.benches)} bench{'es' if len(found.benches) != 1 else ''}"
+    names = ", ".join(each.effect for each in found.findings) or "no effect"
+    other = "no other" if found.findings else "none"
+    return (
+        f"{found.runs} runs of {found.units} units on {benches} show {names}; that they have {other} has probability "
+        f"{found.no_more:.2f}."
+    )
+
+
+def _sentence(found: Finding) -> str:
+    """Return what one effect is of, in a sentence."""
+    chance = found.probabilities[found.attribution]
+    said = f"{found.effect} is {_OF[found.attribution]} (probability {chance:.2f})"
+    if found.attribution is Attribution.SOME and found.share_interval is not None:
+        low, high = found.share_interval
+        having = [each.unit for each in found.units if each.probability > 0.5]
+        said += f": {found.share:.0%} of the units have it ({low:.0%} to {high:.0%}), most likely {_listed(having)}"
+    if found.repair is not None:
+        gap = found.repair.gaps[0]
+        said += f": it changed between {gap.after or gap.after_run} and {gap.before or gap.before_run}"
+        said += f" (probability {gap.probability:.2f})"
+    rivals = [f"{name} ({share:.2f})" for name, share in found.rivals.items()]
+    return f"{said}. In its place it may be {' or '.join(rivals)}." if rivals else f"{said}."
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - _LISTED
+    return ", ".join(names[:_LISTED]) + (f" and {more} more" if more > 0 else "") if names else "none for certain"
+
+
+def _probabilities(rows: Sequence[EffectRow]) -> Table:
+    """Return the table of the probabilities of each attribution."""
+    tried = [each for each in Attribution if any(each in (row.probabilities or {}) for row in rows)]
+    table = Table(title="Of what each effect is: probabilities", title_justify="left")
+    table.add_column("effect")
+    for each in tried:
+        table.add_column(_OF[each], justify="right")
+    table.add_column("of no one", justify="right")
+    for row in rows:
+        shares = [(row.probabilities or {}).get(each, 0.0) for each in tried]
+        table.add_row(row.effect, *(f"{share:.2f}" for share in (*shares, row.no_one or 0.0)))
+    return table
+
+
+def _coefficients(found: Finding) -> Table:
+    """Return the table of the coefficients of one effect."""
+    table = Table(title=f"{found.effect}, {_OF[found.attribution]} (1σ)", title_justify="left")
+    for heading in ("of", "coefficient", "value", "sigma", "unit"):
+        table.add_column(heading, justify="right" if heading in ("value", "sigma") else "left")
+    for bench in found.benches:
+        _add(table, _when(bench), bench.coefficients)
+    if found.population is not None:
+        _add(table, "mean of the units", found.population.mean)
+        unit = found.population.mean[0].unit
+        low, high = (shown(unit).number(each) for each in found.population.spread_interval)
+        table.add_row("spread", "", shown(unit).number(found.population.spread), f"{low} to {high}", shown(unit).label)
+    return table
+
+
+def _when(bench: BenchCoefficients) -> str:
+    return f"{bench.bench or 'the bench'}, since {bench.since}" if bench.since else bench.bench or "the bench"
+
+
+def _add(table: Table, name: str, values: Sequence[PooledEstimate]) -> None:
+    """Add a row for each coefficient."""
+    for k, each in enumerate(values):
+        cells = ("not seen", "")
+        if each.value is not None and each.sigma is not None:
+            value, sigma = shown(each.unit).rounded(each.value, each.sigma)
+            cells = value, f"± {sigma}"
+        table.add_row("" if k else name, symbol(each.symbol), *cells, shown(each.unit).label)

@@ -1,0 +1,242 @@
+"""Many recordings into one table: the same numbers as alone, whatever fails on the way, nothing done twice or lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import dask.config
+import pytest
+from distributed import Client, LocalCluster
+from fleet_generator import Campaign, record
+
+import kf_calib
+from kf_calib.cli.evaluate import replay
+from kf_calib.cli.fleet import SingleCommands
+from kf_calib.fleet import cluster
+from kf_calib.fleet.batch import evaluate_all
+from kf_calib.fleet.evaluation import Evaluation
+from kf_calib.fleet.run_list import Run, runs_of
+from kf_calib.fleet.store import Store
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "fleet.md"
+pytestmark = pytest.mark.xdist_group("fleet")  # recorded once
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four runs of two units."""
+    own = Campaign(tmp_path_factory.mktemp("campaign"), runs=4, units=2, benches=1, dwells=6, dwell_s=3.0)
+    for run in range(own.runs):
+        record(own, run)
+    return own.folder / "runs"
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Client]:
+    """Workers that are threads of this process: they start at once."""
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0") as own,
+        Client(own) as c,
+    ):
+        yield c
+
+
+@pytest.fixture
+def at_once(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command uses these workers."""
+
+    @contextmanager
+    def running(workers: int, scheduler: str | None = None) -> Iterator[Client]:
+        yield client
+
+    monkeypatch.setattr(cluster, "cluster", running)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    own = Store(tmp_path / "fleet")
+    with own.taken():
+        yield own
+
+
+def evaluation(**given: Any) -> Evaluation:
+    usual = replay.make_context("replay", ["run.mcap"]).params
+    own = ("recording", "overwrite", "strict", "as_json", "save", "save_model")
+    commands = SingleCommands({key: value for key, value in usual.items() if key not in own} | given)
+    return Evaluation(commands, commands.checksum)
+
+
+@pytest.mark.usefixtures("at_once")
+def test_each_run_has_the_numbers_that_it_has_alone(campaign: Path, run: Any, tmp_path: Path) -> None:
+    bad = tmp_path / "bad.mcap"
+    bad.write_text("no recording")
+    code, out, _ = run("fleet", campaign, bad, "-o", tmp_path / "fleet", "--json")
+    printed = json.loads(out)
+    assert (code, printed["runs"], printed["failed"], printed["evaluated"], printed["units"]) == (0, 5, 1, 5, 2)
+    assert printed["failures"][0]["run"] == str(bad) and "is not an MCAP file" in printed["failures"][0]["error"]
+    rows = {row["run"]: row for row in kf_calib.open_fleet(tmp_path / "fleet").rows(
+        ["run", "unit", "bench", "date", "replay", "diagnosis", "parameters", "error"]).to_pylist()}  # fmt: skip
+    alone = campaign / "bench-1" / "unit-0002" / "run-000002.mcap"
+    row = rows[str(alone)]
+    for command in ("replay", "diagnose"):
+        _, printed, _ = run(command, alone, "--json")
+        assert json.loads(printed) == json.loads(row[{"diagnose": "diagnosis"}.get(command, command)])
+    assert row["parameters"] == json.loads(row["replay"])["parameters"]
+    assert (row["unit"], row["bench"], row["error"]) == ("unit-0002", "bench-1", None)
+    assert row["date"].isoformat(timespec="seconds") == "2025-10-15T07:06:40+00:00"  # a third of a year after the first
+
+
+def test_a_run_is_evaluated_again_only_if_it_or_the_settings_changed(
+    campaign: Path, client: Client, store: Store, tmp_path: Path
+) -> None:
+    own = shutil.copytree(campaign, tmp_path / "runs")
+    first = evaluate_all(client, evaluation(), runs_of([str(own)]), store)
+    assert (first.evaluated, first.kept) == (4, 0)
+    some, other, *_ = sorted(own.rglob("*.mcap"))
+    os.utime(some, (0, 0))  # another date of the same content
+    shutil.copy(other, some.with_name("new.mcap"))
+    shutil.copy(some, other)
+    again = evaluate_all(client, evaluation(), runs_of([str(own)]), store)
+    assert (again.evaluated, again.kept) == (2, 3)
+    changed = evaluate_all(client, evaluation(effects=("second-order",)), runs_of([str(some)]), store)
+    assert changed.evaluated == 1
+    table = kf_calib.open_fleet(tmp_path / "fleet").rows()
+    assert sorted(table["run"].to_pylist()) == sorted(map(str, own.rglob("*.mcap")))
+    assert [row["model"] for row in table.to_pylist() if row["run"] == str(some)] == [["second-order"]]
+    assert len(list((tmp_path / "fleet" / "runs").glob("*.parquet"))) == 1
+
+
+def test_what_could_not_be_fetched_is_tried_again(campaign: Path, client: Client, store: Store, tmp_path: Path) -> None:
+    gone = Run(str(tmp_path / "gone.mcap"))
+    progress = evaluate_all(client, evaluation(), [gone], store)
+    assert progress.failed == 1
+    assert "cannot be read" in kf_calib.open_fleet(tmp_path / "fleet").failures()[gone.place]
+    shutil.copy(next(campaign.rglob("*.mcap")), gone.place)
+    assert evaluate_all(client, evaluation(), [gone], store).failed == 0
+    assert kf_calib.open_fleet(tmp_path / "fleet").failures() == {}
+
+
+def test_finished_runs_are_in_the_table_before_the_end(
+    campaign: Path, client: Client, store: Store, tmp_path: Path
+) -> None:
+    """A client that is killed loses nothing that was finished."""
+    seen = list[int]()
+
+    def killed(progress: Any) -> None:
+        seen.append(progress.evaluated)
+        if progress.evaluated:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_all(client, evaluation(), runs_of([str(campaign)]), store, killed)
+    (store.folder / ".kf-calib-0000.part").write_bytes(b"half a file")
+    found = kf_calib.open_fleet(tmp_path / "fleet")
+    assert len(found) == seen[-1] > 0
+    assert evaluate_all(client, evaluation(), runs_of([str(campaign)]), store).kept == seen[-1]
+    assert len(kf_calib.open_fleet(tmp_path / "fleet")) == 4
+
+
+class _Deadly(SingleCommands):
+    """Ends its process: at one run each time, at the others the first time."""
+
+    def replay(self, path: Path) -> Any:
+        mark = path.with_suffix(".tried")
+        if path.stem == "run-000001" or not mark.exists():
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().replay(path)
+
+
+def test_the_questions_of_the_page_have_answers(
+    campaign: Path, client: Client, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    duckdb = pytest.importorskip("duckdb", reason="duckdb is not there: the table is asked nothing")
+    evaluate_all(client, evaluation(), runs_of([str(campaign)]), store)
+    monkeypatch.chdir(tmp_path)
+    queries = re.findall(r"^```sql\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
+    months, scales, _, parts = (duckdb.sql(query).to_arrow_table().to_pylist() for query in queries)
+    assert sum(row["runs"] for row in months) == len(parts) == 4
+    assert [(row["unit"], row["symbol"], row["runs"]) for row in scales] == [
+        (f"unit-000{unit}", f"K{i}", 2) for unit in (1, 2) for i in (1, 2, 3)
+    ]
+
+
+@pytest.mark.slow
+def test_a_run_that_ends_its_process_is_tried_again_and_stops_no_other(
+    campaign: Path, store: Store, tmp_path: Path
+) -> None:
+    own = shutil.copytree(campaign, tmp_path / "runs")
+    normal = evaluation()
+    deadly = Evaluation(_Deadly(normal.commands.options), normal.settings)
+    runs = runs_of([str(path) for path in sorted(own.rglob("*.mcap"))[:2]])
+    with cluster.cluster(1) as client:
+        progress = evaluate_all(client, deadly, runs, store)
+    assert (progress.evaluated, progress.failed) == (2, 1)
+    ((place, said),) = kf_calib.open_fleet(tmp_path / "fleet").failures().items()
+    assert place.endswith("run-000001.mcap") and "the process that evaluated it was ended 3 times" in said
+
+
+@contextmanager
+def running(*words: str) -> Iterator[None]:
+    """A process of its own, ended with the block."""
+    process = subprocess.Popen([sys.executable, "-m", *words], stderr=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(60)
+
+
+@pytest.mark.slow
+def test_a_scheduler_and_workers_elsewhere_read_an_object_store(
+    campaign: Path, run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Separate processes over TCP, which fetch from a server with the interface of S3; one of them is killed."""
+    moto, s3fs = pytest.importorskip("moto.server"), pytest.importorskip("s3fs")
+    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0)
+    server.start()
+    host, port = server.get_host_and_port()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "test")
+    s3fs.S3FileSystem.clear_instance_cache()
+    files = s3fs.S3FileSystem()
+    files.mkdir("lab")
+    files.put(str(campaign), "lab/runs", recursive=True)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        url = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    scheduler = ("distributed.cli.dask_scheduler", "--host", url, "--dashboard-address", "127.0.0.1:0")
+    worker = ("distributed.cli.dask_worker", url, "--nthreads", "1", "--dashboard-address", "127.0.0.1:0")
+    with running(*scheduler), running(*worker), running(*worker):
+        with Client(url, timeout=120) as client:
+            client.wait_for_workers(2, 120)
+            first, *_ = client.scheduler_info()["workers"]
+            doomed = client.submit(os.getpid, workers=[first]).result()
+            os.kill(doomed, signal.SIGKILL)
+        code, out, err = run("fleet", "s3://lab/runs", "-o", tmp_path / "fleet", "--scheduler", url, "--json")
+    server.stop()
+    s3fs.S3FileSystem.clear_instance_cache()
+    assert code == 0, err
+    printed = json.loads(out.splitlines()[-1])  # the server has a word to say before
+    assert (printed["runs"], printed["failed"]) == (4, 0)
+    rows = kf_calib.open_fleet(tmp_path / "fleet").rows(["run", "sha256"]).to_pylist()
+    assert {row["run"] for row in rows} == {
+        f"s3://lab/runs/{path.relative_to(campaign)}" for path in campaign.rglob("*.mcap")
+    }
+
+
+def test_a_scheduler_that_does_not_answer_is_one_sentence(campaign: Path, run: Any, tmp_path: Path) -> None:
+    with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
+        code, _, err = run("fleet", campaign, "-o", tmp_path / "fleet", "--scheduler", "tcp://127.0.0.1:9")
+    assert code == 2 and "no scheduler answers at tcp://127.0.0.1:9" in err and len(err.splitlines()) == 1

@@ -1,0 +1,153 @@
+"""Many runs together: the command's last word, the page and the figures, and what is said where something lacks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from distributed import Client, LocalCluster
+from fleet_generator import Campaign, record
+from helpers.run_factors import Hidden, nothing, run_factor_of
+
+import kf_calib
+from kf_calib.estimation import bench_model
+from kf_calib.fleet import cluster
+from kf_calib.fleet.overview import FleetOverview, overview_of
+from kf_calib.fleet.pooled_diagnosis import pooled_diagnosis
+from kf_calib.views.figures import figures
+from kf_calib.views.report.contents import page_of
+
+pytestmark = pytest.mark.xdist_group("fleet")
+BENT = np.array([2.0, -1.5, 2.5])
+BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def at_once() -> Iterator[None]:
+    """The command uses workers that are threads of this process: they start at once."""
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0") as own,
+        Client(own) as client,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+
+        @contextmanager
+        def running(workers: int, scheduler: str | None = None) -> Iterator[Client]:
+            yield client
+
+        patch.setattr(cluster, "cluster", running)
+        yield
+
+
+@pytest.fixture(scope="module")
+def bent(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six runs of six units on a bench that bends by more than each run alone could miss."""
+    own = Campaign(
+        tmp_path_factory.mktemp("bent"),
+        runs=6,
+        units=6,
+        benches=1,
+        dwells=14,
+        dwell_s=3.0,
+        of_bench=("flexure=8sigma",),
+    )
+    for run in range(own.runs):
+        record(own, run)
+    return own.folder / "runs"
+
+
+def test_the_command_ends_with_what_all_runs_show_together(bent: Path, run: Any, tmp_path: Path) -> None:
+    code, out, err = run("fleet", bent, "-o", tmp_path / "fleet", "--json")
+    assert code == 0, err
+    printed = json.loads(out)
+    first, *others = printed["pooled"]
+    assert (first["effect"], first["borne_by"]) == ("flexure", "bench") and first["probability"] > 0.9
+    assert [each["of"] for each in first["coefficients"]] == ["bench-1"] * 3
+    assert {each["borne_by"] for each in others} <= {"none", None} and printed["remarks"] == []
+    (model,) = printed["bench_models"]
+    known = bench_model.read(model)
+    assert (known.bench, known.runs, known.terms[0].effect) == ("bench-1", 6, "flexure")
+    one = next(bent.rglob("*.mcap"))
+    _, alone, _ = run("diagnose", one, "--json")
+    _, with_model, _ = run("diagnose", one, "--bench-model", model, "--json")
+    assert json.loads(alone)["p_value"] < 1e-3 < 0.01 < json.loads(with_model)["p_value"]
+    assert kf_calib.open_fleet(tmp_path / "fleet").pooled().findings[0].effect == "flexure"
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (["--no-pooled"], []),
+        ([], ["the runs were not diagnosed together: that needs two that did not fail, and there is 1."]),
+    ],
+)
+def test_what_is_lacking_is_said(bent: Path, run: Any, tmp_path: Path, given: list[str], says: list[str]) -> None:
+    bad = tmp_path / "bad.mcap"
+    bad.write_text("no recording")
+    runs = [next(bent.rglob("*.mcap")), bad]
+    code, out, err = run("fleet", *runs, "-o", tmp_path / "fleet", "--json", *given)
+    assert code == 0, err
+    printed = json.loads(out)
+    assert (printed["pooled"], printed["bench_models"], printed["remarks"]) == (None, [], says)
+    assert {"unit": str(bad), "chance": 0.0, "reasons": ["bad.mcap failed"]} in printed["another_look"]
+
+
+def rows_of(count: int, outlying: int | None = None) -> list[dict[str, Any]]:
+    """Rows of units measured twice, a week apart each; one of them lies far from the others."""
+    rng = np.random.default_rng(5)
+    own = rng.standard_normal(count)
+    if outlying is not None:
+        own[outlying] = 60.0
+    return [
+        {
+            "run": f"run{k:03d}", "unit": f"unit{k % count:02d}", "bench": "bench 1", "error": None, "consistent": True,
+            "p_value": 0.5, "missing": None, "date": BEGIN + timedelta(weeks=k),
+            "parameters": [{
+                "symbol": "b1", "value": 1e-4 * own[k % count] + 1e-6 * rng.standard_normal(), "sigma": 1e-6,
+                "unit": "m/s^2", "nominal": 0.0,
+            }],
+        }
+        for k in range(2 * count)
+    ]  # fmt: skip
+
+
+def overview_with(hidden: Hidden = nothing, outlying: int | None = None) -> FleetOverview:
+    factors = [run_factor_of(k, hidden, date=(BEGIN + timedelta(weeks=k)).isoformat()) for k in range(20)]
+    return overview_of("fleet", rows_of(20, outlying), {"b1": 2e-6}, pooled_diagnosis(factors), ())
+
+
+def test_a_unit_outside_the_population_is_named_first() -> None:
+    found = overview_with(outlying=7)
+    assert [look.unit for look in found.looks] == ["unit07"] and "b1 is" in found.looks[0].reasons[0]
+    assert overview_with().looks == ()
+    (track,) = found.tracks
+    assert track.scatter == pytest.approx(1e-6, rel=0.4)  # of single runs, about the mean of two
+    assert len(found.weeks.begins) == 40 and found.weeks.counts == {"consistent": (1,) * 40}
+
+
+def test_units_of_a_bench_that_was_repaired_are_counted_once() -> None:
+    def hidden(number: int) -> dict[str, Any]:
+        own = {"second-order": np.array([8.0, -8.0, 8.0])} if number % 10 < 4 else {}
+        return own | ({"flexure": 2.0 * BENT} if number < 15 else {})
+
+    runs = [run_factor_of(k, hidden, unit=f"unit{k % 10}") for k in range(30)]
+    some = next(each for each in pooled_diagnosis(runs).findings if each.effect == "second-order")
+    assert sorted(each.unit for each in some.units) == [f"unit{k}" for k in range(10)]
+
+
+def test_every_figure_and_the_page_are_drawn() -> None:
+    found = overview_with(lambda number: {"flexure": BENT}, outlying=3)
+    drawn = {title: draw() for title, draw in figures(found).items()}
+    axes = drawn["Errors of the bench over time"].axes[0]
+    assert "flexure" in axes.get_title(loc="left") and len(axes.containers) == 3
+    assert "unit03" in {each.get_text() for each in drawn["Parameters over the units"].axes[0].texts}
+    assert "40 of 40" in {each.get_text() for each in drawn["Sigma achieved"].axes[0].texts}
+    html = page_of(found, (), ["kf-calib fleet runs -o fleet"]).html
+    assert "40 runs agree with their models" in html and html.count("<svg") == len(drawn)
+    assert "flexure is of the bench" in html
