@@ -77,8 +77,8 @@ class Finding:
     - rivals: other effects that may be there in its place, with their probabilities.
     - benches: the coefficients of each bench; empty if the effect is the sensors'.
     - over_time: the same from the runs of one part of the campaign after another; ``since``: when the part begins.
-    - population, units, share, share_interval: of the units; None or empty if it is the bench's; no population of one.
-      ``share`` is the share of these units that have it; it is not given if the effect is each run's own.
+    - population, units, share, share_interval: of the units; None or empty if it is the bench's. ``population`` is not
+      given for a single unit, nor ``share``, that of these units that have it, if the effect is each run's own.
     - repair: when it changed, if it did.
     """
 

@@ -22,6 +22,7 @@ _OF = {
     Attribution.RUN: "of each run",
 }
 _LISTED = 12  # units that are named in a sentence
+_HAS_IT = 0.5  # probability above which a unit is taken to have an effect
 _SHOWN = 0.01  # probability below which an effect that was not found is not shown
 
 
@@ -87,7 +88,7 @@ def _sentence(found: Finding) -> str:
     said = f"{found.effect} is {_OF[found.attribution]} (probability {chance:.2f})"
     if found.attribution is Attribution.SOME and found.share_interval is not None:
         low, high = found.share_interval
-        having = [each.unit for each in found.units if each.probability > 0.5]
+        having = [each.unit for each in found.units if each.probability > _HAS_IT]
         said += f": {found.share:.0%} of the units have it ({low:.0%} to {high:.0%}), most likely {_listed(having)}"
     if found.repair is not None:
         gap = found.repair.gaps[0]
@@ -123,6 +124,10 @@ def _coefficients(found: Finding) -> Table:
         table.add_column(heading, justify="right" if heading in ("value", "sigma") else "left")
     for bench in found.benches:
         _add(table, _when(bench), bench.coefficients)
+    if not found.benches and found.population is None:
+        for own in found.units:
+            if own.probability > _HAS_IT:
+                _add(table, own.unit, own.coefficients)
     if found.population is not None:
         _add(table, "mean of the units", found.population.mean)
         unit = found.population.mean[0].unit
