@@ -71,7 +71,7 @@ def test_the_recordings_of_the_tutorial_come_with_the_package(run, tmp_path: Pat
     assert copies == {name: content for name, content in own.items() if not name.endswith(".md")}
     Path("recordings/hidden.mcap").unlink()  # the others stay as they are
     code, out, _ = run("demo", "--tutorial", "--json")
-    assert code == 0 and json.loads(out)["recordings"][0] == "recordings/hidden.mcap"
+    assert code == 0 and "recordings/hidden.mcap" in json.loads(out)["recordings"]
     assert Path("recordings/hidden.mcap").read_bytes() == copies["hidden.mcap"]
 
 

@@ -227,7 +227,7 @@ def diagnose(ctx: click.Context, recording: Path, overwrite: bool, strict: bool,
 @click.option("--interactive", is_flag=True, panel=STEPS, help="Ask at every step; usual on a terminal.")
 @click.option("--unattended", is_flag=True, panel=STEPS, help="Never ask; usual where there is no terminal.")
 @click.option(
-    "--accept-first", is_flag=True, panel=STEPS, help="Of effects that explain it equally well, take the first."
+    "--accept-first", is_flag=True, panel=STEPS, help="Where no effect has 95 % probability, take the likeliest."
 )
 @click.option(
     "--honest",

@@ -162,13 +162,13 @@ class Evidence:
 
 
 def _lengthened(known: Floats, length: float) -> Floats:
-    """Return rows of prior knowledge with one more, which makes their last column as long as ``length``.
+    """Return rows of prior knowledge with another length of their last column, by what no other column explains.
 
     Where an oscillation is fitted, more of the readings within dwells is kept than elsewhere.
     """
-    more = np.zeros((1, known.shape[1]))
-    more[0, -1] = math.sqrt(max(length**2 - float(known[:, -1] @ known[:, -1]), 0.0))
-    return np.vstack([known, more])
+    out = known.copy()
+    out[-1, -1] = math.sqrt(max(out[-1, -1] ** 2 + length**2 - float(known[:, -1] @ known[:, -1]), 0.0))
+    return out
 
 
 def _within(carried: Carried, noise: Noise, state: Floats) -> Floats:

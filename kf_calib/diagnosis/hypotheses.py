@@ -9,6 +9,7 @@ hundred formulas do not outvote one effect.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,12 +22,17 @@ from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates
 from kf_calib.diagnosis.evidence import Evidence, Weighed, size_evidence
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.unknown_effect import Family as Formulas
+from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.effects import effect_named, walk_named
+from kf_calib.estimation.reml import HELD
 from kf_calib.estimation.results import Calibration
 
 NOTHING, NOISE, NONE = "nothing", "unstated noise", "none of the known"
 """Families of the rows that name no effect: nothing missing, noise that was not stated, and no known effect."""
+
+IRREGULAR = "irregular"
+"""Driver of changes that follow nothing that was recorded."""
 
 SURE = 0.95
 """Probability from which an effect is taken for certain enough to be added without asking."""
@@ -34,8 +40,11 @@ SURE = 0.95
 HOLDS = 0.99
 """Probability of the set of explanations that is told."""
 
+TOLD = 0.01
+"""Least probability of an explanation that has a line of its own where the table is shown."""
+
 _KINDS = {"nothing": 0.4, "effect": 0.4, "pair": 0.1, "formula": 0.1}
-_IRREGULAR = {True: 0.6, False: 0.1}  # share of an unknown cause in more scatter, by whether noise was stated
+_NO_NOISE = {True: 0.4, False: 0.1}  # share of an unknown cause in more scatter, by whether noise was stated
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _APART, _CURVED = 8.0, 0.02  # rows further behind, in ln and as a share of the evidence, are not refitted
 _MOST = {"effect": 8, "pair": 4, "walk": 3, "formula": 3}
@@ -49,7 +58,8 @@ class Hypothesis:
     - driver: in words, what the formulas depend on; "irregular" for changes of an unknown cause that follow nothing.
     - families: the physical classes of the effects.
     - log_evidence: of the row with its prior, natural logarithm. probability: its share in all rows.
-    - statistic, dof: fall of chi-squared in the likeliest noise, and the number of coefficients.
+    - statistic, dof: fall of chi-squared in the likeliest noise, and the number of coefficients; of a random walk alone
+      twice its gain in likelihood.
     - refit: the calibration with it; None where none was made.
     """
 
@@ -91,6 +101,29 @@ class Table:
     def probability(self, effects: Sequence[str]) -> float:
         """Probability that all these effects are missing, alone or with others."""
         return sum(row.probability for row in self.rows if set(effects) <= set(row.effects))
+
+    def of_any(self, families: Iterable[str]) -> float:
+        """Probability that something of any of these families is missing."""
+        return sum(row.probability for row in self.rows if set(row.families) & set(families))
+
+    def of_added(self, text: str, name: str) -> float | None:
+        """Probability that what was added to a model is missing, alone or with others; None where no row has it.
+
+        text: the effect as it was added, which a formula is told by. name: its name.
+        """
+        rows = [row for row in self.rows if name in row.effects or text in row.formulas]
+        return sum(row.probability for row in rows) if rows else None
+
+    @cached_property
+    def log10_odds(self) -> tuple[float | None, ...]:
+        """Log10 of the odds of each row to the next; None of the last."""
+        logs = [row.log_evidence / math.log(10.0) for row in self.rows]
+        return (*(one - next_ for one, next_ in itertools.pairwise(logs)), None)
+
+    @property
+    def told(self) -> tuple[Hypothesis, ...]:
+        """The rows that have a line of their own where the table is shown: those of ``TOLD`` or more, and the first."""
+        return tuple(row for row in self.rows if row.probability >= TOLD or row is self.first)
 
     @property
     def first(self) -> Hypothesis:
@@ -158,7 +191,22 @@ class Hypotheses:
             self.inflation = max(1.0, judged.statistic / judged.dof) if judged.dof > 0 else 1.0
         effects = self._screened()
         tried = [*self._without(), *self._effects(effects), *self._pairs(effects), *self._formulas(effects)]
-        return table_of(row for row in tried if math.isfinite(row.log_evidence))
+        tried = [row for row in tried if math.isfinite(row.log_evidence)]
+        least = max(row.log_evidence for row in tried) - _APART
+        walks = [row for row in tried if row.effects == (self.walk,) and row.log_evidence > least]
+        return table_of([*tried, *map(self._returning, walks if self._noise_is_stated else ())])
+
+    @property
+    def _noise_is_stated(self) -> bool:
+        return self.evidence.noise.scatter_stated and self.evidence.noise.setting_stated
+
+    def _returning(self, walk: Hypothesis) -> Hypothesis:
+        """Return the row of biases that move irregularly and return to their mean, from that of a random walk."""
+        assert walk.refit is not None
+        gain, back_s = walk.refit.fit.back_gain
+        driver = f"time (irregular, back within about {one_digit_seconds(back_s)})"
+        prior = math.log(_KINDS["formula"] / _KINDS["effect"] / HELD)
+        return Hypothesis(driver=driver, families=walk.families, log_evidence=walk.log_evidence + gain + prior)
 
     def quick_table(self) -> Table:
         """The table of nothing, noise and single effects by the linear tests alone, for a run with no misfit."""
@@ -177,11 +225,11 @@ class Hypotheses:
         still = float(next(own.log for own in found if not own.parts)) + prior
         turned = _sum([own.log for own in found if own.parts == ("setting",)]) + prior
         spread = _sum([own.log for own in found if "common" in own.parts]) + prior
-        share = _IRREGULAR[self.evidence.noise.scatter_stated and self.evidence.noise.setting_stated]
+        share = _NO_NOISE[self._noise_is_stated]
         either = _sum([spread + math.log(share), still + math.log(_SHORT)]) + _log_odds(self.test.trend)
         yield Hypothesis(families=(NOTHING,), log_evidence=still)
         yield Hypothesis(families=(NOISE,), log_evidence=_sum([turned, spread + math.log(1.0 - share)]))
-        yield Hypothesis(driver="irregular", families=(NONE,), log_evidence=either)
+        yield Hypothesis(driver=IRREGULAR, families=(NONE,), log_evidence=either)
 
     def _screened(self) -> dict[str, float]:
         """Return the log Bayes factor of each effect by the linear tests, the likeliest first."""
@@ -307,7 +355,8 @@ class Hypotheses:
         walks, log = self.walk in effects, float(np.logaddexp.reduce(logs)) + log_prior
         if walks and self.test.trend:  # a walk goes on within dwells, where it has no column
             log += _log_odds(self.test.trend) - _log_odds(trend(refit.fit))
-        return Hypothesis(effects, formulas, "", self._families(effects), log, best.fall, best.dof + walks, refit)
+        fall = best.fall if best.dof else 2.0 * self.before.fit.walk_gain
+        return Hypothesis(effects, formulas, "", self._families(effects), log, fall, best.dof + walks, refit)
 
     def _families(self, effects: Sequence[str]) -> tuple[str, ...]:
         """Return the families of effects, each once."""

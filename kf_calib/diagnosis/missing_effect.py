@@ -22,10 +22,12 @@ from kf_calib.diagnosis.verdict import second_pass_in_words, verdict_in_words
 from kf_calib.dwells import window_average
 from kf_calib.estimation.outlying_dwell import outlying_in_words
 from kf_calib.estimation.results import Calibration, format_p
+from kf_calib.support.tail_probabilities import chi_squared_tail
 from kf_calib.support.threads import one_blas_thread
 
 _SHOWN = 6  # number of suspects that are shown
 _DOUBT = 0.01  # probability from which noise that was not stated is named as a rival
+_NOISE = 1e-6  # p-value below which readings within dwells hold more than an oscillation and noise
 _RETURNS = 1.36  # gain in log-likelihood that 1 of 20 true random walks exceeds with a time constant to return in
 
 
@@ -73,7 +75,14 @@ def _without_vibration(refits: Refits, before: Calibration, test: CandidateTests
     share = np.linalg.norm(refit.estimate.state[refit.model.parts[test.oscillating]]) / np.linalg.norm(
         test.lines[0].amplitude_mps2
     )
-    return test if share > 0.5 else test.without_lines
+    return test if share > 0.5 and _leaves_noise(refit, before) else test.without_lines
+
+
+def _leaves_noise(refit: Calibration, before: Calibration) -> bool:
+    """Tell whether a fitted oscillation leaves noise in what is kept of the readings within dwells for its sake."""
+    more, less = refit.consistency, before.consistency
+    rows = more.dof - less.dof
+    return rows <= 0 or chi_squared_tail(rows, max(more.statistic - less.statistic, 0.0)) > _NOISE
 
 
 def _explained(refits: Refits, before: Calibration, test: CandidateTests) -> Diagnosis:
@@ -89,25 +98,30 @@ def _explained(refits: Refits, before: Calibration, test: CandidateTests) -> Dia
 
 
 def _beside_lines(refits: Refits, before: Calibration, test: CandidateTests) -> Table:
-    """Return the table where an oscillation makes lines within dwells, which nothing else could: each row has it."""
+    """Return the table where an oscillation makes lines within dwells, which nothing else could.
+
+    Every known explanation has it, too; with noise from dwell to dwell it is the oscillation that is missing.
+    """
     name, known = test.oscillating, refits.with_effects(before, (test.oscillating,))
-    rest = refits.assess(known, test.effective_tests)
-    if rest.consistent is False:
-        rows = Hypotheses(refits, known, rest).table().rows
-    else:
-        rows = (Hypothesis(families=(NOTHING,), log_evidence=log_odds_of(test.p_values[name])),)
-    families = known.model.effects[-1].family
-    own = [_with(row, name, families, refits.with_effects(before, (*row.effects, name))) for row in rows]
-    none = Hypothesis(
-        families=(NOTHING,), log_evidence=max(row.log_evidence for row in rows) - log_odds_of(test.p_values[name])
-    )
-    return table_of([*own, none])
+    rest, odds = refits.assess(known, test.effective_tests), log_odds_of(test.p_values[test.oscillating])
+    family = known.model.effects[-1].family
+    alone = Hypothesis((name,), families=(family,), log_evidence=odds, refit=known)
+    if rest.consistent is not False:
+        return table_of([alone, Hypothesis(families=(NOTHING,))])
+    rows = Hypotheses(refits, known, rest).table().rows
+    none = [row.log_evidence for row in rows if not row.effects and not row.driver]
+    both = [
+        _with(refits, before, row, name, family) if row.effects else row for row in rows if row.effects or row.driver
+    ]
+    alone = replace(alone, log_evidence=float(np.logaddexp.reduce(none)))
+    nothing = Hypothesis(families=(NOTHING,), log_evidence=max(row.log_evidence for row in [*both, alone]) - odds)
+    return table_of([*both, alone, nothing])
 
 
-def _with(row: Hypothesis, name: str, family: str, refit: Calibration) -> Hypothesis:
+def _with(refits: Refits, before: Calibration, row: Hypothesis, name: str, family: str) -> Hypothesis:
     """Return a row with one effect more, fitted together with the others."""
-    others = tuple(own for own in row.families if own not in (NOTHING, family))
-    return replace(row, effects=(*row.effects, name), families=(*others, family), refit=refit)
+    effects, families = (*row.effects, name), dict.fromkeys([*row.families, family])
+    return replace(row, effects=effects, families=tuple(families), refit=refits.with_effects(before, effects))
 
 
 def _decided(refits: Refits, found: Diagnosis) -> Diagnosis:

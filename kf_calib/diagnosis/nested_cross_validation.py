@@ -38,7 +38,7 @@ def nested_cross_validation(
 ) -> NestedCrossValidation:
     """The held-out error of stepwise selection: each fold is predicted by a model selected on all others.
 
-    A fold is every ``folds``-th orientation. Where effects explain the misfit equally well, the first one is taken:
+    A fold is every ``folds``-th orientation. Where no effect has 95 % probability, the likeliest is taken:
     they predict nearly the same, and a fold that stopped there would predict nothing.
 
     start: the calibration with the first model. folds: their number, at most the number of orientations. on_fold:

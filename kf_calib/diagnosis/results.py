@@ -22,6 +22,8 @@ from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration, Parameter
 from kf_calib.support.printing import as_html, printed
 
+_TOLD_APART = 4  # most rivals that the next orientation is to tell from the likeliest effect
+
 
 @dataclass(frozen=True)
 class Suspect:
@@ -172,7 +174,9 @@ class Diagnosis:
         named = [name for name in self.ambiguity if name in test.best]
         if named and not self.unknown:
             first = test.candidate(named[0])
-            rivals = [test.candidate(name).effect for name in named[1:5]] if len(self.missing) == 1 else []
+            alone = [row.effects[0] for row in (self.table.rivals if self.table else ()) if len(row.effects) == 1]
+            others = [test.candidate(name).effect for name in alone if name in test.best]
+            rivals = others[:_TOLD_APART] if len(self.missing) == 1 else []
             advice = advise.to_tell_apart(fitted, first.effect, test.scan.coefficients(first), rivals)
             if advice is None:
                 return None

@@ -20,6 +20,7 @@
 
     [[steps]]
     added = "second-order"
+    probability = 0.998                     # with which it was missing before the step
     by = "diagnosis"
     undone = false
     ...
@@ -140,6 +141,7 @@ def write(path: Path, state: Improvement, origin: Origin) -> None:
 def _entry(step: SelectionStep) -> dict[str, Any]:
     """Return the table of one step."""
     out: dict[str, Any] = {} if step.added is None else {"added": step.added}
+    out |= {} if step.probability is None else {"probability": step.probability}
     tests = [vars(each) for each in step.dropped]
     return out | {"by": step.by, "undone": step.undone, "dropped": tests, "figures": figures(step.found)}
 

@@ -3,9 +3,9 @@
 Every step works on the dwell factors of one pass over the data. A refit depends on these factors and on the list of
 effects alone, so that a journal of the steps, or the list by itself, gives the same numbers bit for bit.
 
-Without a user, an effect is added only where no other explains the misfit equally well. Where two do, the twelve
-parameters depend on the choice, which is left to a person. Where several effects are needed together, one is added at
-a time, beginning with one that has no look-alike beside the others; the next diagnosis may then say more.
+Without a user, an effect is added only where it is missing with 95 % probability, alone or with others. Elsewhere the
+twelve parameters depend on the choice, which is left to a person. Where several effects are missing together, one is
+added at a time, the most probable first; the next diagnosis may then say more.
 After each addition every effect of the model is tested for removal, except those that the user put in.
 """
 
@@ -62,6 +62,7 @@ class SelectionStep:
 
     added: the effect that was added, as it was written (None: no effect). dropped: effects that were taken out. by: who
     chose the step. found: the diagnosis of the model after the step. undone: whether the user took the step back.
+    probability: that with which the added effect was missing before the step (None: it was not weighed).
     """
 
     added: str | None
@@ -69,6 +70,7 @@ class SelectionStep:
     by: By
     found: Diagnosis
     undone: bool = False
+    probability: float | None = None
 
     @property
     def result(self) -> Calibration:
@@ -104,7 +106,7 @@ class SelectionStep:
 
 @dataclass(frozen=True)
 class Alternative:
-    """One of several effects that explain the misfit equally well, and the calibration with it."""
+    """One of several effects among which a run cannot decide, and the calibration with it."""
 
     name: str
     result: Calibration
@@ -207,16 +209,16 @@ class Improvement:
         differ = f"; the twelve differ by up to {far.sigmas:.1f} sigma ({far.parameter.symbol})" if far else ""
         rivals = _rivals(self.found)
         if rivals and self.because == "ambiguous":
-            taken = "none was added (--accept-first takes the first)"
-            return f"{names} explain what is left equally well: {taken}{differ}. {verdict}"
-        equals = f" But {names} explain it equally well, and one was taken{differ}." if names and not rivals else ""
+            taken = "none was added (--accept-first takes the likeliest)"
+            return f"This run cannot decide among {names}: {taken}{differ}. {verdict}"
+        equals = f" But this run cannot decide among {names}; one was taken{differ}." if names and not rivals else ""
         if self.because == "asked":
             return f"Ended by you. {verdict}{equals}"
         if self.because == "consistent":
             p_value = format_p(self.found.test.p_value)
             return f"Nothing is left that noise would not leave (p {p_value}).{equals}"
         if self.found.missing and self.because == "ambiguous":
-            return f"{verdict} Others would do as well: none was added (--accept-first takes the first).{equals}"
+            return f"{verdict} No effect is sure: none was added (--accept-first takes the likeliest).{equals}"
         return f"{verdict}{equals}"
 
     @cached_property
@@ -239,8 +241,8 @@ def improve(
 ) -> Improvement:
     """Stepwise selection: add the effects that the diagnosis names until none is missing or none can be chosen.
 
-    run: a calibration, or a recording or source, which is calibrated first. accept_first: take the first of effects
-    that explain the misfit equally well instead of stopping. on_step: called after each step. refits: those of the run,
+    run: a calibration, or a recording or source, which is calibrated first. accept_first: where none has 95 %
+    probability, take the likeliest instead of stopping. on_step: called after each step. refits: those of the run,
     with its source, as for ``diagnose``.
     """
     start, refits = calibration_of(run, refits)
@@ -265,8 +267,9 @@ def _with_alternatives(state: Improvement, refits: Refits) -> Improvement:
 def _alternatives(state: Improvement, refits: Refits) -> tuple[Alternative, ...]:
     """Return the effects among which a run cannot decide: those of its diagnosis, or those of an earlier one."""
     found, result = state.found, state.result
-    if _rivals(found):
-        return tuple(Alternative(name, refits.with_effects(result, (name,))) for name in found.ambiguity)
+    if _rivals(found) and found.table is not None:
+        rows = [(row.effects, row.refit) for row in (found.table.first, *found.table.rivals) if row.effects]
+        return tuple(Alternative(" + ".join(names), refit) for names, refit in rows if refit is not None)
     out, inside = list[Alternative](), {str(effect): k for k, effect in enumerate(result.model.effects)}
     for before, step in zip([state.start, *(step.found for step in state.steps)], state.steps, strict=False):
         if step.name not in inside or step.name not in before.ambiguity:
@@ -325,7 +328,9 @@ def take_step(
     while (weak := _next_out(result, kept, dropped, len(out))) is not None:
         result = refits.of(result, _less(result, weak.name))
         out.append(weak)
-    step = SelectionStep(added, tuple(out), by, diagnose(result, refits))
+    table = state.found.table
+    share = None if added is None or table is None else table.of_added(added, _name(added, result))
+    step = SelectionStep(added, tuple(out), by, diagnose(result, refits), probability=share)
     return _with_alternatives(replace(state, history=(*state.history, step)), refits)
 
 

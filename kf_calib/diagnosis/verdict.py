@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated
-from kf_calib.diagnosis.hypotheses import NOISE, NONE, NOTHING, SURE, Hypothesis
+from kf_calib.diagnosis.hypotheses import IRREGULAR, NOISE, NONE, NOTHING, SURE, Hypothesis
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
@@ -75,7 +75,7 @@ def _named(found: Diagnosis, first: Hypothesis) -> str:
 
 def _unknown(found: Diagnosis, first: Hypothesis) -> str:
     """Return a sentence on a misfit that no known effect explains."""
-    what = "it changes irregularly" if not first.formulas else f"it goes with {first.driver}"
+    what = "it changes irregularly" if first.driver == IRREGULAR else f"it goes with {first.driver}"
     return f"Unknown: no known effect explains it, {what} ({format_probability(first.probability)}){_others(found)}."
 
 
@@ -99,12 +99,25 @@ def _others(found: Diagnosis) -> str:
     return f"; or {', '.join(told)}" if told else ""
 
 
+def explanations_in_words(found: Diagnosis) -> str:
+    """The likeliest explanations with their probabilities, for a line; "" where there are none."""
+    first = found.likeliest
+    if first is None or found.table is None:
+        return ""
+    share = found.table.probability(first.effects) if first.effects else first.probability
+    if found.sure:
+        return f"missing: {' and '.join(found.missing)} {format_probability(share)}"
+    told = [(first, share), *((row, row.probability) for row in found.table.rivals[: _TOLD - 1])]
+    text = ", ".join(f"{_in_words(found, row)} {format_probability(each)}" for row, each in told)
+    return f"suspects {text}" if first.effects else text
+
+
 def _in_words(found: Diagnosis, row: Hypothesis) -> str:
     """Return an explanation in words."""
     if row.effects:
         return _effects_of(row)
     if row.driver:
-        return "no known effect, irregular" if not row.formulas else f"no known effect, goes with {row.driver}"
+        return "no known effect, irregular" if row.driver == IRREGULAR else f"no known effect, goes with {row.driver}"
     return f"scatter from dwell to dwell{' larger than stated' if dwell_noise_is_stated(found.before) else ''}"
 
 
@@ -116,13 +129,9 @@ def _effects_of(row: Hypothesis) -> str:
 def format_probability(probability: float) -> str:
     """A probability in per cent as text, never rounded to certainty."""
     percent = 100.0 * probability
-    return (
-        "over 99.9 %"
-        if percent > 99.9
-        else f"{percent:.1f} %"
-        if percent > 99.0 or percent < 1.0
-        else f"{percent:.0f} %"
-    )
+    if percent > 99.9 or percent < 0.1:
+        return "over 99.9 %" if percent > 50.0 else "under 0.1 %"
+    return f"{percent:.1f} %" if percent > 99.0 or percent < 1.0 else f"{percent:.0f} %"
 
 
 def _returning(found: Diagnosis) -> str:

@@ -34,9 +34,11 @@ FEWEST = 6
 ENOUGH_DIRECTIONS = 12
 """With this many directions of gravity, if spread, it can be checked that a setting error only turns the force."""
 
+HELD = 12
+"""Number of time constants that are tried for a mean-reverting walk."""
+
 _SIGNIFICANT = 5.41  # 1 % point of the likelihood-ratio statistic of a variance against zero, half of a chi2 with 1 dof
 _WALK = 0.5  # a walk has to gain at least this much log-likelihood
-_HELD = 12  # time constants that are tried for a mean-reverting walk
 
 Part = Literal["setting", "common", "scatter", "walk"]
 Parts = tuple[Part, ...]
@@ -214,7 +216,7 @@ def restoring_gain(noise: Noise, means: Means, state: Floats, prior: Floats) -> 
     means, prior = _reduce(means, prior)
     free, still = _likelihood(noise, (), means, state, prior).without(), replace(noise, walk_mps2_per_sqrt_s=0.0)
     spans_s, run_s = means.ends_s[:, 1] - means.ends_s[:, 0], float(means.ends_s[-1, 1] - means.ends_s[0, 0])
-    times_s = np.geomspace(max(float(np.median(spans_s)) / 4.0, run_s * 1e-4), 2.0 * run_s, _HELD).tolist()
+    times_s = np.geomspace(max(float(np.median(spans_s)) / 4.0, run_s * 1e-4), 2.0 * run_s, HELD).tolist()
     costs = [
         _likelihood(still, {"walk"}, means, state, prior, held_s).of(("walk",)).most_likely()[1].cost
         for held_s in times_s

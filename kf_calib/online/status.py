@@ -22,6 +22,7 @@ from kf_calib.diagnosis.candidate_tests import LEVEL, assess_candidates
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.diagnosis.verdict import explanations_in_words
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.calibration import conclude, evaluate_fit, with_remarks
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG
@@ -183,9 +184,7 @@ class Judgement:
         if not self.alarm:
             return f"model consistent (p {format_p(self.p_value)}{looks})"
         dwell, channel, ratio = self.disagreeing
-        named = f"suspects {', '.join(self.suspects)}" if self.suspects else "no known effect explains it"
-        if self.found.missing and len(self.suspects) == len(self.found.missing):
-            named = f"missing: {' and '.join(self.suspects)}"
+        named = explanations_in_words(self.found) or "no known effect explains it"
         return f"orientation {dwell} disagrees: accelerometer {channel} by {ratio:+.1f} sigma; {named}"
 
     @property

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -14,6 +12,7 @@ from rich.text import Text
 from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import LEVEL
 from kf_calib.diagnosis.detectability import Detectable
+from kf_calib.diagnosis.hypotheses import Hypothesis
 from kf_calib.diagnosis.hypotheses import Table as Hypotheses
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
@@ -27,8 +26,6 @@ from kf_calib.views.console import plain, symbol
 from kf_calib.views.json import clean, outlying_object, readings_object
 from kf_calib.views.tables import Table
 from kf_calib.views.terminal import note
-
-_TOLD = 0.01  # least probability of an explanation that is shown
 
 
 def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
@@ -76,8 +73,7 @@ def found_object(found: Diagnosis) -> dict[str, Any]:
 
 def _hypotheses_object(table: Hypotheses | None) -> list[dict[str, Any]]:
     """Return the rows of the table of hypotheses as JSON objects, the likeliest first."""
-    rows = () if table is None else table.rows
-    after = [row.log_evidence for row in rows[1:]]
+    rows = () if table is None else zip(table.rows, table.log10_odds, strict=True)
     return [
         {
             "effects": list(row.effects),
@@ -86,11 +82,11 @@ def _hypotheses_object(table: Hypotheses | None) -> list[dict[str, Any]]:
             "driver": row.driver or None,
             "families": list(row.families),
             "probability": row.probability,
-            "log10_odds_to_next": (row.log_evidence - next_) / math.log(10.0) if next_ is not None else None,
+            "log10_odds_to_next": odds,
             "statistic": row.statistic,
             "dof": row.dof,
         }
-        for row, next_ in zip_longest(rows, after)
+        for row, odds in rows
     ]
 
 
@@ -221,15 +217,17 @@ def _hypothesis_table(table: Hypotheses) -> Table:
     for heading in ("explanation", "family", "probability", "χ² / dof"):
         left = heading in ("explanation", "family")
         shown_.add_column(heading, justify="left" if left else "right", no_wrap=not left)
-    for row in table.rows:
-        if row.probability < _TOLD and row is not table.first:
-            continue
-        what = " + ".join(row.effects) or (
-            f"formula of {row.driver}" if row.formulas else row.driver or row.families[0]
-        )
+    for row in table.told:
         fall = f"{row.statistic:.1f} / {row.dof}" if row.dof else ""
-        shown_.add_row(what, ", ".join(row.families), format_probability(row.probability), fall)
+        shown_.add_row(name_of(row), ", ".join(row.families), format_probability(row.probability), fall)
     return shown_
+
+
+def name_of(row: Hypothesis) -> str:
+    """An explanation in a few words, for a line of a table or figure."""
+    if row.formulas:
+        return f"formula of {row.driver}"
+    return " + ".join(row.effects) or (f"{row.driver} changes" if row.driver else row.families[0])
 
 
 def _suspect_table(found: Diagnosis) -> Table:

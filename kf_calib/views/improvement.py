@@ -12,6 +12,7 @@ from rich.text import Text
 from kf_calib.diagnosis.nested_cross_validation import NestedCrossValidation
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, SelectionStep, Spread
+from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.units import shown
 from kf_calib.views.console import effect_table, parameter_table, symbol
@@ -99,12 +100,13 @@ def _figures(found: Diagnosis) -> dict[str, Any]:
 def _step_object(step: SelectionStep, before: Diagnosis) -> dict[str, Any]:
     """Return one step as a JSON object.
 
-    The key p_value is that of the added effect in the diagnosis before the step; p_value_after is that of the model
-    after it.
+    The keys probability and p_value are those of the added effect in the diagnosis before the step; p_value_after is
+    that of the model after it.
     """
     return {
         "added": step.added,
         "by": step.by,
+        "probability": step.probability,
         **_figures(step.found),
         "p_value": None if step.name is None else before.test.p_values.get(step.name),
         "p_value_after": step.found.test.p_value,
@@ -160,25 +162,26 @@ def improvement_report(
 def progress(state: Improvement) -> RenderableType:
     """The steps as a table: held-out and in-sample rms over the noise floor as numbers and bars, with remarks below."""
     floor = state.result.held_out_floor_mps2
-    rows = [("start", state.start.before, state.start.test.p_value)]
-    rows += [(_label(step), step.result, step.found.test.p_value) for step in state.steps]
+    rows = [("start", state.start.before, None, state.start.test.p_value)]
+    rows += [(_label(step), step.result, step.probability, step.found.test.p_value) for step in state.steps]
     others = [each for each in state.alternatives if each.result is not state.result]
     word = "+" if len(others) == len(state.alternatives) else "or"  # an effect to add, or one to replace the one taken
-    rows += [(f"({word} {each.name})", each.result, None) for each in others]
-    errors = [_errors(result, floor) for _, result, _ in rows]
+    rows += [(f"({word} {each.name})", each.result, None, None) for each in others]
+    errors = [_errors(result, floor) for _, result, _, _ in rows]
     longest = max(error for both in errors for error in both if error is not None)
     unit, alone = shown("m/s^2"), "without any one orientation the model is not determined"
     head = "over the noise floor" if floor else f"{unit.label} ({alone})"
     table = Table(title=f"Rms error, {head}", title_justify="left", box=None, pad_edge=False)
     for heading in ("step", "p of the run", "", "", ""):
         table.add_column(heading, no_wrap=True)
-    for (label, _, p_value), (held_out, fitted) in zip(rows, errors, strict=True):
+    for (label, _, probability, p_value), (held_out, fitted) in zip(rows, errors, strict=True):
         p_text = "" if p_value is None else format_p(p_value).removeprefix("= ")
+        below = "" if probability is None else f"  probability {format_probability(probability)}"
         if held_out is not None:
             table.add_row(label, p_text, "held out", f"{held_out:.2f}", Bar(bar(held_out, longest), style="cyan"))
-            label = p_text = ""
+            label, p_text, below = below, "", ""
         number = f"{fitted:.2f}" if floor else unit.number(fitted, 2)
-        table.add_row(label, p_text, "fitted", number, Bar(bar(fitted, longest), style="dim"))
+        table.add_row(f"{label}{below}", p_text, "fitted", number, Bar(bar(fitted, longest), style="dim"))
     said = [Text(line) for step in state.steps for line in (*map(_out, step.dropped), *step.remarks)]
     tests = [Text(f"Tested: {_test(each)}.") for each in state.removals]
     return Group(table, *said, *tests)
@@ -269,8 +272,8 @@ def _numbered(found: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[Rend
         return []
     refits = {suspect.name: suspect for suspect in found.suspects}
     table = Table(box=None, pad_edge=False)
-    for heading in ("", "suspect", "p of the run", "fits", "held out"):
-        table.add_column(heading, justify="right" if heading in ("", "held out") else "left")
+    for heading in ("", "suspect", "probability", "p of the run", "fits", "held out"):
+        table.add_column(heading, justify="right" if heading in ("", "probability", "held out") else "left")
     for number, names in enumerate(choices, start=1):
         suspect = refits.get(names[0]) if len(names) == 1 else None
         result = suspect.refit if suspect is not None else found.after
@@ -279,5 +282,6 @@ def _numbered(found: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[Rend
             f"{result.held_out_rms_mps2 / result.held_out_floor_mps2:.2f}"
         )  # fmt: skip
         fits = "yes" if suspect is None or suspect.fits else "no"
-        table.add_row(str(number), " + ".join(names), p_value, fits, ratio)
+        share = "" if found.table is None else format_probability(found.table.probability(names))
+        table.add_row(str(number), " + ".join(names), share, p_value, fits, ratio)
     return [table]

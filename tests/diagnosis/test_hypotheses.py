@@ -11,6 +11,7 @@ from helpers.synthetic import plan_of
 
 from kf_calib.diagnosis.hypotheses import NOTHING, Hypothesis, log_odds_of, table_of
 from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.effects import effect_named, names
 from kf_calib.views.diagnosis import diagnosis_object
 
@@ -35,6 +36,24 @@ def test_probabilities_are_evidence_over_the_sum_of_all() -> None:
     assert table.first.effects == ("a",) and table.probability(["a"]) == pytest.approx(0.95)
     assert table.probability(["a", "b"]) == pytest.approx(0.15)
     assert table.families == pytest.approx({"memory": 0.99, NOTHING: 0.01})
+
+
+def test_what_is_told_of_a_table() -> None:
+    table = table_of([*rows(), Hypothesis(formulas=("mine = t",), driver="time", families=("none of the known",),
+                                          log_evidence=float(np.log(0.002)) - 900.0)])  # fmt: skip
+    assert len(table.told) == 3 and table.log10_odds[0] == pytest.approx(np.log10(80 / 15))
+    assert table.log10_odds[-1] is None and len(table.log10_odds) == len(table.rows)
+    assert table.of_any(["memory", "none of the known"]) == pytest.approx(0.992 / 1.002)
+    assert table.of_added("a", "a") == pytest.approx(0.95 / 1.002)
+    assert table.of_added("mine = t", "mine") == pytest.approx(0.002 / 1.002)
+    assert table.of_added("b2", "b2") is None
+
+
+@pytest.mark.parametrize(
+    ("probability", "text"), [(0.9995, "over 99.9 %"), (0.993, "99.3 %"), (0.5, "50 %"), (1e-5, "under 0.1 %")]
+)
+def test_a_probability_is_never_rounded_to_certainty(probability: float, text: str) -> None:
+    assert format_probability(probability) == text
 
 
 def test_rivals_do_not_only_add_to_the_first() -> None:

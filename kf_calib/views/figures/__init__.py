@@ -22,6 +22,7 @@ from kf_calib.views.figures.dwell import dwell  # noqa: E402
 from kf_calib.views.figures.engines import allan_deviation, three_ways, whiteness  # noqa: E402
 from kf_calib.views.figures.experiment import falling, table2  # noqa: E402
 from kf_calib.views.figures.history import history  # noqa: E402
+from kf_calib.views.figures.hypotheses import hypotheses  # noqa: E402
 from kf_calib.views.figures.improvement import improvement, residuals_of_steps  # noqa: E402
 from kf_calib.views.figures.information import correlations, information  # noqa: E402
 from kf_calib.views.figures.orientations import plan, predicted_sigmas  # noqa: E402
@@ -31,6 +32,7 @@ from kf_calib.views.figures.suspects import suspects  # noqa: E402
 
 __all__ = [
     "Figures", "allan_deviation", "convergence", "correlations", "detection_limits", "directions", "dwell", "estimates",
-    "falling", "figures", "history", "improvement", "information", "on_the_sphere", "plan", "predicted_sigmas",
-    "residuals", "residuals_of_steps", "save", "suspects", "table2", "three_ways", "what_they_go_with", "whiteness",
+    "falling", "figures", "history", "hypotheses", "improvement", "information", "on_the_sphere", "plan",
+    "predicted_sigmas", "residuals", "residuals_of_steps", "save", "suspects", "table2", "three_ways",
+    "what_they_go_with", "whiteness",
 ]  # fmt: skip

@@ -27,6 +27,7 @@ from kf_calib.views.figures.directions import directions
 from kf_calib.views.figures.engines import allan_deviation, three_ways, whiteness
 from kf_calib.views.figures.experiment import falling, table2
 from kf_calib.views.figures.history import history
+from kf_calib.views.figures.hypotheses import hypotheses
 from kf_calib.views.figures.improvement import improvement, residuals_of_steps
 from kf_calib.views.figures.information import correlations, information
 from kf_calib.views.figures.orientations import plan, predicted_sigmas
@@ -36,6 +37,9 @@ from kf_calib.views.figures.suspects import suspects
 
 Figures = Mapping[str, Callable[[], Figure]]
 """Title of each figure, and what draws it."""
+
+PROBABILITIES = "What it may be, and with what probability"
+"""Title of the figure that belongs to the verdict."""
 
 
 @singledispatch
@@ -48,9 +52,11 @@ def figures(result: Any) -> Figures:
 @figures.register
 def _(found: Diagnosis) -> Figures:
     fails = found.test.consistent is False
+    likely: Figures = {PROBABILITIES: lambda: hypotheses(found)} if found.table else {}
     return {
         "Where the model fails" if fails else "What the model leaves": lambda: residuals(found),
         "What the residuals go with": lambda: what_they_go_with(found),
+        **likely,
         "Which effect is missing" if fails else "Whether an effect is missing": lambda: suspects(found),
         "What could hide here": lambda: detection_limits(found),
         "Residuals by the direction of gravity": lambda: on_the_sphere(found),

@@ -17,6 +17,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.fleet.overview import FleetOverview
 from kf_calib.views import console, diagnosis, improvement, pooled_diagnosis, side_by_side
 from kf_calib.views.figures import figures
+from kf_calib.views.figures.collection import PROBABILITIES
 from kf_calib.views.report.drawing import Drawing
 from kf_calib.views.report.explorer import Explorer, explorer
 from kf_calib.views.report.measured import Measured, facts
@@ -40,11 +41,14 @@ def page_of(result: Any, measured: Sequence[Measured], commands: Sequence[str], 
 
 @page_of.register
 def _(found: Diagnosis, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
+    drawn = _drawn("", found, "found").parts
+    likely = tuple(each for each in drawn if isinstance(each, Drawing) and each.title == PROBABILITIES)
     return Page(
         measured[0].name, "Calibration report", *_standing(found.test.consistent),
         (diagnosis.verdict(found), *remarks), (Facts("", tuple(facts(measured[0], found.before))),),
         (
-            _drawn("Residuals", found, "found"),
+            Section("", likely),
+            Section("Residuals", tuple(each for each in drawn if each not in likely)),
             Section("Explore the residuals", (_explorer_of(found),)),
             Section("Parameters", (*_calibrated(found.before), *_with_what_is_missing(found))),
             _drawn("The calibration", found.before, "run"),

@@ -16,12 +16,14 @@ import rerun.blueprint as rrb
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.explanation import Explanation
+from kf_calib.diagnosis.hypotheses import TOLD, Table
 from kf_calib.diagnosis.residual_drivers import Driver, is_function_of
 from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import format_p
 from kf_calib.support.plain_text import printable
-from kf_calib.views.diagnosis import verdict
+from kf_calib.views.diagnosis import name_of, verdict
 from kf_calib.views.rerun.chart import Axis, Chart, frames, sheet, thin, write
 from kf_calib.views.rerun.explorer import (
     Log,
@@ -45,6 +47,7 @@ from kf_calib.views.rerun.names import CHANNELS, GOLD, MAUVE, WHITE
 EXPLANATION = "explanation"
 _MOST = 5  # explanations
 _DRIVERS = 8
+_BAR = 16  # letters of a bar
 _SIZE = (236.0, 210.0)
 
 
@@ -171,6 +174,8 @@ def _summary(view: View) -> str:
     """The verdict, the next orientation, the explanations by rank, and the quantities by what they explain."""
     found = view.found
     blocks = [f"**{verdict(found)}**"]
+    if found.table is not None:
+        blocks.append(_probabilities(found.table))
     if found.next_orientation is not None:
         advice, why = found.next_orientation
         angles = ", ".join(f"{angle:.4g}" for angle in advice.gimbal_deg)
@@ -185,6 +190,17 @@ def _summary(view: View) -> str:
         rows = [f"| {each.words} | {of_share(each)} | p {format_p(each.p_value)} |" for each in view.drivers]
         blocks.append("\n".join(["| quantity | goes with | |", "|:--|:--|:--|", *rows]))
     return "\n\n".join(blocks) + "\n"
+
+
+def _probabilities(table: Table) -> str:
+    """Families and explanations with their probabilities as bars, the likeliest first, without the unlikely."""
+    families = [(name, share) for name, share in table.families.items() if share >= TOLD]
+    rows = [*families, ("", None), *((name_of(row), row.probability) for row in table.told)]
+    lines = [
+        "| | | |" if share is None else f"| {name} | {format_probability(share)} | {'█' * round(_BAR * share)} |"
+        for name, share in rows
+    ]
+    return "\n".join(["| it may be | probability | |", "|:--|--:|:--|", *lines])
 
 
 def _p(each: Explanation) -> str:

@@ -18,6 +18,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, SelectionStep
+from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support import units
@@ -239,7 +240,8 @@ def _summary(view: View, number: int) -> str:
 
 
 def _done(step: SelectionStep) -> str:
-    added = [f"{step.added} added"] if step.added else []
+    share = "" if step.probability is None else f", which was missing with {format_probability(step.probability)}"
+    added = [f"{step.added} added{share}"] if step.added else []
     return "; ".join([*added, *(f"{each.name} taken out (p {format_p(each.p_value)})" for each in step.dropped)])
 
 
