@@ -103,7 +103,7 @@ def _content(value: Any) -> Any:
 
 
 @click.command(
-    epilog=examples("fleet campaign/ -o fleet", "fleet 's3://lab/2026/*.mcap' -o fleet --scheduler tcp://host:8786")
+    epilog=examples("fleet campaign/ -o fleet", "fleet s3://lab/2026/ -o fleet --scheduler tcp://host:8786")
 )
 @click.argument("runs", nargs=-1, required=True)
 @click.option("-o", "--out", required=True, type=click.Path(file_okay=False, path_type=Path), metavar="FOLDER",

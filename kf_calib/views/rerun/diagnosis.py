@@ -47,7 +47,6 @@ from kf_calib.views.rerun.names import CHANNELS, GOLD, MAUVE, WHITE
 EXPLANATION = "explanation"
 _MOST = 5  # explanations
 _DRIVERS = 8
-_BAR = 16  # letters of a bar
 _SIZE = (236.0, 210.0)
 
 
@@ -193,14 +192,11 @@ def _summary(view: View) -> str:
 
 
 def _probabilities(table: Table) -> str:
-    """Families and explanations with their probabilities as bars, the likeliest first, without the unlikely."""
+    """Families and explanations with their probabilities, the likeliest first, without the unlikely."""
     families = [(name, share) for name, share in table.families.items() if share >= TOLD]
     rows = [*families, ("", None), *((name_of(row), row.probability) for row in table.told)]
-    lines = [
-        "| | | |" if share is None else f"| {name} | {format_probability(share)} | {'█' * round(_BAR * share)} |"
-        for name, share in rows
-    ]
-    return "\n".join(["| it may be | probability | |", "|:--|--:|:--|", *lines])
+    lines = ["| | |" if share is None else f"| {name} | {format_probability(share)} |" for name, share in rows]
+    return "\n".join(["| it may be | probability |", "|:--|--:|", *lines])
 
 
 def _p(each: Explanation) -> str:
