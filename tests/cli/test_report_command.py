@@ -80,7 +80,7 @@ def test_what_cannot_be_read_is_a_sentence(run, against: str) -> None:
     ("words", "says"),
     [
         (("improve", HIDDEN, "--unattended"), "Stopped, consistent"),
-        (("compare", CLEAN), "differ by at most"),
+        pytest.param(("compare", CLEAN), "differ by at most", marks=pytest.mark.slow),
     ],
 )
 def test_improve_and_compare_save_a_page_too(run, words: tuple[object, ...], says: str) -> None:
