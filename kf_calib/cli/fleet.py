@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -14,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
-from kf_calib.cli.echo import complain
+from kf_calib.cli.echo import complain, echo
 from kf_calib.cli.failures import sentence
-from kf_calib.cli.files import claimed, delivery
+from kf_calib.cli.files import Delivery, claimed, delivery
 from kf_calib.cli.options import (
     MODEL,
     OUTPUT,
@@ -46,13 +45,13 @@ if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Diagnosis
     from kf_calib.estimation.results import Calibration
     from kf_calib.fleet.batch import Progress
+    from kf_calib.fleet.bench_model_files import BenchModelFiles
     from kf_calib.fleet.overview import FleetOverview
     from kf_calib.fleet.reference_unit import ReferenceUnit
-    from kf_calib.fleet.results import Fleet
     from kf_calib.fleet.run_list import Run
+    from kf_calib.support.output_files import Outputs
 
 WORK = "Who does the work"
-_NOT_IN_NAMES = re.compile(r"[^\w.-]+|^\.+")  # of files, on any system
 _PACKAGES = ("distributed", "pyarrow", "fsspec")
 
 
@@ -102,9 +101,7 @@ def _content(value: Any) -> Any:
     return [_content(each) for each in value] if isinstance(value, tuple | list) else value
 
 
-@click.command(
-    epilog=examples("fleet campaign/ -o fleet", "fleet s3://lab/2026/ -o fleet --scheduler tcp://host:8786")
-)
+@click.command(epilog=examples("fleet campaign/ -o fleet", "fleet s3://lab/2026/ -o fleet --scheduler tcp://host:8786"))
 @click.argument("runs", nargs=-1, required=True)
 @click.option("-o", "--out", required=True, type=click.Path(file_okay=False, path_type=Path), metavar="FOLDER",
               panel=OUTPUT, help="The table of runs; runs that are in it already are not evaluated again.")  # fmt: skip
@@ -152,6 +149,7 @@ def fleet(
             "--workers are processes of this machine, --scheduler has workers of its own: choose one."
         )
     from kf_calib.bench.targets import targets_of
+    from kf_calib.fleet.bench_model_files import BenchModelFiles
     from kf_calib.fleet.results import Fleet, populations
     from kf_calib.fleet.run_list import runs_of
     from kf_calib.views import fleet as views
@@ -165,13 +163,14 @@ def fleet(
     found = Fleet(out)
     with progress("diagnosing the runs together", as_json):
         overview = found.overview(wanted, pooled=pooled, reference_unit=reference)
-    models = _save_bench_models(found, overview) if pooled else []
+    models = BenchModelFiles(out, overview.pooled, overwrite)
     if as_json:
-        print_json(views.fleet_object(found, populations(found), done, overview, models))
+        print_json(views.fleet_object(found, populations(found), done, overview, list(models.models)))
     else:
-        show(views.fleet_report(found, populations(found), done, overview, models))
+        show(views.fleet_report(found, populations(found), done, overview))
     commands_again = commands_of(get_current_context())
     with delivery(outputs, as_json) as deliver, progress("drawing the figures", as_json):
+        _deliver_bench_models(models, outputs, deliver, as_json)
         deliver.file(report, lambda path: _save_page(overview, commands_again, path))
         pictures.save_figures(deliver, figures_of(overview))
 
@@ -201,19 +200,15 @@ def _reference(path: Path | None) -> ReferenceUnit | None:
     return ReferenceUnit(unit, (scale[0], scale[1], scale[2]), (sigma[0], sigma[1], sigma[2]))
 
 
-def _save_bench_models(fleet: Fleet, overview: FleetOverview) -> list[Path]:
+def _deliver_bench_models(files: BenchModelFiles, outputs: Outputs, deliver: Delivery, quiet: bool) -> None:
     """Write the bench model of each bench that has errors; those of before that no longer hold are removed."""
-    from kf_calib.fleet.bench_terms import bench_models
-
-    folder = fleet.path / "bench_models"
-    for old in folder.glob("*.toml"):
-        old.unlink()
-    made = list[Path]()
-    for bench, model in bench_models(overview.pooled).items() if overview.pooled else ():
-        folder.mkdir(exist_ok=True)
-        made.append(folder / f"{_NOT_IN_NAMES.sub('_', bench) or 'bench'}.toml")
-        model.write(made[-1])
-    return made
+    words = {path: f"saved {path}: for --bench-model" for path in files.models}
+    words |= {path: f"removed {path}, which no longer holds" for path in files.outdated}
+    for path, said in words.items():
+        outputs.own(path)  # which files may be replaced is seen by what is in them
+        done = deliver.keep(path, files.write if path in files.models else Path.unlink)
+        if done and not quiet:
+            echo(said)
 
 
 def _checked(options: Mapping[str, Any]) -> SingleCommands:

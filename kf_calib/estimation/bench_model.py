@@ -77,6 +77,11 @@ class BenchModel:
 
     def write(self, path: Path) -> None:
         """Write it whole or not at all; raises InputError if it cannot be written."""
+        write_whole(path, self.text.encode())
+
+    @property
+    def text(self) -> str:
+        """It as TOML."""
         import tomli_w
 
         table: dict[str, Any] = {"bench": self.bench} if self.bench else {}
@@ -89,7 +94,7 @@ class BenchModel:
             for term in self.terms
         ]  # fmt: skip
         head = "# Bench model of kf_calib, SI units: kf-calib replay RECORDING --bench-model THIS_FILE\n"
-        write_whole(path, (head + tomli_w.dumps(table)).encode())
+        return head + tomli_w.dumps(table)
 
 
 def read(path: str | Path) -> BenchModel:

@@ -2,11 +2,13 @@
 
 Rows are appended as small Arrow files, which take a hundredth of the time of Parquet, and merged into Parquet from time
 to time and at the end. Every file is written beside its place and renamed when it is whole: whoever reads the folder,
-at any time and however the writer ended, finds whole files only, and all that was finished.
+at any time and however the writer ended, finds whole files only, and all that was finished. What else lies in the folder
+is somebody's own, and neither read nor removed: files of the table are known by their names.
 """
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -24,6 +26,7 @@ from kf_calib.support.file_lock import lock, writer
 from kf_calib.support.output_files import whole
 
 _SMALL, _LARGE = "*.arrow", "*.parquet"
+_OWN_NAME = re.compile(r"runs-\d{20}-\d+")
 _MOST_SMALL = 256
 """Small files that are merged while a fleet is being evaluated."""
 
@@ -63,14 +66,15 @@ class Store:
         held = self.folder / ".lock"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            with held.open("ab") as file:
-                if not lock(file):
-                    raise InputError(
-                        f"{self.folder.parent} is being written by {writer(held) or 'another run'}: wait for it."
-                    )
-                yield
+            file = held.open("ab")
         except OSError as error:
             raise InputError(f"{self.folder}: {error.strerror}: give another folder (-o).") from None
+        with file:
+            if not lock(file):
+                raise InputError(
+                    f"{self.folder.parent} is being written by {writer(held) or 'another run'}: wait for it."
+                )
+            yield
 
     def append(self, rows: Sequence[Row]) -> None:
         """Write rows; when this returns they are on disk."""
@@ -113,7 +117,7 @@ class Store:
         return [*self._files(_LARGE), *self._files(_SMALL)]
 
     def _files(self, kind: str) -> list[Path]:
-        return sorted(file for file in self.folder.glob(kind) if not file.name.startswith("."))
+        return sorted(file for file in self.folder.glob(kind) if _OWN_NAME.fullmatch(file.stem))
 
     def _new(self, kind: str) -> Path:
         self._written += 1
@@ -134,8 +138,15 @@ def _newest(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterato
 
 
 def _rows(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterator[pa.RecordBatch]:
-    """Yield all rows of some files."""
+    """Yield all rows of some files; raises InputError where one of them is damaged."""
     for kind, form in ((_LARGE, "parquet"), (_SMALL, "ipc")):
         if own := [str(file) for file in files if file.match(kind)]:
-            data = ds.dataset(own, schema=SCHEMA, format=form)
-            yield from data.to_batches(columns=list(columns), batch_size=rows, batch_readahead=1, fragment_readahead=1)
+            try:
+                data = ds.dataset(own, schema=SCHEMA, format=form)
+                yield from data.to_batches(columns=list(columns), batch_size=rows, batch_readahead=1,
+                                           fragment_readahead=1)  # fmt: skip
+            except (pa.ArrowException, OSError) as error:
+                said = " ".join(str(error).split()).rstrip(".")
+                raise InputError(
+                    f"a file of the table is damaged ({said}): move it away, and its runs are evaluated again."
+                ) from None

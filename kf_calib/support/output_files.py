@@ -71,7 +71,8 @@ class Outputs:
         self._own.add(path)
 
     def own(self, path: Path) -> None:
-        """This run has begun the file by itself, and may write it again."""
+        """Whoever saves the file sees to it that nobody else's is replaced: this run has begun it, or it tells by what
+        is in it."""
         self._own.add(path)
 
 

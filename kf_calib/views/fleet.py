@@ -59,7 +59,6 @@ def fleet_report(
     populations: Sequence[ParameterPopulation],
     done: Progress,
     overview: FleetOverview,
-    bench_models: Sequence[Path],
 ) -> RenderableType:
     """The report of ``fleet``."""
     failures = fleet.failures()
@@ -74,7 +73,6 @@ def fleet_report(
     if len(failures) > _SHOWN:
         parts.append(note(f"{len(failures) - _SHOWN} more runs failed: the column error of the table says why"))
     parts += [pooled_report(overview.pooled)] if overview.pooled else []
-    parts += [Text(f"saved {path}: for --bench-model") for path in bench_models]
     parts += [look_table(overview)] if overview.looks else []
     return Group(*parts, *(note(said) for said in overview.remarks))
 

@@ -23,6 +23,7 @@ from fleet_generator import Campaign, record
 import kf_calib
 from kf_calib.cli.evaluate import replay
 from kf_calib.cli.fleet import SingleCommands
+from kf_calib.errors import InputError
 from kf_calib.fleet import cluster
 from kf_calib.fleet.batch import evaluate_all
 from kf_calib.fleet.evaluation import Evaluation
@@ -145,6 +146,27 @@ def test_finished_runs_are_in_the_table_before_the_end(
     assert len(found) == seen[-1] > 0
     assert evaluate_all(client, evaluation(), runs_of([str(campaign)]), store).kept == seen[-1]
     assert len(kf_calib.open_fleet(tmp_path / "fleet")) == 4
+
+
+def test_other_files_in_the_folder_of_the_table_stay_and_are_not_read(
+    campaign: Path, client: Client, store: Store, tmp_path: Path
+) -> None:
+    some, *more = runs_of([str(campaign)])
+    evaluate_all(client, evaluation(), [some], store)
+    (own,) = store.folder.glob("*.parquet")
+    others = [store.folder / name for name in ("mine.parquet", "mine.arrow", f"{own.stem} (copy).parquet")]
+    for path in others:
+        path.write_text("mine")
+    (store.folder / "folder.arrow").mkdir()
+    evaluate_all(client, evaluation(), [some, *more], store)
+    shutil.copy(own, others[0])  # of the same form
+    evaluate_all(client, evaluation(effects=("second-order",)), [some], store)
+    assert len(kf_calib.open_fleet(tmp_path / "fleet")) == 4 and not own.exists()
+    assert all(path.exists() for path in others) and (store.folder / "folder.arrow").is_dir()
+    (kept,) = set(store.folder.glob("runs-*.parquet")) - {*others}
+    kept.write_bytes(kept.read_bytes()[:1000])
+    with pytest.raises(InputError, match=r"a file of the table is damaged \(.*runs-.*: move it away"):
+        store.known()
 
 
 class _Deadly(SingleCommands):

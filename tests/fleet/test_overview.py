@@ -78,6 +78,9 @@ def test_the_command_ends_with_what_all_runs_show_together(bent: Path, run: Any,
     _, with_model, _ = run("diagnose", one, "--bench-model", model, "--json")
     assert json.loads(alone)["p_value"] < 1e-3 < 0.01 < json.loads(with_model)["p_value"]
     assert kf_calib.open_fleet(tmp_path / "fleet").pooled().findings[0].effect == "flexure"
+    Path(model).write_text("# mine\n")
+    code, out, err = run("fleet", bent, "-o", tmp_path / "fleet")
+    assert code == 2 and "show flexure" in out and f"{model} is not as kf-calib fleet wrote it, and was left" in err
 
 
 @pytest.mark.parametrize(

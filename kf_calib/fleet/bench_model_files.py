@@ -1,0 +1,81 @@
+"""The bench models in the folder of a fleet: a file for each bench.
+
+The first line of each says that the fleet wrote it under this name, with a checksum of the rest. A file that is still as
+it says is replaced, and removed when it no longer holds. Any other is somebody's own, and stays.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from kf_calib.errors import InputError
+from kf_calib.estimation.bench_model import BenchModel
+from kf_calib.fleet.bench_terms import bench_models
+from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis
+from kf_calib.support.output_files import write_whole
+
+_NOT_IN_NAMES = re.compile(r"[^\w.-]+|^\.+")  # of files, on any system
+_LONGEST = 60
+
+
+@dataclass(frozen=True)
+class BenchModelFiles:
+    """The files that a pooled diagnosis leads to; found: None where there is none, and then all stays as it is."""
+
+    fleet: Path
+    found: PooledDiagnosis | None
+    overwrite: bool = False
+
+    @property
+    def folder(self) -> Path:
+        return self.fleet / "bench_models"
+
+    @cached_property
+    def models(self) -> dict[Path, BenchModel]:
+        """The bench model of each bench that has errors, by its file; no two benches share one."""
+        names = dict[str, Path]()
+        models = {} if self.found is None else bench_models(self.found)
+        for bench in models:
+            name = stem = _NOT_IN_NAMES.sub("_", bench)[:_LONGEST] or "bench"
+            while name.casefold() in names:
+                name = f"{stem}-{len(names) + 1}"
+            names[name.casefold()] = self.folder / f"{name}.toml"
+        return dict(zip(names.values(), models.values(), strict=True))
+
+    def write(self, path: Path) -> None:
+        """Write one of them. Raises InputError where somebody's own file is in its place, or it cannot be written."""
+        if not (self.overwrite or _is_own(path)) and path.exists():
+            raise InputError(
+                f"{path} is not as kf-calib fleet wrote it, and was left: move it away, or give --overwrite."
+            )
+        try:
+            self.folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self.folder} cannot be made ({error.strerror}): move away what is there.") from None
+        text = self.models[path].text
+        write_whole(path, (_head(path, text) + text).encode())
+
+    @property
+    def outdated(self) -> list[Path]:
+        """Files of before that no longer hold."""
+        if self.found is None:
+            return []
+        return [path for path in sorted(self.folder.glob("*.toml")) if path not in self.models and _is_own(path)]
+
+
+def _head(path: Path, text: str) -> str:
+    checksum = hashlib.sha256(text.encode()).hexdigest()[:16]
+    return f"# {path.name}: kf-calib fleet replaces or removes this file as long as nobody changes it ({checksum})\n"
+
+
+def _is_own(path: Path) -> bool:
+    """Whether a file is as it was written here."""
+    try:
+        head, line_end, text = path.read_bytes().decode().partition("\n")
+    except (OSError, ValueError):
+        return False
+    return not path.is_symlink() and head + line_end == _head(path, text)
