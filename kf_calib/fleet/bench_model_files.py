@@ -1,7 +1,7 @@
 """The bench models in the folder of a fleet: a file for each bench.
 
-The first line of each says that the fleet wrote it under this name, with a checksum of the rest. A file that is still as
-it says is replaced, and removed when it no longer holds. Any other is somebody's own, and stays.
+The first line of each says that the fleet wrote it under this name, with a checksum of the rest. A file that is still
+as it says is replaced, and removed when it no longer holds. Any other is somebody's own, and stays.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Rows are appended as small Arrow files, which take a hundredth of the time of Parquet, and merged into Parquet from time
 to time and at the end. Every file is written beside its place and renamed when it is whole: whoever reads the folder,
-at any time and however the writer ended, finds whole files only, and all that was finished. What else lies in the folder
-is somebody's own, and neither read nor removed: files of the table are known by their names.
+at any time and however the writer ended, finds whole files only, and all that was finished. What else lies in the
+folder is somebody's own, and neither read nor removed: files of the table are known by their names.
 """
 
 from __future__ import annotations
