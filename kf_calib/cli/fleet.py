@@ -28,12 +28,13 @@ from kf_calib.cli.options import (
     print_json,
     progress,
     recording_options,
+    save_view,
     settings_of,
     show,
     target_option,
     units_option,
 )
-from kf_calib.cli.pictures import Pictures, figure_options, figures_of
+from kf_calib.cli.pictures import Pictures, figures_of, picture_options
 from kf_calib.cli.report import commands_of, report_option
 from kf_calib.cli.signals import Interrupter, answered
 from kf_calib.errors import InputError
@@ -116,7 +117,7 @@ def _content(value: Any) -> Any:
               "gravity of the bench shows.")  # fmt: skip
 @target_option(panel=OUTPUT)
 @report_option
-@figure_options
+@picture_options
 @overwrite_option
 @recording_options
 @filter_options
@@ -169,10 +170,10 @@ def fleet(
     else:
         show(views.fleet_report(found, populations(found), done, overview))
     commands_again = commands_of(get_current_context())
-    with delivery(outputs, as_json) as deliver, progress("drawing the figures", as_json):
+    with delivery(outputs, as_json) as deliver, progress("drawing the pictures", as_json):
         _deliver_bench_models(models, outputs, deliver, as_json)
         deliver.file(report, lambda path: _save_page(overview, commands_again, path))
-        pictures.save_figures(deliver, figures_of(overview))
+        pictures.save(deliver, lambda path: save_view(overview, path), figures_of(overview))
 
 
 def _save_page(overview: FleetOverview, commands: Sequence[str], path: Path) -> None:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from kf_calib.estimation.engine_comparison import Comparison
     from kf_calib.estimation.results import Calibration
     from kf_calib.estimation.settings import Settings
+    from kf_calib.fleet.overview import FleetOverview
     from kf_calib.sources.files.recording import Recording
     from kf_calib.sources.tables.opening import Units
     from kf_calib.sources.tables.table import Table
@@ -377,7 +378,7 @@ def effects_of(options: Mapping[str, Any]) -> tuple[str, ...]:
     return merged(model.effects, options["effects"])
 
 
-def save_view(result: Calibration | Diagnosis | Improvement | Comparison, path: Path) -> None:
+def save_view(result: Calibration | Diagnosis | Improvement | Comparison | FleetOverview, path: Path) -> None:
     """The Rerun view of a result; Rerun is imported when there is one to save."""
     from kf_calib.views import rerun
 

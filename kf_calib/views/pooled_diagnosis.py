@@ -65,11 +65,16 @@ def _pooled_object(row: EffectRow, finding: Finding | None) -> dict[str, Any]:
 
 def pooled_report(found: PooledDiagnosis) -> RenderableType:
     """A pooled diagnosis for a console: what was found, the probabilities, and the coefficients."""
-    parts: list[RenderableType] = [Text(sentence) for sentence in [_summary(found), *map(_sentence, found.findings)]]
+    parts: list[RenderableType] = [Text(sentence) for sentence in sentences(found)]
     rows = [row for row in found.effects if row.no_one is not None and row.no_one < 1.0 - _SHOWN]
     if rows:
         parts.append(_probabilities(rows))
     return Group(*parts, *(_coefficients(each) for each in found.findings))
+
+
+def sentences(found: PooledDiagnosis) -> list[str]:
+    """A pooled diagnosis in sentences: what the runs show, and of what each effect is."""
+    return [_summary(found), *map(_sentence, found.findings)]
 
 
 def _summary(found: PooledDiagnosis) -> str:
@@ -92,7 +97,8 @@ def _sentence(found: Finding) -> str:
         said += f": {found.share:.0%} of the units have it ({low:.0%} to {high:.0%}), most likely {_listed(having)}"
     if found.repair is not None:
         gap = found.repair.gaps[0]
-        said += f": it changed between {gap.after or gap.after_run} and {gap.before or gap.before_run}"
+        said += f": it changed between {_moment(gap.after) or gap.after_run} and "
+        said += _moment(gap.before) or gap.before_run
         said += f" (probability {gap.probability:.2f})"
     rivals = [f"{name} ({share:.2f})" for name, share in found.rivals.items()]
     return f"{said}. In its place it may be {' or '.join(rivals)}." if rivals else f"{said}."
@@ -137,7 +143,13 @@ def _coefficients(found: Finding) -> Table:
 
 
 def _when(bench: BenchCoefficients) -> str:
-    return f"{bench.bench or 'the bench'}, since {bench.since}" if bench.since else bench.bench or "the bench"
+    name = bench.bench or "the bench"
+    return f"{name}, since {_moment(bench.since)}" if bench.since else name
+
+
+def _moment(date: str) -> str:
+    """A date to the minute."""
+    return date[:16].replace("T", " ")
 
 
 def _add(table: Table, name: str, values: Sequence[PooledEstimate]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +12,17 @@ import numpy as np
 import pytest
 from distributed import Client, LocalCluster
 from fleet_generator import Campaign, record
-from helpers.run_factors import Hidden, nothing, run_factor_of
+from helpers.fleet_overviews import BENT, overview_with
+from helpers.run_factors import run_factor_of
 
 import kf_calib
 from kf_calib.estimation import bench_model
 from kf_calib.fleet import cluster
-from kf_calib.fleet.overview import FleetOverview, overview_of
 from kf_calib.fleet.pooled_diagnosis import pooled_diagnosis
 from kf_calib.views.figures import figures
 from kf_calib.views.report.contents import page_of
 
 pytestmark = pytest.mark.xdist_group("fleet")
-BENT = np.array([2.0, -1.5, 2.5])
-BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -99,30 +96,6 @@ def test_what_is_lacking_is_said(bent: Path, run: Any, tmp_path: Path, given: li
     printed = json.loads(out)
     assert (printed["pooled"], printed["bench_models"], printed["remarks"]) == (None, [], says)
     assert {"unit": str(bad), "chance": 0.0, "reasons": ["bad.mcap failed"]} in printed["another_look"]
-
-
-def rows_of(count: int, outlying: int | None = None) -> list[dict[str, Any]]:
-    """Rows of units measured twice, a week apart each; one of them lies far from the others."""
-    rng = np.random.default_rng(5)
-    own = rng.standard_normal(count)
-    if outlying is not None:
-        own[outlying] = 60.0
-    return [
-        {
-            "run": f"run{k:03d}", "unit": f"unit{k % count:02d}", "bench": "bench 1", "error": None, "consistent": True,
-            "p_value": 0.5, "missing": None, "date": BEGIN + timedelta(weeks=k),
-            "parameters": [{
-                "symbol": "b1", "value": 1e-4 * own[k % count] + 1e-6 * rng.standard_normal(), "sigma": 1e-6,
-                "unit": "m/s^2", "nominal": 0.0,
-            }],
-        }
-        for k in range(2 * count)
-    ]  # fmt: skip
-
-
-def overview_with(hidden: Hidden = nothing, outlying: int | None = None) -> FleetOverview:
-    factors = [run_factor_of(k, hidden, date=(BEGIN + timedelta(weeks=k)).isoformat()) for k in range(20)]
-    return overview_of("fleet", rows_of(20, outlying), {"b1": 2e-6}, pooled_diagnosis(factors), ())
 
 
 def test_a_unit_outside_the_population_is_named_first() -> None:

@@ -24,6 +24,7 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.results import Calibration
+from kf_calib.fleet.overview import FleetOverview
 from kf_calib.online.status import Judgement
 from kf_calib.support.plain_text import printable
 from kf_calib.views.rerun.ahead import log_next, words
@@ -32,6 +33,7 @@ from kf_calib.views.rerun.correlation import log_correlation
 from kf_calib.views.rerun.diagnosis import save as save_diagnosis
 from kf_calib.views.rerun.estimates import log_estimates
 from kf_calib.views.rerun.file import rrd_file, strict
+from kf_calib.views.rerun.fleet import save as save_fleet
 from kf_calib.views.rerun.improvement import save as save_improvement
 from kf_calib.views.rerun.layout import TABS, layout
 from kf_calib.views.rerun.names import BENCH_TIME, ORIENTATION
@@ -52,7 +54,7 @@ def save(result: Any, path: str | Path) -> Path:
     Raises InputError where the file cannot be written.
     """
     raise TypeError(f"there is no Rerun view of {type(result).__name__}: give the result of calibrate, diagnose, "
-                    "improve or compare.")  # fmt: skip
+                    "improve, compare or the overview of a fleet.")  # fmt: skip
 
 
 @save.register
@@ -77,6 +79,11 @@ def _(result: Improvement, path: str | Path) -> Path:
 @save.register
 def _(result: Comparison, path: str | Path) -> Path:
     return save_comparison(result, Path(path))
+
+
+@save.register
+def _(result: FleetOverview, path: str | Path) -> Path:
+    return save_fleet(result, Path(path))
 
 
 def log(result: Calibration, stream: rr.RecordingStream) -> None:

@@ -59,8 +59,20 @@ def per_si() -> Floats:
     return np.array([shown(unit).per_si for unit in paper_parameters.UNITS])
 
 
+def label_of(symbol: str) -> str:
+    """A parameter as it is drawn; a coefficient of an effect as it is called."""
+    return LABELS.get(symbol, printable(symbol))
+
+
+def entity(*parts: str) -> str:
+    """The path of an entity, whatever characters are in the names of its parts."""
+    return rr.new_entity_path([*parts]).lstrip("/")
+
+
 def colour_of(symbol: str) -> Colour:
-    """The accelerometer's colour, paler for its second angle."""
+    """The accelerometer's colour, paler for its second angle; one for all coefficients of effects."""
+    if symbol not in LABELS:
+        return MAUVE
     accelerometer, place = divmod(paper_parameters.SYMBOLS.index(symbol), 4)
     return PALE[accelerometer] if place == 1 else ACCELEROMETERS[accelerometer]
 
@@ -94,7 +106,7 @@ def quantities(model: Model) -> tuple[Quantity, ...]:
     """The twelve parameters, then the coefficients of the effects in the model."""
     coefficients = [
         Quantity(printable(each.symbol), printable(shown(each).label), shown(each).per_si, MAUVE,
-                 rr.new_entity_path(["parameters", "effects", each.symbol]).lstrip("/"))
+                 entity("parameters", "effects", each.symbol))
         for each in model.coefficients
     ]  # fmt: skip
     return (*twelve(), *coefficients)
