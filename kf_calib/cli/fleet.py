@@ -149,6 +149,8 @@ def fleet(
         raise click.UsageError(
             "--workers are processes of this machine, --scheduler has workers of its own: choose one."
         )
+    if reference_unit is not None and not pooled:
+        raise click.UsageError("--reference-unit is for the diagnosis of all runs together: leave out --no-pooled.")
     from kf_calib.bench.targets import targets_of
     from kf_calib.fleet.bench_model_files import BenchModelFiles
     from kf_calib.fleet.results import Fleet, populations
@@ -198,7 +200,8 @@ def _reference(path: Path | None) -> ReferenceUnit | None:
     scale, sigma = ([getattr(each, part) for each in own.values()] for part in ("value", "sigma"))
     if None in (*scale, *sigma):
         raise InputError(f"{path} does not determine all three scale factors: name one that does.")
-    return ReferenceUnit(unit, (scale[0], scale[1], scale[2]), (sigma[0], sigma[1], sigma[2]))
+    known = (scale[0], scale[1], scale[2]), (sigma[0], sigma[1], sigma[2])
+    return ReferenceUnit(unit, *known, saved.provenance.sha256)
 
 
 def _deliver_bench_models(files: BenchModelFiles, outputs: Outputs, deliver: Delivery, quiet: bool) -> None:

@@ -25,6 +25,8 @@ _TOGETHER = 64  # runs whose matrices are computed at once
 _SEEN = 1e-6  # of a column's norm: what is less beside the run's own parameters is rounding
 _LARGE = 64.0  # sigmas of one run, up to which sizes are expected where the catalogue knows no usual ones
 
+_TOLD = 3  # units that a message names
+
 _Part = tuple[str, str, int, int, Floats, Floats]
 """Label, unit, bench, rank, information and score of a block."""
 
@@ -98,8 +100,9 @@ class Campaign:
             raise InputError("there are no runs to diagnose together: give at least two.")
         if not symbols:
             raise InputError("the runs have no columns of effects: runs that are diagnosed together need angles.")
-        if reference and reference.unit not in {key.unit for key in self.keys}:
-            raise InputError(f"no run is of the reference unit {reference.unit}: name a unit that was measured.")
+        self._of_reference = sum(key.unit == reference.unit for key in self.keys) if reference else 0
+        if reference and not self._of_reference:
+            raise InputError(_not_measured(reference.unit, sorted({key.unit for key in self.keys})))
         self.benches = sorted({key.bench for key in self.keys})
         self._columns = [column_name(name, symbol) for name, own in symbols.items() for symbol in own]
         self._places = dict[tuple[str, ...], tuple[NDArray[np.intp], NDArray[np.intp]]]()
@@ -161,7 +164,7 @@ class Campaign:
         for key, factor in zip(self.keys, self._read(), strict=True):
             upper = factor.factor
             if self._reference and key.unit == self._reference.unit:
-                upper = self._reference.known(factor)
+                upper = self._reference.known(factor, self._of_reference)
             own, places = self._found(factor)
             rows = upper[factor.width :, places] * self._units_si[own]
             rows[:, _hidden(upper, factor.width, places)] = 0.0
@@ -229,3 +232,11 @@ def _usual(effect: Effect | None) -> float:
 def _stacked(part: Sequence[_Part]) -> Blocks:
     labels, units, benches, ranks, infos, scores = zip(*part, strict=True)
     return Blocks(labels, units, np.array(benches), np.array(ranks), np.array(infos), np.array(scores))
+
+
+def _not_measured(unit: str, units: Sequence[str]) -> str:
+    more = f" and {len(units) - _TOLD} more" if len(units) > _TOLD else ""
+    return (
+        f"no run is of the reference unit {unit}, they are of {', '.join(units[:_TOLD])}{more}: name a unit that was "
+        "measured, or say of which unit the runs are in a list (.csv with the columns run and unit)."
+    )

@@ -79,7 +79,7 @@ def test_spread_of_the_units_is_that_from_which_they_were_drawn(both: PooledDiag
 def test_report_and_document_say_what_was_found(both: PooledDiagnosis) -> None:
     text = " ".join(rendered(pooled_report(both)).split())
     assert "30 runs of 30 units on 1 bench show" in text
-    assert "flexure is of the bench, changed once" in text and "between 2026-01-01T00:012 and 2026-01-01T00:013" in text
+    assert "flexure is of the bench, changed once" in text and "between 2026-01-01 00:12 and 2026-01-01 00:13" in text
     assert "second-order is of the type of sensor" in text
     document = json.loads(json.dumps(both.document(), allow_nan=False))
     row = next(each for each in document["effects"] if each["effect"] == "second-order")
@@ -132,6 +132,9 @@ def test_wrong_gravity_shows_against_a_reference_unit_alone() -> None:
     assert only.effect == "gravity-error" and only.attribution is Attribution.BENCH
     assert value.value is not None and value.sigma is not None
     assert abs(value.value - 50e-6) < 4.0 * value.sigma < 10e-6
+    roughly = replace(known, sigma=(9e-6, 9e-6, 9e-6))
+    (value,) = pooled_diagnosis(runs, reference_unit=roughly).findings[0].benches[0].coefficients
+    assert value.sigma == pytest.approx(9e-6 / math.sqrt(3.0), rel=0.05)  # four runs do not make it better known
 
 
 def test_two_benches_have_errors_of_their_own() -> None:
@@ -150,7 +153,7 @@ def test_bench_model_holds_what_the_last_runs_have(both: PooledDiagnosis, tmp_pa
     made = bench_model(both, "bench 1")
     made.write(tmp_path / "bench.toml")
     assert bench_models.read(tmp_path / "bench.toml") == made
-    assert [term.effect for term in made.terms] == ["flexure"] and made.terms[0].since == "2026-01-01T00:013"
+    assert [term.effect for term in made.terms] == ["flexure"] and made.terms[0].since == "2026-01-01T00:13"
     with pytest.raises(InputError, match="no run is of the bench 'other': name one of 'bench 1'"):
         bench_model(both, "other")
     with pytest.raises(InputError, match=r"no error of the bench 'bench 1' was found in 4 runs"):

@@ -42,9 +42,10 @@ def run_factor_of(
     for effect, coefficients in hidden(number).items():
         for symbol, size in zip(EFFECTS[effect], coefficients, strict=True):
             readings = readings + columns[f"{effect}/{symbol}"] * size / np.sqrt(_ROWS - len(STATES))
+    moment = date or f"2026-01-01T{number // 60:02d}:{number % 60:02d}"
     rows = np.column_stack([own, *columns.values(), readings])
     return RunFactor(
-        f"run{number:03d}", unit or f"unit{number:03d}", bench or "bench 1", date or f"2026-01-01T00:{number:03d}",
+        f"run{number:03d}", unit or f"unit{number:03d}", bench or "bench 1", moment,
         (*STATES, *names), len(STATES), triangle(rows), _ROWS, {}, NOMINAL, False,
     )  # fmt: skip
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, time, timedelta
+from typing import Literal
 
 import numpy as np
 import rerun as rr
@@ -202,7 +203,10 @@ def _style(stream: rr.RecordingStream, path: str, style: rr.SeriesLines | rr.Ser
 
 
 def _lines(
-    names: Sequence[str], colours: Sequence[Colour] | tuple[int, ...], width: float, mode: str = "Linear"
+    names: Sequence[str],
+    colours: Sequence[Colour] | tuple[int, ...],
+    width: float,
+    mode: Literal["Linear", "StepAfter"] = "Linear",
 ) -> rr.SeriesLines:
     """How as many lines look, in one colour or each in its own."""
     own = list(colours) if isinstance(colours, list) else [colours] * len(names)

@@ -47,7 +47,7 @@ def draw(track: Track, names: Sequence[str], chart: Chart, ink: Ink) -> None:
         ink.lines([chart.level(float(level))], GREY, thin(width))
     values = (track.values[runs] - track.nominal) * per_si
     pale = thin(2.0 * crowd(int(runs.sum())))
-    ink.points(chart.at(track.places[runs] + 1.0, values), (*colour, 90), pale)
+    ink.points(chart.at(track.places[runs].astype(float) + 1.0, values), (*colour, 90), pale)
     means, outside = (track.units - track.nominal) * per_si, track.chances < OUTLIER
     number = np.arange(1.0, len(means) + 1.0)
     inside = thinned_units(track) & ~outside & np.isfinite(means)
