@@ -52,7 +52,7 @@ def evaluate_all(
     would fail again.
     """
     known = store.known()
-    waiting = deque(run for run in runs if not _is_done(run, known.get(run.place), evaluation.settings))
+    waiting = deque(run for run in runs if not _is_done(run, known.get(run.place), evaluation))
     progress = Progress(len(runs), kept=len(runs) - len(waiting))
     on_progress(progress)
     for rows, kept in _evaluated(client, evaluation, waiting, known):
@@ -66,9 +66,10 @@ def evaluate_all(
     return progress
 
 
-def _is_done(run: Run, known: Known | None, settings: str) -> bool:
+def _is_done(run: Run, known: Known | None, evaluation: Evaluation) -> bool:
     """Tell without reading a run that its row in the table holds."""
-    return bool(known and known.sha256 and known.settings == settings and run.version and known.version == run.version)
+    same = known and known.sha256 and run.version and known.version == run.version
+    return bool(same and known and known.settings == evaluation.settings_of(run))
 
 
 def _evaluated(
@@ -80,7 +81,7 @@ def _evaluated(
     def begin() -> None:
         run = waiting.popleft()
         before = known.get(run.place)
-        same = before.sha256 if before and before.settings == evaluation.settings else None
+        same = before.sha256 if before and before.settings == evaluation.settings_of(run) else None
         future = client.submit(evaluation, run, same, pure=False)
         under_way[future] = run
         ready.add(future)
@@ -90,13 +91,13 @@ def _evaluated(
     while waiting and len(under_way) < most:
         begin()
     for futures in ready.batches():
-        rows = [_row(future, under_way.pop(future), evaluation.settings) for future in futures]
+        rows = [_row(future, under_way.pop(future), evaluation) for future in futures]
         for _ in range(min(len(futures), len(waiting))):
             begin()
         yield [row for row in rows if row is not None], sum(row is None for row in rows)
 
 
-def _row(future: Future[Any], run: Run, settings: str) -> Row | None:
+def _row(future: Future[Any], run: Run, evaluation: Evaluation) -> Row | None:
     """Return what a worker found; where it was lost with its process, a row that says so."""
     error: Any = future.exception()
     if error is None:
@@ -104,5 +105,5 @@ def _row(future: Future[Any], run: Run, settings: str) -> Row | None:
     if isinstance(error, KilledWorker):
         times = error.allowed_failures + 1
         said = f"{run.place}: the process that evaluated it was ended {times} times: give the workers more memory."
-        return begun(run, settings) | {"error": said}
+        return begun(run, evaluation.settings_of(run)) | {"error": said}
     raise KfCalibError(f"{run.place}: no worker could evaluate it ({' '.join(str(error).split())}).") from error

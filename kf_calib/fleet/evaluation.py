@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import platform
 import time
 from dataclasses import dataclass
@@ -50,10 +52,17 @@ class Evaluation:
     commands: Commands
     settings: str
 
+    def settings_of(self, run: Run) -> str:
+        """Checksum of all that the row of a run depends on besides its recording: what a list says of it, too."""
+        stated = [run.unit, run.bench, run.date.isoformat() if run.date else None]
+        if not any(stated):
+            return self.settings
+        return hashlib.sha256(json.dumps([self.settings, *stated]).encode()).hexdigest()
+
     def __call__(self, run: Run, known_sha256: str | None = None) -> Row | None:
         """The row of a run; None if its content is the one that ``known_sha256`` belongs to. Whatever goes wrong is a
         sentence in the row."""
-        row, begun_s = begun(run, self.settings), time.process_time()
+        row, begun_s = begun(run, self.settings_of(run)), time.process_time()
         try:
             with local_copy(run) as path, one_blas_thread():
                 row["sha256"] = fingerprint(path)

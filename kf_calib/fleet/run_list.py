@@ -123,7 +123,9 @@ def _listed(files: Any, path: str) -> list[dict[str, str]] | None:
     with files.open(path, "r", encoding="utf-8-sig", newline="") as file:
         if path.endswith(".txt"):
             return [{"run": text} for line in file if (text := line.partition("#")[0].strip())]
-        table = csv.DictReader(file)
+        first = file.readline()
+        file.seek(0)
+        table = csv.DictReader(file, delimiter=max(",;\t", key=first.count))
         columns = [name.strip().lower() for name in table.fieldnames or ()]
         if "run" not in columns:
             return None  # a table of orientations, which is one run itself

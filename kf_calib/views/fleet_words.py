@@ -9,7 +9,7 @@ _LEAST = 1e-6
 
 def short_name(unit: str) -> str:
     """The name of a unit; of one that goes by its recording, the name of the file."""
-    return unit.rsplit("/", 1)[-1]
+    return unit.rsplit("/", 1)[-1] if unit.startswith("/") or "://" in unit else unit
 
 
 def chance_words(chance: float) -> str:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -112,7 +113,11 @@ def test_a_run_is_evaluated_again_only_if_it_or_the_settings_changed(
     assert (again.evaluated, again.kept) == (2, 3)
     changed = evaluate_all(client, evaluation(effects=("second-order",)), runs_of([str(some)]), store)
     assert changed.evaluated == 1
+    (named,) = runs_of([str(other)])
+    named = replace(named, unit="B")
+    assert [evaluate_all(client, evaluation(), [named], store).evaluated for _ in range(2)] == [1, 0]
     table = kf_calib.open_fleet(tmp_path / "fleet").rows()
+    assert [row["unit"] for row in table.to_pylist() if row["run"] == str(other)] == ["B"]
     assert sorted(table["run"].to_pylist()) == sorted(map(str, own.rglob("*.mcap")))
     assert [row["model"] for row in table.to_pylist() if row["run"] == str(some)] == [["second-order"]]
     assert len(list((tmp_path / "fleet" / "runs").glob("*.parquet"))) == 1

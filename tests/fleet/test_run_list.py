@@ -45,6 +45,8 @@ def test_a_list_says_whose_runs_they_are(folder: Path) -> None:
         ("a.mcap", "7"), ("gone.mcap", "8"), ("deep/b.db3", "9"),
     ]  # fmt: skip
     assert found[0].date is not None and found[0].date.isoformat() == "2026-05-31T00:00:00+00:00"
+    (folder / "semicolons.csv").write_text("run;unit\na.mcap;7, new\n")
+    assert [run.unit for run in runs_of([str(folder / "semicolons.csv")])] == ["7, new"]
     (folder / "list.txt").write_text("# of May\n\na.mcap  # the first\n")
     assert names(runs_of([str(folder / "list.txt")]), folder) == ["a.mcap"]
 
