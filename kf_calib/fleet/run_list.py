@@ -128,6 +128,10 @@ def _listed(files: Any, path: str) -> list[dict[str, str]] | None:
         table = csv.DictReader(file, delimiter=max(",;\t", key=first.count))
         columns = [name.strip().lower() for name in table.fieldnames or ()]
         if "run" not in columns:
+            if {"unit", "bench"} & {*columns}:
+                raise InputError(
+                    f"{path}: has no column run: a list names its runs there, beside unit, bench and date."
+                )
             return None  # a table of orientations, which is one run itself
         return [dict(zip(columns, (str(cell or "").strip() for cell in row.values()), strict=False)) for row in table]
 

@@ -20,6 +20,7 @@ from kf_calib.estimation import bench_model
 from kf_calib.fleet import cluster
 from kf_calib.fleet.pooled_diagnosis import pooled_diagnosis
 from kf_calib.views.figures import figures
+from kf_calib.views.fleet_words import short_name
 from kf_calib.views.report.contents import page_of
 
 pytestmark = pytest.mark.xdist_group("fleet")
@@ -96,6 +97,10 @@ def test_what_is_lacking_is_said(bent: Path, run: Any, tmp_path: Path, given: li
     printed = json.loads(out)
     assert (printed["pooled"], printed["bench_models"], printed["remarks"]) == (None, [], says)
     assert {"unit": str(bad), "chance": 0.0, "reasons": ["bad.mcap failed"]} in printed["another_look"]
+
+
+def test_a_unit_goes_by_its_name_or_that_of_its_recording() -> None:
+    assert list(map(short_name, ("lab/7", "/lab/7.mcap", "s3://lab/7.mcap"))) == ["lab/7", "7.mcap", "7.mcap"]
 
 
 def test_a_unit_outside_the_population_is_named_first() -> None:

@@ -47,6 +47,9 @@ def test_a_list_says_whose_runs_they_are(folder: Path) -> None:
     assert found[0].date is not None and found[0].date.isoformat() == "2026-05-31T00:00:00+00:00"
     (folder / "semicolons.csv").write_text("run;unit\na.mcap;7, new\n")
     assert [run.unit for run in runs_of([str(folder / "semicolons.csv")])] == ["7, new"]
+    (folder / "wrong.csv").write_text("file,unit\na.mcap,7\n")
+    with pytest.raises(InputError, match=r"wrong\.csv: has no column run"):
+        runs_of([str(folder / "wrong.csv")])
     (folder / "list.txt").write_text("# of May\n\na.mcap  # the first\n")
     assert names(runs_of([str(folder / "list.txt")]), folder) == ["a.mcap"]
 
