@@ -70,7 +70,7 @@ class Fit:
         """Whitened rows [H | W | z] by which the misfit is judged, see ``square_root_information.misfit_rows``."""
         carried = self.carried
         rows, _ = square_root_information.misfit_rows(
-            self.dwells, carried.columns, self.noise.judging, carried.state, carried.model.count
+            carried.turned, carried.columns, self.noise.judging, carried.state, carried.model.count
         )
         return square_root_information.with_frame(rows, carried.model, self.noise, len(rows) - len(self.dwells))
 
@@ -125,7 +125,7 @@ class Fit:
         1 sigma of each."""
         carried, count = self.carried, self.carried.model.count
         columns = [np.concatenate(both, axis=3) for both in zip(carried.columns, changes, strict=True)]
-        rows = square_root_information.whiten(carried.dwells, columns, self.noise.weights, carried.state)
+        rows = square_root_information.whiten(carried.turned, columns, self.noise.weights, carried.state)
         upper = square_root_information.accumulate(rows, self.steps)
         gains = upper[:count, :count].T @ upper[:count, count:-1]
         return gains @ gains.T
@@ -181,7 +181,7 @@ class Fit:
 
     def _whitened(self, noise: Noise) -> list[Floats]:
         carried = self.carried
-        rows = square_root_information.whiten(self.dwells, carried.columns, noise, carried.state)
+        rows = square_root_information.whiten(carried.turned, carried.columns, noise, carried.state)
         return square_root_information.with_frame(rows, carried.model, noise)
 
 
@@ -402,15 +402,7 @@ def _best(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> int:
 def _falls(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> Floats:
     """Return the decrease of chi-squared for the same effect at several values, each added to the ``rest`` of the
     model."""
-    state = np.concatenate([fitted.carried.state[:12], np.zeros(rest.count - 12)])
+    parts, state = fitted.carried.model.parts, fitted.carried.state
+    state = np.concatenate([state[:STATE_COUNT], *(state[parts[str(effect)]] for effect in rest.effects)])
     return falls(Carried(fitted.dwells, rest, state), fitted.noise.weights, grid)
 
-
-def loss_within_range(fitted: Fit, effect: Effect) -> float:
-    """Increase of chi-squared if the constant of an effect is moved from its value to the best grid value that is at
-    least a factor of two inside its range."""
-    assert effect.unknown is not None
-    stimulus = stimulus_of(fitted.dwells, fitted.carried.model.bench, fitted.carried.state)
-    within = [v for v in effect.grid(stimulus) if 2.0 * effect.unknown.low < v < 0.5 * effect.unknown.high]
-    falls = _falls(fitted, fitted.carried.model - effect, [effect, *(effect.at(value) for value in within)])
-    return float(falls[0] - falls[1:].max(initial=-np.inf))
