@@ -98,7 +98,8 @@ class DwellFactor:
     - came_from: the dwell before it, if that one has been left out of the fit; else None.
     - pose_sigma_rad: uncertainty of its pose due to noise of the angles.
     - turns: whole turns of each gimbal by which its pose goes beyond the angles as recorded.
-    - turned_rad: rotation vector (3,) by which effects of a model turn the specific force that its pose shows.
+    - turned_rad: rotation vector (3,) by which effects of a model turn the specific force that its pose shows; None
+      where they do not.
     """
 
     number: int
@@ -154,15 +155,16 @@ class DwellFactor:
     @cached_property
     def regressors(self) -> Floats:
         """The rows of the regressors 1, f_x, f_y, f_z in each piece, (pieces, K, 4)."""
-        values = self.felt(self.nodes.regressors).reshape(len(self.pieces), 3, -1)
+        nodes = replace(self.nodes, force_mps2=self.felt(self.nodes.force_mps2))
+        values = nodes.regressors.reshape(len(self.pieces), 3, -1)
         return self.triangles[:, : self.width, :3] @ parabola(values)
 
-    def felt(self, regressors: Floats) -> Floats:
-        """Regressors 1, f_x, f_y, f_z (n, 4) with the specific force turned by ``turned_rad``."""
+    def felt(self, force_mps2: Floats) -> Floats:
+        """The specific force (n, 3) that is felt where the angles show this one."""
         if self.turned_rad is None:
-            return regressors
+            return force_mps2
         angle_rad = float(np.linalg.norm(self.turned_rad))
-        return np.hstack([regressors[:, :1], turn(regressors[:, 1:], self.turned_rad / angle_rad, angle_rad)])
+        return turn(force_mps2, self.turned_rad / angle_rad, angle_rad)
 
     @cached_property
     def squares(self) -> Floats:

@@ -61,7 +61,7 @@ class Stimulus:
     variance_mps2_2: variance of the readings about here, (m, 3). rate_radps, rate_change_radps2: omega of the platform
     in its own frame and its derivative there, (m, 3), zero where it stands. half_s, within: half the length of the
     piece of a dwell an instant belongs to, and where in it that is, from -1 to 1, (m,); zeros where it is of no piece.
-    turned_rad: rotation vector by which effects are known to turn the specific force, (m, 3) or (1, 3).
+    turned_rad: rotation vector by which effects of the model have turned the specific force already, (m, 3) or (1, 3).
     carrier_hz: of dwells folded on a carrier, 0: none; part: of a column, that without the carrier (0) or the envelope
     of its cosine (1), sine (2).
     """

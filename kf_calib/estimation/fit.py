@@ -109,12 +109,12 @@ class Fit:
         if carried.model.square:
             out += self._considered(free_attitude.square_changes(carried))
         for known in carried.model.known:
-            columns = candidate_columns(carried.dwells, [known.effect], carried.model.bench, carried.state)
+            columns = candidate_columns(carried.turned, [known.effect], carried.model.bench, carried.state)
             out += self._considered([own @ known.root for own in columns])
         for effect in carried.model.stepped:
             spread, part = self.spreads.get(str(effect), 0.0), carried.model.parts[str(effect)]
             ends = [effect.at(effect.value * math.exp(step)) for step in (spread, -spread)]
-            more, less = (candidate_columns(carried.dwells, [end], carried.model.bench, carried.state) for end in ends)
+            more, less = (candidate_columns(carried.turned, [end], carried.model.bench, carried.state) for end in ends)
             out += self._considered(
                 [0.5 * (a - b) @ carried.state[part, None] for a, b in zip(more, less, strict=True)]
             )
@@ -332,7 +332,7 @@ def _reach(fitted: Fit) -> Floats:
     are not moved."""
     model, reach = fitted.carried.model, np.ones(fitted.carried.model.count)
     if model.unknowns:
-        stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
+        stimulus = stimulus_of(fitted.carried.turned, model.bench, fitted.carried.state)
         for k, effect in model.unknowns.items():
             reach[k] = effect.reach(stimulus)
     return reach
@@ -366,7 +366,7 @@ def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
 def _placed(fitted: Fit) -> Model:
     """Return the model with each unknown constant at the grid value at which its effect lowers chi-squared most."""
     model = fitted.carried.model
-    stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
+    stimulus = stimulus_of(fitted.carried.turned, model.bench, fitted.carried.state)
     for effect in model.unknowns.values():
         grid = [effect.at(value) for value in effect.grid(stimulus)]
         model = model.with_effect(grid[_best(fitted, model - effect, grid)])
@@ -381,7 +381,7 @@ def _averaged(fitted: Fit) -> tuple[Model, dict[str, float]]:
     values at which the columns step.
     """
     model, spreads = fitted.carried.model, dict[str, float]()
-    stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
+    stimulus = stimulus_of(fitted.carried.turned, model.bench, fitted.carried.state)
     for effect in model.stepped:
         edges = np.log(effect.edges(stimulus))
         middles, widths = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)

@@ -176,7 +176,6 @@ class Model:
         """The design H (m, 3, p): the change of each accelerometer's reading per unit of each state, linearised at
         ``state`` (p,)."""
         out = np.zeros((len(stimulus), 3, self.count))
-        stimulus = replace(stimulus, turned_rad=self.turned_rad(stimulus, state))
         for i in range(3) if not stimulus.part else ():
             out[:, i, 4 * i : 4 * i + 3] = stimulus.force_mps2
             out[:, i, 4 * i + 3] = 1.0
@@ -192,11 +191,11 @@ class Model:
         return out
 
     def turned_rad(self, stimulus: Stimulus, state: Floats) -> Floats:
-        """Rotation vectors (m, 3) or (1, 3) by which the effects at ``state`` (p,) turn the specific force."""
-        out = np.zeros((1, 3))
+        """Rotation vectors (m, 3) by which the effects at ``state`` (p,) turn the specific force."""
+        out = np.zeros((len(stimulus), 3))
         for effect in self.effects:
-            if isinstance(effect, FrameEffect):
-                out = out + effect.turned_rad(stimulus, state[self.parts[str(effect)]])
+            if isinstance(effect, FrameEffect) and effect.shows_in(stimulus):
+                out += effect.turned_rad(stimulus, state[self.parts[str(effect)]])
         return out
 
 

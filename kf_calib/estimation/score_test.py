@@ -161,7 +161,7 @@ class Frame:
     def __init__(self, carried: Carried, noise: Noise, effects: Sequence[Effect]) -> None:
         self.dwells, self.noise, self.state, self.effects = carried.turned, noise, carried.state, list(effects)
         self.parts = slices(counts_of(effects))
-        self._stimulus = stimulus_of(carried.dwells, carried.model.bench, carried.state)
+        self._stimulus = stimulus_of(carried.turned, carried.model.bench, carried.state)
         self._whitening = None if _inside(noise) else MisfitColumns(carried.turned, noise, carried.state)
         self.basis, self.coordinates = orthonormal(self.whitened(carried, effects))
         self._periodogram: Periodogram | None = None
@@ -190,7 +190,7 @@ class Frame:
         if self._whitening is not None:
             return self._whitening.of(piece_columns(effects, self._stimulus))
         # a walk is whitened by the columns of the biases, which are among the twelve
-        added = candidate_columns(carried.dwells, effects, carried.model.bench, self.state, self._stimulus)
+        added = candidate_columns(carried.turned, effects, carried.model.bench, self.state, self._stimulus)
         both = [
             np.concatenate([own[..., :STATE_COUNT], more], axis=3)
             for own, more in zip(carried.columns, added, strict=True)
@@ -345,7 +345,7 @@ def unweighted_left(carried: Carried, effects: Sequence[Effect]) -> Floats:
     """The share (n,) of the sum of squares of the residuals of the dwells' means that each effect, added alone, leaves;
     all means of all accelerometers have the same weight."""
     means, state = carried.means, carried.state
-    own = means_of(carried.dwells, candidate_columns(carried.dwells, effects, carried.model.bench, state)).design
+    own = means_of(carried.turned, candidate_columns(carried.turned, effects, carried.model.bench, state)).design
     design = means.design.reshape(-1, means.design.shape[2])
     columns = np.hstack([own.reshape(len(design), -1), means.readings.reshape(-1, 1)])
     basis, sizes = _spanned(design / carried.sizes), np.linalg.norm(columns, axis=0)
@@ -392,10 +392,10 @@ def whiten_model(
     - state: where small rotations and input axes are linearised; by default at the state in ``carried``.
     - stimulus: the stimulus of the dwells at that state, if it is already known.
     """
-    at, dwells = carried.state if state is None else state, carried.dwells
+    at, dwells = carried.state if state is None else state, carried.turned
     added = candidate_columns(dwells, effects, carried.model.bench, at, stimulus)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
-    rows, width = _judged(carried.turned, columns, noise, at, carried.model.count)
+    rows, width = _judged(dwells, columns, noise, at, carried.model.count)
     return _stacked(rows, dwells, noise), width
 
 
