@@ -18,9 +18,6 @@ del os.environ["COLUMNS"]  # readline sets it behind Python's back, and a child 
 import kf_calib.views.diagnosis  # noqa: F401 (with it results print themselves, as with the public names)
 from kf_calib.cli import main
 
-# Tests of full disks limit the size of files: Python 3.11 would leave half a compiled module where it imports one then.
-sys.dont_write_bytecode = True
-
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "recordings"
 
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
 import os
 import re
-import resource
 import signal
 import socket
 import subprocess
@@ -23,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from helpers.full_disk import full_disk
 from helpers.hidden_effects import BENCH
 from helpers.long_runs import slow
 from helpers.paths import ROOT
@@ -412,19 +411,6 @@ def test_a_log_goes_on_when_there_is_room_again(monkeypatch: pytest.MonkeyPatch,
             out("three")
         out("four")
     assert (tmp_path / "log").read_text() == "one\ntw\nfour\n" and out.lost == 2
-
-
-@contextlib.contextmanager
-def full_disk(size: int) -> Iterator[None]:
-    """No file can grow beyond ``size`` bytes, of this process and those that it starts."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # Python 3.11 would keep half a compiled module
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-        try:
-            yield
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize("form", [[], ["--json"]])
