@@ -16,6 +16,7 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from helpers.full_disk import full_disk
 
 from kf_calib import effects
@@ -46,7 +47,7 @@ BENCH = Bench(parse_axes("y z x"), 9.81)
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     path = tmp_path_factory.mktemp("outputs") / "run.mcap"
-    subprocess.run([sys.executable, "-m", "kf_calib.cli", "simulate", path, *QUICK], check=True, capture_output=True)
+    assert CliRunner().invoke(cli, ["simulate", str(path), *QUICK]).exit_code == 0
     return path.read_bytes()
 
 
