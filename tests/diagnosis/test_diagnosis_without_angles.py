@@ -52,7 +52,7 @@ def test_the_board_in_recordings_is_improved_by_what_its_truth_says() -> None:
 
 
 def test_a_walk_of_the_biases_is_found_by_its_likelihood() -> None:
-    found = kf_calib.diagnose(kf_calib.calibrate(by_hand("bias-walk=3e-4", poses=24)))
+    found = kf_calib.diagnose(kf_calib.calibrate(by_hand("bias-walk=3e-4", poses=18)))
     assert found.missing == ("bias-walk",) and found.after is not None
     intensity = found.after.parameters["qb"]
     assert intensity.value == pytest.approx(3e-4, rel=0.6)
