@@ -178,7 +178,7 @@ def _within(carried: Carried, noise: Noise, state: Floats) -> Floats:
     """
     free = replace(noise, scatter_mps2=np.full(3, _FREE_MPS2), setting_rad=0.0, free=False, walk_mps2_per_sqrt_s=0.0)
     columns = [own[..., STATE_COUNT:] for own in carried.columns]
-    rows = np.concatenate(whiten(carried.dwells, columns, free, state, reduced=False))
+    rows = np.concatenate(whiten(carried.turned, columns, free, state, reduced=False))
     lacking = max(rows.shape[1] - len(rows), 0)
     return triangle(np.vstack([rows, np.zeros((lacking, rows.shape[1]))]))
 

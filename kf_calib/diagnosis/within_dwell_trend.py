@@ -119,7 +119,7 @@ def _squares(carried: Carried, state: Floats) -> tuple[Floats, Mask]:
     """
     out, seen = np.zeros((len(carried.dwells), 3, _DEGREE)), np.zeros((len(carried.dwells), _DEGREE), bool)
     for places in alike(carried.dwells):
-        dwells, columns = [carried.dwells[k] for k in places], np.array([carried.columns[k] for k in places])
+        dwells, columns = [carried.turned[k] for k in places], np.array([carried.columns[k] for k in places])
         width, triangles = dwells[0].width, np.array([dwell.triangles for dwell in dwells])
         left = triangles[:, :, :width, width:] - triangles[:, :, :width, :width] @ on_basis(columns @ state)
         frame, known = _shapes_in(dwells, triangles)
