@@ -67,8 +67,8 @@ def test_the_separation_predicted_is_that_of_the_run_that_goes_there(
 
 @pytest.mark.parametrize("sigmas", [14.0, 20.0])
 def test_no_other_stay_gains_much_more_for_its_time(sigmas: float) -> None:
-    """A drift from a warm-up: the gain in squared separation, up to the 36 that suffice, over what the wait and one more
-    visit take, in steps of a sixtieth of the run; none and all of it gain less."""
+    """A drift from a warm-up: the gain in squared separation, up to the 36 that suffice, over the time that a wait and
+    one more visit take, in steps of a sixtieth of the run; to wait not at all or for all of it gains less."""
     bench = run(plan=PLAN).bench
     one, other = effect_named("bias-drift", bench), effect_named("warm-up", bench).at(150.0)
     result, size, found = advised(one, other, sigmas)
