@@ -32,7 +32,7 @@ _STEPS = 12
 _WAY_S = 10.0  # assumed time to the next orientation after a single dwell
 _TOLD = 0.1  # sigma; effects with a smaller separation after any next dwell cannot be told apart
 _MOVE = 3.0  # dwells; the cost of one more visit
-_WAITS = (0.0, 0.25, 1.0)  # possible waits, as shares of the duration so far
+_WAITS = (0.0, *np.geomspace(1.0 / 16.0, 1.0, 9))  # possible waits, as shares of the duration so far
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from kf_calib.effects.effect import Grade
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration, Parameter
 from kf_calib.support.printing import as_html, printed
+from kf_calib.support.units import span
 
 _TOLD_APART = 4  # most rivals that the next orientation is to tell from the likeliest effect
 
@@ -181,7 +182,7 @@ class Diagnosis:
             if advice is None:
                 return None
             words = f"tells {named[0]} from {', '.join(advice.told)}" if advice.told else f"shows {named[0]} best"
-            stay = "" if advice.stay_s is None else f" in {advice.stay_s / 60.0:.0f} min there"
+            stay = "" if advice.stay_s is None else f" in {span(advice.stay_s)} there"
             return advice, f"{words}: separation {advice.before:.1f} -> {advice.after:.1f} sigma{stay}"
         hidden = [test.candidate(name).effect for name in test.invisible if name in test.best]
         shown = advise.to_show(fitted, hidden)

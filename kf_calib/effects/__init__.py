@@ -38,7 +38,7 @@ _PLAIN: dict[str, type[Effect]] = {
         thermal.ThermalBias, thermal.ThermalBias2, thermal.ThermalScale, thermal.ThermalRate,
         thermal.ThermalMisalignment, thermal.ThermalLag, surroundings.Magnetic,
         frame.BaseTilt, frame.BaseTiltDrift, frame.PlatformDrift, frame.GravityError,
-        frame.EarthRotation, frame.Flexure, frame.CrossTalk, dynamic.Latency, dynamic.LeverArm,
+        frame.EarthRotation, frame.Flexure, frame.UnevenFlexure, frame.CrossTalk, dynamic.Latency, dynamic.LeverArm,
     )
 }  # fmt: skip
 _OF_A_GIMBAL = {

@@ -88,7 +88,7 @@ class Flexure(FrameEffect):
 
     family = "base and platform"
     name, title, source = "flexure", "bending under the torque of gravity", "linear elasticity"
-    confused_with = "encoder-harmonic-1, cross-coupling"
+    confused_with = "encoder-harmonic-1, cross-coupling, uneven-flexure"
     typical = Typical((5e-6 / STANDARD_GRAVITY_MPS2, 100e-6 / STANDARD_GRAVITY_MPS2))
 
     @property
@@ -97,6 +97,24 @@ class Flexure(FrameEffect):
 
     def rotations(self, s: Stimulus) -> Floats:
         return -np.cross(s.force_mps2[:, None, :], np.eye(3))
+
+
+class UnevenFlexure(Flexure):
+    """The platform turns by c_i (f x d)_i about its axis i, c the compliances about the three axes.
+
+    The coefficients are the products c_i d_j; equal compliances make a flexure.
+    """
+
+    name, title = "uneven-flexure", "bending with another stiffness about each axis"
+    confused_with = "flexure, cross-coupling, cross-axis-square"
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"c{i}d{j}", "rad s^2/m", 1e-4) for j in "XYZ" for i in "XYZ" if i != j)
+
+    def rotations(self, s: Stimulus) -> Floats:
+        parts = super().rotations(s)[..., None] * np.eye(3)  # (m, j, i, 3): by d_j, about axis i alone
+        return parts[:, *np.nonzero(~np.eye(3, dtype=bool))]  # d_j turns nothing about axis j
 
 
 class CrossTalk(Effect):

@@ -139,6 +139,16 @@ def significant(value: float, digits: int = 3) -> str:
     return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e9 else text
 
 
+def span(seconds: float) -> str:
+    """A duration as text, such as ``45 s``, ``12 min``, ``3.4 h`` or ``5 d``; "-" where it is unknown or infinite."""
+    if not math.isfinite(seconds):
+        return "-"
+    for size, unit in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= 2.0 * size:
+            return f"{seconds / size:.2g} {unit}"
+    return f"{seconds:.0f} s"
+
+
 def rounded(value: float, sigma: float) -> tuple[str, str]:
     """A value and its sigma as text, rounded to two significant digits of sigma (GUM 7.2.6)."""
     if not (math.isfinite(sigma) and sigma > 0):

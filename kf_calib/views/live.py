@@ -15,7 +15,7 @@ from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.online.progress import Progress
 from kf_calib.online.status import Judgement, Standing
 from kf_calib.support.plain_text import sentence
-from kf_calib.support.units import STANDARD_GRAVITY_MPS2, shown
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2, shown, span
 from kf_calib.views.console import symbol
 from kf_calib.views.diagnosis import found_object, orientation_object
 from kf_calib.views.json import clean, replay_object
@@ -209,13 +209,3 @@ def _fit(judgement: Judgement) -> Text:
 def _angles(degrees: Floats | tuple[float, ...]) -> str:
     """Return angles in deg as text, to a tenth of a degree."""
     return ", ".join(f"{round(float(angle), 1):g}" for angle in degrees)
-
-
-def span(seconds: float) -> str:
-    """A duration as text, such as ``45 s``, ``12 min``, ``3.4 h`` or ``5 d``; "-" where it is unknown or infinite."""
-    if not math.isfinite(seconds):
-        return "-"
-    for size, unit in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
-        if seconds >= 2.0 * size:
-            return f"{seconds / size:.2g} {unit}"
-    return f"{seconds:.0f} s"

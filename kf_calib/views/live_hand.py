@@ -13,10 +13,10 @@ from kf_calib.bench import paper_parameters
 from kf_calib.design.sides import turn_in_words
 from kf_calib.online.hand_status import HandJudgement, HandStanding
 from kf_calib.support.plain_text import sentence
-from kf_calib.support.units import shown
+from kf_calib.support.units import shown, span
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean, replay_object
-from kf_calib.views.live import bar, link, source_object, span
+from kf_calib.views.live import bar, link, source_object
 from kf_calib.views.tables import Bar, Table
 
 if TYPE_CHECKING:

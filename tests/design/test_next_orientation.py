@@ -7,7 +7,7 @@ import pytest
 from helpers.hidden_effects import noisy_run as run
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.design.next_orientation import Advice, to_tell_apart
+from kf_calib.design.next_orientation import ENOUGH, Advice, _separations, to_tell_apart
 from kf_calib.effects import Effect, effect_named
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import scan
@@ -23,12 +23,12 @@ def separation(result: Calibration, one: Effect, size: Floats, other: Effect) ->
     return float(np.linalg.norm(signal - rival.basis @ (rival.basis.T @ signal)))
 
 
-def advised(one: Effect, other: Effect) -> tuple[Calibration, Floats, Advice]:
-    """A run, coefficients of 8 sigma in it, and where to go next."""
+def advised(one: Effect, other: Effect, sigmas: float = 8.0) -> tuple[Calibration, Floats, Advice]:
+    """A run, coefficients of so many sigma in it, and where to go next."""
     result = run(plan=PLAN)
     (alone,) = scan(result.carried, result.noise.judging, [one]).candidates
     even = np.ones(len(one.coefficients))
-    size = 8.0 * even / np.linalg.norm(alone.columns @ even)
+    size = sigmas * even / np.linalg.norm(alone.columns @ even)
     found = to_tell_apart(result.fit, one, size, [other])
     assert found is not None
     return result, size, found
@@ -63,6 +63,23 @@ def test_the_separation_predicted_is_that_of_the_run_that_goes_there(
         assert found.after == pytest.approx(reached, rel=0.05)
     elsewhere = run(plan=[*PLAN, Visit((0.0, 0.0, 0.0), 8.0)])
     assert reached >= separation(elsewhere, one, size, other)
+
+
+@pytest.mark.parametrize("sigmas", [14.0, 20.0])
+def test_no_other_stay_gains_much_more_for_its_time(sigmas: float) -> None:
+    """A drift from a warm-up: the gain in squared separation, up to the 36 that suffice, over the time that a wait and
+    one more visit take, in steps of a sixtieth of the run; to wait not at all or for all of it gains less."""
+    bench = run(plan=PLAN).bench
+    one, other = effect_named("bias-drift", bench), effect_named("warm-up", bench).at(150.0)
+    result, size, found = advised(one, other, sigmas)
+    ends_s = np.array([dwell.end_s for dwell in result.fit.dwells])
+    dwell_s, waits_s = float(np.median(np.diff(ends_s))), np.linspace(0.0, ends_s[-1], 61)
+    poses = np.radians([found.gimbal_deg])
+    before, after = _separations(result.fit, one, size, [other], poses, waits_s)
+    gains = (np.minimum(after[:, 0], ENOUGH) ** 2 - before**2) / (3.0 * dwell_s + waits_s)
+    assert found.stay_s is not None and waits_s[5] < found.stay_s - dwell_s < waits_s[-5]
+    own = (min(found.after, ENOUGH) ** 2 - before**2) / (2.0 * dwell_s + found.stay_s)
+    assert own > 0.9 * gains.max() and max(gains[0], gains[-1]) < 0.85 * gains.max()
 
 
 @pytest.mark.parametrize("names", [("cross-coupling-ip", "settling"), ("settling", "bias-drift")])

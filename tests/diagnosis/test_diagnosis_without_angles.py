@@ -21,7 +21,7 @@ from kf_calib.estimation.free_attitude import weights_of_size
 from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.settings import Settings
 
-ATTITUDE = ("magnetic", "base-tilt", "base-tilt-drift", "platform-drift", "flexure")
+ATTITUDE = ("magnetic", "base-tilt", "base-tilt-drift", "platform-drift", "flexure", "uneven-flexure")
 ALWAYS = ("gravity-error", "cross-talk")
 
 

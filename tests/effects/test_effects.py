@@ -46,6 +46,7 @@ PLAN = plan_of(30, dwell_s=6.0, seed=4)
 NAMES = [name for name in names(BENCH) if not effect_named(name, BENCH).dynamic]  # tests/test_slews.py has these
 OWN_TEST = {
     "vibration-rectification", "dead-zone", "bias-walk", "magnetic", "warm-up", "settling", "thermal-lag", "sinusoid",
+    "uneven-flexure",
 }  # fmt: skip
 INVISIBLE = {  # exactly: wrong g is a common scale, the innermost zero a misalignment; a vertical axis turns nothing
     "cross-talk": {"theta1", "phi1", "nu1", "nu2", "theta3", "phi3", "X12", "X13", "X21", "X23", "X31", "X32"},
@@ -114,6 +115,19 @@ def test_coefficients_of_a_nonlinear_truth_are_found(name: str) -> None:
     else:
         np.testing.assert_allclose(got, truth, rtol=0.02, atol=0.01 * size)
     assert without.consistency.statistic > 100 * max(result.consistency.statistic, 1.0)
+
+
+def test_an_uneven_flexure_is_found_as_products_of_compliances_and_offsets() -> None:
+    """The torque leaves no turn about the axis of its offset, and equal compliances are a flexure, which is not enough
+    for these."""
+    offset, compliance = {"X": 1e-6, "Y": -6e-7, "Z": 8e-7}, {"X": 2.0, "Y": 0.1, "Z": 0.7}
+    hidden = ",".join(map(str, offset.values())) + "".join(f";c{i.lower()}={own}" for i, own in compliance.items())
+    dwells = Pass(run([f"uneven-flexure={hidden}"], plan=PLAN[:18], sample_hz=10.0), Settings()).fold()
+    result, even = (evaluate(dwells, BENCH, Settings(effects=(name,))) for name in ("uneven-flexure", "flexure"))
+    got = {symbol: value for symbol, (value, _) in values(result).items()}
+    truth = {f"c{i}d{j}": c * d for j, d in offset.items() for i, c in compliance.items() if i != j}
+    assert got == pytest.approx(truth, rel=0.01, abs=1e-8)
+    assert even.consistency.statistic > 100 * max(result.consistency.statistic, 1.0)
 
 
 @pytest.mark.parametrize(

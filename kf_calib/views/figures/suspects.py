@@ -15,6 +15,7 @@ from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.results import format_p
+from kf_calib.support.units import span
 from kf_calib.views.figures.style import BEST, GREY, PALE, RUNNER_UP, blank, say, styled
 from kf_calib.views.figures.words import wrapped
 
@@ -129,7 +130,7 @@ def _separation(axes: Axes, found: Diagnosis) -> None:
     for k, value in enumerate((advice.before, advice.after)):
         text = f" {value:.0f}" if advice.shows else f" {value:.1f} σ"
         axes.text(value, k, text, va="center", fontsize=9.0)
-    stay = "a dwell" if advice.stay_s is None else f"{advice.stay_s / 60.0:.0f} min"
+    stay = "a dwell" if advice.stay_s is None else span(advice.stay_s)
     axes.set_yticks([0, 1], ["now", f"after {stay} there"])
     axes.set_ylim(1.6, -0.6)
     axes.set_xlim(0.0, 1.2 * max(advice.before, advice.after, 1.0))

@@ -36,7 +36,7 @@ KNOWN = """
     thermal-scale thermal-misalignment thermal-rate thermal-lag settling hysteresis magnetic sinusoid
     vibration-rectification dead-zone quantisation saturation outliers base-tilt base-tilt-drift encoder-offset
     encoder-scale encoder-harmonic-1 encoder-harmonic-2 axis-nonorthogonality flexure platform-drift earth-rotation
-    gravity-error cross-talk latency lever-arm
+    gravity-error cross-talk latency lever-arm uneven-flexure
     """
 """The catalogue's names, fixed."""
 

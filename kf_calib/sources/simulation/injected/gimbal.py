@@ -142,6 +142,16 @@ def flexure(offset: Floats, rig: Rig) -> Step:
     return bending(offset, np.ones(3))
 
 
+@made(
+    "uneven-flexure", "rad/(m/s^2)", ("5urad/g", "100urad/g"), ("0.1mrad/g", "3mrad/g"),
+    stage="force", coefficients=("x", "y", "z"),
+)  # fmt: skip
+def uneven_flexure(offset: Floats, rig: Rig, *, cx: float = 2.0, cy: float = 0.1, cz: float = 0.7) -> Step:
+    """Flexure of different stiffness about each axis: the platform gives way by (cx, cy, cz) times the three parts of
+    f x d, its compliances about its axes, each of them as part of the mean one (Hooke's law)."""
+    return bending(offset, np.array([cx, cy, cz]))
+
+
 def bending(offset: Floats, compliance: Floats) -> Step:
     """The step that turns the platform by f x offset, each part times the compliance (3,) about its axis."""
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.sources.simulation.gimbal_motion import attitude
-from kf_calib.sources.simulation.injected.gimbal import axis_nonorthogonality, base_turning, bending, harmonic
+from kf_calib.sources.simulation.injected.gimbal import axis_nonorthogonality, base_turning, harmonic
 from kf_calib.sources.simulation.injected.kinds import Rig, added, made
 from kf_calib.sources.simulation.injected.terms import above, adding, column, output, pendulous
 from kf_calib.sources.simulation.noise_processes import FirstOrder
@@ -208,14 +208,6 @@ def thermal_hysteresis(alpha: Floats, rig: Rig, *, play: float = 2.0, reference:
         return alpha * column(np.array(followed[1:]) - reference)
 
     return adding(contribution)
-
-
-@made("uneven-flexure", "rad/(m/s^2)", ("5urad/g", "100urad/g"), ("0.1mrad/g", "3mrad/g"), stage="force",
-      coefficients=("x", "y", "z"), known=False, driver="specific force", family="base and platform")  # fmt: skip
-def uneven_flexure(offset: Floats, rig: Rig, *, cx: float = 2.0, cy: float = 0.1, cz: float = 0.7) -> Step:
-    """Flexure of different stiffness about each axis: the platform gives way by (cx, cy, cz) times the three parts of
-    f x d, its compliances about its axes, each of them as part of the mean one (Hooke's law)."""
-    return bending(offset, np.array([cx, cy, cz]))
 
 
 @made("loose-mount", "rad", ("2urad", "50urad"), ("0.1mrad", "5mrad"), stage="attitude", coefficients=("x", "y", "z"),
