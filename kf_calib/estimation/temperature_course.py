@@ -5,7 +5,7 @@ enters the residuals. A block of metal follows its surroundings slowly, so that 
 the run has much less noise than the readings in one dwell. What is left of it is a smooth error of the curve, which is
 the same for all three accelerometers.
 
-The curve is a cubic spline with many knots whose second differences are held small (P. Eilers and B. Marx, 1996). How
+The curve is a cubic spline with many knots whose fourth differences are held small (P. Eilers and B. Marx, 1996). How
 small, and the noise of the thermometer, are those of the largest restricted likelihood. The error of the curve is that
 of the posterior (G. Wahba, 1983). Where the thermometer is quiet, or where the temperature has steps that no smooth
 curve follows, the temperatures are taken as they were read and count as exact.
@@ -23,13 +23,14 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 
 _KNOTS, _MOST_KNOTS = 3, 200  # of a dwell, and of the run
+_ORDER = 4  # of the differences that are held small: what is left of the noise is least in the run of a climate
 _CARRIED_S = 1.5  # readings once a second are carried on to the next one, which adds to the noise of short pieces
 _QUIET = 1e-5  # noise of the mean of a dwell over the spread of the temperature
 _FEWEST = 12  # degrees of freedom within dwells
 _STEPS = 2.0  # the curve leaves at most this times the variance that parabolas within the dwells leave
 _KEPT = 1e-4  # share of the variance of the errors that may be left out
 _SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
-_PENALTIES = np.geomspace(1e-9, 1e9, 181)
+_PENALTIES = np.geomspace(1e-12, 1e12, 241)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +141,7 @@ class _Spline:
         """
         count, away = basis.shape[1], levels - levels.mean()
         information, along = basis.T @ (weights[:, None] * basis), basis.T @ (weights * away)
-        penalty = np.diff(np.eye(count), 2, axis=0)
+        penalty = np.diff(np.eye(count), _ORDER, axis=0)
         penalty = penalty.T @ penalty * (np.trace(information) / count)
         lower = np.linalg.cholesky(information + penalty)
         shares, turn = np.linalg.eigh(_between(lower, penalty))
@@ -148,9 +149,9 @@ class _Spline:
         back = np.linalg.solve(lower.T, turn)
         own, total = (back.T @ along) ** 2, float(weights @ away**2)
         sizes = (1.0 - shares) + _PENALTIES[:, None] * shares
-        freedom = len(levels) - 2
+        freedom = len(levels) - _ORDER
         variances = np.maximum(total - (own / sizes).sum(axis=1), 1e-12 * total) / freedom
-        costs = freedom * np.log(variances) + np.log(sizes).sum(axis=1) - (count - 2) * np.log(_PENALTIES)
+        costs = freedom * np.log(variances) + np.log(sizes).sum(axis=1) - (count - _ORDER) * np.log(_PENALTIES)
         best = int(np.argmin(costs))
         coefficients = back @ ((back.T @ along) / sizes[best])
         return cls(coefficients, back * np.sqrt(variances[best] / sizes[best]), float(variances[best]))
