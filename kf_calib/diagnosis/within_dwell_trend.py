@@ -120,7 +120,10 @@ def _by_thermometer(carried: Carried, noise: Noise) -> Floats | float:
     if noise.sensitivity_mps2_per_k is None:
         return 0.0
     errors = thermometer_errors(carried.dwells, noise.sensitivity_mps2_per_k)
-    rows = [_rows(dwell, own.reshape(*own.shape[:2], 3 * own.shape[3])) for dwell, own in zip(carried.dwells, errors, strict=True)]
+    rows = [
+        _rows(dwell, own.reshape(*own.shape[:2], 3 * own.shape[3]))
+        for dwell, own in zip(carried.dwells, errors, strict=True)
+    ]
     squares, _ = _squares(carried.dwells, rows)
     return squares.reshape(len(rows), 3, -1, _DEGREE).sum(axis=2)
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor
@@ -101,7 +102,7 @@ def _smooth(dwells: Sequence[DwellFactor], at_s: Floats) -> Course | None:
     return Course(levels.mean() + there @ spline.coefficients, _largest(there @ spline.errors))
 
 
-def _within_dwells(middles: Floats, levels: Floats, weights: Floats, owners: Floats) -> tuple[float, int]:
+def _within_dwells(middles: Floats, levels: Floats, weights: Floats, owners: NDArray[np.intp]) -> tuple[float, int]:
     """Return the weighted variance of levels about a parabola in each dwell, and its degrees of freedom."""
     squares, freedom = 0.0, 0
     for number in np.unique(owners):
@@ -159,7 +160,7 @@ class _Spline:
 
 def _between(lower: Floats, matrix: Floats) -> Floats:
     """Return L^-1 M L^-T."""
-    return np.linalg.solve(lower, np.linalg.solve(lower, matrix).T)
+    return np.asarray(np.linalg.solve(lower, np.linalg.solve(lower, matrix).T), float)
 
 
 def _largest(errors: Floats) -> Floats:

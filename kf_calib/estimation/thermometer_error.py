@@ -41,7 +41,7 @@ def sensitivity_to_temperature(carried: Carried, sigma_mps2: Floats) -> Floats |
     added = change**2 * np.sum(errors_c**2, axis=1, keepdims=True) * counts[:, None]
     if added.max() < (_MATTERS * sigma_mps2.min()) ** 2:
         return None
-    return np.linalg.lstsq(_regressors(dwells), change, rcond=1e-9)[0].T
+    return np.asarray(np.linalg.lstsq(_regressors(dwells), change, rcond=1e-9)[0].T, float)
 
 
 def thermometer_errors(dwells: Sequence[DwellFactor], sensitivity_mps2_per_k: Floats) -> list[Floats]:
