@@ -69,6 +69,7 @@ def test_the_error_of_the_temperature_is_in_the_sigmas_and_in_the_test_of_the_mo
     exact = replace(run.fit, noise=replace(run.noise, sensitivity_mps2_per_k=None))
     assert consistency(exact).p_value < 1e-9
     assert run.consistency.consistent
+    assert any("thermometer" in sentence for sentence in run.warnings)
     found = [run.parameters[f"alpha{k}"] for k in (1, 2, 3)]
     assert np.abs([(each.value - true) / each.sigma for each, true in zip(found, LARGE, strict=True)]).max() < 3.0
     truth = GRADES["navigation"].sensors(0).parameters
@@ -82,6 +83,7 @@ def test_the_error_of_the_temperature_is_in_the_sigmas_and_in_the_test_of_the_mo
 def test_an_effect_too_small_for_the_error_of_the_temperature_to_matter_has_none() -> None:
     run, _ = calibrated(1e-4 * LARGE, sigma_c=0.03)
     assert run.noise.sensitivity_mps2_per_k is None
+    assert not any("thermometer" in sentence for sentence in run.warnings)
 
 
 def test_a_quiet_thermometer_is_taken_as_it_was_read(noisy: tuple[Calibration, Ambient]) -> None:
