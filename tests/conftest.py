@@ -6,7 +6,7 @@ import functools
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -17,9 +17,6 @@ del os.environ["COLUMNS"]  # readline sets it behind Python's back, and a child 
 
 import kf_calib.views.diagnosis  # noqa: F401 (with it results print themselves, as with the public names)
 from kf_calib.cli import main
-
-# Tests of full disks limit the size of files: Python 3.11 would leave half a compiled module where it imports one then.
-sys.dont_write_bytecode = True
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "recordings"
 
@@ -76,10 +73,14 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures of a page are blank: to draw them takes most of the time, and tests/views/test_report.py does."""
     from matplotlib.figure import Figure
 
-    from kf_calib.views.report import drawing
+    from kf_calib.views.report import contents
 
-    drawn = drawing.content_of
-    monkeypatch.setattr(drawing, "content_of", lambda _, kind, dpi: drawn(Figure((1.0, 1.0)), kind, dpi))
+    def blank(result: object) -> dict[str, Callable[[], Figure]]:
+        return dict.fromkeys(drawn(result), lambda: Figure((1.0, 1.0)))
+
+    drawn = contents.figures
+    blank.dispatch = drawn.dispatch
+    monkeypatch.setattr(contents, "figures", blank)
 
 
 @pytest.fixture

@@ -229,8 +229,8 @@ def _with_next(
     mean after each wait at each pose."""
     carried, noise = fitted.carried, noise or fitted.noise.judging
     model, state = carried.model, carried.state
-    added = candidate_columns(carried.dwells, effects, model.bench, state)
+    added = candidate_columns(carried.turned, effects, model.bench, state)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
-    upper = accumulate(whiten(carried.dwells, columns, noise, state), steps(carried.dwells, noise))
+    upper = accumulate(whiten(carried.turned, columns, noise, state), steps(carried.dwells, noise))
     prospect = replace(Prospect.following(fitted), noise=noise)
     return upper[:-1, :-1], np.array([prospect.columns(effects, poses, float(wait_s)) for wait_s in waits_s])

@@ -85,11 +85,6 @@ class CandidateTests:
         """Number of effects that were tested or that this run cannot show."""
         return len(self.best) + len(self.in_slews_only) + bool(self.walking)
 
-    @property
-    def ranked(self) -> list[str]:
-        """Names of the effects, the one with the highest score first."""
-        return sorted(self.scores, key=lambda name: -self.scores[name])
-
     @cached_property
     def invisible(self) -> list[str]:
         """Effects invisible in these orientations, effects of slews only, and oscillations at untested frequencies."""

@@ -186,9 +186,9 @@ def _within(carried: Carried, noise: Noise, state: Floats) -> Floats:
     free = replace(noise, scatter_mps2=np.full(3, _FREE_MPS2), setting_rad=0.0, free=False, walk_mps2_per_sqrt_s=0.0)
     columns = [own[..., STATE_COUNT:] for own in carried.columns]
     if noise.sensitivity_mps2_per_k is not None:
-        errors = thermometer_errors(carried.dwells, noise.sensitivity_mps2_per_k)
+        errors = thermometer_errors(carried.turned, noise.sensitivity_mps2_per_k)
         columns = [np.concatenate(both, axis=3) for both in zip(columns, errors, strict=True)]
-    rows = np.concatenate(whiten(carried.dwells, columns, free, state, reduced=False))
+    rows = np.concatenate(whiten(carried.turned, columns, free, state, reduced=False))
     lacking = max(rows.shape[1] - len(rows), 0)
     return triangle(np.vstack([rows, np.zeros((lacking, rows.shape[1]))]))
 

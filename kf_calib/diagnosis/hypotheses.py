@@ -19,14 +19,16 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates, values_of
+from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated
 from kf_calib.diagnosis.evidence import Evidence, Weighed, size_evidence
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.unknown_effect import Family as Formulas
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend
-from kf_calib.effects import effect_named, walk_named
+from kf_calib.effects import FrameEffect, effect_named, walk_named
 from kf_calib.estimation.reml import HELD
 from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.score_test import unweighted_left
 
 NOTHING, NOISE, NONE = "nothing", "unstated noise", "none of the known"
 """Families of the rows that name no effect: nothing missing, noise that was not stated, and no known effect."""
@@ -47,7 +49,7 @@ _KINDS = {"nothing": 0.4, "effect": 0.4, "pair": 0.1, "formula": 0.1}
 _NO_NOISE = {True: 0.4, False: 0.1}  # share of an unknown cause in more scatter, by whether noise was stated
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _APART, _CURVED = 8.0, 0.02  # rows further behind, in ln and as a share of the evidence, are not refitted
-_MOST = {"effect": 8, "pair": 4, "walk": 3, "formula": 3}
+_MOST = {"effect": 8, "turn": 3, "pair": 4, "walk": 3, "formula": 3}
 
 
 @dataclass(frozen=True)
@@ -93,10 +95,6 @@ class Table:
             for family in row.families:
                 found[family] = found.get(family, 0.0) + row.probability
         return dict(sorted(found.items(), key=lambda each: -each[1]))
-
-    def of(self, *families: str) -> float:
-        """Probability of the rows of these families that name no effect."""
-        return sum(row.probability for row in self.rows if not row.effects and set(row.families) & set(families))
 
     def probability(self, effects: Sequence[str]) -> float:
         """Probability that all these effects are missing, alone or with others."""
@@ -182,6 +180,7 @@ class Hypotheses:
         self.refits, self.before, self.test = refits, before, test
         self.evidence, self.inflation = Evidence(before.fit), 1.0
         self.walk = "" if before.model.walks else walk_named(before.bench)
+        self.stated = dwell_noise_is_stated(before)
 
     def table(self) -> Table:
         """The table with the likeliest rows refitted."""
@@ -190,15 +189,13 @@ class Hypotheses:
             judged = self._refit((best,)).consistency
             self.inflation = max(1.0, judged.statistic / judged.dof) if judged.dof > 0 else 1.0
         effects = self._screened()
-        tried = [*self._without(), *self._effects(effects), *self._pairs(effects), *self._formulas(effects)]
+        pairs = self._pairs(effects)
+        tried = [*self._without(), *self._effects(effects, pairs), *self._formulas(effects)]
+        tried += [self._row(names, self._prior("pair", math.comb(len(effects), 2))) for names in pairs]
         tried = [row for row in tried if math.isfinite(row.log_evidence)]
         least = max(row.log_evidence for row in tried) - _APART
         walks = [row for row in tried if row.effects == (self.walk,) and row.log_evidence > least]
-        return table_of([*tried, *map(self._returning, walks if self._noise_is_stated else ())])
-
-    @property
-    def _noise_is_stated(self) -> bool:
-        return self.evidence.noise.scatter_stated and self.evidence.noise.setting_stated
+        return table_of([*tried, *map(self._returning, walks if self.stated else ())])
 
     def _returning(self, walk: Hypothesis) -> Hypothesis:
         """Return the row of biases that move irregularly and return to their mean, from that of a random walk."""
@@ -211,7 +208,7 @@ class Hypotheses:
     def quick_table(self) -> Table:
         """The table of nothing, noise and single effects by the linear tests alone, for a run with no misfit."""
         rows, prior = list(self._without()), self._prior("effect", len(self.test.scores))
-        least = next(own.log for own in self.evidence.of() if not own.parts)
+        least = rows[0].log_evidence - math.log(_KINDS["nothing"])
         rows += [
             Hypothesis((name,), families=self._families((name,)), log_evidence=least + own + prior,
                        statistic=self._fall(name), dof=self._dof(name))
@@ -225,7 +222,7 @@ class Hypotheses:
         still = float(next(own.log for own in found if not own.parts)) + prior
         turned = _sum([own.log for own in found if own.parts == ("setting",)]) + prior
         spread = _sum([own.log for own in found if "common" in own.parts]) + prior
-        share = _NO_NOISE[self._noise_is_stated]
+        share = _NO_NOISE[self.stated]
         either = _sum([spread + math.log(share), still + math.log(_SHORT)]) + _log_odds(self.test.trend)
         yield Hypothesis(families=(NOTHING,), log_evidence=still)
         yield Hypothesis(families=(NOISE,), log_evidence=_sum([turned, spread + math.log(1.0 - share)]))
@@ -265,19 +262,35 @@ class Hypotheses:
         relative = min(1.0, fall / max(float(falls.max()), 1e-9))
         return float(np.logaddexp.reduce(0.5 * relative * (falls - falls.max()))) - math.log(tried)
 
-    def _effects(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
-        """Yield the rows of single effects."""
+    def _effects(self, screened: Mapping[str, float], pairs: Sequence[tuple[str, str]]) -> Iterator[Hypothesis]:
+        """Yield the rows of single effects, of all that are in pairs, too."""
         columns = {name: log for name, log in screened.items() if name != self.walk}
         least = _least(columns.values())
         chosen = [name for name, log in columns.items() if log > least][: _MOST["effect"]]
-        for name in [*chosen, *([self.walk] if self.walk else [])]:
+        chosen += [*self._turning(), *itertools.chain(*pairs), *([self.walk] if self.walk else [])]
+        for name in dict.fromkeys(chosen):
             yield self._row((name,), self._prior("effect", len(screened)))
 
-    def _pairs(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
-        """Yield the rows of the likeliest pairs, and of the likeliest effects beside a random walk."""
-        count = math.comb(len(screened), 2)
-        if not count:
-            return
+    def _turning(self) -> list[str]:
+        """Names of the effects that turn the platform and explain most of the misfit of the dwells' means, whatever
+        its direction.
+
+        Where the setting error was not stated, it is estimated from these turns, too, so that the linear tests give
+        them little weight; and a turn that is not small is not linear along the specific force, where readings are
+        most exact.
+        """
+        effects = {name: self.test.candidate(name).effect for name in self.test.best}
+        effects = {name: effect for name, effect in effects.items() if isinstance(effect, FrameEffect)}
+        carried = self.before.fit.carried
+        left = unweighted_left(carried, list(effects.values()))
+        gains = -0.5 * (3 * len(carried.dwells) - carried.model.count) * np.log(np.maximum(left, 1e-12))
+        likely = sorted(zip(gains.tolist(), effects, strict=True), reverse=True)[: _MOST["turn"]]
+        return [name for gain, name in likely if gain > max(_APART, likely[0][0] - _APART)]
+
+    def _pairs(self, screened: Mapping[str, float]) -> list[tuple[str, str]]:
+        """Return the likeliest pairs, and the likeliest effects beside a random walk."""
+        if len(screened) < 2:
+            return []
         found = self._joint(screened)
         likely = sorted(found, key=lambda names: -found[names])[: _MOST["pair"]]
         least = _least(found.values())
@@ -289,8 +302,7 @@ class Hypotheses:
             beside = Hypotheses(self.refits, walked, assess_candidates(walked.fit, self.test.effective_tests))
             own = [name for name in beside._screened() if name in beside.test.best]
             chosen += [(name, walk) for name in own[: _MOST["walk"]]]
-        for names in chosen:
-            yield self._row(names, self._prior("pair", count))
+        return chosen
 
     def _joint(self, screened: Mapping[str, float]) -> dict[tuple[str, str], float]:
         """Return the log Bayes factors of pairs by the linear tests: each effect at the value of its constant that is

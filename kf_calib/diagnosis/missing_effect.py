@@ -146,7 +146,7 @@ def _decided(refits: Refits, found: Diagnosis) -> Diagnosis:
         ambiguity=names,
         overlaps=_overlaps(found.test, first.effects, names),
         together=tuple(others),
-        as_scatter=table.of(NOISE) > _DOUBT,
+        as_scatter=table.families.get(NOISE, 0.0) > _DOUBT,
         after=first.refit if first.effects else None,
         suspects=_suspects(found, table),
     )

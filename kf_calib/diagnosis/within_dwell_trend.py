@@ -119,7 +119,7 @@ def _by_thermometer(carried: Carried, noise: Noise) -> Floats | float:
     """Return the variances (D, 3, degrees) of the coefficients that the error of the temperature gives."""
     if noise.sensitivity_mps2_per_k is None:
         return 0.0
-    errors = thermometer_errors(carried.dwells, noise.sensitivity_mps2_per_k)
+    errors = thermometer_errors(carried.turned, noise.sensitivity_mps2_per_k)
     rows = [
         _rows(dwell, own.reshape(*own.shape[:2], 3 * own.shape[3]))
         for dwell, own in zip(carried.dwells, errors, strict=True)
@@ -132,7 +132,7 @@ def _residuals(carried: Carried, state: Floats) -> list[Floats]:
     """Return the residuals (pieces, K, 3) of each dwell on the rows of its triangles."""
     return [
         dwell.triangles[:, : dwell.width, dwell.width :] - _rows(dwell, columns @ state)
-        for dwell, columns in zip(carried.dwells, carried.columns, strict=True)
+        for dwell, columns in zip(carried.turned, carried.columns, strict=True)
     ]
 
 

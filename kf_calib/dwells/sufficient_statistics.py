@@ -22,6 +22,7 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import turn
 from kf_calib.dwells.coherent_tone import Cells, Trace, tone
 from kf_calib.dwells.line_spectrum import Line, Spectrum, lines
 from kf_calib.dwells.orthonormal_parabola import orthonormal_parabola
@@ -97,6 +98,8 @@ class DwellFactor:
     - came_from: the dwell before it, if that one has been left out of the fit; else None.
     - pose_sigma_rad: uncertainty of its pose due to noise of the angles.
     - turns: whole turns of each gimbal by which its pose goes beyond the angles as recorded.
+    - turned_rad: rotation vector (3,) by which effects of a model turn the specific force that its pose shows; None
+      where they do not.
     """
 
     number: int
@@ -108,6 +111,7 @@ class DwellFactor:
     came_from: DwellFactor | None = None
     pose_sigma_rad: float = 0.0
     turns: tuple[int, ...] = ()
+    turned_rad: Floats | None = None
 
     @property
     def carrier_hz(self) -> float:
@@ -151,8 +155,16 @@ class DwellFactor:
     @cached_property
     def regressors(self) -> Floats:
         """The rows of the regressors 1, f_x, f_y, f_z in each piece, (pieces, K, 4)."""
-        values = self.nodes.regressors.reshape(len(self.pieces), 3, -1)
+        nodes = replace(self.nodes, force_mps2=self.felt(self.nodes.force_mps2))
+        values = nodes.regressors.reshape(len(self.pieces), 3, -1)
         return self.triangles[:, : self.width, :3] @ parabola(values)
+
+    def felt(self, force_mps2: Floats) -> Floats:
+        """The specific force (n, 3) that is felt where the angles show this one."""
+        if self.turned_rad is None:
+            return force_mps2
+        angle_rad = float(np.linalg.norm(self.turned_rad))
+        return turn(force_mps2, self.turned_rad / angle_rad, angle_rad)
 
     @cached_property
     def squares(self) -> Floats:

@@ -248,8 +248,10 @@ class SensorEffect(Effect):
 class FrameEffect(Effect):
     """The platform stands otherwise than its angles say; ``rotations`` (m, q, 3), rad per unit, in the platform frame.
 
-    A rotation alpha turns the specific force by alpha x f, and reading i changes by s_i . (alpha x f). Where no angles
-    are used, nothing is said of how the platform stands, and it has no columns.
+    A rotation vector rho changes the specific force f to exp([rho]) f. About a force that is turned by ``turned_rad``
+    already, a little more of each coefficient turns it by J(rho) alpha x f, J the left Jacobian of rotations, and
+    reading i changes by s_i times that. Where no angles are used, nothing is said of how the platform stands, and it
+    has no columns.
     """
 
     of_the_bench = True
@@ -260,6 +262,31 @@ class FrameEffect(Effect):
     @abstractmethod
     def rotations(self, s: Stimulus) -> Floats: ...
 
+    def turned_rad(self, s: Stimulus, coefficients: Floats) -> Floats:
+        """The rotation vector (m, 3) with these ``coefficients`` (q,), rad."""
+        return np.einsum("mqx,q->mx", self.rotations(s), coefficients)
+
+    def added(self, s: Stimulus, coefficients: Floats) -> Floats:
+        rho = self.turned_rad(s, coefficients)
+        change = _left_jacobian(rho, np.cross(rho, s.force_mps2)[:, None])[:, 0]  # J(rho) rho x f = exp([rho]) f - f
+        return change @ s.sensitivity.T if self.shows_in(s) else np.zeros((len(s), 3))
+
     def columns(self, s: Stimulus) -> Floats:
-        turned = np.cross(self.rotations(s), s.force_mps2[:, None, :])
+        turned = np.cross(_left_jacobian(s.turned_rad, self.rotations(s)), s.force_mps2[:, None, :])
         return np.einsum("mqx,ix->miq", turned, s.sensitivity)
+
+
+def _left_jacobian(rho: Floats, vectors: Floats) -> Floats:
+    """J(rho) v of vectors v (m, q, 3) and rotation vectors rho (m, 3) or (1, 3) of length r, by series to r^4.
+
+      J = 1 + (1 - cos r) / r^2 [rho] + (r - sin r) / r^3 [rho]^2, the mean of exp(t [rho]) over 0 < t < 1
+
+    exp([rho + d]) = exp([J(rho) d]) exp([rho]) for small d (J. Sola et al., 2018).
+    """
+    if not rho.any():
+        return vectors
+    squares = np.sum(rho**2, axis=1)[:, None, None]
+    once = np.cross(rho[:, None, :], vectors)
+    twice = np.cross(rho[:, None, :], once)
+    first, second = 1 / 2 - squares / 24 + squares**2 / 720, 1 / 6 - squares / 120 + squares**2 / 5040
+    return vectors + first * once + second * twice

@@ -61,6 +61,7 @@ class Stimulus:
     variance_mps2_2: variance of the readings about here, (m, 3). rate_radps, rate_change_radps2: omega of the platform
     in its own frame and its derivative there, (m, 3), zero where it stands. half_s, within: half the length of the
     piece of a dwell an instant belongs to, and where in it that is, from -1 to 1, (m,); zeros where it is of no piece.
+    turned_rad: rotation vector by which effects of the model have turned the specific force already, (m, 3) or (1, 3).
     carrier_hz: of dwells folded on a carrier, 0: none; part: of a column, that without the carrier (0) or the envelope
     of its cosine (1), sine (2).
     """
@@ -79,6 +80,7 @@ class Stimulus:
     rate_change_radps2: Floats = field(default_factory=lambda: np.zeros((1, 3)))
     half_s: Floats = field(default_factory=lambda: np.zeros(1))
     within: Floats = field(default_factory=lambda: np.zeros(1))
+    turned_rad: Floats = field(default_factory=lambda: np.zeros((1, 3)))
     carrier_hz: float = 0.0
     part: int = 0
     whole: Stimulus | None = None

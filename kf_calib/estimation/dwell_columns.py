@@ -14,20 +14,33 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.rows import Rows, basis, on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor, alike, dwells_before, rate_or_zero
-from kf_calib.effects import Effect, Stimulus
-from kf_calib.estimation.measurement_model import Model, effect_columns
+from kf_calib.effects import Effect, FrameEffect, Stimulus
+from kf_calib.estimation.measurement_model import STATE_COUNT, Model, effect_columns
 from kf_calib.estimation.temperature_course import temperature_course
 
+_LITTLE_RAD = 1e-4  # of a setting error of 0.01 deg it leaves 0.2 um/s^2 along the specific force
+_ABSURD_RAD = 0.2  # what hardly determined coefficients may amount to, but no bench
 _VIBRATING = 15.0  # mean squared deviation of the variances in units of sigma; autocorrelation alone gives up to 10
 
 
 def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> Stimulus:
     """The conditions at the nodes of all pieces of all dwells and slews, in order; rotations are linearised at
     ``state``. Poses are NaN where no angles are used."""
-    known = _conditions(tuple(dwells))
+    known = _conditions(tuple(dwells)) | _turned_conditions(dwells)
     if not bench.angles:
         known = known | {key: np.full_like(known[key], np.nan) for key in ("pose", "previous_pose")}
     return Stimulus(bench=bench, sensitivity=state[:12].reshape(3, 4)[:, :3], **known)
+
+
+def _turned_conditions(dwells: Sequence[DwellFactor]) -> dict[str, Any]:
+    """Return the specific force (m, 3) that is felt at the nodes of turned dwells, and by what it is turned there."""
+    if all(dwell.turned_rad is None for dwell in dwells):
+        return {}
+    turns = [np.zeros(3) if dwell.turned_rad is None else dwell.turned_rad for dwell in dwells]
+    return {
+        "force_mps2": np.concatenate([dwell.felt(dwell.nodes.force_mps2) for dwell in dwells]),
+        "turned_rad": np.repeat(turns, [3 * len(dwell.pieces) for dwell in dwells], axis=0),
+    }
 
 
 @lru_cache(maxsize=2)
@@ -145,15 +158,17 @@ def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
         coefficients = on_basis(own.reshape(*own.shape[:3], -1))
         design[places] = np.einsum("db,dbk,dbkc->dc", weights, first, coefficients).reshape(-1, *own.shape[3:])
     means = np.array([dwell.means for dwell in dwells])
+    forces = np.array([dwell.felt(own[1:4]) for dwell, own in zip(dwells, means, strict=True)])
     counts = np.array([dwell.count for dwell in dwells], float)
     ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
-    return Means(design, means[:, 4:], means[:, 1:4], counts, ends)
+    return Means(design, means[:, 4:], forces, counts, ends)
 
 
 class Carried:
     """Dwells with the columns of a model: the common input of noise model, filter and diagnosis.
 
-    ``state`` (p,) is where small rotations and input axes are linearised. ``slews`` and ``slew_columns`` belong to the
+    ``state`` (p,) is where rotations and input axes are linearised, and ``turned`` are the dwells as they are there
+    (``turned``): what whitens rows or makes columns takes these. ``slews`` and ``slew_columns`` belong to the
     motions and are used only if an effect of the model shows in slews; everything else refers to dwells only.
     """
 
@@ -161,7 +176,8 @@ class Carried:
         self, dwells: Sequence[DwellFactor], model: Model, state: Floats, slews: Sequence[DwellFactor] = ()
     ) -> None:
         self.dwells, self.slews, self.model, self.state = list(dwells), list(slews), model, state
-        every = sorted((*dwells, *slews), key=lambda each: (each.number, each.moving)) if slews else self.dwells
+        self.turned = turned(self.dwells, model, state)
+        every = sorted((*self.turned, *slews), key=lambda each: (each.number, each.moving)) if slews else self.turned
         columns = columns_of(every, model, state)
         self.columns = [own for each, own in zip(every, columns, strict=True) if not each.moving]
         self.slew_columns = [own for each, own in zip(every, columns, strict=True) if each.moving]
@@ -170,7 +186,8 @@ class Carried:
         """The same with one more dwell; the columns of the others are not computed again."""
         out = Carried.__new__(Carried)
         out.dwells, out.slews, out.model, out.state = [*self.dwells, dwell], self.slews, self.model, self.state
-        last = stimulus_of(out.dwells, self.model.bench, self.state).ending(3 * len(dwell.pieces))
+        out.turned = [*self.turned, dwell]
+        last = stimulus_of(out.turned, self.model.bench, self.state).ending(3 * len(dwell.pieces))
         out.columns = [*self.columns, *_by_dwell([dwell], lambda s: self.model.columns(s, self.state), last)]
         out.slew_columns = self.slew_columns
         return out
@@ -178,7 +195,7 @@ class Carried:
     @cached_property
     def means(self) -> Means:
         """The means over each dwell."""
-        return means_of(self.dwells, self.columns)
+        return means_of(self.turned, self.columns)
 
     @property
     def carrier_hz(self) -> float:
@@ -219,7 +236,7 @@ def samples_of(rows: Iterable[Rows], carried: Carried) -> Iterator[Samples]:
     squares."""
     every, columns = [*carried.dwells, *carried.slews], [*carried.columns, *carried.slew_columns]
     known = {(each.number, each.moving): iter(own) for each, own in zip(every, columns, strict=True)}
-    forces = {dwell.number: dwell.means[:4] for dwell in carried.dwells}
+    standing = {dwell.number: dwell for dwell in carried.turned}
     for block in rows:
         key = block.dwell, block.moving
         if key not in known:
@@ -230,5 +247,40 @@ def samples_of(rows: Iterable[Rows], carried: Carried) -> Iterator[Samples]:
             observation = (functions.T @ on_basis(own.reshape(len(own), -1))).reshape(len(u), *own.shape[1:])
             regressors, readings = block.columns[part], block.readings[part]
             if not carried.model.bench.angles:
-                regressors = np.tile(forces[block.dwell], (len(u), 1))
+                regressors = np.tile(standing[block.dwell].means[:4], (len(u), 1))
+            elif not block.moving and (rho := standing[block.dwell].turned_rad) is not None:
+                force = standing[block.dwell].felt(regressors[:, 1:])
+                regressors = np.hstack([regressors[:, :1], force])
+                readings = readings + turning_mps2(rho, force, carried.state)
             yield Samples(block.dwell, block.elapsed_s[part], observation, regressors, readings, block.moving)
+
+
+def turned(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[DwellFactor]:
+    """The dwells about which a model with effects that turn the platform is linear.
+
+    At ``state`` the effects turn the specific force f of a dwell by the rotation vector rho, its mean over the dwell,
+    and S g + b is read, g = exp([rho]) f and S the sensitivities. What is still to be found (changes of coefficients
+    and of S, setting errors) acts on g, which therefore takes the place of f. The columns of the effects there, times
+    their coefficients, amount to S (rho x g); as S g has the rotation in it already, that is added to the readings.
+    Where rho is below ``_LITTLE_RAD`` in all dwells, or absurd, they are returned as they are.
+    """
+    if not model.bench.angles or not any(isinstance(effect, FrameEffect) for effect in model.effects):
+        return list(dwells)
+    rotations = model.turned_rad(stimulus_of(dwells, model.bench, state), state)
+    ends = np.cumsum([3 * len(dwell.pieces) for dwell in dwells])[:-1]
+    means = [own.mean(axis=0) for own in np.split(rotations, ends)]
+    if not _LITTLE_RAD < np.abs(means).max() < _ABSURD_RAD:
+        return list(dwells)
+    return [_turned(dwell, rho, state) if rho.any() else dwell for dwell, rho in zip(dwells, means, strict=True)]
+
+
+def _turned(dwell: DwellFactor, rho: Floats, state: Floats) -> DwellFactor:
+    own = replace(dwell, turned_rad=rho)
+    there = turning_mps2(rho, own.felt(dwell.nodes.force_mps2), state).reshape(len(dwell.pieces), 3, 3)
+    nodes = np.concatenate([there, np.zeros((len(there), dwell.width - 3, 3))], axis=1)  # no part on a carrier
+    return own.less(-on_basis(nodes))
+
+
+def turning_mps2(rho: Floats, force_mps2: Floats, state: Floats) -> Floats:
+    """Return S (rho x f) (n, 3), by how much a small rotation changes the readings."""
+    return np.cross(rho, force_mps2) @ state[:STATE_COUNT].reshape(3, 4)[:, :3].T

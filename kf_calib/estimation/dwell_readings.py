@@ -51,7 +51,7 @@ def readings_of(source: Source, result: Calibration, number: int | None = None, 
     dwell, residual = result.visits[k].dwell, result.visits[k].residual_mps2
     every = max(1, -(-dwell.count // most))
     time_s, readings = _inside(source, dwell.start_s, dwell.end_s, every)
-    predicted = result.carried.means.readings[k] - residual
+    predicted = dwell.means[4:] - residual
     return DwellReadings(number, time_s, readings - predicted, every, dwell.count, residual, mean_sigmas(result)[k])
 
 

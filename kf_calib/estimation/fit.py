@@ -71,7 +71,7 @@ class Fit:
         """Whitened rows [H | W | z] by which the misfit is judged, see ``square_root_information.misfit_rows``."""
         carried = self.carried
         rows, _ = square_root_information.misfit_rows(
-            self.dwells, carried.columns, self.noise.judging, carried.state, carried.model.count
+            carried.turned, carried.columns, self.noise.judging, carried.state, carried.model.count
         )
         return square_root_information.with_frame(rows, carried.model, self.noise, len(rows) - len(self.dwells))
 
@@ -110,14 +110,14 @@ class Fit:
         if carried.model.square:
             out += self._considered(free_attitude.square_changes(carried))
         if self.noise.sensitivity_mps2_per_k is not None:
-            out += self._considered(thermometer_errors(carried.dwells, self.noise.sensitivity_mps2_per_k))
+            out += self._considered(thermometer_errors(carried.turned, self.noise.sensitivity_mps2_per_k))
         for known in carried.model.known:
-            columns = candidate_columns(carried.dwells, [known.effect], carried.model.bench, carried.state)
+            columns = candidate_columns(carried.turned, [known.effect], carried.model.bench, carried.state)
             out += self._considered([own @ known.root for own in columns])
         for effect in carried.model.stepped:
             spread, part = self.spreads.get(str(effect), 0.0), carried.model.parts[str(effect)]
             ends = [effect.at(effect.value * math.exp(step)) for step in (spread, -spread)]
-            more, less = (candidate_columns(carried.dwells, [end], carried.model.bench, carried.state) for end in ends)
+            more, less = (candidate_columns(carried.turned, [end], carried.model.bench, carried.state) for end in ends)
             out += self._considered(
                 [0.5 * (a - b) @ carried.state[part, None] for a, b in zip(more, less, strict=True)]
             )
@@ -128,7 +128,7 @@ class Fit:
         1 sigma of each."""
         carried, count = self.carried, self.carried.model.count
         columns = [np.concatenate(both, axis=3) for both in zip(carried.columns, changes, strict=True)]
-        rows = square_root_information.whiten(carried.dwells, columns, self.noise.weights, carried.state)
+        rows = square_root_information.whiten(carried.turned, columns, self.noise.weights, carried.state)
         upper = square_root_information.accumulate(rows, self.steps)
         gains = upper[:count, :count].T @ upper[:count, count:-1]
         return gains @ gains.T
@@ -184,7 +184,7 @@ class Fit:
 
     def _whitened(self, noise: Noise) -> list[Floats]:
         carried = self.carried
-        rows = square_root_information.whiten(self.dwells, carried.columns, noise, carried.state)
+        rows = square_root_information.whiten(carried.turned, carried.columns, noise, carried.state)
         return square_root_information.with_frame(rows, carried.model, noise)
 
 
@@ -339,7 +339,7 @@ def _reach(fitted: Fit) -> Floats:
     are not moved."""
     model, reach = fitted.carried.model, np.ones(fitted.carried.model.count)
     if model.unknowns:
-        stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
+        stimulus = stimulus_of(fitted.carried.turned, model.bench, fitted.carried.state)
         for k, effect in model.unknowns.items():
             reach[k] = effect.reach(stimulus)
     return reach
@@ -373,7 +373,7 @@ def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
 def _placed(fitted: Fit) -> Model:
     """Return the model with each unknown constant at the grid value at which its effect lowers chi-squared most."""
     model = fitted.carried.model
-    stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
+    stimulus = stimulus_of(fitted.carried.turned, model.bench, fitted.carried.state)
     for effect in model.unknowns.values():
         grid = [effect.at(value) for value in effect.grid(stimulus)]
         model = model.with_effect(grid[_best(fitted, model - effect, grid)])
@@ -388,7 +388,7 @@ def _averaged(fitted: Fit) -> tuple[Model, dict[str, float]]:
     values at which the columns step.
     """
     model, spreads = fitted.carried.model, dict[str, float]()
-    stimulus = stimulus_of(fitted.dwells, model.bench, fitted.carried.state)
+    stimulus = stimulus_of(fitted.carried.turned, model.bench, fitted.carried.state)
     for effect in model.stepped:
         edges = np.log(effect.edges(stimulus))
         middles, widths = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
@@ -409,15 +409,7 @@ def _best(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> int:
 def _falls(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> Floats:
     """Return the decrease of chi-squared for the same effect at several values, each added to the ``rest`` of the
     model."""
-    state = np.concatenate([fitted.carried.state[:12], np.zeros(rest.count - 12)])
+    parts, state = fitted.carried.model.parts, fitted.carried.state
+    state = np.concatenate([state[:STATE_COUNT], *(state[parts[str(effect)]] for effect in rest.effects)])
     return falls(Carried(fitted.dwells, rest, state), fitted.noise.weights, grid)
 
-
-def loss_within_range(fitted: Fit, effect: Effect) -> float:
-    """Increase of chi-squared if the constant of an effect is moved from its value to the best grid value that is at
-    least a factor of two inside its range."""
-    assert effect.unknown is not None
-    stimulus = stimulus_of(fitted.dwells, fitted.carried.model.bench, fitted.carried.state)
-    within = [v for v in effect.grid(stimulus) if 2.0 * effect.unknown.low < v < 0.5 * effect.unknown.high]
-    falls = _falls(fitted, fitted.carried.model - effect, [effect, *(effect.at(value) for value in within)])
-    return float(falls[0] - falls[1:].max(initial=-np.inf))

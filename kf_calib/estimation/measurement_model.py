@@ -18,7 +18,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.rows import REGRESSORS
-from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named
+from kf_calib.effects import Coefficient, Effect, FrameEffect, Stimulus, effect_named
 from kf_calib.errors import InputError
 from kf_calib.estimation.known_effect import KnownEffect
 from kf_calib.support.printing import printed
@@ -188,6 +188,14 @@ class Model:
             if own.stop < part.stop:
                 out[:, :, own.stop : part.stop] = effect.derivative(stimulus, state[own])
         out[:, :, list(self.fixed)] = 0.0
+        return out
+
+    def turned_rad(self, stimulus: Stimulus, state: Floats) -> Floats:
+        """Rotation vectors (m, 3) by which the effects at ``state`` (p,) turn the specific force."""
+        out = np.zeros((len(stimulus), 3))
+        for effect in self.effects:
+            if isinstance(effect, FrameEffect) and effect.shows_in(stimulus):
+                out += effect.turned_rad(stimulus, state[self.parts[str(effect)]])
         return out
 
 

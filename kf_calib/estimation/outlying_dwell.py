@@ -18,7 +18,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_without
-from kf_calib.estimation.dwell_columns import Carried, Means
+from kf_calib.estimation.dwell_columns import Carried, Means, turning_mps2
 from kf_calib.estimation.noise_model import lift_rounding, mean_covariances
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Turn
 from kf_calib.support.tail_probabilities import f_tail
@@ -64,14 +64,15 @@ def _test_dwell(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell
     if rest.consistency.consistent is not True:
         return None
     dwells, estimate, noise = result.fit.dwells, rest.estimate, rest.noise
-    means = Carried(dwells, rest.model, estimate.state).means[[k]]
+    carried = Carried(dwells, rest.model, estimate.state)
+    means = carried.means[[k]]
     error, covariance = means.readings[0] - means.design[0] @ estimate.state, _covariance(rest, means)
     freedom = 1e9 if noise.setting_stated and noise.scatter_stated else max(rest.consistency.dof, 1)
     statistic = float(error @ np.linalg.solve(covariance, error))
     p_value = min(len(dwells) * f_tail(3.0, freedom, statistic / 3.0), 1.0)
     if p_value > _BEYOND_DOUBT:
         return None
-    turns = tuple(_turns(dwells[k], means, rest))
+    turns = tuple(_turns(carried.turned[k], means, rest))
     if not turns and np.linalg.norm(error) < _GROSS * result.bench.gravity_mps2:
         return None
     return OutlyingDwell(dwells[k], dwells[k].number, error, p_value, turns, rest)
@@ -93,13 +94,19 @@ def _turns(dwell: DwellFactor, means: Means, rest: Calibration) -> Iterator[Turn
         """Return the dwell's means with the specific force that the platform would have at this angle of the gimbal."""
         pose = dwell.pose.copy()
         pose[gimbal] += turn_rad
-        force, design = bench.specific_force(at_s, pose[None]), means.design.copy()
+        force, design = dwell.felt(bench.specific_force(at_s, pose[None])), means.design.copy()
         for i in range(3):
             design[:, i, 4 * i : 4 * i + 3] = force
-        return replace(means, force_mps2=force, design=design)
+        return replace(means, force_mps2=force, design=design, readings=means.readings + there(force))
+
+    def there(force: Floats) -> Floats:
+        """Return by how much more effects turn the readings at another specific force."""
+        rho = dwell.turned_rad
+        return np.zeros(3) if rho is None else turning_mps2(rho, force - means.force_mps2, state)
 
     def error(gimbal: int, turn_rad: float) -> Floats:
-        return means.readings[0] - at(gimbal, turn_rad).design[0] @ state
+        other = at(gimbal, turn_rad)
+        return other.readings[0] - other.design[0] @ state
 
     for gimbal, axis in enumerate(bench.to_metadata().get("axes", "").split()):
         grid = np.linspace(-np.pi, np.pi, _GRID, endpoint=False).tolist()

@@ -251,8 +251,8 @@ class _Path:
 
 def _waves(carried: Carried, noise: Noise, kinds: Sequence[Effect]) -> tuple[Waves, list[int]]:
     """Return the whitened columns (m, points, 3) of oscillations, and where the rows of each dwell begin and end."""
-    whitening = MisfitColumns(carried.dwells, noise, carried.state)
-    stimulus = stimulus_of(carried.dwells, carried.model.bench, carried.state)
+    whitening = MisfitColumns(carried.turned, noise, carried.state)
+    stimulus = stimulus_of(carried.turned, carried.model.bench, carried.state)
     ends = whitening.ends - whitening.ends[0]
     out = np.empty((int(ends[-1]), len(kinds), 3), np.complex128)
     for k, each in enumerate(kinds):  # one at a time, which saves memory
@@ -263,12 +263,12 @@ def _waves(carried: Carried, noise: Noise, kinds: Sequence[Effect]) -> tuple[Wav
 
 def _waves_beside_walk(carried: Carried, noise: Noise, kinds: Sequence[Effect]) -> tuple[Waves, list[int], Floats]:
     """Return the same where the biases walk, and the rows [S | H | ...] that have the walk in them."""
-    waves = candidate_columns(carried.dwells, kinds, carried.model.bench, carried.state)
+    waves = candidate_columns(carried.turned, kinds, carried.model.bench, carried.state)
     columns = [
         np.concatenate([own[..., :STATE_COUNT], more], axis=3) for own, more in zip(carried.columns, waves, strict=True)
     ]
     rows, width = square_root_information.misfit_rows(
-        carried.dwells, columns, noise, carried.state, STATE_COUNT, reduced=False
+        carried.turned, columns, noise, carried.state, STATE_COUNT, reduced=False
     )
     rows = rows[len(rows) - len(carried.dwells) :]
     stacked = np.concatenate(rows)

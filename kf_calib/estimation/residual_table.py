@@ -83,7 +83,7 @@ def residual_table(result: Run) -> NDArray[np.void]:
     ``sigma_mps2``: of the mean; ``ratio``: residual over sigma; ``innovation_mps2``, ``innovation_sigma_mps2``: the
     mean less its prediction from the dwells before, NaN while there is none; ``nis``, ``nis_dof``: of the dwell.
     """
-    dwells, means = result.carried.dwells, result.carried.means
+    dwells = result.carried.dwells
     of = quantity_means(result, ["fx", "fy", "fz", "a", "p", "o", "da", "dT"])
     sigmas, visits = mean_sigmas(result), result.visits
 
@@ -107,7 +107,7 @@ def residual_table(result: Run) -> NDArray[np.void]:
         "step_mps2": of["da"].ravel(),
         "temperature_c": each(warmth),
         "temperature_rate_kps": of["dT"].ravel(),
-        "mean_mps2": means.readings.ravel(),
+        "mean_mps2": np.concatenate([dwell.means[4:] for dwell in dwells]),
         "residual_mps2": result.residuals_mps2.ravel(),
         "sigma_mps2": sigmas.ravel(),
         "ratio": (result.residuals_mps2 / sigmas).ravel(),

@@ -364,7 +364,7 @@ class Calibration:
         factor = square_root_information.start(self.settings.prior, model)
         extra = np.zeros((model.count, model.count))
         for index, (dwell, columns, (pause, _)) in enumerate(
-            zip(self.carried.dwells, self.carried.columns, self.fit.steps, strict=True)
+            zip(self.carried.turned, self.carried.columns, self.fit.steps, strict=True)
         ):
             before, extra_before = factor, extra
             for part in dwell.prefixes():

@@ -26,7 +26,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect, Stimulus
 from kf_calib.estimation import random_walk, square_root_information
 from kf_calib.estimation.complement import Complement
-from kf_calib.estimation.dwell_columns import Carried, candidate_columns, piece_columns, stimulus_of
+from kf_calib.estimation.dwell_columns import Carried, candidate_columns, means_of, piece_columns, stimulus_of
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise, steps
 from kf_calib.estimation.periodogram import Periodogram
@@ -159,10 +159,10 @@ class Frame:
     """
 
     def __init__(self, carried: Carried, noise: Noise, effects: Sequence[Effect]) -> None:
-        self.dwells, self.noise, self.state, self.effects = carried.dwells, noise, carried.state, list(effects)
+        self.dwells, self.noise, self.state, self.effects = carried.turned, noise, carried.state, list(effects)
         self.parts = slices(counts_of(effects))
-        self._stimulus = stimulus_of(carried.dwells, carried.model.bench, carried.state)
-        self._whitening = None if _inside(noise) else MisfitColumns(carried.dwells, noise, carried.state)
+        self._stimulus = stimulus_of(carried.turned, carried.model.bench, carried.state)
+        self._whitening = None if _inside(noise) else MisfitColumns(carried.turned, noise, carried.state)
         self.basis, self.coordinates = orthonormal(self.whitened(carried, effects))
         self._periodogram: Periodogram | None = None
         self._lines: dict[float, tuple[Line, ...]] = {}
@@ -190,12 +190,12 @@ class Frame:
         if self._whitening is not None:
             return self._whitening.of(piece_columns(effects, self._stimulus))
         # a walk is whitened by the columns of the biases, which are among the twelve
-        added = candidate_columns(carried.dwells, effects, carried.model.bench, self.state, self._stimulus)
+        added = candidate_columns(carried.turned, effects, carried.model.bench, self.state, self._stimulus)
         both = [
             np.concatenate([own[..., :STATE_COUNT], more], axis=3)
             for own, more in zip(carried.columns, added, strict=True)
         ]
-        rows, width = _judged(carried.dwells, both, self.noise, self.state, STATE_COUNT)
+        rows, width = _judged(carried.turned, both, self.noise, self.state, STATE_COUNT)
         return _stacked(rows, carried.dwells, self.noise)[:, width:-1]
 
     def lines(self, level: float) -> tuple[Line, ...]:
@@ -207,7 +207,7 @@ class Frame:
 
     def serves(self, carried: Carried, noise: Noise) -> bool:
         """Tell whether the frame was made for exactly these dwells and this noise."""
-        same = len(carried.dwells) == len(self.dwells) and all(map(_is, carried.dwells, self.dwells))
+        same = len(carried.turned) == len(self.dwells) and all(map(_is, carried.turned, self.dwells))
         return same and all(np.array_equal(getattr(noise, key), getattr(self.noise, key)) for key in _OF_NOISE)
 
     def scan(self, carried: Carried, more: Sequence[Effect] = ()) -> Scan:
@@ -342,6 +342,26 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
     return np.concatenate(out)
 
 
+def unweighted_left(carried: Carried, effects: Sequence[Effect]) -> Floats:
+    """The share (n,) of the sum of squares of the residuals of the dwells' means that each effect, added alone, leaves;
+    all means of all accelerometers have the same weight."""
+    means, state = carried.means, carried.state
+    own = means_of(carried.turned, candidate_columns(carried.turned, effects, carried.model.bench, state)).design
+    design = means.design.reshape(-1, means.design.shape[2])
+    columns = np.hstack([own.reshape(len(design), -1), means.readings.reshape(-1, 1)])
+    basis, sizes = _spanned(design / carried.sizes), np.linalg.norm(columns, axis=0)
+    rest = columns - basis @ (basis.T @ columns)
+    left, rest = rest[:, -1], rest / np.where(sizes > 0, sizes, 1.0)
+    found = (np.sum((_spanned(rest[:, part]).T @ left) ** 2) for part in slices(counts_of(effects)))
+    return 1.0 - np.array([*found]) / max(float(left @ left), 1e-300)
+
+
+def _spanned(columns: Floats) -> Floats:
+    """Return an orthonormal basis of columns of about unit length, without directions that are rounding."""
+    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
+    return left[:, singular > _SEEN]
+
+
 def falls_together(carried: Carried, noise: Noise, groups: Sequence[Sequence[Effect]]) -> list[tuple[float, int]]:
     """Decrease of chi-squared if all effects of a group are added together, and their rank, of each group alone.
 
@@ -373,7 +393,7 @@ def whiten_model(
     - state: where small rotations and input axes are linearised; by default at the state in ``carried``.
     - stimulus: the stimulus of the dwells at that state, if it is already known.
     """
-    at, dwells = carried.state if state is None else state, carried.dwells
+    at, dwells = carried.state if state is None else state, carried.turned
     added = candidate_columns(dwells, effects, carried.model.bench, at, stimulus)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
     rows, width = _judged(dwells, columns, noise, at, carried.model.count)
@@ -407,7 +427,7 @@ def _stacked(rows: Sequence[Floats], dwells: Sequence[DwellFactor], noise: Noise
 def _with_and_without_walk(carried: Carried, noise: Noise, state: Floats, width: int) -> tuple[Floats, Floats, int]:
     """Rows of the model in ``carried`` as ``Periodogram.falls`` needs them: whitened, the walk of the biases taken out;
     those of the dwells alone with the walk still in them; and how many columns the first ``width`` become with W."""
-    rows, count = _judged(carried.dwells, carried.columns, noise, state, width)
+    rows, count = _judged(carried.turned, carried.columns, noise, state, width)
     of_dwells = np.concatenate(rows[len(rows) - len(carried.dwells) :])
     return _stacked(rows, carried.dwells, noise), of_dwells[:, _inside(noise) :], count
 

@@ -28,7 +28,7 @@ def sensitivity_to_temperature(carried: Carried, sigma_mps2: Floats) -> Floats |
 
     sigma_mps2 (3,): noise of white readings.
     """
-    dwells, model, state = carried.dwells, carried.model, carried.state
+    dwells, model, state = carried.turned, carried.model, carried.state
     errors_c = temperature_course(tuple(dwells)).errors_c
     if not errors_c.shape[1] or not model.effects:
         return None

@@ -165,5 +165,5 @@ class Running:
     def _rows(self, chosen: Sequence[int] | None = None) -> list[Floats]:
         """Return the whitened rows of all dwells, or of those chosen."""
         chosen = range(len(self.dwells)) if chosen is None else chosen
-        dwells, columns = [self.dwells[k] for k in chosen], [self.carried.columns[k] for k in chosen]
+        dwells, columns = [self.carried.turned[k] for k in chosen], [self.carried.columns[k] for k in chosen]
         return square_root_information.whiten(dwells, columns, self.noise.weights, self.about, self.about)

@@ -76,6 +76,7 @@ def test_what_cannot_be_read_is_a_sentence(run, against: str) -> None:
     assert (code, out) == (2, "") and against in err and err.count("\n") == 1
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("words", "says"),
     [

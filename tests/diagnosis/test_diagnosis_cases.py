@@ -230,12 +230,12 @@ def test_a_walk_that_explains_all_gets_no_companion_by_chance(seeds: range) -> N
     assert not any(len(each.missing) > 1 for each in found), [each.missing for each in found]
 
 
-@pytest.mark.parametrize("seeds, dwells", [(range(1, 3), 24), *slow((range(36), 24))])
-def test_a_walk_is_named_before_what_its_path_happens_to_look_like(seeds: range, dwells: int) -> None:
+@pytest.mark.parametrize("seeds", [range(1, 2), *slow(range(36))])
+def test_a_walk_is_named_before_what_its_path_happens_to_look_like(seeds: range) -> None:
     """By their odds: a line through a path is the best of many, and the likelihood of a walk is over all its paths."""
-    first = [diagnose(source("bias-walk=10sigma", seed=seed, dwells=dwells)).missing[:1] for seed in seeds]
+    first = [diagnose(source("bias-walk=10sigma", seed=seed, dwells=24)).missing[:1] for seed in seeds]
     assert sum(each == ("bias-walk",) for each in first) >= 0.75 * len(first)  # a half of them by chi-squared alone
-    drifts = [diagnose(source("bias-drift=10sigma", seed=seed, dwells=dwells)).missing for seed in seeds[::12]]
+    drifts = [diagnose(source("bias-drift=10sigma", seed=seed, dwells=24)).missing for seed in seeds[::12]]
     assert ("bias-walk",) not in drifts
 
 
@@ -310,7 +310,7 @@ def test_a_bias_that_goes_to_and_fro_is_no_walk(seeds: range) -> None:
     assert walks <= len(found) // 6  # of six, four where nothing asks whether it comes back
 
 
-@pytest.mark.parametrize("runs", [6, *slow(24)])
+@pytest.mark.parametrize("runs", [4, *slow(24)])
 def test_a_walk_rarely_looks_as_if_it_came_back(runs: int) -> None:
     walks = [run("bias-walk=15sigma", seed=seed, dwells=24) for seed in range(runs)]
     gains = [2.0 * Refits().with_effects(each, ("bias-walk",)).fit.back_gain[0] for each in walks]

@@ -39,6 +39,7 @@ def test_an_effect_of_ten_sigma_is_named_or_among_its_equals(name: str) -> None:
     assert found.after.held_out.rms_mps2 < 0.8 * found.before.held_out.rms_mps2
 
 
+@pytest.mark.slow  # docs/no_angles.md says the same of it, in short
 def test_the_board_in_recordings_is_improved_by_what_its_truth_says() -> None:
     truth = json.loads((RECORDINGS / "hand.truth.json").read_text())["effects"][0]
     state = kf_calib.improve(kf_calib.open_recording(RECORDINGS / "hand.mcap", angles=False))
@@ -51,7 +52,7 @@ def test_the_board_in_recordings_is_improved_by_what_its_truth_says() -> None:
 
 
 def test_a_walk_of_the_biases_is_found_by_its_likelihood() -> None:
-    found = kf_calib.diagnose(kf_calib.calibrate(by_hand("bias-walk=3e-4", poses=24)))
+    found = kf_calib.diagnose(kf_calib.calibrate(by_hand("bias-walk=3e-4", poses=18)))
     assert found.missing == ("bias-walk",) and found.after is not None
     intensity = found.after.parameters["qb"]
     assert intensity.value == pytest.approx(3e-4, rel=0.6)

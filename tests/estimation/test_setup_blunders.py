@@ -10,6 +10,7 @@ from itertools import permutations, product
 import numpy as np
 import pytest
 from helpers.altered import Altered, short_run
+from helpers.long_runs import slow
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, parse_axes, parse_channels
@@ -54,9 +55,10 @@ WIRINGS = [
     for places in permutations((1, 2, 3))
     for signs in product((1, -1), repeat=3)
 ]
+WRONG = [wiring for wiring in WIRINGS if wiring != (1, 2, 3)]
 
 
-@pytest.mark.parametrize("channels", [w for w in WIRINGS if w != (1, 2, 3)], ids=str)
+@pytest.mark.parametrize("channels", [*WRONG[::5], *slow(*((w,) for k, w in enumerate(WRONG) if k % 5))], ids=str)
 def test_each_of_47_wrong_wirings_is_refused_and_its_mending_mends(channels: tuple[int, int, int]) -> None:
     run = short_run(count=8, dwell_s=1.5)
     source = Altered(run, reordered(*channels))
@@ -94,7 +96,7 @@ def test_each_of_47_wrong_wirings_is_refused_and_its_mending_mends(channels: tup
         (lambda t, a: np.where((t > 60)[:, None] & [False, False, True], 1.5, a), None, "stuck: from dwell 9 on"),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("grade", ["navigation", "mems"])
+@pytest.mark.parametrize("grade", ["navigation", *slow("mems")])
 def test_blunders_are_named(grade: str, readings, poses, words: str) -> None:
     assert words in refused(Altered(short_run(grade=grade), readings, poses))
 
@@ -122,7 +124,7 @@ def test_any_axis_may_be_up(up: str) -> None:
     "options", [{}, {"plan": "faces"}, {"count": 4}, {"count": 3}, {"grade": "mems"}, {"grade": "paper"}], ids=str
 )
 def test_sound_runs_are_left_alone(options) -> None:
-    for seed in range(5):
+    for seed in range(3):
         calibrate(short_run(seed=seed, **options))
 
 

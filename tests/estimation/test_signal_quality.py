@@ -34,7 +34,7 @@ def stored(values: np.ndarray) -> np.ndarray:
     return values.astype(np.float32).astype(float)
 
 
-@pytest.mark.parametrize("sigmas", [0.1, 0.5, 1.0, 2.0, 4.0, 20.0, 300.0])
+@pytest.mark.parametrize("sigmas", [0.1, 1.0, 2.0, 4.0, 300.0])
 @pytest.mark.parametrize("store", [lambda values: values, stored, lambda values: 9.80665 * stored(values / 9.80665)])
 def test_the_step_is_found_and_matters_where_averaging_cannot_help(sigmas: float, store) -> None:
     step = sigmas * 1e-4

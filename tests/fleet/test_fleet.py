@@ -17,8 +17,9 @@ from typing import Any
 
 import dask.config
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client
 from fleet_generator import Campaign, record
+from helpers.fleet_workers import threads, used
 
 import kf_calib
 from kf_calib.cli.evaluate import replay
@@ -44,23 +45,14 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def client() -> Iterator[Client]:
-    """Workers that are threads of this process: they start at once."""
-    with (
-        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0") as own,
-        Client(own) as c,
-    ):
-        yield c
+    with threads() as own:
+        yield own
 
 
 @pytest.fixture
-def at_once(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command uses these workers."""
-
-    @contextmanager
-    def running(workers: int, scheduler: str | None = None) -> Iterator[Client]:
-        yield client
-
-    monkeypatch.setattr(cluster, "cluster", running)
+def at_once(client: Client) -> Iterator[None]:
+    with used(client):
+        yield
 
 
 @pytest.fixture

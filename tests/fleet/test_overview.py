@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from distributed import Client, LocalCluster
 from fleet_generator import Campaign, record
+from helpers.fleet_workers import threads, used
 from helpers.run_factors import Hidden, nothing, run_factor_of
 
 import kf_calib
 from kf_calib.estimation import bench_model
-from kf_calib.fleet import cluster
 from kf_calib.fleet.overview import FleetOverview, overview_of
 from kf_calib.fleet.pooled_diagnosis import pooled_diagnosis
 from kf_calib.views.figures import figures
@@ -30,28 +28,17 @@ BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
 
 @pytest.fixture(scope="module", autouse=True)
 def at_once() -> Iterator[None]:
-    """The command uses workers that are threads of this process: they start at once."""
-    with (
-        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0") as own,
-        Client(own) as client,
-        pytest.MonkeyPatch.context() as patch,
-    ):
-
-        @contextmanager
-        def running(workers: int, scheduler: str | None = None) -> Iterator[Client]:
-            yield client
-
-        patch.setattr(cluster, "cluster", running)
+    with threads() as client, used(client):
         yield
 
 
 @pytest.fixture(scope="module")
 def bent(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six runs of six units on a bench that bends by more than each run alone could miss."""
+    """Four runs of four units on a bench that bends by more than each run alone could miss."""
     own = Campaign(
         tmp_path_factory.mktemp("bent"),
-        runs=6,
-        units=6,
+        runs=4,
+        units=4,
         benches=1,
         dwells=14,
         dwell_s=3.0,
@@ -72,7 +59,7 @@ def test_the_command_ends_with_what_all_runs_show_together(bent: Path, run: Any,
     assert {each["borne_by"] for each in others} <= {"none", None} and printed["remarks"] == []
     (model,) = printed["bench_models"]
     known = bench_model.read(model)
-    assert (known.bench, known.runs, known.terms[0].effect) == ("bench-1", 6, "flexure")
+    assert (known.bench, known.runs, known.terms[0].effect) == ("bench-1", 4, "flexure")
     one = next(bent.rglob("*.mcap"))
     _, alone, _ = run("diagnose", one, "--json")
     _, with_model, _ = run("diagnose", one, "--bench-model", model, "--json")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
 import os
 import re
-import resource
 import signal
 import socket
 import subprocess
@@ -23,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from helpers.full_disk import full_disk
 from helpers.hidden_effects import BENCH
 from helpers.long_runs import slow
 from helpers.paths import ROOT
@@ -277,7 +276,7 @@ REPLAY_KEYS = {"samples", "dwells", "model", "parameters", "noise", "consistency
 DIAGNOSE_KEYS = {"consistent", "p_value", "verdict", "missing", "suspects", "ambiguity_set", "may_be_scatter",
                  "invisible", "detectable", "unknown", "next_orientation"}  # fmt: skip
 URL = "sim://?speed=500&orientations=6&dwell_s=5&sample_hz=50&slew_degps=180&seed=3"
-SLOW = URL.replace("speed=500", "speed=10").replace("orientations=6", "orientations=20")
+SLOW = URL.replace("speed=500", "speed=30").replace("orientations=6", "orientations=30")
 
 
 def live(*words: str, **kwargs: Any) -> subprocess.Popen[str]:
@@ -388,7 +387,7 @@ def test_a_signal_finishes_the_file_and_prints_the_summary(tmp_path: Path, how: 
     assert replayed("replay", str(out))["warnings"] == [], "a finished file"
 
 
-@pytest.mark.parametrize("form", [[], ["--json"]])
+@pytest.mark.parametrize("form", [["--json"], *slow([])])
 def test_a_full_log_disk_ends_nothing(tmp_path: Path, form: list[str]) -> None:
     out, model = tmp_path / "run.mcap", tmp_path / "model.toml"
     words = [URL, *form, "--record", str(out), "--save-model", str(model)]
@@ -414,20 +413,7 @@ def test_a_log_goes_on_when_there_is_room_again(monkeypatch: pytest.MonkeyPatch,
     assert (tmp_path / "log").read_text() == "one\ntw\nfour\n" and out.lost == 2
 
 
-@contextlib.contextmanager
-def full_disk(size: int) -> Iterator[None]:
-    """No file can grow beyond ``size`` bytes, of this process and those that it starts."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # Python 3.11 would keep half a compiled module
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-        try:
-            yield
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-@pytest.mark.parametrize("form", [[], ["--json"]])
+@pytest.mark.parametrize("form", [[], *slow(["--json"])])
 def test_a_recording_that_stops_is_told_at_once_and_by_the_exit_code(tmp_path: Path, form: list[str]) -> None:
     out = tmp_path / "run.mcap"
     with full_disk(40_000):
@@ -453,7 +439,7 @@ def test_a_recording_that_stops_is_loud_on_the_screen() -> None:
 
 def test_nohup_keeps_a_run_alive(tmp_path: Path) -> None:
     out = tmp_path / "run.mcap"
-    process = live(SLOW.replace("orientations=20", "orientations=8"), "--record", str(out),
+    process = live(SLOW.replace("orientations=30", "orientations=8"), "--record", str(out),
                    preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN))  # fmt: skip
     with process:
         assert process.stdout is not None and process.stdout.readline()
@@ -469,7 +455,7 @@ def test_a_terminal_that_is_closed_costs_the_screen_only(tmp_path: Path, how: si
 
     out, model = tmp_path / "run.mcap", tmp_path / "model.toml"
     leader, follower = pty.openpty()
-    source = SLOW.replace("orientations=20", "orientations=10")
+    source = SLOW if how else SLOW.replace("orientations=30", "orientations=10")
     process = live(source, "--record", str(out), "--save-model", str(model), stdin=follower, stdout=follower,
                    stderr=follower, env={**os.environ, "TERM": "xterm"}, start_new_session=True)  # fmt: skip
     os.close(follower)
@@ -482,11 +468,11 @@ def test_a_terminal_that_is_closed_costs_the_screen_only(tmp_path: Path, how: si
         time.sleep(0.1)
     assert process.wait(120) == 2, "what it had to say could not be written"
     found = replayed("replay", str(out))
-    assert found["warnings"] == [] and (found["dwells"] < 10 if how else found["dwells"] == 10) and model.exists()
+    assert found["warnings"] == [] and (found["dwells"] < 30 if how else found["dwells"] == 10) and model.exists()
 
 
 def test_nobody_reading_ends_a_run_that_is_not_recorded() -> None:
-    with live(SLOW.replace("orientations=20", "orientations=10")) as process:
+    with live(SLOW.replace("orientations=30", "orientations=10")) as process:
         assert process.stdout is not None and process.stdout.readline()
         process.stdout.close()
         assert process.wait(timeout=120) == 0

@@ -6,18 +6,18 @@ import errno
 import json
 import os
 import random
-import resource
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import click
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from helpers.full_disk import full_disk
 
 from kf_calib import effects
 from kf_calib.bench.bench import Bench, parse_axes
@@ -47,7 +47,7 @@ BENCH = Bench(parse_axes("y z x"), 9.81)
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     path = tmp_path_factory.mktemp("outputs") / "run.mcap"
-    subprocess.run([sys.executable, "-m", "kf_calib.cli", "simulate", path, *QUICK], check=True, capture_output=True)
+    assert CliRunner().invoke(cli, ["simulate", str(path), *QUICK]).exit_code == 0
     return path.read_bytes()
 
 
@@ -250,19 +250,6 @@ def test_what_fails_half_way_leaves_the_earlier_file(here: Path) -> None:
         part.write_bytes(b"half")
         raise RuntimeError
     assert (here / "old").read_bytes() == MINE and not list(here.glob(".*"))
-
-
-@contextmanager
-def full_disk(size: int) -> Iterator[None]:
-    """No file can grow beyond ``size`` bytes, of this process and those that it starts."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # Python 3.11 would keep half a compiled module
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-        try:
-            yield
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 FAST = "live sim://?speed=500&orientations=6&dwell_s=5&sample_hz=50&slew_degps=180&seed=3"

@@ -14,6 +14,7 @@ from blind_trials.best_possible import (
     _pair_log_odds,
     best_possible,
     best_possible_pairs,
+    best_possible_probability,
 )
 from scipy.special import ndtr
 
@@ -29,6 +30,18 @@ def test_the_best_chooser_is_right_as_often_as_theory_has_it() -> None:
     assert list(found.values()) == pytest.approx([expected] * 2, abs=4.0 * math.sqrt(0.25 / 20_000))
     assert 0.8 < expected < 0.85
     assert set(best_possible(spaces, {name: {"one", "two"} for name in spaces}, sigmas).values()) == {1.0}
+
+
+def test_the_probability_of_the_truth_is_that_of_bayes() -> None:
+    """Of two effects of one coefficient and either sign, whose likelihoods are cosh(n w)."""
+    overlap, sigmas = 0.9, 4.0
+    other = np.array([overlap, math.sqrt(1.0 - overlap**2)])
+    spaces = {"one": Columns([np.eye(2)[:, :1]]), "two": Columns([other[:, None]])}
+    found = best_possible_probability(spaces, {name: {name} for name in spaces}, sigmas, draws=20_000)
+    readings = np.random.default_rng(1).normal([sigmas, 0.0], 1.0, (100_000, 2))
+    true, false = np.cosh(sigmas * readings[:, 0]), np.cosh(sigmas * readings @ other)
+    assert found["one"] == pytest.approx(float(np.mean(true / (true + false))), abs=0.008)
+    assert found["one"] < best_possible(spaces, {name: {name} for name in spaces}, sigmas, draws=20_000)["one"]
 
 
 @pytest.mark.parametrize("dofs", [(3, 3), (2, 3), (3, 1)])

@@ -58,6 +58,10 @@ def told() -> list[str]:
     return []
 
 
+LIGHT = pytest.mark.parametrize("shown", ["light"], indirect=True)
+"""Where colours do not matter."""
+
+
 @pytest.fixture(params=["light", "dark"])
 def shown(browser: Any, path: Path, told: list[str], request: pytest.FixtureRequest) -> Iterator[Any]:
     """The page, open; what the browser complains of, and asks for beside the page, is told."""
@@ -75,8 +79,9 @@ def shown(browser: Any, path: Path, told: list[str], request: pytest.FixtureRequ
 def test_every_figure_has_ink_and_nothing_is_asked_or_complained_of(shown: Any, told: list[str]) -> None:
     drawn = shown.locator(".drawing svg, .drawing img, .plot canvas")
     assert drawn.count() >= 3
-    for k in range(drawn.count()):
-        assert _ink(drawn.nth(k).screenshot()) > 0.003
+    page = Image.open(io.BytesIO(shown.screenshot(full_page=True))).convert("L")
+    for box in (drawn.nth(k).bounding_box() for k in range(drawn.count())):
+        assert _ink(page.crop((box["x"], box["y"], box["x"] + box["width"], box["y"] + box["height"]))) > 0.003
     assert shown.title().endswith(MORE_EVIL) and "evil" != shown.title()
     assert shown.locator("img:not([src^='data:image/png'])").count() == 0
     assert told == []
@@ -97,10 +102,12 @@ def test_figures_are_light_on_dark_and_dark_on_light(shown: Any, told: list[str]
     assert told == []
 
 
+@LIGHT
 def test_nothing_is_wider_than_the_page(shown: Any) -> None:
     assert shown.evaluate("document.documentElement.scrollWidth") <= 1200
 
 
+@LIGHT
 def test_the_explorer_shows_what_is_chosen(shown: Any, found: kf_calib.Diagnosis, told: list[str]) -> None:
     place, canvas = shown.locator(".plot").first, shown.locator(".plot canvas").first
     pictures = [canvas.screenshot()]
@@ -117,6 +124,7 @@ def test_the_explorer_shows_what_is_chosen(shown: Any, found: kf_calib.Diagnosis
     assert told == []
 
 
+@LIGHT
 def test_the_explorer_reads_out_the_residual_of_a_dwell(shown: Any, found: kf_calib.Diagnosis) -> None:
     shown.locator(".plot").scroll_into_view_if_needed()
     box, readout = shown.locator(".plot .u-over").bounding_box(), shown.locator(".readout")
@@ -190,10 +198,10 @@ def test_a_number_is_split_at_its_decimal_point(text: str, parts: tuple[str, str
     assert (cell.whole, cell.fraction, cell.rest) == parts
 
 
-def many_points(seed: int) -> Figure:
+def many_points(seed: int, count: int = 20_000) -> Figure:
     with style.styled():
         figure = style.blank()
-        values = np.random.default_rng(seed).normal(size=(2, 20000))
+        values = np.random.default_rng(seed).normal(size=(2, count))
         for axes in figure.subplots(1, 2).flat:
             axes.plot(*values, "o", color=style.ACCELEROMETERS[0], markersize=1.5)
             axes.axhline(0.0, color="#6b6b6b")
@@ -213,15 +221,15 @@ def test_figures_of_many_points_stay_small_and_have_greys_of_the_page() -> None:
 
 
 def test_what_is_still_too_large_is_a_picture() -> None:
-    drawings = [Drawing(f"{k}", many_points(k), f"d{k}") for k in range(2)]
+    drawings = [Drawing(f"{k}", many_points(k, 2_000), f"d{k}") for k in range(2)]
     fit(drawings, 0)
     for each in drawings:
         assert each.on_white and each.markup.startswith("<img") and len(each.markup) < 250_000
 
 
-def _ink(png: bytes) -> float:
+def _ink(picture: Image.Image) -> float:
     """The share of pixels that are not like the paper, which most are."""
-    pixels = np.asarray(Image.open(io.BytesIO(png)).convert("L"), float)
+    pixels = np.asarray(picture, float)
     return float(np.mean(np.abs(pixels - np.median(pixels)) > 40))
 
 

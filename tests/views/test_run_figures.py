@@ -219,7 +219,9 @@ def test_sigmas_of_the_experiment_end_at_those_expected(experiment: Experiment) 
 @pytest.mark.parametrize("name", ODD)
 def test_odd_runs_have_all_figures(name: str) -> None:
     for draw in plot.figures(ODD[name]()).values():
-        assert len(content_of(draw(), "png", 40.0)) > 2000
+        figure = draw()
+        figure.draw_without_rendering()
+        assert any(axes.has_data() for axes in figure.axes)
 
 
 def test_a_run_is_saved_as_png_svg_and_pdf_with_a_page_a_figure(run, tmp_path: Path) -> None:

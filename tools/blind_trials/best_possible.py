@@ -10,7 +10,7 @@ of n sigma, it takes the likeliest pair. Rivals are explanations that have no na
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -137,14 +137,31 @@ def best_possible(
     effects: by name. same: the names that mean the same as each. sigmas: size of the effects. draws: for each effect.
     rivals: further explanations, which are never hidden.
     """
-    every = {**effects, **(rivals or {})}
-    rng, names, out = np.random.default_rng(seed), list(every), dict[str, float]()
+    return {
+        name: float(np.mean([names[k] in same[name] for k in np.argmax(logs, axis=0)]))
+        for name, names, logs in _log_odds_of_all(effects, sigmas, draws, seed, rivals)
+    }
+
+
+def best_possible_probability(
+    effects: Mapping[str, Effect], same: Mapping[str, set[str]], sigmas: float, draws: int = 100, seed: int = 0
+) -> dict[str, float]:
+    """Return for each effect the mean probability that the same chooser gives to the truth."""
+    return {
+        name: float(np.mean(np.exp(logs - np.logaddexp.reduce(logs, axis=0))[[k in same[name] for k in names]].sum(0)))
+        for name, names, logs in _log_odds_of_all(effects, sigmas, draws, seed, None)
+    }
+
+
+def _log_odds_of_all(
+    effects: Mapping[str, Effect], sigmas: float, draws: int, seed: int, rivals: Mapping[str, Effect] | None
+) -> Iterator[tuple[str, list[str], Floats]]:
+    """Yield for each hidden effect the names of the explanations, and their log odds (n, draws) in readings with it."""
+    every, rng = {**effects, **(rivals or {})}, np.random.default_rng(seed)
     for name in effects:
         readings = sigmas * effects[name].signals(draws, rng)
         readings = readings + rng.standard_normal(readings.shape)
-        likeliest = np.argmax([_log_odds(each, readings, sigmas) for each in every.values()], axis=0)
-        out[name] = float(np.mean([names[k] in same[name] for k in likeliest]))
-    return out
+        yield name, list(every), np.array([_log_odds(each, readings, sigmas) for each in every.values()])
 
 
 def best_possible_pairs(

@@ -8,7 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from blind_trials.best_possible import Columns, Effect, Process, best_possible, best_possible_pairs
+from blind_trials.best_possible import (
+    Columns,
+    Effect,
+    Process,
+    best_possible,
+    best_possible_pairs,
+    best_possible_probability,
+)
 from blind_trials.columns import column_effects, group_by_name, span_the_same
 from blind_trials.criteria import APART
 from blind_trials.outcome import Outcome
@@ -53,6 +60,9 @@ def compute_ideal(task: Task) -> Outcome:
         f"{size}{words}": best_possible(effects, same, size, seed=task.seed, rivals=rivals)
         for size in SIZES_SIGMA
         for words, rivals in (("", {}), (SCATTER_ALLOWED, {"scatter": scatter}))
+    }
+    extra["probability"] = {
+        str(size): best_possible_probability(effects, same, size, seed=task.seed) for size in SIZES_SIGMA
     }
     extra["pairs"] = best_possible_pairs(effects, same, PAIR_SIGMA, apart, seed=task.seed)
     return Outcome(task, extra=extra)

@@ -6,7 +6,6 @@ import errno
 import os
 import random
 import re
-import resource
 import struct
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.full_disk import full_disk
 from helpers.long_runs import slow
 from helpers.paths import ROOT
 from helpers.recordings import BENCH, START_NS, assert_equal, count_missing, made_batch, read, record
@@ -207,17 +207,12 @@ def test_the_end_of_a_dwell_waits_for_the_disk(tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_full_disk_is_told_and_what_was_written_stays(tmp_path: Path) -> None:
-    path, limit, dwell = tmp_path / "a.mcap", 60_000, 0
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
-    try:
-        with pytest.raises(KfCalibError, match=r"a\.mcap cannot be written on \(File too large\)"):  # noqa: SIM117
-            with Recorder(path, BENCH, chunk_size=20_000) as recorder:
-                for dwell in range(1000):
-                    recorder.write(made_batch(100, START_NS + dwell * 10**9))
-                    recorder.end_dwell()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    path, dwell = tmp_path / "a.mcap", 0
+    told = pytest.raises(KfCalibError, match=r"a\.mcap cannot be written on \(File too large\)")
+    with told, full_disk(60_000), Recorder(path, BENCH, chunk_size=20_000) as recorder:
+        for dwell in range(1000):
+            recorder.write(made_batch(100, START_NS + dwell * 10**9))
+            recorder.end_dwell()
     recording = Recording(path)
     found = read(recording)
     assert dwell * 100 <= len(found.accel) < (dwell + 1) * 100

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import random
-import resource
-import signal
 import socket
 import struct
 import subprocess
@@ -20,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import serial
+from helpers.full_disk import full_disk
 from helpers.links import (
     HEADER,
     KEYS,
@@ -325,14 +324,8 @@ def test_a_patient_feed_waits_for_its_consumer() -> None:
 
 def test_a_full_disk_ends_the_recording_and_not_the_run(tmp_path: Path) -> None:
     parts, path = batches(300), tmp_path / "a.mcap"
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
-    try:
-        with LiveSource(Given(*parts), path, queued=10**6) as source:
-            got = joined(list(source))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with full_disk(100_000), LiveSource(Given(*parts), path, queued=10**6) as source:
+        got = joined(list(source))
     assert_equal(got, joined(parts))
     assert "a.mcap cannot be written on (File too large)" in source.status.recording_trouble
     recording = Recording(path)
