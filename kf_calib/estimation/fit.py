@@ -412,4 +412,3 @@ def _falls(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> Floats:
     parts, state = fitted.carried.model.parts, fitted.carried.state
     state = np.concatenate([state[:STATE_COUNT], *(state[parts[str(effect)]] for effect in rest.effects)])
     return falls(Carried(fitted.dwells, rest, state), fitted.noise.weights, grid)
-
