@@ -134,6 +134,10 @@ def simulation_options(command: F) -> F:
                       help="How much colder the start is, K."),
         warmth_option("--warm-up-s", "warm_up_s", type=NUMBER, default=1800.0, show_default=True,
                       help="Time constant of the warming up, s."),
+        warmth_option("--thermometer-sigma", "sigma_c", type=NUMBER, default=0.01, show_default=True,
+                      help="Noise of the thermometer, K."),
+        warmth_option("--thermometer-step", "step_c", type=NUMBER, default=0.0, show_default=True,
+                      help="Resolution of the thermometer, K."),
     ]  # fmt: skip
     for option in reversed(options):
         command = option(command)

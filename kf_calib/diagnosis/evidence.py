@@ -24,8 +24,9 @@ from kf_calib.estimation.dwell_columns import Carried, Means
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise
-from kf_calib.estimation.reml import Likelihood, Part, Parts, likelihood_of, with_slow_scatter
+from kf_calib.estimation.reml import Likelihood, Part, Parts, likelihood_of, with_shared_noise
 from kf_calib.estimation.square_root_information import whiten
+from kf_calib.estimation.thermometer_error import thermometer_errors
 
 _SIZES = np.exp(np.linspace(0.0, math.log(1e14), 120))  # prior variance of a coefficient over that of its estimate
 _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of noise
@@ -88,19 +89,23 @@ class Evidence:
 
     @cached_property
     def _alone(self) -> _Rows:
-        return self._rows(self._fit.carried)
+        return self._rows(self._fit.carried, self.noise)
 
     def of(self, refit: Fit | None = None, walk: bool = False) -> list[Weighed]:
         """The evidence of the effects that a refit has and the fit has not, for each set of free parts of the noise.
 
         refit: the fit with the effects (None: none is added). walk: whether a random walk of the biases is among them.
         """
-        own = self._alone if refit is None else self._rows(refit.carried)
-        alone = replace(self._alone, known=_lengthened(self._alone.known, float(np.linalg.norm(own.known[:, -1]))))
+        noise, alone = self.noise, self._alone
+        if refit is not None and refit.noise.sensitivity_mps2_per_k is not None:
+            noise = replace(noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
+            alone = self._rows(self._fit.carried, noise)
+        own = alone if refit is None else self._rows(refit.carried, noise)
+        alone = replace(alone, known=_lengthened(alone.known, float(np.linalg.norm(own.known[:, -1]))))
         walking: Parts = ("walk",) if walk or self._walks else ()
         every: Parts = (*walking, "setting", "common")
         with_, without = (
-            likelihood_of(self.noise, every, each.means, self._fit.carried.state, each.known) for each in (own, alone)
+            likelihood_of(noise, every, each.means, self._fit.carried.state, each.known) for each in (own, alone)
         )
         free = self._free(len(alone.means.counts))
         found = (self._weighed(with_, without, parts + walking, own.dof) for parts in free)
@@ -146,15 +151,16 @@ class Evidence:
         chances = {part: _BEYOND if known else _UNSTATED for part, known in stated.items()}
         return sum(math.log(own if part in parts else 1.0 - own) for part, own in chances.items())
 
-    def _rows(self, carried: Carried) -> _Rows:
+    def _rows(self, carried: Carried, noise: Noise) -> _Rows:
         """Return what the likelihood needs: columns that the model hides are left out, and with an effect that was
         fitted with a constant the derivative by this constant counts as a column, but as no coefficient."""
-        means, slow = with_slow_scatter(carried.dwells, self.noise, carried.means)
+        means, shared = with_shared_noise(carried.dwells, noise, carried.means)
         first, last, count = self._fit.carried.model.count, carried.model.count, means.design.shape[2]
-        within = _within(carried, self.noise, self._fit.carried.state)
-        known = np.vstack([slow, np.zeros((len(within), count + 1))])
-        known[len(slow) :, [*range(STATE_COUNT, last), count]] = within
-        turn = _visible(means, self.noise, known, first, last)
+        within = _within(carried, noise, self._fit.carried.state)
+        known = np.vstack([shared, np.zeros((len(within), count + 1))])
+        places = [*range(STATE_COUNT, last), *range(count + 1 - (within.shape[1] - last + STATE_COUNT), count + 1)]
+        known[len(shared) :, places] = within
+        turn = _visible(means, noise, known, first, last)
         design, constants = means.design, sum(place >= first for place in carried.model.unknowns)
         parts = design[..., :first], design[..., first:last] @ turn, design[..., last:]
         known = np.hstack([known[:, :first], known[:, first:last] @ turn, known[:, last:]])
@@ -172,12 +178,16 @@ def _lengthened(known: Floats, length: float) -> Floats:
 
 
 def _within(carried: Carried, noise: Noise, state: Floats) -> Floats:
-    """Return the triangular factor [G | z] of what the readings within dwells say of all effects G.
+    """Return the triangular factor [G | T | z] of what the readings within dwells say of all effects G and of the
+    errors T of the temperature.
 
     The mean of each dwell is left out: it is as if scatter had no limit.
     """
     free = replace(noise, scatter_mps2=np.full(3, _FREE_MPS2), setting_rad=0.0, free=False, walk_mps2_per_sqrt_s=0.0)
     columns = [own[..., STATE_COUNT:] for own in carried.columns]
+    if noise.sensitivity_mps2_per_k is not None:
+        errors = thermometer_errors(carried.turned, noise.sensitivity_mps2_per_k)
+        columns = [np.concatenate(both, axis=3) for both in zip(columns, errors, strict=True)]
     rows = np.concatenate(whiten(carried.turned, columns, free, state, reduced=False))
     lacking = max(rows.shape[1] - len(rows), 0)
     return triangle(np.vstack([rows, np.zeros((lacking, rows.shape[1]))]))

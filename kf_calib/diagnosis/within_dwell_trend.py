@@ -24,6 +24,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
 from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.noise_model import Noise, flicker_sigma
+from kf_calib.estimation.thermometer_error import thermometer_errors
 
 _DEGREE = 3
 _GRID = 600
@@ -97,11 +98,12 @@ def trend_beside(carried: Carried, noise: Noise, state: Floats) -> Trend | None:
     if dwells[0].averaged or not noise.scatter_stated:
         return None
     sigma, lengths_s = noise.effective_sigma_mps2, np.array([dwell.end_s - dwell.start_s for dwell in dwells])
-    squares, seen = _squares(carried, state)
+    squares, seen = _squares(dwells, _residuals(carried, state))
     own = (sigma**2 / np.array([[dwell.count] for dwell in dwells]))[:, :, None]
     by_walk, by_flicker = _of_shapes()
     walked = noise.walk_mps2_per_sqrt_s**2 * lengths_s[:, None, None] * by_walk
-    allowed = own + walked + flicker_sigma(noise, len(dwells))[:, None] ** 2 * by_flicker
+    by_noise = own + walked + flicker_sigma(noise, len(dwells))[:, None] ** 2 * by_flicker
+    allowed = by_noise + _by_thermometer(carried, noise)
     ratios = np.where(seen[:, None, :], squares / allowed, 0.0)
     count = 3 * int(seen.sum())
     if not count:
@@ -113,18 +115,42 @@ def trend_beside(carried: Carried, noise: Noise, state: Floats) -> Trend | None:
     return Trend(ratio, float(fdtrc(count, 2.0 / unsure, ratio)), ratios.sum(axis=2))
 
 
-def _squares(carried: Carried, state: Floats) -> tuple[Floats, Mask]:
-    """Return the squared coefficients (D, 3, degrees) of the residuals on the shapes, scaled to mean square 1, and a
-    mask (D, degrees) of the degrees that the readings of each dwell determine.
+def _by_thermometer(carried: Carried, noise: Noise) -> Floats | float:
+    """Return the variances (D, 3, degrees) of the coefficients that the error of the temperature gives."""
+    if noise.sensitivity_mps2_per_k is None:
+        return 0.0
+    errors = thermometer_errors(carried.turned, noise.sensitivity_mps2_per_k)
+    rows = [
+        _rows(dwell, own.reshape(*own.shape[:2], 3 * own.shape[3]))
+        for dwell, own in zip(carried.dwells, errors, strict=True)
+    ]
+    squares, _ = _squares(carried.dwells, rows)
+    return squares.reshape(len(rows), 3, -1, _DEGREE).sum(axis=2)
+
+
+def _residuals(carried: Carried, state: Floats) -> list[Floats]:
+    """Return the residuals (pieces, K, 3) of each dwell on the rows of its triangles."""
+    return [
+        dwell.triangles[:, : dwell.width, dwell.width :] - _rows(dwell, columns @ state)
+        for dwell, columns in zip(carried.turned, carried.columns, strict=True)
+    ]
+
+
+def _rows(dwell: DwellFactor, values: Floats) -> Floats:
+    """Return the rows (pieces, K, c) of functions of time that are given at the nodes."""
+    return dwell.triangles[:, : dwell.width, : dwell.width] @ on_basis(values)
+
+
+def _squares(dwells: Sequence[DwellFactor], rows: Sequence[Floats]) -> tuple[Floats, Mask]:
+    """Return the squared coefficients (D, c, degrees) of rows (pieces, K, c) on the shapes, scaled to mean square 1,
+    and a mask (D, degrees) of the degrees that the readings of each dwell determine.
     """
-    out, seen = np.zeros((len(carried.dwells), 3, _DEGREE)), np.zeros((len(carried.dwells), _DEGREE), bool)
-    for places in alike(carried.dwells):
-        dwells, columns = [carried.turned[k] for k in places], np.array([carried.columns[k] for k in places])
-        width, triangles = dwells[0].width, np.array([dwell.triangles for dwell in dwells])
-        left = triangles[:, :, :width, width:] - triangles[:, :, :width, :width] @ on_basis(columns @ state)
-        frame, known = _shapes_in(dwells, triangles)
-        counts = np.array([dwell.count for dwell in dwells])[:, None, None]
-        along = np.swapaxes(left.reshape(len(dwells), -1, 3), 1, 2) @ frame
+    out, seen = np.zeros((len(dwells), rows[0].shape[2], _DEGREE)), np.zeros((len(dwells), _DEGREE), bool)
+    for places in alike(dwells):
+        some, left = [dwells[k] for k in places], np.array([rows[k] for k in places])
+        frame, known = _shapes_in(some, np.array([dwell.triangles for dwell in some]))
+        counts = np.array([dwell.count for dwell in some])[:, None, None]
+        along = np.swapaxes(left.reshape(len(some), -1, left.shape[3]), 1, 2) @ frame
         out[places, :, : frame.shape[2]] = along**2 / counts
         seen[places, : frame.shape[2]] = known
     return out, seen

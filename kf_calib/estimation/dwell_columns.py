@@ -16,6 +16,7 @@ from kf_calib.dwells.rows import Rows, basis, on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor, alike, dwells_before, rate_or_zero
 from kf_calib.effects import Effect, FrameEffect, Stimulus
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model, effect_columns
+from kf_calib.estimation.temperature_course import temperature_course
 
 _LITTLE_RAD = 1e-4  # of a setting error of 0.01 deg it leaves 0.2 um/s^2 along the specific force
 _ABSURD_RAD = 0.2  # what hardly determined coefficients may amount to, but no bench
@@ -55,7 +56,7 @@ def _conditions(dwells: tuple[DwellFactor, ...]) -> dict[str, Any]:
         "previous_force_mps2": np.repeat([each.means[1:4] for each in before], 3, axis=0),
         "pose": np.concatenate([each.pose for each in nodes]),
         "previous_pose": np.repeat([each.pose for each in before], 3, axis=0),
-        "temperature_c": _signal_only(dwells, np.concatenate([each.temperature_c for each in nodes])),
+        "temperature_c": temperature_course(dwells).temperature_c,
         "variance_mps2_2": _varying(dwells).reshape(-1, 3),
         "rate_radps": np.concatenate([rate_or_zero(each.rate_radps) for each in nodes]),
         "rate_change_radps2": np.concatenate([rate_or_zero(each.rate_change_radps2) for each in nodes]),
@@ -63,26 +64,6 @@ def _conditions(dwells: tuple[DwellFactor, ...]) -> dict[str, Any]:
         "within": np.tile([-1.0, 0.0, 1.0], len(before)),
         "carrier_hz": dwells[0].carrier_hz,
     }
-
-
-def _signal_only(dwells: Sequence[DwellFactor], temperature_c: Floats) -> Floats:
-    """Return the temperatures (m,) at the nodes, or their mean if they only scatter as a thermometer does in a steady
-    room.
-
-    They only scatter if the means of consecutive dwells differ as much as any two means do (von Neumann's ratio near 1)
-    and by no more than temperatures within a dwell.
-    """
-    counts = np.array([3 * len(dwell.pieces) for dwell in dwells])
-    firsts = np.cumsum(counts) - counts
-    means = np.add.reduceat(temperature_c, firsts) / counts
-    if len(means) < 4 or not np.isfinite(means).all():
-        return temperature_c
-    spread = np.add.reduceat((temperature_c - np.repeat(means, counts)) ** 2, firsts) / counts
-    between, within = means.var(), float(spread.mean())
-    alike = np.mean(np.diff(means) ** 2) > between  # about 2 var if consecutive means are independent
-    if alike and between < 2.0 * within:
-        return np.full(len(temperature_c), means.mean())
-    return temperature_c
 
 
 def _varying(dwells: Sequence[DwellFactor]) -> Floats:

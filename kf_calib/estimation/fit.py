@@ -26,8 +26,9 @@ from kf_calib.estimation import free_attitude, square_root_information
 from kf_calib.estimation.dwell_columns import Carried, Means, candidate_columns, stimulus_of
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, steps, within_dwells
-from kf_calib.estimation.reml import Part, gain_of, misfit, restoring_gain, with_dwell_parts, with_slow_scatter
+from kf_calib.estimation.reml import Part, gain_of, misfit, restoring_gain, with_dwell_parts, with_shared_noise
 from kf_calib.estimation.score_test import falls
+from kf_calib.estimation.thermometer_error import sensitivity_to_temperature, thermometer_errors
 
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
@@ -99,7 +100,7 @@ class Fit:
     @cached_property
     def considered(self) -> Floats:
         """Contribution B (p, p) of considered parameters to the covariance, which becomes P + P B P: constants without
-        a derivative, and known effects.
+        a derivative, known effects, and the error of the temperature.
 
         B is the sum of b b^T with b = A^T W g, where A is the design, W the weights and g the change of the readings if
         the constant changes by 1 sigma. The constants are considered parameters: known to be uncertain, but not
@@ -108,6 +109,8 @@ class Fit:
         carried, out = self.carried, np.zeros((self.carried.model.count,) * 2)
         if carried.model.square:
             out += self._considered(free_attitude.square_changes(carried))
+        if self.noise.sensitivity_mps2_per_k is not None:
+            out += self._considered(thermometer_errors(carried.turned, self.noise.sensitivity_mps2_per_k))
         for known in carried.model.known:
             columns = candidate_columns(carried.turned, [known.effect], carried.model.bench, carried.state)
             out += self._considered([own @ known.root for own in columns])
@@ -159,7 +162,7 @@ class Fit:
     def _wandering(self) -> tuple[Noise, Means, Floats]:
         """Return the noise without a walk, the means with columns for slow scatter, and the prior of these columns."""
         noise, carried = replace(self.noise.judging, walk_mps2_per_sqrt_s=0.0), self.carried
-        return noise, *with_slow_scatter(carried.dwells, noise, carried.means)
+        return noise, *with_shared_noise(carried.dwells, noise, carried.means)
 
     @cached_property
     def back_gain(self) -> tuple[float, float]:
@@ -214,7 +217,11 @@ def fit(
             model = model.moved(np.clip(moved, -reach, reach))
         carried = linearised(fitted.carried, model, state)
         stated = _setting_deg(dwells, bench), bench.scatter_sigma_mps2
-        noise, sizes = with_dwell_parts(within, carried.means, state, *stated, walks=model.walks, near=sizes)
+        within = replace(
+            within, sensitivity_mps2_per_k=sensitivity_to_temperature(carried, within.effective_sigma_mps2)
+        )
+        means, prior = with_shared_noise(dwells, within, carried.means)
+        noise, sizes = with_dwell_parts(within, means, state, *stated, walks=model.walks, near=sizes, prior=prior)
         noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
         fitted = replace(fitted, carried=carried, noise=noise)
         if model.walks:
@@ -405,4 +412,3 @@ def _falls(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> Floats:
     parts, state = fitted.carried.model.parts, fitted.carried.state
     state = np.concatenate([state[:STATE_COUNT], *(state[parts[str(effect)]] for effect in rest.effects)])
     return falls(Carried(fitted.dwells, rest, state), fitted.noise.weights, grid)
-

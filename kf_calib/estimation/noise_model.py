@@ -6,6 +6,8 @@ noise of the same variance, so that the mean of n readings has the variance kapp
 setting error, one small rotation per dwell that all three accelerometers share. sigma_s is the scatter of each
 accelerometer from dwell to dwell. The setting error and the scatter are either stated or estimated (``reml``). In
 addition the biases may follow a random walk of intensity q, whose standard deviation after the time t is q sqrt(t).
+The noise of the thermometer leaves a smooth error of the temperature (``temperature_course``), which enters the
+readings times their sensitivity to the temperature in the model.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
 from kf_calib.estimation import random_walk
 from kf_calib.estimation.autoregression import expected_products, unbiased
 from kf_calib.estimation.dwell_columns import Means
+from kf_calib.estimation.thermometer_error import thermometer_errors
 
 FLOOR_MPS2 = 1e-9
 """Least sigma of a reading, used where readings are exactly constant; the rounding of a double is about 1e-15 m/s^2."""
@@ -54,6 +57,8 @@ class Noise:
     - free: the attitude of a dwell is not known at all (``free_attitude``); setting_rad then only stands for that.
     - walk_mps2_per_sqrt_s: the intensity q of the random walk of each bias.
     - walk_spread: the sigma of ln q; None if q was stated or is zero.
+    - sensitivity_mps2_per_k (3, 8): change of the readings per K on the regressors 1, f and T, T f
+      (``thermometer_error``); None where the noise of the thermometer does not matter.
     - within_seen: whether readings within dwells showed their noise; in a table of means alone they do not.
     """
 
@@ -69,6 +74,7 @@ class Noise:
     walk_spread: float | None = None
     free: bool = False
     within_seen: bool = True
+    sensitivity_mps2_per_k: Floats | None = None
 
     def __post_init__(self) -> None:
         if self.scatter_mps2 is None:  # pyright: ignore[reportUnnecessaryComparison]
@@ -211,7 +217,7 @@ def slow_scatter(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floa
     """
     channels = np.flatnonzero(noise.scatter_mps2 > 0)
     if len(dwells) < 4 or not channels.size:
-        return [np.zeros((len(dwell.pieces), 3, 3, 0)) for dwell in dwells], np.zeros(0)
+        return [np.zeros((len(dwell.pieces), dwell.width, 3, 0)) for dwell in dwells], np.zeros(0)
     start, span = dwells[0].start_s, dwells[-1].end_s - dwells[0].start_s
     orders, out = np.arange(1, _WANDER + 1), list[Floats]()
     for dwell in dwells:
@@ -221,6 +227,17 @@ def slow_scatter(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floa
         out.append(own.reshape(*own.shape[:3], -1))
     sigma = flicker_sigma(noise, len(dwells))[channels, None] / np.sqrt(orders)
     return out, sigma.ravel()
+
+
+def shared_noise(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floats], Floats]:
+    """Columns (pieces, nodes, 3, q) of all noise that dwells have in common, the slow part of a stated scatter and the
+    error of the temperature, and the prior sigmas (q,) of their coefficients."""
+    slow, sigma = slow_scatter(dwells, noise)
+    if noise.sensitivity_mps2_per_k is None:
+        return slow, sigma
+    errors = thermometer_errors(dwells, noise.sensitivity_mps2_per_k)
+    columns = [np.concatenate(both, axis=3) for both in zip(slow, errors, strict=True)]
+    return columns, np.append(sigma, np.ones(errors[0].shape[3]))
 
 
 def flicker_sigma(noise: Noise, dwells: int) -> Floats:

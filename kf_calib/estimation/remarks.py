@@ -16,6 +16,7 @@ from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.noise_model import TOO_SHORT, Noise
 from kf_calib.estimation.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, directions
 from kf_calib.estimation.results import Consistency, Estimate
+from kf_calib.estimation.temperature_course import temperature_course
 from kf_calib.support.units import shown
 
 
@@ -70,6 +71,12 @@ def remarks_on(
             "readings and angles recorded all through the motions, angles at least every half second."
         )
     yield from (remark for effect in model.effects for remark in remarks_of(effect))
+    if noise.sensitivity_mps2_per_k is not None:
+        left_c = np.sqrt(np.mean(np.sum(temperature_course(tuple(dwells)).errors_c ** 2, axis=1)))
+        yield (
+            f"the noise of the thermometer leaves the temperature uncertain by {left_c:.1g} K, which counts as noise "
+            "of the readings: a quieter thermometer would show smaller effects."
+        )
     unseen = [symbol for symbol, hidden in zip(paper_parameters.SYMBOLS, estimate.unseen, strict=True) if hidden]
     unseen += [c.symbol for c, s in zip(model.coefficients, estimate.effect_sigma, strict=True) if np.isnan(s)]
     if not model.bench.angles:

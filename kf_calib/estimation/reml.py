@@ -22,8 +22,8 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation.dwell_columns import Means
-from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, mean_covariances, setting_covariances, slow_scatter
+from kf_calib.estimation.dwell_columns import Means, means_of
+from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, mean_covariances, setting_covariances, shared_noise
 from kf_calib.estimation.random_walk import Links, mean_links
 from kf_calib.estimation.restricted_likelihood import Point, Restricted
 from kf_calib.support.tail_probabilities import chi_squared_tail
@@ -74,6 +74,7 @@ def with_dwell_parts(
     scatter_mps2: float | None,
     walks: bool = False,
     near: Mapping[Parts, Floats] | None = None,
+    prior: Floats | None = None,
 ) -> tuple[Noise, Mapping[Parts, Floats]]:
     """Complete the noise within dwells by setting error, scatter and, if ``walks``, the random walk of the biases.
 
@@ -88,6 +89,7 @@ def with_dwell_parts(
     - means: the dwells' means; state (p,): where they are linearised.
     - angle_sigma_deg, scatter_mps2: the stated parts; None if not stated.
     - walks: estimate the intensity of a random walk of the biases.
+    - prior: rows of prior knowledge about the coefficients, those of ``with_shared_noise``.
     - near: sizes found before for similar means, which shorten the searches.
 
     Returns the noise, and the sizes found for each combination, to be passed as ``near`` the next time.
@@ -107,12 +109,12 @@ def with_dwell_parts(
         )
     if stated.setting_stated and stated.scatter_stated and not walks:
         return stated, {}
-    means, _ = _reduce(means)
-    free = (len(means.readings) if within.free else means.readings.size) - means.design.shape[2]
+    means, prior = _reduce(means, prior)
+    free = (len(means.readings) if within.free else means.readings.size) + len(prior) - means.design.shape[2]
     if free < FEWEST:
         return stated, {}
     combinations = _combinations(stated, walks)
-    likelihood = _likelihood(stated.weights, {part for parts in combinations for part in parts}, means, state)
+    likelihood = _likelihood(stated.weights, {part for parts in combinations for part in parts}, means, state, prior)
     without = likelihood.without()
     if not walks and chi_squared_tail(free, without.misfit) > 0.1:  # the model already fits
         return stated, {}
@@ -191,7 +193,7 @@ def degrees_of_freedom(means: Means) -> int:
 def likelihood_of(noise: Noise, parts: Collection[Part], means: Means, state: Floats, prior: Floats) -> Likelihood:
     """The likelihood of the dwells' means in a noise to which these parts may be added.
 
-    ``means`` and ``prior`` are those that ``with_slow_scatter`` returns; further rows may be added to ``prior``.
+    ``means`` and ``prior`` are those that ``with_shared_noise`` returns; further rows may be added to ``prior``.
     """
     means, prior = _reduce(means, prior)
     return _likelihood(noise, parts, means, state, prior)
@@ -200,7 +202,7 @@ def likelihood_of(noise: Noise, parts: Collection[Part], means: Means, state: Fl
 def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats) -> float:
     """Gain in log-likelihood if a part of the noise is raised to its most likely size.
 
-    ``means`` and ``prior`` are those that ``with_slow_scatter`` returns.
+    ``means`` and ``prior`` are those that ``with_shared_noise`` returns.
     """
     likelihood = likelihood_of(noise, (part,), means, state, prior)
     _, point = likelihood.of((part,)).most_likely()
@@ -211,7 +213,7 @@ def restoring_gain(noise: Noise, means: Means, state: Floats, prior: Floats) -> 
     """Gain in log-likelihood of a mean-reverting walk over the random walk in the noise, and its time constant, s.
 
     The mean-reverting walk is a Gauss-Markov process of any variance; with an infinite time constant it is the random
-    walk. ``means`` and ``prior`` are those that ``with_slow_scatter`` returns.
+    walk. ``means`` and ``prior`` are those that ``with_shared_noise`` returns.
     """
     means, prior = _reduce(means, prior)
     free, still = _likelihood(noise, (), means, state, prior).without(), replace(noise, walk_mps2_per_sqrt_s=0.0)
@@ -225,11 +227,13 @@ def restoring_gain(noise: Noise, means: Means, state: Floats, prior: Floats) -> 
     return max(free.cost - costs[least], 0.0), times_s[least]
 
 
-def with_slow_scatter(dwells: Sequence[DwellFactor], noise: Noise, means: Means) -> tuple[Means, Floats]:
-    """Means with additional columns for the slow part of a stated scatter (``noise_model.slow_scatter``), and the rows
-    (q, p + q + 1) of the prior of their coefficients."""
-    columns, sigma = slow_scatter(dwells, noise)
-    design = np.concatenate([means.design, [own[0, 0] for own in columns]], axis=2)
+def with_shared_noise(dwells: Sequence[DwellFactor], noise: Noise, means: Means) -> tuple[Means, Floats]:
+    """Means with additional columns for the noise that dwells have in common (``noise_model.shared_noise``), and the
+    rows (q, p + q + 1) of the prior of their coefficients."""
+    columns, sigma = shared_noise(dwells, noise)
+    if not sigma.size:
+        return means, np.zeros((0, means.design.shape[2] + 1))
+    design = np.concatenate([means.design, means_of(dwells, columns).design], axis=2)
     prior = np.zeros((len(sigma), design.shape[2] + 1))
     prior[:, means.design.shape[2] : -1] = np.diag(1.0 / sigma)
     return replace(means, design=design), prior

@@ -259,7 +259,8 @@ class Frame:
         return self._periodogram.falls(*_with_and_without_walk(carried, self.noise, self.state, STATE_COUNT))
 
 
-_OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps2_per_sqrt_s")
+_OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps2_per_sqrt_s",
+             "sensitivity_mps2_per_k")  # fmt: skip
 
 
 def counts_of(effects: Sequence[Effect]) -> list[int]:

@@ -22,7 +22,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
 from kf_calib.estimation import random_walk
 from kf_calib.estimation.free_attitude import tangents
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model, dwell_map
-from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, flicker_sigma, slow_scatter
+from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, flicker_sigma, shared_noise, slow_scatter
 from kf_calib.estimation.prior import Prior
 
 _SLOW = np.arange(1, 5)
@@ -161,22 +161,27 @@ def misfit_rows(
     """Rows [H | W | G | z] by which the misfit is judged, and the number of columns before G; H is the first ``width``
     columns.
 
-    W are columns for the slow part of a stated scatter, which consecutive dwells have in common
-    (``noise_model.slow_scatter``). Their coefficients have a prior, whose rows come first in the list. Within a dwell
+    W are columns for noise that dwells have in common (``noise_model.shared_noise``): the slow part of a stated scatter
+    and the error of the temperature. Their coefficients have a prior, whose rows come first in the list. Within a dwell
     the slow components of 1/f noise are nuisance states.
     """
-    slow, sigma = slow_scatter(dwells, noise)
+    shared, sigma = shared_noise(dwells, noise)
+    flicker = _flicker(dwells, noise)
     if not sigma.size:
         return whiten(dwells, columns, noise, state, reduced=reduced), width
-    flicker = flicker_sigma(noise, len(dwells))
     count, places = columns[0].shape[3] + len(sigma) + 1, width + np.arange(len(sigma))
     prior = np.zeros((len(sigma), count))
     prior[np.arange(len(sigma)), places] = 1.0 / sigma
     both = [
         np.concatenate([own[..., :width], more, own[..., width:]], axis=3)
-        for own, more in zip(columns, slow, strict=True)
+        for own, more in zip(columns, shared, strict=True)
     ]
     return [prior, *whiten(dwells, both, noise, state, flicker_mps2=flicker, reduced=reduced)], width + len(sigma)
+
+
+def _flicker(dwells: Sequence[DwellFactor], noise: Noise) -> Floats | None:
+    """Return sqrt(h) (3,) of the 1/f noise that a stated scatter may be; None where it has no slow part."""
+    return flicker_sigma(noise, len(dwells)) if slow_scatter(dwells, noise)[1].size else None
 
 
 @dataclass(frozen=True)
@@ -200,12 +205,12 @@ class MisfitColumns:
     """
 
     def __init__(self, dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> None:
-        self._sigma, slow = noise.effective_sigma_mps2, len(slow_scatter(dwells, noise)[1])
-        flicker = flicker_sigma(noise, len(dwells)) if slow else None
-        priors = len(_dwell_priors(noise)) + (3 * len(_SLOW) if slow else 0)
+        self._sigma, shared = noise.effective_sigma_mps2, len(shared_noise(dwells, noise)[1])
+        flicker = _flicker(dwells, noise)
+        priors = len(_dwell_priors(noise)) + (0 if flicker is None else 3 * len(_SLOW))
         counts = np.array([len(dwell.pieces) for dwell in dwells])
         lengths = 3 * counts * [dwell.width for dwell in dwells] + priors
-        self._groups, self.ends = list[_Alike](), slow + np.cumsum([0, *lengths])
+        self._groups, self.ends = list[_Alike](), shared + np.cumsum([0, *lengths])
         """The first row of each dwell, and at last the number of rows."""
         first_piece, first_row = np.cumsum(counts) - counts, self.ends[:-1]
         for places in _batches(dwells, _USUAL):

@@ -35,7 +35,8 @@ class Ambient:
     period_s: float = 14400.0
     warm_up_c: float = 0.0
     warm_up_s: float = 1800.0
-    sigma_c: float = 0.01  # of the recorded values
+    sigma_c: float = 0.01  # noise of the recorded values
+    step_c: float = 0.0  # their resolution; 0: not rounded
 
     def __post_init__(self) -> None:
         if not all(map(math.isfinite, astuple(self))):
@@ -45,6 +46,8 @@ class Ambient:
                 raise InputError(f"the {words} is {value_s:g} s: give a positive time.")
         if self.sigma_c < 0.0:
             raise InputError(f"the noise of the thermometer is {self.sigma_c:g} K: give zero or a positive number.")
+        if self.step_c < 0.0:
+            raise InputError(f"the resolution of the thermometer is {self.step_c:g} K: give zero or a positive number.")
         coldest_c = self.constant_c - abs(self.swing_c) - max(self.warm_up_c, 0.0)
         if coldest_c < -273.15:
             raise InputError(f"the temperature falls to {coldest_c:g} degC, below absolute zero: give a warmer one.")

@@ -210,6 +210,8 @@ class Simulation:
 
     def _temperatures(self, time_ns: Times, rng: np.random.Generator) -> Stream:
         values = self.ambient(np.multiply(time_ns, 1e-9)) + self.ambient.sigma_c * rng.standard_normal(len(time_ns))
+        if self.ambient.step_c:
+            values = self.ambient.step_c * np.rint(values / self.ambient.step_c)
         return Stream(START_NS + time_ns, values[:, None])
 
 

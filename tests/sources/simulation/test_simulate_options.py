@@ -54,7 +54,7 @@ def test_temperature_is_as_the_options_say(run, tmp_path: Path):
     assert run("simulate", path, "--overwrite", *QUICK)[0] == 0
     ambient = json.loads(path.with_suffix(".truth.json").read_text())["ambient"]
     usual = {"constant_c": 25.0, "swing_c": 0.0, "period_s": 3600.0, "warm_up_c": 0.0, "warm_up_s": 1800.0}
-    assert ambient == usual | {"sigma_c": 0.01}
+    assert ambient == usual | {"sigma_c": 0.01, "step_c": 0.0}
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,170 @@
+"""The course of the temperature over a run: a smooth curve through what a noisy thermometer read, and its uncertainty.
+
+The noise of a thermometer is an error in the variables: times the sensitivity of an accelerometer to the temperature it
+enters the residuals. A block of metal follows its surroundings slowly, so that a smooth curve through all readings of
+the run has much less noise than the readings in one dwell. What is left of it is a smooth error of the curve, which is
+the same for all three accelerometers.
+
+The curve is a cubic spline with many knots whose fourth differences are held small (P. Eilers and B. Marx, 1996). How
+small, and the noise of the thermometer, are those of the largest restricted likelihood. The error of the curve is that
+of the posterior (G. Wahba, 1983). Where the thermometer is quiet, or where the temperature has steps that no smooth
+curve follows, the temperatures are taken as they were read and count as exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+
+_KNOTS, _MOST_KNOTS = 3, 200  # of a dwell, and of the run
+_ORDER = 4  # of the differences that are held small: what is left of the noise is least in the run of a climate
+_CARRIED_S = 1.5  # readings once a second are carried on to the next one, which adds to the noise of short pieces
+_QUIET = 1e-5  # noise of the mean of a dwell over the spread of the temperature
+_FEWEST = 12  # degrees of freedom within dwells
+_STEPS = 2.0  # the curve leaves at most this times the variance that parabolas within the dwells leave
+_KEPT = 1e-4  # share of the variance of the errors that may be left out
+_SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
+_PENALTIES = np.geomspace(1e-12, 1e12, 241)
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """The temperature at the nodes of all pieces of some dwells and slews.
+
+    - temperature_c (m,): NaN where it was not measured.
+    - errors_c (m, k): by how much each of k independent errors of 1 sigma changes them.
+    """
+
+    temperature_c: Floats
+    errors_c: Floats
+
+
+@lru_cache(maxsize=4)
+def temperature_course(dwells: tuple[DwellFactor, ...]) -> Course:
+    """The course of the temperature over dwells, and slews between them, in order of time."""
+    read = np.concatenate([dwell.nodes.temperature_c for dwell in dwells])
+    exact = Course(read, np.zeros((len(read), 0)))
+    standing = [dwell for dwell in dwells if not dwell.moving]
+    if len(standing) < 4 or not np.isfinite(read).all():
+        return exact
+    if _only_scatters(dwells, read):
+        return Course(np.full(len(read), _means(dwells, read).mean()), exact.errors_c)
+    at_s = np.concatenate([dwell.nodes.elapsed_s for dwell in dwells])
+    return _smooth(standing, at_s) or exact
+
+
+def _only_scatters(dwells: Sequence[DwellFactor], read: Floats) -> bool:
+    """Tell whether temperatures at the nodes only scatter as a thermometer does in a steady room.
+
+    They only scatter if the means of consecutive dwells differ as much as any two means do (von Neumann's ratio near 1)
+    and by no more than temperatures within a dwell.
+    """
+    means, counts = _means(dwells, read), np.array([3 * len(dwell.pieces) for dwell in dwells])
+    spread = np.add.reduceat((read - np.repeat(means, counts)) ** 2, np.cumsum(counts) - counts) / counts
+    between, within = means.var(), float(spread.mean())
+    alike = np.mean(np.diff(means) ** 2) > between  # about 2 var if consecutive means are independent
+    return bool(alike and between < 2.0 * within)
+
+
+def _means(dwells: Sequence[DwellFactor], read: Floats) -> Floats:
+    """Return the mean temperature (D,) of the nodes of each dwell."""
+    counts = np.array([3 * len(dwell.pieces) for dwell in dwells])
+    return np.add.reduceat(read, np.cumsum(counts) - counts) / counts
+
+
+def _smooth(dwells: Sequence[DwellFactor], at_s: Floats) -> Course | None:
+    """Return the smooth course at the times ``at_s`` (m,); None where temperatures are taken as they were read."""
+    pieces = [piece.nodes for dwell in dwells for piece in dwell.pieces]
+    ends, levels = np.array([own.elapsed_s for own in pieces]), np.array([own.temperature_c[1] for own in pieces])
+    lengths = ends[:, 2] - ends[:, 0]
+    owners = np.repeat(np.arange(len(dwells)), [len(dwell.pieces) for dwell in dwells])
+    used = lengths > 0.0
+    ends, levels, lengths, owners = ends[used], levels[used], lengths[used], owners[used]
+    weights = lengths**2 / (lengths + _CARRIED_S)  # over the variance of readings of 1 K per sqrt(Hz)
+    within, freedom = _within_dwells(ends[:, 1], levels, weights, owners)
+    if freedom < _FEWEST:
+        return None
+    knots = min(_KNOTS * len(dwells), _MOST_KNOTS)
+    begin, spacing = ends[0, 0], (ends[-1, 2] - ends[0, 0]) / (knots - 3)
+    over_piece = np.einsum("j,njk->nk", _SIMPSON, _bumps((ends - begin) / spacing, knots))
+    spline = _Spline.through(over_piece, levels, weights)
+    usual_s = float(np.median(np.bincount(owners, lengths)))
+    if spline.variance / usual_s < (_QUIET * levels.std()) ** 2 or spline.variance > _STEPS * within:
+        return None
+    there = _bumps(np.clip((at_s - begin) / spacing, 0.0, knots - 3), knots)
+    return Course(levels.mean() + there @ spline.coefficients, _largest(there @ spline.errors))
+
+
+def _within_dwells(middles: Floats, levels: Floats, weights: Floats, owners: NDArray[np.intp]) -> tuple[float, int]:
+    """Return the weighted variance of levels about a parabola in each dwell, and its degrees of freedom."""
+    squares, freedom = 0.0, 0
+    for number in np.unique(owners):
+        own = owners == number
+        if own.sum() > 3:
+            u, root = middles[own] - middles[own].mean(), np.sqrt(weights[own])
+            basis = np.linalg.qr(np.vander(u / np.abs(u).max(), 3) * root[:, None])[0]
+            left = root * (levels[own] - levels[own].mean())
+            squares += float(np.sum((left - basis @ (basis.T @ left)) ** 2))
+            freedom += int(own.sum()) - 3
+    return squares / max(freedom, 1), freedom
+
+
+def _bumps(places: Floats, count: int) -> Floats:
+    """Return cubic B-splines (..., count) at places in units of the distance of the knots; that of number k has its
+    middle at k - 1."""
+    x = np.abs(places[..., None] - np.arange(-1, count - 1))
+    inner, outer = 2.0 / 3.0 - x**2 + 0.5 * x**3, np.maximum(2.0 - x, 0.0) ** 3 / 6.0
+    return np.where(x < 1.0, inner, outer)
+
+
+@dataclass(frozen=True)
+class _Spline:
+    """A penalised spline: its coefficients (c,) about the mean of the levels, their independent errors (c, c) of 1
+    sigma, and the variance of a level of weight 1."""
+
+    coefficients: Floats
+    errors: Floats
+    variance: float
+
+    @classmethod
+    def through(cls, basis: Floats, levels: Floats, weights: Floats) -> _Spline:
+        """The spline of the largest restricted likelihood; basis (n, c).
+
+        In the coordinates in which both the information A = B' W B and the penalty P are diagonal, a + l p, the
+        likelihood costs little for each penalty l.
+        """
+        count, away = basis.shape[1], levels - levels.mean()
+        information, along = basis.T @ (weights[:, None] * basis), basis.T @ (weights * away)
+        penalty = np.diff(np.eye(count), _ORDER, axis=0)
+        penalty = penalty.T @ penalty * (np.trace(information) / count)
+        lower = np.linalg.cholesky(information + penalty)
+        shares, turn = np.linalg.eigh(_between(lower, penalty))
+        shares = np.clip(shares, 0.0, 1.0)  # of the penalty in their sum
+        back = np.linalg.solve(lower.T, turn)
+        own, total = (back.T @ along) ** 2, float(weights @ away**2)
+        sizes = (1.0 - shares) + _PENALTIES[:, None] * shares
+        freedom = len(levels) - _ORDER
+        variances = np.maximum(total - (own / sizes).sum(axis=1), 1e-12 * total) / freedom
+        costs = freedom * np.log(variances) + np.log(sizes).sum(axis=1) - (count - _ORDER) * np.log(_PENALTIES)
+        best = int(np.argmin(costs))
+        coefficients = back @ ((back.T @ along) / sizes[best])
+        return cls(coefficients, back * np.sqrt(variances[best] / sizes[best]), float(variances[best]))
+
+
+def _between(lower: Floats, matrix: Floats) -> Floats:
+    """Return L^-1 M L^-T."""
+    return np.asarray(np.linalg.solve(lower, np.linalg.solve(lower, matrix).T), float)
+
+
+def _largest(errors: Floats) -> Floats:
+    """Return the fewest independent errors (m, k) that make up nearly all of the variance of ``errors`` (m, c)."""
+    values, vectors = np.linalg.eigh(errors.T @ errors)
+    left_out = np.cumsum(np.maximum(values, 0.0)) < _KEPT * values.sum()
+    return errors @ vectors[:, ~left_out]
