@@ -27,6 +27,7 @@ from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.effects import effect_named, walk_named
 from kf_calib.estimation.reml import HELD
 from kf_calib.estimation.results import Calibration
+from kf_calib.support.logarithms import weights
 
 NOTHING, NOISE, NONE = "nothing", "unstated noise", "none of the known"
 """Families of the rows that name no effect: nothing missing, noise that was not stated, and no known effect."""
@@ -144,8 +145,7 @@ def table_of(rows: Iterable[Hypothesis]) -> Table:
     """The table of rows, of which only the evidence is known."""
     rows = list(rows)
     logs = np.array([row.log_evidence for row in rows])
-    shares = np.exp(logs - np.logaddexp.reduce(logs))
-    found = [replace(row, probability=float(share)) for row, share in zip(rows, shares, strict=True)]
+    found = [replace(row, probability=share) for row, share in zip(rows, weights(logs).tolist(), strict=True)]
     return Table(tuple(sorted(found, key=lambda row: -row.probability)))
 
 

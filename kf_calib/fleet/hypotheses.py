@@ -18,6 +18,7 @@ from kf_calib.fleet.campaign import Campaign, Group
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
 from kf_calib.fleet.population import Own, OwnCoefficients
 from kf_calib.fleet.some_units import SomeUnits
+from kf_calib.support.logarithms import weights
 
 _USUAL = 2.0 / 3.0
 _HAS_IT = 0.5
@@ -76,8 +77,8 @@ def table(campaign: Campaign, terms: PooledTerms) -> AttributionTable:
     tried = {name: {each.attribution for each in every if each.name == name} for name in (g.name for g in groups)}
     rows = [replace(each, log_prior=_log_prior(each.term, tried[each.name], len(groups))) for each in every]
     logs = np.array([np.log(_HAS_IT), *(each.log_odds + each.log_prior for each in rows)])
-    shares = np.exp(logs - np.logaddexp.reduce(logs))
-    return AttributionTable(tuple(rows), shares[1:], float(shares[0]))
+    found = weights(logs)
+    return AttributionTable(tuple(rows), found[1:], float(found[0]))
 
 
 def _every(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[AttributionHypothesis]:
@@ -119,7 +120,8 @@ def _of_units(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -
     out = list[AttributionHypothesis]()
     for group, own, part in zip(groups, sums, parts, strict=True):
         units = Own.joined(part)
-        some, every = SomeUnits(group, units), _drawn(group, Attribution.SENSORS, own)
+        every = _drawn(group, Attribution.SENSORS, own)
+        some = SomeUnits(group, units, with_mean=every.log_odds > 0.0)  # where nothing speaks for any mean, none
         shapes = float(np.logaddexp(every.log_odds, some.log_odds_of_all) - np.log(2.0))
         out.append(replace(every, log_odds=shapes))
         out.append(_of_some(group, units, some))

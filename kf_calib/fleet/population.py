@@ -21,9 +21,9 @@ from kf_calib.fleet.evidence import (
     modes,
     posterior,
     sizes,
-    weights,
 )
 from kf_calib.fleet.pooled_terms import Common, PooledTerms, Sums, shares_of
+from kf_calib.support.logarithms import weights
 
 _LEAST = 0.25  # sigma of one run: the smallest spread that is expected
 _RATIOS = np.array([0.0, 1.0, 3.0])  # of the mean of a population to its spread
