@@ -14,7 +14,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.campaign import Group
 from kf_calib.fleet.evidence import log_evidence_of_modes, modes, sizes
-from kf_calib.fleet.population import Own
+from kf_calib.fleet.population import Own, told_of_mean
 from kf_calib.fleet.shape import SHARES, Shape
 
 _LEAST, _ALIKE = 0.25, 64.0  # sigma of one run: the smallest and the largest spread that is expected
@@ -28,12 +28,12 @@ _LOG_ODDS = np.log(SHARES / (1.0 - SHARES))[:, None]
 class _Told:
     """What units tell of the mean: log L = apart + score' mean - 1/2 mean' info mean, against no effect.
 
-    apart (n,), score (n, q), info (n, q, q).
+    apart (n,), info (n, q, q), score (n, q).
     """
 
     apart: Floats
-    score: Floats
     info: Floats
+    score: Floats
 
     def ratios(self, mean: Floats) -> Floats:
         """log L (..., n) for means (..., q)."""
@@ -48,11 +48,11 @@ class _Told:
 def about_mean(group: Group, own: Own) -> Shape:
     """The shape of units that have an effect about a mean of their own."""
     values, along, turned = modes(own.info, own.score)
-    spreads, count = sizes(_LEAST, min(_ALIKE, group.largest)), values.shape[1]
+    spreads, count = sizes(_LEAST, _ALIKE), values.shape[1]
     members = len(SHARES) * len(spreads) * len(_RATIOS)
     ratios, logs, size = list[Floats](), list[Floats](), list[Floats]()
     for spread in spreads.tolist():
-        told = _told(values, along, turned, spread)
+        told = _Told(log_evidence_of_modes(values, along, spread), *told_of_mean(values, along, turned, spread))
         for prior in (spread * _RATIOS).tolist():
             mean = _likeliest(told, prior)
             found = told.ratios(mean)
@@ -62,22 +62,15 @@ def about_mean(group: Group, own: Own) -> Shape:
     return Shape(np.stack(ratios, axis=2), np.stack(logs, axis=1), np.stack(size, axis=1))
 
 
-def _told(values: Floats, along: Floats, turned: Floats, spread: float) -> _Told:
-    """Return what units tell of the mean, their own departures from it eliminated."""
-    kept = 1.0 / (1.0 + spread**2 * values)
-    info = np.swapaxes(turned, 1, 2) @ ((kept * values)[:, :, None] * turned)
-    score = (np.swapaxes(turned, 1, 2) @ (kept * along)[:, :, None])[:, :, 0]
-    return _Told(log_evidence_of_modes(values, along, spread), score, info)
-
-
 def _likeliest(told: _Told, prior: float) -> Floats:
     """Return the likeliest mean (shares, q) for each share; prior: standard deviation of its coefficients before."""
     known = np.eye(told.score.shape[1]) / prior**2
-    mean = np.linalg.solve(told.info.sum(axis=0) + known, told.score.sum(axis=0)) / SHARES[:, None]
+    pooled = np.linalg.solve(told.info.sum(axis=0) + known, told.score.sum(axis=0))
+    mean = np.asarray(pooled / SHARES[:, None], float)
     for _ in range(_ROUNDS):
         chances = _chances(told.ratios(mean))
         new = np.linalg.solve(told.info_of(chances) + known, (chances @ told.score)[:, :, None])[:, :, 0]
-        moved, mean = float(np.abs(new - mean).max()), new
+        moved, mean = float(np.abs(new - mean).max()), np.asarray(new, float)
         if moved < _ENOUGH:
             break
     return mean

@@ -16,19 +16,19 @@ from kf_calib.fleet.evidence import modes, sizes
 from kf_calib.fleet.population import Own
 from kf_calib.fleet.shape import SHARES, Shape
 
-POWERS = (0, 2, 32)
-"""Of c' A c: normal, clearly not zero, and nearly of one size."""
-
 _SEEN = 1e-6  # of the largest information of a unit: what is less counts as not seen
 _LEAST = 1.0  # sigma of one run: the smallest size of the effect of a unit
-_STEP = np.sqrt(2.0)  # ratio of a size to the one before
-_ALIKE, _CLOSE = 64.0, 1.2  # the largest size, and that ratio, where sizes are nearly one: units tell it closely
+_STEPS = {0: 2.0, 2: 2.0**0.5, 32: 1.2}  # ratio of a size to the one before: the more alike, the closer
+POWERS = tuple(_STEPS)
+"""Of c' A c: normal, clearly not zero, and nearly of one size."""
+
+_ALIKE = 64.0  # sigma of one run: the largest size that is tried where all are nearly one
 
 
 def about_zero(group: Group, own: Own, power: int) -> Shape:
     """The shape with m = ``power``."""
     values, along, _ = modes(own.info, own.score)
-    tried = sizes(_LEAST, _ALIKE, _CLOSE) if power == max(POWERS) else sizes(_LEAST, group.largest, _STEP)
+    tried = sizes(_LEAST, _ALIKE if power == max(POWERS) else group.largest, _STEPS[power])
     count = len(SHARES) * len(tried)
     ratios = _ratios(values, along, tried, power)[:, None]
     return Shape(ratios, np.full((len(SHARES), len(tried)), -np.log(count)), tried[None] / np.sqrt(values.shape[1]))
@@ -57,9 +57,10 @@ def _log_moment(variances: Floats, means: Floats, power: int) -> Floats:
     whole = np.sum(variances + means**2, axis=-1)
     whole = np.where(whole > 0.0, whole, 1.0)  # of a unit that sees nothing: before and after are the same
     part, squares = variances / whole[..., None], means**2 / whole[..., None]
-    cumulants, moments, raised = list[Floats](), [np.ones_like(whole)], np.ones_like(part)
-    for order in range(1, power + 1):
-        cumulants.append(np.sum(raised * (part + order * squares), axis=-1))
-        moments.append(np.einsum("k...,k...", np.array(cumulants), np.array(moments[::-1])) / order)
+    cumulants, moments = np.empty((power, *whole.shape)), np.ones((power + 1, *whole.shape))
+    raised = np.ones_like(part)
+    for k in range(power):
+        cumulants[k] = np.sum(raised * (part + (k + 1) * squares), axis=-1)
+        moments[k + 1] = np.einsum("k...,k...", cumulants[: k + 1], moments[k::-1]) / (k + 1)
         raised = 2.0 * part * raised
     return power * np.log(whole) + np.log(np.maximum(moments[-1], np.finfo(float).tiny))
