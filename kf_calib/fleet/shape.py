@@ -72,5 +72,5 @@ class Shape:
         for whole, has in self._odds():
             chances = np.exp(has - whole).reshape(len(whole), -1)[:, chosen]
             counts += np.sum(rng.random(chances.shape) < chances, axis=0)
-        low, high = np.quantile(counts / len(self.ratios), [0.025, 0.975]).tolist()
+        low, high = np.quantile(counts / len(self.ratios), [0.025, 0.975], method="inverted_cdf").tolist()
         return low, high
