@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,20 +22,26 @@ _DRAWS = 4000
 class Shape:
     """One supposition, for each share of a grid and each size of another.
 
-    - ratios (n, shares or 1, sizes): log of the likelihood of each unit with the effect against that without.
+    - units: their number. ratios: of a few of them, the log of the likelihood of each with the effect against that
+      without, (units, shares or 1, sizes), to be computed when it is needed, to save memory.
     - log_prior (shares, sizes): of the suppositions before the runs; they sum to 1.
     - sizes (shares or 1, sizes): of a coefficient of a unit that has it, in ``Group.sigma``.
     """
 
-    ratios: Floats
+    units: int
+    ratios: Callable[[slice], Floats]
     log_prior: Floats
     sizes: Floats
+
+    def _parts(self) -> Iterator[Floats]:
+        """Yield the ratios of a few units at a time."""
+        return (self.ratios(slice(first, first + _TOGETHER)) for first in range(0, self.units, _TOGETHER))
 
     def _odds(self) -> Iterator[tuple[Floats, Floats]]:
         """Yield the log of the likelihood (units, shares, sizes) of a few units at a time, whether or not they have it,
         and of that part of it in which they have it."""
-        for first in range(0, len(self.ratios), _TOGETHER):
-            has = np.log(SHARES)[:, None] + self.ratios[first : first + _TOGETHER]
+        for part in self._parts():
+            has = np.log(SHARES)[:, None] + part
             yield np.logaddexp(has, np.log1p(-SHARES)[:, None]), has
 
     @cached_property
@@ -51,7 +57,7 @@ class Shape:
     @property
     def log_odds_of_all(self) -> float:
         """The same that all units have it."""
-        logs = self.log_prior + self.ratios.sum(axis=0)
+        logs = self.log_prior + sum(part.sum(axis=0) for part in self._parts())
         return float(np.logaddexp.reduce(logs, axis=None))
 
     @property
@@ -72,5 +78,5 @@ class Shape:
         for whole, has in self._odds():
             chances = np.exp(has - whole).reshape(len(whole), -1)[:, chosen]
             counts += np.sum(rng.random(chances.shape) < chances, axis=0)
-        low, high = np.quantile(counts / len(self.ratios), [0.025, 0.975], method="inverted_cdf").tolist()
+        low, high = np.quantile(counts / self.units, [0.025, 0.975], method="inverted_cdf").tolist()
         return low, high

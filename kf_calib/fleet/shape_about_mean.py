@@ -7,12 +7,12 @@ a normal density about it (Laplace), with the information that is left without k
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.fleet.campaign import Group
 from kf_calib.fleet.evidence import log_evidence_of_modes, modes, sizes
 from kf_calib.fleet.population import Own, told_of_mean
 from kf_calib.fleet.shape import SHARES, Shape
@@ -45,21 +45,30 @@ class _Told:
         return (chances @ self.info.reshape(len(self.info), -1)).reshape(*chances.shape[:-1], *self.info.shape[1:])
 
 
-def about_mean(group: Group, own: Own) -> Shape:
+def about_mean(own: Own) -> Shape:
     """The shape of units that have an effect about a mean of their own."""
-    values, along, turned = modes(own.info, own.score)
-    spreads, count = sizes(_LEAST, _ALIKE), values.shape[1]
-    members = len(SHARES) * len(spreads) * len(_RATIOS)
-    ratios, logs, size = list[Floats](), list[Floats](), list[Floats]()
-    for spread in spreads.tolist():
-        told = _Told(log_evidence_of_modes(values, along, spread), *told_of_mean(values, along, turned, spread))
+    found, count = modes(own.info, own.score), own.score.shape[1]
+    means, logs, size = list[tuple[float, Floats]](), list[Floats](), list[Floats]()
+    for spread in sizes(_LEAST, _ALIKE).tolist():
+        told = _told(found, spread)
         for prior in (spread * _RATIOS).tolist():
             mean = _likeliest(told, prior)
-            found = told.ratios(mean)
-            ratios.append(found.T)
-            logs.append(_log_volume(told, mean, found, prior) - np.log(members))
+            means.append((spread, mean))
+            logs.append(_log_volume(told, mean, prior))
             size.append(np.sqrt(spread**2 + np.sum(mean**2, axis=1) / count))
-    return Shape(np.stack(ratios, axis=2), np.stack(logs, axis=1), np.stack(size, axis=1))
+
+    def ratios(part: slice) -> Floats:
+        here = [each[part] for each in found]
+        return np.stack([_told(here, spread).ratios(mean).T for spread, mean in means], axis=2)
+
+    log_prior = np.stack(logs, axis=1) - np.log(len(SHARES) * len(means))
+    return Shape(len(own.score), ratios, log_prior, np.stack(size, axis=1))
+
+
+def _told(found: Sequence[Floats], spread: float) -> _Told:
+    """Return what units tell of the mean, from their ``modes``, their own departures from it eliminated."""
+    values, along, turned = found
+    return _Told(log_evidence_of_modes(values, along, spread), *told_of_mean(values, along, turned, spread))
 
 
 def _likeliest(told: _Told, prior: float) -> Floats:
@@ -76,9 +85,9 @@ def _likeliest(told: _Told, prior: float) -> Floats:
     return mean
 
 
-def _log_volume(told: _Told, mean: Floats, ratios: Floats, prior: float) -> Floats:
+def _log_volume(told: _Told, mean: Floats, prior: float) -> Floats:
     """Return the log (shares,) of the prior density at the mean times the volume in which the mean is as likely."""
-    chances = _chances(ratios)
+    chances = _chances(told.ratios(mean))
     departures = told.score - np.einsum("nij,sj->sni", told.info, mean)
     unsure = np.einsum("sn,sni,snj->sij", chances * (1.0 - chances), departures, departures, optimize=True)
     left = np.linalg.eigvalsh(told.info_of(chances) + np.eye(mean.shape[1]) / prior**2 - unsure)

@@ -29,9 +29,9 @@ def about_zero(group: Group, own: Own, power: int) -> Shape:
     """The shape with m = ``power``."""
     values, along, _ = modes(own.info, own.score)
     tried = sizes(_LEAST, _ALIKE if power == max(POWERS) else group.largest, _STEPS[power])
-    count = len(SHARES) * len(tried)
+    log_prior = np.full((len(SHARES), len(tried)), -np.log(len(SHARES) * len(tried)))
     ratios = _ratios(values, along, tried, power)[:, None]
-    return Shape(ratios, np.full((len(SHARES), len(tried)), -np.log(count)), tried[None] / np.sqrt(values.shape[1]))
+    return Shape(len(values), ratios.__getitem__, log_prior, tried[None] / np.sqrt(values.shape[1]))
 
 
 def _ratios(values: Floats, along: Floats, tried: Floats, power: int) -> Floats:

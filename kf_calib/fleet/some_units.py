@@ -27,7 +27,7 @@ class SomeUnits:
         """with_mean: whether they may have a mean of their own; if not, that shape counts as impossible."""
         zero = {power: about_zero(group, own, power) for power in POWERS}
         self._clear = [shape for power, shape in zero.items() if power]
-        self._shapes = [*zero.values(), *([about_mean(group, own)] if with_mean else [])]
+        self._shapes = [*zero.values(), *([about_mean(own)] if with_mean else [])]
         self._logs = np.array([shape.log_odds for shape in self._shapes]) - np.log(len(POWERS) + 1)
 
     @property

@@ -106,14 +106,14 @@ def test_evidence_of_any_direction_is_the_integral_of_likelihood_times_density(p
     density = squares**power * np.exp(-0.5 * c**2 @ (1.0 / variances))
     likelihood = np.exp(c @ score - 0.5 * squares)
     truth = np.log((density * likelihood).sum() / density.sum())
-    assert float(shape.ratios[0, 0, place]) == pytest.approx(truth, rel=1e-5)
+    assert float(shape.ratios(slice(1))[0, 0, place]) == pytest.approx(truth, rel=1e-5)
 
 
 def test_evidence_about_a_mean_is_the_integral_over_the_mean() -> None:
     """Of ten units with one coefficient each, of which six have it, on a grid of the mean."""
     scores = np.random.default_rng(5).standard_normal((10, 1)) + 3.0 * (np.arange(10) < 6)[:, None]
     own = Own([""] * 10, np.ones((10, 1, 1)), scores)
-    shape = about_mean(Campaign(campaign_of(2)).groups[0], own)
+    shape = about_mean(own)
     grid, logs = np.linspace(-40.0, 40.0, 641), list[float]()
     for spread in sizes(0.25, 64.0):
         has = norm(grid, np.hypot(1.0, spread)).logpdf(scores) - norm.logpdf(scores)
