@@ -18,7 +18,7 @@ from kf_calib.fleet.shape import SHARES, Shape
 
 _SEEN = 1e-6  # of the largest information of a unit: what is less counts as not seen
 _LEAST = 1.0  # sigma of one run: the smallest size of the effect of a unit
-_STEPS = {0: 2.0, 2: 2.0**0.5, 32: 1.2}  # ratio of a size to the one before: the more alike, the closer
+_STEPS = {0: 2.0**0.5, 2: 2.0**0.5, 32: 1.2}  # ratio of a size to the one before: closer where sizes are alike
 POWERS = tuple(_STEPS)
 """Of c' A c: normal, clearly not zero, and nearly of one size."""
 
