@@ -55,12 +55,12 @@ class SomeUnits:
 
         all_have_it: probability that all have it, rather than some.
 
-        The interval holds the share of each shape that is not ruled out, and all units unless that is. Which of them is
-        the likelier may depend on no more than what was as likely as what before the runs, and the share on which.
+        The interval reaches over those of all shapes that are not ruled out, and up to all units unless that is: how
+        likely each was before the runs often decides which is the likelier, and so must not decide what the share is.
         """
         chances = (1.0 - all_have_it) * weights(self._logs)
         held = zip(self._shapes, chances.tolist(), strict=True)
         intervals = [shape.interval() for shape, chance in held if chance > _RULED_OUT]
         intervals += [(1.0, 1.0)] if all_have_it > _RULED_OUT else []
-        low, high = (min(low for low, _ in intervals), max(high for _, high in intervals))
+        low, high = min(low for low, _ in intervals), max(high for _, high in intervals)
         return all_have_it + (1.0 - all_have_it) * float(self.probabilities.mean()), (low, high)
