@@ -29,6 +29,7 @@ from kf_calib.effects import FrameEffect, effect_named, walk_named
 from kf_calib.estimation.reml import HELD
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import unweighted_left
+from kf_calib.support.logarithms import weights
 
 NOTHING, NOISE, NONE = "nothing", "unstated noise", "none of the known"
 """Families of the rows that name no effect: nothing missing, noise that was not stated, and no known effect."""
@@ -142,8 +143,7 @@ def table_of(rows: Iterable[Hypothesis]) -> Table:
     """The table of rows, of which only the evidence is known."""
     rows = list(rows)
     logs = np.array([row.log_evidence for row in rows])
-    shares = np.exp(logs - np.logaddexp.reduce(logs))
-    found = [replace(row, probability=float(share)) for row, share in zip(rows, shares, strict=True)]
+    found = [replace(row, probability=share) for row, share in zip(rows, weights(logs).tolist(), strict=True)]
     return Table(tuple(sorted(found, key=lambda row: -row.probability)))
 
 
@@ -210,7 +210,7 @@ class Hypotheses:
         rows, prior = list(self._without()), self._prior("effect", len(self.test.scores))
         least = rows[0].log_evidence - math.log(_KINDS["nothing"])
         rows += [
-            Hypothesis((name,), families=self._families((name,)), log_evidence=least + own + prior,
+            Hypothesis((name,), families=self._families((name,)), log_evidence=least + own + prior + self._log_prior(name),
                        statistic=self._fall(name), dof=self._dof(name))
             for name, own in self._screened().items()
         ]  # fmt: skip
@@ -269,7 +269,7 @@ class Hypotheses:
         chosen = [name for name, log in columns.items() if log > least][: _MOST["effect"]]
         chosen += [*self._turning(), *itertools.chain(*pairs), *([self.walk] if self.walk else [])]
         for name in dict.fromkeys(chosen):
-            yield self._row((name,), self._prior("effect", len(screened)))
+            yield self._row((name,), self._prior("effect", len(screened)) + self._log_prior(name))
 
     def _turning(self) -> list[str]:
         """Names of the effects that turn the platform and explain most of the misfit of the dwells' means, whatever
@@ -366,13 +366,22 @@ class Hypotheses:
         best: Weighed = found[int(np.argmax(logs))]
         walks, log = self.walk in effects, float(np.logaddexp.reduce(logs)) + log_prior
         if walks and self.test.trend:  # a walk goes on within dwells, where it has no column
-            log += _log_odds(self.test.trend) - _log_odds(trend(refit.fit))
+            log += _log_odds(self._trend_without_walk(effects)) - _log_odds(trend(refit.fit))
         fall = best.fall if best.dof else 2.0 * self.before.fit.walk_gain
         return Hypothesis(effects, formulas, "", self._families(effects), log, fall, best.dof + walks, refit)
+
+    def _trend_without_walk(self, effects: Sequence[str]) -> Trend | None:
+        """Return the test of trends within dwells beside the other effects alone, which may explain them."""
+        others = tuple(name for name in effects if name != self.walk)
+        return trend(self._refit(others).fit) if others else self.test.trend
 
     def _families(self, effects: Sequence[str]) -> tuple[str, ...]:
         """Return the families of effects, each once."""
         return tuple(dict.fromkeys(effect_named(name, self.before.bench).family for name in effects))
+
+    def _log_prior(self, name: str) -> float:
+        """Return the log of how much likelier an effect is beforehand than another."""
+        return math.log(effect_named(name, self.before.bench).prior)
 
     def _refit(self, added: Sequence[str]) -> Calibration:
         return self.refits.with_effects(self.before, added)

@@ -59,16 +59,8 @@ def log_evidence_of_modes(values: Floats, score: Floats, size: Floats | float) -
 
 def log_mean(logarithms: Floats, axis: int | tuple[int, ...] | None = None) -> Floats:
     """Logarithm of the mean of numbers that are given by their logarithms."""
-    top = np.max(logarithms, axis=axis, keepdims=True)
-    top = np.where(np.isfinite(top), top, 0.0)
-    with np.errstate(divide="ignore"):
-        return np.log(np.mean(np.exp(logarithms - top), axis=axis)) + np.squeeze(top, axis=axis)
-
-
-def weights(logarithms: Floats) -> Floats:
-    """Numbers that sum to 1 and are in proportion to those given by their logarithms."""
-    found = np.exp(logarithms - logarithms.max())
-    return found / found.sum()
+    whole = np.logaddexp.reduce(logarithms, axis=axis)
+    return whole - np.log(logarithms.size / whole.size)
 
 
 def _within(info: Floats, prior: Floats) -> Floats:

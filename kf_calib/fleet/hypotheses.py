@@ -8,7 +8,7 @@ is for the other; each part is shared equally, but a bench that was repaired is 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,10 +18,15 @@ from kf_calib.fleet.campaign import Campaign, Group
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
 from kf_calib.fleet.population import Own, OwnCoefficients
 from kf_calib.fleet.some_units import SomeUnits
+from kf_calib.support.logarithms import weights
 
-_USUAL = 2.0 / 3.0
-_HAS_IT = 0.5
+_NONE, _USUAL = 0.5, 2.0 / 3.0
 _RARELY = 0.25  # how much rarer a repair is than a bench that stays as it is
+_HAS_IT = 0.5  # probability above which a unit counts as one that has the effect
+
+
+_Weighed = tuple[Term, float]
+"""A term and its log evidence against none."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +56,6 @@ class AttributionTable:
     probabilities: Floats
     none: float
 
-    @property
-    def best(self) -> AttributionHypothesis:
-        """The likeliest hypothesis."""
-        return self.hypotheses[int(np.argmax(self.probabilities))]
-
     def of(self, name: str) -> dict[Attribution, float]:
         """The probability of each attribution of an effect."""
         rows = zip(self.hypotheses, self.probabilities.tolist(), strict=True)
@@ -72,16 +72,16 @@ class AttributionTable:
 def table(campaign: Campaign, terms: PooledTerms) -> AttributionTable:
     """The table of the hypotheses for one term more than ``terms``."""
     groups = [group for group in campaign.groups if group.sigma and group.name not in terms.names()]
-    every = [each for each in _every(campaign, terms, groups) if _can_be_told(each.term)]
-    tried = {name: {each.attribution for each in every if each.name == name} for name in (g.name for g in groups)}
-    rows = [replace(each, log_prior=_log_prior(each.term, tried[each.name], len(groups))) for each in every]
-    logs = np.array([np.log(_HAS_IT), *(each.log_odds + each.log_prior for each in rows)])
-    shares = np.exp(logs - np.logaddexp.reduce(logs))
-    return AttributionTable(tuple(rows), shares[1:], float(shares[0]))
-
-
-def _every(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[AttributionHypothesis]:
-    return [*_of_units(campaign, terms, groups), *_of_runs(campaign, terms, groups)]
+    weighed = [*_of_units(campaign, terms, groups), *_of_runs(campaign, terms, groups)]
+    weighed = [(term, log_odds) for term, log_odds in weighed if _can_be_told(term)]
+    tried = {group.name: {term.attribution for term, _ in weighed if term.group is group} for group in groups}
+    rows = [
+        AttributionHypothesis(term, log_odds, _log_prior(term, tried[term.group.name], len(groups)))
+        for term, log_odds in weighed
+    ]
+    logs = np.array([np.log(_NONE), *(each.log_odds + each.log_prior for each in rows)])
+    found = weights(logs)
+    return AttributionTable(tuple(rows), found[1:], float(found[0]))
 
 
 def _can_be_told(term: Term) -> bool:
@@ -89,9 +89,9 @@ def _can_be_told(term: Term) -> bool:
     return not term.group.alone or term.attribution.common == term.group.of_the_bench
 
 
-def _of_runs(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[AttributionHypothesis]:
-    """Return the hypotheses of coefficients of benches and, if units were measured again, of single runs."""
-    dated, out = DatedSums(campaign, terms), list[AttributionHypothesis]()
+def _of_runs(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[_Weighed]:
+    """Return the terms of coefficients of benches and, if units were measured again, of single runs."""
+    dated, out = DatedSums(campaign, terms), list[_Weighed]()
     sums = [OwnCoefficients(group, terms) for group in groups] if campaign.repeats else []
     for blocks in campaign.runs():
         rest = terms.beside_own(blocks)
@@ -100,15 +100,15 @@ def _of_runs(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) ->
             own.add(rest)
     for group in groups:
         one, two = dated.constant(group), dated.repaired(group)
-        out.append(AttributionHypothesis(Term(group, Attribution.BENCH, one.size), one.log_odds, 0.0))
+        out.append((Term(group, Attribution.BENCH, one.size), one.log_odds))
         if two is not None:
             term = Term(group, Attribution.REPAIRED, two.size, repair=two.repair)
-            out.append(AttributionHypothesis(term, two.log_odds, 0.0))
+            out.append((term, two.log_odds))
     return [*out, *(_drawn(group, Attribution.RUN, own) for group, own in zip(groups, sums, strict=False))]
 
 
-def _of_units(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[AttributionHypothesis]:
-    """Return the hypotheses of coefficients that units have, all of them or some."""
+def _of_units(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[_Weighed]:
+    """Return the terms of coefficients that units have, all of them or some."""
     means, sums = terms.solved(campaign)[0], [OwnCoefficients(group, terms) for group in groups]
     parts = [list[Own]() for _ in groups]
     for blocks in campaign.units(terms.repairs):
@@ -116,26 +116,25 @@ def _of_units(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -
         for group, own, part in zip(groups, sums, parts, strict=True):
             own.add(rest)
             part.append(Own.of(group, terms, means, rest))
-    out = list[AttributionHypothesis]()
+    out = list[_Weighed]()
     for group, own, part in zip(groups, sums, parts, strict=True):
-        units = Own.joined(part)
-        some, every = SomeUnits(group, units), _drawn(group, Attribution.SENSORS, own)
-        shapes = float(np.logaddexp(every.log_odds, some.log_odds_of_all) - np.log(2.0))
-        out.append(replace(every, log_odds=shapes))
-        out.append(_of_some(group, units, some))
+        units, (term, log_odds) = Own.joined(part), _drawn(group, Attribution.SENSORS, own)
+        some = SomeUnits(group, units, with_mean=log_odds > 0.0)  # where nothing speaks for a mean of all, none
+        out.append((term, float(np.logaddexp(log_odds, some.log_odds_of_all) - np.log(2.0))))
+        out.append((_of_some(group, units, some), some.log_odds))
     return out
 
 
-def _of_some(group: Group, units: Own, some: SomeUnits) -> AttributionHypothesis:
-    """Return the hypothesis that some units have it; which is asked only if it may be so."""
+def _of_some(group: Group, units: Own, some: SomeUnits) -> Term:
+    """Return the term that some units have; which is asked only if it may be so."""
     held = some.probabilities > _HAS_IT if some.log_odds > 0.0 else np.zeros(len(units.units), bool)
     having = frozenset(unit for unit, here in zip(units.units, held.tolist(), strict=True) if here)
-    return AttributionHypothesis(Term(group, Attribution.SOME, some.size, units=having), some.log_odds, 0.0)
+    return Term(group, Attribution.SOME, some.size, units=having)
 
 
-def _drawn(group: Group, attribution: Attribution, own: OwnCoefficients) -> AttributionHypothesis:
+def _drawn(group: Group, attribution: Attribution, own: OwnCoefficients) -> _Weighed:
     found = own.evidence()
-    return AttributionHypothesis(Term(group, attribution, found.spread, found.mean_size), found.log_odds, 0.0)
+    return Term(group, attribution, found.spread, found.mean_size), found.log_odds
 
 
 def _log_prior(term: Term, tried: set[Attribution], groups: int) -> float:
@@ -144,4 +143,4 @@ def _log_prior(term: Term, tried: set[Attribution], groups: int) -> float:
     usual = term.group.of_the_bench == term.attribution.common
     total = sum(part for each, part in alike.items() if each.common == term.attribution.common)
     share = (_USUAL if usual else 1.0 - _USUAL) * alike[term.attribution] / total
-    return float(np.log((1.0 - _HAS_IT) / groups * share))
+    return float(np.log((1.0 - _NONE) / groups * share))

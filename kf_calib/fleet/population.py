@@ -21,9 +21,9 @@ from kf_calib.fleet.evidence import (
     modes,
     posterior,
     sizes,
-    weights,
 )
 from kf_calib.fleet.pooled_terms import Common, PooledTerms, Sums, shares_of
+from kf_calib.support.logarithms import weights
 
 _LEAST = 0.25  # sigma of one run: the smallest spread that is expected
 _RATIOS = np.array([0.0, 1.0, 3.0])  # of the mean of a population to its spread
@@ -144,7 +144,8 @@ def population(own: Own, largest: float) -> Population:
     """The population from its units by restricted likelihood; largest: the largest spread that is tried."""
     tried, flat = np.concatenate([[0.0], sizes(_NARROW, largest, _FINE)]), np.full(own.score.shape[1], FLAT)
     values, along, turned = modes(own.info, own.score)
-    rests = [_beside_spread(values, along, turned, spread) for spread in tried.tolist()]
+    told = [told_of_mean(values, along, turned, spread) for spread in tried.tolist()]
+    rests = [Sums(info.sum(axis=0), score.sum(axis=0)) for info, score in told]
     logs = np.array([
         log_evidence_of_modes(values, along, spread).sum() + log_evidence(rest.info, rest.score, flat)
         for spread, rest in zip(tried.tolist(), rests, strict=True)
@@ -157,8 +158,8 @@ def population(own: Own, largest: float) -> Population:
     return Population(mean, covariance, float(tried[best]), (low, high))
 
 
-def _beside_spread(values: Floats, along: Floats, turned: Floats, spread: float) -> Sums:
-    """Return what all units tell of the mean, their own departures from it eliminated."""
-    kept = 1.0 / (1.0 + spread**2 * values)
-    info = np.einsum("nki,nk,nkj->ij", turned, kept * values, turned)
-    return Sums(info, np.einsum("nki,nk->i", turned, kept * along))
+def told_of_mean(values: Floats, along: Floats, turned: Floats, spread: float) -> tuple[Floats, Floats]:
+    """What each unit tells of the mean of a population, its own departure from it eliminated: information (n, q, q) and
+    score (n, q), from the ``modes`` of what it tells of its own coefficients."""
+    kept, back = 1.0 / (1.0 + spread**2 * values), np.swapaxes(turned, 1, 2)
+    return back @ ((kept * values)[:, :, None] * turned), (back @ (kept * along)[:, :, None])[:, :, 0]

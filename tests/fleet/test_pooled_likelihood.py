@@ -5,12 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.run_factors import campaign_of, run_factor_of
-from scipy.stats import multivariate_normal
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal, norm
 
 from kf_calib.fleet.campaign import Campaign
-from kf_calib.fleet.evidence import log_evidence, log_evidence_of_modes, modes, posterior
+from kf_calib.fleet.evidence import log_evidence, log_evidence_of_modes, modes, posterior, sizes
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
 from kf_calib.fleet.population import Own, population
+from kf_calib.fleet.shape import SHARES
+from kf_calib.fleet.shape_about_mean import about_mean
+from kf_calib.fleet.shape_about_zero import POWERS, about_zero
 from kf_calib.fleet.some_units import SomeUnits
 
 
@@ -86,13 +90,53 @@ def test_posterior_without_information_is_the_prior() -> None:
     np.testing.assert_allclose(covariance, np.diag([1.0, 9.0]))
 
 
-def test_share_of_the_units_covers_the_truth_as_often_as_it_says() -> None:
+@pytest.mark.parametrize("power", POWERS)
+def test_evidence_of_any_direction_is_the_integral_of_likelihood_times_density(power: int) -> None:
+    """Of one unit that sees one direction better than the other, on a grid of its coefficients."""
+    info, score = np.diag([0.3, 1.7]), np.array([0.4, 3.0])
+    own = Own(["unit"], info[None], score[None])
+    shape = about_zero(Campaign(campaign_of(2)).groups[0], own, power)
+    place, tilt = 2, power / (power + 1.0)
+    size = shape.sizes[0, place] * np.sqrt(2.0)
+    seen = np.diag(info) ** (1.0 - tilt) if power else np.diag(info)
+    variances = seen / (seen.mean() if power else 1.0) * size**2 / (2 * power + 2) / np.diag(info)
+    grid = np.linspace(-40.0, 40.0, 1001)
+    c = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1)
+    squares = c**2 @ np.diag(info)
+    density = squares**power * np.exp(-0.5 * c**2 @ (1.0 / variances))
+    likelihood = np.exp(c @ score - 0.5 * squares)
+    truth = np.log((density * likelihood).sum() / density.sum())
+    assert float(shape.ratios(slice(1))[0, 0, place]) == pytest.approx(truth, rel=1e-5)
+
+
+def test_evidence_about_a_mean_is_the_integral_over_the_mean() -> None:
+    """Of ten units with one coefficient each, of which six have it, on a grid of the mean."""
+    scores = np.random.default_rng(5).standard_normal((10, 1)) + 3.0 * (np.arange(10) < 6)[:, None]
+    own = Own([""] * 10, np.ones((10, 1, 1)), scores)
+    shape = about_mean(own)
+    grid, logs = np.linspace(-40.0, 40.0, 641), list[float]()
+    for spread in sizes(0.25, 64.0):
+        has = norm(grid, np.hypot(1.0, spread)).logpdf(scores) - norm.logpdf(scores)
+        for ratio in (1.0, 3.0, 10.0):
+            prior = norm.logpdf(grid, scale=ratio * spread) + np.log(grid[1] - grid[0])
+            each = np.logaddexp(np.log(SHARES)[:, None, None] + has, np.log1p(-SHARES)[:, None, None])
+            logs.append(float(logsumexp(each.sum(axis=1) + prior)))
+    truth = logsumexp(logs) - np.log(len(logs) * len(SHARES))
+    assert shape.log_odds == pytest.approx(truth, abs=0.2)
+
+
+@pytest.mark.parametrize("alike", [False, True])
+def test_share_covers_the_truth_where_units_hardly_tell_who_has_the_effect(alike: bool) -> None:
+    """Half of them have 2.5 sigma in a direction of their own, or all the same; one direction is seen far better."""
     group, rng, inside = Campaign(campaign_of(2)).groups[0], np.random.default_rng(4), 0
-    for _ in range(20):
-        has, drawn = rng.permutation(40) < rng.integers(4, 37), rng.standard_normal((40, 3))
-        sizes = 4.0 * has[:, None] / np.linalg.norm(drawn, axis=1, keepdims=True)
-        scores = rng.standard_normal((40, 3)) + sizes * drawn
-        some = SomeUnits(group, Own([""] * 40, np.tile(np.eye(3), (40, 1, 1)), scores))
-        low, high = some.share(0.0)[1]
-        inside += low <= has.mean() <= high
-    assert inside >= 17
+    info = np.diag([0.04, 0.04, 2.9])
+    for _ in range(8):
+        drawn = np.tile(rng.standard_normal(3), (40, 1)) if alike else rng.standard_normal((40, 3))
+        norms = np.sqrt(np.einsum("ni,ij,nj->n", drawn, info, drawn))
+        truth = drawn * (2.5 / norms * (rng.permutation(40) < 20))[:, None]
+        scores = truth @ info + rng.standard_normal((40, 3)) * np.sqrt(np.diag(info))
+        some = SomeUnits(group, Own([""] * 40, np.tile(info, (40, 1, 1)), scores))
+        every = 1.0 / (1.0 + np.exp(some.log_odds - some.log_odds_of_all))
+        low, high = some.share(float(every))[1]
+        inside += low <= 0.5 <= high
+    assert inside >= 7
