@@ -13,7 +13,7 @@ import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -191,7 +191,7 @@ class Hypotheses:
         effects = self._screened()
         pairs = self._pairs(effects)
         tried = [*self._without(), *self._effects(effects, pairs), *self._formulas(effects)]
-        tried += [self._row(names, self._prior("pair", math.comb(len(effects), 2))) for names in pairs]
+        tried += [self._row(names, self._prior("pair", math.comb(len(effects), 2), *names)) for names in pairs]
         tried = [row for row in tried if math.isfinite(row.log_evidence)]
         least = max(row.log_evidence for row in tried) - _APART
         walks = [row for row in tried if row.effects == (self.walk,) and row.log_evidence > least]
@@ -207,10 +207,10 @@ class Hypotheses:
 
     def quick_table(self) -> Table:
         """The table of nothing, noise and single effects by the linear tests alone, for a run with no misfit."""
-        rows, prior = list(self._without()), self._prior("effect", len(self.test.scores))
+        rows, prior = list(self._without()), partial(self._prior, "effect", len(self.test.scores))
         least = rows[0].log_evidence - math.log(_KINDS["nothing"])
         rows += [
-            Hypothesis((name,), families=self._families((name,)), log_evidence=least + own + prior + self._log_prior(name),
+            Hypothesis((name,), families=self._families((name,)), log_evidence=least + own + prior(name),
                        statistic=self._fall(name), dof=self._dof(name))
             for name, own in self._screened().items()
         ]  # fmt: skip
@@ -269,7 +269,7 @@ class Hypotheses:
         chosen = [name for name, log in columns.items() if log > least][: _MOST["effect"]]
         chosen += [*self._turning(), *itertools.chain(*pairs), *([self.walk] if self.walk else [])]
         for name in dict.fromkeys(chosen):
-            yield self._row((name,), self._prior("effect", len(screened)) + self._log_prior(name))
+            yield self._row((name,), self._prior("effect", len(screened), name))
 
     def _turning(self) -> list[str]:
         """Names of the effects that turn the platform and explain most of the misfit of the dwells' means, whatever
@@ -379,14 +379,10 @@ class Hypotheses:
         """Return the families of effects, each once."""
         return tuple(dict.fromkeys(effect_named(name, self.before.bench).family for name in effects))
 
-    def _log_prior(self, name: str) -> float:
-        """Return the log of how much likelier an effect is beforehand than another."""
-        return math.log(effect_named(name, self.before.bench).prior)
-
     def _refit(self, added: Sequence[str]) -> Calibration:
         return self.refits.with_effects(self.before, added)
 
-    @staticmethod
-    def _prior(kind: str, members: int) -> float:
-        """Return the log of the prior probability of one of so many members of a kind."""
-        return math.log(_KINDS[kind] / max(members, 1))
+    def _prior(self, kind: str, members: int, *effects: str) -> float:
+        """Return the log of the prior probability of these effects, or formulas, among so many of their kind."""
+        own = math.prod(effect_named(name, self.before.bench).prior for name in effects)
+        return math.log(own * _KINDS[kind] / max(members, 1))

@@ -106,6 +106,7 @@ class Effect(ABC):
     force and temperature alone: of a, p, o (along its axes), before, after (readings of the two other accelerometers,
     in their order), T and the constant. Empty where it cannot be written so.
     typical: usual sizes of its coefficients. family: the physical class to which it belongs.
+    prior: how much likelier it is than another effect before anything is measured, 1 for most.
     of_the_bench: it belongs to the bench, so that all sensors on it usually have the same coefficients.
     """
 
@@ -123,6 +124,7 @@ class Effect(ABC):
     formulas: ClassVar[tuple[str, ...]] = ()
     typical: ClassVar[Typical] = Typical()
     family: ClassVar[str] = "none of the known"
+    prior: ClassVar[float] = 1.0
     of_the_bench: ClassVar[bool] = False
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""

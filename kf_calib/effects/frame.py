@@ -107,6 +107,7 @@ class UnevenFlexure(Flexure):
 
     name, title = "uneven-flexure", "bending with another stiffness about each axis"
     confused_with = "flexure, cross-coupling, cross-axis-square"
+    prior = 0.25  # it contains the flexure, from which readings alone tell it apart only by the price of coefficients
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:

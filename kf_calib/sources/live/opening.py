@@ -17,6 +17,7 @@ from kf_calib.sources.live.feed import Feed
 from kf_calib.sources.live.links import GrowingFile, Link, SerialPort, StandardInput, Tcp
 from kf_calib.sources.live.source import QUEUED, LiveSource
 from kf_calib.sources.live.streamed import StreamedFeed
+from kf_calib.sources.tables.grid import EXCEL_SUFFIXES
 from kf_calib.support.output_files import Outputs
 
 _TEXT_FILES = (".csv", ".jsonl", ".txt", ".tsv", ".log")
@@ -98,6 +99,8 @@ def _bag(address: str) -> Path | None:
         return files[-1]
     if path.suffix in (".db3", ".zstd"):
         raise InputError(f"{path} can be read when it is finished, not while it is recorded: use replay.")
+    if path.suffix in EXCEL_SUFFIXES:
+        raise InputError(f"{path} is a table of a run that is finished, not one that goes on: use replay.")
     return path if path.suffix == ".mcap" else None
 
 

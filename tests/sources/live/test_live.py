@@ -253,6 +253,7 @@ def test_what_cannot_be_opened_is_told_at_once(tmp_path: Path) -> None:
         ("missing.csv", {}, "cannot be opened"),
         ("missing.mcap", {}, "does not exist"),
         (str(tmp_path / "nothing"), {}, "neither a file nor a port"),
+        (str(tmp_path / "run.xlsx"), {}, "use replay"),
         ("sim://?speed=0", {}, "speed=0 is not a positive number"),
         ("sim://?sped=3", {}, "no setting 'sped'"),
         ("sim://", {"record": tmp_path / "there.mcap"}, "exists already"),

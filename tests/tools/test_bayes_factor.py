@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from kf_calib.diagnosis.bayes_factor import log_odds
+from blind_trials.bayes_factor import log_odds
 
 
 @pytest.mark.parametrize("dof", [1, 2, 3, 6])
