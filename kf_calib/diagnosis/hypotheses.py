@@ -190,8 +190,10 @@ class Hypotheses:
             self.inflation = max(1.0, judged.statistic / judged.dof) if judged.dof > 0 else 1.0
         effects = self._screened()
         pairs = self._pairs(effects)
-        tried = [*self._without(), *self._effects(effects, pairs), *self._formulas(effects)]
+        tried = [*self._without(), *self._effects(effects), *self._formulas(effects)]
         tried += [self._row(names, self._prior("pair", math.comb(len(effects), 2), *names)) for names in pairs]
+        likeliest, known = max(tried, key=lambda row: row.log_evidence), {row.effects for row in tried}
+        tried += [self._single(name, effects) for name in likeliest.effects if (name,) not in known]
         tried = [row for row in tried if math.isfinite(row.log_evidence)]
         least = max(row.log_evidence for row in tried) - _APART
         walks = [row for row in tried if row.effects == (self.walk,) and row.log_evidence > least]
@@ -262,14 +264,16 @@ class Hypotheses:
         relative = min(1.0, fall / max(float(falls.max()), 1e-9))
         return float(np.logaddexp.reduce(0.5 * relative * (falls - falls.max()))) - math.log(tried)
 
-    def _effects(self, screened: Mapping[str, float], pairs: Sequence[tuple[str, str]]) -> Iterator[Hypothesis]:
-        """Yield the rows of single effects, of all that are in pairs, too."""
+    def _effects(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
+        """Yield the rows of single effects."""
         columns = {name: log for name, log in screened.items() if name != self.walk}
         least = _least(columns.values())
         chosen = [name for name, log in columns.items() if log > least][: _MOST["effect"]]
-        chosen += [*self._turning(), *itertools.chain(*pairs), *([self.walk] if self.walk else [])]
-        for name in dict.fromkeys(chosen):
-            yield self._row((name,), self._prior("effect", len(screened), name))
+        chosen += [*self._turning(), *([self.walk] if self.walk else [])]
+        yield from (self._single(name, screened) for name in dict.fromkeys(chosen))
+
+    def _single(self, name: str, screened: Mapping[str, float]) -> Hypothesis:
+        return self._row((name,), self._prior("effect", len(screened), name))
 
     def _turning(self) -> list[str]:
         """Names of the effects that turn the platform and explain most of the misfit of the dwells' means, whatever

@@ -20,7 +20,8 @@ BENCHES = ("a b", "a/b")  # the same in the name of a file
 @pytest.fixture(scope="module")
 def found() -> PooledDiagnosis:
     """Two benches that bend."""
-    runs = [run_factor_of(k, lambda number: {"flexure": np.array([8.0, -6.0, 8.0])}) for k in range(12)]
+    sizes = np.array([[8.0, -6.0, 8.0], [5.0, 7.0, -3.0]])
+    runs = [run_factor_of(k, lambda number: {"flexure": sizes[number % 2]}) for k in range(12)]
     return pooled_diagnosis([replace(run, bench=BENCHES[k % 2]) for k, run in enumerate(runs)])
 
 

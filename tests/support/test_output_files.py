@@ -139,7 +139,7 @@ WRITING = [
     ("paper --repetitions 1", PICTURES),
     ("live sim://?speed=100", ["--record", "--rrd", "--save-model", "--save"]),
     ("history cal.json", ["--png", "--svg", "--pdf"]),
-    ("fleet run.mcap -o fleet", ["--png", "--svg", "--pdf", "--report"]),
+    ("fleet run.mcap -o fleet", [*PICTURES, "--report"]),
     ("record", [""]),
     ("simulate", [""]),
 ]
