@@ -50,7 +50,8 @@ class CandidateTests:
     them. vibration: lines that are not an oscillation of constant amplitude, and so count as noise. without_lines: the
     same tests with the lines treated as vibration. between: in words, the frequencies of an oscillation that are too
     fast for the scan and too slow for a line. trend: the test of trends within dwells
-    (None: it cannot be made, or there are lines).
+    (None: it cannot be made, or there are lines). noise_p: p-value of noise from dwell to dwell that was not stated
+    against all explanations (``hypotheses.noise_p``; None: all was stated).
     """
 
     scan: Scan
@@ -67,13 +68,16 @@ class CandidateTests:
     without_lines: CandidateTests | None = None
     between: str = ""
     trend: Trend | None = None
+    noise_p: float | None = None
 
     @property
     def p_value(self) -> float | None:
-        """The p-value of the run: the smallest of all tests, each at its share; None where nothing could be tested."""
+        """The p-value of the run: the smallest of all tests, each at its share, and of ``noise_p``; None where nothing
+        could be tested."""
         found = [*self.p_values.values(), *([self.misfit_p] if self.misfit_p is not None else [])]
         found += [self.trend.p_value * SHARE / REST] if self.trend else []
-        return min(1.0, min(found) / SHARE) if found else None
+        least = [] if self.noise_p is None else [self.noise_p]
+        return min(1.0, min(found) / SHARE, *least) if found else None
 
     @property
     def consistent(self) -> bool | None:

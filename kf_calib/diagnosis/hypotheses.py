@@ -147,6 +147,17 @@ def table_of(rows: Iterable[Hypothesis]) -> Table:
     return Table(tuple(sorted(found, key=lambda row: -row.probability)))
 
 
+def noise_p(table: Table) -> float:
+    """P-value of noise alone, stated or not, against all that a table has beside it.
+
+    In noise the odds of the others to it, over their odds before the readings, have the mean 1, so that they exceed 1/p
+    with a probability of p at most (Markov's inequality).
+    """
+    alone = table.families.get(NOTHING, 0.0) + table.families.get(NOISE, 0.0)
+    before = _KINDS["nothing"] / (1.0 - _KINDS["nothing"])
+    return min(1.0, alone / max(1.0 - alone, 1e-300) / before)
+
+
 def log_odds_of(p_value: float) -> float:
     """The largest log odds that a p-value gives against what it tests: -ln(-e p ln p), 0 above 1/e (T. Sellke, M.
     Bayarri, J. Berger, 2001)."""

@@ -15,7 +15,7 @@ import numpy as np
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.candidate_tests import CandidateTests, overlap_matrix
 from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated, with_noise_as_stated
-from kf_calib.diagnosis.hypotheses import NOISE, NOTHING, Hypotheses, Hypothesis, Table, log_odds_of, table_of
+from kf_calib.diagnosis.hypotheses import NOISE, NOTHING, Hypotheses, Hypothesis, Table, log_odds_of, noise_p, table_of
 from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.verdict import second_pass_in_words, verdict_in_words
@@ -90,8 +90,12 @@ def _explained(refits: Refits, before: Calibration, test: CandidateTests) -> Dia
     found = Diagnosis(before=before, test=test)
     if test.consistent is None:
         return found
-    if test.consistent:
+    if test.consistent and dwell_noise_is_stated(before):
         return replace(found, table=Hypotheses(refits, before, test).quick_table())
+    if test.consistent:  # noise that is estimated from all of the misfit explains as much of it as an effect does
+        table = Hypotheses(refits, before, test).table()
+        found = replace(found, test=replace(test, noise_p=noise_p(table)), table=table)
+        return found if found.test.consistent else _decided(refits, found)
     if test.oscillating:
         return _decided(refits, replace(found, table=_beside_lines(refits, before, test)))
     return _decided(refits, replace(found, table=Hypotheses(refits, before, test).table()))

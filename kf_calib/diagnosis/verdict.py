@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated
 from kf_calib.diagnosis.hypotheses import IRREGULAR, NOISE, NONE, NOTHING, SURE, Hypothesis
 from kf_calib.diagnosis.results import Diagnosis
@@ -39,12 +40,18 @@ def verdict_in_words(found: Diagnosis) -> str:
             )
         agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
         return f"{agreed}: no effect is missing that this run could show.{blind}"
-    start, first = f"Residuals fail (p {format_p(test.p_value)}).", found.likeliest
+    start, first = f"{_failing(test)} (p {format_p(test.p_value)}).", found.likeliest
     if first is None:
         return start
     if first.effects:
         return f"{start} {_named(found, first)}{_returning(found)}.{_held_out(found)}"
     return f"{start} {_noise(found, first) if found.noise else _unknown(found, first)}"
+
+
+def _failing(test: CandidateTests) -> str:
+    """Return what fails: the size of the residuals, or, where no noise was stated, how they scatter."""
+    scattering = test.noise_p is not None and test.noise_p == test.p_value
+    return "The dwells do not scatter as noise does" if scattering else "Residuals fail"
 
 
 def second_pass_in_words(found: Diagnosis) -> str:

@@ -15,6 +15,10 @@ from kf_calib.errors import InputError
 _CONFIG = {
     "distributed.scheduler.allowed-failures": 2,  # so often may a run take its process with it and be tried again
     "distributed.scheduler.worker-saturation": 1.0,  # no run waits at a process that another one takes with it
+    "distributed.worker.profile.enabled": False,  # looks a hundred times a second at what a worker does
+    # Dask would have free memory of 64 kB given back at once, and arrays of 128 kB fetched from the system each time.
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 28,
+    "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 25,
 }
 
 

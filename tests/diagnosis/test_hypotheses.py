@@ -6,10 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
-from helpers.hidden_effects import run, source
+from helpers.hidden_effects import noisy_source, run, source
 from helpers.synthetic import plan_of
 
-from kf_calib.diagnosis.hypotheses import NOTHING, Hypothesis, log_odds_of, table_of
+from kf_calib.diagnosis.hypotheses import NOISE, NOTHING, Hypothesis, log_odds_of, table_of
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.effects import effect_named, names
@@ -108,3 +108,24 @@ def test_a_formula_is_told_where_no_known_effect_explains_it() -> None:
     assert said["missing"] == "unknown" and not first["effects"] and "sin(3*q" in first["formula"]
     assert said["unknown"]["formula"] == first["formula"] and said["unknown"]["driver"] == first["driver"]
     assert said["families"][0]["family"] == "gimbal and encoder"
+
+
+def test_an_error_that_no_known_effect_is_does_not_pass_as_noise_that_nobody_stated() -> None:
+    """Three cycles a turn of an encoder: a setting error of twice the size has the same sum of squares."""
+    not_stated = {"angle_sigma_deg": None, "scatter_sigma_mps2": None}
+    hidden = "encoder-harmonic-3:z=15sigma"
+    found = diagnose(noisy_source(hidden, dwells=24, setting_sigma_deg=2e-4, states=not_stated, seed=3))
+    tests = [*found.test.p_values.values(), found.test.misfit_p or 1.0]
+    assert min(tests) > 0.01 and found.test.consistent is False  # the other tests see nothing
+    assert found.unknown and found.table is not None and "angle" in found.table.rows[0].driver
+    assert found.verdict.startswith("The dwells do not scatter as noise does (p = ")
+
+
+@pytest.mark.parametrize("seeds", [range(3), *slow(range(100))])
+def test_noise_that_nobody_stated_is_told_as_noise(seeds: range) -> None:
+    not_stated = {"angle_sigma_deg": None, "scatter_sigma_mps2": None}
+    noise = {"setting_sigma_deg": 2e-4, "scatter_mps2": 1e-5}
+    found = [diagnose(noisy_source(dwells=16, states=not_stated, seed=500 + seed, **noise)) for seed in seeds]
+    assert sum(each.test.consistent is False for each in found) <= 0.03 * len(found)
+    tables = [each.table for each in found]
+    assert all(table and table.of_any([NOISE, NOTHING]) > 0.3 for table in tables)
