@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 import pytest
 from helpers.hidden_effects import noisy_source, run, source
+from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 
 from kf_calib.diagnosis.hypotheses import NOISE, NOTHING, Hypothesis, log_odds_of, table_of
