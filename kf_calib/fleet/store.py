@@ -143,8 +143,9 @@ def _rows(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterator[
         if own := [str(file) for file in files if file.match(kind)]:
             try:
                 data = ds.dataset(own, schema=SCHEMA, format=form)
+                # with threads each would keep memory of its own, more with every pass over the table
                 yield from data.to_batches(columns=list(columns), batch_size=rows, batch_readahead=1,
-                                           fragment_readahead=1)  # fmt: skip
+                                           fragment_readahead=1, use_threads=False)  # fmt: skip
             except (pa.ArrowException, OSError) as error:
                 said = " ".join(str(error).split()).rstrip(".")
                 raise InputError(
