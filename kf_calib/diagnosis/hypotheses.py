@@ -313,8 +313,9 @@ class Hypotheses:
         walk = self.walk
         if walk and self.before.fit.walk_gain > 0.0:
             walked = self._refit((walk,))
-            # in a frame of its own: that of the run without a walk is needed again, and only one is kept
-            beside = Hypotheses(self.refits, walked, assess_candidates(walked.fit, self.test.effective_tests))
+            frames = self.refits.frames_beside_walk
+            test = assess_candidates(walked.fit, self.test.effective_tests, frames=frames)
+            beside = Hypotheses(self.refits, walked, test)
             own = [name for name in beside._screened() if name in beside.test.best]
             chosen += [(name, walk) for name in own[: _MOST["walk"]]]
         return chosen

@@ -35,7 +35,7 @@ class Refits:
     def __init__(self, source: Source | str | PathLike[str] | None = None) -> None:
         source = None if source is None else opened(source)
         self.source = None if isinstance(source, Table) else source
-        self.frames = list[Frame]()
+        self.frames, self.frames_beside_walk = list[Frame](), list[Frame]()  # each keeps the last one
         # with each value what its key is made of, since the id of an object that is gone may be used again
         self._refits = dict[tuple[int, tuple[str, ...]], tuple[Calibration, Calibration]]()
         self._families = dict[Hashable, tuple[Fit, list[Family]]]()
