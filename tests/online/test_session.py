@@ -279,6 +279,11 @@ URL = "sim://?speed=500&orientations=6&dwell_s=5&sample_hz=50&slew_degps=180&see
 SLOW = URL.replace("speed=500", "speed=30").replace("orientations=6", "orientations=30")
 
 
+def finished(found: dict[str, Any]) -> bool:
+    """Whether the file of a replay has its end; it may warn of readings where a run was ended in a motion."""
+    return not any("was not finished" in each for each in found["warnings"])
+
+
 def live(*words: str, **kwargs: Any) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "kf_calib.cli", "live", *words]
     streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | kwargs
@@ -384,7 +389,7 @@ def test_a_signal_finishes_the_file_and_prints_the_summary(tmp_path: Path, how: 
         said, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
     assert "Parameters (1σ)" in said and "Model and measurements agree" in said
-    assert replayed("replay", str(out))["warnings"] == [], "a finished file"
+    assert finished(replayed("replay", str(out)))
 
 
 @pytest.mark.parametrize("form", [["--json"], *slow([])])
@@ -468,7 +473,7 @@ def test_a_terminal_that_is_closed_costs_the_screen_only(tmp_path: Path, how: si
         time.sleep(0.1)
     assert process.wait(120) == 2, "what it had to say could not be written"
     found = replayed("replay", str(out))
-    assert found["warnings"] == [] and (found["dwells"] < 30 if how else found["dwells"] == 10) and model.exists()
+    assert finished(found) and (found["dwells"] < 30 if how else found["dwells"] == 10) and model.exists()
 
 
 def test_nobody_reading_ends_a_run_that_is_not_recorded() -> None:
