@@ -280,13 +280,13 @@ class Hypotheses:
         columns = {name: log for name, log in screened.items() if name != self.walk}
         least = _least(columns.values())
         chosen = [name for name, log in columns.items() if log > least][: _MOST["effect"]]
-        chosen += [*self._turning(), *([self.walk] if self.walk else [])]
+        chosen += [*self._effects_that_turn(), *([self.walk] if self.walk else [])]
         yield from (self._single(name, screened) for name in dict.fromkeys(chosen))
 
     def _single(self, name: str, screened: Mapping[str, float]) -> Hypothesis:
         return self._row((name,), self._prior("effect", len(screened), name))
 
-    def _turning(self) -> list[str]:
+    def _effects_that_turn(self) -> list[str]:
         """Names of the effects that turn the platform and explain most of the misfit of the dwells' means, whatever
         its direction.
 

@@ -40,7 +40,7 @@ def verdict_in_words(found: Diagnosis) -> str:
             )
         agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
         return f"{agreed}: no effect is missing that this run could show.{blind}"
-    start, first = f"{_failing(test)} (p {format_p(test.p_value)}).", found.likeliest
+    start, first = f"{_what_fails(test)} (p {format_p(test.p_value)}).", found.likeliest
     if first is None:
         return start
     if first.effects:
@@ -48,7 +48,7 @@ def verdict_in_words(found: Diagnosis) -> str:
     return f"{start} {_noise(found, first) if found.noise else _unknown(found, first)}"
 
 
-def _failing(test: CandidateTests) -> str:
+def _what_fails(test: CandidateTests) -> str:
     """Return what fails: the size of the residuals, or, where no noise was stated, how they scatter."""
     scattering = test.noise_p is not None and test.noise_p == test.p_value
     return "The dwells do not scatter as noise does" if scattering else "Residuals fail"

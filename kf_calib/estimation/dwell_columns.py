@@ -167,9 +167,10 @@ def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
 class Carried:
     """Dwells with the columns of a model: the common input of noise model, filter and diagnosis.
 
-    ``state`` (p,) is where rotations and input axes are linearised, and ``turned`` are the dwells as they are there
-    (``turned``): what whitens rows or makes columns takes these. ``slews`` and ``slew_columns`` belong to the
-    motions and are used only if an effect of the model shows in slews; everything else refers to dwells only.
+    ``state`` (p,) is where rotations and input axes are linearised. The attribute ``turned`` has the dwells as the
+    function of this name returns them: columns are made from these, and rows are whitened with them. ``slews`` and
+    ``slew_columns`` belong to the motions and are used only if an effect of the model shows in slews; everything else
+    refers to dwells only.
     """
 
     def __init__(
