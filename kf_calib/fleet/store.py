@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -107,8 +107,8 @@ class Store:
 
     def _merge(self, files: Sequence[Path]) -> None:
         with whole(self._new(_LARGE)) as part, pq.ParquetWriter(part, SCHEMA, compression="zstd") as out:
-            for batch in _newest(files, SCHEMA.names, AT_ONCE):
-                out.write_batch(batch)
+            for batch in _together(_newest(files, SCHEMA.names, AT_ONCE)):
+                out.write_table(batch)
         for file in files:
             file.unlink()
 
@@ -135,6 +135,19 @@ def _newest(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterato
         pairs = zip(batch["run"].to_pylist(), batch["evaluated"].to_pylist(), strict=True)
         kept = [left.get(run) == evaluated and bool(left.pop(run)) for run, evaluated in pairs]
         yield batch.filter(pa.array(kept)).select(list(columns))
+
+
+def _together(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
+    """Yield batches joined to ``AT_ONCE`` rows or somewhat more: each becomes a row group, of which a reader keeps a
+    description of 10 kB and more in memory."""
+    waiting = list[pa.RecordBatch]()
+    for batch in batches:
+        waiting.append(batch)
+        if sum(each.num_rows for each in waiting) >= AT_ONCE:
+            yield pa.Table.from_batches(waiting)
+            waiting = []
+    if waiting:
+        yield pa.Table.from_batches(waiting)
 
 
 def _rows(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterator[pa.RecordBatch]:
