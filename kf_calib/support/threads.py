@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
+from functools import cache
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
     """While it is entered BLAS works in one thread: small decompositions take three times as long with several, and
     these need not give the same bits every time."""
-    return threadpool_limits(1, user_api="blas")
+    return _controller().limit(limits=1, user_api="blas")
+
+
+@cache
+def _controller() -> ThreadpoolController:
+    """Of the libraries of numpy and scipy, which it takes a millisecond to find."""
+    import numpy  # noqa: F401  # loads its library
+    import scipy.linalg  # noqa: F401  # loads another one
+
+    return ThreadpoolController()

@@ -84,7 +84,7 @@ class Recording:
         angles: bool = True,
     ) -> None:
         self.path = Path(path)
-        self.fraction = 0.0
+        self.fraction, self._begin_ns = 0.0, None
         self._accel_scale, self._angle_scale = np.asarray(accel_scale, float), angle_scale
         self._stated = fields_by_role(fields)
         wanted = {READINGS: accel_topic, POSES: pose_topic, TEMPERATURES: temperature_topic}
@@ -117,9 +117,11 @@ class Recording:
         return self._batches(growing=True)
 
     def begin_ns(self) -> int | None:
-        """Stamp of the first reading; None where there is none. Reads the recording as far as to there."""
-        stamps = (batch.accel.time_ns for batch in self)
-        return next((int(each[0]) for each in stamps if len(each)), None)
+        """Stamp of the first reading; None where there is none. Reads the recording as far as to there, unless it has
+        been read."""
+        if self._begin_ns is None:
+            next((batch for batch in self if len(batch.accel)), None)
+        return self._begin_ns
 
     @property
     def warnings_while_read(self) -> list[str]:
@@ -135,6 +137,8 @@ class Recording:
             passage = _Passage(contents, self._limit, self._warn_of_damage)
             for end, batch in self._part(file, passage, decoders, growing and file is parts.files[-1]):
                 self.fraction = math.nan if growing else min((begun + end) / parts.size, 1.0)
+                if self._begin_ns is None and len(batch.accel):
+                    self._begin_ns = int(batch.accel.time_ns[0])
                 if growing or len(batch.accel) or len(batch.pose) or len(batch.temperature):
                     yield batch
             passage.account(file.summary.message_counts if file.summary else {}, self.warnings.append)
