@@ -1,10 +1,10 @@
 """The table of hypotheses: every explanation of a misfit as one row, with its probability.
 
 Rows are: nothing; noise from dwell to dwell that was not stated; each effect; pairs of effects, which may mask each
-other; an effect beside a random walk of the biases; formulas that are no known effect, by what they depend on; and
-irregular changes of an unknown cause. The likeliest of each kind by the linear tests are refitted, because large
-effects are not linear, and weighed by their ``Evidence``. The prior of a kind is shared among its members, so that a
-hundred formulas do not outvote one effect.
+other; an effect beside a random walk of the biases; formulas that are no known effect, by what they depend on;
+irregular changes of an unknown cause; and unknown causes that look like a known effect, so that no name is certain. The
+likeliest of each kind by the linear tests are refitted, because large effects are not linear, and weighed by their
+``Evidence``. The prior of a kind is shared among its members, so that a hundred formulas do not outvote one effect.
 """
 
 from __future__ import annotations
@@ -37,6 +37,9 @@ NOTHING, NOISE, NONE = "nothing", "unstated noise", "none of the known"
 IRREGULAR = "irregular"
 """Driver of changes that follow nothing that was recorded."""
 
+ALIKE = "like a known effect"
+"""Driver of a cause in no catalogue that looks in this run like a known effect."""
+
 SURE = 0.95
 """Probability from which an effect is taken for certain enough to be added without asking."""
 
@@ -48,6 +51,7 @@ TOLD = 0.01
 
 _KINDS = {"nothing": 0.4, "effect": 0.4, "pair": 0.1, "formula": 0.1}
 _NO_NOISE = {True: 0.4, False: 0.1}  # share of an unknown cause in more scatter, by whether noise was stated
+_ALIKE = 0.05 * _KINDS["formula"]  # of what has a known effect's look: what is in no catalogue, and 1 of 20 looks so
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _APART, _CURVED = 8.0, 0.02  # rows further behind, in ln and as a share of the evidence, are not refitted
 _MOST = {"effect": 8, "turn": 3, "pair": 4, "walk": 3, "formula": 3}
@@ -58,7 +62,8 @@ class Hypothesis:
     """One row of the table.
 
     - effects: names of the effects that would be missing. formulas: those of no known effect, as they can be added.
-    - driver: in words, what the formulas depend on; "irregular" for changes of an unknown cause that follow nothing.
+    - driver: in words, what the formulas depend on; "irregular" for changes of an unknown cause that follow nothing,
+      "like a known effect" for a cause that cannot be told from one.
     - families: the physical classes of the effects.
     - log_evidence: of the row with its prior, natural logarithm. probability: its share in all rows.
     - statistic, dof: fall of chi-squared in the likeliest noise, and the number of coefficients; of a random walk alone
@@ -132,16 +137,19 @@ class Table:
     @cached_property
     def rivals(self) -> tuple[Hypothesis, ...]:
         """The explanations other than the first that have ``HOLDS`` of the probability together with it, without those
-        that only add to its effects."""
-        first, rows = self.first, [row for row in self.rows if row.families != (NOTHING,)]
+        that only add to its effects or look like them."""
+        first, rows = self.first, [row for row in self.rows if row.families != (NOTHING,) and row.driver != ALIKE]
         before = np.cumsum([0.0, *(row.probability for row in rows)]) / sum(row.probability for row in rows)
         likely = [row for k, row in enumerate(rows) if before[k] < HOLDS and row is not first]
         return tuple(row for row in likely if not (first.effects and set(first.effects) <= set(row.effects)))
 
 
 def table_of(rows: Iterable[Hypothesis]) -> Table:
-    """The table of rows, of which only the evidence is known."""
-    rows = list(rows)
+    """The table of rows, of which only the evidence is known, with one for causes that look like a known effect."""
+    rows = [replace(row, log_evidence=row.log_evidence + math.log1p(-_ALIKE)) if row.effects else row for row in rows]
+    if known := [row.log_evidence for row in rows if row.effects]:
+        alike = _sum(known) + math.log(_ALIKE / (1.0 - _ALIKE))
+        rows.append(Hypothesis(driver=ALIKE, families=(NONE,), log_evidence=alike))
     logs = np.array([row.log_evidence for row in rows])
     found = [replace(row, probability=share) for row, share in zip(rows, weights(logs).tolist(), strict=True)]
     return Table(tuple(sorted(found, key=lambda row: -row.probability)))
