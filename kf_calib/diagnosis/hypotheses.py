@@ -26,7 +26,6 @@ from kf_calib.diagnosis.unknown_effect import Family as Formulas
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.effects import FrameEffect, effect_named, walk_named
-from kf_calib.estimation.reml import HELD
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import unweighted_left
 from kf_calib.support.logarithms import weights
@@ -216,15 +215,20 @@ class Hypotheses:
         tried = [row for row in tried if math.isfinite(row.log_evidence)]
         least = max(row.log_evidence for row in tried) - _APART
         walks = [row for row in tried if row.effects == (self.walk,) and row.log_evidence > least]
-        return table_of([*tried, *map(self._returning, walks if self.stated else ())])
+        return table_of([*tried, *(back for walk in walks if self.stated for back in self._returning(walk))])
 
-    def _returning(self, walk: Hypothesis) -> Hypothesis:
-        """Return the row of biases that move irregularly and return to their mean, from that of a random walk."""
+    def _returning(self, walk: Hypothesis) -> Iterator[Hypothesis]:
+        """Yield the row of biases that move irregularly and return to their mean after any time, from that of a random
+        walk; none where no walk is likelier than none."""
         assert walk.refit is not None
-        gain, back_s = walk.refit.fit.back_gain
-        driver = f"time (irregular, back within about {one_digit_seconds(back_s)})"
-        prior = math.log(_KINDS["formula"] / _KINDS["effect"] / HELD)
-        return Hypothesis(driver=driver, families=walk.families, log_evidence=walk.log_evidence + gain + prior)
+        gains, times_s = walk.refit.fit.back_gains
+        driver = f"time (irregular, back within about {one_digit_seconds(float(times_s[np.argmax(gains)]))})"
+        prior = self._prior("effect", len(self.test.scores), self.walk) + math.log(_KINDS["formula"] / _KINDS["effect"])
+        for own in self.evidence.of(walk.refit.fit, walk=True):
+            if not own.parts:  # the gains are over a walk that nothing else explains
+                log = own.log + float(np.logaddexp.reduce(gains)) - math.log(len(gains)) + prior
+                log += self._within(walk.effects, walk.refit)
+                yield Hypothesis(driver=driver, families=walk.families, log_evidence=log)
 
     def quick_table(self) -> Table:
         """The table of nothing, noise and single effects by the linear tests alone, for a run with no misfit."""
@@ -389,15 +393,18 @@ class Hypotheses:
         logs = [own.log + self._log_share(effects, own.fall) for own in found]
         best: Weighed = found[int(np.argmax(logs))]
         walks, log = self.walk in effects, float(np.logaddexp.reduce(logs)) + log_prior
-        if walks and self.test.trend:  # a walk goes on within dwells, where it has no column
-            log += _log_odds(self._trend_without_walk(effects)) - _log_odds(trend(refit.fit))
+        log += self._within(effects, refit) if walks else 0.0
         fall = best.fall if best.dof else 2.0 * self.before.fit.walk_gain
         return Hypothesis(effects, formulas, "", self._families(effects), log, fall, best.dof + walks, refit)
 
-    def _trend_without_walk(self, effects: Sequence[str]) -> Trend | None:
-        """Return the test of trends within dwells beside the other effects alone, which may explain them."""
+    def _within(self, effects: Sequence[str], refit: Calibration) -> float:
+        """Return the log odds of what a walk explains within dwells, where it goes on but has no column: trends that
+        the other effects leave, less those that are left beside it."""
+        if not self.test.trend:
+            return 0.0
         others = tuple(name for name in effects if name != self.walk)
-        return trend(self._refit(others).fit) if others else self.test.trend
+        before = trend(self._refit(others).fit) if others else self.test.trend
+        return _log_odds(before) - _log_odds(trend(refit.fit))
 
     def _families(self, effects: Sequence[str]) -> tuple[str, ...]:
         """Return the families of effects, each once."""
