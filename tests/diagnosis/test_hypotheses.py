@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -124,6 +125,15 @@ def test_an_error_that_no_known_effect_is_does_not_pass_as_noise_that_nobody_sta
     found = diagnose(run)
     assert found.test.consistent is False and found.unknown
     assert found.table is not None and found.table.rows[0].driver == "angle of gimbal 2, 3 a turn"
+
+
+@pytest.mark.parametrize("seeds", [(1, 3), *slow(range(1, 17))])
+def test_a_setting_error_larger_than_stated_is_no_change_of_the_bias(seeds: Sequence[int]) -> None:
+    """A bias that returns to its mean within less than a dwell is scatter, which has a likelier name."""
+    states: dict[str, float | None] = {"angle_sigma_deg": 2e-4}
+    found = [diagnose(noisy_run(dwells=24, setting_sigma_deg=8e-4, states=states, seed=seed)) for seed in seeds]
+    assert sum(each.noise for each in found) >= 0.9 * len(found)
+    assert all(each.table and each.table.families.get("bias in time", 0.0) < 0.5 for each in found)
 
 
 @pytest.mark.parametrize("seeds", [range(3), *slow(range(100))])
