@@ -11,7 +11,8 @@ from helpers.hidden_effects import noisy_run, noisy_source, run, source
 from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 
-from kf_calib.diagnosis.hypotheses import ALIKE, NOISE, NONE, NOTHING, Hypothesis, log_odds_of, table_of
+from kf_calib.diagnosis.hypotheses import log_odds_of
+from kf_calib.diagnosis.hypothesis_table import ALIKE, NOISE, NONE, NOTHING, Hypothesis, table_of
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.verdict import format_probability
