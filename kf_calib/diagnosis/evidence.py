@@ -28,7 +28,7 @@ from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise
 from kf_calib.estimation.reml import Likelihood, Part, Parts, likelihood_of, with_shared_noise
 from kf_calib.estimation.restricted_likelihood import Point
-from kf_calib.estimation.square_root_information import whiten
+from kf_calib.estimation.square_root_information import flicker_of_scatter, whiten
 from kf_calib.estimation.thermometer_error import thermometer_errors
 
 _SIZES = np.exp(np.linspace(0.0, math.log(1e14), 120))  # prior variance of a coefficient over that of its estimate
@@ -215,14 +215,16 @@ def _within(carried: Carried, noise: Noise, state: Floats) -> Floats:
     """Return the triangular factor [G | T | z] of what the readings within dwells say of all effects G and of the
     errors T of the temperature.
 
-    The mean of each dwell is left out: it is as if scatter had no limit.
+    The mean of each dwell is left out: it is as if scatter had no limit. Scatter that is stated may be 1/f noise, which
+    goes on within dwells.
     """
     free = replace(noise, scatter_mps2=np.full(3, _FREE_MPS2), setting_rad=0.0, free=False, walk_mps2_per_sqrt_s=0.0)
     columns = [own[..., STATE_COUNT:] for own in carried.columns]
     if noise.sensitivity_mps2_per_k is not None:
         errors = thermometer_errors(carried.turned, noise.sensitivity_mps2_per_k)
         columns = [np.concatenate(both, axis=3) for both in zip(columns, errors, strict=True)]
-    rows = np.concatenate(whiten(carried.turned, columns, free, state, reduced=False))
+    flicker = flicker_of_scatter(carried.turned, noise)
+    rows = np.concatenate(whiten(carried.turned, columns, free, state, flicker_mps2=flicker, reduced=False))
     lacking = max(rows.shape[1] - len(rows), 0)
     return triangle(np.vstack([rows, np.zeros((lacking, rows.shape[1]))]))
 

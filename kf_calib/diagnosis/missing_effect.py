@@ -16,7 +16,7 @@ from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.candidate_tests import CandidateTests, overlap_matrix
 from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated, with_noise_as_stated
 from kf_calib.diagnosis.hypotheses import Hypotheses, log_odds_of
-from kf_calib.diagnosis.hypothesis_table import ALIKE, NOISE, NOTHING, Hypothesis, Table, noise_p, table_of
+from kf_calib.diagnosis.hypothesis_table import ALIKE, NOISE, NOTHING, TOLD, Hypothesis, Table, noise_p, table_of
 from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.verdict import second_pass_in_words, verdict_in_words
@@ -110,23 +110,23 @@ def _beside_lines(refits: Refits, before: Calibration, test: CandidateTests) -> 
     name, known = test.oscillating, refits.with_effects(before, (test.oscillating,))
     rest, odds = refits.assess(known, test.effective_tests), log_odds_of(test.p_values[test.oscillating])
     family = known.model.effects[-1].family
-    alone = Hypothesis((name,), families=(family,), log_evidence=odds, refit=known)
-    if rest.consistent is not False:
-        return table_of([alone, Hypothesis(families=(NOTHING,))])
-    rows = [row for row in Hypotheses(refits, known, rest).table().rows if row.driver != ALIKE]
+    made = Hypotheses(refits, known, rest)
+    table = made.table() if rest.consistent is False else made.quick_table()
+    rows = [row for row in table.rows if row.driver != ALIKE]
     none = [row.log_evidence for row in rows if not row.effects and not row.driver]
     both = [
         _with(refits, before, row, name, family) if row.effects else row for row in rows if row.effects or row.driver
     ]
-    alone = replace(alone, log_evidence=float(np.logaddexp.reduce(none)))
+    alone = Hypothesis((name,), families=(family,), log_evidence=float(np.logaddexp.reduce(none)), refit=known)
     nothing = Hypothesis(families=(NOTHING,), log_evidence=max(row.log_evidence for row in [*both, alone]) - odds)
     return table_of([*both, alone, nothing])
 
 
 def _with(refits: Refits, before: Calibration, row: Hypothesis, name: str, family: str) -> Hypothesis:
-    """Return a row with one effect more, fitted together with the others."""
-    effects, families = (*row.effects, name), dict.fromkeys([*row.families, family])
-    return replace(row, effects=effects, families=tuple(families), refit=refits.with_effects(before, effects))
+    """Return a row with one effect more, fitted together with the others if it is likely enough to be told."""
+    effects, families = (*row.effects, name), tuple(dict.fromkeys([*row.families, family]))
+    refit = refits.with_effects(before, effects) if row.probability >= TOLD else None
+    return replace(row, effects=effects, families=families, refit=refit)
 
 
 def _decided(refits: Refits, found: Diagnosis) -> Diagnosis:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from kf_calib.dwells.line_spectrum import Line
 from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder, lines_of
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.fit import Fit, fit
@@ -14,7 +15,7 @@ from kf_calib.support import stage
 
 _CARRIERS = 3  # largest number of passes in search of a carrier
 _CYCLES = 50.0  # cycles per dwell; a line below may be the remainder of a slow oscillation
-_SLOW = 0.3  # cycles per dwell; of a slower oscillation a parabola leaves less than a thousandth of the power
+_SLOW, _LEFT = 0.3, 1e-3  # cycles per dwell; of a slower oscillation a parabola leaves less than this of the power
 _NEAR = 0.06  # cycles by which oscillation and carrier may differ in a piece; a parabola then leaves 1e-3 of it
 
 
@@ -25,7 +26,7 @@ def on_carrier(
 
     The first carrier is the strongest line in the spectrum; if there is none, the oscillation is slow and is fitted to
     the plain dwells. A line of only a few cycles per dwell may be the remainder of a slow oscillation after the
-    parabola was removed; then both are tried and the more likely one is taken.
+    parabola was removed; where that could leave it, both are tried and the more likely one is taken.
     """
     seen = lines_of(dwells)
     if not seen:
@@ -34,8 +35,25 @@ def on_carrier(
     shortest_s = min(dwell.end_s - dwell.start_s for dwell in dwells if dwell.count > dwells[0].count // 2)
     found = [_nearer(passed, seen[0].frequency_hz, on_progress)]
     if seen[0].frequency_hz * shortest_s < _CYCLES:
-        found.append(_nearer(passed, plain or fitted_to(passed, dwells), on_progress))
+        slow = plain or fitted_to(passed, dwells)
+        if _may_leave(slow, seen[0]):
+            found.append(_nearer(passed, slow, on_progress))
     return min(found, key=lambda each: _unlikeliness(each[1]))
+
+
+def _may_leave(slow: Fit, line: Line) -> bool:
+    """Tell whether a fitted oscillation may leave this line beside a parabola over each dwell.
+
+    Otherwise it is no more than a drift that the oscillation mimics. Less than half a cycle a run is no oscillation.
+    """
+    dwells, effect = slow.dwells, slow.carried.model.oscillation
+    assert effect is not None
+    if effect.value * (dwells[-1].end_s - dwells[0].start_s) < 0.5:
+        return False
+    part = slow.carried.model.parts[str(effect)]
+    amplitude = float(np.linalg.norm(slow.state[part][: len(effect.coefficients)]))
+    seen = float(np.linalg.norm(line.amplitude_mps2))
+    return _cycles(slow) >= _SLOW or amplitude**2 * _LEFT > seen**2
 
 
 def _unlikeliness(fitted: Fit) -> float:
@@ -53,8 +71,7 @@ def holds_its_oscillation(fitted: Fit) -> bool:
     dwells = fitted.dwells
     if not fitted.carried.model.oscillates or dwells[0].carrier_hz:
         return True
-    longest_s = max(dwell.end_s - dwell.start_s for dwell in dwells)
-    return _oscillation_hz(fitted) * longest_s < _SLOW and not lines_of(dwells)
+    return _cycles(fitted) < _SLOW and not lines_of(dwells)
 
 
 def _nearer(passed: Pass, carrier: float | Fit, on_progress: Callable[[float], None] | None) -> tuple[Pass, Fit]:
@@ -76,6 +93,11 @@ def _nearer(passed: Pass, carrier: float | Fit, on_progress: Callable[[float], N
 def fitted_to(passed: Pass, dwells: list[DwellFactor]) -> Fit:
     """The fit of the settings' model to these dwells."""
     return fit(dwells, passed.model, passed.settings.walk_mps2_per_sqrt_s, passed.folder.slews)
+
+
+def _cycles(fitted: Fit) -> float:
+    """Return the cycles of the model's oscillation in the longest dwell."""
+    return _oscillation_hz(fitted) * max(dwell.end_s - dwell.start_s for dwell in fitted.dwells)
 
 
 def _oscillation_hz(fitted: Fit) -> float:

@@ -166,7 +166,7 @@ def misfit_rows(
     the slow components of 1/f noise are nuisance states.
     """
     shared, sigma = shared_noise(dwells, noise)
-    flicker = _flicker(dwells, noise)
+    flicker = flicker_of_scatter(dwells, noise)
     if not sigma.size:
         return whiten(dwells, columns, noise, state, reduced=reduced), width
     count, places = columns[0].shape[3] + len(sigma) + 1, width + np.arange(len(sigma))
@@ -179,8 +179,8 @@ def misfit_rows(
     return [prior, *whiten(dwells, both, noise, state, flicker_mps2=flicker, reduced=reduced)], width + len(sigma)
 
 
-def _flicker(dwells: Sequence[DwellFactor], noise: Noise) -> Floats | None:
-    """Return sqrt(h) (3,) of the 1/f noise that a stated scatter may be; None where it has no slow part."""
+def flicker_of_scatter(dwells: Sequence[DwellFactor], noise: Noise) -> Floats | None:
+    """sqrt(h) (3,) of the 1/f noise that a stated scatter may be; None where it has no slow part."""
     return flicker_sigma(noise, len(dwells)) if slow_scatter(dwells, noise)[1].size else None
 
 
@@ -206,7 +206,7 @@ class MisfitColumns:
 
     def __init__(self, dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> None:
         self._sigma, shared = noise.effective_sigma_mps2, len(shared_noise(dwells, noise)[1])
-        flicker = _flicker(dwells, noise)
+        flicker = flicker_of_scatter(dwells, noise)
         priors = len(_dwell_priors(noise)) + (0 if flicker is None else 3 * len(_SLOW))
         counts = np.array([len(dwell.pieces) for dwell in dwells])
         lengths = 3 * counts * [dwell.width for dwell in dwells] + priors
