@@ -123,7 +123,7 @@ def test_an_error_that_no_known_effect_is_does_not_pass_as_noise_that_nobody_sta
     assert found.table is not None and found.table.rows[0].driver == "angle of gimbal 2, 3 a turn"
 
 
-@pytest.mark.parametrize("seeds", [range(3), *slow(range(100))])
+@pytest.mark.parametrize("seeds", [range(1), *slow(range(100))])
 def test_noise_that_nobody_stated_is_told_as_noise(seeds: range) -> None:
     not_stated, noise = {"angle_sigma_deg": None, "scatter_sigma_mps2": None}, {"setting_sigma_deg": 2e-4}
     found = [diagnose(noisy_source(dwells=16, states=not_stated, seed=500 + seed, **noise)) for seed in seeds]
