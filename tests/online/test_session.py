@@ -150,7 +150,7 @@ def test_candidates_are_tried_again_only_where_that_may_say_something_else(monke
     diagnosed = list[int]()
     monkeypatch.setattr(status, "diagnose", lambda result: diagnosed.append(len(result.visits)) or diagnose(result))
     monkeypatch.setattr(status, "assess_candidates", lambda *_: pytest.fail("nobody has asked"))
-    judgements = judged_one_by_one(bench("second-order=15sigma", orientations=18))
+    judgements = judged_one_by_one(bench("second-order=15sigma", orientations=24))
     alarmed = [k for k, each in judgements.items() if each.watch is not None and each.watch.alarmed is not None]
     assert 5 < alarmed[0], (alarmed, diagnosed)
     assert alarmed[0] == diagnosed[0] and len(diagnosed) < len(alarmed) - 3
