@@ -88,7 +88,8 @@ PICTURES: dict[str, Callable[[], Image.Image]] = {
 
 @cache
 def drawn_from() -> str:
-    """Digest of what the pictures show: the recording, and the numbers to three digits, which other machines share."""
+    """Digest of what the pictures show: the recording, the verdict, and the numbers to three digits, which other
+    machines share."""
     numbers = [
         *(float(p.value or 0.0) for p in improved().result.parameters.values()),
         *(float(p.sigma or 0.0) for p in improved().result.parameters.values()),
@@ -97,7 +98,7 @@ def drawn_from() -> str:
     largest = np.abs(found().before.residuals_mps2).max()
     rounded = [f"{value if abs(value) > 1e-3 * largest else 0.0:.2e}" for value in numbers]
     content = {"recording": hashlib.sha256(RECORDING.read_bytes()).hexdigest(), "numbers": rounded,
-               "pictures": sorted(PICTURES)}  # fmt: skip
+               "verdict": found().verdict, "pictures": sorted(PICTURES)}  # fmt: skip
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 

@@ -11,12 +11,14 @@ which no noise from dwell to dwell enters.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.qr import triangle
@@ -25,6 +27,7 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise
 from kf_calib.estimation.reml import Likelihood, Part, Parts, likelihood_of, with_shared_noise
+from kf_calib.estimation.restricted_likelihood import Point
 from kf_calib.estimation.square_root_information import whiten
 from kf_calib.estimation.thermometer_error import thermometer_errors
 
@@ -102,14 +105,26 @@ class Evidence:
             alone = self._rows(self._fit.carried, noise)
         own = alone if refit is None else self._rows(refit.carried, noise)
         alone = replace(alone, known=_lengthened(alone.known, float(np.linalg.norm(own.known[:, -1]))))
+        related = [] if refit is None else [self._rows(refit.carried, noise, each) for each in self._relations(refit)]
         walking: Parts = ("walk",) if walk or self._walks else ()
         every: Parts = (*walking, "setting", "common")
-        with_, without = (
-            likelihood_of(noise, every, each.means, self._fit.carried.state, each.known) for each in (own, alone)
+        without, with_, *with_related = (
+            likelihood_of(noise, every, each.means, self._fit.carried.state, each.known)
+            for each in (alone, own, *related)
         )
+        relations = [(likelihood, rows.dof) for likelihood, rows in zip(with_related, related, strict=True)]
         free = self._free(len(alone.means.counts))
-        found = (self._weighed(with_, without, parts + walking, own.dof) for parts in free)
+        found = (self._weighed(with_, without, parts + walking, own.dof, relations) for parts in free)
         return [each for each in found if each is not None]
+
+    def _relations(self, refit: Fit) -> list[Floats]:
+        """Return what the added states may be together: matrices (q, k), times k free numbers each; empty where they
+        may have any values."""
+        added = refit.carried.model.effects[len(self._fit.carried.model.effects) :]
+        if not any(effect.relations for effect in added):
+            return []
+        of_each = [effect.relations or [np.eye(len(effect.states))] for effect in added]
+        return [np.asarray(block_diag(*chosen), float) for chosen in itertools.product(*of_each)]
 
     def _free(self, dwells: int) -> Iterator[Parts]:
         """Yield the sets of parts of the noise from dwell to dwell that may be free."""
@@ -123,25 +138,41 @@ class Evidence:
         if not (self.noise.setting_stated and self.noise.scatter_stated):
             yield "setting", "common"
 
-    def _weighed(self, own: Likelihood, alone: Likelihood, parts: Parts, dof: int) -> Weighed | None:
+    def _weighed(
+        self,
+        own: Likelihood,
+        alone: Likelihood,
+        parts: Parts,
+        dof: int,
+        relations: Sequence[tuple[Likelihood, int]],
+    ) -> Weighed | None:
         """Return the evidence with these parts of the noise free; None where one of them is best at zero.
 
         The logarithms of the sizes of the parts are averaged out by Laplace's method. A part of no size is counted
-        where it is absent.
+        where it is absent. relations: the likelihood with each possible relation of the coefficients, and how many of
+        them it leaves; they are averaged in the noise that is likeliest without a relation.
         """
         likelihood = own.of(parts)
         relative, point = likelihood.most_likely() if parts else (np.zeros(0), own.without())
         if not all(size for part, size in zip(parts, relative, strict=True) if part != "walk" or not self._walks):
             return None
         sizes = np.array([own.units[part][0] for part in parts]) * relative
-        without = alone.of(parts).at((sizes / np.array([alone.units[part][0] for part in parts])) ** 2)
+
+        def at_sizes(each: Likelihood) -> Point:
+            return each.of(parts).at((sizes / np.array([each.units[part][0] for part in parts])) ** 2)
+
+        without = at_sizes(alone)
         fall, log = max(without.misfit - point.misfit, 0.0), self._log_prior(parts) - without.cost
         if parts:
             curves = np.linalg.eigvalsh(likelihood.curvature(relative))
             log += float(
                 np.sum(0.5 * np.log(2.0 * np.pi / np.maximum(curves, 2.0 * np.pi / _RANGE**2)) - math.log(_RANGE))
             )
-        log += float(size_evidence(dof, fall)) if dof else 0.0
+        if relations:
+            falls = [(left, max(without.misfit - at_sizes(each).misfit, 0.0)) for each, left in relations]
+            log += float(np.logaddexp.reduce([size_evidence(*each) for each in falls])) - math.log(len(falls))
+        elif dof:
+            log += float(size_evidence(dof, fall))
         beyond: Parts = tuple(part for part in parts if part != "walk")
         return Weighed(beyond, log, tuple(sizes.tolist()), fall, dof)
 
@@ -151,16 +182,19 @@ class Evidence:
         chances = {part: _BEYOND if known else _UNSTATED for part, known in stated.items()}
         return sum(math.log(own if part in parts else 1.0 - own) for part, own in chances.items())
 
-    def _rows(self, carried: Carried, noise: Noise) -> _Rows:
+    def _rows(self, carried: Carried, noise: Noise, relation: Floats | None = None) -> _Rows:
         """Return what the likelihood needs: columns that the model hides are left out, and with an effect that was
-        fitted with a constant the derivative by this constant counts as a column, but as no coefficient."""
+        fitted with a constant the derivative by this constant counts as a column, but as no coefficient.
+
+        relation: of the added coefficients (None: they may have any values).
+        """
         means, shared = with_shared_noise(carried.dwells, noise, carried.means)
         first, last, count = self._fit.carried.model.count, carried.model.count, means.design.shape[2]
         within = _within(carried, noise, self._fit.carried.state)
         known = np.vstack([shared, np.zeros((len(within), count + 1))])
         places = [*range(STATE_COUNT, last), *range(count + 1 - (within.shape[1] - last + STATE_COUNT), count + 1)]
         known[len(shared) :, places] = within
-        turn = _visible(means, noise, known, first, last)
+        turn = _visible(means, noise, known, first, last, np.eye(last - first) if relation is None else relation)
         design, constants = means.design, sum(place >= first for place in carried.model.unknowns)
         parts = design[..., :first], design[..., first:last] @ turn, design[..., last:]
         known = np.hstack([known[:, :first], known[:, first:last] @ turn, known[:, last:]])
@@ -193,17 +227,25 @@ def _within(carried: Carried, noise: Noise, state: Floats) -> Floats:
     return triangle(np.vstack([rows, np.zeros((lacking, rows.shape[1]))]))
 
 
-def _visible(means: Means, noise: Noise, known: Floats, first: int, last: int) -> Floats:
+def _visible(means: Means, noise: Noise, known: Floats, first: int, last: int, relation: Floats) -> Floats:
     """Return combinations (q, k) of the added columns that are orthonormal beside the model's, without hidden ones.
 
-    first, last: the added columns follow those of the model, and come before those that have a prior.
+    first, last: the added columns follow those of the model, and come before those that have a prior. relation (q, r):
+    the combinations that are possible.
     """
     sigma = noise.effective_sigma_mps2 / np.sqrt(means.counts[:, None])
     columns = np.vstack([(means.design / sigma[..., None]).reshape(-1, means.design.shape[2]), known[:, :-1]])
-    scale = np.linalg.norm(columns, axis=0)
-    columns, units = columns / np.where(scale > 0, scale, 1.0), np.where(scale > 0, scale, 1.0)[first:last, None]
-    left, singular, _ = np.linalg.svd(columns[:, :first], full_matrices=False)
-    basis, own = left[:, singular > 1e-9 * singular[0]], columns[:, first:last]
+    model, own = _of_unit_length(columns[:, :first])[0], columns[:, first:last] @ relation
+    own, lengths = _of_unit_length(own)
+    left, singular, _ = np.linalg.svd(model, full_matrices=False)
+    basis = left[:, singular > 1e-9 * singular[0]]
     _, singular, right = np.linalg.svd(own - basis @ (basis.T @ own), full_matrices=False)
     seen = singular > _SEEN
-    return (right[seen].T / singular[seen]) / units
+    return relation @ (right[seen].T / singular[seen] / lengths[:, None])
+
+
+def _of_unit_length(columns: Floats) -> tuple[Floats, Floats]:
+    """Return columns of length 1, and their lengths; columns of zeros stay so."""
+    lengths = np.linalg.norm(columns, axis=0)
+    lengths = np.where(lengths > 0, lengths, 1.0)
+    return columns / lengths, lengths

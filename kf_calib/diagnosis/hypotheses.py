@@ -1,18 +1,17 @@
-"""The table of hypotheses: every explanation of a misfit as one row, with its probability.
+"""The rows of the table of hypotheses: every explanation of a misfit, refitted and weighed.
 
 Rows are: nothing; noise from dwell to dwell that was not stated; each effect; pairs of effects, which may mask each
-other; an effect beside a random walk of the biases; formulas that are no known effect, by what they depend on; and
-irregular changes of an unknown cause. The likeliest of each kind by the linear tests are refitted, because large
-effects are not linear, and weighed by their ``Evidence``. The prior of a kind is shared among its members, so that a
-hundred formulas do not outvote one effect.
+other; an effect beside a random walk of the biases; formulas that are no known effect, by what they depend on;
+irregular changes of an unknown cause; and unknown causes that look like a known effect, so that no name is certain. The
+likeliest of each kind by the linear tests are refitted, because large effects are not linear, and weighed by their
+``Evidence``. The prior of a kind is shared among its members, so that a hundred formulas do not outvote one effect.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -21,141 +20,19 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates, values_of
 from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated
 from kf_calib.diagnosis.evidence import Evidence, Weighed, size_evidence
+from kf_calib.diagnosis.hypothesis_table import IRREGULAR, KINDS, NOISE, NONE, NOTHING, Hypothesis, Table, table_of
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.unknown_effect import Family as Formulas
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.effects import FrameEffect, effect_named, walk_named
-from kf_calib.estimation.reml import HELD
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import unweighted_left
-from kf_calib.support.logarithms import weights
 
-NOTHING, NOISE, NONE = "nothing", "unstated noise", "none of the known"
-"""Families of the rows that name no effect: nothing missing, noise that was not stated, and no known effect."""
-
-IRREGULAR = "irregular"
-"""Driver of changes that follow nothing that was recorded."""
-
-SURE = 0.95
-"""Probability from which an effect is taken for certain enough to be added without asking."""
-
-HOLDS = 0.99
-"""Probability of the set of explanations that is told."""
-
-TOLD = 0.01
-"""Least probability of an explanation that has a line of its own where the table is shown."""
-
-_KINDS = {"nothing": 0.4, "effect": 0.4, "pair": 0.1, "formula": 0.1}
 _NO_NOISE = {True: 0.4, False: 0.1}  # share of an unknown cause in more scatter, by whether noise was stated
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _APART, _CURVED = 8.0, 0.02  # rows further behind, in ln and as a share of the evidence, are not refitted
 _MOST = {"effect": 8, "turn": 3, "pair": 4, "walk": 3, "formula": 3}
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """One row of the table.
-
-    - effects: names of the effects that would be missing. formulas: those of no known effect, as they can be added.
-    - driver: in words, what the formulas depend on; "irregular" for changes of an unknown cause that follow nothing.
-    - families: the physical classes of the effects.
-    - log_evidence: of the row with its prior, natural logarithm. probability: its share in all rows.
-    - statistic, dof: fall of chi-squared in the likeliest noise, and the number of coefficients; of a random walk alone
-      twice its gain in likelihood.
-    - refit: the calibration with it; None where none was made.
-    """
-
-    effects: tuple[str, ...] = ()
-    formulas: tuple[str, ...] = ()
-    driver: str = ""
-    families: tuple[str, ...] = ()
-    log_evidence: float = 0.0
-    statistic: float = 0.0
-    dof: int = 0
-    refit: Calibration | None = None
-    probability: float = 0.0
-
-    @property
-    def unknown(self) -> bool:
-        """Whether the row says that something is missing that no known effect explains."""
-        return bool(self.driver)
-
-
-@dataclass(frozen=True)
-class Table:
-    """All rows, the likeliest first; their probabilities sum to one."""
-
-    rows: tuple[Hypothesis, ...]
-
-    @cached_property
-    def families(self) -> dict[str, float]:
-        """Probability that something of each family is missing; with two effects at once they sum to more than one."""
-        found = dict[str, float]()
-        for row in self.rows:
-            for family in row.families:
-                found[family] = found.get(family, 0.0) + row.probability
-        return dict(sorted(found.items(), key=lambda each: -each[1]))
-
-    def probability(self, effects: Sequence[str]) -> float:
-        """Probability that all these effects are missing, alone or with others."""
-        return sum(row.probability for row in self.rows if set(effects) <= set(row.effects))
-
-    def of_any(self, families: Iterable[str]) -> float:
-        """Probability that something of any of these families is missing."""
-        return sum(row.probability for row in self.rows if set(row.families) & set(families))
-
-    def of_added(self, text: str, name: str) -> float | None:
-        """Probability that what was added to a model is missing, alone or with others; None where no row has it.
-
-        text: the effect as it was added, which a formula is told by. name: its name.
-        """
-        rows = [row for row in self.rows if name in row.effects or text in row.formulas]
-        return sum(row.probability for row in rows) if rows else None
-
-    @cached_property
-    def log10_odds(self) -> tuple[float | None, ...]:
-        """Log10 of the odds of each row to the next; None of the last."""
-        logs = [row.log_evidence / math.log(10.0) for row in self.rows]
-        return (*(one - next_ for one, next_ in itertools.pairwise(logs)), None)
-
-    @property
-    def told(self) -> tuple[Hypothesis, ...]:
-        """The rows that have a line of their own where the table is shown: those of ``TOLD`` or more, and the first."""
-        return tuple(row for row in self.rows if row.probability >= TOLD or row is self.first)
-
-    @property
-    def first(self) -> Hypothesis:
-        """The likeliest explanation, with nothing missing left out."""
-        return next(row for row in self.rows if row.families != (NOTHING,))
-
-    @cached_property
-    def rivals(self) -> tuple[Hypothesis, ...]:
-        """The explanations other than the first that have ``HOLDS`` of the probability together with it, without those
-        that only add to its effects."""
-        first, rows = self.first, [row for row in self.rows if row.families != (NOTHING,)]
-        before = np.cumsum([0.0, *(row.probability for row in rows)]) / sum(row.probability for row in rows)
-        likely = [row for k, row in enumerate(rows) if before[k] < HOLDS and row is not first]
-        return tuple(row for row in likely if not (first.effects and set(first.effects) <= set(row.effects)))
-
-
-def table_of(rows: Iterable[Hypothesis]) -> Table:
-    """The table of rows, of which only the evidence is known."""
-    rows = list(rows)
-    logs = np.array([row.log_evidence for row in rows])
-    found = [replace(row, probability=share) for row, share in zip(rows, weights(logs).tolist(), strict=True)]
-    return Table(tuple(sorted(found, key=lambda row: -row.probability)))
-
-
-def noise_p(table: Table) -> float:
-    """P-value of noise alone, stated or not, against all that a table has beside it.
-
-    In noise the odds of the others to it, over their odds before the readings, have the mean 1, so that they exceed 1/p
-    with a probability of p at most (Markov's inequality).
-    """
-    alone = table.families.get(NOTHING, 0.0) + table.families.get(NOISE, 0.0)
-    before = _KINDS["nothing"] / (1.0 - _KINDS["nothing"])
-    return min(1.0, alone / max(1.0 - alone, 1e-300) / before)
 
 
 def log_odds_of(p_value: float) -> float:
@@ -208,20 +85,25 @@ class Hypotheses:
         tried = [row for row in tried if math.isfinite(row.log_evidence)]
         least = max(row.log_evidence for row in tried) - _APART
         walks = [row for row in tried if row.effects == (self.walk,) and row.log_evidence > least]
-        return table_of([*tried, *map(self._returning, walks if self.stated else ())])
+        return table_of([*tried, *(back for walk in walks if self.stated for back in self._returning(walk))])
 
-    def _returning(self, walk: Hypothesis) -> Hypothesis:
-        """Return the row of biases that move irregularly and return to their mean, from that of a random walk."""
+    def _returning(self, walk: Hypothesis) -> Iterator[Hypothesis]:
+        """Yield the row of biases that move irregularly and return to their mean after any time, from that of a random
+        walk; none where no walk is likelier than none."""
         assert walk.refit is not None
-        gain, back_s = walk.refit.fit.back_gain
-        driver = f"time (irregular, back within about {one_digit_seconds(back_s)})"
-        prior = math.log(_KINDS["formula"] / _KINDS["effect"] / HELD)
-        return Hypothesis(driver=driver, families=walk.families, log_evidence=walk.log_evidence + gain + prior)
+        gains, times_s = walk.refit.fit.back_gains
+        driver = f"time (irregular, back within about {one_digit_seconds(float(times_s[np.argmax(gains)]))})"
+        prior = self._prior("effect", len(self.test.scores), self.walk) + math.log(KINDS["formula"] / KINDS["effect"])
+        for own in self.evidence.of(walk.refit.fit, walk=True):
+            if not own.parts:  # the gains are over a walk that nothing else explains
+                log = own.log + float(np.logaddexp.reduce(gains)) - math.log(len(gains)) + prior
+                log += self._within(walk.effects, walk.refit)
+                yield Hypothesis(driver=driver, families=walk.families, log_evidence=log)
 
     def quick_table(self) -> Table:
         """The table of nothing, noise and single effects by the linear tests alone, for a run with no misfit."""
         rows, prior = list(self._without()), partial(self._prior, "effect", len(self.test.scores))
-        least = rows[0].log_evidence - math.log(_KINDS["nothing"])
+        least = rows[0].log_evidence - math.log(KINDS["nothing"])
         rows += [
             Hypothesis((name,), families=self._families((name,)), log_evidence=least + own + prior(name),
                        statistic=self._fall(name), dof=self._dof(name))
@@ -231,7 +113,7 @@ class Hypotheses:
 
     def _without(self) -> Iterator[Hypothesis]:
         """Yield the rows without an effect: nothing, noise that was not stated, and irregular changes."""
-        found, prior = self.evidence.of(), math.log(_KINDS["nothing"])
+        found, prior = self.evidence.of(), math.log(KINDS["nothing"])
         still = float(next(own.log for own in found if not own.parts)) + prior
         turned = _sum([own.log for own in found if own.parts == ("setting",)]) + prior
         spread = _sum([own.log for own in found if "common" in own.parts]) + prior
@@ -381,15 +263,18 @@ class Hypotheses:
         logs = [own.log + self._log_share(effects, own.fall) for own in found]
         best: Weighed = found[int(np.argmax(logs))]
         walks, log = self.walk in effects, float(np.logaddexp.reduce(logs)) + log_prior
-        if walks and self.test.trend:  # a walk goes on within dwells, where it has no column
-            log += _log_odds(self._trend_without_walk(effects)) - _log_odds(trend(refit.fit))
+        log += self._within(effects, refit) if walks else 0.0
         fall = best.fall if best.dof else 2.0 * self.before.fit.walk_gain
         return Hypothesis(effects, formulas, "", self._families(effects), log, fall, best.dof + walks, refit)
 
-    def _trend_without_walk(self, effects: Sequence[str]) -> Trend | None:
-        """Return the test of trends within dwells beside the other effects alone, which may explain them."""
+    def _within(self, effects: Sequence[str], refit: Calibration) -> float:
+        """Return the log odds of what a walk explains within dwells, where it goes on but has no column: trends that
+        the other effects leave, less those that are left beside it."""
+        if not self.test.trend:
+            return 0.0
         others = tuple(name for name in effects if name != self.walk)
-        return trend(self._refit(others).fit) if others else self.test.trend
+        before = trend(self._refit(others).fit) if others else self.test.trend
+        return _log_odds(before) - _log_odds(trend(refit.fit))
 
     def _families(self, effects: Sequence[str]) -> tuple[str, ...]:
         """Return the families of effects, each once."""
@@ -401,4 +286,4 @@ class Hypotheses:
     def _prior(self, kind: str, members: int, *effects: str) -> float:
         """Return the log of the prior probability of these effects, or formulas, among so many of their kind."""
         own = math.prod(effect_named(name, self.before.bench).prior for name in effects)
-        return math.log(own * _KINDS[kind] / max(members, 1))
+        return math.log(own * KINDS[kind] / max(members, 1))

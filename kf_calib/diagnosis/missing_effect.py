@@ -15,7 +15,8 @@ import numpy as np
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.candidate_tests import CandidateTests, overlap_matrix
 from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated, with_noise_as_stated
-from kf_calib.diagnosis.hypotheses import NOISE, NOTHING, Hypotheses, Hypothesis, Table, log_odds_of, noise_p, table_of
+from kf_calib.diagnosis.hypotheses import Hypotheses, log_odds_of
+from kf_calib.diagnosis.hypothesis_table import ALIKE, NOISE, NOTHING, Hypothesis, Table, noise_p, table_of
 from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.verdict import second_pass_in_words, verdict_in_words
@@ -112,7 +113,7 @@ def _beside_lines(refits: Refits, before: Calibration, test: CandidateTests) -> 
     alone = Hypothesis((name,), families=(family,), log_evidence=odds, refit=known)
     if rest.consistent is not False:
         return table_of([alone, Hypothesis(families=(NOTHING,))])
-    rows = Hypotheses(refits, known, rest).table().rows
+    rows = [row for row in Hypotheses(refits, known, rest).table().rows if row.driver != ALIKE]
     none = [row.log_evidence for row in rows if not row.effects and not row.driver]
     both = [
         _with(refits, before, row, name, family) if row.effects else row for row in rows if row.effects or row.driver

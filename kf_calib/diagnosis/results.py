@@ -13,7 +13,7 @@ from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.detectability import Detectable, Unseen, detectable, sensor_grade, unseen
 from kf_calib.diagnosis.explanation import Explanation
-from kf_calib.diagnosis.hypotheses import SURE, Hypothesis, Table
+from kf_calib.diagnosis.hypothesis_table import SURE, Hypothesis, Table
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe, explained_share

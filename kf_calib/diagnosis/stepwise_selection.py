@@ -21,7 +21,7 @@ import numpy as np
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.streams import Source
-from kf_calib.diagnosis.hypotheses import SURE
+from kf_calib.diagnosis.hypothesis_table import SURE
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.diagnosis.results import Diagnosis

@@ -6,7 +6,7 @@ import numpy as np
 
 from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated
-from kf_calib.diagnosis.hypotheses import IRREGULAR, NOISE, NONE, NOTHING, SURE, Hypothesis
+from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE, NONE, NOTHING, SURE, Hypothesis
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.estimation.oscillation_carrier import holds_its_oscillation

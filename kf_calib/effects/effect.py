@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
 
@@ -164,6 +165,12 @@ class Effect(ABC):
         if own is None or not self.smooth:
             return self.coefficients
         return *self.coefficients, Coefficient(own.symbol, own.unit, 1.0, own.shown_unit, own.per_si)
+
+    @property
+    def relations(self) -> Sequence[Floats]:
+        """Matrices (q, k), all as likely: the coefficients are one of them times k free numbers. Empty where they may
+        have any values."""
+        return ()
 
     @property
     def walks(self) -> bool:

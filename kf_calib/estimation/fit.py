@@ -26,7 +26,7 @@ from kf_calib.estimation import free_attitude, square_root_information
 from kf_calib.estimation.dwell_columns import Carried, Means, candidate_columns, stimulus_of
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, steps, within_dwells
-from kf_calib.estimation.reml import Part, gain_of, misfit, restoring_gain, with_dwell_parts, with_shared_noise
+from kf_calib.estimation.reml import Part, gain_of, misfit, restoring_gains, with_dwell_parts, with_shared_noise
 from kf_calib.estimation.score_test import falls
 from kf_calib.estimation.thermometer_error import sensitivity_to_temperature, thermometer_errors
 
@@ -165,14 +165,21 @@ class Fit:
         return noise, *with_shared_noise(carried.dwells, noise, carried.means)
 
     @cached_property
-    def back_gain(self) -> tuple[float, float]:
-        """Gain in log-likelihood of a mean-reverting (Gauss-Markov) walk over the fitted random walk, and its time
-        constant, s.
+    def back_gains(self) -> tuple[Floats, Floats]:
+        """Gains in log-likelihood (k,) of mean-reverting (Gauss-Markov) walks over the likeliest random walk, and their
+        time constants (k,), s.
 
         The slow part of a stated scatter is allowed for.
         """
         _, means, prior = self._wandering
-        return restoring_gain(self.noise.judging, means, self.carried.state, prior)
+        return restoring_gains(self.noise.judging, means, self.carried.state, prior)
+
+    @property
+    def back_gain(self) -> tuple[float, float]:
+        """The largest of these gains, 0 where none gains anything, and its time constant, s."""
+        gains, times_s = self.back_gains
+        best = int(np.argmax(gains))
+        return max(float(gains[best]), 0.0), float(times_s[best])
 
     def rows(self, noise: Noise | None = None) -> list[Floats]:
         """Whitened rows [H | z] of each dwell, with the weights of the fit or with another noise."""

@@ -209,22 +209,21 @@ def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats
     return max(likelihood.without().cost - point.cost, 0.0)
 
 
-def restoring_gain(noise: Noise, means: Means, state: Floats, prior: Floats) -> tuple[float, float]:
-    """Gain in log-likelihood of a mean-reverting walk over the random walk in the noise, and its time constant, s.
+def restoring_gains(noise: Noise, means: Means, state: Floats, prior: Floats) -> tuple[Floats, Floats]:
+    """Gains in log-likelihood (k,) of mean-reverting walks over the likeliest random walk, and their time constants
+    (k,), s.
 
-    The mean-reverting walk is a Gauss-Markov process of any variance; with an infinite time constant it is the random
-    walk. ``means`` and ``prior`` are those that ``with_shared_noise`` returns.
+    A mean-reverting walk is a Gauss-Markov process of any variance; with an infinite time constant it is the random
+    walk, with a short one scatter. ``means`` and ``prior`` are those that ``with_shared_noise`` returns.
     """
-    means, prior = _reduce(means, prior)
-    free, still = _likelihood(noise, (), means, state, prior).without(), replace(noise, walk_mps2_per_sqrt_s=0.0)
+    (means, prior), still = _reduce(means, prior), replace(noise, walk_mps2_per_sqrt_s=0.0)
     spans_s, run_s = means.ends_s[:, 1] - means.ends_s[:, 0], float(means.ends_s[-1, 1] - means.ends_s[0, 0])
-    times_s = np.geomspace(max(float(np.median(spans_s)) / 4.0, run_s * 1e-4), 2.0 * run_s, HELD).tolist()
-    costs = [
+    times_s = np.geomspace(max(float(np.median(spans_s)) / 4.0, run_s * 1e-4), 2.0 * run_s, HELD)
+    costs = np.array([
         _likelihood(still, {"walk"}, means, state, prior, held_s).of(("walk",)).most_likely()[1].cost
-        for held_s in times_s
-    ]
-    least = int(np.argmin(costs))
-    return max(free.cost - costs[least], 0.0), times_s[least]
+        for held_s in (math.inf, *times_s.tolist())
+    ])  # fmt: skip
+    return costs[0] - costs[1:], times_s
 
 
 def with_shared_noise(dwells: Sequence[DwellFactor], noise: Noise, means: Means) -> tuple[Means, Floats]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import AbstractContextManager
 from functools import cache
 
@@ -11,13 +12,10 @@ from threadpoolctl import ThreadpoolController
 def one_blas_thread() -> AbstractContextManager[object]:
     """While it is entered BLAS works in one thread: small decompositions take three times as long with several, and
     these need not give the same bits every time."""
-    return _controller().limit(limits=1, user_api="blas")
+    return _controller("scipy.linalg" in sys.modules).limit(limits=1, user_api="blas")
 
 
 @cache
-def _controller() -> ThreadpoolController:
-    """Of the libraries of numpy and scipy, which it takes a millisecond to find."""
-    import numpy  # noqa: F401  # loads its library
-    import scipy.linalg  # noqa: F401  # loads another one
-
+def _controller(scipy: bool) -> ThreadpoolController:
+    """Of the libraries that are loaded, which it takes a millisecond to find; scipy brings one of its own."""
     return ThreadpoolController()

@@ -12,8 +12,8 @@ from rich.text import Text
 from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import LEVEL
 from kf_calib.diagnosis.detectability import Detectable
-from kf_calib.diagnosis.hypotheses import Hypothesis
-from kf_calib.diagnosis.hypotheses import Table as Hypotheses
+from kf_calib.diagnosis.hypothesis_table import Hypothesis
+from kf_calib.diagnosis.hypothesis_table import Table as Hypotheses
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
 from kf_calib.diagnosis.verdict import format_probability

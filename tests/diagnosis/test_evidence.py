@@ -14,6 +14,7 @@ from scipy.stats import chi2, multivariate_normal
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.evidence import Evidence, size_evidence
 from kf_calib.diagnosis.refits import Refits
+from kf_calib.effects import effect_named
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration
 
@@ -102,3 +103,17 @@ def test_an_effect_that_is_there_beats_one_that_is_not(before: Calibration) -> N
     assert log("second-order") > none + 10.0 > log("hysteresis") + 8.0
     walk = refits.with_effects(before, ("bias-walk",))
     assert logsumexp([own.log for own in evidence.of(walk.fit, walk=True)]) < log("second-order") - 10.0
+
+
+def test_coefficients_of_one_field_are_averaged_over_its_directions(before: Calibration) -> None:
+    """Against dense least squares with three columns a direction; in more noise nothing is changed but the falls."""
+    refit, effect = Refits().with_effects(before, ("magnetic",)), effect_named("magnetic", before.bench)
+    assert [own.shape for own in effect.relations] == [(6, 3)] * 18
+    own = next(each for each in Evidence(before.fit).of(refit.fit) if not each.parts)
+    still = next(each for each in Evidence(before.fit).of() if not each.parts)
+    (columns, readings), added = _dense(refit, 0.0), before.model.count
+    parts = [np.hstack([columns[:, :added], columns[:, added:] @ relation]) for relation in effect.relations]
+    falls = np.array([_left(*_dense(before, 0.0)) - _left(each, readings) for each in parts])
+    expected = logsumexp(size_evidence(3, falls)) - np.log(len(falls))
+    assert own.log - still.log == pytest.approx(expected, abs=0.02) and own.dof == 6
+    assert expected > float(size_evidence(6, falls.max()))

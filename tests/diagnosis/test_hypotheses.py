@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from helpers.hidden_effects import noisy_run, noisy_source, run, source
 from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 
-from kf_calib.diagnosis.hypotheses import NOISE, NOTHING, Hypothesis, log_odds_of, table_of
+from kf_calib.diagnosis.hypotheses import log_odds_of
+from kf_calib.diagnosis.hypothesis_table import ALIKE, NOISE, NONE, NOTHING, Hypothesis, table_of
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.verdict import format_probability
@@ -33,20 +35,23 @@ def rows() -> list[Hypothesis]:
 
 
 def test_probabilities_are_evidence_over_the_sum_of_all() -> None:
+    """Of what has a known effect's look, 1 in 200 is in no catalogue."""
     table = table_of(rows())
-    assert [row.probability for row in table.rows] == pytest.approx([0.80, 0.15, 0.04, 0.01])
-    assert table.first.effects == ("a",) and table.probability(["a"]) == pytest.approx(0.95)
-    assert table.probability(["a", "b"]) == pytest.approx(0.15)
-    assert table.families == pytest.approx({"memory": 0.99, NOTHING: 0.01})
+    shares = [0.995 * 0.80, 0.995 * 0.15, 0.995 * 0.04, 0.01, 0.005 * 0.99]
+    assert [row.probability for row in table.rows] == pytest.approx(shares)
+    assert table.first.effects == ("a",) and table.probability(["a"]) == pytest.approx(0.995 * 0.95)
+    assert table.probability(["a", "b"]) == pytest.approx(0.995 * 0.15)
+    assert table.families == pytest.approx({"memory": 0.995 * 0.99, NOTHING: 0.01, NONE: 0.005 * 0.99})
+    assert table.rows[-1].driver == ALIKE and table.rows[-1].unknown
 
 
 def test_what_is_told_of_a_table() -> None:
-    table = table_of([*rows(), Hypothesis(formulas=("mine = t",), driver="time", families=("none of the known",),
+    table = table_of([*rows(), Hypothesis(formulas=("mine = t",), driver="time", families=(NONE,),
                                           log_evidence=float(np.log(0.002)) - 900.0)])  # fmt: skip
     assert len(table.told) == 3 and table.log10_odds[0] == pytest.approx(np.log10(80 / 15))
     assert table.log10_odds[-1] is None and len(table.log10_odds) == len(table.rows)
-    assert table.of_any(["memory", "none of the known"]) == pytest.approx(0.992 / 1.002)
-    assert table.of_added("a", "a") == pytest.approx(0.95 / 1.002)
+    assert table.of_any(["memory", NONE]) == pytest.approx(0.992 / 1.002)
+    assert table.of_added("a", "a") == pytest.approx(0.995 * 0.95 / 1.002)
     assert table.of_added("mine = t", "mine") == pytest.approx(0.002 / 1.002)
     assert table.of_added("b2", "b2") is None
 
@@ -72,7 +77,7 @@ def test_odds_of_a_p_value() -> None:
 
 def test_every_effect_has_a_family() -> None:
     bench = run().bench
-    assert {effect_named(name, bench).family for name in names(bench)} <= FAMILIES - {"none of the known"}
+    assert {effect_named(name, bench).family for name in names(bench)} <= FAMILIES - {NONE}
 
 
 def test_an_effect_far_above_the_noise_is_sure_and_its_family_too() -> None:
@@ -121,6 +126,15 @@ def test_an_error_that_no_known_effect_is_does_not_pass_as_noise_that_nobody_sta
     found = diagnose(run)
     assert found.test.consistent is False and found.unknown
     assert found.table is not None and found.table.rows[0].driver == "angle of gimbal 2, 3 a turn"
+
+
+@pytest.mark.parametrize("seeds", [(1,), *slow(range(1, 17))])
+def test_a_setting_error_larger_than_stated_is_no_change_of_the_bias(seeds: Sequence[int]) -> None:
+    """A bias that returns to its mean within less than a dwell is scatter, which has a likelier name."""
+    states: dict[str, float | None] = {"angle_sigma_deg": 2e-4}
+    found = [diagnose(noisy_run(dwells=24, setting_sigma_deg=8e-4, states=states, seed=seed)) for seed in seeds]
+    assert sum(each.noise for each in found) >= 0.9 * len(found)
+    assert all(each.table and each.table.families.get("bias in time", 0.0) < 0.5 for each in found)
 
 
 @pytest.mark.parametrize("seeds", [range(1), *slow(range(100))])

@@ -15,8 +15,11 @@ from blind_trials.best_possible import (
     best_possible,
     best_possible_pairs,
     best_possible_probability,
+    probability_where_two_are_possible,
 )
 from scipy.special import ndtr
+
+from kf_calib.diagnosis.evidence import size_evidence
 
 
 def test_the_best_chooser_is_right_as_often_as_theory_has_it() -> None:
@@ -42,6 +45,18 @@ def test_the_probability_of_the_truth_is_that_of_bayes() -> None:
     true, false = np.cosh(sigmas * readings[:, 0]), np.cosh(sigmas * readings @ other)
     assert found["one"] == pytest.approx(float(np.mean(true / (true + false))), abs=0.008)
     assert found["one"] < best_possible(spaces, {name: {name} for name in spaces}, sigmas, draws=20_000)["one"]
+
+
+def test_a_chooser_who_allows_for_two_effects_is_less_sure() -> None:
+    """Two effects across each other: B(x^2) of the one there against B(y^2) and two at once, a fourth as likely."""
+    sigmas, spaces = 5.0, {"one": Columns([np.eye(3)[:, :1]]), "two": Columns([np.eye(3)[:, 1:2]])}
+    same = {name: {name} for name in spaces}
+    found = probability_where_two_are_possible(spaces, same, sigmas, draws=2_000, seed=3)
+    falls = np.random.default_rng(1).normal([sigmas, 0.0], 1.0, (20_000, 2)) ** 2
+    one, two = np.exp(size_evidence(1, falls)).T / 2.0
+    both = np.exp(size_evidence(2, falls.sum(axis=1))) / 4.0
+    assert found["one"] == pytest.approx(float(np.mean(one / (one + two + both))), abs=0.01)
+    assert found["one"] < best_possible_probability(spaces, same, sigmas, draws=2_000)["one"] - 0.02
 
 
 @pytest.mark.parametrize("dofs", [(3, 3), (2, 3), (3, 1)])

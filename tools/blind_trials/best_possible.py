@@ -10,8 +10,8 @@ of n sigma, it takes the likeliest pair. Rivals are explanations that have no na
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -21,9 +21,13 @@ from scipy.stats import vonmises_fisher
 
 from blind_trials.bayes_factor import log_odds
 from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.evidence import size_evidence
 
 _NEAR = 12.0  # in the logarithm of the odds: a pair that lags by more is never the likeliest
 _DRAWN = 400  # directions, for the mean over them
+_ONE_TO_TWO = 4.0  # odds of one effect against two, before the readings
+_SEEN = 1e-3  # singular value of a combination of columns that counts
+_TRIED = np.exp(np.linspace(0.0, np.log(1e7), 60))  # sizes of a walk, sigma
 _INTENSITIES, _PATHS = 8, 2000  # intensities of a process that are tried, and paths that give their range
 
 
@@ -151,6 +155,51 @@ def best_possible_probability(
         name: float(np.mean(np.exp(logs - np.logaddexp.reduce(logs, axis=0))[[k in same[name] for k in names]].sum(0)))
         for name, names, logs in _log_odds_of_all(effects, sigmas, draws, seed, None)
     }
+
+
+def probability_where_two_are_possible(
+    effects: Mapping[str, Effect], same: Mapping[str, set[str]], sigmas: float, draws: int = 10, seed: int = 0
+) -> dict[str, float]:
+    """Return for each effect the mean probability of the truth for a chooser that knows neither size nor number.
+
+    Every size is equally likely on a logarithmic scale. One effect is four times as likely as two at once, which have
+    columns, each at its best constant.
+    """
+    out, rng = dict[str, float](), np.random.default_rng(seed)
+    for name in effects:
+        readings = sigmas * effects[name].signals(draws, rng)
+        readings = readings + rng.standard_normal(readings.shape)
+        alone = np.array([_log_odds_of_any_size(each, readings) for each in effects.values()]) - np.log(len(effects))
+        both = np.array([_log_odds_of_pairs(effects.values(), own) for own in readings]) - np.log(_ONE_TO_TWO)
+        logs = alone - np.logaddexp.reduce([*alone, both], axis=0)
+        out[name] = float(np.mean(np.exp(logs[[each in same[name] for each in effects]]).sum(0)))
+    return out
+
+
+def _log_odds_of_any_size(effect: Effect, readings: Floats) -> Floats:
+    """Return the log of the mean likelihood ratio (m,) of the signals of any size against none."""
+    parts = [
+        size_evidence(each.basis.shape[1], np.sum((readings @ each.basis) ** 2, axis=1))
+        if isinstance(each, Sphere)
+        else np.logaddexp.reduce([replace(each, variances=each.variances * n**2).log_odds(readings, n) for n in _TRIED])
+        - np.log(len(_TRIED))
+        for each in effect.parts(1.0)
+    ]
+    return np.logaddexp.reduce(parts, axis=0) - np.log(len(parts))
+
+
+def _log_odds_of_pairs(effects: Iterable[Effect], readings: Floats) -> float:
+    """Return the log of the mean likelihood ratio of all pairs of effects with columns, of any size, against none."""
+    best, logs = list[tuple[Floats, float]](), list[float]()
+    for bases in (effect.bases for effect in effects if isinstance(effect, Columns)):
+        falls = np.array([np.sum((readings @ basis) ** 2) for basis in bases])
+        share = np.logaddexp.reduce(0.5 * (falls - falls.max())) - np.log(len(falls))
+        best.append((bases[int(np.argmax(falls))], float(share)))
+    for (one, of_one), (other, of_other) in itertools.combinations(best, 2):
+        left, singular, _ = np.linalg.svd(np.hstack([one, other]), full_matrices=False)
+        basis = left[:, singular > _SEEN]
+        logs.append(float(size_evidence(basis.shape[1], float(np.sum((readings @ basis) ** 2)))) + of_one + of_other)
+    return float(np.logaddexp.reduce(logs)) - np.log(len(logs))
 
 
 def _log_odds_of_all(

@@ -68,9 +68,10 @@ def exact_sets(task: Task, effect: dict[str, Any], given: Iterable[Sequence[str]
 
 
 def _exact_mimics(task: Task, effect: dict[str, Any], others: Sequence[str]) -> list[str]:
-    """Return the names that explain a hidden effect to a hundredth of its size, where it is large and alone."""
+    """Return the names that explain a hidden effect to a hundredth of its size, where it is large and alone, in stated
+    noise: what is not stated is estimated, and would be as large as the effect."""
     path = Path("alone.mcap")
-    simulate_trial(with_size(task, effect, _ALONE_SIGMA / effect["size_sigma"]), path)
+    simulate_trial(with_size(task.stated, effect, _ALONE_SIGMA / effect["size_sigma"]), path)
     spaces, residual = scan_columns(path, [effect["name"], *others])
     falls = {name: max(float(np.sum((each.basis.T @ residual) ** 2)) for each in own) for name, own in spaces.items()}
     return [name for name in others if falls[name] > (1.0 - _LEFT**2) * falls[effect["name"]]]

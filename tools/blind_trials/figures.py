@@ -234,10 +234,12 @@ def _ideal(_: str, own: list[Outcome]) -> Iterator[Figure]:
         yield Figure(f"worst effect, {said}, best possible: {lowest}", *_mean_and_range(hits), len(hits))
         walks = [each[WALK] for each in shares]
         yield Figure(f"{WALK}, {said}: best possible", *_mean_and_range(walks), len(walks))
-    known = [each.extra["probability"] for each in own if "probability" in each.extra]
-    for size in map(str, SIZES_SIGMA) if known else ():
-        means = [float(np.mean(list(each[size].values()))) for each in known]
-        yield Figure(f"probability of the truth, n = {size}, mean: best possible", *_mean_and_range(means), len(means))
+    for key, words in (("probability", ""), ("probability, two possible", ", size and number unknown")):
+        known = [each.extra[key] for each in own if key in each.extra]
+        for size in map(str, SIZES_SIGMA) if known else ():
+            means = [float(np.mean(list(each[size].values()))) for each in known]
+            said = f"probability of the truth, n = {size}, mean: best possible{words}"
+            yield Figure(said, *_mean_and_range(means), len(means))
     hits = [(pair, right) for each in own for pair, right in each.extra.get("pairs", [])]
     for walks, words in ((False, ""), (True, ", a walk of the biases being one")):
         shown = [right for pair, right in hits if WALK in pair or not walks]

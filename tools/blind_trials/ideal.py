@@ -15,6 +15,7 @@ from blind_trials.best_possible import (
     best_possible,
     best_possible_pairs,
     best_possible_probability,
+    probability_where_two_are_possible,
 )
 from blind_trials.columns import column_effects, group_by_name, span_the_same
 from blind_trials.criteria import APART
@@ -63,6 +64,9 @@ def compute_ideal(task: Task) -> Outcome:
     }
     extra["probability"] = {
         str(size): best_possible_probability(effects, same, size, seed=task.seed) for size in SIZES_SIGMA
+    }
+    extra["probability, two possible"] = {
+        str(size): probability_where_two_are_possible(effects, same, size, seed=task.seed) for size in SIZES_SIGMA
     }
     extra["pairs"] = best_possible_pairs(effects, same, PAIR_SIGMA, apart, seed=task.seed)
     return Outcome(task, extra=extra)

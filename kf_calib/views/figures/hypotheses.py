@@ -8,7 +8,7 @@ from typing import NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
-from kf_calib.diagnosis.hypotheses import NOISE, NONE, NOTHING, SURE, TOLD, Hypothesis, Table
+from kf_calib.diagnosis.hypothesis_table import NOISE, NONE, NOTHING, SURE, TOLD, Hypothesis, Table
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.views.diagnosis import name_of

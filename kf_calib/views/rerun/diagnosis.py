@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.explanation import Explanation
-from kf_calib.diagnosis.hypotheses import TOLD, Table
+from kf_calib.diagnosis.hypothesis_table import TOLD, Table
 from kf_calib.diagnosis.residual_drivers import Driver, is_function_of
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import format_probability

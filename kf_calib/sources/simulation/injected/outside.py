@@ -83,7 +83,7 @@ def fourth_harmonic(k: Floats, state: State) -> Floats:
     ("2mg", "20mg"),
     known=False,
     driver="specific force",
-    family=NO_FAMILY,
+    family="nonlinearity",
 )
 def third_cosine(k: Floats, state: State) -> Floats:
     """Cosine of thrice the direction: H s^3 cos(3 psi), psi and s the angle about the output axis and the sine of the

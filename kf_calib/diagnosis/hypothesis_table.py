@@ -1,0 +1,149 @@
+"""Explanations of a misfit with their probabilities, as one table.
+
+Its rows are made and weighed by ``hypotheses``.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib.estimation.results import Calibration
+from kf_calib.support.logarithms import weights
+
+NOTHING, NOISE, NONE = "nothing", "unstated noise", "none of the known"
+"""Families of the rows that name no effect: nothing missing, noise that was not stated, and no known effect."""
+
+IRREGULAR = "irregular"
+"""Driver of changes that follow nothing that was recorded."""
+
+ALIKE = "like a known effect"
+"""Driver of a cause in no catalogue that looks in this run like a known effect."""
+
+SURE = 0.95
+"""Probability from which an effect is taken for certain enough to be added without asking."""
+
+HOLDS = 0.99
+"""Probability of the set of explanations that is told."""
+
+TOLD = 0.01
+"""Least probability of an explanation that has a line of its own where the table is shown."""
+
+KINDS = {"nothing": 0.4, "effect": 0.4, "pair": 0.1, "formula": 0.1}
+"""Prior probability of each kind of explanation."""
+
+_ALIKE = 0.05 * KINDS["formula"]  # of what has a known effect's look: what is in no catalogue, and 1 of 20 looks so
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One row of the table.
+
+    - effects: names of the effects that would be missing. formulas: those of no known effect, as they can be added.
+    - driver: in words, what the formulas depend on; "irregular" for changes of an unknown cause that follow nothing,
+      "like a known effect" for a cause that cannot be told from one.
+    - families: the physical classes of the effects.
+    - log_evidence: of the row with its prior, natural logarithm. probability: its share in all rows.
+    - statistic, dof: fall of chi-squared in the likeliest noise, and the number of coefficients; of a random walk alone
+      twice its gain in likelihood.
+    - refit: the calibration with it; None where none was made.
+    """
+
+    effects: tuple[str, ...] = ()
+    formulas: tuple[str, ...] = ()
+    driver: str = ""
+    families: tuple[str, ...] = ()
+    log_evidence: float = 0.0
+    statistic: float = 0.0
+    dof: int = 0
+    refit: Calibration | None = None
+    probability: float = 0.0
+
+    @property
+    def unknown(self) -> bool:
+        """Whether the row says that something is missing that no known effect explains."""
+        return bool(self.driver)
+
+
+@dataclass(frozen=True)
+class Table:
+    """All rows, the likeliest first; their probabilities sum to one."""
+
+    rows: tuple[Hypothesis, ...]
+
+    @cached_property
+    def families(self) -> dict[str, float]:
+        """Probability that something of each family is missing; with two effects at once they sum to more than one."""
+        found = dict[str, float]()
+        for row in self.rows:
+            for family in row.families:
+                found[family] = found.get(family, 0.0) + row.probability
+        return dict(sorted(found.items(), key=lambda each: -each[1]))
+
+    def probability(self, effects: Sequence[str]) -> float:
+        """Probability that all these effects are missing, alone or with others."""
+        return sum(row.probability for row in self.rows if set(effects) <= set(row.effects))
+
+    def of_any(self, families: Iterable[str]) -> float:
+        """Probability that something of any of these families is missing."""
+        return sum(row.probability for row in self.rows if set(row.families) & set(families))
+
+    def of_added(self, text: str, name: str) -> float | None:
+        """Probability that what was added to a model is missing, alone or with others; None where no row has it.
+
+        text: the effect as it was added, which a formula is told by. name: its name.
+        """
+        rows = [row for row in self.rows if name in row.effects or text in row.formulas]
+        return sum(row.probability for row in rows) if rows else None
+
+    @cached_property
+    def log10_odds(self) -> tuple[float | None, ...]:
+        """Log10 of the odds of each row to the next; None of the last."""
+        logs = [row.log_evidence / math.log(10.0) for row in self.rows]
+        return (*(one - next_ for one, next_ in itertools.pairwise(logs)), None)
+
+    @property
+    def told(self) -> tuple[Hypothesis, ...]:
+        """The rows that have a line of their own where the table is shown: those of ``TOLD`` or more, and the first."""
+        return tuple(row for row in self.rows if row.probability >= TOLD or row is self.first)
+
+    @property
+    def first(self) -> Hypothesis:
+        """The likeliest explanation, with nothing missing left out."""
+        return next(row for row in self.rows if row.families != (NOTHING,))
+
+    @cached_property
+    def rivals(self) -> tuple[Hypothesis, ...]:
+        """The explanations other than the first that have ``HOLDS`` of the probability together with it, without those
+        that only add to its effects or look like them."""
+        first, rows = self.first, [row for row in self.rows if row.families != (NOTHING,) and row.driver != ALIKE]
+        before = np.cumsum([0.0, *(row.probability for row in rows)]) / sum(row.probability for row in rows)
+        likely = [row for k, row in enumerate(rows) if before[k] < HOLDS and row is not first]
+        return tuple(row for row in likely if not (first.effects and set(first.effects) <= set(row.effects)))
+
+
+def table_of(rows: Iterable[Hypothesis]) -> Table:
+    """The table of rows, of which only the evidence is known, with one for causes that look like a known effect."""
+    rows = [replace(row, log_evidence=row.log_evidence + math.log1p(-_ALIKE)) if row.effects else row for row in rows]
+    if known := [row.log_evidence for row in rows if row.effects]:
+        alike = float(np.logaddexp.reduce(known)) + math.log(_ALIKE / (1.0 - _ALIKE))
+        rows.append(Hypothesis(driver=ALIKE, families=(NONE,), log_evidence=alike))
+    logs = np.array([row.log_evidence for row in rows])
+    found = [replace(row, probability=share) for row, share in zip(rows, weights(logs).tolist(), strict=True)]
+    return Table(tuple(sorted(found, key=lambda row: -row.probability)))
+
+
+def noise_p(table: Table) -> float:
+    """P-value of noise alone, stated or not, against all that a table has beside it.
+
+    In noise the odds of the others to it, over their odds before the readings, have the mean 1, so that they exceed 1/p
+    with a probability of p at most (Markov's inequality).
+    """
+    alone = table.families.get(NOTHING, 0.0) + table.families.get(NOISE, 0.0)
+    before = KINDS["nothing"] / (1.0 - KINDS["nothing"])
+    return min(1.0, alone / max(1.0 - alone, 1e-300) / before)
