@@ -19,7 +19,7 @@ QUICK = ("--orientations", 6, "--dwell-s", 4, "--slew-degps", 360, "--sample-hz"
 CSV = "time_s,ax_g,ay_g,az_g,outer_deg,middle_deg,inner_deg\n0,0,1,0,0,0,0\n1,0,1,0,0,0,0\n"
 COMMANDS: dict[str, tuple[object, ...]] = {
     "replay": (HIDDEN,),
-    "compare": (HIDDEN,),
+    "compare": (HIDDEN.with_name("mems_faces.mcap"),),
     "diagnose": (HIDDEN,),
     "improve": (HIDDEN, "--unattended"),
     "fleet": (HIDDEN, HIDDEN.with_name("mems_faces.mcap"), "lines.csv", "-o", "table", "--workers", 1),

@@ -26,6 +26,8 @@ README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 WITH_COMMANDS = [page for page in PAGES if "```console" in page.read_text()]
 BLOCK = re.compile(r"^```(\S*)(?: \S+)?\n(.*?)^```", re.DOTALL | re.MULTILINE)
+OF_OTHER_TESTS = ("--honest", "--from-journal")
+"""Options of commands that take long, and do what tests/diagnosis/test_stepwise_selection.py proves."""
 END = "-- the end of a block --"
 FILE = re.compile(r"^:caption: (\S+)\n\n(.*)", re.DOTALL)
 
@@ -64,9 +66,9 @@ def test_the_readme_and_the_changelog_are_short() -> None:
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda page: page.name)
-@pytest.mark.parametrize("left_out", ["--honest", *slow(None)])
+@pytest.mark.parametrize("in_short", [True, *slow(False)])
 def test_the_commands_of_a_page_print_what_is_shown(
-    page: Path, left_out: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    page: Path, in_short: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = page.read_text()
     if "kf-calib certificate" in text:
@@ -77,9 +79,8 @@ def test_the_commands_of_a_page_print_what_is_shown(
         Path(name).write_text(content)
     with _workers_at_once() if "kf-calib fleet" in text else nullcontext():
         for command, shown in consoles(text):
-            if left_out and left_out in command:
-                continue
-            _assert_shown(shown, _said(command), f"{page.name}: {command!r}")
+            if not (in_short and any(option in command for option in OF_OTHER_TESTS)):
+                _assert_shown(shown, _said(command), f"{page.name}: {command!r}")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

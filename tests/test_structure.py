@@ -6,6 +6,8 @@ import ast
 import json
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -40,28 +42,39 @@ def room(module: str) -> str:
     return ".".join(module.split(".")[:2])
 
 
-GRAPH = {name: imported(path) - {name} for name, path in MODULES.items()}
-ROOMS = {
-    own: {room(other) for name in MODULES if room(name) == own for other in GRAPH[name]} - {own}
-    for own in sorted(set(map(room, MODULES)))
-}
+@cache
+def modules() -> dict[str, set[str]]:
+    """What each module imports; read when a test asks, not by every process that only collects the tests."""
+    return {name: imported(path) - {name} for name, path in MODULES.items()}
 
 
-@pytest.mark.parametrize("graph", [GRAPH, ROOMS], ids=["modules", "packages"])
-def test_imports_go_in_no_circle(graph: dict[str, set[str]]) -> None:
+@cache
+def packages() -> dict[str, set[str]]:
+    """What each package imports."""
+    return {
+        own: {room(other) for name in MODULES if room(name) == own for other in modules()[name]} - {own}
+        for own in ROOMS
+    }
+
+
+ROOMS = sorted(set(map(room, MODULES)))
+
+
+@pytest.mark.parametrize("graph", [modules, packages])
+def test_imports_go_in_no_circle(graph: Callable[[], dict[str, set[str]]]) -> None:
     try:
-        order = list(TopologicalSorter(graph).static_order())
+        order = list(TopologicalSorter(graph()).static_order())
     except CycleError as error:
         pytest.fail(" -> ".join(error.args[1]))
-    assert set(graph) <= set(order)
+    assert set(graph()) <= set(order)
 
 
-@pytest.mark.parametrize("own", sorted(ROOMS))
+@pytest.mark.parametrize("own", ROOMS)
 def test_imports_point_the_way_that_data_flow(own: str) -> None:
     """Sources know the bench alone; what is simulated and its truth are known to no estimator; views to the commands
     and to the names of the package itself."""
     name = own.removeprefix("kf_calib").removeprefix(".")
-    seen = {other.removeprefix("kf_calib.") for other in ROOMS[own]}
+    seen = {other.removeprefix("kf_calib.") for other in packages()[own]}
     if name in ("errors", "support", "bench", "effects", "sources"):
         assert seen <= {"errors": set(), "support": {"errors"}, "bench": {"errors", "support"},
                         "effects": {"errors", "support", "bench"},
@@ -70,7 +83,7 @@ def test_imports_point_the_way_that_data_flow(own: str) -> None:
         assert not seen & {"views", "cli", "reproduction"}
         for module in MODULES:
             if room(module) == own:
-                assert not any(other.startswith("kf_calib.sources.simulation") for other in GRAPH[module]), module
+                assert not any(other.startswith("kf_calib.sources.simulation") for other in modules()[module]), module
     if name not in ("cli", "views", "", "__main__"):
         assert "views" not in seen and "cli" not in seen
 

@@ -40,7 +40,8 @@ class Bend(SensorEffect):
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("trust") / "run.mcap"
-    words = ["simulate", str(out), "--dwell-s", "4", "--slew-degps", "90", "--orientations", "12"]
+    words = ["simulate", str(out), "--dwell-s", "4", "--slew-degps", "180", "--orientations", "12",
+             "--sample-hz", "25"]  # fmt: skip
     assert cli.main(words, standalone_mode=False) in (0, None)
     return out
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +21,19 @@ from kf_calib.diagnosis.candidate_tests import assess_candidates, independent_te
 from kf_calib.diagnosis.detectability import detectable
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
+from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.effects import effect_named
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.score_test import Candidate, Scan, scan
 from kf_calib.sources.simulation.visit_plans import six_faces
 
 HAND = SHARED / "ferraris_hand.mcap"
+
+
+@cache
+def unlisted(name: str) -> Diagnosis:
+    """Of an effect that is in no catalogue."""
+    return diagnose(source(f"{name}=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
 
 
 @pytest.mark.parametrize(
@@ -63,7 +71,7 @@ def test_nothing_is_found_in_noise(case: dict, runs: int) -> None:
 def test_what_is_in_no_catalogue_is_unknown(name: str, driver: str) -> None:
     from kf_calib.views.diagnosis import diagnosis_object
 
-    found = diagnose(source(f"{name}=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
+    found = unlisted(name)
     assert found.unknown and not found.missing
     shape = found.description
     assert shape is not None and driver in shape.driver
@@ -77,7 +85,7 @@ def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
     from kf_calib.views.console import plain
     from kf_calib.views.diagnosis import diagnosis_object, diagnosis_report
 
-    found = diagnose(source("encoder-harmonic-3:z=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
+    found = unlisted("encoder-harmonic-3:z")
     shown, printed = diagnosis_object(found), plain(diagnosis_report(found))
     assert shown["unknown"] and shown["detectable"] and "To try:" in printed
     for name in ("describe", "detectable", "advise", "mean_covariances"):
@@ -87,7 +95,7 @@ def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_formula_that_explains_more_than_a_known_effect_speaks_against_it() -> None:
     """A fifth power looks like a third power to 0.96: named third-order, it would be a wrong name."""
-    found = diagnose(source("fifth-order=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
+    found = unlisted("fifth-order")
     shape = found.description
     assert found.unknown and shape is not None and shape.formula == "mine = a**5"
 
@@ -132,12 +140,12 @@ def test_command_line(tmp_path: Path) -> None:
     made = ["simulate", str(out), "--hide", "second-order=40sigma", "--dwell-s", "6", "--slew-degps", "90",
             "--orientations", "10"]  # fmt: skip
     assert CliRunner().invoke(cli, made).exit_code == 0
-    printed = CliRunner().invoke(cli, ["diagnose", str(out), "--json"])
+    printed = CliRunner().invoke(cli, ["diagnose", str(out), "--strict", "--json"])
     content = json.loads(printed.stdout)
+    assert printed.exit_code == 1
     assert content["missing"] == "second-order" and content["ambiguity_set"][0] == "second-order"
     keys = {"consistent", "p_value", "verdict", "suspects", "invisible", "detectable", "unknown", "next_orientation"}
     assert keys <= set(content)
-    assert CliRunner().invoke(cli, ["diagnose", str(out), "--strict"]).exit_code == 1
     cured = json.loads(CliRunner().invoke(cli, ["diagnose", str(out), "--with", "second-order", "--json"]).stdout)
     assert cured["consistent"] and cured["missing"] is None
 

@@ -30,6 +30,17 @@ def walking(seed: int) -> Diagnosis:
     return diagnose(source("bias-walk=15sigma", seed=seed, dwells=24))
 
 
+@cache
+def oscillating(hidden: str) -> tuple[Diagnosis, Diagnosis]:
+    """A run diagnosed by what its calibration holds, and with its readings at hand."""
+    recorded = source(hidden)
+    before = calibrate(recorded)
+    return diagnose(before), diagnose(before, Refits(recorded))
+
+
+LINE = "sinusoid=6ug;frequency=7.3"
+
+
 def not_wrong(found: Diagnosis, *truth: str) -> None:
     """Nothing is named, or what is named may be the truth."""
     assert not found.missing or set(truth) & set(found.ambiguity), found.verdict
@@ -77,7 +88,7 @@ def test_a_walk_is_not_taken_for_a_drift(seed: int) -> None:
 
 
 def test_a_line_is_named_with_its_frequency() -> None:
-    found = diagnose(source("sinusoid=6ug;frequency=7.3"))
+    _, found = oscillating(LINE)
     assert found.missing == ("sinusoid",) and found.after is not None
     frequency = found.after.parameters["fSin"]
     assert frequency.value is not None and frequency.sigma is not None
@@ -86,19 +97,16 @@ def test_a_line_is_named_with_its_frequency() -> None:
 
 def test_without_its_source_a_line_is_judged_by_one_pass_and_that_is_said() -> None:
     """A calibration does not reach back to its readings: whoever holds them gives their refits."""
-    recorded = source("sinusoid=6ug;frequency=7.3")
-    before = calibrate(recorded)
-    alone, whole = diagnose(before), diagnose(before, Refits(recorded))
+    alone, whole = oscillating(LINE)
     assert "A second pass over the readings is needed to judge the lines in their spectrum" in alone.verdict
-    assert whole.missing == ("sinusoid",) and whole.verdict == diagnose(recorded).verdict
+    assert whole.missing == ("sinusoid",) and whole.verdict == diagnose(source(LINE)).verdict
     assert "second pass" not in whole.verdict
 
 
 def test_without_its_source_a_slow_oscillation_is_fitted_by_one_pass_and_that_is_said() -> None:
-    recorded = source("sinusoid=15sigma;frequency=0.1")
-    before = calibrate(recorded)
-    assert "is needed to judge sinusoid" in diagnose(before).verdict
-    assert "second pass" not in diagnose(before, Refits(recorded)).verdict
+    alone, whole = oscillating("sinusoid=15sigma;frequency=0.1")
+    assert "is needed to judge sinusoid" in alone.verdict
+    assert "second pass" not in whole.verdict
 
 
 @pytest.mark.parametrize("frequency_hz", [0.01, *slow(0.1, 0.3, 1.5)])
@@ -248,7 +256,7 @@ def test_a_jump_is_not_called_a_walk(seed: int) -> None:
     assert said is not None and said.driver == JUMP
 
 
-@pytest.mark.parametrize("seeds", [range(6, 8), *slow(range(3, 8))])
+@pytest.mark.parametrize("seeds", [range(6, 7), *slow(range(3, 8))])
 def test_in_a_few_dwells_a_walk_could_explain_what_an_effect_does(seeds: range) -> None:
     """Three coefficients of six degrees of freedom: what is left is no proof. In 16 dwells it is."""
     few = [diagnose(source("hysteresis=12sigma", plan=plan_of(6, dwell_s=8.0, seed=seed))) for seed in seeds]
@@ -267,7 +275,6 @@ SETTING = ({"setting_sigma_deg": 3e-5}, {"angle_sigma_deg": 1e-5})
     "noise, seeds",
     [
         (TWICE, range(40, 41)),
-        (SETTING, range(40, 41)),
         *slow((SCATTER, range(40, 52)), (TWICE, range(40, 52)), (SETTING, range(40, 52))),
     ],
 )
@@ -310,7 +317,7 @@ def test_a_bias_that_goes_to_and_fro_is_no_walk(seeds: range) -> None:
     assert walks <= len(found) // 6  # of six, four where nothing asks whether it comes back
 
 
-@pytest.mark.parametrize("runs", [4, *slow(24)])
+@pytest.mark.parametrize("runs", [2, *slow(24)])
 def test_a_walk_rarely_looks_as_if_it_came_back(runs: int) -> None:
     walks = [run("bias-walk=15sigma", seed=seed, dwells=24) for seed in range(runs)]
     gains = [2.0 * Refits().with_effects(each, ("bias-walk",)).fit.back_gain[0] for each in walks]

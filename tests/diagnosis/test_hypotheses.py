@@ -128,7 +128,7 @@ def test_an_error_that_no_known_effect_is_does_not_pass_as_noise_that_nobody_sta
     assert found.table is not None and found.table.rows[0].driver == "angle of gimbal 2, 3 a turn"
 
 
-@pytest.mark.parametrize("seeds", [(1, 3), *slow(range(1, 17))])
+@pytest.mark.parametrize("seeds", [(1,), *slow(range(1, 17))])
 def test_a_setting_error_larger_than_stated_is_no_change_of_the_bias(seeds: Sequence[int]) -> None:
     """A bias that returns to its mean within less than a dwell is scatter, which has a likelier name."""
     states: dict[str, float | None] = {"angle_sigma_deg": 2e-4}
@@ -137,7 +137,7 @@ def test_a_setting_error_larger_than_stated_is_no_change_of_the_bias(seeds: Sequ
     assert all(each.table and each.table.families.get("bias in time", 0.0) < 0.5 for each in found)
 
 
-@pytest.mark.parametrize("seeds", [range(3), *slow(range(100))])
+@pytest.mark.parametrize("seeds", [range(1), *slow(range(100))])
 def test_noise_that_nobody_stated_is_told_as_noise(seeds: range) -> None:
     not_stated, noise = {"angle_sigma_deg": None, "scatter_sigma_mps2": None}, {"setting_sigma_deg": 2e-4}
     found = [diagnose(noisy_source(dwells=16, states=not_stated, seed=500 + seed, **noise)) for seed in seeds]

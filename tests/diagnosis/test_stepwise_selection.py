@@ -66,7 +66,7 @@ def test_the_error_falls_to_the_noise(improved: Improvement) -> None:
     assert improved.removals[0].needed and not improved.steps[0].remarks
 
 
-@pytest.mark.parametrize("name", ["axis-nonorthogonality:z", *slow("hysteresis", "encoder-harmonic-1:z")])
+@pytest.mark.parametrize("name", slow("axis-nonorthogonality:z", "hysteresis", "encoder-harmonic-1:z"))
 def test_other_kinds_of_effects(name: str) -> None:
     state = improve(source(f"{name}=15sigma"))
     assert [step.added for step in state.steps] == [name] and state.because == "consistent"

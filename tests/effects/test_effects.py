@@ -140,7 +140,7 @@ def test_an_uneven_flexure_is_found_as_products_of_compliances_and_offsets() -> 
 def test_time_constants_are_found_with_their_sigma(hidden: str, constant: float) -> None:
     name = hidden.partition("=")[0]
     plan = plan_of(24, dwell_s=30.0, seed=4)
-    for seed in (5, 6, 7):
+    for seed in (5, 6):
         source = run([hidden], 5e-5, seed, plan, sample_hz=50.0, period_s=600.0)
         result = with_effect(name, source)
         found, truth = values(result), [*source.hidden[0].sizes, constant]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.hidden_effects import noisy_source
+from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 from scipy.spatial.transform import Rotation
 
@@ -61,8 +62,13 @@ def test_engines_agree_where_a_large_turn_meets_setting_errors() -> None:
         assert way.max_difference_sigma <= 1e-6 and way.max_relative_variance <= 1e-8
 
 
-@pytest.mark.parametrize("states", [{}, NOT_STATED], ids=["stated", "not stated"])
-@pytest.mark.parametrize("hidden", ["base-tilt=0.004", "encoder-harmonic-1:z=0.005"])
+@pytest.mark.parametrize(
+    "hidden, states",
+    [
+        ("base-tilt=0.004", NOT_STATED), ("encoder-harmonic-1:z=0.005", {}),
+        *slow(("base-tilt=0.004", {}), ("encoder-harmonic-1:z=0.005", NOT_STATED)),
+    ],
+)  # fmt: skip
 def test_a_turn_of_a_fifth_of_a_degree_is_named_beside_setting_errors(
     hidden: str, states: dict[str, float | None]
 ) -> None:

@@ -78,7 +78,7 @@ def calibrated(seed: int) -> kf_calib.Calibration:
     return kf_calib.calibrate(simulated(seed, 10, hidden=hidden), kf_calib.Settings(effects="second-order"))
 
 
-@pytest.mark.parametrize("runs", [100, *slow(400)])
+@pytest.mark.parametrize("runs", [60, *slow(400)])
 def test_sigma_covers_the_true_specific_force(runs: int) -> None:
     scores = []
     for seed in range(runs):

@@ -38,7 +38,7 @@ def bent(tmp_path_factory: pytest.TempPathFactory) -> Path:
         runs=4,
         units=4,
         benches=1,
-        dwells=14,
+        dwells=10,
         dwell_s=3.0,
         of_bench=("flexure=8sigma",),
     )

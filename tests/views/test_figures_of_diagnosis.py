@@ -38,6 +38,11 @@ def found(*hidden: str) -> Diagnosis:
 
 
 @cache
+def improved() -> Improvement:
+    return improve(run("second-order=15sigma"))
+
+
+@cache
 def hysteresis() -> Diagnosis:
     return diagnose(calibrate(kf_calib.open_recording(HIDDEN)))
 
@@ -89,7 +94,7 @@ def test_bars_of_suspects_are_their_shares_and_those_that_do_not_fit_are_hatched
     assert axes.get_xlabel().endswith("%")
 
 
-@pytest.mark.parametrize("hidden", [(), ("second-order=15sigma",)])
+@pytest.mark.parametrize("hidden", [(), ("triple-product=25sigma",)])
 def test_bars_of_probabilities_are_those_of_the_table(hidden: tuple[str, ...]) -> None:
     table = found(*hidden).table
     assert table is not None
@@ -159,7 +164,7 @@ def test_residuals_of_single_dwells_are_drawn_in_micro_g_or_si() -> None:
 
 
 def test_errors_fall_in_the_figure_as_in_the_result() -> None:
-    state = improve(run("second-order=15sigma"))
+    state = improved()
     figure = plot.improvement(state)
     assert_ink(figure)
     axes = axes_of(figure, "The error of the model")
@@ -211,7 +216,7 @@ def test_odd_improvements_are_drawn(made: object) -> None:
 
 
 def test_residuals_of_each_step_share_their_axes() -> None:
-    state = improve(run("second-order=15sigma"))
+    state = improved()
     axes = panels(plot.residuals_of_steps(state))
     assert len(axes) == 3 * (1 + len(state.steps))
     assert len({each.get_ylim() for each in axes}) == len({each.get_xlim() for each in axes}) == 1

@@ -60,6 +60,7 @@ def told() -> list[str]:
 
 LIGHT = pytest.mark.parametrize("shown", ["light"], indirect=True)
 """Where colours do not matter."""
+DARK = pytest.mark.parametrize("shown", ["dark"], indirect=True)
 
 
 @pytest.fixture(params=["light", "dark"])
@@ -76,6 +77,7 @@ def shown(browser: Any, path: Path, told: list[str], request: pytest.FixtureRequ
     page.close()
 
 
+@LIGHT
 def test_every_figure_has_ink_and_nothing_is_asked_or_complained_of(shown: Any, told: list[str]) -> None:
     drawn = shown.locator(".drawing svg, .drawing img, .plot canvas")
     assert drawn.count() >= 3
@@ -144,6 +146,7 @@ def test_the_explorer_reads_out_the_residual_of_a_dwell(shown: Any, found: kf_ca
     assert angles == pytest.approx([row[f"gimbal{k}_deg"] for k in (1, 2, 3)], rel=1e-3, abs=1e-3)
 
 
+@DARK
 def test_print_has_the_figures_and_leaves_out_what_needs_a_hand(shown: Any) -> None:
     shown.emulate_media(media="print")
     assert not shown.locator(".explorer").first.is_visible() and not shown.locator("nav").is_visible()

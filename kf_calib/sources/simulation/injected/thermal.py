@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.signal import lfilter
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.sources.simulation.injected.kinds import Rig, added, made
@@ -75,6 +74,8 @@ class Lag:
         self._carried: Floats | None = None
 
     def __call__(self, values: Floats) -> Floats:
+        from scipy.signal import lfilter  # takes 0.4 s to load, which other effects need not wait for
+
         if self._carried is None:
             self._carried = (1.0 - self._over[0]) * values[:1]
         lagged, self._carried = lfilter(self._over, self._under, values, zi=self._carried)
