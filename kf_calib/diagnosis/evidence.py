@@ -104,7 +104,8 @@ class Evidence:
             noise = replace(noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
             alone = self._rows(self._fit.carried, noise)
         own = alone if refit is None else self._rows(refit.carried, noise)
-        alone = replace(alone, known=_lengthened(alone.known, float(np.linalg.norm(own.known[:, -1]))))
+        own_length, length = (float(np.linalg.norm(each.known[:, -1])) for each in (own, alone))
+        alone = replace(alone, known=_lengthened(alone.known, own_length))
         related = [] if refit is None else [self._rows(refit.carried, noise, each) for each in self._relations(refit)]
         walking: Parts = ("walk",) if walk or self._walks else ()
         every: Parts = (*walking, "setting", "common")
@@ -115,7 +116,10 @@ class Evidence:
         relations = [(likelihood, rows.dof) for likelihood, rows in zip(with_related, related, strict=True)]
         free = self._free(len(alone.means.counts))
         found = (self._weighed(with_, without, parts + walking, own.dof, relations) for parts in free)
-        return [each for each in found if each is not None]
+        # What is kept of the readings for the sake of an oscillation alone is noise to all others, which leave it out.
+        on_carrier = refit is not None and refit.dwells[0].carrier_hz != self._fit.dwells[0].carrier_hz
+        more = 0.5 * (own_length**2 - length**2) if on_carrier else 0.0
+        return [replace(each, log=each.log + more) for each in found if each is not None]
 
     def _relations(self, refit: Fit) -> list[Floats]:
         """Return what the added states may be together: matrices (q, k), times k free numbers each; empty where they

@@ -16,6 +16,7 @@ from kf_calib.support import stage
 _CARRIERS = 3  # largest number of passes in search of a carrier
 _CYCLES = 50.0  # cycles per dwell; a line below may be the remainder of a slow oscillation
 _SLOW, _LEFT = 0.3, 1e-3  # cycles per dwell; of a slower oscillation a parabola leaves less than this of the power
+_APART = 3.0  # cycles per dwell between a slow oscillation and the strongest line that it leaves, at most
 _NEAR = 0.06  # cycles by which oscillation and carrier may differ in a piece; a parabola then leaves 1e-3 of it
 
 
@@ -44,11 +45,13 @@ def on_carrier(
 def _may_leave(slow: Fit, line: Line) -> bool:
     """Tell whether a fitted oscillation may leave this line beside a parabola over each dwell.
 
-    Otherwise it is no more than a drift that the oscillation mimics. Less than half a cycle a run is no oscillation.
+    What is left is near it, or at one to two cycles a dwell. Otherwise the fit is no more than a drift that the
+    oscillation mimics; less than half a cycle a run is no oscillation.
     """
     dwells, effect = slow.dwells, slow.carried.model.oscillation
     assert effect is not None
-    if effect.value * (dwells[-1].end_s - dwells[0].start_s) < 0.5:
+    apart = abs(line.frequency_hz - effect.value) * max(dwell.end_s - dwell.start_s for dwell in dwells)
+    if apart > _APART or effect.value * (dwells[-1].end_s - dwells[0].start_s) < 0.5:
         return False
     part = slow.carried.model.parts[str(effect)]
     amplitude = float(np.linalg.norm(slow.state[part][: len(effect.coefficients)]))

@@ -119,6 +119,16 @@ def test_a_slow_oscillation_is_named_with_its_frequency(frequency_hz: float) -> 
     assert abs(frequency.value - frequency_hz) < 4.0 * frequency.sigma < 1e-3
 
 
+@pytest.mark.parametrize("seed", [2, *slow(1, 3, 4)])
+def test_a_drift_beside_an_oscillation_is_not_taken_for_a_slow_oscillation(seed: int) -> None:
+    """A line of six cycles a dwell is no remainder of an oscillation slower than the run."""
+    both = source("sinusoid=12sigma;frequency=0.7", "bias-drift=15sigma", seed=seed, dwells=24)
+    found = diagnose(both)
+    assert found.table is not None and "sinusoid" in found.missing and found.after is not None
+    assert found.table.families["bias in time"] > 0.9 and found.table.probability(["bias-drift", "sinusoid"]) > 0.1
+    assert found.after.parameters["fSin"].value == pytest.approx(0.7, abs=0.005)
+
+
 @pytest.mark.slow
 def test_one_cycle_a_run_is_not_told_from_what_the_temperature_does() -> None:
     """The temperature of these runs swings once, too."""

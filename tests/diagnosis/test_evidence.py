@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.hidden_effects import run
+from helpers.hidden_effects import run, source
 from helpers.synthetic import plan_of
 from scipy.special import logsumexp
 from scipy.stats import chi2, multivariate_normal
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.evidence import Evidence, size_evidence
-from kf_calib.diagnosis.refits import Refits
+from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.effects import effect_named
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration
@@ -117,3 +117,15 @@ def test_coefficients_of_one_field_are_averaged_over_its_directions(before: Cali
     expected = logsumexp(size_evidence(3, falls)) - np.log(len(falls))
     assert own.log - still.log == pytest.approx(expected, abs=0.02) and own.dof == 6
     assert expected > float(size_evidence(6, falls.max()))
+
+
+def test_an_oscillation_is_weighed_against_what_needs_no_carrier() -> None:
+    """The readings that are kept for its sake alone are no loss to it: half the fall of chi-squared, less the price of
+    six coefficients and a frequency."""
+    made = source("sinusoid=15sigma;frequency=0.1", plan=plan_of(16, dwell_s=8.0, seed=5))
+    before, refits = calibration_of(made, None)
+    refit, evidence = refits.with_effects(before, ("sinusoid",)), Evidence(before.fit)
+    assert refit.fit.dwells[0].carrier_hz and not before.fit.dwells[0].carrier_hz
+    own, none = (next(each for each in found if not each.parts) for found in (evidence.of(refit.fit), evidence.of()))
+    assert own.dof == 6 and 150.0 < own.fall < 350.0
+    assert own.log - none.log == pytest.approx(float(size_evidence(6, own.fall)), abs=0.1)
