@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.hidden_effects import run, source
+from helpers.hidden_effects import BENCH, run, source
+from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 from scipy.special import logsumexp
 from scipy.stats import chi2, multivariate_normal
@@ -15,8 +16,13 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.evidence import Evidence, size_evidence
 from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.effects import effect_named
+from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration
+from kf_calib.sources.simulation.noise_processes import TrueNoise
+from kf_calib.sources.simulation.physics import Ambient
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
 
 
 @pytest.mark.parametrize("dof", [1, 3, 6])
@@ -129,3 +135,21 @@ def test_an_oscillation_is_weighed_against_what_needs_no_carrier() -> None:
     own, none = (next(each for each in found if not each.parts) for found in (evidence.of(refit.fit), evidence.of()))
     assert own.dof == 6 and 150.0 < own.fall < 350.0
     assert own.log - none.log == pytest.approx(float(size_evidence(6, own.fall)), abs=0.1)
+
+
+@pytest.mark.parametrize("seeds", [range(1, 7), *slow(range(1, 41))])
+def test_one_over_f_noise_is_no_evidence_of_a_temperature_effect(seeds: range) -> None:
+    """It goes on within long dwells, where the temperature changes, too, and no setting error hides it."""
+    noise = TrueNoise(white_mps2=5e-5, flicker_mps2=1e-5, setting_sigma_deg=2e-3)
+    bench = replace(BENCH, angle_sigma_deg=2e-3, scatter_sigma_mps2=noise.dwell_sigma_mps2(12))
+    found = list[float]()
+    for seed in seeds:
+        made = Simulation(
+            bench, GRADES["navigation"].sensors(seed), noise, plan_of(12, dwell_s=60.0, seed=seed), sample_hz=40.0,
+            angle_hz=4.0, slew_rate_degps=90.0, seed=seed, ambient=Ambient(swing_c=10.0, period_s=1800.0, sigma_c=0.0),
+        )  # fmt: skip
+        before = calibrate(made)
+        evidence, refit = Evidence(before.fit), Refits().with_effects(before, ("thermal-scale",))
+        own, none = (logsumexp([each.log for each in rows]) for rows in (evidence.of(refit.fit), evidence.of()))
+        found.append(float(own - none))
+    assert max(found) < np.log(20.0 * len(found))  # in noise odds exceed 1/p with a probability of p at most
