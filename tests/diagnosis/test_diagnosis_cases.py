@@ -272,7 +272,7 @@ def test_in_a_few_dwells_a_walk_could_explain_what_an_effect_does(seeds: range) 
     few = [diagnose(source("hysteresis=12sigma", plan=plan_of(6, dwell_s=8.0, seed=seed))) for seed in seeds]
     kept = [found for found in few if {"hysteresis", "bias-walk"} <= set(found.ambiguity)]
     assert len(kept) > 0.7 * len(few)  # now and then the effect fits so closely that it is a proof
-    assert all(found.missing and "bias-walk" in found.verdict for found in kept)
+    assert all(found.missing and ("bias-walk" in found.verdict or " others" in found.verdict) for found in kept)
     assert "bias-walk" not in diagnose(source("hysteresis=12sigma")).ambiguity
 
 
