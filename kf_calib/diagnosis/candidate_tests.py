@@ -51,7 +51,7 @@ class CandidateTests:
     same tests with the lines treated as vibration. between: in words, the frequencies of an oscillation that are too
     fast for the scan and too slow for a line. trend: the test of trends within dwells
     (None: it cannot be made, or there are lines). noise_p: p-value of noise from dwell to dwell that was not stated
-    against all explanations (``hypotheses.noise_p``; None: all was stated).
+    against all explanations (``hypothesis_table.noise_p``; None: all was stated).
     """
 
     scan: Scan
