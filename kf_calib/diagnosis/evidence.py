@@ -92,7 +92,7 @@ class Evidence:
 
     @cached_property
     def _alone(self) -> _Rows:
-        return self._rows(self._fit.carried, self.noise)
+        return self._rows(self._fit.carried, self.noise)[0]
 
     def of(self, refit: Fit | None = None, walk: bool = False) -> list[Weighed]:
         """The evidence of the effects that a refit has and the fit has not, for each set of free parts of the noise.
@@ -102,11 +102,10 @@ class Evidence:
         noise, alone = self.noise, self._alone
         if refit is not None and refit.noise.sensitivity_mps2_per_k is not None:
             noise = replace(noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
-            alone = self._rows(self._fit.carried, noise)
-        own = alone if refit is None else self._rows(refit.carried, noise)
+            (alone,) = self._rows(self._fit.carried, noise)
+        own, *related = [alone] if refit is None else self._rows(refit.carried, noise, self._relations(refit))
         own_length, length = (float(np.linalg.norm(each.known[:, -1])) for each in (own, alone))
         alone = replace(alone, known=_lengthened(alone.known, own_length))
-        related = [] if refit is None else [self._rows(refit.carried, noise, each) for each in self._relations(refit)]
         walking: Parts = ("walk",) if walk or self._walks else ()
         every: Parts = (*walking, "setting", "common")
         without, with_, *with_related = (
@@ -186,23 +185,25 @@ class Evidence:
         chances = {part: _BEYOND if known else _UNSTATED for part, known in stated.items()}
         return sum(math.log(own if part in parts else 1.0 - own) for part, own in chances.items())
 
-    def _rows(self, carried: Carried, noise: Noise, relation: Floats | None = None) -> _Rows:
-        """Return what the likelihood needs: columns that the model hides are left out, and with an effect that was
-        fitted with a constant the derivative by this constant counts as a column, but as no coefficient.
-
-        relation: of the added coefficients (None: they may have any values).
-        """
+    def _rows(self, carried: Carried, noise: Noise, relations: Sequence[Floats] = ()) -> list[_Rows]:
+        """Return what the likelihood needs, with coefficients of any values and then with each relation of them:
+        columns that the model hides are left out, and with an effect that was fitted with a constant the derivative by
+        this constant counts as a column, but as no coefficient."""
         means, shared = with_shared_noise(carried.dwells, noise, carried.means)
         first, last, count = self._fit.carried.model.count, carried.model.count, means.design.shape[2]
         within = _within(carried, noise, self._fit.carried.state)
         known = np.vstack([shared, np.zeros((len(within), count + 1))])
         places = [*range(STATE_COUNT, last), *range(count + 1 - (within.shape[1] - last + STATE_COUNT), count + 1)]
         known[len(shared) :, places] = within
-        turn = _visible(means, noise, known, first, last, np.eye(last - first) if relation is None else relation)
-        design, constants = means.design, sum(place >= first for place in carried.model.unknowns)
-        parts = design[..., :first], design[..., first:last] @ turn, design[..., last:]
-        known = np.hstack([known[:, :first], known[:, first:last] @ turn, known[:, last:]])
-        return _Rows(replace(means, design=np.concatenate(parts, axis=2)), known, max(turn.shape[1] - constants, 0))
+        constants, out = sum(place >= first for place in carried.model.unknowns), list[_Rows]()
+        for relation in (np.eye(last - first), *relations):
+            turn = _visible(means, noise, known, first, last, relation)
+            design, prior = (
+                np.concatenate([own[..., :first], own[..., first:last] @ turn, own[..., last:]], axis=-1)
+                for own in (means.design, known)
+            )
+            out.append(_Rows(replace(means, design=design), prior, max(turn.shape[1] - constants, 0)))
+        return out
 
 
 def _lengthened(known: Floats, length: float) -> Floats:
