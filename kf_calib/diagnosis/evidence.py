@@ -132,10 +132,10 @@ class Evidence:
     def _free(self, dwells: int) -> Iterator[Parts]:
         """Yield the sets of parts of the noise from dwell to dwell that may be free."""
         yield ()
-        if (1 if self.noise.free else 3) * dwells <= self._fit.carried.model.count:
+        if (1 if self.noise.attitude_unknown else 3) * dwells <= self._fit.carried.model.count:
             return
         yield ("common",)
-        if self.noise.free:  # a rotation of the dwells has no limit anyway
+        if self.noise.attitude_unknown:  # a rotation of the dwells has no limit anyway
             return
         yield ("setting",)
         if not (self.noise.setting_stated and self.noise.scatter_stated):
@@ -223,7 +223,7 @@ def _within(carried: Carried, noise: Noise, state: Floats) -> Floats:
     The mean of each dwell is left out: it is as if scatter had no limit. Scatter that is stated may be 1/f noise, which
     goes on within dwells.
     """
-    free = replace(noise, scatter_mps2=np.full(3, _FREE_MPS2), setting_rad=0.0, free=False, walk_mps2_per_sqrt_s=0.0)
+    free = replace(noise, scatter_mps2=np.full(3, _FREE_MPS2), setting_rad=0.0, walk_mps2_per_sqrt_s=0.0)
     columns = [own[..., STATE_COUNT:] for own in carried.columns]
     if noise.sensitivity_mps2_per_k is not None:
         errors = thermometer_errors(carried.turned, noise.sensitivity_mps2_per_k)

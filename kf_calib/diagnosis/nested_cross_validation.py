@@ -13,8 +13,8 @@ from kf_calib.dwells.sufficient_statistics import dwells_without
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.calibration import evaluate
 from kf_calib.estimation.cross_validation import orientations, told_of
-from kf_calib.estimation.fit import carried_at
 from kf_calib.estimation.noise_model import mean_covariances
+from kf_calib.estimation.relinearisation import carried_at
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.threads import one_blas_thread
 
@@ -73,8 +73,8 @@ def _prediction_errors(start: Calibration, result: Calibration, left: list[int])
             "run of more orientations."
         )
     noise, state = result.noise.judging, result.carried.state
-    means = carried_at(start.fit.dwells, result.model, state).means[left]
+    means = carried_at(start.fit.dwells, result.model, state, result.noise.weights).means[left]
     spread = means.design @ result.estimate.covariance @ np.swapaxes(means.design, 1, 2)
     spread = spread + mean_covariances(noise.of_readings, means, state)
-    told = told_of(means.readings - means.design @ result.estimate.state, spread, means, state, noise.free)
+    told = told_of(means.readings - means.design @ result.estimate.state, spread, means, state, noise.attitude_unknown)
     return (told.errors_mps2**2).ravel(), np.einsum("dii->di", told.covariance).ravel()

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -86,6 +87,33 @@ class Piece:
     taken: int = 0
 
 
+_OF_CONDITIONS = ("nodes", "squares", "counts", "variances", "walk", "shaking", "count", "pose")
+"""Cached properties of a dwell that stay if the means of its readings change."""
+_OF_READINGS = (*_OF_CONDITIONS, "triangles", "factor", "means")
+"""Cached properties of a dwell that stay if its force is turned."""
+
+
+@dataclass(frozen=True)
+class AttitudeError:
+    """What the readings show of a dwell's setting error, the rotation alpha by which it stands off its pose.
+
+    - rotation_rad (3,): the rotation vector across the force at which the dwell is linearised.
+    - variance_rad2: sum of the variances of its two components across the force, which shorten the mean of the force:
+      E[R(alpha) f] = (1 - variance / 2) R(mode) f.
+    - bending (3, 3): by how much the effects of the model change the mean readings per unit of the force, m/s^2 per
+      m/s^2; it adds to the sensitivities by which a small rotation shows.
+    """
+
+    rotation_rad: Floats
+    variance_rad2: float = 0.0
+    bending: Floats | None = None
+
+    @property
+    def length(self) -> float:
+        """Length of the mean force over that of the force."""
+        return 1.0 - 0.5 * self.variance_rad2
+
+
 @dataclass(frozen=True, repr=False, eq=False)
 class DwellFactor:
     """The sufficient statistics of one dwell.
@@ -100,6 +128,7 @@ class DwellFactor:
     - turns: whole turns of each gimbal by which its pose goes beyond the angles as recorded.
     - turned_rad: rotation vector (3,) by which effects of a model turn the specific force that its pose shows; None
       where they do not.
+    - attitude: what is known of its setting error beyond the prior; None where none is allowed for.
     """
 
     number: int
@@ -112,6 +141,7 @@ class DwellFactor:
     pose_sigma_rad: float = 0.0
     turns: tuple[int, ...] = ()
     turned_rad: Floats | None = None
+    attitude: AttitudeError | None = None
 
     @property
     def carrier_hz(self) -> float:
@@ -131,7 +161,17 @@ class DwellFactor:
             upper = piece.triangle.copy()
             upper[: self.width, self.width :] -= upper[: self.width, : self.width] @ own
             pieces.append(replace(piece, triangle=upper))
-        return replace(self, pieces=tuple(pieces))
+        return self._with(_OF_CONDITIONS, pieces=tuple(pieces))
+
+    def linearised(self, turned_rad: Floats | None, attitude: AttitudeError | None) -> DwellFactor:
+        """The same dwell about a force that is turned otherwise."""
+        return self._with(_OF_READINGS, turned_rad=turned_rad, attitude=attitude)
+
+    def _with(self, known: Collection[str], **changes: Any) -> DwellFactor:
+        """Return the dwell with changes that leave these cached properties as they are."""
+        changed = replace(self, **changes)
+        changed.__dict__.update({name: self.__dict__[name] for name in known if name in self.__dict__})
+        return changed
 
     @cached_property
     def triangles(self) -> Floats:
@@ -161,10 +201,11 @@ class DwellFactor:
 
     def felt(self, force_mps2: Floats) -> Floats:
         """The specific force (n, 3) that is felt where the angles show this one."""
-        if self.turned_rad is None:
-            return force_mps2
-        angle_rad = float(np.linalg.norm(self.turned_rad))
-        return turn(force_mps2, self.turned_rad / angle_rad, angle_rad)
+        if self.turned_rad is not None:
+            force_mps2 = _rotated(force_mps2, self.turned_rad)
+        if self.attitude is not None:
+            force_mps2 = self.attitude.length * _rotated(force_mps2, self.attitude.rotation_rad)
+        return force_mps2
 
     @cached_property
     def squares(self) -> Floats:
@@ -240,7 +281,11 @@ class DwellFactor:
     @cached_property
     def means(self) -> Floats:
         """Means (7,) of the regressors 1, f_x, f_y, f_z and of the three readings."""
-        return self.factor[0] / self.factor[0, 0]
+        functions = self.triangles[:, 0] / self.triangles[:, :1, 0]  # means of the basis, then of the readings
+        forces = self.nodes.force_mps2.reshape(-1, 3, 3)
+        regressors = np.einsum("pk,pkc->pc", functions[:, :3], parabola(forces))
+        each = np.column_stack([np.ones(len(forces)), regressors, functions[:, self.width :]])
+        return np.asarray(self.counts @ each / self.counts.sum(), float)
 
     def rows(self, columns: Sequence[Floats]) -> Floats:
         """Rows [X | z1 z2 z3], ((K + 3) pieces, c + 3), of columns without an oscillating part, given as (3, c) at the
@@ -309,6 +354,12 @@ def _square_factor(stacked: Floats) -> Floats:
     if len(stacked) < width:
         stacked = np.vstack([stacked, np.zeros((width - len(stacked), width))])
     return triangle(stacked)
+
+
+def _rotated(force_mps2: Floats, rotation_rad: Floats) -> Floats:
+    """Return forces (n, 3) turned by a rotation vector (3,)."""
+    angle_rad = float(np.linalg.norm(rotation_rad))
+    return turn(force_mps2, rotation_rad / angle_rad, angle_rad) if angle_rad else force_mps2
 
 
 def rate_or_zero(rate: Floats | None) -> Floats:

@@ -281,8 +281,17 @@ class FrameEffect(Effect):
         return change @ s.sensitivity.T if self.shows_in(s) else np.zeros((len(s), 3))
 
     def columns(self, s: Stimulus) -> Floats:
-        turned = np.cross(_left_jacobian(s.turned_rad, self.rotations(s)), s.force_mps2[:, None, :])
+        rotations = _turned_along(s.attitude_rad, _left_jacobian(s.turned_rad, self.rotations(s)))
+        turned = np.cross(rotations, s.force_mps2[:, None, :])
         return np.einsum("mqx,ix->miq", turned, s.sensitivity)
+
+
+def _turned_along(alpha: Floats, vectors: Floats) -> Floats:
+    """Vectors v (m, q, 3) turned by small rotation vectors alpha (m, 3) or (1, 3), to their square."""
+    if not alpha.any():
+        return vectors
+    once = np.cross(alpha[:, None, :], vectors)
+    return vectors + once + 0.5 * np.cross(alpha[:, None, :], once)
 
 
 def _left_jacobian(rho: Floats, vectors: Floats) -> Floats:

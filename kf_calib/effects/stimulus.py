@@ -62,6 +62,7 @@ class Stimulus:
     in its own frame and its derivative there, (m, 3), zero where it stands. half_s, within: half the length of the
     piece of a dwell an instant belongs to, and where in it that is, from -1 to 1, (m,); zeros where it is of no piece.
     turned_rad: rotation vector by which effects of the model have turned the specific force already, (m, 3) or (1, 3).
+    attitude_rad: rotation vector by which the platform then stands off that, as far as the readings show it, likewise.
     carrier_hz: of dwells folded on a carrier, 0: none; part: of a column, that without the carrier (0) or the envelope
     of its cosine (1), sine (2).
     """
@@ -81,6 +82,7 @@ class Stimulus:
     half_s: Floats = field(default_factory=lambda: np.zeros(1))
     within: Floats = field(default_factory=lambda: np.zeros(1))
     turned_rad: Floats = field(default_factory=lambda: np.zeros((1, 3)))
+    attitude_rad: Floats = field(default_factory=lambda: np.zeros((1, 3)))
     carrier_hz: float = 0.0
     part: int = 0
     whole: Stimulus | None = None

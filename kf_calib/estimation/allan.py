@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation.dwell_columns import Samples
 from kf_calib.estimation.noise_model import Noise, flicker_sigma
 from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.samples import Samples
 
 _DWELLS = 5  # as many of the longest are enough
 _LONG = 0.5  # of the longest dwell; shorter ones say nothing of the longest clusters

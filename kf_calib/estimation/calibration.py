@@ -25,7 +25,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import of_the_users
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation import kalman_filterpy, square_root_information
-from kf_calib.estimation.dwell_columns import Carried, Samples, samples_of
+from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.free_attitude import holding_frame
@@ -38,6 +38,7 @@ from kf_calib.estimation.random_walk import predict, to_mean
 from kf_calib.estimation.remarks import misfit_remark, remarks_on
 from kf_calib.estimation.reml import FEWEST, degrees_of_freedom
 from kf_calib.estimation.results import Calibration, Estimate, Visit, consistency, estimate_of, estimates
+from kf_calib.estimation.samples import Samples, samples_of
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.square_root_information import FilterStep
 from kf_calib.sources.files.recording import opened
@@ -173,14 +174,13 @@ def filterpy_estimate(
     """
     prior, model = result.settings.prior, result.model
     scale = np.concatenate([np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), result.carried.sizes[STATE_COUNT:]])
-    samples = samples_of(Pass(source, result.settings).rows(), result.carried)
-    samples = holding_frame(samples, result.carried)
+    samples = samples_of(Pass(source, result.settings).rows(), result.carried, result.noise.weights)
+    samples = holding_frame(samples, result.carried, result.noise.weights)
     posterior = kalman_filterpy.estimate(
         _counted(samples, result.carried, on_progress, at_most),
         result.noise.weights,
         model.nominal_state(),
         None if prior.diffuse else square_root_information.prior_covariance(prior, model),
-        result.carried.state,
         scale,
         form,
         on_dwell,

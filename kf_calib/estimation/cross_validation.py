@@ -70,7 +70,7 @@ def held_out(fitted: Fit) -> HeldOut | None:
     predicted = (_beside if fitted.noise.walk_mps2_per_sqrt_s else _without)(fitted, orientations(fitted.dwells))
     if predicted is None:
         return None
-    return told_of(*predicted, fitted.carried.means, fitted.carried.state, fitted.noise.free)
+    return told_of(*predicted, fitted.carried.means, fitted.carried.state, fitted.noise.attitude_unknown)
 
 
 def told_of(errors_mps2: Floats, covariance: Floats, means: Means, state: Floats, free: bool) -> HeldOut:

@@ -3,16 +3,17 @@ sample by sample."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cached_property, lru_cache
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.dwells.rows import Rows, basis, on_basis
+from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor, alike, dwells_before, rate_or_zero
 from kf_calib.effects import Effect, FrameEffect, Stimulus
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model, effect_columns
@@ -26,7 +27,7 @@ _VIBRATING = 15.0  # mean squared deviation of the variances in units of sigma; 
 def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> Stimulus:
     """The conditions at the nodes of all pieces of all dwells and slews, in order; rotations are linearised at
     ``state``. Poses are NaN where no angles are used."""
-    known = _conditions(tuple(dwells)) | _turned_conditions(dwells)
+    known = _conditions(dwells) | _turned_conditions(dwells)
     if not bench.angles:
         known = known | {key: np.full_like(known[key], np.nan) for key in ("pose", "previous_pose")}
     return Stimulus(bench=bench, sensitivity=state[:12].reshape(3, 4)[:, :3], **known)
@@ -34,18 +35,35 @@ def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> S
 
 def _turned_conditions(dwells: Sequence[DwellFactor]) -> dict[str, Any]:
     """Return the specific force (m, 3) that is felt at the nodes of turned dwells, and by what it is turned there."""
-    if all(dwell.turned_rad is None for dwell in dwells):
+    if all(dwell.turned_rad is None and dwell.attitude is None for dwell in dwells):
         return {}
-    turns = [np.zeros(3) if dwell.turned_rad is None else dwell.turned_rad for dwell in dwells]
+    counts, still = [3 * len(dwell.pieces) for dwell in dwells], np.zeros(3)
+    turns = [still if dwell.turned_rad is None else dwell.turned_rad for dwell in dwells]
+    attitudes = [still if dwell.attitude is None else dwell.attitude.rotation_rad for dwell in dwells]
     return {
         "force_mps2": np.concatenate([dwell.felt(dwell.nodes.force_mps2) for dwell in dwells]),
-        "turned_rad": np.repeat(turns, [3 * len(dwell.pieces) for dwell in dwells], axis=0),
+        "turned_rad": np.repeat(turns, counts, axis=0),
+        "attitude_rad": np.repeat(attitudes, counts, axis=0),
     }
 
 
-@lru_cache(maxsize=2)
-def _conditions(dwells: tuple[DwellFactor, ...]) -> dict[str, Any]:
-    """What the stimulus of a run always is; every fit asks for it several times."""
+def _conditions(dwells: Sequence[DwellFactor]) -> dict[str, Any]:
+    """What the stimulus of a run always is; every fit asks for it several times.
+
+    Of dwells that differ in their readings and in how they are turned only, it is the same.
+    """
+    key = tuple(id(dwell.nodes) for dwell in dwells)
+    for known_key, _, known in _KNOWN:
+        if known_key == key:
+            return known
+    _KNOWN.append((key, tuple(dwells), _conditions_of(dwells)))  # the dwells are kept, so that the key stays theirs
+    return _KNOWN[-1][-1]
+
+
+_KNOWN = deque[tuple[tuple[int, ...], tuple[DwellFactor, ...], dict[str, Any]]](maxlen=2)
+
+
+def _conditions_of(dwells: Sequence[DwellFactor]) -> dict[str, Any]:
     nodes = [dwell.nodes for dwell in dwells]
     before = [last for dwell, last in zip(dwells, dwells_before(dwells), strict=True) for _ in dwell.pieces]
     elapsed_s = np.concatenate([each.elapsed_s for each in nodes])
@@ -56,7 +74,7 @@ def _conditions(dwells: tuple[DwellFactor, ...]) -> dict[str, Any]:
         "previous_force_mps2": np.repeat([each.means[1:4] for each in before], 3, axis=0),
         "pose": np.concatenate([each.pose for each in nodes]),
         "previous_pose": np.repeat([each.pose for each in before], 3, axis=0),
-        "temperature_c": temperature_course(dwells).temperature_c,
+        "temperature_c": temperature_course(tuple(dwells)).temperature_c,
         "variance_mps2_2": _varying(dwells).reshape(-1, 3),
         "rate_radps": np.concatenate([rate_or_zero(each.rate_radps) for each in nodes]),
         "rate_change_radps2": np.concatenate([rate_or_zero(each.rate_change_radps2) for each in nodes]),
@@ -135,6 +153,7 @@ class Means:
     - readings (D, 3), force_mps2 (D, 3): readings and specific force.
     - counts (D,): number of readings.
     - ends_s (D, 2): when each dwell begins and ends.
+    - bending (D, 3, 3): by how much effects change the readings per unit of force (``AttitudeError``).
     """
 
     design: Floats
@@ -142,9 +161,17 @@ class Means:
     force_mps2: Floats
     counts: Floats
     ends_s: Floats
+    bending: Floats = field(default_factory=lambda: np.zeros((1, 3, 3)))
 
     def __getitem__(self, part: int | list[int]) -> Means:
-        return Means(*(getattr(self, each.name)[part] for each in fields(self)))
+        known = {each.name: getattr(self, each.name) for each in fields(self)}
+        if len(self.bending) != len(self.counts):
+            del known["bending"]
+        return Means(**{name: values[part] for name, values in known.items()})
+
+    def sensitivities(self, state: Floats) -> Floats:
+        """Change (D, 3, 3) of the mean readings per unit of force at ``state`` (p,), effects included."""
+        return state[:STATE_COUNT].reshape(3, 4)[:, :3] + self.bending
 
 
 def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
@@ -161,7 +188,13 @@ def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
     forces = np.array([dwell.felt(own[1:4]) for dwell, own in zip(dwells, means, strict=True)])
     counts = np.array([dwell.count for dwell in dwells], float)
     ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
-    return Means(design, means[:, 4:], forces, counts, ends)
+    return Means(design, means[:, 4:], forces, counts, ends, np.array([bending_of(dwell) for dwell in dwells]))
+
+
+def bending_of(dwell: DwellFactor) -> Floats:
+    """By how much effects change the mean readings of a dwell per unit of force, (3, 3)."""
+    known = None if dwell.attitude is None else dwell.attitude.bending
+    return np.zeros((3, 3)) if known is None else known
 
 
 class Carried:
@@ -213,75 +246,53 @@ class Carried:
         return np.where(largest > 0, largest, 1.0)
 
 
-@dataclass(frozen=True)
-class Samples:
-    """Rows of one piece, sample by sample.
-
-    - dwell: number of the dwell; moving: True for the slew after it.
-    - elapsed_s (n,): times of the samples.
-    - observation (n, 3, p): the design H.
-    - regressors (n, 4): the regressors 1, f_x, f_y, f_z of the dwell's nuisance states.
-    - readings (n, 3): the readings.
-    """
-
-    dwell: int
-    elapsed_s: Floats
-    observation: Floats
-    regressors: Floats
-    readings: Floats
-    moving: bool = False
-
-
-def samples_of(rows: Iterable[Rows], carried: Carried) -> Iterator[Samples]:
-    """Yield samples from a second pass over the rows, with the columns of the first; for filterpy and batch least
-    squares."""
-    every, columns = [*carried.dwells, *carried.slews], [*carried.columns, *carried.slew_columns]
-    known = {(each.number, each.moving): iter(own) for each, own in zip(every, columns, strict=True)}
-    standing = {dwell.number: dwell for dwell in carried.turned}
-    for block in rows:
-        key = block.dwell, block.moving
-        if key not in known:
-            continue
-        for part, u, _ in block.pieces:
-            own = next(known[key])
-            functions = basis(u, block.elapsed_s[part], carried.carrier_hz)
-            observation = (functions.T @ on_basis(own.reshape(len(own), -1))).reshape(len(u), *own.shape[1:])
-            regressors, readings = block.columns[part], block.readings[part]
-            if not carried.model.bench.angles:
-                regressors = np.tile(standing[block.dwell].means[:4], (len(u), 1))
-            elif not block.moving and (rho := standing[block.dwell].turned_rad) is not None:
-                force = standing[block.dwell].felt(regressors[:, 1:])
-                regressors = np.hstack([regressors[:, :1], force])
-                readings = readings + turning_mps2(rho, force, carried.state)
-            yield Samples(block.dwell, block.elapsed_s[part], observation, regressors, readings, block.moving)
-
-
 def turned(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[DwellFactor]:
-    """The dwells about which a model with effects that turn the platform is linear.
+    """The dwells about which a model is linear in the rotations of its dwells.
 
-    At ``state`` the effects turn the specific force f of a dwell by the rotation vector rho, its mean over the dwell,
-    and S g + b is read, g = exp([rho]) f and S the sensitivities. What is still to be found (changes of coefficients
-    and of S, setting errors) acts on g, which therefore takes the place of f. The columns of the effects there, times
-    their coefficients, amount to S (rho x g); as S g has the rotation in it already, that is added to the readings.
-    Where rho is below ``_LITTLE_RAD`` in all dwells, or absurd, they are returned as they are.
+    At ``state`` the effects of the frame turn the specific force f of a dwell by the rotation vector rho, its mean over
+    the dwell, and the setting error turns it by alpha, so that S g + b is read, g = R(alpha) exp([rho]) f and S the
+    sensitivities. What is still to be found (changes of coefficients, of S and of alpha) acts on g, which therefore
+    takes the place of f. The columns of the effects there, times their coefficients, amount to S (R(alpha) rho x g),
+    and alpha itself, about which the prior is zero, to S (alpha x g); as S g has both rotations in it already, they
+    are added to the readings. An rho below ``_LITTLE_RAD`` in all dwells, or absurd, is taken for none.
     """
-    if not model.bench.angles or not any(isinstance(effect, FrameEffect) for effect in model.effects):
+    rotations = _rotations_of_effects(dwells, model, state)
+    if rotations is None and all(dwell.attitude is None for dwell in dwells):
         return list(dwells)
+    each = rotations if rotations is not None else [np.zeros(3)] * len(dwells)
+    return [_turned(dwell, rho, state) for dwell, rho in zip(dwells, each, strict=True)]
+
+
+def _rotations_of_effects(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[Floats] | None:
+    """Return the mean rotation vector (3,) of each dwell by effects of the frame; None where they are little."""
+    if not model.bench.angles or not any(isinstance(effect, FrameEffect) for effect in model.effects):
+        return None
     rotations = model.turned_rad(stimulus_of(dwells, model.bench, state), state)
     ends = np.cumsum([3 * len(dwell.pieces) for dwell in dwells])[:-1]
     means = [own.mean(axis=0) for own in np.split(rotations, ends)]
-    if not _LITTLE_RAD < np.abs(means).max() < _ABSURD_RAD:
-        return list(dwells)
-    return [_turned(dwell, rho, state) if rho.any() else dwell for dwell, rho in zip(dwells, means, strict=True)]
+    return means if _LITTLE_RAD < np.abs(means).max() < _ABSURD_RAD else None
 
 
 def _turned(dwell: DwellFactor, rho: Floats, state: Floats) -> DwellFactor:
-    own = replace(dwell, turned_rad=rho)
-    there = turning_mps2(rho, own.felt(dwell.nodes.force_mps2), state).reshape(len(dwell.pieces), 3, 3)
+    dwell = dwell.linearised(rho if rho.any() else None, dwell.attitude)
+    if not has_turns(dwell):
+        return dwell
+    there = turning_mps2(dwell, dwell.felt(dwell.nodes.force_mps2), state).reshape(len(dwell.pieces), 3, 3)
     nodes = np.concatenate([there, np.zeros((len(there), dwell.width - 3, 3))], axis=1)  # no part on a carrier
-    return own.less(-on_basis(nodes))
+    return dwell.less(-on_basis(nodes))
 
 
-def turning_mps2(rho: Floats, force_mps2: Floats, state: Floats) -> Floats:
-    """Return S (rho x f) (n, 3), by how much a small rotation changes the readings."""
-    return np.cross(rho, force_mps2) @ state[:STATE_COUNT].reshape(3, 4)[:, :3].T
+def has_turns(dwell: DwellFactor) -> bool:
+    """Whether a dwell is linearised about a force that its pose does not show."""
+    return dwell.turned_rad is not None or (dwell.attitude is not None and bool(dwell.attitude.rotation_rad.any()))
+
+
+def turning_mps2(dwell: DwellFactor, force_mps2: Floats, state: Floats) -> Floats:
+    """Return by how much the rotations of a turned dwell change readings (n, 3) to first order about the forces (n, 3)
+    that are felt: S (rho x g) + (S + B) (alpha x g), with B the bending by effects."""
+    sensitivity, out = state[:STATE_COUNT].reshape(3, 4)[:, :3], np.zeros_like(force_mps2)
+    alpha = np.zeros(3) if dwell.attitude is None else dwell.attitude.rotation_rad
+    if dwell.turned_rad is not None:
+        rho = dwell.turned_rad + np.cross(alpha, dwell.turned_rad)
+        out += np.cross(rho, force_mps2) @ sensitivity.T
+    return out + np.cross(alpha, force_mps2) @ (sensitivity + bending_of(dwell)).T if alpha.any() else out

@@ -21,10 +21,10 @@ from kf_calib.bench.streams import Source
 from kf_calib.estimation.allan import AllanDeviation, LongestDwells
 from kf_calib.estimation.batch_least_squares import least_squares, running_states
 from kf_calib.estimation.calibration import calibrate, filterpy_estimate
-from kf_calib.estimation.dwell_columns import Samples, samples_of
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.free_attitude import holding_frame
 from kf_calib.estimation.results import Calibration, Estimate
+from kf_calib.estimation.samples import Samples, samples_of
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.files.recording import opened
 from kf_calib.sources.tables.table import Table
@@ -89,17 +89,17 @@ def compare(
     result, block_s = _timed(lambda: calibrate(source, settings, on_progress))
 
     by_filterpy, conditions = list[Floats](), (
-        result.noise.weights, result.carried.state, result.model.nominal_state()
+        result.noise.weights, result.model.nominal_state()
     )  # fmt: skip
 
     def batch() -> Estimate:
         return result.considering(*least_squares(held(samples()), *conditions))
 
     def samples() -> Iterator[Samples]:
-        return samples_of(Pass(source, settings).rows(), result.carried)
+        return samples_of(Pass(source, settings).rows(), result.carried, result.noise.weights)
 
     def held(some: Iterable[Samples]) -> Iterator[Samples]:
-        return holding_frame(some, result.carried)
+        return holding_frame(some, result.carried, result.noise.weights)
 
     stage.say("filterpy, reading by reading")
     filterpy, filterpy_s = _timed(

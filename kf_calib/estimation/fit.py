@@ -23,9 +23,11 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation import free_attitude, square_root_information
+from kf_calib.estimation.attitude import facing_readings, without_attitude
 from kf_calib.estimation.dwell_columns import Carried, Means, candidate_columns, stimulus_of
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
-from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, steps, within_dwells
+from kf_calib.estimation.noise_model import ATTITUDE_UNKNOWN_RAD, FLOOR_MPS2, Noise, steps, within_dwells
+from kf_calib.estimation.relinearisation import SETTLED, UNSETTLED, descended, left_to_settle, linearised
 from kf_calib.estimation.reml import Part, gain_of, misfit, restoring_gains, with_dwell_parts, with_shared_noise
 from kf_calib.estimation.score_test import falls
 from kf_calib.estimation.thermometer_error import sensitivity_to_temperature, thermometer_errors
@@ -34,7 +36,6 @@ _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
 _EXACT_RAD = 1e-9
 _TURNS = 50  # most times that forces and state are found in turn
-_SETTLED = 1e-9  # relative to g; the next step is of the size of rounding
 _SINGULAR = 100.0
 _STILL = 2.5e-4  # the search ends when no step of ln(value) exceeds this share of its largest allowed step
 
@@ -60,11 +61,20 @@ class Fit:
         """Variances (D, 2) of the biases' steps before and within each dwell; zeros if they do not walk."""
         return steps(self.dwells, self.noise)
 
-    @cached_property
+    @property
     def state(self) -> Floats:
         """The estimate (p,) from all readings; if the biases walk, it holds their values after the last dwell."""
+        return self._solution[0]
+
+    @property
+    def sigma(self) -> Floats:
+        """Sigmas (p,) of the estimate from all readings, without considered parameters and what is not determined."""
+        return np.sqrt(np.diag(self._solution[1]))
+
+    @cached_property
+    def _solution(self) -> tuple[Floats, Floats, Floats]:
         factor = square_root_information.accumulate(self.all_rows(), self.steps)[:-1]
-        return square_root_information.solve(factor, self.carried.model.nominal_state())[0]
+        return square_root_information.solve(factor, self.carried.model.nominal_state())
 
     @cached_property
     def judged(self) -> list[Floats]:
@@ -204,48 +214,71 @@ def fit(
     - model: the model to fit.
     - walk_mps2_per_sqrt_s: stated intensity of the random walk of the biases, m/s^2/s^(1/2).
     - slews: the slews; used only if the model has effects that show in slews only.
+
+    Raises UnobservableError if the poses tell too little, or if the fit does not converge.
     """
     slews = [slew for slew in slews if slew.number >= dwells[0].number] if model.dynamic else []
     fitted = _begun(dwells, model, slews, walk_mps2_per_sqrt_s)
     model, within, bench = fitted.carried.model, fitted.noise, model.bench
-    searching, sizes = False, None
+    searching, sizes, left = False, None, 0.0
     for number in range(_most_passes(model)):
         if number == 1 and model.unknowns:
             model, searching = _placed(fitted), True
-            fitted = replace(fitted, carried=linearised(fitted.carried, model, fitted.carried.state))
+            fitted = replace(fitted, carried=linearised(fitted, model, fitted.carried.state))
         if number and model.stepped:
             model, spreads = _averaged(fitted)
-            fitted = replace(fitted, carried=linearised(fitted.carried, model, fitted.carried.state), spreads=spreads)
+            fitted = replace(fitted, carried=linearised(fitted, model, fitted.carried.state), spreads=spreads)
         state, moved = _solved(fitted)
         if not (bench.angles or _sensible(state)):
-            break  # the linearisation before is as good as any
-        reach, left = _reach(fitted), _left_to_settle(fitted, state)
+            raise UnobservableError(_not_sensible(model))
+        reach, left = _reach(fitted), left_to_settle(fitted, state)
         if searching:
             model = model.moved(np.clip(moved, -reach, reach))
-        carried = linearised(fitted.carried, model, state)
+        carried, state = descended(fitted, model, state)
         stated = _setting_deg(dwells, bench), bench.scatter_sigma_mps2
         within = replace(
             within, sensitivity_mps2_per_k=sensitivity_to_temperature(carried, within.effective_sigma_mps2)
         )
-        means, prior = with_shared_noise(dwells, within, carried.means)
+        means, prior = with_shared_noise(carried.dwells, within, carried.means)
         noise, sizes = with_dwell_parts(within, means, state, *stated, walks=model.walks, near=sizes, prior=prior)
         noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
+        turning = noise.weights.setting_rad > 0.0
         fitted = replace(fitted, carried=carried, noise=noise)
         if model.walks:
             own = within_dwells(dwells, noise.walk_mps2_per_sqrt_s)
             within = replace(within, sigma_mps2=own.sigma_mps2, inflation=own.inflation)
         # a constant without a derivative holds the input axes near their linearisation, so that convergence is slow
-        still = (np.abs(moved) <= _STILL * reach).all() and left < _SETTLED and not model.stepped
-        if number >= _PASSES - 1 and still:
-            break
+        still = (np.abs(moved) <= _STILL * reach).all() and not model.stepped
+        if number >= _PASSES - 1 and still and (left < SETTLED or not turning):
+            return fitted
+    if not bench.angles and left > UNSETTLED:
+        raise UnobservableError(_not_settled(model))
     return fitted
+
+
+def _not_settled(model: Model) -> str:
+    effects = " and ".join(map(str, model.effects))
+    return (
+        "the sizes of the readings at rest do not determine "
+        + (f"{effects} beside the nine parameters: leave {effects} out" if effects else "the nine parameters")
+        + ", or turn it to more sides (the fit does not converge)."
+    )
+
+
+def _not_sensible(model: Model) -> str:
+    if model.effects:
+        return _not_settled(model)
+    return (
+        "the sizes of the readings at rest lead to no sensible set of scale factors, biases and angles: check the unit "
+        "of the readings (--accel-unit) and gravity, and turn it to more sides."
+    )
 
 
 def _most_passes(model: Model) -> int:
     """Return how often noise, linearisation and constants are estimated in turn at most."""
-    if model.unknowns or model.stepped:
-        return _PASSES_WITH_UNKNOWNS
-    return _PASSES if model.bench.angles else _TURNS
+    if not model.bench.angles:
+        return _TURNS
+    return _PASSES_WITH_UNKNOWNS
 
 
 def _begun(dwells: list[DwellFactor], model: Model, slews: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float) -> Fit:
@@ -256,40 +289,23 @@ def _begun(dwells: list[DwellFactor], model: Model, slews: Sequence[DwellFactor]
     """
     within = replace(within_dwells(dwells, walk_mps2_per_sqrt_s), walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
     if model.bench.angles:
+        dwells = [without_attitude(dwell) for dwell in dwells]
         return Fit(Carried(dwells, model, model.nominal_state(), slews), within)
     stated = model.bench.scatter_sigma_mps2
     noise = replace(
-        within, setting_rad=free_attitude.UNBOUNDED_RAD, setting_stated=True, free=True,
+        within, setting_rad=ATTITUDE_UNKNOWN_RAD, setting_stated=True,
         scatter_mps2=np.full(3, stated or 0.0), scatter_stated=stated is not None,
     )  # fmt: skip
     bare = Model(model.bench, square=True)
-    carried = carried_at(dwells, bare, bare.nominal_state())
-    free_attitude.refuse_poses(carried, noise)
-    settled = _settled(Fit(carried, noise)).carried
-    if free_attitude.tells_angles(settled, noise):
-        carried = linearised(settled, Model(model.bench), settled.state)
-        settled = _settled(Fit(carried, noise)).carried
-    state = np.append(settled.state, np.zeros(model.count - STATE_COUNT))
-    return Fit(linearised(settled, replace(model, square=settled.model.square), state), noise)
-
-
-def carried_at(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> Carried:
-    """Dwells with the columns of a model at a state, with the specific force that their readings show there if no
-    angles are used; what effects add to it is found in turn."""
-    carried = Carried(dwells, model, state)
-    for _ in range(0 if model.bench.angles else _PASSES if model.effects else 1):
-        carried = linearised(carried, model, state)
-    return carried
-
-
-def linearised(carried: Carried, model: Model, state: Floats) -> Carried:
-    """The dwells with the columns of a model at a state; if no angles are used, with the specific force that their
-    readings show there, less what effects add by the columns so far."""
-    dwells, own = carried.dwells, carried.means.design[:, :, STATE_COUNT:]
-    if not model.bench.angles:
-        added = own @ state[STATE_COUNT:] if own.shape[2] == len(state) - STATE_COUNT else None
-        dwells = free_attitude.turned(dwells, state, model.bench.gravity_mps2, added)
-    return Carried(dwells, model, state, carried.slews)
+    facing = facing_readings(dwells, bare.nominal_state(), bare.bench.gravity_mps2)
+    begun = Fit(Carried(facing, bare, bare.nominal_state()), noise)
+    free_attitude.refuse_poses(begun.carried, noise)
+    settled = _settled(begun)
+    if free_attitude.tells_angles(settled.carried, noise):
+        settled = _settled(Fit(linearised(settled, Model(model.bench), settled.carried.state), noise))
+    state = np.append(settled.carried.state, np.zeros(model.count - STATE_COUNT))
+    whole = replace(model, square=settled.carried.model.square)
+    return Fit(Carried(settled.dwells, whole, state), noise)
 
 
 def _settled(fitted: Fit) -> Fit:
@@ -298,28 +314,17 @@ def _settled(fitted: Fit) -> Fit:
         state = fitted.state
         if not _sensible(state):
             break
-        left = _left_to_settle(fitted, state)
-        fitted = replace(fitted, carried=linearised(fitted.carried, fitted.carried.model, state))
-        if left < _SETTLED:
+        left = left_to_settle(fitted, state)
+        fitted = replace(fitted, carried=descended(fitted, fitted.carried.model, state)[0])
+        if left < SETTLED:
             return fitted
-    raise UnobservableError(
-        "the sizes of the readings at rest lead to no sensible set of scale factors, biases and angles: check the unit "
-        "of the readings (--accel-unit) and gravity, and turn it to more sides."
-    )
+    raise UnobservableError(_not_sensible(fitted.carried.model))
 
 
 def _sensible(state: Floats) -> bool:
     """Tell whether a state (p,) tells the specific force from the readings."""
     sensitivity = state[:STATE_COUNT].reshape(3, 4)[:, :3]
     return bool(np.isfinite(state).all() and np.linalg.cond(sensitivity) < _SINGULAR)
-
-
-def _left_to_settle(fitted: Fit, state: Floats) -> float:
-    """Return by how much the parameters move, relative to g, from where the fit has its forces; 0 with angles."""
-    if fitted.carried.model.bench.angles:
-        return 0.0
-    unit = np.tile([1.0, 1.0, 1.0, fitted.carried.model.bench.gravity_mps2], 3)
-    return float(np.abs((state - fitted.carried.state)[:STATE_COUNT] / unit).max())
 
 
 def _setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:

@@ -15,20 +15,18 @@ square, and the uncertainty of that enters the covariance (considered parameters
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.errors import UnobservableError
-from kf_calib.estimation.dwell_columns import Carried, Means, Samples
+from kf_calib.estimation.dwell_columns import Carried, Means
 from kf_calib.estimation.measurement_model import FRAME, SQUARE, STATE_COUNT
 from kf_calib.estimation.noise_model import Noise
+from kf_calib.estimation.nuisance_states import nuisance_sigmas
+from kf_calib.estimation.samples import Samples
 
-UNBOUNDED_RAD = 10.0
-"""Prior sigma of a rotation in the engines that need a finite one: what it tells is 1e-8 of a reading or less."""
 DIRECTIONS: dict[str, Floats] = {
     " ".join(f"{'+' if sign > 0 else '-'}{axis}" for sign, axis in zip(signs, "xyz", strict=True) if sign): (
         np.array(signs, float) / np.linalg.norm(signs)
@@ -42,55 +40,10 @@ _NINE = [k for k in range(STATE_COUNT) if k not in FRAME]
 _HOPELESS_SCALE, _HOPELESS_MPS2 = 0.2, 2.0
 
 
-def tangents(force: Floats) -> Floats:
-    """Two unit vectors across each force, as columns (D, 3, 2)."""
-    unit = force / np.linalg.norm(force, axis=1, keepdims=True)
-    start = np.eye(3)[np.abs(unit).argmin(axis=1)]
-    one = np.cross(unit, start)
-    one /= np.linalg.norm(one, axis=1, keepdims=True)
-    return np.asarray(np.stack([one, np.cross(unit, one)], axis=2), float)
-
-
 def felt(readings: Floats, state: Floats) -> Floats:
     """Specific force (D, 3) by the mean readings (D, 3) alone: S^-1 (z - b)."""
     affine = state[:STATE_COUNT].reshape(3, 4)
     return np.asarray(np.linalg.solve(affine[:, :3], (readings - affine[:, 3]).T).T, float)
-
-
-def turned(
-    dwells: Sequence[DwellFactor], state: Floats, gravity_mps2: float, added_mps2: Floats | None = None
-) -> list[DwellFactor]:
-    """The dwells with the specific force that their readings show at ``state``, of size g, and a pose that has it up.
-
-    The heading of such a pose is arbitrary. added_mps2 (D, 3): what effects add to the mean readings.
-    """
-    means = np.array([dwell.means[4:] for dwell in dwells])
-    raw = felt(means if added_mps2 is None else means - added_mps2, state)
-    unit = raw / np.linalg.norm(raw, axis=1, keepdims=True)
-    out = [_with_force(dwell, gravity_mps2 * own, _pose(own)) for dwell, own in zip(dwells, unit, strict=True)]
-    left = [k for k, dwell in enumerate(out) if dwell.came_from is not None]
-    before = turned([each for each in (out[k].came_from for k in left) if each], state, gravity_mps2) if left else []
-    for k, last in zip(left, before, strict=True):
-        out[k] = replace(out[k], came_from=last)
-    return out
-
-
-def _with_force(dwell: DwellFactor, force: Floats, pose: Floats) -> DwellFactor:
-    """Return the dwell with another specific force and pose at all its nodes."""
-    pieces = (
-        replace(each, nodes=replace(each.nodes, force_mps2=np.tile(force, (3, 1)), pose=np.tile(pose, (3, 1))))
-        for each in dwell.pieces
-    )
-    return replace(dwell, pieces=tuple(pieces))
-
-
-def _pose(unit: Floats) -> Floats:
-    """Return the quaternion (x, y, z, w) of the shortest rotation that brings a direction up, that is to +y."""
-    x, y, z = unit
-    if y < -1.0 + 1e-12:
-        return np.array([1.0, 0.0, 0.0, 0.0])
-    quaternion = np.array([-z, 0.0, x, 1.0 + y])
-    return quaternion / np.linalg.norm(quaternion)
 
 
 def weights_of_size(means: Means, state: Floats) -> Floats:
@@ -205,12 +158,16 @@ def most_informative(covariance: Floats, state: Floats, gravity_mps2: float) -> 
     return best
 
 
-def holding_frame(samples: Iterable[Samples], carried: Carried) -> Iterator[Samples]:
+def holding_frame(samples: Iterable[Samples], carried: Carried, noise: Noise) -> Iterator[Samples]:
     """Yield first a reading of each state that is fixed at zero, times g, then the samples."""
+    sigmas = nuisance_sigmas(noise)
+    count = len(sigmas)
     for first in range(0, len(carried.model.fixed), 3):
         observation = np.zeros((1, 3, carried.model.count))
         for i, place in enumerate(carried.model.fixed[first : first + 3]):
             observation[0, i, place] = carried.model.bench.gravity_mps2
         number, start_s = carried.dwells[0].number, np.array([carried.dwells[0].start_s])
-        yield Samples(number, start_s, observation, np.zeros((1, 4)), np.zeros((1, 3)))
+        yield Samples(
+            number, start_s, observation, np.zeros((1, 3, count)), sigmas, np.zeros((1, 3))
+        )  # fmt: skip
     yield from samples

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation.dwell_columns import Samples
-from kf_calib.estimation.measurement_model import STATE_COUNT, dwell_map
+from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise
+from kf_calib.estimation.nuisance_states import nuisance_sigmas
+from kf_calib.estimation.samples import Samples
 
 _DIFFUSE = 1e5
 """Sigma of a diffuse prior, in sigmas of one reading: wide enough not to bias, narrow enough for double precision."""
@@ -40,7 +41,6 @@ def estimate(
     noise: Noise,
     nominal_state: Floats,
     prior_covariance: Floats | None,
-    linearised_at: Floats,
     scale: Floats,
     form: Literal["square-root", "plain"] = "square-root",
     on_dwell: Callable[[Floats], None] | None = None,
@@ -48,22 +48,20 @@ def estimate(
     """Run the filter over all samples and return the posterior.
 
     - nominal_state (p,): mean of the prior; prior_covariance (p, p): None for a diffuse prior.
-    - linearised_at: where the nuisance states are linearised.
     - scale (p,): approximate change of a reading per unit of each state, m/s^2.
     - form: which of filterpy's filters is used.
     - on_dwell: called with the state (p,) after each dwell and the slew that follows it.
 
     The biases walk with the intensity in ``noise`` from reading to reading (process noise Q).
     """
-    count, used = len(nominal_state), np.flatnonzero(noise.dwell_sigmas > 0)
-    nuisances = dwell_map(linearised_at)[:, :, used]
+    count = len(nominal_state)
     if prior_covariance is None:
-        setting_mps2 = 0.0 if noise.free else scale[0] * noise.setting_rad
+        setting_mps2 = 0.0 if noise.attitude_unknown else scale[0] * noise.setting_rad
         widest = max(noise.effective_sigma_mps2.max(), noise.scatter_mps2.max(), setting_mps2)
         root = _DIFFUSE * widest * np.eye(count)
     else:
         root = np.linalg.cholesky(prior_covariance * np.outer(scale, scale))
-    kf = _Filter(form, nominal_state * scale, root, noise.dwell_sigmas[used])
+    kf = _Filter(form, nominal_state * scale, root, nuisance_sigmas(noise))
     place, nis, done, previous_s = (-1, False), 0.0, 0, math.nan
     for piece in samples:
         if (piece.dwell, piece.moving) != place:
@@ -71,8 +69,7 @@ def estimate(
                 on_dwell(kf.state() / scale)
             kf.enter_dwell(noise.of(piece.moving).effective_sigma_mps2)
             place = (piece.dwell, piece.moving)
-        own = np.einsum("nc,icp->nip", piece.regressors, nuisances)
-        observations = np.concatenate([piece.observation / scale, own], axis=2)
+        observations = np.concatenate([piece.observation / scale, piece.nuisances], axis=2)
         for observation, reading, now_s in zip(observations, piece.readings, piece.elapsed_s.tolist(), strict=True):
             if noise.walk_mps2_per_sqrt_s and now_s > previous_s:
                 kf.walk(noise.walk_mps2_per_sqrt_s**2 * (now_s - previous_s))

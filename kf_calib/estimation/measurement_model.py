@@ -17,7 +17,6 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.dwells.rows import REGRESSORS
 from kf_calib.effects import Coefficient, Effect, FrameEffect, Stimulus, effect_named
 from kf_calib.errors import InputError
 from kf_calib.estimation.known_effect import KnownEffect
@@ -32,8 +31,6 @@ FRAME = (1, 2, 6)
 """s1y, s1z, s2z: without angles the frame is that in which accelerometer 1 is x and 2 lies in the plane of x and y."""
 SQUARE = (4, 8, 9)
 """s2x, s3x, s3y: by how much the axes are not square, in that frame."""
-DWELL_STATES = 6
-"""Number of nuisance states of a dwell: three small rotations (setting error) and three offsets (scatter)."""
 
 
 @dataclass(frozen=True)
@@ -211,18 +208,3 @@ def effect_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
         # and what depends on an attitude that is not known (NaN), of which nothing can be seen
         columns[:, :, end - count : end] = np.where(np.abs(own) * scales >= _ROUNDING_MPS2, own, 0.0)
     return columns
-
-
-def dwell_map(state: Floats) -> Floats:
-    """N (3, 4, 6): the coefficients of a dwell's nuisance states on the regressors 1, f_x, f_y, f_z, linearised at
-    ``state``.
-
-    Columns 0 to 2 belong to the small rotation alpha, whose derivative in channel i is f x s_i; columns 3 to 5 are the
-    offsets of the three accelerometers.
-    """
-    out = np.zeros((3, len(REGRESSORS), DWELL_STATES))
-    for i in range(3):
-        sx, sy, sz = state[4 * i : 4 * i + 3]
-        out[i, 1:, :3] = np.array([[0.0, -sz, sy], [sz, 0.0, -sx], [-sy, sx, 0.0]])  # (f x s) = f^T [s]
-        out[i, 0, 3 + i] = 1.0
-    return out

@@ -39,6 +39,9 @@ _WANDER = 6
 _ROUNDING = 1e-14  # relative to a dwell's variance
 _TURNED = 1e4  # sigmas of a mean reading: what an attitude that is not known may change it by
 
+ATTITUDE_UNKNOWN_RAD = np.inf
+"""The setting error where the attitude of the dwells is not known at all."""
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -46,15 +49,15 @@ class Noise:
 
     - sigma_mps2 (3,): sigma_w of each accelerometer.
     - inflation (3,): kappa of each accelerometer.
-    - setting_rad: sigma_alpha.
+    - setting_rad: sigma_alpha; infinite where the attitude of the dwells is not known at all.
     - scatter_mps2 (3,): sigma_s of each accelerometer; zeros if not given.
     - setting_stated, scatter_stated: whether these parts were stated rather than estimated.
+    - setting_judged: whether a setting error that was estimated is so clear that it counts where the misfit is judged.
     - checked: whether the setting error is weighted. It is if the scatter is stated, or if there are enough
       orientations to check that a setting error only turns the specific force; readings along the specific force, which
       no rotation changes, then get more weight. Otherwise dwells are weighted by their scatter alone and the setting
       error is a considered parameter (Schmidt), which enlarges the covariance but does not change the estimate.
     - slew_sigma_mps2 (3,): the effective sigma in slews; None if no slews are used.
-    - free: the attitude of a dwell is not known at all (``free_attitude``); setting_rad then only stands for that.
     - walk_mps2_per_sqrt_s: the intensity q of the random walk of each bias.
     - walk_spread: the sigma of ln q; None if q was stated or is zero.
     - sensitivity_mps2_per_k (3, 8): change of the readings per K on the regressors 1, f and T, T f
@@ -68,11 +71,11 @@ class Noise:
     scatter_mps2: Floats = None  # type: ignore[assignment]  # set in __post_init__
     setting_stated: bool = False
     scatter_stated: bool = False
+    setting_judged: bool = False
     checked: bool = True
     slew_sigma_mps2: Floats | None = None
     walk_mps2_per_sqrt_s: float = 0.0
     walk_spread: float | None = None
-    free: bool = False
     within_seen: bool = True
     sensitivity_mps2_per_k: Floats | None = None
 
@@ -92,9 +95,13 @@ class Noise:
 
     @property
     def judging(self) -> Noise:
-        """The noise by which the misfit is judged: without scatter that was itself estimated from this misfit, unless
-        no other noise is known."""
-        return self if self.scatter_stated or not self.within_seen else replace(self, scatter_mps2=np.zeros(3))
+        """The noise by which the misfit is judged: without scatter, and an unclear setting error, that were estimated
+        from this misfit itself, unless no other noise is known."""
+        if not self.within_seen:
+            return self
+        scatter_mps2 = self.scatter_mps2 if self.scatter_stated else np.zeros(3)
+        setting_rad = self.setting_rad if self.setting_stated or self.setting_judged else 0.0
+        return replace(self, scatter_mps2=scatter_mps2, setting_rad=setting_rad)
 
     def of(self, moving: bool) -> Noise:
         """The noise that applies in slews if ``moving``, else the noise in dwells."""
@@ -105,13 +112,12 @@ class Noise:
     @property
     def of_readings(self) -> Noise:
         """The noise without an unknown attitude, which the readings themselves show; with angles, all of it."""
-        return replace(self, setting_rad=0.0, free=False) if self.free else self
+        return replace(self, setting_rad=0.0) if self.attitude_unknown else self
 
     @property
-    def dwell_sigmas(self) -> Floats:
-        """Prior sigmas (6,) of a dwell's nuisance states: three rotations in rad and three offsets in m/s^2; 0 for a
-        state that is absent."""
-        return np.concatenate([np.full(3, self.setting_rad), self.scatter_mps2])
+    def attitude_unknown(self) -> bool:
+        """Whether nothing is known of the attitude of a dwell, so that only the size of the force is."""
+        return not np.isfinite(self.setting_rad)
 
 
 def steps(dwells: Sequence[DwellFactor], noise: Noise) -> Floats:
@@ -255,7 +261,7 @@ def mean_covariances(noise: Noise, means: Means, state: Floats) -> Floats:
     """
     own = noise.effective_sigma_mps2**2 / means.counts[:, None] + noise.scatter_mps2**2
     size = np.linalg.norm(means.force_mps2, axis=1).max()
-    setting_rad = _TURNED * np.sqrt(own.max()) / size if noise.free else noise.setting_rad
+    setting_rad = _TURNED * np.sqrt(own.max()) / size if noise.attitude_unknown else noise.setting_rad
     return own[:, :, None] * np.eye(3) + setting_rad**2 * setting_covariances(means, state)
 
 
@@ -271,9 +277,9 @@ def lift_rounding(covariances: Floats) -> Floats:
 
 def setting_covariances(means: Means, state: Floats) -> Floats:
     """Covariances (D, 3, 3) of the mean readings that a random small rotation of unit variance per axis produces."""
-    force, sensitivity = means.force_mps2, state[:12].reshape(3, 4)[:, :3]
+    force, sensitivity = means.force_mps2, means.sensitivities(state)
     across = np.einsum("di,di->d", force, force)[:, None, None] * np.eye(3) - force[:, :, None] * force[:, None, :]
-    return sensitivity @ across @ sensitivity.T
+    return sensitivity @ across @ np.swapaxes(sensitivity, 1, 2)
 
 
 def considered_information(noise: Noise, means: Means, state: Floats) -> Floats:

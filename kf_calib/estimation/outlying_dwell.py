@@ -101,8 +101,7 @@ def _turns(dwell: DwellFactor, means: Means, rest: Calibration) -> Iterator[Turn
 
     def there(force: Floats) -> Floats:
         """Return by how much more effects turn the readings at another specific force."""
-        rho = dwell.turned_rad
-        return np.zeros(3) if rho is None else turning_mps2(rho, force - means.force_mps2, state)
+        return turning_mps2(dwell, force - means.force_mps2, state)
 
     def error(gimbal: int, turn_rad: float) -> Floats:
         other = at(gimbal, turn_rad)

@@ -130,7 +130,7 @@ def remarks_on(
             f"the angles are noisy themselves: together with the stated setting error of {stated_deg:g} deg, each "
             f"pose is uncertain by {np.degrees(noise.setting_rad):.2g} deg, which is used to weight the dwells."
         )
-    if not noise.setting_stated and noise.setting_rad > 0:
+    if not noise.setting_stated and noise.judging.setting_rad > 0:
         yield (
             f"angle_sigma_deg was not stated; {np.degrees(noise.setting_rad):.2g} deg was estimated from the misfit "
             "between dwells, which an effect not in the model could also cause."

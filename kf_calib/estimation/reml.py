@@ -39,6 +39,7 @@ HELD = 12
 
 _SIGNIFICANT = 5.41  # 1 % point of the likelihood-ratio statistic of a variance against zero, half of a chi2 with 1 dof
 _WALK = 0.5  # a walk has to gain at least this much log-likelihood
+_JUDGED = 2.71  # 5 % point of that statistic: a setting error that is clearer belongs to the noise that judges
 
 Part = Literal["setting", "common", "scatter", "walk"]
 Parts = tuple[Part, ...]
@@ -79,8 +80,9 @@ def with_dwell_parts(
     """Complete the noise within dwells by setting error, scatter and, if ``walks``, the random walk of the biases.
 
     Parts that are stated are taken as they are. Of the combinations of the other parts (scatter as one number for all
-    accelerometers or one for each), the one with the largest restricted likelihood is taken, less a charge per number:
-    the 1 % point of its likelihood ratio against zero. The intensity of a walk has a smaller charge. Nothing is
+    accelerometers or one for each), the one with the largest restricted likelihood is taken, less a charge per number
+    of the scatter: the 1 % point of its likelihood ratio against zero. A walk has a smaller charge, a setting error
+    none. Nothing is
     estimated with fewer than 6 degrees of freedom between dwells. If there are too few orientations to tell a setting
     error from scatter, the whole misfit counts as scatter. Where attitudes are not known, a dwell tells one number,
     and scatter has one size for all accelerometers.
@@ -100,7 +102,7 @@ def with_dwell_parts(
         scatter_stated=scatter_mps2 is not None,
         walk_mps2_per_sqrt_s=0.0 if walks else within.walk_mps2_per_sqrt_s,
     )
-    if not within.free:
+    if not within.attitude_unknown:
         stated = replace(
             stated,
             setting_rad=float(np.radians(angle_sigma_deg or 0.0)),
@@ -110,13 +112,16 @@ def with_dwell_parts(
     if stated.setting_stated and stated.scatter_stated and not walks:
         return stated, {}
     means, prior = _reduce(means, prior)
-    free = (len(means.readings) if within.free else means.readings.size) + len(prior) - means.design.shape[2]
+    measured = len(means.readings) if within.attitude_unknown else means.readings.size
+    free = measured + len(prior) - means.design.shape[2]
     if free < FEWEST:
         return stated, {}
     combinations = _combinations(stated, walks)
     likelihood = _likelihood(stated.weights, {part for parts in combinations for part in parts}, means, state, prior)
     without = likelihood.without()
     if not walks and chi_squared_tail(free, without.misfit) > 0.1:  # the model already fits
+        combinations = [parts for parts in combinations if parts == ("setting",)]
+    if not combinations:
         return stated, {}
     return _chosen(stated, likelihood, combinations, without, near or {})
 
@@ -125,7 +130,7 @@ def _combinations(stated: Noise, walks: bool) -> list[Parts]:
     """Return the combinations of parts that may be estimated; the last one contains all others."""
     settings: list[Parts] = [()] if stated.setting_stated or not stated.checked else [(), ("setting",)]
     scatters: list[Parts] = [()] if stated.scatter_stated else [(), ("common",)]
-    if stated.checked and not (stated.scatter_stated or stated.free):
+    if stated.checked and not (stated.scatter_stated or stated.attitude_unknown):
         scatters.append(("scatter",))
     walking: list[Parts] = [(), ("walk",)] if walks else [()]
     return [setting + scatter + walk for walk, setting, scatter in product(walking, settings, scatters)][1:]
@@ -155,12 +160,21 @@ def _chosen(
     if "walk" in best:
         spread = _last_spread(likelihood.of(best).curvature(found[best]))
         noise = replace(noise, walk_spread=spread)
+    if "setting" in best:
+        rest: Parts = tuple(part for part in best if part != "setting")
+        cost = likelihood.of(rest).most_likely()[1].cost if rest else without.cost
+        gain = cost - likelihood.of(best).at(found[best] ** 2).cost
+        noise = replace(noise, setting_judged=2.0 * gain > _JUDGED)
     return noise, found
 
 
 def _charge(parts: Parts, likelihood: Likelihood) -> float:
-    """Return the log-likelihood that the parts have to gain in order to be taken."""
-    return sum(_WALK if part == "walk" else 0.5 * _SIGNIFICANT * len(likelihood.units[part]) for part in parts)
+    """Return the log-likelihood that the parts have to gain in order to be taken.
+
+    A setting error is taken at its likeliest size, however small: left out below a limit, it would be missing in sigma.
+    """
+    charges = {"walk": _WALK, "setting": 0.0}
+    return sum(charges.get(part, 0.5 * _SIGNIFICANT * len(likelihood.units[part])) for part in parts)
 
 
 def _last_spread(curvature: Floats) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -21,7 +21,7 @@ from kf_calib.estimation.cross_validation import HeldOut, held_out
 from kf_calib.estimation.dwell_columns import Carried, columns_of, means_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
-from kf_calib.estimation.noise_model import Noise, considered_information, steps
+from kf_calib.estimation.noise_model import ATTITUDE_UNKNOWN_RAD, Noise, considered_information, steps
 from kf_calib.estimation.residual_table import residual_table, table_as
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings
@@ -416,14 +416,28 @@ def consistency(fitted: Fit) -> Consistency:
     upper = square_root_information.accumulate(rows, fitted.steps)
     statistic = float(upper[-1, -1] ** 2)
     dof = sum(square_root_information.row_rank(own) for own in rows) - square_root_information.rank(upper[:-1])
-    dof -= int(not noise.setting_stated and noise.setting_rad > 0)
+    estimated = not noise.setting_stated and noise.judging.setting_rad > 0
+    dof -= int(estimated)
     if dof <= 0:
         return Consistency(statistic, 0, None, None)
     if not noise.within_seen and not noise.scatter_stated:  # the noise was taken from this misfit
         return Consistency(statistic, dof, None, None)
     noise_dof = float(sum(max(dwell.count - 4, 1) for dwell in dwells) / noise.inflation.mean())
-    p_value = f_tail(dof, max(noise_dof, 1.0), statistic / dof)
+    left, tested = statistic, dof
+    if estimated and (along := _dof_along_force(fitted)):
+        # What lies across the force has the size of the setting error that was estimated from it: it is as large as
+        # its degrees of freedom whatever the model is, and the misfit along the force alone is left to be tested.
+        left, tested = max(statistic - (dof - along), 0.0), along
+    p_value = f_tail(tested, max(noise_dof, 1.0), left / tested)
     return Consistency(statistic, dof, p_value, p_value >= LEVEL)
+
+
+def _dof_along_force(fitted: Fit) -> int:
+    """Return the degrees of freedom of the sizes of the force, which no setting error changes."""
+    carried, noise = fitted.carried, replace(fitted.noise.judging, setting_rad=ATTITUDE_UNKNOWN_RAD)
+    rows = square_root_information.whiten(carried.turned, carried.columns, noise, carried.state)
+    known = square_root_information.rank(square_root_information.accumulate(rows)[:-1][:, -carried.model.count - 1 :])
+    return max(sum(square_root_information.row_rank(dwell_rows) for dwell_rows in rows) - known, 0)
 
 
 def format_p(p_value: float | None) -> str:

@@ -20,9 +20,9 @@ from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
 from kf_calib.estimation import random_walk
-from kf_calib.estimation.free_attitude import tangents
-from kf_calib.estimation.measurement_model import STATE_COUNT, Model, dwell_map
+from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, flicker_sigma, shared_noise, slow_scatter
+from kf_calib.estimation.nuisance_states import nuisance_map, nuisance_sigmas
 from kf_calib.estimation.prior import Prior
 
 _SLOW = np.arange(1, 5)
@@ -97,8 +97,7 @@ def _weighted(
     last.
     """
     sigma, priors = noise.effective_sigma_mps2, _dwell_priors(noise)
-    used, slow = np.flatnonzero(noise.dwell_sigmas > 0), 0 if flicker_mps2 is None else len(_SLOW)
-    offsets = len(priors)
+    offsets, slow = len(priors), 0 if flicker_mps2 is None else len(_SLOW)
     if flicker_mps2 is not None:
         priors = np.append(priors, np.outer(np.maximum(flicker_mps2, FLOOR_MPS2), 1.0 / np.sqrt(_SLOW)))
     count, (many, pieces, functions, _, width) = len(priors), columns.shape
@@ -106,18 +105,12 @@ def _weighted(
     triangles = np.array([dwell.triangles for dwell in dwells])
     carried = triangles[:, :, :functions, :functions]
     regressors = np.array([dwell.regressors for dwell in dwells])
-    nuisances = list(dwell_map(state)[:, :, used])
-    if noise.free:
-        across = tangents(np.array([dwell.means[1:4] for dwell in dwells]))
-        nuisances = [
-            np.concatenate([own[:, :3] @ across, np.repeat(own[None, :, 3:], many, axis=0)], axis=2)[:, None]
-            for own in nuisances
-        ]
+    nuisances = nuisance_map(dwells, noise, state)[:, :, None]
     waves = carried[..., :3] @ on_basis(np.array([_waves(dwell) for dwell in dwells])) if slow else None
     rows = np.zeros((many, 3 * size + count, count + inside + width + 1))
     for i in range(3):
         part = rows[:, i * size : (i + 1) * size]
-        part[..., :offsets] = (regressors @ nuisances[i]).reshape(many, size, offsets)
+        part[..., :offsets] = (regressors @ nuisances[:, i]).reshape(many, size, offsets)
         if waves is not None:
             first = offsets + slow * i
             part[..., first : first + slow] = waves.reshape(many, size, slow)
@@ -137,11 +130,9 @@ def _weighted(
 
 
 def _dwell_priors(noise: Noise) -> Floats:
-    """Return the prior sigmas of a dwell's nuisance states, its rotations and offsets; where its attitude is not known,
-    two rotations across the force have none."""
-    sigmas = noise.dwell_sigmas
-    rotations = np.full(2, np.inf) if noise.free else sigmas[:3]
-    return np.concatenate([rotations[rotations > 0], sigmas[3:][sigmas[3:] > 0]])
+    """Return the prior sigmas of a dwell's nuisance states; rotations of an unknown attitude have none."""
+    sigmas = nuisance_sigmas(noise)
+    return np.concatenate([np.full(2, np.inf), sigmas[2:]]) if noise.attitude_unknown else sigmas
 
 
 def _less(rows: Floats, count: int) -> Floats:

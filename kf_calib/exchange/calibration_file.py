@@ -181,8 +181,8 @@ def saved(
         noise=SavedNoise(
             sigma_mps2=noise.sigma_mps2.tolist(), inflation=noise.inflation.tolist(),
             dwell_sigma_mps2=noise.scatter_mps2.tolist(), dwell_sigma_stated=noise.scatter_stated,
-            angle_sigma_deg=0.0 if noise.free else math.degrees(noise.setting_rad),
-            angle_sigma_stated=noise.setting_stated and not noise.free,
+            angle_sigma_deg=0.0 if noise.attitude_unknown else math.degrees(noise.setting_rad),
+            angle_sigma_stated=noise.setting_stated and not noise.attitude_unknown,
             walk_mps2_per_sqrt_s=float(noise.walk_mps2_per_sqrt_s),
         ),
         consistency=SavedConsistency(

@@ -29,9 +29,10 @@ from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import evaluate_fit
 from kf_calib.estimation.correction import Correction
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
-from kf_calib.estimation.fit import Fit, carried_at, fit
+from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.measurement_model import SQUARE, Model
 from kf_calib.estimation.noise_model import Noise, mean_covariances
+from kf_calib.estimation.relinearisation import carried_at
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.exchange.calibration_file import SavedCalibration
@@ -114,7 +115,7 @@ def verify(
         fitted = fit(dwells, Model(source.bench, model.effects))
         free = tuple(str(each) for each in model.effects if beyond_force_and_temperature(each, source.bench))
         statistic, rms = _misfit(saved, fitted, _noise(saved, fitted), free)
-        dof = (1 if fitted.noise.free else 3) * len(dwells) - _free_count(model, free)
+        dof = (1 if fitted.noise.attitude_unknown else 3) * len(dwells) - _free_count(model, free)
         p_value = chi_squared_tail(dof, statistic)
         new = evaluate_fit(fitted, settings)
         seen = None if new.estimate.unseen.any() else new
@@ -146,7 +147,7 @@ def _free_count(model: Model, free: Sequence[str]) -> int:
 def _misfit(saved: SavedCalibration, fitted: Fit, noise: Noise, free: Sequence[str]) -> tuple[float, float]:
     """Return the normalised misfit of the new means, and the rms of their residuals by the old state, m/s^2."""
     old, model = np.array(saved.state.values), fitted.carried.model
-    means = carried_at(fitted.dwells, model, old).means if noise.free else fitted.carried.means
+    means = carried_at(fitted.dwells, model, old, noise).means if noise.attitude_unknown else fitted.carried.means
     kept = [
         k for k in range(model.count) if not any(k in range(*model.parts[name].indices(model.count)) for name in free)
     ]

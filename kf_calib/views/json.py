@@ -33,8 +33,8 @@ def replay_object(result: Calibration) -> dict[str, Any]:
                 "inflation": noise.inflation,
                 "dwell_sigma_mps2": noise.scatter_mps2,
                 "dwell_sigma_stated": noise.scatter_stated,
-                "angle_sigma_deg": None if noise.free else math.degrees(noise.setting_rad),
-                "angle_sigma_stated": noise.setting_stated and not noise.free,
+                "angle_sigma_deg": None if noise.attitude_unknown else math.degrees(noise.setting_rad),
+                "angle_sigma_stated": noise.setting_stated and not noise.attitude_unknown,
             },
             "consistency": {
                 "consistent": judged.consistent,

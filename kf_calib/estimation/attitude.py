@@ -1,0 +1,162 @@
+"""The attitude of each dwell, on the sphere: where it most likely stands, given the readings and the state.
+
+A setting error alpha turns the specific force, and R(alpha) f is never longer than f. The model f + alpha x f about the
+force that the angles show is therefore wrong by half the square of alpha, along the force, where the readings are exact
+to their noise. So each dwell is linearised about its own posterior mode, which is found in turn with the state: the
+fixed point of an iterated Kalman update, and least squares with the state and all alpha free (``fit``). Where no angles
+are used, alpha has no prior, and the size of the force is all that is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.sufficient_statistics import AttitudeError, DwellFactor
+from kf_calib.effects import FrameEffect
+from kf_calib.estimation.dwell_columns import Carried, Means, stimulus_of
+from kf_calib.estimation.measurement_model import STATE_COUNT
+from kf_calib.estimation.noise_model import Noise
+from kf_calib.estimation.nuisance_states import rotation_map, tangents
+
+_STEP = 1e-6  # relative to g, of the differences that give the bending
+_ABRUPT = 0.5  # a bending beyond this is a jump of an effect's column, which has no derivative
+_FARTHEST_RAD = 0.3  # of one step of an attitude
+
+
+def at_their_modes(carried: Carried, noise: Noise, state: Floats) -> list[DwellFactor]:
+    """The dwells with attitudes at their posterior modes at ``state`` (p,), to first order about where they were.
+
+    Dwells stay as they are where no setting error is allowed for. Where it is only considered (``Noise.checked``),
+    attitudes stay as recorded, and the force is shorter by what the setting error takes from its mean.
+    """
+    if not noise.setting_rad:
+        return [without_attitude(dwell) for dwell in carried.dwells]
+    bendings = bendings_of(carried, state)
+    if not noise.checked:
+        known = [AttitudeError(np.zeros(3), 2.0 * noise.setting_rad**2, bending) for bending in bendings]
+        return [d.linearised(d.turned_rad, attitude) for d, attitude in zip(carried.dwells, known, strict=True)]
+    moved, variances = _posterior_rotations(carried.means, noise, state, bendings)
+    forces = carried.means.force_mps2 / np.array([_length(dwell) for dwell in carried.dwells])[:, None]
+    out = list[DwellFactor]()
+    for k, (dwell, turned) in enumerate(zip(carried.dwells, carried.turned, strict=True)):
+        before = np.zeros(3) if dwell.attitude is None else dwell.attitude.rotation_rad
+        force = rotated(forces[k], _limited(moved[k] - before))
+        attitude = AttitudeError(np.zeros(3), float(variances[k]), bendings[k])
+        if noise.attitude_unknown:
+            left_out = dwell.came_from and facing_readings([dwell.came_from], state, float(np.linalg.norm(force)))[0]
+            out.append(replace(with_force(dwell, force), attitude=attitude, came_from=left_out))
+        else:
+            shown = without_attitude(turned).felt(dwell.means[None, 1:4])[0]
+            out.append(dwell.linearised(None, replace(attitude, rotation_rad=rotation_between(shown, force))))
+    return out
+
+
+def without_attitude(dwell: DwellFactor) -> DwellFactor:
+    """The dwell linearised about the force that its pose shows."""
+    return dwell.linearised(dwell.turned_rad, None) if dwell.attitude else dwell
+
+
+def _length(dwell: DwellFactor) -> float:
+    return 1.0 if dwell.attitude is None else dwell.attitude.length
+
+
+def _posterior_rotations(means: Means, noise: Noise, state: Floats, bendings: Floats) -> tuple[Floats, Floats]:
+    """Return the modes (D, 3) of the setting errors about the forces in ``means``, and the sums (D,) of the variances
+    of their two components across the force."""
+    axes = tangents(means.force_mps2)
+    sensitivities = state[:STATE_COUNT].reshape(3, 4)[:, :3] + bendings
+    columns = rotation_map(means.force_mps2, sensitivities, axes)
+    weights = 1.0 / (noise.effective_sigma_mps2**2 / means.counts[:, None] + noise.scatter_mps2**2)
+    weighted = np.swapaxes(columns * weights[:, :, None], 1, 2)
+    prior = 0.0 if noise.attitude_unknown else 1.0 / noise.setting_rad**2
+    covariances = np.linalg.inv(weighted @ columns + prior * np.eye(2))
+    errors = means.readings - means.design @ state
+    modes = covariances @ weighted @ errors[:, :, None]
+    return (axes @ modes)[:, :, 0], np.einsum("dii->d", covariances)
+
+
+def bendings_of(carried: Carried, state: Floats) -> Floats:
+    """By how much the effects of the model change the mean readings of each dwell per unit of force, (D, 3, 3), from
+    central differences; zeros for effects that turn the platform, oscillate, or show in slews only."""
+    model, dwells = carried.model, carried.turned
+    out = np.zeros((len(dwells), 3, 3))
+    bent = [e for e in model.effects if not (isinstance(e, FrameEffect) or e.dynamic or e.oscillates or e.no_columns)]
+    bent = [effect for effect in bent if state[model.parts[str(effect)]].any()]
+    if not bent:
+        return out
+    stimulus = stimulus_of(dwells, model.bench, state)
+    step_mps2, firsts = _STEP * model.bench.gravity_mps2, np.cumsum([0, *(3 * len(d.pieces) for d in dwells)])[:-1]
+    for axis in range(3):
+        ends = list[Floats]()
+        for sign in (1.0, -1.0):
+            force = stimulus.force_mps2 + sign * step_mps2 * np.eye(3)[axis]
+            there = replace(stimulus, force_mps2=force)
+            ends.append(sum((e.added(there, state[model.parts[str(e)]][: len(e.coefficients)]) for e in bent),
+                            np.zeros((len(stimulus), 3))))  # fmt: skip
+        slopes = (ends[0] - ends[1]) / (2.0 * step_mps2)
+        counts = np.array([3 * len(dwell.pieces) for dwell in dwells])[:, None]
+        out[:, :, axis] = np.add.reduceat(slopes, firsts, axis=0) / counts
+    return np.where(np.abs(out) < _ABRUPT, out, 0.0)
+
+
+def rotated(vector: Floats, rotation_rad: Floats) -> Floats:
+    """A vector (3,) turned by a rotation vector (3,)."""
+    angle_rad = float(np.linalg.norm(rotation_rad))
+    if not angle_rad:
+        return vector
+    axis = rotation_rad / angle_rad
+    along = (axis @ vector) * axis
+    return along + np.cos(angle_rad) * (vector - along) + np.sin(angle_rad) * np.cross(axis, vector)
+
+
+def rotation_between(one: Floats, other: Floats) -> Floats:
+    """The rotation vector (3,) of the shortest turn from the direction of one vector (3,) to that of another."""
+    across = np.cross(one, other)
+    sine = float(np.linalg.norm(across))
+    return across * (np.arctan2(sine, one @ other) / sine) if sine else np.zeros(3)
+
+
+def _limited(rotation_rad: Floats) -> Floats:
+    """Return a rotation vector no longer than a step may be."""
+    angle_rad = float(np.linalg.norm(rotation_rad))
+    return rotation_rad * min(1.0, _FARTHEST_RAD / angle_rad) if angle_rad else rotation_rad
+
+
+def with_force(dwell: DwellFactor, force_mps2: Floats) -> DwellFactor:
+    """The dwell with another specific force at all its nodes, and a pose that has it up, of an arbitrary heading."""
+    pose = _pose(force_mps2 / np.linalg.norm(force_mps2))
+    pieces = (
+        replace(
+            piece, nodes=replace(piece.nodes, force_mps2=np.tile(force_mps2, (3, 1)), pose=np.tile(pose, (3, 1)))
+        )
+        for piece in dwell.pieces
+    )
+    return replace(dwell, pieces=tuple(pieces))
+
+
+def _pose(unit: Floats) -> Floats:
+    """Return the quaternion (x, y, z, w) of the shortest rotation that brings a direction up, that is to +y."""
+    x, y, z = unit
+    if y < -1.0 + 1e-12:
+        return np.array([1.0, 0.0, 0.0, 0.0])
+    quaternion = np.array([-z, 0.0, x, 1.0 + y])
+    return quaternion / np.linalg.norm(quaternion)
+
+
+def facing_readings(dwells: Sequence[DwellFactor], state: Floats, gravity_mps2: float) -> list[DwellFactor]:
+    """The dwells with the specific force that their mean readings alone show at ``state``, S^-1 (z - b) with the size
+    of g: where the search for attitudes that are not known begins."""
+    affine = state[:STATE_COUNT].reshape(3, 4)
+    out = list[DwellFactor]()
+    for dwell in dwells:
+        force = np.linalg.solve(affine[:, :3], dwell.means[4:] - affine[:, 3])
+        before = dwell.came_from
+        facing = with_force(dwell, gravity_mps2 * force / np.linalg.norm(force))
+        if before is not None:
+            facing = replace(facing, came_from=facing_readings([before], state, gravity_mps2)[0])
+        out.append(facing)
+    return out

@@ -1,0 +1,61 @@
+"""The rows of a recording sample by sample, from a second pass, for filterpy and for batch least squares."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.rows import Rows, basis, on_basis
+from kf_calib.estimation.dwell_columns import Carried, has_turns, turning_mps2
+from kf_calib.estimation.noise_model import Noise
+from kf_calib.estimation.nuisance_states import nuisance_map, nuisance_sigmas
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Rows of one piece, sample by sample.
+
+    - dwell: number of the dwell; moving: True for the slew after it.
+    - elapsed_s (n,): times of the samples.
+    - observation (n, 3, p): the design H.
+    - nuisances (n, 3, q): the columns of the dwell's nuisance states.
+    - nuisance_sigmas (q,): the prior sigmas of these.
+    - readings (n, 3): the readings.
+    """
+
+    dwell: int
+    elapsed_s: Floats
+    observation: Floats
+    nuisances: Floats
+    nuisance_sigmas: Floats
+    readings: Floats
+    moving: bool = False
+
+
+def samples_of(rows: Iterable[Rows], carried: Carried, noise: Noise) -> Iterator[Samples]:
+    """Yield samples from a second pass over the rows, with the columns of the first."""
+    every, columns = [*carried.turned, *carried.slews], [*carried.columns, *carried.slew_columns]
+    known = {(dwell.number, dwell.moving): (dwell, iter(own)) for dwell, own in zip(every, columns, strict=True)}
+    sigmas = nuisance_sigmas(noise)
+    for block in rows:
+        if (block.dwell, block.moving) not in known:
+            continue
+        dwell, pieces = known[block.dwell, block.moving]
+        regressor_map = nuisance_map([dwell], noise, carried.state)[0]
+        for part, u, _ in block.pieces:
+            own = next(pieces)
+            functions = basis(u, block.elapsed_s[part], carried.carrier_hz)
+            observation = (functions.T @ on_basis(own.reshape(len(own), -1))).reshape(len(u), *own.shape[1:])
+            regressors, readings = block.columns[part], block.readings[part]
+            if not carried.model.bench.angles:
+                regressors = np.tile(dwell.means[:4], (len(u), 1))
+            if dwell.attitude is not None or dwell.turned_rad is not None:
+                force = dwell.felt(regressors[:, 1:])
+                regressors = np.hstack([regressors[:, :1], force])
+                if has_turns(dwell):
+                    readings = readings + turning_mps2(dwell, force, carried.state)
+            nuisances = np.einsum("nc,icq->niq", regressors, regressor_map)
+            yield Samples(block.dwell, block.elapsed_s[part], observation, nuisances, sigmas, readings, block.moving)
