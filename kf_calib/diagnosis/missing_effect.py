@@ -49,7 +49,7 @@ def diagnose(run: Calibration | Source | str | PathLike[str], refits: Refits | N
 def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
     """Diagnose a calibration: look for an outlying dwell first, then for effects, with vibration averaged out."""
     if before.outlying:  # one wrong dwell is not an effect, but would make many effects significant
-        test = refits.assess(before)
+        test = replace(refits.assess(before), noise_p=min(dwell.p_value for dwell in before.outlying))
         verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {outlying_in_words(before.outlying)}"
         return Diagnosis(before=before, test=test, verdict=verdict, unknown=test.consistent is False)
     test = _without_vibration(refits, before, refits.assess(before))

@@ -37,12 +37,22 @@ from kf_calib.estimation.outlying_dwell import outlying_dwells, outlying_in_word
 from kf_calib.estimation.random_walk import predict, to_mean
 from kf_calib.estimation.remarks import misfit_remark, remarks_on
 from kf_calib.estimation.reml import FEWEST, degrees_of_freedom
-from kf_calib.estimation.results import Calibration, Estimate, Visit, consistency, estimate_of, estimates
+from kf_calib.estimation.results import (
+    Calibration,
+    Consistency,
+    Estimate,
+    OutlyingDwell,
+    Visit,
+    consistency,
+    estimate_of,
+    estimates,
+)
 from kf_calib.estimation.samples import Samples, samples_of
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.square_root_information import FilterStep
 from kf_calib.sources.files.recording import opened
 from kf_calib.support import stage
+from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.threads import one_blas_thread
 
 
@@ -123,7 +133,18 @@ def with_remarks(result: Calibration, passed: Pass) -> Calibration:
     counted = [*passed.tally.sentences(), *passed.tally.unmet(passed.settings.stillness)]
     notes += [f"{known.sentence}." for known in result.model.known]
     said = [*passed.source.warnings, *counted, *readings.warnings, *found, *usual, *notes]
-    return replace(result, tally=passed.tally, readings=readings, warnings=tuple(said), outlying=outlying)
+    judged = result.consistency if not outlying else _with_outlying(result.consistency, outlying)
+    return replace(
+        result, tally=passed.tally, readings=readings, warnings=tuple(said), outlying=outlying, consistency=judged
+    )
+
+
+def _with_outlying(judged: Consistency, outlying: Sequence[OutlyingDwell]) -> Consistency:
+    """Return the test of the misfit where a dwell does not fit the others, which a setting error estimated from the
+    misfit may hide."""
+    clearest = min(dwell.p_value for dwell in outlying)
+    p_value = min(1.0, 2.0 * min(clearest, judged.p_value if judged.p_value is not None else 1.0))
+    return replace(judged, p_value=p_value, consistent=p_value >= LEVEL)
 
 
 def _fit_again(result: Calibration, dwells: list[DwellFactor]) -> Fit:

@@ -18,6 +18,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_without
+from kf_calib.estimation.attitude import without_attitude
 from kf_calib.estimation.dwell_columns import Carried, Means, turning_mps2
 from kf_calib.estimation.noise_model import lift_rounding, mean_covariances
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Turn
@@ -64,7 +65,7 @@ def _test_dwell(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell
     if rest.consistency.consistent is not True:
         return None
     dwells, estimate, noise = result.fit.dwells, rest.estimate, rest.noise
-    carried = Carried(dwells, rest.model, estimate.state)
+    carried = Carried([without_attitude(dwell) for dwell in dwells], rest.model, estimate.state)
     means = carried.means[[k]]
     error, covariance = means.readings[0] - means.design[0] @ estimate.state, _covariance(rest, means)
     freedom = 1e9 if noise.setting_stated and noise.scatter_stated else max(rest.consistency.dof, 1)

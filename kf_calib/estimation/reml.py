@@ -39,7 +39,7 @@ HELD = 12
 
 _SIGNIFICANT = 5.41  # 1 % point of the likelihood-ratio statistic of a variance against zero, half of a chi2 with 1 dof
 _WALK = 0.5  # a walk has to gain at least this much log-likelihood
-_JUDGED = 2.71  # 5 % point of that statistic: a setting error that is clearer belongs to the noise that judges
+_JUDGED = 3.84  # 2.5 % point of that statistic: a setting error that is clearer belongs to the noise that judges
 
 Part = Literal["setting", "common", "scatter", "walk"]
 Parts = tuple[Part, ...]
