@@ -16,9 +16,9 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import AttitudeError, DwellFactor
-from kf_calib.effects import FrameEffect
+from kf_calib.effects import Effect, FrameEffect, Stimulus
 from kf_calib.estimation.dwell_columns import Carried, Means, stimulus_of
-from kf_calib.estimation.measurement_model import STATE_COUNT
+from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import Noise
 from kf_calib.estimation.nuisance_states import rotation_map, tangents
 
@@ -83,24 +83,43 @@ def bendings_of(carried: Carried, state: Floats) -> Floats:
     """By how much the effects of the model change the mean readings of each dwell per unit of force, (D, 3, 3), from
     central differences; zeros for effects that turn the platform, oscillate, or show in slews only."""
     model, dwells = carried.model, carried.turned
-    out = np.zeros((len(dwells), 3, 3))
-    bent = [e for e in model.effects if not (isinstance(e, FrameEffect) or e.dynamic or e.oscillates or e.no_columns)]
-    bent = [effect for effect in bent if state[model.parts[str(effect)]].any()]
+    out, bent = np.zeros((len(dwells), 3, 3)), bent_effects(model, state)
     if not bent:
         return out
     stimulus = stimulus_of(dwells, model.bench, state)
     step_mps2, firsts = _STEP * model.bench.gravity_mps2, np.cumsum([0, *(3 * len(d.pieces) for d in dwells)])[:-1]
+    counts = np.array([3 * len(dwell.pieces) for dwell in dwells])[:, None]
     for axis in range(3):
-        ends = list[Floats]()
-        for sign in (1.0, -1.0):
-            force = stimulus.force_mps2 + sign * step_mps2 * np.eye(3)[axis]
-            there = replace(stimulus, force_mps2=force)
-            ends.append(sum((e.added(there, state[model.parts[str(e)]][: len(e.coefficients)]) for e in bent),
-                            np.zeros((len(stimulus), 3))))  # fmt: skip
-        slopes = (ends[0] - ends[1]) / (2.0 * step_mps2)
-        counts = np.array([3 * len(dwell.pieces) for dwell in dwells])[:, None]
-        out[:, :, axis] = np.add.reduceat(slopes, firsts, axis=0) / counts
+        more, less = (
+            added_by(bent, replace(stimulus, force_mps2=stimulus.force_mps2 + step * np.eye(3)[axis]), model, state)
+            for step in (step_mps2, -step_mps2)
+        )
+        out[:, :, axis] = np.add.reduceat((more - less) / (2.0 * step_mps2), firsts, axis=0) / counts
     return np.where(np.abs(out) < _ABRUPT, out, 0.0)
+
+
+def bent_effects(model: Model, state: Floats) -> list[Effect]:
+    """The effects of a model that depend on the force in dwells, as far as their coefficients in ``state`` are not
+    zero."""
+    return [
+        effect
+        for effect in model.effects
+        if not (isinstance(effect, FrameEffect) or effect.dynamic or effect.oscillates or effect.no_columns)
+        and state[model.parts[str(effect)]].any()
+    ]
+
+
+def added_by(effects: Sequence[Effect], stimulus: Stimulus, model: Model, state: Floats) -> Floats:
+    """What effects of a model add to the readings, (m, 3), with their coefficients in ``state`` (p,)."""
+    out = np.zeros((len(stimulus), 3))
+    for effect in effects:
+        out += effect.added(stimulus, state[model.parts[str(effect)]][: len(effect.coefficients)])
+    return out
+
+
+def matrix_of(rotation_rad: Floats) -> Floats:
+    """The rotation matrix (3, 3) of a rotation vector (3,)."""
+    return np.array([rotated(axis, rotation_rad) for axis in np.eye(3)]).T
 
 
 def rotated(vector: Floats, rotation_rad: Floats) -> Floats:

@@ -119,6 +119,8 @@ class Fit:
         carried, out = self.carried, np.zeros((self.carried.model.count,) * 2)
         if carried.model.square:
             out += self._considered(free_attitude.square_changes(carried))
+        if not carried.model.bench.angles and carried.model.effects:
+            out += self._considered(free_attitude.triad_changes(carried))
         if self.noise.sensitivity_mps2_per_k is not None:
             out += self._considered(thermometer_errors(carried.turned, self.noise.sensitivity_mps2_per_k))
         for known in carried.model.known:

@@ -15,13 +15,16 @@ square, and the uncertainty of that enters the covariance (considered parameters
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.errors import UnobservableError
-from kf_calib.estimation.dwell_columns import Carried, Means
+from kf_calib.estimation.attitude import added_by, bent_effects, matrix_of
+from kf_calib.estimation.dwell_columns import Carried, Means, stimulus_of
 from kf_calib.estimation.measurement_model import FRAME, SQUARE, STATE_COUNT
 from kf_calib.estimation.noise_model import Noise
 from kf_calib.estimation.nuisance_states import nuisance_sigmas
@@ -38,6 +41,7 @@ DIRECTIONS: dict[str, Floats] = {
 
 _NINE = [k for k in range(STATE_COUNT) if k not in FRAME]
 _HOPELESS_SCALE, _HOPELESS_MPS2 = 0.2, 2.0
+_TRIAD_STEP_RAD = 1e-4
 
 
 def felt(readings: Floats, state: Floats) -> Floats:
@@ -110,6 +114,37 @@ def square_changes(carried: Carried) -> list[Floats]:
             own[:, :, channel, k] = force[:, :, axis] * affine[channel, channel] * carried.model.bench.square_rad
         out.append(own)
     return out
+
+
+def triad_changes(carried: Carried) -> list[Floats]:
+    """Changes (pieces, nodes, 3, 3) of each dwell's readings by the effects of the model if the pendulous and output
+    axes are turned by 1 sigma about each axis of the frame.
+
+    The frame of the sensors is not that of the block, in which these axes lie: the two differ by as much as the input
+    axes do from a square. With square axes, |f| does not tell the three coefficients of some effects from each other;
+    what else would is no more than this uncertainty of where their axes are.
+    """
+    model, state = carried.model, carried.state
+    sensitivity = state[:STATE_COUNT].reshape(3, 4)[:, :3]
+    unit = sensitivity / np.linalg.norm(sensitivity, axis=1, keepdims=True)
+    off_square = math.sqrt(float(np.mean((unit @ unit.T)[np.triu_indices(3, 1)] ** 2)))
+    sigma_rad = max(model.bench.square_rad, off_square)
+    stimulus = stimulus_of(carried.turned, model.bench, state)
+    changes = np.zeros((len(stimulus), 3, 3))
+    for axis in range(3):
+        ends = list[Floats]()
+        for sign in (1.0, -1.0):
+            turn = matrix_of(sign * _TRIAD_STEP_RAD * np.eye(3)[axis])
+            turned = replace(
+                stimulus, force_mps2=stimulus.force_mps2 @ turn.T, sensitivity=sensitivity @ turn.T,
+                previous_force_mps2=stimulus.previous_force_mps2 @ turn.T,
+            )  # fmt: skip
+            ends.append(added_by(bent_effects(model, state), turned, model, state))
+        changes[:, :, axis] = (ends[0] - ends[1]) * (0.5 * sigma_rad / _TRIAD_STEP_RAD)
+    shaped = changes.reshape(-1, 3, 3, 3)
+    width = carried.columns[0].shape[1]
+    padded = np.concatenate([shaped, np.zeros((len(shaped), width - 3, 3, 3))], axis=1)
+    return np.split(padded, np.cumsum([len(dwell.pieces) for dwell in carried.dwells])[:-1])
 
 
 def undetermined(covariance: Floats) -> list[str]:

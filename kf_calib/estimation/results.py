@@ -30,6 +30,7 @@ from kf_calib.support.tail_probabilities import LEVEL, f_tail
 from kf_calib.support.threads import one_blas_thread
 from kf_calib.support.units import field_unit, shown
 
+_WEAK = 5.0  # times the size that a coefficient may well have
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # larger sigmas: not determined
 
 
@@ -271,6 +272,9 @@ class Calibration:
         coefficients, (effects, gains) = self.model.coefficients, self.model.natural(self.estimate.state)
         sigmas = estimate.effect_sigma * gains
         sigmas = np.where((gains != 1.0) & (sigmas > effects), np.nan, sigmas)  # not known: sigma over value
+        if not self.bench.angles:  # |f| tells of some effects little more than that they are not absurdly large
+            scales = np.array([coefficient.scale for coefficient in coefficients])
+            sigmas = np.where((gains == 1.0) & (sigmas > _WEAK * scales), np.nan, sigmas)
         found = [
             *zip(
                 paper_parameters.SYMBOLS,
@@ -346,7 +350,7 @@ class Calibration:
         extra = (
             considered_information(self.noise, self.carried.means, self.carried.state).sum(axis=0) + self.fit.considered
         )
-        return Estimate(state, covariance + covariance @ extra @ covariance, self.estimate.undetermined)
+        return Estimate(state, enlarged(covariance, extra), self.estimate.undetermined)
 
     def __str__(self) -> str:
         return printed(self)
@@ -405,9 +409,23 @@ def estimate_of(factor: Floats, nominal_state: Floats, extra: Floats) -> Estimat
 def estimates(factors: Floats, nominal_state: Floats, extra: Floats) -> list[Estimate]:
     """The estimates from many factors (n, p, p + 1), as ``estimate_of``; ``extra`` is (p, p) or (n, p, p)."""
     states, covariances, undetermined = zip(*square_root_information.solve_all(factors, nominal_state), strict=True)
-    covariance = np.array(covariances)
-    covariance = covariance + covariance @ extra @ covariance
+    covariance = enlarged(np.array(covariances), extra)
     return [Estimate(*each) for each in zip(states, covariance, undetermined, strict=True)]
+
+
+def enlarged(covariance: Floats, extra: Floats) -> Floats:
+    """P + P B P for covariances P (..., p, p) and contributions B = ``extra`` (..., p, p) of considered parameters.
+
+    By a root of B, so that no variance is negative whatever the rounding of large ones is.
+    """
+    if not extra.any():
+        return covariance
+    sizes = np.sqrt(np.maximum(np.einsum("...ii->...i", extra), 0.0))
+    sizes = np.where(sizes > 0.0, sizes, 1.0)
+    values, vectors = np.linalg.eigh(extra / (sizes[..., :, None] * sizes[..., None, :]))
+    root = sizes[..., :, None] * vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    gained = covariance @ root
+    return np.asarray(covariance + gained @ np.swapaxes(gained, -1, -2), float)
 
 
 def consistency(fitted: Fit) -> Consistency:
