@@ -223,7 +223,8 @@ def _within(carried: Carried, noise: Noise, state: Floats) -> Floats:
     The mean of each dwell is left out: it is as if scatter had no limit. Scatter that is stated may be 1/f noise, which
     goes on within dwells.
     """
-    free = replace(noise, scatter_mps2=np.full(3, _FREE_MPS2), setting_rad=0.0, walk_mps2_per_sqrt_s=0.0)
+    setting_rad = noise.setting_rad if noise.attitude_unknown else 0.0
+    free = replace(noise, scatter_mps2=np.full(3, _FREE_MPS2), setting_rad=setting_rad, walk_mps2_per_sqrt_s=0.0)
     columns = [own[..., STATE_COUNT:] for own in carried.columns]
     if noise.sensitivity_mps2_per_k is not None:
         errors = thermometer_errors(carried.turned, noise.sensitivity_mps2_per_k)

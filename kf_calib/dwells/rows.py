@@ -82,6 +82,8 @@ class Rows:
     - taken: number of readings that a row stands for.
     - pose_sigma_rad: uncertainty of the pose due to noise of the angles.
     - turns: whole turns by which the pose goes beyond the angles as recorded.
+    - along (3,): unit vector of the mean reading where no angles are used, which is the force but for scale factors and
+      biases; else None.
     """
 
     dwell: int
@@ -97,6 +99,16 @@ class Rows:
     taken: int = 1
     pose_sigma_rad: float = 0.0
     turns: tuple[int, ...] = ()
+    along: Floats | None = None
+
+    @property
+    def felt(self) -> tuple[Floats, Floats]:
+        """Innovations (3, n) and readings (n, 3) as far as no rotation changes them: all of them with angles, else
+        their parts along the force. A body in the hand creeps and trembles, which is no noise of its sensors."""
+        if self.along is None:
+            return self.innovation, self.readings
+        part = np.outer(self.along, self.along)
+        return part @ self.innovation, self.readings @ part
 
 
 def model_rows(
@@ -161,7 +173,13 @@ def _rows(block: Block, bench: Bench, force: Floats | None) -> Rows:
     return Rows(
         block.dwell, block.elapsed_s, columns, block.accel_mps2, innovation, force is not None, pieces,
         pose_sigma_rad=block.pose_sigma_rad, turns=block.turns,
+        along=None if bench.angles else _direction(block.accel_mps2.mean(axis=0)),
     )  # fmt: skip
+
+
+def _direction(vector: Floats) -> Floats:
+    """Return the unit vector of a vector (3,); zeros for one of no length."""
+    return vector / max(float(np.linalg.norm(vector)), 1e-300)
 
 
 def _slew_rows(block: Block, bench: Bench, curve: Curve) -> Rows:

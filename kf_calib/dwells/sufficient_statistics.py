@@ -212,6 +212,17 @@ class DwellFactor:
         """Sums of squares (pieces, 3) of the readings about their fit by the basis functions."""
         return (self.triangles[:, self.width :, self.width :] ** 2).sum(axis=1)
 
+    def squares_along(self, weights: Floats) -> Floats:
+        """The same (pieces,) of one combination of the channels with weights (3,)."""
+        return np.asarray(((self.triangles[:, self.width :, self.width :] @ weights) ** 2).sum(axis=1), float)
+
+    @cached_property
+    def spread(self) -> Floats:
+        """Covariance (3, 3) of the readings about their mean, courses and noise within the dwell alike."""
+        parts = self.triangles[:, :, self.width :]
+        mean = self.means[4:]
+        return np.asarray(np.einsum("pri,prj->ij", parts, parts) / self.counts.sum() - np.outer(mean, mean), float)
+
     @cached_property
     def counts(self) -> Floats:
         """Number of readings of each piece, (pieces,)."""
@@ -473,11 +484,12 @@ class Folder:
             rows.dwell, fold(rows, self.carrier_hz), moving=rows.moving, pose_sigma_rad=rows.pose_sigma_rad,
             turns=rows.turns,
         )  # fmt: skip
+        innovation, readings = rows.felt
         if not rows.moving and growing.autocovariance_count(rows.dwell) < _CORRELATED_SAMPLES:
-            left = less_curve(rows.innovation, rows.elapsed_s, self.carrier_hz)
+            left = less_curve(innovation, rows.elapsed_s, self.carrier_hz)
             own, spectrum = Autocovariance.of(left), Spectrum.of(left, rows.elapsed_s)
             block = replace(block, autocovariance=own, spectrum=spectrum)
         self._cells = self._cells or Cells.of(rows.elapsed_s)
         if self._cells and not rows.moving and not block.averaged:
-            block = replace(block, trace=Trace.of(rows.readings, rows.elapsed_s, self._cells))
+            block = replace(block, trace=Trace.of(readings, rows.elapsed_s, self._cells))
         growing.add(block)

@@ -94,11 +94,7 @@ class LongestDwells:
 
     def allan_deviation(self) -> AllanDeviation:
         """The Allan deviation of what was collected."""
-        state = self.result.estimate.state
-        series = [
-            np.concatenate([piece.readings - piece.observation @ state for piece in pieces])
-            for pieces in self.kept.values()
-        ]
+        series = [np.concatenate([piece.residual_mps2 for piece in pieces]) for pieces in self.kept.values()]
         times = [np.concatenate([piece.elapsed_s for piece in pieces]) for pieces in self.kept.values()]
         period_s = float(np.median(np.concatenate([np.diff(each) for each in times])))
         sizes = cluster_sizes(max(map(len, series)))

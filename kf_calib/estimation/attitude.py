@@ -47,6 +47,8 @@ def at_their_modes(carried: Carried, noise: Noise, state: Floats) -> list[DwellF
         force = rotated(forces[k], _limited(moved[k] - before))
         attitude = AttitudeError(np.zeros(3), float(variances[k]), bendings[k])
         if noise.attitude_unknown:
+            variance_rad2 = variances[k] + _wander_rad2(dwell, noise, state, force)
+            attitude = replace(attitude, variance_rad2=float(variance_rad2))
             left_out = dwell.came_from and facing_readings([dwell.came_from], state, float(np.linalg.norm(force)))[0]
             out.append(replace(with_force(dwell, force), attitude=attitude, came_from=left_out))
         else:
@@ -58,6 +60,16 @@ def at_their_modes(carried: Carried, noise: Noise, state: Floats) -> list[DwellF
 def without_attitude(dwell: DwellFactor) -> DwellFactor:
     """The dwell linearised about the force that its pose shows."""
     return dwell.linearised(dwell.turned_rad, None) if dwell.attitude else dwell
+
+
+def _wander_rad2(dwell: DwellFactor, noise: Noise, state: Floats, force: Floats) -> float:
+    """Return the mean square of the angle by which the force wanders about its mean within a dwell: what the readings
+    spread across it beyond their noise. A hand creeps and trembles, and a mean of directions is shorter than each."""
+    inverse = np.linalg.inv(state[:STATE_COUNT].reshape(3, 4)[:, :3])
+    size = np.linalg.norm(force)
+    beyond = inverse @ (dwell.spread - np.diag(noise.sigma_mps2**2)) @ inverse.T
+    across = np.trace(beyond) - force @ beyond @ force / size**2
+    return float(np.clip(across / size**2, 0.0, _FARTHEST_RAD**2))
 
 
 def _length(dwell: DwellFactor) -> float:

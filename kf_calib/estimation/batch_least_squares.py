@@ -14,7 +14,6 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.qr import triangle
-from kf_calib.estimation.noise_model import Noise
 from kf_calib.estimation.samples import Samples
 from kf_calib.estimation.square_root_information import scale_columns
 
@@ -22,7 +21,7 @@ _SEEN = 1e-9  # singular values that are smaller relative to the largest are rou
 
 
 def least_squares(
-    samples: Iterable[Samples], noise: Noise, around: Floats
+    samples: Iterable[Samples], around: Floats
 ) -> tuple[Floats, Floats]:
     """State (p,) and covariance (p, p) from all samples, with a diffuse prior and without process noise.
 
@@ -36,13 +35,13 @@ def least_squares(
     by_dwell: dict[tuple[int, bool], list[Samples]] = {}
     for piece in samples:
         by_dwell.setdefault((piece.dwell, piece.moving), []).append(piece)
-    whitened = (_whitened(pieces, noise.of(pieces[0].moving)) for pieces in by_dwell.values())
+    whitened = (_whitened(pieces) for pieces in by_dwell.values())
     stacked = np.concatenate(list(whitened))
     scale = np.linalg.norm(stacked[:, :-1], axis=0)
     return _solution(stacked, np.where(scale > 0, scale, 1.0), around)
 
 
-def running_states(samples: Iterable[Samples], noise: Noise, around: Floats) -> Floats:
+def running_states(samples: Iterable[Samples], around: Floats) -> Floats:
     """States (D, p) from the samples of the first dwell alone, the first two, ... all D; slews belong to the dwell
     before. Each is the least-squares solution as in ``least_squares``; the rows so far are kept as a triangle."""
 
@@ -54,7 +53,7 @@ def running_states(samples: Iterable[Samples], noise: Noise, around: Floats) -> 
     for (_, moving), pieces in itertools.groupby(samples, key=lambda piece: (piece.dwell, piece.moving)):
         if not moving and len(upper):
             states.append(solved(upper))
-        rows = _whitened(list(pieces), noise.of(moving))
+        rows = _whitened(list(pieces))
         upper = triangle(np.vstack([upper, rows]))
     return np.array([*states, solved(upper)])
 
@@ -70,14 +69,14 @@ def _solution(rows: Floats, scale: Floats, around: Floats) -> tuple[Floats, Floa
     return np.asarray(solution, float), np.asarray(inverse @ inverse.T, float)
 
 
-def _whitened(pieces: list[Samples], noise: Noise) -> Floats:
+def _whitened(pieces: list[Samples]) -> Floats:
     """Return the whitened rows [H | z] (3 n, p + 1) of one dwell's samples."""
-    sigma = noise.effective_sigma_mps2
     rows = np.concatenate([np.concatenate([p.observation, p.readings[:, :, None]], axis=2) for p in pieces])
-    flat = (rows / sigma[:, None]).reshape(-1, rows.shape[2])
+    sigma = np.concatenate([np.repeat(p.sigma_mps2[None], len(p.readings), axis=0) for p in pieces])[:, :, None]
+    flat = (rows / sigma).reshape(-1, rows.shape[2])
     if pieces[0].nuisance_sigmas.size:
         shared = np.concatenate([p.nuisances * p.nuisance_sigmas for p in pieces])
-        shared = (shared / sigma[:, None]).reshape(len(flat), -1)
+        shared = (shared / sigma).reshape(len(flat), -1)
         left, singular, _ = np.linalg.svd(shared, full_matrices=False)
         flat = flat - left @ ((1 - 1 / np.sqrt(1 + singular**2))[:, None] * (left.T @ flat))
     return flat

@@ -88,12 +88,10 @@ def compare(
     stage.say("block engine")
     result, block_s = _timed(lambda: calibrate(source, settings, on_progress))
 
-    by_filterpy, conditions = list[Floats](), (
-        result.noise.weights, result.model.nominal_state()
-    )  # fmt: skip
+    by_filterpy, around = list[Floats](), result.model.nominal_state()
 
     def batch() -> Estimate:
-        return result.considering(*least_squares(held(samples()), *conditions))
+        return result.considering(*least_squares(held(samples()), around))
 
     def samples() -> Iterator[Samples]:
         return samples_of(Pass(source, settings).rows(), result.carried, result.noise.weights)
@@ -115,7 +113,7 @@ def compare(
     }
     ways = {name: _against(way, result.estimate) for name, way in ways.items()}
     longest = LongestDwells(result)
-    running = {"filterpy": by_filterpy, "batch": running_states(held(longest.passed_by(samples())), *conditions)}
+    running = {"filterpy": by_filterpy, "batch": running_states(held(longest.passed_by(samples())), around)}
     differences = {name: _along(states, result) for name, states in running.items()}
     allan = None if isinstance(source, Table) else longest.allan_deviation()
     return Comparison(result, ways, tuple(_remarks(settings, result)), differences, allan)

@@ -27,6 +27,7 @@ from kf_calib.estimation.attitude import facing_readings, without_attitude
 from kf_calib.estimation.dwell_columns import Carried, Means, candidate_columns, stimulus_of
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import ATTITUDE_UNKNOWN_RAD, FLOOR_MPS2, Noise, steps, within_dwells
+from kf_calib.estimation.nuisance_states import along_force, sensitivities_of
 from kf_calib.estimation.relinearisation import SETTLED, UNSETTLED, descended, left_to_settle, linearised
 from kf_calib.estimation.reml import Part, gain_of, misfit, restoring_gains, with_dwell_parts, with_shared_noise
 from kf_calib.estimation.score_test import falls
@@ -246,8 +247,9 @@ def fit(
         noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
         turning = noise.weights.setting_rad > 0.0
         fitted = replace(fitted, carried=carried, noise=noise)
-        if model.walks:
-            own = within_dwells(dwells, noise.walk_mps2_per_sqrt_s)
+        if model.walks or noise.attitude_unknown:
+            along = _along(carried, noise)
+            own = within_dwells(carried.dwells, noise.walk_mps2_per_sqrt_s, along)
             within = replace(within, sigma_mps2=own.sigma_mps2, inflation=own.inflation)
         # a constant without a derivative holds the input axes near their linearisation, so that convergence is slow
         still = (np.abs(moved) <= _STILL * reach).all() and not model.stepped
@@ -256,6 +258,13 @@ def fit(
     if not bench.angles and left > UNSETTLED:
         raise UnobservableError(_not_settled(model))
     return fitted
+
+
+def _along(carried: Carried, noise: Noise) -> Floats | None:
+    """Return the weights (D, 3) of the channels in the size of the force where attitudes are not known, else None."""
+    if not noise.attitude_unknown:
+        return None
+    return along_force(carried.turned, sensitivities_of(carried.turned, carried.state))
 
 
 def _not_settled(model: Model) -> str:
@@ -289,13 +298,15 @@ def _begun(dwells: list[DwellFactor], model: Model, slews: Sequence[DwellFactor]
 
     Raises UnobservableError if the poses tell too little.
     """
-    within = replace(within_dwells(dwells, walk_mps2_per_sqrt_s), walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
     if model.bench.angles:
+        within = replace(within_dwells(dwells, walk_mps2_per_sqrt_s), walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
         dwells = [without_attitude(dwell) for dwell in dwells]
         return Fit(Carried(dwells, model, model.nominal_state(), slews), within)
-    stated = model.bench.scatter_sigma_mps2
+    readings, stated = np.array([dwell.means[4:] for dwell in dwells]), model.bench.scatter_sigma_mps2
+    facing_up = readings / np.linalg.norm(readings, axis=1, keepdims=True)
+    within = within_dwells(dwells, walk_mps2_per_sqrt_s, facing_up)
     noise = replace(
-        within, setting_rad=ATTITUDE_UNKNOWN_RAD, setting_stated=True,
+        within, walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s, setting_rad=ATTITUDE_UNKNOWN_RAD, setting_stated=True,
         scatter_mps2=np.full(3, stated or 0.0), scatter_stated=stated is not None,
     )  # fmt: skip
     bare = Model(model.bench, square=True)

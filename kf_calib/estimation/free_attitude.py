@@ -195,14 +195,12 @@ def most_informative(covariance: Floats, state: Floats, gravity_mps2: float) -> 
 
 def holding_frame(samples: Iterable[Samples], carried: Carried, noise: Noise) -> Iterator[Samples]:
     """Yield first a reading of each state that is fixed at zero, times g, then the samples."""
-    sigmas = nuisance_sigmas(noise)
-    count = len(sigmas)
-    for first in range(0, len(carried.model.fixed), 3):
-        observation = np.zeros((1, 3, carried.model.count))
-        for i, place in enumerate(carried.model.fixed[first : first + 3]):
-            observation[0, i, place] = carried.model.bench.gravity_mps2
-        number, start_s = carried.dwells[0].number, np.array([carried.dwells[0].start_s])
-        yield Samples(
-            number, start_s, observation, np.zeros((1, 3, count)), sigmas, np.zeros((1, 3))
-        )  # fmt: skip
+    fixed, sigmas = carried.model.fixed, nuisance_sigmas(noise)
+    if fixed:
+        observation = np.zeros((len(fixed), 1, carried.model.count))
+        observation[np.arange(len(fixed)), 0, list(fixed)] = carried.model.bench.gravity_mps2
+        number, start_s = carried.dwells[0].number, np.full(len(fixed), carried.dwells[0].start_s)
+        none, readings = np.zeros((len(fixed), 1, len(sigmas))), np.zeros((len(fixed), 1))
+        sigma_mps2 = noise.effective_sigma_mps2[:1]
+        yield Samples(number, start_s, observation, none, sigmas, readings, np.zeros((len(fixed), 3)), sigma_mps2)
     yield from samples

@@ -61,14 +61,16 @@ def estimate(
         root = _DIFFUSE * widest * np.eye(count)
     else:
         root = np.linalg.cholesky(prior_covariance * np.outer(scale, scale))
-    kf = _Filter(form, nominal_state * scale, root, nuisance_sigmas(noise))
+    channels = 1 if noise.attitude_unknown else 3
+    kf = _Filter(form, nominal_state * scale, root, nuisance_sigmas(noise), channels)
     place, nis, done, previous_s = (-1, False), 0.0, 0, math.nan
     for piece in samples:
         if (piece.dwell, piece.moving) != place:
             if on_dwell is not None and done and not piece.moving:
                 on_dwell(kf.state() / scale)
-            kf.enter_dwell(noise.of(piece.moving).effective_sigma_mps2)
+            kf.enter_dwell()
             place = (piece.dwell, piece.moving)
+        kf.set_noise(piece.sigma_mps2)
         observations = np.concatenate([piece.observation / scale, piece.nuisances], axis=2)
         for observation, reading, now_s in zip(observations, piece.readings, piece.elapsed_s.tolist(), strict=True):
             if noise.walk_mps2_per_sqrt_s and now_s > previous_s:
@@ -108,14 +110,16 @@ def repeated(
 class _Filter:
     """Either of filterpy's two filters behind a common interface."""
 
-    def __init__(self, form: str, state: Floats, root: NDArray[np.floating[Any]], dwell_sigmas: Floats) -> None:
+    def __init__(
+        self, form: str, state: Floats, root: NDArray[np.floating[Any]], dwell_sigmas: Floats, channels: int
+    ) -> None:
         from filterpy.kalman import KalmanFilter, SquareRootKalmanFilter
 
         self.plain = form == "plain"
         self.dwell_sigmas = dwell_sigmas
         self.count = len(state)
         size = self.count + len(dwell_sigmas)
-        kf: Any = (KalmanFilter if self.plain else SquareRootKalmanFilter)(dim_x=size, dim_z=3)
+        kf: Any = (KalmanFilter if self.plain else SquareRootKalmanFilter)(dim_x=size, dim_z=channels)
         kf.x = np.concatenate([state, np.zeros(len(dwell_sigmas))])  # 1-D: a column would broadcast to (n, 3)
         full = np.zeros((size, size))
         full[: self.count, : self.count] = root
@@ -125,13 +129,15 @@ class _Filter:
             kf._P1_2 = full  # its setter would square the root and lose half the digits
         self.kf = kf
 
-    def enter_dwell(self, sigma_mps2: Floats) -> None:
-        """Reset the nuisance states to their prior, independent of everything before, and set the sigma of a
-        reading."""
+    def set_noise(self, sigma_mps2: Floats) -> None:
+        """Set the sigma of a reading."""
         if self.plain:
             self.kf.R = np.diag(sigma_mps2**2)
         else:
             self.kf._R1_2 = np.diag(sigma_mps2)  # its setter would square the root and lose half the digits
+
+    def enter_dwell(self) -> None:
+        """Reset the nuisance states to their prior, independent of everything before."""
         own = slice(self.count, None)
         self.kf.x[own] = 0.0
         matrix, sigma = (self.kf.P, self.dwell_sigmas**2) if self.plain else (self.kf._P1_2, self.dwell_sigmas)

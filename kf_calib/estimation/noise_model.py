@@ -36,6 +36,7 @@ TOO_SHORT = 4.0
 
 _AVERAGES = 60  # least number of averages of a block from which their own correlation is estimated
 _WANDER = 6
+_STEPS_ALONG = 30
 _ROUNDING = 1e-14  # relative to a dwell's variance
 _TURNED = 1e4  # sigmas of a mean reading: what an attitude that is not known may change it by
 
@@ -126,8 +127,12 @@ def steps(dwells: Sequence[DwellFactor], noise: Noise) -> Floats:
     return random_walk.variances(ends[:, 0], ends[:, 1], noise.walk_mps2_per_sqrt_s)
 
 
-def within_dwells(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float = 0.0) -> Noise:
+def within_dwells(
+    dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float = 0.0, along: Floats | None = None
+) -> Noise:
     """The noise within dwells, sigma_w and kappa of each accelerometer, pooled over all pieces.
+
+    along (D, 3): the weights of the channels in the size of the force, where nothing else is known in a dwell.
 
     The contribution of a random walk of known intensity is subtracted. Over a piece of n readings, the sum of squares
     about a parabola has the expectation sigma^2 (n - 3 kappa) if n is at least 40 kappa. If there is no such piece,
@@ -142,6 +147,8 @@ def within_dwells(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float = 0
     inflation, variance = np.array([known(total, i) for i in range(3)]).T
     if not dwells[0].averaged and total.count < _SHORT * inflation.max() * total.blocks:
         inflation, variance = _alike(total)
+    if along is not None:
+        return Noise(_sigma_along(dwells, along, inflation), inflation, within_seen=any(d.count > 1 for d in dwells))
     squares, counts = (np.concatenate([getattr(each, key) for each in dwells]) for key in ("squares", "counts"))
     if walk_mps2_per_sqrt_s:
         rest = np.concatenate([dwell.walk.rest for dwell in dwells])
@@ -152,6 +159,26 @@ def within_dwells(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float = 0
     pooled = np.where(long, squares, 0.0).sum(axis=0) / np.maximum(freedom, 1.0)
     sigma = np.sqrt(np.where(long.any(axis=0), pooled, variance))
     return Noise(sigma, inflation, within_seen=any(dwell.count > 1 for dwell in dwells))
+
+
+def _sigma_along(dwells: Sequence[DwellFactor], along: Floats, inflation: Floats) -> Floats:
+    """Return sigma_w (3,) of the accelerometers from the readings along the force alone, which have the variance sum of
+    (m_i sigma_i)^2 with m = ``along`` (D, 3).
+
+    The likeliest variances of such gamma distributed sums, by steps that keep them positive.
+    """
+    weights = along**2
+    squares = np.array([dwell.squares_along(m).sum() for dwell, m in zip(dwells, along, strict=True)])
+    freedom = np.array([np.maximum(dwell.counts - 3.0 * inflation.mean(), 0.0).sum() for dwell in dwells])
+    if not freedom.any():
+        freedom = np.array([max(dwell.count - 1.0, 0.0) for dwell in dwells])
+    if not squares.any() or not freedom.any():
+        return np.zeros(3)
+    variances = np.full(3, squares.sum() / (freedom @ weights).sum())
+    for _ in range(_STEPS_ALONG):
+        expected = weights @ variances
+        variances = variances * ((squares / expected**2) @ weights) / np.maximum((freedom / expected) @ weights, 1e-300)
+    return np.sqrt(variances)
 
 
 def _walk_products(dwells: Sequence[DwellFactor]) -> Floats:

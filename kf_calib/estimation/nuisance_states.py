@@ -1,8 +1,9 @@
 """The nuisance states of a dwell: its setting error, a small rotation, and the scatter of each accelerometer.
 
 A rotation about the axis t changes the reading of accelerometer i by t . (f x s_i), with s_i its sensitivity, to which
-what effects add per unit of force belongs. Where the attitude of the dwells is known but for a setting error, t are the
-three axes of the platform; where it is not known at all, two axes across f, since a rotation about f shows in nothing.
+what effects add per unit of force belongs. Where the attitude of the dwells is not known at all, nor that it stays the
+same within a dwell (a hand creeps and trembles), one combination of the three readings is left at every instant: that
+along the force, which no rotation changes.
 """
 
 from __future__ import annotations
@@ -17,9 +18,6 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.dwell_columns import bending_of
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise
-
-UNBOUNDED_RAD = 10.0
-"""Prior sigma of a rotation in the engines that need a finite one: what it tells is 1e-8 of a reading or less."""
 
 
 def tangents(force: Floats) -> Floats:
@@ -37,26 +35,38 @@ def rotation_map(force_mps2: Floats, sensitivities: Floats, axes: Floats) -> Flo
     return np.asarray(sensitivities @ np.swapaxes(turned, 1, 2), float)
 
 
+def along_force(dwells: Sequence[DwellFactor], sensitivities: Floats) -> Floats:
+    """The weights m (D, 3) of the three channels in the size of the force of each dwell: m = S^-T f / |f|.
+
+    No rotation changes m . reading, which is |f| but for biases; sensitivities S are (D, 3, 3).
+    """
+    force = np.array([dwell.felt(dwell.means[None, 1:4])[0] for dwell in dwells])
+    unit = force / np.linalg.norm(force, axis=1, keepdims=True)
+    return np.asarray(np.linalg.solve(np.swapaxes(sensitivities, 1, 2), unit[:, :, None])[:, :, 0], float)
+
+
+def sensitivities_of(dwells: Sequence[DwellFactor], state: Floats) -> Floats:
+    """Change (D, 3, 3) of the readings of each dwell per unit of force at ``state`` (p,), effects included."""
+    return state[:STATE_COUNT].reshape(3, 4)[:, :3] + np.array([bending_of(dwell) for dwell in dwells])
+
+
 def nuisance_sigmas(noise: Noise) -> Floats:
     """Prior sigmas (q,) of the nuisance states: of the rotations, rad, and of the offsets, m/s^2; those that are zero
-    are left out."""
-    rotations = np.full(2, UNBOUNDED_RAD) if noise.attitude_unknown else np.full(3, noise.setting_rad)
+    are left out, and rotations of an unknown attitude, of which readings along the force are free."""
+    rotations = np.full(0 if noise.attitude_unknown else 3, noise.setting_rad)
     return np.concatenate([rotations[rotations > 0], noise.scatter_mps2[noise.scatter_mps2 > 0]])
 
 
 def nuisance_map(dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> Floats:
     """The coefficients (D, 3, 4, q) of the nuisance states on the regressors 1, f_x, f_y, f_z, linearised at
     ``state``."""
-    sensitivity = state[:STATE_COUNT].reshape(3, 4)[:, :3]
-    axes = np.zeros((3, 0)) if not noise.setting_rad else np.eye(3)
-    scattering = np.flatnonzero(noise.scatter_mps2 > 0)
-    across = np.repeat(axes[None], len(dwells), axis=0)
-    if noise.attitude_unknown:
-        across = tangents(np.array([dwell.means[1:4] for dwell in dwells]))
-    count = across.shape[2]
+    turning = 0.0 < noise.setting_rad < np.inf
+    scattering, count = np.flatnonzero(noise.scatter_mps2 > 0), 3 if turning else 0
     out = np.zeros((len(dwells), 3, len(REGRESSORS), count + len(scattering)))
-    for k, dwell in enumerate(dwells):
-        for i, (x, y, z) in enumerate(sensitivity + bending_of(dwell)):
-            out[k, i, 1:, :count] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ across[k]  # f^T [s] t
+    if turning:
+        x, y, z = np.moveaxis(sensitivities_of(dwells, state), 2, 0)
+        none = np.zeros_like(x)
+        crossing = np.array([[none, -z, y], [z, none, -x], [-y, x, none]])  # (f x s) = f^T [s]
+        out[:, :, 1:, :3] = np.moveaxis(crossing, (0, 1), (2, 3))
     out[:, scattering, 0, count + np.arange(len(scattering))] = 1.0
     return out

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.rows import Rows, basis, on_basis
 from kf_calib.estimation.dwell_columns import Carried, has_turns, turning_mps2
 from kf_calib.estimation.noise_model import Noise
-from kf_calib.estimation.nuisance_states import nuisance_map, nuisance_sigmas
+from kf_calib.estimation.nuisance_states import along_force, nuisance_map, nuisance_sigmas, sensitivities_of
 
 
 @dataclass(frozen=True)
@@ -20,10 +20,13 @@ class Samples:
 
     - dwell: number of the dwell; moving: True for the slew after it.
     - elapsed_s (n,): times of the samples.
-    - observation (n, 3, p): the design H.
-    - nuisances (n, 3, q): the columns of the dwell's nuisance states.
+    - observation (n, c, p): the design H of the c channels: three accelerometers, or the size of the force alone where
+      attitudes are not known.
+    - nuisances (n, c, q): the columns of the dwell's nuisance states.
     - nuisance_sigmas (q,): the prior sigmas of these.
-    - readings (n, 3): the readings.
+    - readings (n, c): the readings.
+    - residual_mps2 (n, 3): the readings of the accelerometers less their prediction by the state of the linearisation.
+    - sigma_mps2 (c,): sigma of white readings with the same variance of their mean.
     """
 
     dwell: int
@@ -32,7 +35,19 @@ class Samples:
     nuisances: Floats
     nuisance_sigmas: Floats
     readings: Floats
+    residual_mps2: Floats
+    sigma_mps2: Floats
     moving: bool = False
+
+    def along(self, weights: Floats) -> Samples:
+        """The samples of one combination of the three channels, with weights (3,)."""
+        return replace(
+            self,
+            observation=np.einsum("i,nip->np", weights, self.observation)[:, None],
+            nuisances=np.einsum("i,niq->nq", weights, self.nuisances)[:, None],
+            readings=(self.readings @ weights)[:, None],
+            sigma_mps2=np.array([np.linalg.norm(weights * self.sigma_mps2)]),
+        )
 
 
 def samples_of(rows: Iterable[Rows], carried: Carried, noise: Noise) -> Iterator[Samples]:
@@ -44,6 +59,7 @@ def samples_of(rows: Iterable[Rows], carried: Carried, noise: Noise) -> Iterator
         if (block.dwell, block.moving) not in known:
             continue
         dwell, pieces = known[block.dwell, block.moving]
+        along = along_force([dwell], sensitivities_of([dwell], carried.state))[0] if noise.attitude_unknown else None
         regressor_map = nuisance_map([dwell], noise, carried.state)[0]
         for part, u, _ in block.pieces:
             own = next(pieces)
@@ -58,4 +74,10 @@ def samples_of(rows: Iterable[Rows], carried: Carried, noise: Noise) -> Iterator
                 if has_turns(dwell):
                     readings = readings + turning_mps2(dwell, force, carried.state)
             nuisances = np.einsum("nc,icq->niq", regressors, regressor_map)
-            yield Samples(block.dwell, block.elapsed_s[part], observation, nuisances, sigmas, readings, block.moving)
+            sigma_mps2 = noise.of(block.moving).effective_sigma_mps2
+            residual_mps2 = readings - observation @ carried.state
+            samples = Samples(
+                block.dwell, block.elapsed_s[part], observation, nuisances, sigmas, readings, residual_mps2,
+                sigma_mps2, block.moving,
+            )  # fmt: skip
+            yield samples.along(along) if along is not None else samples

@@ -22,7 +22,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
 from kf_calib.estimation import random_walk
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, flicker_sigma, shared_noise, slow_scatter
-from kf_calib.estimation.nuisance_states import nuisance_map, nuisance_sigmas
+from kf_calib.estimation.nuisance_states import along_force, nuisance_map, nuisance_sigmas, sensitivities_of
 from kf_calib.estimation.prior import Prior
 
 _SLOW = np.arange(1, 5)
@@ -96,7 +96,7 @@ def _weighted(
     ``columns`` is (d, pieces, K, 3, p). The rows of the three channels follow one another; the rows of the priors come
     last.
     """
-    sigma, priors = noise.effective_sigma_mps2, _dwell_priors(noise)
+    sigma, priors = noise.effective_sigma_mps2, nuisance_sigmas(noise)
     offsets, slow = len(priors), 0 if flicker_mps2 is None else len(_SLOW)
     if flicker_mps2 is not None:
         priors = np.append(priors, np.outer(np.maximum(flicker_mps2, FLOOR_MPS2), 1.0 / np.sqrt(_SLOW)))
@@ -107,9 +107,9 @@ def _weighted(
     regressors = np.array([dwell.regressors for dwell in dwells])
     nuisances = nuisance_map(dwells, noise, state)[:, :, None]
     waves = carried[..., :3] @ on_basis(np.array([_waves(dwell) for dwell in dwells])) if slow else None
-    rows = np.zeros((many, 3 * size + count, count + inside + width + 1))
+    parts = np.zeros((many, 3, size, count + inside + width + 1))
     for i in range(3):
-        part = rows[:, i * size : (i + 1) * size]
+        part = parts[:, i]
         part[..., :offsets] = (regressors @ nuisances[:, i]).reshape(many, size, offsets)
         if waves is not None:
             first = offsets + slow * i
@@ -122,17 +122,29 @@ def _weighted(
         if inside:
             part[..., count + i] = [dwell.walk.step for dwell in dwells]
         part /= sigma[i]
-        if inside:
-            for own, dwell in zip(part, dwells, strict=True):
-                own[:] = dwell.walk.whiten(own, float(noise.walk_mps2_per_sqrt_s / sigma[i]))
-    rows[:, 3 * size :, :count] = np.diag(1.0 / priors)
+    walks = np.repeat((noise.walk_mps2_per_sqrt_s / sigma)[None], many, axis=0)
+    if noise.attitude_unknown:
+        along = _unit_along(dwells, noise, state)
+        parts, walks = _combined(parts, along), np.sqrt((along**2)[:, None] @ (walks**2)[:, :, None])[:, :, 0]
+    if inside:
+        for dwell_parts, dwell, ratios in zip(parts, dwells, walks, strict=True):
+            for part, ratio in zip(dwell_parts, ratios.tolist(), strict=True):
+                part[:] = dwell.walk.whiten(part, ratio)
+    rows = np.zeros((many, parts.shape[1] * size + count, parts.shape[3]))
+    rows[:, :-count or None] = parts.reshape(many, -1, parts.shape[3])
+    rows[:, len(rows[0]) - count :, :count] = np.diag(1.0 / priors)
     return rows, count
 
 
-def _dwell_priors(noise: Noise) -> Floats:
-    """Return the prior sigmas of a dwell's nuisance states; rotations of an unknown attitude have none."""
-    sigmas = nuisance_sigmas(noise)
-    return np.concatenate([np.full(2, np.inf), sigmas[2:]]) if noise.attitude_unknown else sigmas
+def _unit_along(dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> Floats:
+    """Return the unit vectors (d, 3) by which whitened channels are combined to the size of the force."""
+    along = along_force(dwells, sensitivities_of(dwells, state)) * noise.effective_sigma_mps2
+    return along / np.linalg.norm(along, axis=1, keepdims=True)
+
+
+def _combined(parts: Floats, along: Floats) -> Floats:
+    """Return the rows (d, 1, r, n) of whitened channels (d, 3, r, n) along unit vectors (d, 3)."""
+    return np.einsum("di,dirn->drn", along, parts)[:, None]
 
 
 def _less(rows: Floats, count: int) -> Floats:
@@ -181,12 +193,14 @@ class _Alike:
 
     - pieces (d, pieces), rows (d, r): which of all pieces and rows are theirs.
     - triangles (d, pieces, K, K): of the basis functions. nuisances (d, r, n): orthonormal basis of nuisance states.
+    - along (d, 3): by which whitened channels are combined where attitudes are not known; else None.
     """
 
     pieces: NDArray[np.intp]
     rows: NDArray[np.intp]
     triangles: Floats
     nuisances: Floats
+    along: Floats | None
 
 
 class MisfitColumns:
@@ -198,9 +212,10 @@ class MisfitColumns:
     def __init__(self, dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> None:
         self._sigma, shared = noise.effective_sigma_mps2, len(shared_noise(dwells, noise)[1])
         flicker = flicker_of_scatter(dwells, noise)
-        priors = len(_dwell_priors(noise)) + (0 if flicker is None else 3 * len(_SLOW))
+        priors = len(nuisance_sigmas(noise)) + (0 if flicker is None else 3 * len(_SLOW))
         counts = np.array([len(dwell.pieces) for dwell in dwells])
-        lengths = 3 * counts * [dwell.width for dwell in dwells] + priors
+        channels = 1 if noise.attitude_unknown else 3
+        lengths = channels * counts * [dwell.width for dwell in dwells] + priors
         self._groups, self.ends = list[_Alike](), shared + np.cumsum([0, *lengths])
         """The first row of each dwell, and at last the number of rows."""
         first_piece, first_row = np.cumsum(counts) - counts, self.ends[:-1]
@@ -213,6 +228,7 @@ class MisfitColumns:
                 first_row[places, None] + np.arange(rows.shape[1]),
                 np.array([dwell.triangles[:, :width, :width] for dwell in some]),
                 np.linalg.qr(rows[..., :count])[0],
+                _unit_along(some, noise, state) if noise.attitude_unknown else None,
             )
             self._groups.append(group)
 
@@ -223,10 +239,12 @@ class MisfitColumns:
             own = columns[each.pieces]  # (d, pieces, K, 3, q)
             many, pieces, width, _, count = own.shape
             found = each.triangles @ on_basis(own.reshape(many, pieces, width, 3 * count))
-            found = found.reshape(own.shape) / self._sigma[:, None]
+            parts = np.moveaxis(found.reshape(own.shape) / self._sigma[:, None], 3, 1).reshape(many, 3, -1, count)
+            if each.along is not None:
+                parts = _combined(parts, each.along)
+            size = parts.shape[1] * parts.shape[2]
             rows = np.zeros((many, each.rows.shape[1], count))
-            size = 3 * pieces * width
-            rows[:, :size] = np.moveaxis(found, 3, 1).reshape(many, size, count)
+            rows[:, :size] = parts.reshape(many, size, count)
             out[each.rows] = rows - each.nuisances @ (np.swapaxes(each.nuisances[:, :size], 1, 2) @ rows[:, :size])
         return out
 
@@ -238,7 +256,7 @@ def with_frame(rows: list[Floats], model: Model, noise: Noise, first: int = 0) -
         return rows
     own, inside = np.zeros((len(model.fixed), rows[first].shape[1])), 3 if noise.walk_mps2_per_sqrt_s else 0
     for k, place in enumerate(model.fixed):
-        own[k, inside + place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2[k % 3]
+        own[k, inside + place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2[0]
     return [*rows[:first], np.vstack([own, rows[first]]), *rows[first + 1 :]]
 
 

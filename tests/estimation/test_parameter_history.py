@@ -103,10 +103,10 @@ def test_running_batch_least_squares_is_that_of_the_first_dwells() -> None:
     run = Run(seed=2, dwells=9, count=80, setting_deg=0.01)
     result = calibrate(run)
     samples = list(samples_of(Pass(run, result.settings).rows(), result.carried, result.noise.weights))
-    conditions = result.noise.weights, result.model.nominal_state()
-    states = running_states(samples, *conditions)
+    around = result.model.nominal_state()
+    states = running_states(samples, around)
     for count in (5, 9):
-        alone, covariance = least_squares([each for each in samples if each.dwell <= count], *conditions)
+        alone, covariance = least_squares([each for each in samples if each.dwell <= count], around)
         assert np.abs(states[count - 1] - alone).max() < 1e-6 * np.sqrt(np.diag(covariance)).min()
 
 

@@ -144,7 +144,7 @@ def test_the_size_of_f_in_poses_left_out_is_predicted_within_its_covariance() ->
         rest = evaluate([*dwells[:4], *dwells[5:]], result.bench, Settings())
         affine = rest.estimate.state.reshape(3, 4)
         force = np.linalg.solve(affine[:, :3], dwells[4].means[4:] - affine[:, 3])
-        assert result.held_out.errors_mps2[4, 0] == pytest.approx(np.linalg.norm(force) - G, rel=0.02, abs=1e-5)
+        assert result.held_out.errors_mps2[4, 0] == pytest.approx(np.linalg.norm(force) - G, rel=0.05, abs=1e-5)
         assert 0.1 < np.mean(result.held_out.statistics) < 3.0
 
 
