@@ -103,21 +103,29 @@ class Evidence:
         if refit is not None and refit.noise.sensitivity_mps2_per_k is not None:
             noise = replace(noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
             (alone,) = self._rows(self._fit.carried, noise)
-        own, *related = [alone] if refit is None else self._rows(refit.carried, noise, self._relations(refit))
+        averaged = noise
+        if refit is not None and refit.dwells[0].averaged != self._fit.dwells[0].averaged:
+            # averages have a noise of their own; by that of single readings, of which there are more, it would be small
+            averaged = replace(noise, sigma_mps2=refit.noise.sigma_mps2, inflation=refit.noise.inflation)
+        own, *related = [alone] if refit is None else self._rows(refit.carried, averaged, self._relations(refit))
+        if refit is not None and not own.dof and not walk:
+            own, related, averaged = alone, [], noise  # nothing of it is seen
         own_length, length = (float(np.linalg.norm(each.known[:, -1])) for each in (own, alone))
         alone = replace(alone, known=_lengthened(alone.known, own_length))
         walking: Parts = ("walk",) if walk or self._walks else ()
         every: Parts = (*walking, "setting", "common")
-        without, with_, *with_related = (
-            likelihood_of(noise, every, each.means, self._fit.carried.state, each.known)
-            for each in (alone, own, *related)
+        without = likelihood_of(noise, every, alone.means, self._fit.carried.state, alone.known)
+        with_, *with_related = (
+            likelihood_of(averaged, every, rows.means, self._fit.carried.state, rows.known) for rows in (own, *related)
         )
         relations = [(likelihood, rows.dof) for likelihood, rows in zip(with_related, related, strict=True)]
         free = self._free(len(alone.means.counts))
         found = (self._weighed(with_, without, parts + walking, own.dof, relations) for parts in free)
-        # What is kept of the readings for the sake of an oscillation alone is noise to all others, which leave it out.
-        on_carrier = refit is not None and refit.dwells[0].carrier_hz != self._fit.dwells[0].carrier_hz
-        more = 0.5 * (own_length**2 - length**2) if on_carrier else 0.0
+        # Readings that are folded otherwise, on a carrier or averaged, leave more or less of themselves within dwells.
+        # That is no evidence for what they were folded for: it counts as noise does.
+        folded, before = (refit or self._fit).dwells[0], self._fit.dwells[0]
+        otherwise = (folded.carrier_hz, folded.averaged) != (before.carrier_hz, before.averaged)
+        more = 0.5 * (own_length**2 - length**2) if otherwise else 0.0
         return [replace(each, log=each.log + more) for each in found if each is not None]
 
     def _relations(self, refit: Fit) -> list[Floats]:

@@ -155,7 +155,9 @@ def one_digit_seconds(duration_s: float) -> str:
 def _back_s(fitted: Fit, walk: str) -> float | None:
     """Return the time constant, s, with which an irregular drift returns, or None if it is no different from a walk."""
     model = fitted.carried.model
-    walked = fit(fitted.dwells, model + effect_named(walk, model.bench), 0.0, fitted.carried.slews)
+    walked = fit(
+        fitted.dwells, model + effect_named(walk, model.bench), 0.0, fitted.carried.slews, must_settle=False
+    )
     if not walked.noise.walk_mps2_per_sqrt_s:
         return None
     gain, back_s = walked.back_gain
@@ -172,7 +174,8 @@ def _trend_beside(fitted: Fit, family: Family) -> Trend | None:
     model = fitted.carried.model
     for text in family.formulas:
         model += effect_named(text, model.bench)
-    return trend_of(fit(fitted.dwells, model, fitted.noise.walk_mps2_per_sqrt_s, fitted.carried.slews))
+    walk = fitted.noise.walk_mps2_per_sqrt_s
+    return trend_of(fit(fitted.dwells, model, walk, fitted.carried.slews, must_settle=False))
 
 
 def families(fitted: Fit, known: Sequence[Effect] = (), frame: Frame | None = None) -> list[Family]:

@@ -209,7 +209,11 @@ class Fit:
 
 
 def fit(
-    dwells: list[DwellFactor], model: Model, walk_mps2_per_sqrt_s: float = 0.0, slews: Sequence[DwellFactor] = ()
+    dwells: list[DwellFactor],
+    model: Model,
+    walk_mps2_per_sqrt_s: float = 0.0,
+    slews: Sequence[DwellFactor] = (),
+    must_settle: bool = True,
 ) -> Fit:
     """Estimate the noise, the linearisation and the model's unknown constants in turn until they no longer change.
 
@@ -217,6 +221,7 @@ def fit(
     - model: the model to fit.
     - walk_mps2_per_sqrt_s: stated intensity of the random walk of the biases, m/s^2/s^(1/2).
     - slews: the slews; used only if the model has effects that show in slews only.
+    - must_settle: whether a fit that does not converge is an error; else it is returned as far as it came.
 
     Raises UnobservableError if the poses tell too little, or if the fit does not converge.
     """
@@ -233,7 +238,9 @@ def fit(
             fitted = replace(fitted, carried=linearised(fitted, model, fitted.carried.state), spreads=spreads)
         state, moved = _solved(fitted)
         if not (bench.angles or _sensible(state)):
-            raise UnobservableError(_not_sensible(model))
+            if must_settle:
+                raise UnobservableError(_not_sensible(model))
+            return fitted
         reach, left = _reach(fitted), left_to_settle(fitted, state)
         if searching:
             model = model.moved(np.clip(moved, -reach, reach))
@@ -255,7 +262,7 @@ def fit(
         still = (np.abs(moved) <= _STILL * reach).all() and not model.stepped
         if number >= _PASSES - 1 and still and (left < SETTLED or not turning):
             return fitted
-    if not bench.angles and left > UNSETTLED:
+    if must_settle and not bench.angles and left > UNSETTLED:
         raise UnobservableError(_not_settled(model))
     return fitted
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 SETTLED = 1e-4
 """In sigmas of each state: a smaller step ends the search."""
-UNSETTLED = 0.1
+UNSETTLED = 1.0
 """In sigmas: a fit whose last step was larger has not converged."""
 _HALVES = 6
 _UPHILL = 1e-6  # by which the misfit may grow, relative; more is no rounding

@@ -131,7 +131,7 @@ def _weighted(
             for part, ratio in zip(dwell_parts, ratios.tolist(), strict=True):
                 part[:] = dwell.walk.whiten(part, ratio)
     rows = np.zeros((many, parts.shape[1] * size + count, parts.shape[3]))
-    rows[:, :-count or None] = parts.reshape(many, -1, parts.shape[3])
+    rows[:, : rows.shape[1] - count] = parts.reshape(many, rows.shape[1] - count, parts.shape[3])
     rows[:, len(rows[0]) - count :, :count] = np.diag(1.0 / priors)
     return rows, count
 
@@ -239,7 +239,8 @@ class MisfitColumns:
             own = columns[each.pieces]  # (d, pieces, K, 3, q)
             many, pieces, width, _, count = own.shape
             found = each.triangles @ on_basis(own.reshape(many, pieces, width, 3 * count))
-            parts = np.moveaxis(found.reshape(own.shape) / self._sigma[:, None], 3, 1).reshape(many, 3, -1, count)
+            parts = np.moveaxis(found.reshape(own.shape) / self._sigma[:, None], 3, 1)
+            parts = parts.reshape(many, 3, pieces * width, count)
             if each.along is not None:
                 parts = _combined(parts, each.along)
             size = parts.shape[1] * parts.shape[2]
