@@ -112,7 +112,7 @@ def quantities(axes: tuple[Vector, ...]) -> dict[str, Quantity]:
 
 def split(text: str) -> tuple[str, str]:
     """Name and expression of ``NAME = FORMULA``; raises InputError where the name is none."""
-    name, _, expression = (part.strip() for part in text.partition("="))
+    name, _, expression = (" ".join(part.split()) for part in text.partition("="))  # on one line
     if not is_name(name.partition(":")[0]):
         raise InputError(f"{name[:60]!r} cannot name an effect: write NAME = FORMULA, the name of {NAME_RULE}.")
     return name, expression

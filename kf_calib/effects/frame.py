@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
@@ -257,9 +259,9 @@ class GravityError(Effect):
 
 def gimbal_number(variant: str, letters: str) -> int:
     """The gimbal a variant names: by the letter of its axis where that is one gimbal's only, else by number from 1."""
-    if letters.count(variant) == 1:
+    if len(variant) == 1 and letters.count(variant) == 1:
         return letters.index(variant)
-    if variant.isdigit() and 1 <= int(variant) <= len(letters):
+    if re.fullmatch("[0-9]{1,3}", variant) and 1 <= int(variant) <= len(letters):
         return int(variant) - 1
     known = ", ".join(letter if letters.count(letter) == 1 else str(k + 1) for k, letter in enumerate(letters))
     raise InputError(f"{variant!r} names no gimbal of this bench: use one of {known or 'none: it has no axes'}.")

@@ -149,6 +149,8 @@ def _common(calibrations: Sequence[SavedCalibration]) -> list[str]:
 def _track(symbol: str, calibrations: Sequence[SavedCalibration], days: Floats) -> Track:
     """Return the track of one parameter."""
     found = [next(p for p in each.parameters if p.symbol == symbol) for each in calibrations]
+    if len(units := sorted({p.unit for p in found})) > 1:
+        raise InputError(f"{symbol} is in {' and in '.join(units)} in these calibrations: give those of one model.")
     values, sigmas = (np.array([getattr(p, key) for p in found], float) for key in ("value", "sigma"))
     known = 1.0 / np.maximum(sigmas, 1e-300) ** 2
     mean = float(known @ values / known.sum())
