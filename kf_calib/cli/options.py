@@ -69,6 +69,7 @@ BENCH_OPTIONS = {
         "base: angles are relative to the bench (usual); inertial: stabilised platform.",
     ),
     "azimuth_deg": ("--azimuth", NUMBER, "DEG", "Azimuth of the bench's x axis from North toward East, deg."),
+    "date": ("--date", str, "DATE", "When the run began, ISO 8601 (UTC), where its stamps are no dates or wrong ones."),
     "nominal": ("--nominal", str, "JSON", "Nominal parameters that differ, for example '{\"theta1\": 0}'."),
 }  # fmt: skip
 _ANGLE_UNITS, _ACCEL_UNITS = ("rad", "deg"), ("m/s2", "g", "mg", "ug")

@@ -54,6 +54,8 @@ from kf_calib.exchange.calibration_parts import (
 )
 from kf_calib.sources.files.bags import fingerprint
 from kf_calib.sources.files.recording import Recording
+from kf_calib.sources.run_date import run_date
+from kf_calib.support import dates
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.plain_text import cut, sentence
 
@@ -161,19 +163,19 @@ def _at_constant(effect: effects.Effect, constant: float | None, origin: Path) -
 
 
 def saved(
-    result: Calibration, recording: str = "", sha256: str | None = None, first_ns: int | None = None
+    result: Calibration, recording: str = "", sha256: str | None = None, began: datetime | None = None
 ) -> SavedCalibration:
-    """A calibration as it is saved; recording: its name. sha256: of its file. first_ns: stamp of its first sample.
+    """A calibration as it is saved; recording: its name. sha256: of its file. began: when its run did, if known.
 
     Raises InputError where a calibration cannot be saved.
     """
     try:
-        return _saved(result, recording, sha256, first_ns)
+        return _saved(result, recording, sha256, began)
     except ValidationError as error:
         raise InputError(f"this calibration cannot be saved, as {_said(error)}.") from None
 
 
-def _saved(result: Calibration, recording: str, sha256: str | None, first_ns: int | None) -> SavedCalibration:
+def _saved(result: Calibration, recording: str, sha256: str | None, began: datetime | None) -> SavedCalibration:
     """The calibration as its parts say it."""
     estimate, noise, judged = result.estimate, result.noise, result.consistency
     return SavedCalibration(
@@ -202,19 +204,17 @@ def _saved(result: Calibration, recording: str, sha256: str | None, first_ns: in
             held_out_floor_mps2=result.held_out_floor_mps2,
         ),
         not_seen=_not_seen(result),
-        conditions=_conditions(result, first_ns),
+        conditions=_conditions(result, began),
         provenance=_provenance(result, recording, sha256),
         fixed=result.fixed,
     )  # fmt: skip
 
 
 def of_source(result: Calibration, source: Source) -> SavedCalibration:
-    """The calibration of a source: of a recording with its name, checksum and the date of its first sample."""
+    """The calibration of a source, with the date of its run, and of a recording with its name and checksum."""
     path = getattr(source, "path", None)
-    if path is None:
-        return saved(result)
-    first_ns = next((int(batch.accel.time_ns[0]) for batch in source if len(batch.accel)), None)
-    return saved(result, path.name, fingerprint(path), first_ns)
+    name, checksum = ("", None) if path is None else (path.name, fingerprint(path))
+    return saved(result, name, checksum, run_date(source))
 
 
 def save_calibration(
@@ -238,13 +238,13 @@ def _not_seen(result: Calibration) -> list[str]:
     return [str(each.effect) for each in seen if not each.visible]
 
 
-def _conditions(result: Calibration, first_ns: int | None) -> SavedConditions:
+def _conditions(result: Calibration, began: datetime | None) -> SavedConditions:
     """Return when and how the run was made."""
     dwells = [visit.dwell for visit in result.visits]
     warmth = np.concatenate([dwell.nodes.temperature_c for dwell in dwells])
     known = bool(np.isfinite(warmth).any())
     return SavedConditions(
-        began=_in_words(first_ns),
+        began=None if began is None else dates.written(began),
         duration_s=dwells[-1].end_s,
         temperature_min_c=float(np.nanmin(warmth)) if known else None,
         temperature_mean_c=float(np.nanmean(warmth)) if known else None,
@@ -252,18 +252,6 @@ def _conditions(result: Calibration, first_ns: int | None) -> SavedConditions:
         dwells=[SavedDwell(gimbal_deg=np.degrees(dwell.recorded_pose).tolist() if result.bench.axes else None,
                            start_s=dwell.start_s, end_s=dwell.end_s, readings=dwell.count) for dwell in dwells],
     )  # fmt: skip
-
-
-def date_of(first_ns: int | None) -> datetime | None:
-    """A stamp as a date in UTC; None for stamps that count from a start of a clock (before the year 2000)."""
-    if first_ns is None or not 946_684_800 <= first_ns / 1e9 < 4_102_444_800:
-        return None
-    return datetime.fromtimestamp(first_ns / 1e9, UTC)
-
-
-def _in_words(first_ns: int | None) -> str | None:
-    date = date_of(first_ns)
-    return None if date is None else date.isoformat(timespec="milliseconds")
 
 
 def _provenance(result: Calibration, recording: str, sha256: str | None) -> SavedProvenance:

@@ -98,7 +98,7 @@ class SavedDwell(Part):
 
 
 class SavedConditions(Part):
-    """Under which conditions it holds: when, how warm, which orientations. began: null where stamps are no dates."""
+    """Under which conditions it holds: when, how warm, which orientations. began: of the run; null if not known."""
 
     began: Text | None
     duration_s: Annotated[Seconds, Field(ge=0.0)]
