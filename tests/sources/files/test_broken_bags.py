@@ -105,7 +105,7 @@ def without_messages(folder: Path) -> Path:
 
 
 BROKEN: dict[str, tuple[Callable[[Path], Path], tuple[str, ...], str]] = {
-    "no tables": (altered("DROP TABLE messages"), (), "cannot be read as a ROS 2 bag (no such table"),
+    "no tables": (altered("DROP TABLE messages"), (), "cannot be read as a ROS 2 bag (it has no table messages)"),
     "other tables": (altered("ALTER TABLE topics RENAME COLUMN type TO k"), (), "no such column: type"),
     "no topics": (altered("DELETE FROM topics"), (), "has no accelerometer topic"),
     "no messages": (without_messages, (), "holds no accelerometer readings"),
@@ -117,7 +117,7 @@ BROKEN: dict[str, tuple[Callable[[Path], Path], tuple[str, ...], str]] = {
     "messages of another type": (altered("UPDATE topics SET type='sensor_msgs/msg/Imu' WHERE id=3",
                                          "DELETE FROM topics WHERE id=1"), (), "/temperature cannot be used: "),
     "short messages": (altered("UPDATE messages SET data=substr(data, 1, 30)"), (), "cannot be used: "),
-    "no bytes": (altered("UPDATE messages SET data=zeroblob(0)"), (), "cannot be used: "),
+    "no bytes": (altered("UPDATE messages SET data=zeroblob(0)"), (), "holds no accelerometer readings"),
     "text for bytes": (altered("UPDATE messages SET data='nothing'"), (), "cannot be used: "),
     "big-endian": (altered("UPDATE messages SET data=CAST(x'00000000' || substr(data, 5) AS BLOB)"), (),
                    "only 00 01 (little-endian CDR"),
