@@ -66,6 +66,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--count", type=int, default=sys.maxsize, help="changes to draw (all, where it is left out)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--line", type=int, help="only changes of this line")
+    parser.add_argument("--own", action="store_true", help="only the tests of the package, none of other folders")
     parser.add_argument("-o", "--out", type=Path, help="write the table here, too")
     options = parser.parse_args(words)
     tasks = drawn(modules(options.paths), options.count, options.seed, options.line)
@@ -73,7 +74,7 @@ def main(words: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory(prefix="mutation") as folder:
         copy = copied(ROOT, Path(folder))
         for package in sorted({path.parts[:2] for path, _ in tasks}):
-            with Runner(copy, Path(*package)) as runner:
+            with Runner(copy, Path(*package), not options.own) as runner:
                 for path, change in (task for task in tasks if task[0].parts[:2] == package):
                     begun_s = time.monotonic()
                     noticed_by = runner.noticed_by(path, change)

@@ -35,10 +35,10 @@ def copied(root: Path, folder: Path) -> Path:
 
 
 class Runner:
-    """The tests of one package of a copy, and the process that runs them."""
+    """The tests of one package of a copy, and the process that runs them; further: those of other folders, too."""
 
-    def __init__(self, root: Path, package: Path) -> None:
-        self._root, self._own = root, own_tests(root, package)
+    def __init__(self, root: Path, package: Path, further: bool = True) -> None:
+        self._root, self._own, self._further = root, own_tests(root, package), further
         self._folder = tempfile.TemporaryDirectory(prefix="mutation_map")
         place = Path(self._folder.name, "map.json")
         places = os.pathsep.join([str(root), str(Path(server.__file__).parents[1])])
@@ -60,14 +60,12 @@ class Runner:
         for stale in (place.parent / "__pycache__").glob(f"{place.stem}.*.pyc"):
             stale.unlink()
         try:
-            return self._of_its_folder(path, change.line) or self._of_others(path)
+            return self._of_its_folder(path, change.line) or (self._of_others(path) if self._further else "")
         finally:
             place.write_text(source)
 
     def _of_its_folder(self, path: Path, line: int) -> str:
         tests = self.map.tests_of(path, line)
-        if not tests:  # executed when it is loaded, or by none
-            tests = [test for test in self.map.seconds if test not in self.map.failed]
         files = sorted({test.partition("::")[0] for test in tests})
         usual_s = sum(self.map.seconds[test] for test in tests)
         return self._ask(files, tests, max(_SLOWER * usual_s, _LEAST_S)) if tests else ""

@@ -32,9 +32,11 @@ class TestMap:
 
     def tests_of(self, path: Path, line: int) -> list[str]:
         """The tests that execute a line, and then the others of their files, which may share what one has made once;
-        files that take little time first."""
-        place = f"{path}:{line}"
-        hits = {test for test, places in self.lines.items() if place in places and test not in self.failed}
+        files that take little time first. Of a line that is executed when its module is loaded, those of the module."""
+        place, module = f"{path}:{line}", f"{path}:"
+        hits = {test for test, places in self.lines.items() if place in places}
+        hits = hits or {test for test, places in self.lines.items() if any(one.startswith(module) for one in places)}
+        hits -= {*self.failed}
         files = {test.partition("::")[0] for test in hits}
         others = {test for test in self.seconds if test.partition("::")[0] in files} - hits - {*self.failed}
         cost = {name: sum(self.seconds[t] for t in hits if t.startswith(f"{name}::")) for name in files}
