@@ -8,7 +8,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects.effect import Coefficient, Effect, FrameEffect, Typical
+from kf_calib.effects.effect import Bearer, Coefficient, Effect, FrameEffect, Typical
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -56,6 +56,7 @@ class PlatformDrift(FrameEffect):
 
     family = "base and platform"
     name, title, source = "platform-drift", "drift of the platform", "geometry of the bench"
+    borne_by = Bearer.EITHER  # a block that creeps on its mount drifts in the same way
     typical = Typical((np.radians(0.01) / 3600, np.radians(1.0) / 3600))
 
     @property
@@ -125,6 +126,7 @@ class CrossTalk(Effect):
 
     family = "cross-axis"
     name, title, source = "cross-talk", "a share of another channel's reading", "IEEE Std 1293"
+    borne_by = Bearer.SENSORS
     formulas = ("before", "after")
     confused_with = "misalignment, always at rest"
     typical = Typical((1e-6, 100e-6))
@@ -243,7 +245,7 @@ class GravityError(Effect):
     family = "base and platform"
     name, title, source = "gravity-error", "wrong local gravity", "size of the reference"
     confused_with = "a common scale factor, always"
-    of_the_bench = True
+    borne_by = Bearer.BENCH
     typical = Typical((10e-6, 700e-6))
 
     @property
