@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
-from kf_calib.fleet.evidence import FLAT, log_evidence, log_evidence_of_modes, modes, sizes
+from kf_calib.fleet.evidence import FLAT, STEP, log_evidence, log_evidence_of_modes, modes, sizes
 from kf_calib.fleet.own_coefficients import OwnAndCommon
 from kf_calib.fleet.pooled_terms import Sums
 
 _NARROW, _WIDE = 0.02, 1e6  # sigma of one run: the smallest spread that is told from none, and a larger one than any
-_FINE = 1.05  # ratio of the spreads among which the likeliest is looked for
 _SEEN = 1e-6  # of the largest information of a unit: what is less counts as not seen
-_TAILS = (0.975, 0.025)  # of chi-squared, at the lower and the upper end of the interval
+_ABOVE = (0.025, 0.975)  # probability that chi-squared is above that at the lower and the upper end of the interval
 
 
 @dataclass(frozen=True)
@@ -43,8 +42,7 @@ def population(told: OwnAndCommon, members: Mask, largest: float) -> Population 
     misfits = _Misfits(told, members)
     if misfits.freedom < 1:
         return None
-    tried = np.concatenate([[0.0], sizes(_NARROW, largest, _FINE)])
-    spread = float(tried[np.argmax([misfits.log_likelihood(each) for each in tried.tolist()])])
+    spread = misfits.likeliest(largest)
     mean, covariance = misfits.mean(spread)
     low, high = misfits.interval()
     return Population(mean, covariance, spread, (low, high))
@@ -68,6 +66,16 @@ class _Misfits:
                  for info in (self._common.info, self._sums(0.0).info)]  # fmt: skip
         return int(self._seen.sum()) + ranks[0] - ranks[1]
 
+    def likeliest(self, largest: float) -> float:
+        """The spread of the largest likelihood: the best of a grid, and then the best near that."""
+        from scipy.optimize import minimize_scalar
+
+        tried = [0.0, *sizes(_NARROW, largest).tolist(), largest * STEP]
+        best = int(np.argmax([self.log_likelihood(each) for each in tried[:-1]]))
+        near = tried[max(best - 1, 0)], tried[best + 1]
+        refined: Any = minimize_scalar(lambda spread: -self.log_likelihood(spread), bounds=near, method="bounded")
+        return float(refined.x) if -refined.fun > self.log_likelihood(tried[best]) else tried[best]
+
     def log_likelihood(self, spread: float) -> float:
         """Restricted, but for a constant."""
         sums = self._sums(spread)
@@ -82,9 +90,9 @@ class _Misfits:
 
     def interval(self) -> tuple[float, float]:
         """The spreads at which the misfit is neither too large nor too small, with 95 % probability."""
-        from scipy.stats import chi2
+        from scipy.special import chdtri
 
-        low, high = (self._spread_of(float(chi2.ppf(tail, self.freedom))) for tail in _TAILS)
+        low, high = (self._spread_of(float(chdtri(self.freedom, above))) for above in _ABOVE)
         return low, high
 
     def _spread_of(self, misfit: float) -> float:
