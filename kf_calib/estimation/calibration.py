@@ -40,7 +40,7 @@ from kf_calib.estimation.reml import FEWEST, degrees_of_freedom
 from kf_calib.estimation.results import Calibration, Estimate, Visit, consistency, estimate_of, estimates
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.square_root_information import FilterStep
-from kf_calib.sources.files.recording import opened
+from kf_calib.sources.opening import opened
 from kf_calib.support import stage
 from kf_calib.support.threads import one_blas_thread
 

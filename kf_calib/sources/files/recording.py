@@ -22,7 +22,7 @@ from mcap.records import Metadata
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.gravity_alone import bench_without_angles
-from kf_calib.bench.streams import Batch, Source, Stream
+from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.bags import files_of
 from kf_calib.sources.files.cdr import CdrError, Decoder
@@ -45,7 +45,6 @@ from kf_calib.sources.files.mcap_file import Warn
 from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, RecordBlock
 from kf_calib.sources.files.packed_messages import are_packed, unpacked
 from kf_calib.sources.files.record_files import RecordFile, open_record_file
-from kf_calib.sources.tables.opening import is_table, open_table
 from kf_calib.support import dates
 
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
@@ -270,13 +269,6 @@ class _Decoders:
             joints = self.joints if role is POSES else None
             self.known[role] = self.parts.having(topic).decoder(role, topic, width, joints, self.warn)
         return self.known[role]
-
-
-def opened(source: Source | str | PathLike[str]) -> Source:
-    """The source itself, or the recording or table at a path."""
-    if not isinstance(source, str | PathLike):
-        return source
-    return open_table(source) if is_table(source) else Recording(source)
 
 
 class _Passage:

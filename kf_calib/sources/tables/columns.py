@@ -62,6 +62,11 @@ class Columns:
         return ", ".join(repr(cut(self.grid.header[k], 40)) for k in places)
 
     @property
+    def orientation(self) -> str:
+        """How orientations are told: ``face``, ``attitude`` or ``angles``; empty if they are not."""
+        return "face" if self.has("face") else "attitude" if self.has(*QUATERNION) else "angles" if self.angles else ""
+
+    @property
     def unused(self) -> list[int]:
         """Indices of the columns that mean nothing here."""
         return [k for k, own in enumerate(self.meanings) if not own.ours and self.grid.header[k]]

@@ -25,6 +25,7 @@ _LARGEST = (5_000_000, 50_000_000)  # bytes, of text and of a spreadsheet, which
 _LONGEST_CELL = 300  # characters; a longer one is a remark, of which the middle is left out
 _MOST_COLUMNS, _MOST_CELLS = 1000, 2_000_000
 _DELIMITERS = ";\t,|"
+_TELLING = 200  # lines by which the delimiter is told
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,9 @@ def _of_text(path: Path) -> Grid:
     first, _, rest = text.partition("\n")
     if first.lower().startswith("sep=") and len(first.strip()) == 5:
         delimiter, text, skipped = first.strip()[-1], rest, 1
-    delimiter = delimiter or _delimiter(text)
+    delimiter = delimiter or delimiter_of(
+        [line for line in text.splitlines()[:200] if line.strip() and not line.startswith("#")]
+    )
     try:
         reader = csv.reader(text.splitlines(), delimiter=delimiter, skipinitialspace=True)
         lines = [(reader.line_num + skipped, [_text(cell) for cell in row]) for row in reader]
@@ -102,12 +105,11 @@ def _decoded(path: Path, content: bytes) -> str:
         return content.decode("cp1252", errors="replace")
 
 
-def _delimiter(text: str) -> str:
-    """Return the delimiter with which the most lines have the same number of cells, two or more."""
-    lines = [line for line in text.splitlines()[:200] if line.strip() and not line.startswith("#")]
+def delimiter_of(lines: Sequence[str]) -> str:
+    """The delimiter with which the most of some lines have the same number of cells, two or more."""
 
     def fitness(delimiter: str) -> int:
-        widths = [len(row) for row in csv.reader(lines, delimiter=delimiter) if len(row) > 1]
+        widths = [len(row) for row in csv.reader(lines[:_TELLING], delimiter=delimiter) if len(row) > 1]
         return max(map(widths.count, set(widths)), default=0)
 
     try:

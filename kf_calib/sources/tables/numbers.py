@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -43,6 +44,29 @@ class Numbers:
             decimal = ","
         return cls(",", ".") if decimal == "," else cls()
 
+    @classmethod
+    def told_by(cls, cells: Iterable[str], *, commas_count: bool) -> Numbers | None:
+        """How numbers are written by the first cell that shows it; None where none does.
+
+        commas_count: whether a comma in a cell that could be either is one before decimals, since it separates no
+        cells.
+        """
+        could_be = False
+        for cell in cells:
+            if ("," in cell or "." in cell) and _NUMBER.fullmatch(cell):
+                if decimal := _decimal_of(cell):
+                    return _DECIMAL_COMMA if decimal == "," else DECIMAL_POINT
+                could_be |= commas_count and "," in cell
+        return _DECIMAL_COMMA if could_be else None
+
+    def with_point(self, cell: str) -> str:
+        """A number with a point before its decimals; raises ValueError where it has separators of thousands."""
+        if self.decimal == ".":
+            return cell
+        if "." in cell:
+            raise ValueError
+        return cell.replace(",", ".")
+
     def value(self, cell: Cell) -> float:
         """The number in a cell; raises ValueError where there is none."""
         if isinstance(cell, str):
@@ -67,6 +91,10 @@ class Numbers:
         return f"9{self.decimal}80665"
 
 
+DECIMAL_POINT = Numbers()
+_DECIMAL_COMMA = Numbers(",", ".")
+
+
 def _decimal_of(cell: str) -> str:
     """Return the decimal sign that a number shows, or nothing where it could be either or has none."""
     points, commas = cell.count("."), cell.count(",")
@@ -89,17 +117,13 @@ def stamps_of(grid: Grid, name: str, cells: list[Cell], or_else: str = "") -> li
 
     Raises InputError for a cell that is none; or_else: what else to do then.
     """
-    texts = [cell for cell in cells if isinstance(cell, str)]
-    parts = [found.groups() for text in texts if (found := _LOCAL.fullmatch(text))]
-    month_first = any(int(part[1]) > 12 for part in parts) or (
-        any(part[7] for part in parts) and not any(int(part[0]) > 12 for part in parts if len(part[0]) <= 2)
-    )
+    month_first = month_comes_first([cell for cell in cells if isinstance(cell, str)])
     wanted = "write a stamp such as 2026-05-04T13:45:00+02:00 or 04.05.2026 13:45:00, or seconds"
     wanted += f", or {or_else}" if or_else else ""
     out = list[datetime]()
     for row, cell in enumerate(cells):
         try:
-            out.append(cell if isinstance(cell, datetime) else _stamp(str(cell or ""), month_first))
+            out.append(cell if isinstance(cell, datetime) else stamp_of(str(cell or ""), month_first))
         except ValueError:
             raise grid.refuse(row, name, cell, wanted) from None
         if (out[row].tzinfo is None) != (out[0].tzinfo is None):
@@ -107,8 +131,16 @@ def stamps_of(grid: Grid, name: str, cells: list[Cell], or_else: str = "") -> li
     return out
 
 
-def _stamp(text: str, month_first: bool) -> datetime:
-    """Return one stamp; raises ValueError."""
+def month_comes_first(texts: Sequence[str]) -> bool:
+    """Whether local stamps have the month before the day, by all of them."""
+    parts = [found.groups() for text in texts if (found := _LOCAL.fullmatch(text))]
+    return any(int(part[1]) > 12 for part in parts) or (
+        any(part[7] for part in parts) and not any(int(part[0]) > 12 for part in parts if len(part[0]) <= 2)
+    )
+
+
+def stamp_of(text: str, month_first: bool) -> datetime:
+    """The stamp that a text says; raises ValueError where it says none."""
     try:
         return datetime.fromisoformat(text)
     except ValueError:

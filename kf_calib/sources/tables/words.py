@@ -32,8 +32,9 @@ _SPREAD = _words(
     "sd std stdev stddev sigma s rms dev deviation standardabweichung streuung stabw stdabw noise rauschen"
 )
 _READING = _words(
-    "a acc accel acceleration accelerometer accelerometers beschleunigung f force specific reading readings mean avg "
-    "average mittel mittelwert m sensor channel ch kanal messwert out output signal value wert raw"
+    "a acc accl accel acceleration accelerometer accelerometers beschleunigung beschl f force specific reading "
+    "readings imu linear mean avg average mittel mittelwert m sensor channel ch kanal messwert out output signal "
+    "value wert raw"
 )
 _ANGLE = _words(
     "outer middle inner aussen mitte mittlerer innen innere innerer aeussere ausserer angle winkel gimbal roll pitch "
@@ -44,6 +45,8 @@ _LENGTH = _words("dwell duration dauer length lange")
 _TEMPERATURE = _words("temp temperature temperatur t")
 _COUNT = _words("count counts n samples num number anzahl messungen stichprobe readings werte")
 _FACE = _words("face side seite position pose orientation lage richtung direction flache")
+_RATE = re.compile(r"(?:deg|degrees?|rad|radians?|°)\s*(?:/|p|per)\s*s|dps")
+_CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
 _FACES = re.compile(r"['’]?([+\-−–]?)\s*([xyz123])\s*([+\-−–]?|up|down|oben|unten)", re.IGNORECASE)
 
 
@@ -64,9 +67,16 @@ def is_unit(text: str) -> bool:
 
 def meaning_of(name: str) -> Meaning:
     """What the name of a column says."""
+    told = _meaning_of(name)
+    return told if told.ours or not _CAMEL.search(name) else _meaning_of(_CAMEL.sub(" ", name))
+
+
+def _meaning_of(name: str) -> Meaning:
     own = name.strip().lower()
     if own in ("qx", "qy", "qz", "qw", "-"):
         return Meaning("" if own == "-" else own, "")
+    if _RATE.search(own):
+        return Meaning("", "")
     text, unit = _unit_of(own)
     tokens = _tokens(text)
     channel = next((each for each in tokens if each in "xyz123"), "")
@@ -84,7 +94,7 @@ def meaning_of(name: str) -> Meaning:
         return Meaning("angle", unit if unit in ANGLE else "", rank)
     if words & _SPREAD or {"standard", "deviation"} <= words:
         return Meaning(f"s{channel}" if channel else "sd", unit if unit in ACCEL else "")
-    if channel and (words & _READING or not words):
+    if channel and (words & _READING or not words or unit in ACCEL):
         return Meaning(f"a{channel}", unit if unit in ACCEL else "")
     if words & _FACE:
         return Meaning("face", "")
