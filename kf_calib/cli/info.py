@@ -46,7 +46,8 @@ _AXES = {1: '--axes "z"', 2: '--axes "z x"'}
 """The same of axes where there are so many angles."""
 _BY_HAND = (
     "--no-angles",
-    "orientations: nothing was recognised as gimbal angles or attitude{by_column}; the command does without",
+    "orientations: no column was taken for gimbal angles{or_else} (--column says which is one); the command does "
+    "without",
 )
 
 
@@ -120,7 +121,7 @@ def _of_lines(
         inventory = inventory_of_lines(path, renamed, units)
     bench, angles = {**inventory.bench, **overrides(options)}, not options["no_angles"]
     if angles and inventory.has_angles is None:
-        angles, missing["angles"] = False, _BY_HAND[1].format(by_column=" (--column says which column is one)")
+        angles, missing["angles"] = False, _BY_HAND[1].format(or_else=" or attitude")
         words.append(_BY_HAND[0])
     axes = _AXES.get(inventory.angles or 0, _NAMED["axes"][0])
     for key in _lacks(bench, bool(inventory.has_angles) and angles):
@@ -169,7 +170,7 @@ def _show_table(
     words = _given(ctx, _not_of(ctx, OF_MESSAGES + OF_DWELLS))
     if table.is_by_hand and not options["no_angles"]:
         words.append(_BY_HAND[0])
-        missing.append(_BY_HAND[1].format(by_column=" or face (--column says which column is one)"))
+        missing.append(_BY_HAND[1].format(or_else=", attitude or face"))
     missing += [_NAMED[key][1] for key in lacking]
     words += [_AXES.get(table.angles, _NAMED[key][0]) if key == "axes" else _NAMED[key][0] for key in lacking]
     if table.count < least:

@@ -23,7 +23,7 @@ from kf_calib.sources.files.csv_heading import Heading
 from kf_calib.sources.files.line_parts import LineError, number_of, stamp_ns
 from kf_calib.sources.tables.columns import QUATERNION, READINGS, SPREADS
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, Numbers, month_comes_first, stamp_of
-from kf_calib.sources.tables.words import ANGLE, TIME, Meaning, meaning_of
+from kf_calib.sources.tables.words import ANGLE, NO_HEADER, TIME, Meaning, are_numbers, meaning_of
 from kf_calib.sources.units import Units, reading_units
 from kf_calib.support.plain_text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -144,6 +144,8 @@ class CsvColumns:
         lower = [name.lower() for name in names]
         if repeated := next((name for name in lower if name and lower.count(name) > 1), None):
             raise InputError(f"two columns are named {repeated!r}: rename or remove one of them.")
+        if are_numbers(header):
+            raise InputError(f"{NO_HEADER}: {cut(','.join(header), 60)!r}.")
         full = [row for row in heading.rows if len(row) == len(names)]
         columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2)
         columns._meanings = [meaning_of(name) for name in names]
@@ -264,6 +266,8 @@ class CsvColumns:
                 f"{self._quoted(places)} are in {' and '.join(sorted(set(units)))} by their names, and --angle-unit is "
                 f"{self.units.angle}: leave out --angle-unit."
             )
+        elif not all(_EXACT.fullmatch(self.names[at]) for at in places):
+            self.said.append(f"gimbal angles, outer to inner, from {self._quoted(places)}")
         return Quantity(tuple(places), tuple(ANGLE[unit] for unit in units))
 
     def quaternion(self) -> Quantity:

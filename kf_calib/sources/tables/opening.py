@@ -19,8 +19,9 @@ from kf_calib.sources.tables.numbers import Numbers
 from kf_calib.sources.tables.orientation import Orientation
 from kf_calib.sources.tables.table import Table
 from kf_calib.sources.tables.times import Times
-from kf_calib.sources.tables.words import ANGLE, face_of
+from kf_calib.sources.tables.words import ANGLE, NO_HEADER, are_numbers, face_of
 from kf_calib.sources.units import Units, mps2_per, reading_units
+from kf_calib.support.plain_text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _SAMPLES, _FAST_S = 50, 1.0
@@ -130,6 +131,8 @@ class Opening:
 
     def _refuse_missing(self) -> None:
         columns, header = self.columns, ", ".join(map(repr, self.grid.header))
+        if are_numbers(self.grid.header):
+            raise InputError(f"{self.grid.name}: {NO_HEADER}: {cut(','.join(self.grid.header), 60)!r}.")
         missing = [ours for ours in READINGS if not columns.has(ours)]
         if missing:
             raise InputError(
