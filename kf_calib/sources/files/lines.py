@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -73,9 +73,13 @@ class Lines:
     def bench(self) -> Bench:
         """The bench; a stream is read for it up to the first pose, which shows how the platform is described."""
         if self._bench is None:
-            self._waiting = self._begin()
-            with self._waiting.closed_on_failure():
-                self._bench = self._describe_bench(self._waiting)
+            passage = self._begin()
+            with passage.closed_on_failure():
+                self._bench = self._describe_bench(passage)
+            if self._path:  # it is read from its beginning again, if it is
+                passage.close()
+            else:
+                self._waiting = passage
         return self._bench
 
     @property
@@ -245,12 +249,12 @@ class _Passage:
         self._file = stream if isinstance(stream, TextFile) else None
         self.fraction = 0.0 if self._file else math.nan
         self._blocks = self._split(stream)
-        self._ahead = list[Batch]()
+        self._ahead, self._said = list[Batch](), list[str]()
         self._has_accel = self._has_pose = False
 
     def sentences(self) -> list[str]:
         """What was taken for what, where that is not plain, and what was not used."""
-        told = f"{'; '.join(self.parser.said)}. {HOW}." if self.parser.said else ""
+        told = f"{'; '.join(self._said)}. {HOW}." if self._said else ""
         trouble = self._file.trouble if self._file else ""
         return [sentence for sentence in (told, trouble) if sentence] + self.account.sentences()
 
@@ -260,9 +264,13 @@ class _Passage:
         try:
             yield
         except BaseException:
-            if self._file:
-                self._file.close()
+            self.close()
             raise
+
+    def close(self) -> None:
+        """Closes a file opened here."""
+        if self._file:
+            self._file.close()
 
     def survey(self) -> None:
         """Reads up to the first pose, if there must be one, and keeps what it has read."""
@@ -274,10 +282,13 @@ class _Passage:
             self._ahead.append(batch)
 
     def __iter__(self) -> Iterator[Batch]:
-        while self._ahead:
-            yield self._ahead.pop(0)
-        while (batch := self._next_batch()) is not None:
-            yield batch
+        try:
+            while self._ahead:
+                yield self._ahead.pop(0)
+            while (batch := self._next_batch()) is not None:
+                yield batch
+        finally:
+            self.close()
         met = {"readings": self._has_accel, "platform angles": self._has_pose or not self._angles}
         for what, is_met in met.items():
             if not is_met:
@@ -305,6 +316,7 @@ class _Passage:
             raise CountsError(f"{self._name}: {error}", error.scale) from None
         except InputError as error:
             raise InputError(f"{self._name}: {error}") from None
+        self._said = self.parser.said
         self.account.lines += heading
         self._ahead.append(self._parse(lines[heading:]))
 
@@ -332,9 +344,8 @@ class _Passage:
 
     def _read(self, stream: BinaryIO | TextFile) -> Iterator[bytes]:
         read = getattr(stream, "read1", stream.read)  # read1 does not wait until a whole block has come
-        with self._file or nullcontext():
-            while block := self._read_block(read):
-                yield block
+        while block := self._read_block(read):
+            yield block
 
     def _read_block(self, read: Callable[[int], bytes]) -> bytes:
         try:

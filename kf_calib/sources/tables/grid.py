@@ -22,6 +22,7 @@ TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
 EXCEL_SUFFIXES = (".xlsx", ".xlsm")
 OLD_SUFFIXES = (".xls", ".ods")
 _LARGEST = (5_000_000, 50_000_000)  # bytes, of text and of a spreadsheet, which may hold pictures
+_SHOWN = 6  # rows in a message
 _LONGEST_CELL = 300  # characters; a longer one is a remark, of which the middle is left out
 _MOST_COLUMNS, _MOST_CELLS = 1000, 2_000_000
 _DELIMITERS = ";\t,|"
@@ -130,6 +131,12 @@ def _of_excel(path: Path) -> Grid:
     hidden = ", ".join(repr(sheet.name) for sheet in sheets if sheet.hidden)
     remarks = [f"sheet {seen[0].name!r} was read, not {others}; put the table on the first sheet"] if others else []
     remarks += [f"{hidden} was not read, as it is hidden"] if hidden else []
+    if rows := seen[0].left_out:
+        numbers = ", ".join(map(str, rows[:_SHOWN])) + " ..." * (len(rows) > _SHOWN)
+        one = len(rows) == 1
+        remarks.append(
+            f"row{'s' * (not one)} {numbers} {'was' if one else 'were'} not read, as hidden rows are no data"
+        )
     return replace(_headed(str(path), lines), remarks=tuple(remarks))
 
 

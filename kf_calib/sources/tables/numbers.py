@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -32,16 +32,18 @@ class Numbers:
         seen = dict[str, tuple[int, int]]()
         for k, row in enumerate(grid.rows):
             for j, cell in enumerate(row):
-                if isinstance(cell, str) and _NUMBER.fullmatch(cell) and (decimal := _decimal_of(cell)):
+                if not isinstance(cell, str) or not _shows_another(cell, seen):
+                    continue
+                if _NUMBER.fullmatch(cell) and (decimal := _decimal_of(cell)):
                     seen.setdefault(decimal, (k, j))
         if len(seen) == 2:
             (_, (k, j)), (other, _) = sorted(seen.items(), key=lambda item: item[1])[::-1]
             raise grid.refuse(k, grid.header[j], grid.rows[k][j], f"other numbers of the table have decimals after "
                               f"{other!r}: write all of them in one way")  # fmt: skip
         decimal = next(iter(seen), "")
-        cells = [cell for row in grid.rows for cell in row if isinstance(cell, str) and _NUMBER.fullmatch(cell)]
-        if not decimal and grid.is_semicolon and any("," in cell for cell in cells):
-            decimal = ","
+        if not decimal and grid.is_semicolon:
+            cells = (cell for row in grid.rows for cell in row if isinstance(cell, str) and "," in cell)
+            decimal = "," if any(_NUMBER.fullmatch(cell) for cell in cells) else ""
         return cls(",", ".") if decimal == "," else cls()
 
     @classmethod
@@ -69,7 +71,9 @@ class Numbers:
 
     def value(self, cell: Cell) -> float:
         """The number in a cell; raises ValueError where there is none."""
-        if isinstance(cell, str):
+        if isinstance(cell, str) and self.decimal == "." and _is_plain(cell):
+            cell = float(cell)
+        elif isinstance(cell, str):
             text = cell.translate(_SPACES).replace("−", "-")
             whole, _, rest = text.partition(self.decimal)
             if self.thousands in rest or self.decimal in rest:
@@ -93,6 +97,19 @@ class Numbers:
 
 DECIMAL_POINT = Numbers()
 _DECIMAL_COMMA = Numbers(",", ".")
+
+
+_PLAIN = frozenset("0123456789.+-eE")
+
+
+def _is_plain(cell: str) -> bool:
+    """Whether a number is written as programs write it; raises no error for what is none."""
+    return _PLAIN.issuperset(cell)
+
+
+def _shows_another(cell: str, seen: Container[str]) -> bool:
+    """Whether a cell may show another sign before decimals than those that were seen."""
+    return ("." in cell and "." not in seen) or ("," in cell and "," not in seen)
 
 
 def _decimal_of(cell: str) -> str:

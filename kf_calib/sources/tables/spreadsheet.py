@@ -29,17 +29,22 @@ _MOST_FILLED = 2_000_000  # cells from the first to the last of each row
 _MOST_BYTES, _MOST_TAGS = 64_000_000, 2_000_000  # unpacked, of all parts but pictures; a tag takes some 120 bytes
 _PICTURES = "xl/media/"
 _ROW = re.compile(rb'<(?:\w+:)?row\b[^<>]*?\sr\s*=\s*["\'](\d{1,9})["\']')
+_HIDDEN_ROW = re.compile(
+    rb'<(?:\w+:)?row\b(?=[^<>]*?\shidden\s*=\s*["\'](?:1|true)["\'])[^<>]*?\sr\s*=\s*["\'](\d{1,9})["\']'
+)
 _LONG_FORMAT = re.compile(rb"formatCode\s*=\s*([\"'])[^\"'<>]{1000}")  # of a number; Excel's have at most 255 letters
 _DECLARED = (b"<!DOCTYPE", b"<!ENTITY", b"<\0!\0D\0", b"\0<\0!\0D")  # in UTF-8, and in both kinds of UTF-16
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """A sheet of a file: what is filled in it."""
+    """A sheet of a file: what is filled in it and not hidden. left_out: numbers of filled rows that are hidden, by hand
+    or by a filter."""
 
     name: str
     hidden: bool
     lines: list[Line]
+    left_out: list[int]
 
 
 def sheets_of(path: Path) -> list[Sheet]:
@@ -53,9 +58,7 @@ def sheets_of(path: Path) -> list[Sheet]:
             _refuse_unfit(file)
             with warnings.catch_warnings(action="ignore"):  # of what openpyxl leaves out, which no cell is part of
                 book = openpyxl.load_workbook(file, read_only=True, data_only=True)
-                sheets = [
-                    Sheet(sheet.title, sheet.sheet_state != "visible", _lines(sheet)) for sheet in book.worksheets
-                ]
+                sheets = [_sheet(sheet, _hidden_rows(file, sheet)) for sheet in book.worksheets]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except Exception as error:  # what openpyxl raises for a damaged file depends on where the damage is
@@ -91,6 +94,20 @@ def _refuse_part(content: bytes) -> None:
     numbers = list(map(int, _ROW.findall(content)))
     if any(after <= before for before, after in itertools.pairwise(numbers)):
         raise InputError("has rows that are out of order, which would be lost: save it again.")
+
+
+def _hidden_rows(file: Any, sheet: ReadOnlyWorksheet) -> set[int]:
+    """Return the numbers of the rows that are hidden, which openpyxl does not tell where it reads row by row."""
+    with zipfile.ZipFile(file) as archive:
+        content = archive.read(sheet._worksheet_path.lstrip("/"))  # pyright: ignore[reportPrivateUsage]
+    return set(map(int, _HIDDEN_ROW.findall(content)))
+
+
+def _sheet(sheet: ReadOnlyWorksheet, hidden_rows: set[int]) -> Sheet:
+    lines = _lines(sheet)
+    seen = [line for line in lines if line[0] not in hidden_rows]
+    left_out = [number for number, _ in lines if number in hidden_rows]
+    return Sheet(sheet.title, sheet.sheet_state != "visible", seen, left_out)
 
 
 def _lines(sheet: ReadOnlyWorksheet) -> list[Line]:

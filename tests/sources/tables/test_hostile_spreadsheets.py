@@ -185,3 +185,19 @@ def test_mutated_files_are_read_or_refused_in_a_sentence(cases: int, tmp_path: P
             except KfCalibError as error:
                 assert "\n" not in str(error) and len(str(error)) < 1500
     assert 0.1 * cases < read < 0.9 * cases
+
+
+def test_a_hidden_row_is_not_read(tmp_path: Path) -> None:
+    """Nor is one that a filter hides; the warning names the rows of the sheet."""
+    openpyxl = pytest.importorskip("openpyxl", reason="openpyxl is not there")
+    book = openpyxl.Workbook()
+    book.active.append(["face", "ax [g]", "ay [g]", "az [g]"])
+    for face, *reading in (("+x", 1, 0, 0), ("-x", -1, 0, 0), ("+y", 9, 9, 9), ("-y", 0, -1, 0), ("+z", 8, 8, 8)):
+        book.active.append([face, *reading])
+    for row in (4, 6, 9):  # the last is empty
+        book.active.row_dimensions[row].hidden = True
+    book.save(tmp_path / "table.xlsx")
+    table = kf_calib.open_table(tmp_path / "table.xlsx", {"gravity_mps2": "9.80665"})
+    assert [row.mean_mps2.tolist() for row in table.orientations] == [[9.80665, 0, 0], [-9.80665, 0, 0],
+                                                                      [0, -9.80665, 0]]  # fmt: skip
+    assert any("rows 4, 6 were not read, as hidden rows are no data" in said for said in table.warnings)
