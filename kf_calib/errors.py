@@ -14,6 +14,14 @@ class InputError(KfCalibError):
     """A recording, a line or a file of parameters cannot be used as it is."""
 
 
+class CountsError(InputError):
+    """Readings are in counts, and the size of one is not stated; ``scale`` is a guess at it by gravity, m/s^2."""
+
+    def __init__(self, said: str, scale: float) -> None:
+        super().__init__(said)
+        self.scale = scale
+
+
 class BenchError(InputError):
     """The description of the bench (axes, reference, gravity, latitude ...) is missing or impossible."""
 

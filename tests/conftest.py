@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import gc
+import math
 import os
 import sys
 import tempfile
@@ -11,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from helpers.slow_share import Share, SlowShare
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: a process a core is enough
 os.environ["COLUMNS"] = ""
@@ -20,6 +22,19 @@ import kf_calib.views.diagnosis  # noqa: F401 (with it results print themselves,
 from kf_calib.cli import main
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "recordings"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    group, words = parser.getgroup("slow tests"), "of the slow tests (-m slow), those whose turn it is at this commit"
+    group.addoption("--slow-share", metavar="COMMIT", help=words)
+    words = "begin no test of a share after so many minutes"
+    group.addoption("--slow-minutes", type=float, default=math.inf, metavar="N", help=words)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if commit := config.getoption("slow_share"):
+        share = Share.of_commit(config.rootpath, commit)
+        config.pluginmanager.register(SlowShare(share, config.getoption("slow_minutes")))
 
 
 def pytest_collection_finish() -> None:

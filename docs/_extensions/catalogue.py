@@ -40,10 +40,10 @@ def _name(effect: dict[str, Any]) -> str:
 
 
 def _overview(every: list[list[dict[str, Any]]]) -> Iterator[str]:
-    yield from ("## All effects", "", "| effect | what it is | confused with, shown by |", "|---|---|---|")
+    yield from ("## All effects", "", "| effect | what it is | borne by | confused with, shown by |", "|---|---|---|---|")
     for own in every:
         first = own[0]
-        yield f"| [`{_name(first)}`](#{_name(first)}) | {first['title']} | {_plain(first['confused_with'])} |"
+        yield f"| [`{_name(first)}`](#{_name(first)}) | {first['title']} | {first['borne_by']} | {_plain(first['confused_with'])} |"
 
 
 def _details(every: list[list[dict[str, Any]]]) -> Iterator[str]:

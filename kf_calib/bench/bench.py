@@ -18,6 +18,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from datetime import date
 from typing import Any, Literal
 
 import numpy as np
@@ -120,7 +121,7 @@ class Bench:
     - scatter_sigma_mps2: scatter of each accelerometer from dwell to dwell, one standard deviation; None if it is
       unknown and has to be estimated.
     - nominal: nominal parameters that differ from the paper's, in rad, 1 and m/s^2.
-    - notes: free text such as the serial number of the block.
+    - notes: free text such as the serial number of the block, and the date of the run where it is stated.
     - up: the axis that points up when all angles are zero. The azimuth is that of x, or of y if x is vertical.
     - channels: the channel of the recording for accelerometers 1, 2, 3, negative if its sign is reversed.
     - joints: names of the gimbals' joints, outer to inner, if angles come as joint states; empty if their names tell.
@@ -145,11 +146,11 @@ class Bench:
     square_sigma_deg: float | None = None
 
     def __post_init__(self) -> None:
-        from kf_calib.bench.keys import FREE_TEXT, NUMBERS, checked
+        from kf_calib.bench.keys import NOTES, NUMBERS, checked
 
         own = {key: getattr(self, key) for key in ("reference", "up", *NUMBERS)}
         stated = {key: value for key, value in own.items() if value is not None or key == "gravity_mps2"}
-        notes = {key: value for key, value in self.notes.items() if key in FREE_TEXT}
+        notes = {key: value for key, value in self.notes.items() if key in NOTES}
         for key, value in {**stated, "nominal": self.nominal, "joints": " ".join(self.joints), **notes}.items():
             checked(key, value)
         if self.reference == "inertial" and self.latitude_deg is None:
@@ -183,7 +184,7 @@ class Bench:
     def from_metadata(cls, metadata: Mapping[str, str], has_angles: bool = True) -> Bench:
         """The bench described by the strings of a metadata record (docs/format.md) or by options of the same names;
         raises BenchError."""
-        from kf_calib.bench.keys import FREE_TEXT, NUMBERS, known
+        from kf_calib.bench.keys import NOTES, NUMBERS, known
 
         given = known(metadata)
         numbers = {key: given[key] for key in NUMBERS if key in given}
@@ -203,7 +204,7 @@ class Bench:
             reference=given.get("reference", "base"),
             nominal=given.get("nominal", {}),
             joints=tuple(given.get("joints", "").replace(",", " ").split()) if has_angles else (),
-            notes={key: given[key] for key in FREE_TEXT if given.get(key)},
+            notes={key: given[key] for key in NOTES if given.get(key)},
             up=given.get("up", "y"),
             channels=parse_channels(given.get("channels", "1,2,3")),
             **numbers,
@@ -275,7 +276,8 @@ def metadata_of(values: Mapping[str, Any]) -> dict[str, str]:
 
     Raises ValueError or RecursionError for integers of thousands of digits and for excessively nested lists.
     """
-    return {key: value if isinstance(value, str) else json.dumps(value, default=str) for key, value in values.items()}
+    texts = {key: value.isoformat() if isinstance(value, date) else value for key, value in values.items()}
+    return {key: text if isinstance(text, str) else json.dumps(text, default=str) for key, text in texts.items()}
 
 
 def _frame_with_up(up: str) -> Floats:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from kf_calib.bench import paper_parameters
 from kf_calib.errors import BenchError, how_to_write
+from kf_calib.support import dates
 from kf_calib.support.plain_text import COMMANDS, LONGEST, cut
 
 FORMAT_VERSION = "1"
@@ -28,6 +29,7 @@ NUMBERS = (
     "square_sigma_deg",
 )
 FREE_TEXT = ("block_serial", "bench", "operator", "note")
+NOTES = (*FREE_TEXT, "date")
 
 _COMMAND = re.compile(f"[{COMMANDS}]")
 _OF_SYMBOL = {
@@ -54,6 +56,12 @@ def _text(value: Any) -> str:
     if not isinstance(value, str) or len(value) > LONGEST or _COMMAND.search(value):
         raise ValueError("it must be text without control characters")
     value.encode()  # raises ValueError for an unpaired surrogate
+    return value
+
+
+def _date(value: Any) -> str:
+    """Return the text of a date."""
+    dates.read(_text(value))  # raises ValueError
     return value
 
 
@@ -121,6 +129,7 @@ KEYS: Mapping[str, Key] = {
         f'a JSON object such as {{"theta1": 0}} of parameters ({", ".join(paper_parameters.SYMBOLS)}) in rad, 1 or '
         "m/s^2, nu within 0.78 rad",
     ),
+    "date": Key(_date, "when the run began, such as 2024-05-31 or 2024-05-31T14:05 (UTC) or 2024-05-31T14:05+02:00"),
     **dict.fromkeys(FREE_TEXT, Key(_text, _WORDS)),
 }  # fmt: skip
 

@@ -272,7 +272,7 @@ def record(
 @contextmanager
 def _told_if_table(path: Path) -> Iterator[None]:
     """Where lines cannot be recorded because they are a table of orientations, say so."""
-    from kf_calib.sources.tables.opening import is_table
+    from kf_calib.sources.opening import Kind, kind_of
     from kf_calib.sources.tables.survey import survey
 
     try:
@@ -280,7 +280,7 @@ def _told_if_table(path: Path) -> Iterator[None]:
     except InputError:
         found = None
         with suppress(InputError):
-            found = survey(path) if is_table(path) else None
+            found = survey(path) if kind_of(path) is Kind.TABLE else None
         if found is not None and found.rows:
             raise InputError(
                 f"{path} is a table of orientations, with a row a dwell, and is evaluated as it is: kf-calib replay "

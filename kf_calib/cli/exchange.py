@@ -70,10 +70,15 @@ def apply(calibration: Path, recording: Path, out: Path | None, overwrite: bool,
     if out is None or columns:
         raise click.UsageError("a recording is corrected to a copy: name it by -o OUT.mcap, and leave out --column.")
     from kf_calib.exchange.corrected_file import apply_to_file
-    from kf_calib.sources.tables.opening import is_table
+    from kf_calib.sources.opening import Kind, kind_of
     from kf_calib.views import exchange as views
 
-    if is_table(recording):
+    if (kind := kind_of(recording)) is Kind.SAMPLES:
+        raise InputError(
+            f"{recording} holds lines of text: correct them to standard output, by kf-calib apply {calibration} - < "
+            f"{recording}, or record them first (kf-calib record)."
+        )
+    if kind is Kind.TABLE:
         raise InputError(
             f"{recording} is no recording of samples: apply corrects MCAP files, bags, and lines of samples from "
             "standard input (apply CAL - < LINES); mean readings are corrected in Python, by "

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Set
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,8 @@ import rich_click as click
 from click.core import ParameterSource
 
 from kf_calib.cli.options import (
-    BENCH_OPTIONS,
+    OF_DWELLS,
+    OF_MESSAGES,
     examples,
     json_option,
     messages_of,
@@ -24,21 +26,29 @@ from kf_calib.cli.options import (
     show,
     units_of,
 )
-from kf_calib.errors import BenchError, InputError, KfCalibError
+from kf_calib.errors import BenchError, CountsError, KfCalibError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 if TYPE_CHECKING:
     from kf_calib.bench.streams import Source
     from kf_calib.dwells.overview import DwellFound
     from kf_calib.sources.files.inventory import Inventory
-    from kf_calib.sources.tables.survey import Survey
     from kf_calib.views.overview import Overview
+
+Tick = Callable[[float], None]
 
 _NAMED = {
     "axes": ('--axes "y z x"', "the gimbal axes, outer to inner: --axes"),
     "gravity_mps2": ("--gravity 9.81", "local gravity: --gravity in m/s^2 (best), or --latitude in degrees"),
 }
 """What a bench's description must have: how an option gives it, and what it is."""
+_AXES = {1: '--axes "z"', 2: '--axes "z x"'}
+"""The same of axes where there are so many angles."""
+_BY_HAND = (
+    "--no-angles",
+    "orientations: no column was taken for gimbal angles{or_else} (--column says which is one); the command does "
+    "without",
+)
 
 
 @click.command(epilog=examples("info run.mcap", "info rosbag2_2026_05_04", "info log.csv --json"))
@@ -51,12 +61,18 @@ def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json:
 
     FILE is an MCAP file, the folder of a ROS 2 bag, a .db3 file, lines of CSV or JSON, or a table of orientations.
     """
+    from kf_calib.sources.opening import Kind, kind_of
+
     renamed = dict(map(pair, columns))
-    table = _surveyed(recording, renamed, options)
-    if table is not None:
-        _show_table(ctx, table, options, as_json)
+    kind = kind_of(recording, renamed)
+    if kind is Kind.TABLE:
+        _show_table(ctx, recording, renamed, options, as_json)
         return
-    found = _overview(ctx, recording, renamed, as_json, options)
+    with progress(f"reading {recording.name}", as_json) as tick:
+        if kind is Kind.SAMPLES:
+            found = _of_lines(ctx, recording, renamed, options, tick)
+        else:
+            found = _of_messages(ctx, recording, options, tick)
     from kf_calib.views.overview import overview_object, overview_report
 
     if as_json:
@@ -65,90 +81,110 @@ def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json:
         show(overview_report(found))
 
 
-def _overview(
-    ctx: click.Context, recording: Path, renamed: Mapping[str, str], as_json: bool, options: Mapping[str, Any]
-) -> Overview:
-    """What is in a recording of samples."""
+def _of_messages(ctx: click.Context, path: Path, options: Mapping[str, Any], tick: Tick) -> Overview:
+    """What is in files of messages."""
     from kf_calib.sources.files.inventory import inventory_of
+
+    inventory = inventory_of(path, options["fields"])
+    bench = {**inventory.bench, **overrides(options)}
+    by_hand = inventory.has_readings and inventory.has_angles is None and not any(t.paths for t in inventory.topics)
+    lacking = _lacks(bench, inventory.has_angles is not False and not (by_hand or options["no_angles"]))
+    missing = {key: _NAMED[key][1] for key in lacking}
+    dwells, warnings = None, list(inventory.warnings)
+    try:
+        source = messages_of(path, options, not options["no_angles"])
+        dwells = _dwells(source, tick)
+        warnings = list(dict.fromkeys([*warnings, *source.warnings]))
+    except BenchError as error:
+        missing = missing or {"": str(error)}
+    except KfCalibError as error:
+        missing = {"": str(error), **missing}
+    words = _given(ctx, _not_of(ctx, ("columns", "g_unit"))) + _fields(inventory) + [_NAMED[key][0] for key in lacking]
+    words += ["--no-angles"] if by_hand and not options["no_angles"] else []
+    return _overview(inventory, bench, dwells, missing, words, warnings)
+
+
+def _of_lines(
+    ctx: click.Context, path: Path, renamed: Mapping[str, str], options: Mapping[str, Any], tick: Tick
+) -> Overview:
+    """What is in a log of samples; what is not stated of the bench does not matter for what stands still."""
+    from kf_calib.sources.files.inventory import inventory_of_lines
+    from kf_calib.sources.files.lines import Lines
+
+    units, missing, words = units_of(options), dict[str, str](), _given(ctx, _not_of(ctx, OF_MESSAGES))
+    try:
+        inventory = inventory_of_lines(path, renamed, units)
+    except CountsError as error:
+        missing["accel_scale"], size = str(error), f"{error.scale:.3g}"
+        words.append(f"--accel-scale {size}")
+        units = replace(units, accel_scale=float(size))
+        inventory = inventory_of_lines(path, renamed, units)
+    bench, angles = {**inventory.bench, **overrides(options)}, not options["no_angles"]
+    if angles and inventory.has_angles is None:
+        angles, missing["angles"] = False, _BY_HAND[1].format(or_else=" or attitude")
+        words.append(_BY_HAND[0])
+    axes = _AXES.get(inventory.angles or 0, _NAMED["axes"][0])
+    for key in _lacks(bench, bool(inventory.has_angles) and angles):
+        missing[key] = _NAMED[key][1]
+        words.append(axes if key == "axes" else _NAMED[key][0])
+    provisional = {"axes": shlex.split(axes)[1]} if angles and inventory.has_angles else {}
+    gravity = {} if bench.get("latitude_deg") else {"gravity_mps2": str(STANDARD_GRAVITY_MPS2)}
+    dwells, warnings = None, list(inventory.warnings)
+    try:
+        source = Lines(path, {**provisional, **gravity, **bench}, renamed, units=units, angles=angles)
+        dwells = _dwells(source, tick)
+        warnings = list(dict.fromkeys([*warnings, *source.warnings]))
+    except KfCalibError as error:
+        missing = {"": str(error), **missing}
+    return _overview(inventory, bench, dwells, missing, words, warnings)
+
+
+def _overview(
+    inventory: Inventory,
+    bench: dict[str, str],
+    dwells: list[DwellFound] | None,
+    missing: dict[str, str],
+    words: list[str],
+    warnings: list[str],
+) -> Overview:
     from kf_calib.views.overview import Overview
 
-    with progress(f"reading {recording.name}", as_json) as tick:
-        inventory = inventory_of(recording, renamed, options["fields"])
-        bench = {**inventory.bench, **overrides(options)}
-        missing = _lacking(inventory, bench)
-        dwells, warnings = None, list(inventory.warnings)
-        try:
-            source = _opened(inventory, renamed, options)
-            dwells = _dwells(source, tick)
-            warnings = list(dict.fromkeys([*warnings, *source.warnings]))
-        except BenchError as error:
-            missing = missing or {"": str(error)}
-        except KfCalibError as error:
-            missing = {"": str(error), **missing}
     if dwells is not None and not dwells:
         missing[""] = "a stretch in which the platform stands still: --still-deg says what counts as standing still"
-    of_lines = {"bench_file", "columns", *BENCH_OPTIONS}
-    taken = of_lines if inventory.is_lines else {name for name in ctx.params if name not in ("columns", "as_json")}
-    words = [*_given(ctx, taken), *_fields(inventory), *(_NAMED[key][0] for key in missing if key in _NAMED)]
-    words += ["--no-angles"] if _by_hand(inventory) and not options["no_angles"] else []
-    return Overview(inventory, bench, dwells, list(missing.values()), _command(inventory, words), warnings)
+    command = " ".join(["kf-calib replay", _quoted(str(inventory.path)), *words])
+    return Overview(inventory, bench, dwells, list(missing.values()), command, warnings)
 
 
-def _surveyed(path: Path, columns: Mapping[str, str], options: Mapping[str, Any]) -> Survey | None:
-    """What is in a table of orientations; None of any other file."""
-    from kf_calib.sources.tables.opening import is_table, is_text
-    from kf_calib.sources.tables.survey import survey
-
-    if not is_table(path):
-        return None
-    try:
-        return survey(path, overrides(options), columns, units_of(options))
-    except InputError:
-        if is_text(path) and _has_samples(path, columns):
-            return None
-        raise
-
-
-def _has_samples(path: Path, columns: Mapping[str, str]) -> bool:
-    """Whether a file that is no table has a header of samples."""
-    from kf_calib.sources.files.inventory import inventory_of
-
-    try:
-        inventory_of(path, columns)
-    except InputError:
-        return False
-    return True
-
-
-def _show_table(ctx: click.Context, table: Survey, options: Mapping[str, Any], as_json: bool) -> None:
+def _show_table(
+    ctx: click.Context, path: Path, renamed: Mapping[str, str], options: Mapping[str, Any], as_json: bool
+) -> None:
     """Print what is in a table of orientations."""
-    from kf_calib.sources.tables.survey import LEAST, LEAST_WITHOUT_SIGMA
+    from kf_calib.sources.tables.survey import LEAST, LEAST_WITHOUT_SIGMA, survey
     from kf_calib.views.table_overview import TableOverview, table_object, table_report
 
+    table = survey(path, overrides(options), renamed, units_of(options), angles=not options["no_angles"])
     bench = overrides(options)
     lacking = _lacks(bench, table.orientation == "angles")
     least = LEAST if table.has_sigma else LEAST_WITHOUT_SIGMA
-    missing = [*([table.trouble] if table.trouble else []), *(_NAMED[key][1] for key in lacking)]
+    missing = [table.trouble] if table.trouble else []
+    words = _given(ctx, _not_of(ctx, OF_MESSAGES + OF_DWELLS))
+    if table.is_by_hand and not options["no_angles"]:
+        words.append(_BY_HAND[0])
+        missing.append(_BY_HAND[1].format(or_else=", attitude or face"))
+    missing += [_NAMED[key][1] for key in lacking]
+    words += [_AXES.get(table.angles, _NAMED[key][0]) if key == "axes" else _NAMED[key][0] for key in lacking]
     if table.count < least:
         missing.append(f"orientations: {table.count} rows are there, and {least} are the least")
-    scale = list[str]()
     if table.rows and not table.has_unit:
         missing.append("the size of one count of the readings: --accel-scale, in m/s^2 or what --accel-unit says")
         level = median(row.norm_mps2 for row in table.rows)
-        scale.append(f"--accel-scale {STANDARD_GRAVITY_MPS2 / level:.3g}")
-    words = [*_given(ctx, {name for name in options if name != "as_json"} | {"columns"}),
-             *(_NAMED[key][0] for key in lacking), *scale]  # fmt: skip
+        words.append(f"--accel-scale {STANDARD_GRAVITY_MPS2 / level:.3g}")
     command = " ".join(["kf-calib replay", _quoted(str(table.path)), *words])
     found = TableOverview(table, bench, missing, command)
     if as_json:
         print_json(table_object(found))
     else:
         show(table_report(found))
-
-
-def _lacking(inventory: Inventory, bench: Mapping[str, str]) -> dict[str, str]:
-    """What the bench's description lacks, by the key."""
-    return {key: _NAMED[key][1] for key in _lacks(bench, inventory.has_angles is not False and not _by_hand(inventory))}
 
 
 def _lacks(bench: Mapping[str, str], has_angles: bool) -> list[str]:
@@ -158,18 +194,15 @@ def _lacks(bench: Mapping[str, str], has_angles: bool) -> list[str]:
     return [key for key, lacks in keys.items() if lacks]
 
 
-def _opened(inventory: Inventory, columns: Mapping[str, str], options: Mapping[str, Any]) -> Source:
-    if not inventory.is_lines:
-        return messages_of(inventory.path, options, not options["no_angles"])
-    from kf_calib.sources.files.lines import Lines
-
-    return Lines(inventory.path, overrides(options), columns)
-
-
-def _dwells(source: Source, tick: Any) -> list[DwellFound]:
+def _dwells(source: Source, tick: Tick) -> list[DwellFound]:
     from kf_calib.dwells.overview import dwells_found
 
     return dwells_found(source, on_progress=tick)
+
+
+def _not_of(ctx: click.Context, names: Sequence[str]) -> set[str]:
+    """Names of the options but for these, and but for the form of what is printed."""
+    return {param.name for param in ctx.command.params if param.name} - {*names, "as_json"}
 
 
 def _given(ctx: click.Context, taken: Set[str]) -> list[str]:
@@ -201,18 +234,3 @@ def _fields(inventory: Inventory) -> list[str]:
     accel = [] if inventory.has_readings else ["--field accel=TOPIC:X,Y,Z@TIME"]
     angles = [] if inventory.has_angles is not None else ["--field angles=TOPIC:OUTER,MIDDLE,INNER@TIME"]
     return accel + angles
-
-
-def _by_hand(inventory: Inventory) -> bool:
-    """Whether a recording has readings and nothing that could be angles, as that of a board turned by hand."""
-    angles = inventory.has_angles is not None or any(topic.paths for topic in inventory.topics)
-    return inventory.has_readings and not (inventory.is_lines or angles)
-
-
-def _command(inventory: Inventory, words: list[str]) -> str:
-    """The command that evaluates the recording; for lines the one that records them, which goes before."""
-    path = _quoted(str(inventory.path))
-    if not inventory.is_lines:
-        return " ".join(["kf-calib replay", path, *words])
-    made = _quoted(str(inventory.path.with_suffix(".mcap")))
-    return f"{' '.join(['kf-calib record', made, path, *words])} && kf-calib replay {made}"

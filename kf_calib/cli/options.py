@@ -30,9 +30,10 @@ if TYPE_CHECKING:
     from kf_calib.estimation.results import Calibration
     from kf_calib.estimation.settings import Settings
     from kf_calib.fleet.overview import FleetOverview
+    from kf_calib.sources.files.lines import Lines
     from kf_calib.sources.files.recording import Recording
-    from kf_calib.sources.tables.opening import Units
     from kf_calib.sources.tables.table import Table
+    from kf_calib.sources.units import Units
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -69,6 +70,7 @@ BENCH_OPTIONS = {
         "base: angles are relative to the bench (usual); inertial: stabilised platform.",
     ),
     "azimuth_deg": ("--azimuth", NUMBER, "DEG", "Azimuth of the bench's x axis from North toward East, deg."),
+    "date": ("--date", str, "DATE", "When the run began, ISO 8601 (UTC), where its stamps are no dates or wrong ones."),
     "nominal": ("--nominal", str, "JSON", "Nominal parameters that differ, for example '{\"theta1\": 0}'."),
 }  # fmt: skip
 _ANGLE_UNITS, _ACCEL_UNITS = ("rad", "deg"), ("m/s2", "g", "mg", "ug")
@@ -107,15 +109,15 @@ no_angles_option = click.option(
 def recording_options(command: F) -> F:
     """How to read a recording: the bench, unit of the readings, and topics."""
     options = [
-        click.option("--accel-unit", type=click.Choice(_ACCEL_UNITS), show_default="m/s2; in a table, as its header or "
-                     "its numbers tell", help="Unit of the readings.", panel=INPUT),
+        click.option("--accel-unit", type=click.Choice(_ACCEL_UNITS), show_default="m/s2; in text, as the header or "
+                     "the numbers tell", help="Unit of the readings.", panel=INPUT),
         click.option("--accel-scale", type=NUMBER, default=1.0, show_default=True,
                      help="Size of one count, in the unit of the readings.", panel=INPUT),
-        click.option("--angle-unit", type=click.Choice(_ANGLE_UNITS), show_default="rad; in a table, as its header or "
-                     "its numbers tell", help="Unit of the gimbal angles.", panel=INPUT),
+        click.option("--angle-unit", type=click.Choice(_ANGLE_UNITS), show_default="rad; in text, as the header or "
+                     "the numbers tell", help="Unit of the gimbal angles.", panel=INPUT),
         no_angles_option,
         click.option("--g-unit", metavar="M/S^2", default="9.80665", show_default=True,
-                     help="What 1 g stands for in a table of orientations; local: gravity of the bench.",
+                     help="What 1 g stands for in a table or a log in lines; local: gravity of the bench.",
                      panel=INPUT),
         columns_option,
         click.option("--accel-topic", metavar="TOPIC", help="Topic of the accelerometer, where there are several.",
@@ -255,25 +257,30 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
     return keys
 
 
-def recording_of(path: Path, options: Mapping[str, Any]) -> Recording | Table:
-    """The recording or table at a path."""
-    from kf_calib.sources.tables.opening import is_table, open_table
+def recording_of(path: Path, options: Mapping[str, Any]) -> Recording | Lines | Table:
+    """The recording, log of samples or table at a path."""
+    from kf_calib.sources.files.lines import Lines
+    from kf_calib.sources.opening import Kind, kind_of
+    from kf_calib.sources.tables.opening import open_table
 
-    columns = dict(map(pair, options["columns"]))
-    if is_table(path):
-        _refuse_given(_OF_SAMPLES, f"{path} is a table of mean readings")
-        stated = {name: options[name] for name in ("accel_unit", "accel_scale", "angle_unit", "g_unit")}
-        return open_table(path, overrides(options), columns=columns, **stated)
-    _refuse_given(_OF_TABLES, f"{path} is no table (.csv, .xlsx)")
-    return messages_of(path, options, not options["no_angles"])
+    columns, angles = dict(map(pair, options["columns"])), not options["no_angles"]
+    match kind_of(path, columns):
+        case Kind.TABLE:
+            _refuse_given(OF_MESSAGES + OF_DWELLS, f"{path} is a table of mean readings")
+            stated = {name: options[name] for name in ("accel_unit", "accel_scale", "angle_unit", "g_unit")}
+            return open_table(path, overrides(options), columns=columns, angles=angles, **stated)
+        case Kind.SAMPLES:
+            _refuse_given(OF_MESSAGES, f"{path} is a log in lines of text")
+            return Lines(path, overrides(options), columns, units=units_of(options), angles=angles)
+        case Kind.RECORDING:
+            _refuse_given(_OF_TEXT, f"{path} is no table (.csv, .xlsx) and no log in lines of text")
+            return messages_of(path, options, angles)
 
 
-_OF_TABLES = ("columns", "g_unit")
-_OF_SAMPLES = (
-    "no_angles", "joints", "accel_topic", "pose_topic", "temperature_topic", "fields", "max_chunk_mb", "settle_s",
-    "still_deg", "gate", "gate_sigma",
-)  # fmt: skip
-"""Options that act on tables of orientations only, and on recordings of samples only."""
+_OF_TEXT = ("columns", "g_unit")
+OF_MESSAGES = ("accel_topic", "pose_topic", "temperature_topic", "fields", "max_chunk_mb")
+OF_DWELLS = ("joints", "settle_s", "still_deg", "gate", "gate_sigma")
+"""Options that act on text and spreadsheets only, on files of messages only, and where dwells are to be found."""
 
 
 def _refuse_given(names: Sequence[str], what: str) -> None:
@@ -291,8 +298,8 @@ def _refuse_given(names: Sequence[str], what: str) -> None:
 
 
 def units_of(options: Mapping[str, Any]) -> Units:
-    """Units of a table, as the options state them."""
-    from kf_calib.sources.tables.opening import Units
+    """Units of a table or a log, as the options state them."""
+    from kf_calib.sources.units import Units
 
     return Units(options["accel_unit"], options["accel_scale"], options["angle_unit"], options["g_unit"])
 
@@ -348,8 +355,8 @@ def used_of(options: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def opened(path: Path, options: Mapping[str, Any]) -> tuple[Recording | Table, Settings]:
-    """A recording or table, and how to evaluate it; an impossible model is refused before any reading is read."""
+def opened(path: Path, options: Mapping[str, Any]) -> tuple[Recording | Lines | Table, Settings]:
+    """A recording, log or table, and how to evaluate it; an impossible model is refused before any reading is read."""
     from kf_calib.estimation.measurement_model import Model
 
     settings = settings_of(options)

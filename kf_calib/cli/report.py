@@ -113,7 +113,7 @@ def report(
     if certificate is not None and stated is not None:
         from kf_calib.exchange import calibration_file
 
-        saved = calibration_file.saved(found.before, measured.name, measured.sha256, measured.begin_ns)
+        saved = calibration_file.saved(found.before, measured.name, measured.sha256, measured.began)
         write_certificate(outputs, certificate, stated, (saved, found.before.model))
         if not as_json:
             show(f"saved {certificate}")
@@ -150,9 +150,10 @@ def measured_of(recording: Path, options: dict[str, Any]) -> Measured:
     """What a page says of a recording's file; raises MissingExtraError, before the work, where no page can be made."""
     import kf_calib.views.figures  # noqa: F401  # which a page needs
     from kf_calib.diagnosis.selection_journal import Origin
+    from kf_calib.sources.run_date import run_date
     from kf_calib.views.report.measured import Measured
 
-    return Measured(recording.name, Origin.of(recording).sha256, recording_of(recording, options).begin_ns())
+    return Measured(recording.name, Origin.of(recording).sha256, run_date(recording_of(recording, options)))
 
 
 def _diagnosed(recording: Path, options: dict[str, Any], quiet: bool) -> tuple[Diagnosis, Measured]:

@@ -16,7 +16,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import Frame
-from kf_calib.sources.files.recording import opened
+from kf_calib.sources.opening import opened
 from kf_calib.sources.tables.table import Table
 from kf_calib.support import stage
 from kf_calib.support.threads import one_blas_thread

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
 from kf_calib.dwells.rest_in_readings import segmenter_of
 from kf_calib.dwells.segmenter import dwell_blocks
@@ -17,7 +19,8 @@ from kf_calib.dwells.stationarity import Stillness
 class DwellFound:
     """A dwell: when it was arrived at, from the first sample on, how long its readings last, and where it is.
 
-    pose: mean gimbal angles in rad, outer to inner, or attitude.
+    pose: mean gimbal angles in rad, outer to inner, or attitude; empty without angles. norm_mps2: size of the mean of
+    its readings. up (3,): the unit vector along that mean.
     """
 
     number: int
@@ -25,20 +28,29 @@ class DwellFound:
     lasts_s: float
     readings: int
     pose: tuple[float, ...]
+    norm_mps2: float
+    up: tuple[float, float, float]
 
 
 def dwells_found(
     source: Source, stillness: Stillness | None = None, on_progress: Callable[[float], None] = lambda _: None
 ) -> list[DwellFound]:
     """The dwells of a source, which is read to its end; raises what reading it raises."""
-    found = dict[int, DwellFound]()
+    found, totals = dict[int, DwellFound](), dict[int, Floats]()
     segmenter = segmenter_of(source.bench, stillness)
     for block in dwell_blocks(source, segmenter):
         on_progress(source.fraction)
         if not len(block.elapsed_s) or block.curve is not None:
             continue
-        pose = tuple(float(each) for each in np.asarray(block.pose)[0])
-        own = found.setdefault(block.dwell, DwellFound(block.dwell, block.arrival_s, 0.0, 0, pose))
+        pose = tuple(float(each) for each in np.asarray(block.pose)[0]) if source.bench.angles else ()
+        new = DwellFound(block.dwell, block.arrival_s, 0.0, 0, pose, math.nan, (0.0, 0.0, 0.0))
+        own = found.setdefault(block.dwell, new)
         own.readings += len(block.elapsed_s)
         own.lasts_s = float(block.elapsed_s[-1]) - own.arrival_s
+        totals[block.dwell] = totals.get(block.dwell, np.zeros(3)) + block.accel_mps2.sum(axis=0)
+    for number, own in found.items():
+        mean = totals[number] / own.readings
+        own.norm_mps2 = float(np.linalg.norm(mean))
+        x, y, z = (mean / max(own.norm_mps2, 1e-300)).tolist()
+        own.up = x, y, z
     return list(found.values())

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import MICRO_G, MILLI_G, Coefficient, Effect, SensorEffect, Typical, Unknown
+from kf_calib.effects.effect import MICRO_G, MILLI_G, Bearer, Coefficient, Effect, SensorEffect, Typical, Unknown
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -155,6 +155,7 @@ class BiasWalk(Effect):
 
     family = "bias in time"
     name, title, source = "bias-walk", "bias that walks at random", "IEEE Std 1293, annex on Allan variance"
+    borne_by = Bearer.SENSORS
     confused_with = "bias-drift; scatter from dwell to dwell"
     intensity = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5)
 

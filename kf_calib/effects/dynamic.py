@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import Coefficient, Effect
+from kf_calib.effects.effect import Bearer, Coefficient, Effect
 from kf_calib.effects.stimulus import Stimulus
 
 
@@ -14,6 +14,7 @@ class Latency(Effect):
 
     family = "slews"
     name, title, source = "latency", "delay of the readings", "acquisition chain"
+    borne_by = Bearer.BENCH  # the clock and the acquisition are the bench's
     confused_with = "seen in slews only"
     dynamic = True
 

@@ -11,6 +11,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -92,6 +93,19 @@ def _complete(own: Coefficient | Unknown) -> None:
         object.__setattr__(own, "per_si", unit.per_si)
 
 
+class Bearer(StrEnum):
+    """What can have an effect, by its physics.
+
+    - BENCH: gimbals, encoders, the base, the clock: all sensors on a bench have the same, and none takes it elsewhere.
+    - SENSORS: what is inside an accelerometer goes with it from bench to bench.
+    - EITHER: a field of the bench that a sensor feels, or what nobody has said.
+    """
+
+    BENCH = "bench"
+    SENSORS = "sensors"
+    EITHER = "either"
+
+
 class Effect(ABC):
     """A physical effect the readings may contain besides the twelve parameters.
 
@@ -108,7 +122,7 @@ class Effect(ABC):
     in their order), T and the constant. Empty where it cannot be written so.
     typical: usual sizes of its coefficients. family: the physical class to which it belongs.
     prior: how much likelier it is than another effect before anything is measured, 1 for most.
-    of_the_bench: it belongs to the bench, so that all sensors on it usually have the same coefficients.
+    borne_by: what can have it at all; what nobody knows, as of a user's effect, may be of either.
     """
 
     name: ClassVar[str]
@@ -126,7 +140,7 @@ class Effect(ABC):
     typical: ClassVar[Typical] = Typical()
     family: ClassVar[str] = "none of the known"
     prior: ClassVar[float] = 1.0
-    of_the_bench: ClassVar[bool] = False
+    borne_by: ClassVar[Bearer] = Bearer.EITHER
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""
     value: float = 0.0
@@ -232,6 +246,7 @@ class SensorEffect(Effect):
     shown: a unit of the field and how many of it make one SI unit, where it is not that of ``support.units``.
     """
 
+    borne_by = Bearer.SENSORS
     symbol: ClassVar[str]
     unit: ClassVar[str]
     scale: ClassVar[float]
@@ -263,7 +278,7 @@ class FrameEffect(Effect):
     has no columns.
     """
 
-    of_the_bench = True
+    borne_by = Bearer.BENCH
 
     def shows_in(self, s: Stimulus) -> bool:
         return s.bench.angles and super().shows_in(s)

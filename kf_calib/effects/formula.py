@@ -35,7 +35,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.effects import checks
-from kf_calib.effects.effect import Coefficient, FrameEffect, SensorEffect
+from kf_calib.effects.effect import Bearer, Coefficient, FrameEffect, SensorEffect
 from kf_calib.effects.expression import Expression
 from kf_calib.effects.frame import about_axis, gimbal_number
 from kf_calib.effects.stimulus import Stimulus
@@ -112,7 +112,7 @@ def quantities(axes: tuple[Vector, ...]) -> dict[str, Quantity]:
 
 def split(text: str) -> tuple[str, str]:
     """Name and expression of ``NAME = FORMULA``; raises InputError where the name is none."""
-    name, _, expression = (part.strip() for part in text.partition("="))
+    name, _, expression = (" ".join(part.split()) for part in text.partition("="))  # on one line
     if not is_name(name.partition(":")[0]):
         raise InputError(f"{name[:60]!r} cannot name an effect: write NAME = FORMULA, the name of {NAME_RULE}.")
     return name, expression
@@ -176,6 +176,7 @@ class Formula(SensorEffect):
     """
 
     source, confused_with = "user's formula", ""
+    borne_by = Bearer.EITHER
 
     def __init__(self, name: str, expression: str, bench: Bench, checked: bool = True) -> None:
         self._values, unit, shown = _Reading(name, expression, bench), "", ("", 1.0)
@@ -201,6 +202,7 @@ class FrameFormula(FrameEffect):
     """
 
     source, confused_with = "user's formula", ""
+    borne_by = Bearer.EITHER
 
     def __init__(self, name: str, place: str, expression: str, bench: Bench, checked: bool = True) -> None:
         self._values, unit, shown = _Reading(name, expression, bench), "", ("", 1.0)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects.effect import Coefficient, Effect, FrameEffect, Typical
+from kf_calib.effects.effect import Bearer, Coefficient, Effect, FrameEffect, Typical
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -54,6 +56,7 @@ class PlatformDrift(FrameEffect):
 
     family = "base and platform"
     name, title, source = "platform-drift", "drift of the platform", "geometry of the bench"
+    borne_by = Bearer.EITHER  # a block that creeps on its mount drifts in the same way
     typical = Typical((np.radians(0.01) / 3600, np.radians(1.0) / 3600))
 
     @property
@@ -123,6 +126,7 @@ class CrossTalk(Effect):
 
     family = "cross-axis"
     name, title, source = "cross-talk", "a share of another channel's reading", "IEEE Std 1293"
+    borne_by = Bearer.SENSORS
     formulas = ("before", "after")
     confused_with = "misalignment, always at rest"
     typical = Typical((1e-6, 100e-6))
@@ -241,7 +245,7 @@ class GravityError(Effect):
     family = "base and platform"
     name, title, source = "gravity-error", "wrong local gravity", "size of the reference"
     confused_with = "a common scale factor, always"
-    of_the_bench = True
+    borne_by = Bearer.BENCH
     typical = Typical((10e-6, 700e-6))
 
     @property
@@ -257,9 +261,9 @@ class GravityError(Effect):
 
 def gimbal_number(variant: str, letters: str) -> int:
     """The gimbal a variant names: by the letter of its axis where that is one gimbal's only, else by number from 1."""
-    if letters.count(variant) == 1:
+    if len(variant) == 1 and letters.count(variant) == 1:
         return letters.index(variant)
-    if variant.isdigit() and 1 <= int(variant) <= len(letters):
+    if re.fullmatch("[0-9]{1,3}", variant) and 1 <= int(variant) <= len(letters):
         return int(variant) - 1
     known = ", ".join(letter if letters.count(letter) == 1 else str(k + 1) for k, letter in enumerate(letters))
     raise InputError(f"{variant!r} names no gimbal of this bench: use one of {known or 'none: it has no axes'}.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import MICRO_G, MICRO_PER_G, MILLI_PER_G, SensorEffect, Typical, Unknown
+from kf_calib.effects.effect import MICRO_G, MICRO_PER_G, MILLI_PER_G, Bearer, SensorEffect, Typical, Unknown
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -143,6 +143,7 @@ class VibrationRectification(SensorEffect):
 
     family = "surroundings"
     name, title, source = "vibration-rectification", "shift of the bias under vibration", IEEE
+    borne_by = Bearer.EITHER  # the sensor rectifies what the bench shakes
     confused_with = "needs vibration that varies"
     averages = True
     symbol, unit, scale = "K2v", "s^2/m", 1e-4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import MICRO_G, MILLI_G, Coefficient, Effect, SensorEffect, Typical, Unknown
+from kf_calib.effects.effect import MICRO_G, MILLI_G, Bearer, Coefficient, Effect, SensorEffect, Typical, Unknown
 from kf_calib.effects.stimulus import Stimulus
 
 IEEE = "IEEE Std 1293, environmental sensitivities"
@@ -69,6 +69,7 @@ class ThermalMisalignment(Effect):
 
     family = "temperature"
     name, title, source = "thermal-misalignment", "alignment that follows the temperature", IEEE
+    borne_by = Bearer.SENSORS
     formulas = ("T*p", "T*o")
     typical = Typical((0.1e-6, 10e-6))
 

@@ -26,7 +26,7 @@ from pathlib import Path
 from types import ModuleType
 
 from kf_calib.effects import checks
-from kf_calib.effects.effect import Effect, SensorEffect
+from kf_calib.effects.effect import Bearer, Effect, FrameEffect, SensorEffect
 from kf_calib.effects.formula import NAME_RULE, is_name, symbol_stem
 from kf_calib.errors import InputError
 
@@ -132,6 +132,9 @@ def completed(kind: type[Effect], origin: str) -> type[Effect]:
     for key, value in defaults.items():
         if not hasattr(kind, key):
             setattr(kind, key, value)
+    said_by = next(each for each in kind.__mro__ if "borne_by" in vars(each))
+    if said_by in (SensorEffect, FrameEffect):  # the shape of its columns does not say what has it
+        kind.borne_by = Bearer.EITHER
     checks.guard(kind)
     return kind
 

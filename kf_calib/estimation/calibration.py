@@ -50,7 +50,7 @@ from kf_calib.estimation.results import (
 from kf_calib.estimation.samples import Samples, samples_of
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.square_root_information import FilterStep
-from kf_calib.sources.files.recording import opened
+from kf_calib.sources.opening import opened
 from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.threads import one_blas_thread

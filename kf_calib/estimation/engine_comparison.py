@@ -26,7 +26,7 @@ from kf_calib.estimation.free_attitude import holding_frame
 from kf_calib.estimation.results import Calibration, Estimate
 from kf_calib.estimation.samples import Samples, samples_of
 from kf_calib.estimation.settings import Settings
-from kf_calib.sources.files.recording import opened
+from kf_calib.sources.opening import opened
 from kf_calib.sources.tables.table import Table
 from kf_calib.support import stage
 

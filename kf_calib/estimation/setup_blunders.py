@@ -40,6 +40,7 @@ _BETTER = 0.2  # a change explains the readings if it leaves less than this shar
 _SPREAD = 0.2  # least singular value of the directions over sqrt(D); 0.577 if they are spread evenly
 _BIAS = 0.3  # g; prior sigma of a bias, which matters if the orientations do not determine it
 _NOMINAL = 0.15  # g; largest rms deviation from nominal without a mistake, from biases, scale factors and mounting
+_INDISTINCT = 0.25  # g^2; assignments whose sums of squares differ by less explain the readings alike
 _MOST_DWELLS = 96  # so many dwells are used at most, spread over the run
 _MOST_CHANGES = 4  # largest number of changes of gimbals and channels together
 _MOST_NAMED = 3  # largest number of equally good changes in a message
@@ -329,8 +330,8 @@ def _advice(stated: Bench, mending: Mending) -> str:
 
 
 def _refuse_exchange(means: Means, stated: Mounting) -> None:
-    """Refuse a run in which the channels change their order or signs between two dwells, with both parts near
-    nominal."""
+    """Refuse a run in which the channels change their order or signs between two dwells, with both parts near nominal,
+    and which no one assignment explains: a sign shows in no dwell in which gravity is across."""
     if len(means.numbers) < 6:
         return
     bench = stated.bench
@@ -340,9 +341,11 @@ def _refuse_exchange(means: Means, stated: Mounting) -> None:
     before = np.cumsum(squares, axis=1)[:, :-1]  # sums over the dwells up to k, for each assignment
     after = squares.sum(axis=1, keepdims=True) - before
     k = int(np.argmin(before.min(axis=0) + after.min(axis=0)))
-    first, then = int(before[:, k].argmin()), int(after[:, k].argmin())
-    left = math.sqrt((before[first, k] + after[then, k]) / expected.size)
-    if first == then or left > _NOMINAL or not 2 <= k + 1 <= len(readings) - 2:
+    explaining = [part <= part.min() + _INDISTINCT for part in (before[:, k], after[:, k])]
+    if (explaining[0] & explaining[1]).any() or not 2 <= k + 1 <= len(readings) - 2:
+        return
+    first, then = (min(np.flatnonzero(own), key=lambda i: _changes_of(_WIRINGS[i])) for own in explaining)
+    if math.sqrt((before[first, k] + after[then, k]) / expected.size) > _NOMINAL:
         return
     wirings = (Mending(stated, _WIRINGS[own]) for own in (first, then))
     told = [" and ".join(_reasons(bench, each)) or "channels are as stated" for each in wirings]

@@ -19,7 +19,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -36,7 +36,9 @@ from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.model_file import ModelFile
 from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.results import Calibration
+from kf_calib.exchange import calibration_agreement as agreement
 from kf_calib.exchange.calibration_parts import (
+    MOST_EFFECTS,
     Part,
     SavedConditions,
     SavedConsistency,
@@ -47,18 +49,18 @@ from kf_calib.exchange.calibration_parts import (
     SavedProgram,
     SavedProvenance,
     SavedState,
+    States,
     Text,
 )
 from kf_calib.sources.files.bags import fingerprint
 from kf_calib.sources.files.recording import Recording
+from kf_calib.sources.run_date import run_date
+from kf_calib.support import dates
 from kf_calib.support.output_files import write_whole
-from kf_calib.support.plain_text import cut
+from kf_calib.support.plain_text import cut, sentence
 
 FORMAT, VERSION = "kf_calib.calibration", 1
-_LARGEST_BYTES = 50_000_000
-_LARGEST_VARIANCE = 1e60  # far beyond any, and products of a few are numbers still
-AFFINE = tuple(f"{name}{i}" for i in (1, 2, 3) for name in ("sx", "sy", "sz", "b"))
-"""Symbols of the affine state: reading i = sx_i f_x + sy_i f_y + sz_i f_z + b_i."""
+_LARGEST_BYTES = 20_000_000
 
 
 class SavedCalibration(Part):
@@ -71,9 +73,9 @@ class SavedCalibration(Part):
 
     format: Literal["kf_calib.calibration"]
     version: Literal[1]
-    parameters: list[SavedParameter]
+    parameters: Annotated[list[SavedParameter], States]
     state: SavedState
-    effects: list[SavedEffect]
+    effects: Annotated[list[SavedEffect], Field(max_length=MOST_EFFECTS)]
     noise: SavedNoise
     consistency: SavedConsistency
     not_seen: list[Text]
@@ -83,31 +85,18 @@ class SavedCalibration(Part):
 
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> SavedCalibration:
-        with np.errstate(all="ignore"):  # absurd numbers are refused, not computed
+        with np.errstate(all="ignore"):  # absurd numbers are refused, whatever they give
             self._refuse_disagreement()
         return self
 
     def _refuse_disagreement(self) -> None:
         """Raise ValueError if parts of the content contradict each other."""
-        state, count = self.state, len(self.state.symbols)
-        if tuple(state.symbols[:STATE_COUNT]) != AFFINE or len(state.values) != count:
-            raise ValueError("state has other symbols than its values need")
-        covariance = np.array(state.covariance) if all(len(row) == count for row in state.covariance) else np.zeros(0)
-        if covariance.shape != (count, count) or not np.allclose(covariance, covariance.T, rtol=1e-9, atol=0.0):
-            raise ValueError(f"state.covariance is no symmetric matrix of {count} rows")
-        if np.abs(covariance).max() > _LARGEST_VARIANCE:
-            raise ValueError("state.covariance has numbers that no calibration has")
-        scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        relative = covariance / scale / scale[:, None]
-        if not np.isfinite(relative).all() or np.linalg.eigvalsh(relative).min() < -1e-6:
-            raise ValueError("state.covariance is no covariance: it has a negative variance")
-        twelve = [(each.symbol, each.unit) for each in self.parameters[:STATE_COUNT]]
-        if twelve != list(zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True)):
-            raise ValueError(f"parameters must begin with {', '.join(paper_parameters.SYMBOLS)}")
-        found = paper_parameters.parameters_of(np.array(state.values[:STATE_COUNT]))
-        for own, value in zip(self.parameters, found, strict=False):
-            if own.value is not None and not math.isclose(own.value, value, rel_tol=1e-9, abs_tol=1e-12):
-                raise ValueError(f"parameters say {own.symbol} = {own.value!r}, but its state says {float(value)!r}")
+        agreement.refuse_state(self.state, self.fixed)
+        agreement.refuse_effects(self.effects, self.state)
+        agreement.refuse_parameters(self.parameters, self.state, self.fixed, self.bench)
+        agreement.refuse_dependent_axes(self.state)
+        agreement.refuse_judgement(self.consistency)
+        agreement.refuse_conditions(self.conditions, self.provenance, self.bench)
 
     @property
     def bench(self) -> Bench:
@@ -144,10 +133,11 @@ class SavedCalibration(Part):
         model = Model(bench, square="square" in self.fixed.values())
         for own in self.effects:
             effect = effects.effect_named(own.text, bench)
-            model += effect if own.constant is None else effect.at(own.constant)
-        if model.count != len(self.state.symbols):
-            raise InputError(f"{origin}: its effects have {model.count - STATE_COUNT} coefficients, its state has "
-                             f"{len(self.state.symbols) - STATE_COUNT}: it was saved by another version.")  # fmt: skip
+            model += _at_constant(effect, own.constant, origin)
+        try:
+            agreement.refuse_coefficients(self.parameters, self.state, self.noise, model)
+        except ValueError as error:
+            raise InputError(f"{origin}: {error}: give a calibration as --save has written it.") from None
         return model
 
     def correction(
@@ -160,10 +150,33 @@ class SavedCalibration(Part):
         )  # fmt: skip
 
 
+def _at_constant(effect: effects.Effect, constant: float | None, origin: Path) -> effects.Effect:
+    """The effect with its constant, which a file states for effects that have one, and within their range."""
+    if constant is None and effect.unknown is None:
+        return effect
+    if constant is None or effect.unknown is None or effect.at(constant).value != constant:
+        known = effect.unknown
+        can = f"from {known.low:g} to {known.high:g} {known.unit}" if known else "none at all"
+        raise InputError(f"{origin}: {effect} has the constant {constant}, and can have {can}: give a calibration as "
+                         "--save has written it.")  # fmt: skip
+    return effect.at(constant)
+
+
 def saved(
-    result: Calibration, recording: str = "", sha256: str | None = None, first_ns: int | None = None
+    result: Calibration, recording: str = "", sha256: str | None = None, began: datetime | None = None
 ) -> SavedCalibration:
-    """A calibration as it is saved; recording: its name. sha256: of its file. first_ns: stamp of its first sample."""
+    """A calibration as it is saved; recording: its name. sha256: of its file. began: when its run did, if known.
+
+    Raises InputError where a calibration cannot be saved.
+    """
+    try:
+        return _saved(result, recording, sha256, began)
+    except ValidationError as error:
+        raise InputError(f"this calibration cannot be saved, as {_said(error)}.") from None
+
+
+def _saved(result: Calibration, recording: str, sha256: str | None, began: datetime | None) -> SavedCalibration:
+    """The calibration as its parts say it."""
     estimate, noise, judged = result.estimate, result.noise, result.consistency
     return SavedCalibration(
         format=FORMAT,
@@ -171,7 +184,7 @@ def saved(
         parameters=[SavedParameter(symbol=p.symbol, value=p.value, sigma=p.sigma, unit=p.unit, nominal=p.nominal)
                     for p in result.parameters.values()],
         state=SavedState(
-            symbols=[*AFFINE, *(c.symbol for c in result.model.coefficients)],
+            symbols=[*agreement.AFFINE, *(c.symbol for c in result.model.coefficients)],
             values=estimate.state.tolist(),
             covariance=estimate.covariance.tolist(),
             undetermined=list(result.undetermined),
@@ -191,19 +204,17 @@ def saved(
             held_out_floor_mps2=result.held_out_floor_mps2,
         ),
         not_seen=_not_seen(result),
-        conditions=_conditions(result, first_ns),
+        conditions=_conditions(result, began),
         provenance=_provenance(result, recording, sha256),
         fixed=result.fixed,
     )  # fmt: skip
 
 
 def of_source(result: Calibration, source: Source) -> SavedCalibration:
-    """The calibration of a source: of a recording with its name, checksum and the date of its first sample."""
+    """The calibration of a source, with the date of its run, and of a recording with its name and checksum."""
     path = getattr(source, "path", None)
-    if path is None:
-        return saved(result)
-    first_ns = next((int(batch.accel.time_ns[0]) for batch in source if len(batch.accel)), None)
-    return saved(result, path.name, fingerprint(path), first_ns)
+    name, checksum = ("", None) if path is None else (path.name, fingerprint(path))
+    return saved(result, name, checksum, run_date(source))
 
 
 def save_calibration(
@@ -227,13 +238,13 @@ def _not_seen(result: Calibration) -> list[str]:
     return [str(each.effect) for each in seen if not each.visible]
 
 
-def _conditions(result: Calibration, first_ns: int | None) -> SavedConditions:
+def _conditions(result: Calibration, began: datetime | None) -> SavedConditions:
     """Return when and how the run was made."""
     dwells = [visit.dwell for visit in result.visits]
     warmth = np.concatenate([dwell.nodes.temperature_c for dwell in dwells])
     known = bool(np.isfinite(warmth).any())
     return SavedConditions(
-        began=_in_words(first_ns),
+        began=None if began is None else dates.written(began),
         duration_s=dwells[-1].end_s,
         temperature_min_c=float(np.nanmin(warmth)) if known else None,
         temperature_mean_c=float(np.nanmean(warmth)) if known else None,
@@ -243,36 +254,24 @@ def _conditions(result: Calibration, first_ns: int | None) -> SavedConditions:
     )  # fmt: skip
 
 
-def date_of(first_ns: int | None) -> datetime | None:
-    """A stamp as a date in UTC; None for stamps that count from a start of a clock (before the year 2000)."""
-    if first_ns is None or not 946_684_800 <= first_ns / 1e9 < 4_102_444_800:
-        return None
-    return datetime.fromtimestamp(first_ns / 1e9, UTC)
-
-
-def _in_words(first_ns: int | None) -> str | None:
-    date = date_of(first_ns)
-    return None if date is None else date.isoformat(timespec="milliseconds")
-
-
 def _provenance(result: Calibration, recording: str, sha256: str | None) -> SavedProvenance:
     """Return where a result comes from."""
     settings = result.settings
     return SavedProvenance(
-        recording=recording,
+        recording=sentence(recording),
         sha256=sha256,
-        bench=result.bench.to_metadata(),
+        bench={key: sentence(text) for key, text in result.bench.to_metadata().items()},
         settings={
             "engine": settings.engine, "gate_sigma": str(settings.gate_sigma), "prior": str(settings.prior),
             "walk_mps2_per_sqrt_s": str(settings.walk_mps2_per_sqrt_s), "stillness": str(settings.stillness),
             "left_out": " ".join(map(str, settings.left_out)),
-            **({"bench_model": str(settings.bench_model)} if settings.bench_model else {}),
+            **({"bench_model": sentence(str(settings.bench_model))} if settings.bench_model else {}),
         },
         programs=[SavedProgram(path=str(each.path), sha256=each.sha256)
                   for each in effects.programs_of(result.model.effects)],
         versions={"kf_calib": version("kf_calib"), "numpy": np.__version__, "python": platform.python_version()},
         created=now(),
-        warnings=list(result.warnings),
+        warnings=list(map(sentence, result.warnings)),
     )  # fmt: skip
 
 
@@ -314,13 +313,17 @@ def _checked(path: Path, content: dict[str, Any]) -> SavedCalibration:
         found = SavedCalibration.model_validate(content)
         found.bench  # noqa: B018  # raises BenchError
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        place, said = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
-        where = f"{cut(place, 100)}: " if place else ""
-        raise InputError(f"{path}: {where}{said}: give a calibration as --save has written it.") from None
+        raise InputError(f"{path}: {_said(error)}: give a calibration as --save has written it.") from None
     except BenchError as error:
         raise InputError(f"{path}: provenance.bench: {error}") from None
     return found
+
+
+def _said(error: ValidationError) -> str:
+    """The first thing that does not fit, and where."""
+    first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+    place, said = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
+    return f"{cut(place, 100)}: {said}" if place else said
 
 
 def schema() -> dict[str, Any]:

@@ -6,12 +6,19 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-from kf_calib.support.plain_text import COMMANDS, LONGEST
+from kf_calib.support.plain_text import CONTROLS, LONGEST
 
-Text = Annotated[str, StringConstraints(max_length=LONGEST, pattern=rf"^[^{COMMANDS}]*$")]
+Text = Annotated[str, StringConstraints(max_length=LONGEST, pattern=rf"^[^{CONTROLS}]*$")]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Three = Annotated[list[Positive], Field(min_length=3, max_length=3)]
+Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0, le=10**15)]
+Seconds = Annotated[float, Field(ge=-1e11, le=1e11, allow_inf_nan=False)]  # some thousand years
+Warmth = Annotated[float, Field(ge=-273.15, le=1e4, allow_inf_nan=False)]
+MOST_STATES, MOST_EFFECTS = 500, 100
+"""Far more than a model can have that a bench could show; the time to check a file grows with their cubes."""
+States = Field(max_length=MOST_STATES)
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 
 
@@ -37,10 +44,10 @@ class SavedState(Part):
     undetermined: symbols of the parameters and coefficients that the run did not determine.
     """
 
-    symbols: list[Text]
-    values: list[Number]
-    covariance: list[list[Number]]
-    undetermined: list[Text]
+    symbols: Annotated[list[Text], States]
+    values: Annotated[list[Number], States]
+    covariance: Annotated[list[Annotated[list[Number], States]], States]
+    undetermined: Annotated[list[Text], States]
 
 
 class SavedProgram(Part):
@@ -73,9 +80,9 @@ class SavedConsistency(Part):
     """Whether model and measurements agree; null where nothing was left over to judge by."""
 
     consistent: bool | None
-    p_value: Number | None
-    nis_per_dof: Number | None
-    dof: int
+    p_value: Share | None
+    nis_per_dof: Positive | None
+    dof: Count
     residual_rms_mps2: Positive
     held_out_rms_mps2: Positive | None
     held_out_floor_mps2: Positive | None
@@ -85,19 +92,19 @@ class SavedDwell(Part):
     """One orientation: gimbal angles (null: attitude recorded), begin, end, readings used."""
 
     gimbal_deg: list[Number] | None
-    start_s: Number
-    end_s: Number
-    readings: int
+    start_s: Seconds
+    end_s: Seconds
+    readings: Annotated[Count, Field(ge=1)]
 
 
 class SavedConditions(Part):
-    """Under which conditions it holds: when, how warm, which orientations. began: null where stamps are no dates."""
+    """Under which conditions it holds: when, how warm, which orientations. began: of the run; null if not known."""
 
     began: Text | None
-    duration_s: Positive
-    temperature_min_c: Number | None
-    temperature_mean_c: Number | None
-    temperature_max_c: Number | None
+    duration_s: Annotated[Seconds, Field(ge=0.0)]
+    temperature_min_c: Warmth | None
+    temperature_mean_c: Warmth | None
+    temperature_max_c: Warmth | None
     dwells: list[SavedDwell]
 
 

@@ -82,7 +82,7 @@ class CorrectedLines:
             if not text:
                 return
             try:
-                self._reader = reader_for(text, self._columns, self._account, angles=False)
+                self._reader, _ = reader_for([text], self._columns, self._account, angles=False)
             except InputError as error:
                 raise InputError(f"standard input: {error}") from None
             if text[0] not in "{[":  # the header

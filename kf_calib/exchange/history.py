@@ -13,6 +13,9 @@ A dozen calibrations cannot tell a walk from poor repeatability, and each of the
 open: a walk of the level, repeatability of the drift. Averaged over both, intervals of 95 % cover the next value in 94
 to 98 % of simulated histories of whichever kind; the drift in 86 to 94 % where all scatter is a walk, and in every one
 where all is repeatability.
+
+Runs of less than a day show repeatability, and neither walk nor drift: what changes a sensor within hours, warmth and
+handling, is not what ages it, and a year is thousands of such spans.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 
 import numpy as np
 
@@ -29,10 +32,15 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.errors import InputError
 from kf_calib.exchange.calibration_file import SavedCalibration
+from kf_calib.support import dates
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
 DAY_S = 86400.0
 FEWEST = 2
+SHORTEST_DAYS = 1.0
+"""Calibrations that span less show no drift."""
+_MONTH_DAYS = 30.0
+_NAMED = 3
 _COVERED = 2.0  # sigmas of a parameter that have to be within its tolerance
 _GRID = np.concatenate([[0.0], np.geomspace(0.03, 30.0, 25)])
 """Values of q and r, in units of the scatter that they are to explain."""
@@ -45,10 +53,11 @@ class Track:
     """One parameter over the calibrations, in SI and days.
 
     values (n,), sigmas (n,): as found and calibrated. level, level_sigma: what it is at the last calibration, by all of
-    them. drift, drift_sigma: its change per day (None: fewer than three); level_drift_covariance: of the two. walk:
-    intensity q of its random walk, per square root of a day, rms over what is likely. repeatability: r, likewise.
-    constant_p: that a constant parameter shows such differences. predicted, predicted_sigma (n,): each calibration as
-    those before it predict it, by the q and r of all; NaN for the first, or the first two where there is a drift.
+    them. drift, drift_sigma: its change per day (None: fewer than three, or within a day); level_drift_covariance: of
+    the two. walk: intensity q of its random walk, per square root of a day, rms over what is likely. repeatability: r,
+    likewise. constant_p: that a constant parameter shows such differences. predicted, predicted_sigma (n,): each
+    calibration as those before it predict it, by the q and r of all; NaN for the first, or the first two where there is
+    a drift.
     """
 
     symbol: str
@@ -81,7 +90,8 @@ class History:
     """All parameters of one block over its calibrations.
 
     dates (n,): of the calibrations, in order; serial: of the block. due: the date up to which every parameter with a
-    tolerance stays within it (95 %), by ``due_by`` (None: no tolerance, or longer than twenty years).
+    tolerance stays within it (95 %), by ``due_by`` (None: no tolerance, longer than twenty years, or, without a drift,
+    not to be told). warnings: what its dates and their span do not tell.
     """
 
     serial: str
@@ -90,6 +100,7 @@ class History:
     tolerances: Mapping[str, float]
     due: datetime | None
     due_by: str
+    warnings: tuple[str, ...] = ()
 
     @property
     def days(self) -> Floats:
@@ -113,29 +124,57 @@ def history(calibrations: Sequence[SavedCalibration], tolerances: Mapping[str, f
             "some of the calibrations were made without angles, in the frame of the sensors, others in that of the "
             "platform: give those of one kind."
         )
-    dates = tuple(map(date_of, ordered))
-    twice = next((one for one, other in itertools.pairwise(dates) if one == other), None)
+    begun = tuple(map(date_of, ordered))
+    twice = next((one for one, other in itertools.pairwise(begun) if one == other), None)
     if twice is not None:
-        raise InputError(f"two calibrations have the date {twice.isoformat()}: give each once.")
-    days = np.array([(date - dates[0]).total_seconds() / DAY_S for date in dates])
+        raise InputError(f"two calibrations have the date {twice.isoformat()}: give each once, or its time of day too.")
+    days = np.array([(date - begun[0]).total_seconds() / DAY_S for date in begun])
     tracks = tuple(_track(k, ordered, days) for k in _common(ordered))
     wanted = dict(tolerances or {})
     unknown = sorted(set(wanted) - {track.symbol for track in tracks})
     if unknown:
         raise InputError(f"{unknown[0]} has a tolerance, but not all calibrations determine it: leave it out.")
     due, by = _due(tracks, wanted)
-    date = None if due is None else dates[-1] + timedelta(days=due)
-    return History(next(iter(serials), ""), dates, tracks, wanted, date, by)
+    date = None if due is None else begun[-1] + timedelta(days=due)
+    warnings = (*_undated(ordered), *_of_the_span(days))
+    return History(next(iter(serials), ""), begun, tracks, wanted, date, by, warnings)
 
 
 def date_of(saved: SavedCalibration) -> datetime:
-    """When a calibration was made: when its recording began, or, where that has no date, when it was saved."""
+    """When the run of a calibration began, or, where its file does not say that, when it was computed."""
     text = saved.conditions.began or saved.provenance.created
     try:
-        date = datetime.fromisoformat(text)
+        return dates.read(text)
     except ValueError:
         raise InputError(f"{text!r} is no date: a calibration needs one (ISO 8601).") from None
-    return date if date.tzinfo else date.replace(tzinfo=UTC)
+
+
+def _undated(calibrations: Sequence[SavedCalibration]) -> list[str]:
+    """Return a sentence about the calibrations whose files do not say when their runs began, if there are any."""
+    those = [own.provenance for own in calibrations if own.conditions.began is None]
+    if not those:
+        return []
+    which = ", ".join(f"{each.recording or 'without a recording'}, {each.created}" for each in those[:_NAMED])
+    return [
+        f"{len(those)} of the {len(calibrations)} calibrations do not say when their runs began, and are dated by when "
+        f"they were computed ({which}{', ...' * (len(those) > _NAMED)}): evaluate those runs again with --date and "
+        "--save, if they are older"
+    ]
+
+
+def _of_the_span(days: Floats) -> list[str]:
+    """Return a sentence if the calibrations lie so close together that they tell little or nothing of a drift."""
+    span = float(days[-1])
+    if span < SHORTEST_DAYS:
+        spans = f"{24.0 * span:.1f} h" if span > 1.0 / 24.0 else f"{1440.0 * span:.0f} min"
+        return [f"the calibrations span {spans}, too short to tell a drift: they show repeatability alone, and no date "
+                "of the next one follows"]  # fmt: skip
+    if len(days) == FEWEST:
+        return ["two calibrations show no drift apart from repeatability, and no date of the next one: save a third"]
+    if span < _MONTH_DAYS:
+        return [f"the calibrations span {span:.1f} days, so that the drift of a year is theirs, extrapolated "
+                f"{365.25 / span:.0f}-fold: calibrate again some months later to know it"]  # fmt: skip
+    return []
 
 
 def _common(calibrations: Sequence[SavedCalibration]) -> list[str]:
@@ -149,12 +188,14 @@ def _common(calibrations: Sequence[SavedCalibration]) -> list[str]:
 def _track(symbol: str, calibrations: Sequence[SavedCalibration], days: Floats) -> Track:
     """Return the track of one parameter."""
     found = [next(p for p in each.parameters if p.symbol == symbol) for each in calibrations]
+    if len(units := sorted({p.unit for p in found})) > 1:
+        raise InputError(f"{symbol} is in {' and in '.join(units)} in these calibrations: give those of one model.")
     values, sigmas = (np.array([getattr(p, key) for p in found], float) for key in ("value", "sigma"))
     known = 1.0 / np.maximum(sigmas, 1e-300) ** 2
     mean = float(known @ values / known.sum())
     constant_p = chi_squared_tail(len(values) - 1, float(known @ (values - mean) ** 2))
-    with_drift = len(values) >= 3
-    found_by = _filtered(values, sigmas, days, *_pairs(values, sigmas, days), with_drift)
+    with_drift = len(values) > FEWEST and float(days[-1]) >= SHORTEST_DAYS
+    found_by = _filtered(values, sigmas, days, *_pairs(values, sigmas, days, with_drift), with_drift)
     weights = found_by.weights
     walk, repeatability = (math.sqrt(weights @ each**2) for each in (found_by.walks, found_by.repeatabilities))
     state = weights @ found_by.states
@@ -170,12 +211,14 @@ def _track(symbol: str, calibrations: Sequence[SavedCalibration], days: Floats) 
     )  # fmt: skip
 
 
-def _pairs(values: Floats, sigmas: Floats, days: Floats) -> tuple[Floats, Floats, Floats]:
+def _pairs(values: Floats, sigmas: Floats, days: Floats, with_walk: bool) -> tuple[Floats, Floats, Floats]:
     """Return all pairs of walk q and repeatability r, (m,) each, and the logarithm of their prior (m,)."""
     spread = max(float(np.std(values, ddof=1)), float(np.median(sigmas)))
-    step = max(float(np.median(np.diff(days))), 1e-9)
+    steps = np.diff(days)
+    apart = steps[steps >= SHORTEST_DAYS]  # what differs within a day is repeatability
+    step = float(np.median(apart)) if apart.size else SHORTEST_DAYS
     prior = -np.log(np.maximum(_GRID, 1.0))
-    count = len(_GRID) if len(values) > FEWEST else 1  # two calibrations cannot tell a walk from repeatability
+    count = len(_GRID) if with_walk else 1  # two calibrations, or hours, cannot tell a walk from repeatability
     walks, repeatabilities = np.meshgrid(_GRID[:count] * spread / math.sqrt(step), _GRID * spread, indexing="ij")
     return walks.ravel(), repeatabilities.ravel(), np.add.outer(prior[:count], prior).ravel()
 

@@ -28,6 +28,7 @@ from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import evaluate_fit
 from kf_calib.estimation.correction import Correction
+from kf_calib.estimation.dwell_columns import Means
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.measurement_model import SQUARE, Model
@@ -45,6 +46,7 @@ LEVEL = 0.01
 whole, half by a parameter that seems to have moved."""
 
 _DIRECTIONS = 4000
+_ROUNDS = 6  # till columns and state agree; the error of each is about the square of the one before
 
 
 @dataclass(frozen=True)
@@ -145,24 +147,50 @@ def _free_count(model: Model, free: Sequence[str]) -> int:
 
 
 def _misfit(saved: SavedCalibration, fitted: Fit, noise: Noise, free: Sequence[str]) -> tuple[float, float]:
-    """Return the normalised misfit of the new means, and the rms of their residuals by the old state, m/s^2."""
+    """Return the normalised misfit of the new means, and the rms of their residuals by the old state, m/s^2.
+
+    Without angles the columns turn with the axes: they are those of the state that fits best within the old sigmas,
+    found in turn.
+    """
     old, model = np.array(saved.state.values), fitted.carried.model
-    means = carried_at(fitted.dwells, model, old, noise).means if noise.attitude_unknown else fitted.carried.means
-    kept = [
-        k for k in range(model.count) if not any(k in range(*model.parts[name].indices(model.count)) for name in free)
-    ]
+    if not noise.attitude_unknown:
+        means, at = fitted.carried.means, fitted.carried.state
+        misfit, _ = _least_misfit(saved, model, means, mean_covariances(noise, means, at), free)
+        return misfit, _rms(means, old)
+    means, state, misfit = carried_at(fitted.dwells, model, old, noise).means, old, 0.0
+    rms = _rms(means, old)
+    for _ in range(_ROUNDS):
+        means = carried_at(fitted.dwells, model, state, noise).means
+        misfit, state = _least_misfit(saved, model, means, mean_covariances(noise, means, state), free)
+    return misfit, rms
+
+
+def _rms(means: Means, state: Floats) -> float:
+    """Return the rms of mean readings less those of a state."""
+    return float(np.sqrt(np.mean((means.readings - means.design @ state) ** 2)))
+
+
+def _least_misfit(
+    saved: SavedCalibration, model: Model, means: Means, covariances: Floats, free: Sequence[str]
+) -> tuple[float, Floats]:
+    """Return the least normalised misfit of new means and old state together, and the state that has it."""
+    old = np.array(saved.state.values)
+    given_up = [k for name in free for k in range(*model.parts[name].indices(model.count))]
+    kept = np.delete(np.arange(model.count), given_up)
     covariance = (np.array(saved.state.covariance) + _square(saved))[np.ix_(kept, kept)]
-    lower = np.linalg.inv(np.linalg.cholesky(mean_covariances(noise, means, fitted.carried.state)))
-    residuals = means.readings - means.design @ old
+    lower = np.linalg.inv(np.linalg.cholesky(covariances))
     rows = (lower @ means.design).reshape(-1, model.count)
-    right = np.einsum("dij,dj->di", lower, residuals).ravel()
+    right = np.einsum("dij,dj->di", lower, means.readings - means.design @ old).ravel()
     root = _root(covariance)  # x - x1 = root y with y of unit variance
-    mixed = np.hstack([rows[:, kept] @ root, np.delete(rows, kept, axis=1)])
-    prior = np.eye(len(kept), mixed.shape[1])
-    stacked, target = np.vstack([mixed, prior]), np.append(right, np.zeros(len(kept)))
+    mixed = np.hstack([rows[:, kept] @ root, rows[:, given_up]])
+    stacked = np.vstack([mixed, np.eye(len(kept), mixed.shape[1])])
+    target = np.append(right, np.zeros(len(kept)))
     scale = np.maximum(np.linalg.norm(stacked, axis=0), 1e-300)
-    left = target - stacked @ (np.linalg.lstsq(stacked / scale, target, rcond=None)[0] / scale)
-    return float(left @ left), float(np.sqrt(np.mean(residuals**2)))
+    solution = np.linalg.lstsq(stacked / scale, target, rcond=None)[0] / scale
+    left, state = target - stacked @ solution, old.copy()
+    state[kept] += root @ solution[: len(kept)]
+    state[given_up] += solution[len(kept) :]
+    return float(left @ left), state
 
 
 def _square(saved: SavedCalibration) -> Floats:
@@ -181,7 +209,11 @@ def _root(covariance: Floats) -> Floats:
 
 
 def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tuple[Move, ...]:
-    """Return the differences of all that both runs determine, the clearest first."""
+    """Return the differences of all that both runs determine, the clearest first.
+
+    A scale factor by axes that were taken for square is K cos(angle off square), wrong by about K angle^2 / 2.
+    """
+    off_square = saved.bench.square_rad**2 if "square" in saved.fixed.values() and not new.model.square else 0.0
     skipped = {symbol for each in new.model.effects if str(each) in free for symbol in _symbols(each)}
     before = {each.symbol: each for each in saved.parameters}
     found = list[tuple[str, str, float, float, float]]()
@@ -189,7 +221,9 @@ def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tu
         was = before.get(symbol)
         if was is None or symbol in skipped or None in (was.value, was.sigma, now.value, now.sigma):
             continue
-        found.append((symbol, now.unit, was.value, now.value, float(np.hypot(was.sigma, now.sigma))))  # type: ignore[arg-type]
+        assert was.value is not None and was.sigma is not None and now.value is not None and now.sigma is not None
+        bent = now.value * off_square if symbol in ("K2", "K3") else 0.0  # the axis of accelerometer 1 is that of x
+        found.append((symbol, now.unit, was.value, now.value, math.hypot(was.sigma, now.sigma, bent)))
     moves = [
         Move(symbol, unit, old, value, value - old, sigma,
              sidak(math.erfc(abs(value - old) / max(sigma, 1e-300) / math.sqrt(2.0)), len(found)))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats, Mask
-from kf_calib.effects import Effect, described
+from kf_calib.effects import Bearer, Effect, described
 from kf_calib.errors import InputError
 from kf_calib.fleet.reference_unit import ReferenceUnit
 from kf_calib.fleet.run_factor import RunFactor, column_name
@@ -52,8 +52,7 @@ class Group:
     - name: of the effect. columns: their indices. symbols: of the coefficients.
     - sigma: what one run leaves uncertain of a coefficient beside its own parameters, SI; 0 where no run shows it.
     - largest: the largest size that is expected, in ``sigma``.
-    - of_the_bench: whether it usually belongs to the bench.
-    - alone: whether only one unit shows it, so that nobody can tell whether it is the bench's.
+    - borne_by: what can have it.
     """
 
     name: str
@@ -61,8 +60,7 @@ class Group:
     symbols: tuple[str, ...]
     sigma: float
     largest: float
-    of_the_bench: bool
-    alone: bool = False
+    borne_by: Bearer
 
 
 @dataclass(frozen=True)
@@ -187,19 +185,16 @@ class Campaign:
         ends = np.cumsum([0, *map(len, symbols.values())]).tolist()
         parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
         total, runs = np.zeros(ends[-1]), np.zeros(ends[-1])
-        units = [set[str]() for _ in parts]
-        for key, info, _ in self._each():
+        for _, info, _ in self._each():
             own = np.diag(info)
             total, runs = total + own, runs + (own > 0.0)
-            for part, shown_by in zip(parts, units, strict=True):
-                shown_by |= {key.unit} if own[part].any() else set()
         groups = list[Group]()
-        for (name, own), part, shown_by in zip(symbols.items(), parts, units, strict=True):
+        for (name, own), part in zip(symbols.items(), parts, strict=True):
             seen, effect = runs[part] > 0.0, described(name)
             sigma = float(np.mean(total[part][seen] / runs[part][seen])) ** -0.5 if seen.any() else 0.0
             largest = max(_LARGE, _usual(effect) / sigma) if sigma else _LARGE
-            of_bench, alone = effect is not None and effect.of_the_bench, len(shown_by) == 1 < len(self.keys)
-            groups.append(Group(name, part, tuple(own), sigma, largest, of_bench, alone))
+            borne_by = Bearer.EITHER if effect is None else effect.borne_by
+            groups.append(Group(name, part, tuple(own), sigma, largest, borne_by))
         return groups
 
 

@@ -14,13 +14,13 @@ from typing import Any, Protocol
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.results import Calibration
-from kf_calib.exchange.calibration_file import date_of
 from kf_calib.fleet import run_row
 from kf_calib.fleet.local_copy import local_copy
 from kf_calib.fleet.run_factor import run_factor
 from kf_calib.fleet.run_list import Run
 from kf_calib.fleet.run_row import Row
 from kf_calib.sources.files.bags import fingerprint
+from kf_calib.sources.run_date import run_date
 from kf_calib.support.threads import one_blas_thread
 
 
@@ -83,7 +83,7 @@ class Evaluation:
         notes = result.bench.notes
         row["unit"] = row["unit"] or notes.get("block_serial")
         row["bench"] = row["bench"] or notes.get("bench")
-        row["date"] = row["date"] or _first_reading(source)
+        row["date"] = row["date"] or run_date(source)
         row |= run_row.of_replay(self.commands.replay_document(result))
         row |= run_row.of_factor(run_factor(result.fit))
         if result.bench.angles:  # without them there is no telling what depends on the attitude
@@ -96,12 +96,6 @@ def begun(run: Run, settings: str) -> Row:
     stated = {"run": run.place, "unit": run.unit, "bench": run.bench, "date": run.date}
     told = {"bytes": run.size, "version": run.version, "settings": settings, "host": platform.node()}
     return dict.fromkeys(run_row.SCHEMA.names) | stated | told | {"evaluated": datetime.now(UTC)}
-
-
-def _first_reading(source: Source) -> datetime | None:
-    """Return the date of the first reading; None where stamps count from the start of a clock."""
-    begin_ns = getattr(source, "begin_ns", None)
-    return date_of(begin_ns() if begin_ns else None)
 
 
 def _call_by_place(row: Row, path: Path, run: Run) -> None:

@@ -1,8 +1,8 @@
 """The table of hypotheses that compete to be the next term: every effect with every attribution, and none of them.
 
 Before the runs, none has a probability of one half. The other half is shared equally by the effects that the runs can
-show. Of the share of an effect, two thirds are for what it usually belongs to, the bench or the sensors, and one third
-is for the other; each part is shared equally, but a bench that was repaired is a quarter as likely as one that was not.
+show, and the share of an effect by what can have it, as its physics says: an error of an encoder is never of sensors.
+A bench that was repaired, and what is each run's own, are a quarter as likely as the others.
 """
 
 from __future__ import annotations
@@ -15,14 +15,16 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.bench_coefficient import DatedSums
 from kf_calib.fleet.campaign import Campaign, Group
+from kf_calib.fleet.own_coefficients import Own, OwnAndCommon
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
-from kf_calib.fleet.population import Own, OwnCoefficients
+from kf_calib.fleet.population_evidence import OwnCoefficients
 from kf_calib.fleet.some_units import SomeUnits
 from kf_calib.support.logarithms import weights
 
-_NONE, _USUAL = 0.5, 2.0 / 3.0
-_RARELY = 0.25  # how much rarer a repair is than a bench that stays as it is
+_NONE = 0.5
+_RARELY = {Attribution.REPAIRED: 0.25, Attribution.RUN: 0.25}  # how much likelier others are: 1
 _HAS_IT = 0.5  # probability above which a unit counts as one that has the effect
+_MAY_HAVE_IT = 0.05  # and as one that may have it
 
 
 _Weighed = tuple[Term, float]
@@ -73,7 +75,6 @@ def table(campaign: Campaign, terms: PooledTerms) -> AttributionTable:
     """The table of the hypotheses for one term more than ``terms``."""
     groups = [group for group in campaign.groups if group.sigma and group.name not in terms.names()]
     weighed = [*_of_units(campaign, terms, groups), *_of_runs(campaign, terms, groups)]
-    weighed = [(term, log_odds) for term, log_odds in weighed if _can_be_told(term)]
     tried = {group.name: {term.attribution for term, _ in weighed if term.group is group} for group in groups}
     rows = [
         AttributionHypothesis(term, log_odds, _log_prior(term, tried[term.group.name], len(groups)))
@@ -84,13 +85,9 @@ def table(campaign: Campaign, terms: PooledTerms) -> AttributionTable:
     return AttributionTable(tuple(rows), found[1:], float(found[0]))
 
 
-def _can_be_told(term: Term) -> bool:
-    """Tell whether the runs can speak for a term: what one unit alone shows is of what it usually belongs to."""
-    return not term.group.alone or term.attribution.common == term.group.of_the_bench
-
-
 def _of_runs(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[_Weighed]:
     """Return the terms of coefficients of benches and, if units were measured again, of single runs."""
+    of_bench = [group for group in groups if Attribution.BENCH.possible(group.borne_by)]
     dated, out = DatedSums(campaign, terms), list[_Weighed]()
     sums = [OwnCoefficients(group, terms) for group in groups] if campaign.repeats else []
     for blocks in campaign.runs():
@@ -98,7 +95,7 @@ def _of_runs(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) ->
         dated.add(rest)
         for own in sums:
             own.add(rest)
-    for group in groups:
+    for group in of_bench:
         one, two = dated.constant(group), dated.repaired(group)
         out.append((Term(group, Attribution.BENCH, one.size), one.log_odds))
         if two is not None:
@@ -109,27 +106,29 @@ def _of_runs(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) ->
 
 def _of_units(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[_Weighed]:
     """Return the terms of coefficients that units have, all of them or some."""
-    means, sums = terms.solved(campaign)[0], [OwnCoefficients(group, terms) for group in groups]
-    parts = [list[Own]() for _ in groups]
+    groups = [group for group in groups if Attribution.SENSORS.possible(group.borne_by)]
+    sums, parts = [OwnCoefficients(group, terms) for group in groups], [list[OwnAndCommon]() for _ in groups]
     for blocks in campaign.units(terms.repairs):
         rest = terms.beside_own(blocks)
         for group, own, part in zip(groups, sums, parts, strict=True):
             own.add(rest)
-            part.append(Own.of(group, terms, means, rest))
+            part.append(OwnAndCommon.of(group, terms, rest))
     out = list[_Weighed]()
     for group, own, part in zip(groups, sums, parts, strict=True):
-        units, (term, log_odds) = Own.joined(part), _drawn(group, Attribution.SENSORS, own)
+        told, (term, log_odds) = OwnAndCommon.joined(part), _drawn(group, Attribution.SENSORS, own)
+        units, too_much = told.integrated(), told.explained_by_common()
         some = SomeUnits(group, units, with_mean=log_odds > 0.0)  # where nothing speaks for a mean of all, none
-        out.append((term, float(np.logaddexp(log_odds, some.log_odds_of_all) - np.log(2.0))))
-        out.append((_of_some(group, units, some), some.log_odds))
+        out.append((term, float(np.logaddexp(log_odds, some.log_odds_of_all - too_much) - np.log(2.0))))
+        out.append((_of_some(group, units, some), some.log_odds - too_much))
     return out
 
 
 def _of_some(group: Group, units: Own, some: SomeUnits) -> Term:
     """Return the term that some units have; which is asked only if it may be so."""
-    held = some.probabilities > _HAS_IT if some.log_odds > 0.0 else np.zeros(len(units.units), bool)
-    having = frozenset(unit for unit, here in zip(units.units, held.tolist(), strict=True) if here)
-    return Term(group, Attribution.SOME, some.size, units=having)
+    chances = some.probabilities.tolist() if some.log_odds > 0.0 else [0.0] * len(units.units)
+    may_have, has = (frozenset(unit for unit, chance in zip(units.units, chances, strict=True) if chance > least)
+                     for least in (_MAY_HAVE_IT, _HAS_IT))  # fmt: skip
+    return Term(group, Attribution.SOME, some.size, units=has, unsure=may_have - has)
 
 
 def _drawn(group: Group, attribution: Attribution, own: OwnCoefficients) -> _Weighed:
@@ -139,8 +138,5 @@ def _drawn(group: Group, attribution: Attribution, own: OwnCoefficients) -> _Wei
 
 def _log_prior(term: Term, tried: set[Attribution], groups: int) -> float:
     """Return the log of the probability of a term before the runs."""
-    alike = {each: _RARELY if each is Attribution.REPAIRED else 1.0 for each in tried}
-    usual = term.group.of_the_bench == term.attribution.common
-    total = sum(part for each, part in alike.items() if each.common == term.attribution.common)
-    share = (_USUAL if usual else 1.0 - _USUAL) * alike[term.attribution] / total
+    share = _RARELY.get(term.attribution, 1.0) / sum(_RARELY.get(each, 1.0) for each in tried)
     return float(np.log((1.0 - _NONE) / groups * share))

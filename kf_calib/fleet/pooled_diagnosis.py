@@ -15,8 +15,9 @@ from kf_calib.fleet.bench_coefficient import BenchEstimate, DatedSums
 from kf_calib.fleet.campaign import Campaign, Factors, Group
 from kf_calib.fleet.evidence import FLAT
 from kf_calib.fleet.hypotheses import AttributionTable
+from kf_calib.fleet.own_coefficients import OwnAndCommon
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
-from kf_calib.fleet.population import Own, Population, population
+from kf_calib.fleet.population import Population, population
 from kf_calib.fleet.reference_unit import ReferenceUnit
 from kf_calib.fleet.repair_date import RepairDate, repair_date
 from kf_calib.fleet.some_units import SomeUnits
@@ -24,6 +25,7 @@ from kf_calib.support.threads import one_blas_thread
 
 RIVAL = 0.01
 """Probability above which another effect is named as a rival."""
+_MAY_BE = 0.05  # of the probability of an effect: above it all units may have it
 
 
 @dataclass(frozen=True)
@@ -99,8 +101,8 @@ class Finding:
 class EffectRow:
     """One effect of the catalogue: the probability of each attribution and that no run has it.
 
-    benches: what it would be as one of the bench, beside what was found. Probabilities are None where no run can show
-    the effect.
+    benches: what it would be as one of the bench, beside what was found; empty where it cannot be of one.
+    Probabilities are None where no run can show the effect.
     """
 
     effect: str
@@ -149,49 +151,64 @@ def pooled_diagnosis(factors: Factors, *, reference_unit: ReferenceUnit | None =
 def _finding(campaign: Campaign, found: Attributed, number: int) -> Finding:
     """Return what is to be said of one term, from its table beside the others."""
     term, table = found.terms[number], found.tables[number]
-    others = PooledTerms([each for each in found.terms if each is not term], len(campaign.benches))
     shares = dict(table.of(term.group.name))
     rivals = {name: share for name, share in table.effects().items() if share > RIVAL and name != term.group.name}
-    attribution = chosen(table).attribution
-    if attribution.common:
-        sums = DatedSums.of(campaign, others, [term.repair] if term.repair else [])
-        benches = tuple(
-            _bench_coefficients(campaign, term.group, each) for each in sums.estimates(term.group, term.repair)
-        )
-        followed = tuple(
-            replace(_bench_coefficients(campaign, term.group, each), since=campaign.by_date[each.since].date)
-            for bench in range(len(campaign.benches))
-            for each in sums.over_time(term.group, bench)
-        )
-        when = repair_date(campaign, others, term) if term.repair else None
-        return Finding(term.group.name, attribution, shares, rivals, benches, followed, repair=when)
-    return _of_units(campaign, others, term, Finding(term.group.name, attribution, shares, rivals))
+    so_far = Finding(term.group.name, chosen(table).attribution, shares, rivals)
+    if not so_far.attribution.common:
+        return _of_units(campaign, found, number, so_far)
+    sums = DatedSums.of(campaign, _free(campaign, found, number), [term.repair] if term.repair else [])
+    benches = tuple(_bench_coefficients(campaign, term.group, each) for each in sums.estimates(term.group, term.repair))
+    followed = tuple(
+        replace(_bench_coefficients(campaign, term.group, each), since=campaign.by_date[each.since].date)
+        for bench in range(len(campaign.benches))
+        for each in sums.over_time(term.group, bench)
+    )
+    when = repair_date(campaign, _others(campaign, found, number), term) if term.repair else None
+    return replace(so_far, benches=benches, over_time=followed, repair=when)
 
 
-def _of_units(campaign: Campaign, others: PooledTerms, term: Term, so_far: Finding) -> Finding:
+def _others(campaign: Campaign, found: Attributed, number: int) -> PooledTerms:
+    """Return all terms but one, with their sizes: what is likely of that one is said beside these."""
+    return PooledTerms([*found.terms[:number], *found.terms[number + 1 :]], len(campaign.benches))
+
+
+def _free(campaign: Campaign, found: Attributed, number: int | None = None) -> PooledTerms:
+    """Return all terms, or all but one, with nothing supposed of their coefficients: values are estimated beside these.
+
+    A term of some units is one of all of them where that may well be so.
+    """
+    free = [term.free() for term in found.terms]
+    chances = [table.of(term.group.name) for term, table in zip(found.terms, found.tables, strict=True)]
+    every = [shares.get(Attribution.SENSORS, 0.0) > _MAY_BE * sum(shares.values()) for shares in chances]
+    free = [replace(term, units=None) if all_have_it else term for term, all_have_it in zip(free, every, strict=True)]
+    return PooledTerms([term for k, term in enumerate(free) if k != number], len(campaign.benches))
+
+
+def _of_units(campaign: Campaign, found: Attributed, number: int, so_far: Finding) -> Finding:
     """Return the finding with population, units and share."""
-    group, means = term.group, others.solved(campaign)[0]
-    level = campaign.runs() if term.attribution is Attribution.RUN else campaign.units(others.repairs)
-    own = Own.joined([Own.of(group, others, means, others.beside_own(blocks)) for blocks in level])
+    term, free = found.terms[number], _free(campaign, found, number)
+    told = _told(campaign, term, free)
     if term.attribution is Attribution.RUN:
-        people = population(own, group.largest)
-        units = _units(group, own, people, np.ones(len(own.units)))
-        return replace(so_far, population=_figures(group, people), units=units)
-    own = own.by_unit()
-    some, chance = SomeUnits(group, own), so_far.probabilities
-    every = chance[Attribution.SENSORS] / (chance[Attribution.SENSORS] + chance[Attribution.SOME])
-    has = every + (1.0 - every) * some.probabilities
-    having = own.only(has > 0.5)
-    people = population(having, group.largest)
-    figures = _figures(group, people) if len(having.units) > 1 else None  # one unit has no spread
-    share, interval = some.share(every)
-    units = _units(group, own, people, has)
+        has, share, interval = np.ones(len(told.own.units)), None, None
+    else:
+        some = SomeUnits(term.group, _told(campaign, term, _others(campaign, found, number)).integrated())
+        chance = so_far.probabilities
+        every = chance[Attribution.SENSORS] / (chance[Attribution.SENSORS] + chance[Attribution.SOME])
+        has = every + (1.0 - every) * some.probabilities
+        share, interval = some.share(every)
+    people = population(told, has > 0.5, term.group.largest)
+    figures = _figures(term.group, people) if people is not None else None
+    rows = zip(told.own.units, has.tolist(), told.integrated().estimates(), strict=True)
+    units = tuple(UnitFigures(unit, chance, _estimates(term.group, *values)) for unit, chance, values in rows)
     return replace(so_far, population=figures, units=units, share=share, share_interval=interval)
 
 
-def _units(group: Group, own: Own, people: Population, chances: Floats) -> tuple[UnitFigures, ...]:
-    rows = zip(own.units, chances.tolist(), people.coefficients(own), strict=True)
-    return tuple(UnitFigures(unit, chance, _estimates(group, *found)) for unit, chance, found in rows)
+def _told(campaign: Campaign, term: Term, others: PooledTerms) -> OwnAndCommon:
+    """Return what units tell of the coefficients of a term, or single runs where these are theirs."""
+    of_runs = term.attribution is Attribution.RUN
+    level = campaign.runs() if of_runs else campaign.units(others.repairs)
+    told = OwnAndCommon.joined([OwnAndCommon.of(term.group, others, others.beside_own(blocks)) for blocks in level])
+    return told if of_runs else told.by_unit()
 
 
 def _figures(group: Group, people: Population) -> PopulationFigures:
@@ -204,7 +221,7 @@ def _figures(group: Group, people: Population) -> PopulationFigures:
 
 def _rows(campaign: Campaign, found: Attributed, findings: Mapping[str, Finding]) -> Iterable[EffectRow]:
     """Yield a row for every effect, those found first."""
-    sums = DatedSums.of(campaign, PooledTerms(found.terms, len(campaign.benches)))
+    sums = DatedSums.of(campaign, _free(campaign, found))
     order = {name: k for k, name in enumerate(findings)}
     for group in sorted(campaign.groups, key=lambda group: order.get(group.name, len(order))):
         if group.name in findings:
@@ -214,7 +231,8 @@ def _rows(campaign: Campaign, found: Attributed, findings: Mapping[str, Finding]
             yield EffectRow(group.name, None, None, ())
         else:
             shares = _likeliest(group.name, [found.rest, *found.tables])
-            benches = tuple(_bench_coefficients(campaign, group, each) for each in sums.estimates(group))
+            of_bench = sums.estimates(group) if Attribution.BENCH.possible(group.borne_by) else []
+            benches = tuple(_bench_coefficients(campaign, group, each) for each in of_bench)
             yield EffectRow(group.name, shares, _rest(shares), benches)
 
 

@@ -14,8 +14,9 @@ from enum import StrEnum
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.effects import Bearer
 from kf_calib.fleet.campaign import Blocks, Campaign, Group
-from kf_calib.fleet.evidence import posterior
+from kf_calib.fleet.evidence import FLAT, posterior
 
 
 class Attribution(StrEnum):
@@ -39,6 +40,12 @@ class Attribution(StrEnum):
         """Whether the coefficients are the bench's."""
         return self in (Attribution.BENCH, Attribution.REPAIRED)
 
+    def possible(self, borne_by: Bearer) -> bool:
+        """Whether an effect can be this, by its physics; in each run it may be another, whatever has it."""
+        if self is Attribution.RUN or borne_by is Bearer.EITHER:
+            return True
+        return self.common == (borne_by is Bearer.BENCH)
+
 
 @dataclass(frozen=True)
 class Term:
@@ -47,7 +54,7 @@ class Term:
     - size: of the prior of a bench's coefficients, or the spread of the units' about their mean.
     - mean_size: of the prior of that mean.
     - repair: number of the bench and first rank after the repair.
-    - units: the units that have it, where not all do.
+    - units: the units that have it, where not all do; unsure: further units that may have it.
     """
 
     group: Group
@@ -56,6 +63,15 @@ class Term:
     mean_size: float = 0.0
     repair: tuple[int, int] | None = None
     units: frozenset[str] | None = None
+    unsure: frozenset[str] = frozenset()
+
+    def free(self) -> Term:
+        """The same with nothing supposed of its coefficients: none is drawn to zero, to a mean or to those of others.
+
+        Sizes decide what there is; what it is, is then estimated without them.
+        """
+        units = None if self.units is None else self.units | self.unsure
+        return replace(self, size=FLAT, mean_size=0.0, units=units)
 
 
 @dataclass(frozen=True)

@@ -1,126 +1,27 @@
-"""Coefficients that are each unit's own, drawn about the mean of a population (random effects).
+"""The mean of a population of units and the spread of their coefficients about it (random effects).
 
-The evidence is exact for normal coefficients of a given spread and averaged over the spread and over the ratio of the
-mean to it. The spread itself is estimated by restricted likelihood (REML), in which the mean has no prior.
+The spread is estimated by restricted likelihood (REML), in which the mean and what all runs have in common are unknown
+without any prior. Its interval is that of the misfit Q of the units to their mean: Q of the true spread is distributed
+as chi-squared, whatever the mean and however few the units (Q-profile, W. Viechtbauer, 2007).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
-from kf_calib.fleet.campaign import Blocks, Group
-from kf_calib.fleet.evidence import (
-    FLAT,
-    log_evidence,
-    log_evidence_of_modes,
-    log_mean,
-    modes,
-    posterior,
-    sizes,
-)
-from kf_calib.fleet.pooled_terms import Common, PooledTerms, Sums, shares_of
-from kf_calib.support.logarithms import weights
+from kf_calib.fleet.evidence import FLAT, STEP, log_evidence, log_evidence_of_modes, modes, sizes
+from kf_calib.fleet.own_coefficients import OwnAndCommon
+from kf_calib.fleet.pooled_terms import Sums
 
-_LEAST = 0.25  # sigma of one run: the smallest spread that is expected
-_RATIOS = np.array([0.0, 1.0, 3.0])  # of the mean of a population to its spread
-_NARROW = 0.02  # sigma of one run: the smallest spread that is told from none
-_FINE = 1.05  # ratio of the spreads among which the likeliest is looked for
-
-
-@dataclass(frozen=True)
-class PopulationEvidence:
-    """Log evidence of own coefficients against none, and the likeliest spread and size of the mean, in
-    ``Group.sigma``."""
-
-    log_odds: float
-    spread: float
-    mean_size: float
-
-
-class OwnCoefficients:
-    """Sums over units (or runs) for one effect, for each spread of a grid."""
-
-    def __init__(self, group: Group, terms: PooledTerms) -> None:
-        self._terms, self._group = terms, group
-        self._spreads = sizes(_LEAST, group.largest)
-        self._more = [Common(k, 1.0) for k in range(group.columns.start, group.columns.stop)]
-        count = len(terms.common) + len(self._more)
-        self._own = np.zeros(len(self._spreads))
-        self._total = Sums(np.zeros((count, count)), np.zeros(count))
-        self._lost = Sums(np.zeros((len(self._spreads), count, count)), np.zeros((len(self._spreads), count)))
-
-    def add(self, blocks: Blocks) -> None:
-        """Add units, of which what is their own by other terms has been eliminated."""
-        own, every = self._group.columns, [*self._terms.common, *self._more]
-        shares = shares_of(every, blocks)
-        values, along, turned = modes(blocks.info[:, own, own], blocks.score[:, own])
-        across = turned @ (blocks.info[:, own][:, :, [each.column for each in every]] * shares[:, None, :])
-        rows, scores = across.reshape(-1, len(every)), along.reshape(-1)
-        for k, spread in enumerate(self._spreads):
-            gain = (spread**2 / (1.0 + spread**2 * values)).reshape(-1, 1)
-            self._own[k] += log_evidence_of_modes(values, along, spread).sum()
-            self._lost.info[k] += rows.T @ (gain * rows)
-            self._lost.score[k] += (gain * rows).T @ scores
-        self._total = self._total + self._terms.sums(blocks, self._more)
-
-    def evidence(self) -> PopulationEvidence:
-        """The evidence of all blocks that were added."""
-        count = len(self._terms.common)
-        info, score = self._total.info - self._lost.info, self._total.score - self._lost.score
-        means = self._spreads[:, None] * _RATIOS
-        prior = np.concatenate([
-            np.broadcast_to(self._terms.prior, (*means.shape, count)),
-            np.repeat(means[..., None], len(self._more), axis=2),
-        ], axis=2)  # fmt: skip
-        logs = log_evidence(info[:, None], score[:, None], prior) + self._own[:, None]
-        logs -= log_evidence(self._total.info[:count, :count], self._total.score[:count], self._terms.prior)
-        best = np.unravel_index(np.argmax(logs), logs.shape)
-        return PopulationEvidence(float(log_mean(logs)), float(self._spreads[best[0]]), float(means[best]))
-
-
-@dataclass(frozen=True)
-class Own:
-    """What units tell of their own coefficients of one effect, with everything else known, in ``Group.sigma``.
-
-    units (n,): their names. info (n, q, q), score (n, q).
-    """
-
-    units: Sequence[str]
-    info: Floats
-    score: Floats
-
-    @classmethod
-    def of(cls, group: Group, terms: PooledTerms, means: Floats, blocks: Blocks) -> Own:
-        """What blocks tell, with the common coefficients of other terms at their ``means`` (j,)."""
-        own, columns = group.columns, [each.column for each in terms.common]
-        offsets = shares_of(terms.common, blocks) * means
-        known = (blocks.info[:, own][:, :, columns] @ offsets[:, :, None])[:, :, 0]
-        return cls(blocks.labels, blocks.info[:, own, own].copy(), blocks.score[:, own] - known)  # no view of all
-
-    def only(self, kept: Mask) -> Own:
-        """Some of them."""
-        units = [unit for unit, here in zip(self.units, kept.tolist(), strict=True) if here]
-        return Own(units, self.info[kept], self.score[kept])
-
-    def by_unit(self) -> Own:
-        """With one entry for each unit, where a repair of the bench has parted its runs."""
-        names = list(dict.fromkeys(self.units))
-        numbers = {unit: k for k, unit in enumerate(names)}
-        places = [numbers[unit] for unit in self.units]
-        info, score = np.zeros((len(names), *self.info.shape[1:])), np.zeros((len(names), *self.score.shape[1:]))
-        np.add.at(info, places, self.info)
-        np.add.at(score, places, self.score)
-        return Own(names, info, score)
-
-    @classmethod
-    def joined(cls, parts: Sequence[Own]) -> Own:
-        """All of several parts."""
-        units = [unit for part in parts for unit in part.units]
-        return cls(units, np.concatenate([part.info for part in parts]), np.concatenate([p.score for p in parts]))
+_NARROW, _WIDE = 0.02, 1e6  # sigma of one run: the smallest spread that is told from none, and a larger one than any
+_SEEN = 1e-6  # of the largest information of a unit: what is less counts as not seen
+_ABOVE = (0.025, 0.975)  # probability that chi-squared is above that at the lower and the upper end of the interval
 
 
 @dataclass(frozen=True)
@@ -132,30 +33,103 @@ class Population:
     spread: float
     spread_interval: tuple[float, float]
 
-    def coefficients(self, own: Own) -> list[tuple[Floats, Floats]]:
-        """The coefficients (q,) of each unit with their covariance (q, q), given that it is of this population."""
-        prior = np.full(len(self.mean), self.spread)
-        rows = zip(own.info, own.score - own.info @ self.mean, strict=True)
-        found = [posterior(info, score, prior) for info, score in rows]
-        return [(self.mean + departure, covariance) for departure, covariance in found]
+
+def population(told: OwnAndCommon, members: Mask, largest: float) -> Population | None:
+    """The population of some units; None where they are too few to have a spread.
+
+    members (n,): who is of it; nothing is supposed of the others. largest: the largest likeliest spread.
+    """
+    misfits = _Misfits(told, members)
+    if misfits.freedom < 1:
+        return None
+    spread = misfits.likeliest(largest)
+    mean, covariance = misfits.mean(spread)
+    low, high = misfits.interval()
+    return Population(mean, covariance, spread, (low, high))
 
 
-def population(own: Own, largest: float) -> Population:
-    """The population from its units by restricted likelihood; largest: the largest spread that is tried."""
-    tried, flat = np.concatenate([[0.0], sizes(_NARROW, largest, _FINE)]), np.full(own.score.shape[1], FLAT)
-    values, along, turned = modes(own.info, own.score)
-    told = [told_of_mean(values, along, turned, spread) for spread in tried.tolist()]
-    rests = [Sums(info.sum(axis=0), score.sum(axis=0)) for info, score in told]
-    logs = np.array([
-        log_evidence_of_modes(values, along, spread).sum() + log_evidence(rest.info, rest.score, flat)
-        for spread, rest in zip(tried.tolist(), rests, strict=True)
-    ])  # fmt: skip
-    best = int(np.argmax(logs))
-    mean, covariance = posterior(rests[best].info, rests[best].score, flat)
-    share = np.cumsum(weights(logs) * np.gradient(tried))
-    places = np.searchsorted(share / share[-1], [0.025, 0.975])
-    low, high = tried[np.minimum(places, len(tried) - 1)].tolist()
-    return Population(mean, covariance, float(tried[best]), (low, high))
+class _Misfits:
+    """How well units fit to their common mean, for every spread about it."""
+
+    def __init__(self, told: OwnAndCommon, members: Mask) -> None:
+        self._common = told.common
+        self._values, self._along, self._turned = modes(told.own.info[members], told.own.score[members])
+        self._seen = self._values > _SEEN * self._values.max(initial=0.0)
+        self._rows = self._turned @ told.across[members]
+        self._coefficients = told.own.score.shape[1]
+        self._prior = np.concatenate([np.full(self._coefficients, FLAT), told.prior])
+
+    @cached_property
+    def freedom(self) -> int:
+        """Degrees of freedom of the misfit: what units tell, less the mean and what this takes of the common ones."""
+        ranks = [int(np.linalg.matrix_rank(info, hermitian=True, rtol=_SEEN)) if info.size else 0
+                 for info in (self._common.info, self._sums(0.0).info)]  # fmt: skip
+        return int(self._seen.sum()) + ranks[0] - ranks[1]
+
+    def likeliest(self, largest: float) -> float:
+        """The spread of the largest likelihood: the best of a grid, and then the best near that."""
+        from scipy.optimize import minimize_scalar
+
+        tried = [0.0, *sizes(_NARROW, largest).tolist(), largest * STEP]
+        best = int(np.argmax([self.log_likelihood(each) for each in tried[:-1]]))
+        near = tried[max(best - 1, 0)], tried[best + 1]
+        refined: Any = minimize_scalar(lambda spread: -self.log_likelihood(spread), bounds=near, method="bounded")
+        return float(refined.x) if -refined.fun > self.log_likelihood(tried[best]) else tried[best]
+
+    def log_likelihood(self, spread: float) -> float:
+        """Restricted, but for a constant."""
+        sums = self._sums(spread)
+        apart = log_evidence_of_modes(self._values, self._along, spread).sum()
+        return float(apart + log_evidence(sums.info, sums.score, self._prior))
+
+    def mean(self, spread: float) -> tuple[Floats, Floats]:
+        """The mean (q,) with its covariance (q, q), the common coefficients being uncertain, too."""
+        sums, own = self._sums(spread), slice(self._coefficients)
+        covariance = np.asarray(np.linalg.inv(sums.info + np.diag(self._prior**-2)), float)
+        return (covariance @ sums.score)[own], covariance[own, own]
+
+    def interval(self) -> tuple[float, float]:
+        """The spreads at which the misfit is neither too large nor too small, with 95 % probability."""
+        from scipy.special import chdtri
+
+        low, high = (self._spread_of(float(chdtri(self.freedom, above))) for above in _ABOVE)
+        return low, high
+
+    def _spread_of(self, misfit: float) -> float:
+        """Return the spread at which the misfit is this; 0 where it is smaller without any."""
+        from scipy.optimize import brentq
+
+        if self._misfit(0.0) <= misfit:
+            return 0.0
+        ends = math.log(_NARROW * _NARROW), math.log(_WIDE)
+        if self._misfit(math.exp(ends[0])) <= misfit:
+            return 0.0
+        root: Any = brentq(lambda log_spread: self._misfit(math.exp(log_spread)) - misfit, *ends, xtol=1e-4)
+        return math.exp(root)
+
+    def _misfit(self, spread: float) -> float:
+        """Return chi-squared of the units about their mean, beside that of the common coefficients alone."""
+        sums, count = self._sums(spread), self._coefficients
+        whole = float(np.sum(self._left(spread) * self._along**2))
+        explained = sums.score @ np.linalg.solve(sums.info + np.diag(self._prior**-2), sums.score)
+        before = self._common.info + np.diag(self._prior[count:] ** -2)
+        return whole - float(explained) + float(self._common.score @ np.linalg.solve(before, self._common.score))
+
+    def _left(self, spread: float) -> Floats:
+        """Return the square (n, q) of the variance of an estimate over that variance and the spread's together."""
+        values = np.where(self._seen, self._values, 1.0)
+        return np.where(self._seen, 1.0 / (values * (1.0 + spread**2 * values)), 0.0)
+
+    def _sums(self, spread: float) -> Sums:
+        """Return what units tell of the mean and the common coefficients, their departures from the mean eliminated."""
+        info, score = told_of_mean(self._values, self._along, self._turned, spread)
+        kept = 1.0 / (1.0 + spread**2 * self._values)
+        across = np.einsum("nkq,nk,nkj->qj", self._turned, kept, self._rows)
+        weighed = self._left(spread)[:, :, None] * self._rows
+        common = self._common.info + np.einsum("nki,nkj->ij", weighed, self._rows)
+        along = self._common.score + np.einsum("nkj,nk->j", weighed, self._along)
+        both = np.block([[info.sum(axis=0), across], [across.T, common]])
+        return Sums(both, np.concatenate([score.sum(axis=0), along]))
 
 
 def told_of_mean(values: Floats, along: Floats, turned: Floats, spread: float) -> tuple[Floats, Floats]:

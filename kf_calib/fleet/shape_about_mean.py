@@ -14,7 +14,8 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.evidence import log_evidence_of_modes, modes, sizes
-from kf_calib.fleet.population import Own, told_of_mean
+from kf_calib.fleet.own_coefficients import Own
+from kf_calib.fleet.population import told_of_mean
 from kf_calib.fleet.shape import SHARES, Shape
 
 _LEAST, _ALIKE = 0.25, 64.0  # sigma of one run: the smallest and the largest spread that is expected

@@ -13,7 +13,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.campaign import Group
 from kf_calib.fleet.evidence import modes, sizes
-from kf_calib.fleet.population import Own
+from kf_calib.fleet.own_coefficients import Own
 from kf_calib.fleet.shape import SHARES, Shape
 
 _SEEN = 1e-6  # of the largest information of a unit: what is less counts as not seen

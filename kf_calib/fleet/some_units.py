@@ -12,7 +12,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.campaign import Group
 from kf_calib.fleet.evidence import log_mean
-from kf_calib.fleet.population import Own
+from kf_calib.fleet.own_coefficients import Own
 from kf_calib.fleet.shape_about_mean import about_mean
 from kf_calib.fleet.shape_about_zero import POWERS, about_zero
 from kf_calib.support.logarithms import weights

@@ -5,6 +5,8 @@
   stays, and the file it points to is written.
 - All this, and whether the folder can be written in, is seen before the work begins.
 - A file is written beside its place and takes its name when it is whole (``whole``): who looks sees the old or the new.
+  Of two runs that write one name without ``--overwrite``, the second to be done is told so. What a killed run has left
+  beside is removed by the next one.
 - What grows for as long as a run lasts must be found if the run is killed (``Growing``). It is written under its own
   name from the start; where it replaces an earlier file, it takes that one's name as soon as its first readings are on
   the disk, and till then the earlier one stays. Where nothing came, nothing is left. Till it ends, no other run can
@@ -21,13 +23,17 @@ import shutil
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from itertools import combinations
 from pathlib import Path
 from typing import IO
 
 from kf_calib.errors import InputError
 from kf_calib.support.file_lock import lock, writer
+from kf_calib.support.part_files import beside, remove_stale
 
+_new: ContextVar[frozenset[Path]] = ContextVar("_new", default=frozenset())
+"""Files that must not be there before they are written."""
 _STREAMS = {0: "standard input", 1: "standard output"}
 
 
@@ -65,9 +71,12 @@ class Outputs:
 
     def write(self, path: Path, save: Callable[[Path], object]) -> None:
         """Have ``save`` write the file; raises InputError where another one has come to be there in the meantime."""
-        if path not in self._own and not self._overwrite and path.exists():
-            raise InputError(f"{path} came to be during the run and was left as it is: run again with another name.")
-        save(path)
+        if path in self._own or self._overwrite:
+            save(path)
+        else:
+            _refuse_come(path)
+            with _new_names(target_of(path)):
+                save(path)
         self._own.add(path)
 
     def own(self, path: Path) -> None:
@@ -84,6 +93,7 @@ def refuse(path: Path, overwrite: bool = False, name: str = "name") -> None:
             raise InputError(f"{path} cannot be created, there is no folder {target.parent}: give another {name}.")
         with suppress(FileNotFoundError):
             _refuse_found(path, target.lstat(), overwrite, name)
+        remove_stale(target.parent)
         trial = beside(target)
         trial.open("xb").close()
         trial.unlink()
@@ -113,11 +123,6 @@ def target_of(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
-def beside(target: Path) -> Path:
-    """A new name in the same folder, for what is not whole yet."""
-    return target.with_name(f".kf-calib-{os.urandom(4).hex()}.part")
-
-
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """A name to write under; ``path`` is the file when the block ends, and stays as it was where the block fails.
@@ -132,7 +137,10 @@ def whole(path: Path) -> Iterator[Path]:
         _refuse_device(path, target.lstat())
     try:
         yield part
-        _rename(part, target)
+        if target in _new.get():
+            _take(part, path, target)
+        else:
+            _rename(part, target)
     except OSError as error:
         raise InputError(
             f"{path} cannot be written ({error.strerror or error}): make room, or give another place."
@@ -193,6 +201,36 @@ class Growing:
     def _refuse(self) -> None:
         who = writer(self._target) or "another run"
         raise InputError(f"{self._path} is being written by {who}: end that one first, or give another name.")
+
+
+@contextmanager
+def _new_names(target: Path) -> Iterator[None]:
+    """Within this, ``whole`` replaces no file at ``target``."""
+    token = _new.set(_new.get() | {target})
+    try:
+        yield
+    finally:
+        _new.reset(token)
+
+
+def _take(part: Path, path: Path, target: Path) -> None:
+    """Give a file a name that nobody has; raises InputError where somebody has, whoever was there first."""
+    try:
+        try:
+            os.link(part, target)
+        except FileExistsError:
+            raise
+        except OSError:  # a file system without links: an empty file holds the name for an instant
+            target.open("xb").close()
+            part.replace(target)
+    except FileExistsError:
+        _refuse_come(path)
+        raise
+
+
+def _refuse_come(path: Path) -> None:
+    if path.exists():
+        raise InputError(f"{path} came to be during the run and was left as it is: run again with another name.")
 
 
 def _rename(part: Path, target: Path) -> None:

@@ -10,6 +10,8 @@ LONGEST = 1000
 """Characters of a message, at most."""
 COMMANDS = r"\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069"
 """Control characters, but for line ends and tabs, and what turns the direction of writing: for a regular expression."""
+CONTROLS = COMMANDS.replace(r"\x00-\x08\x0b-\x1f", r"\x00-\x1f")
+"""The same, and line ends and tabs: what no text of one line has."""
 _END = 300  # of a message that is cut: its last words say what to do
 
 

@@ -10,11 +10,17 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib.effects import Effect, as_text, remarks_of
+from kf_calib.effects import Bearer, Effect, as_text, remarks_of
 from kf_calib.estimation.observability import Visibility
 from kf_calib.support.units import shown
 from kf_calib.views.console import GRADES, effect_rows, size_range, symbol
 from kf_calib.views.tables import Table
+
+_BEARERS = {
+    Bearer.BENCH: "the bench, never sensors",
+    Bearer.SENSORS: "sensors, never the bench",
+    Bearer.EITHER: "the bench or sensors",
+}
 
 
 def overview(effects: Sequence[Effect]) -> RenderableType:
@@ -58,6 +64,7 @@ def _detail(effect: Effect) -> list[RenderableType]:
     for row in effect_rows(effect):
         table.add_row(*row)
     lines = [f"reading i is larger by: {formula_of(effect)}", f"source: {effect.source}"]
+    lines.append(f"borne by: {_BEARERS[effect.borne_by]}")
     if effect.confused_with:
         lines.append(f"confused with: {effect.confused_with}")
     lines += [f"typical size: {sizes}" for sizes in _typical_sizes(effect)]
@@ -165,6 +172,7 @@ def _object(effect: Effect) -> dict[str, Any]:
             "navigation": _bounds(effect.typical.navigation),
             "mems": _bounds(effect.typical.mems),
         },
+        "borne_by": effect.borne_by.value,
         "confused_with": effect.confused_with,
         "source": effect.source,
         "remarks": list(remarks_of(effect)),

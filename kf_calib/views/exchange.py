@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -133,6 +134,7 @@ def history_object(found: History) -> dict[str, Any]:
             "tolerances": dict(found.tolerances),
             "due": None if found.due is None else found.due.isoformat(),
             "due_by": found.due_by or None,
+            "warnings": list(found.warnings),
         }
     )
 
@@ -159,14 +161,20 @@ def history_report(found: History) -> RenderableType:
         table.add_row(*_track_row(track))
     parts.append(table)
     if found.due is not None:
-        where = "now" if found.due <= found.dates[-1] else f"by {found.due.date()}"
-        why = f"{symbol(found.due_by)} may leave its tolerance then (2σ)"
-        parts.append(Text(f"Calibrate again {where}: {why}.", style="bold"))
-    elif found.tolerances:
+        parts.append(Text(_next_calibration(found, found.due), style="bold"))
+    elif found.tolerances and all(track.drift is not None for track in found.tracks):
         parts.append(Text("No tolerance is left within twenty years, as far as these calibrations can tell."))
+    return Group(*parts, *map(note, found.warnings))
+
+
+def _next_calibration(found: History, due: datetime) -> str:
+    """Return when the next calibration is due, and why."""
+    what = symbol(found.due_by)
+    if due > found.dates[-1]:
+        return f"Calibrate again by {due.date()}: {what} may leave its tolerance then (2σ)."
     if any(track.drift is None for track in found.tracks):
-        parts.append(note("two calibrations show no drift apart from repeatability: save a third"))
-    return Group(*parts)
+        return f"{what} may be beyond its tolerance at once (2σ): its repeatability is not better than that."
+    return f"Calibrate again now: {what} may be beyond its tolerance already (2σ)."
 
 
 def _track_row(track: Track) -> list[str]:

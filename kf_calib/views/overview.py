@@ -109,7 +109,8 @@ def _dwell_parts(dwells: Sequence[DwellFound]) -> list[RenderableType]:
     lasts = [dwell.lasts_s for dwell in dwells]
     parts: list[RenderableType] = [Text(f"{len(dwells)} dwells of {min(lasts):.3g} to {max(lasts):.3g} s:")]
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for heading in ("dwell", "at s", "lasts s", "readings", "platform"):
+    platform = "platform" if dwells[0].pose else "up by the readings"
+    for heading in ("dwell", "at s", "lasts s", "readings", platform, "norm m/s^2"):
         table.add_column(heading, justify="right")
     for dwell in dwells[:_SHOWN]:
         table.add_row(
@@ -117,12 +118,18 @@ def _dwell_parts(dwells: Sequence[DwellFound]) -> list[RenderableType]:
             f"{dwell.arrival_s:.2f}",
             f"{dwell.lasts_s:.2f}",
             str(dwell.readings),
-            pose_text(dwell.pose),
+            pose_text(dwell.pose) or up_text(dwell.up),
+            f"{dwell.norm_mps2:.4f}",
         )  # fmt: skip
     parts.append(table)
     if len(dwells) > _SHOWN:
         parts.append(Text(f"and {len(dwells) - _SHOWN} more, all of them by --json"))
     return parts
+
+
+def up_text(up: tuple[float, float, float]) -> str:
+    """The direction that is up, in the axes of the accelerometers."""
+    return " ".join(f"{part:+.2f}" for part in up)
 
 
 def pose_text(pose: tuple[float, ...]) -> str:

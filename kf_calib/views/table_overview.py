@@ -14,12 +14,12 @@ from rich.text import Text
 from kf_calib.sources.tables.survey import ColumnFound, RowFound, Survey
 from kf_calib.support.plain_text import cut
 from kf_calib.views.json import clean
-from kf_calib.views.overview import pose_text
+from kf_calib.views.overview import pose_text, up_text
 from kf_calib.views.tables import Table
 from kf_calib.views.terminal import note
 
 _SHOWN = 40  # orientations
-_ORIENTATIONS = {"angles": "gimbal angles", "attitude": "attitude", "face": "axis up"}
+_ORIENTATIONS = {"angles": "gimbal angles", "attitude": "attitude", "face": "axis up", "": "up by the readings"}
 _QUANTITIES = {
     "a": "mean", "s": "standard deviation", "angle": "gimbal angle", "face": "axis that points up",
     "time": "time", "count": "number of readings", "temperature": "temperature", "q": "attitude",
@@ -56,7 +56,7 @@ def table_object(found: TableOverview) -> dict[str, Any]:
 
 
 def _row_object(row: RowFound) -> dict[str, Any]:
-    return vars(row) | {"pose": list(row.pose)}
+    return vars(row) | {"pose": list(row.pose), "up": list(row.up)}
 
 
 def table_report(found: TableOverview) -> RenderableType:
@@ -112,13 +112,17 @@ def _quantity(meaning: str) -> str:
     return f"{_QUANTITIES[name]}{' ' * bool(number)}{number}"
 
 
+def _orientation(row: RowFound) -> str:
+    return row.face or pose_text(row.pose) or up_text(row.up)
+
+
 def _row_table(own: Survey) -> Table:
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for heading in ("dwell", "row", "at s", _ORIENTATIONS[own.orientation], "norm m/s^2", "readings", "°C"):
         table.add_column(heading, justify="right")
     for row in own.rows[:_SHOWN]:
         table.add_row(
-            str(row.number), str(row.row), f"{row.at_s:g}", row.face or pose_text(row.pose), f"{row.norm_mps2:.4f}",
+            str(row.number), str(row.row), f"{row.at_s:g}", _orientation(row), f"{row.norm_mps2:.4f}",
             "" if row.readings is None else str(row.readings),
             "" if math.isnan(row.temperature_c) else f"{row.temperature_c:.2f}",
         )  # fmt: skip

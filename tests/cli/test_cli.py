@@ -188,7 +188,7 @@ def test_bad_recordings_are_one_sentence(run, recording: Path, tmp_path: Path, n
         (["replay", "{tmp}/absent.mcap"], "absent.mcap"),
         (["replay", "{tmp}"], "holds several recordings (empty.mcap, text.mcap)"),
         (["replay", "{tmp}/empty.mcap"], "empty"),
-        (["replay", "{tmp}/text.mcap"], "not an MCAP"),
+        (["replay", "{tmp}/text.mcap"], "a header and no rows"),
         (["replay", "{run}", "--axes", "y q x"], "'q'"),
         (["replay", "{run}", "--axes", "y z"], "2 gimbal axes"),
         (["replay", "{run}", "--gravity", "981"], "m/s^2"),

@@ -74,10 +74,11 @@ def test_lines(facts: Any, run: Any, tmp_path: Path) -> None:
     found = facts(table, "--column", "when_s=time_s")
     assert [(topic["topic"], topic["messages"]) for topic in found["topics"]] == [("readings", 400),
                                                                                 ("platform angles", 400)]  # fmt: skip
-    assert len(found["missing"]) == 2 and "record" in found["command"] and "--column when_s=time_s" in found["command"]
-    first = shlex.split(found["command"].partition("&&")[0])[1:]
-    code, _, err = run(*first)
+    assert len(found["missing"]) == 2 and "--column when_s=time_s" in found["command"]
+    assert [round(dwell["norm_mps2"], 3) for dwell in found["dwells"]] == [round(9.80665 * 1.05**0.5, 3)] * 2
+    code, out, err = run(*shlex.split(found["command"])[1:], "--json")
     assert code == 0, err
+    assert json.loads(out)["samples"] == 400
     assert len(facts(table, "--column", "when_s=time_s", "--axes", "y z x", "--gravity", "9.81")["dwells"]) == 2
 
 
@@ -135,7 +136,7 @@ def test_damage_is_told_beside_what_is_there(facts: Any, tmp_path: Path) -> None
         (b"SQLite format 3\0" + bytes(500), "cannot be read as a ROS 2 bag"),
         (b"\x28\xb5\x2f\xfd....", "does not decompress"),
         (b"#ROSBAG V2.0\n", "is a bag of ROS 1"),
-        (b"a,b\n1,2\n", "gives the time"),
+        (b"a,b\n1,2\n", "has no table: write a header and a row for each orientation"),
     ],
 )
 def test_what_cannot_be_read_is_one_sentence(run: Any, tmp_path: Path, content: bytes, says: str) -> None:

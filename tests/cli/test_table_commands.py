@@ -48,12 +48,17 @@ def test_columns_and_g_are_settled_by_options(run, tmp_path: Path) -> None:
     assert any("1 g = 9.81 m/s^2" in warning for warning in found["warnings"])
 
 
-def test_samples_are_to_be_recorded_first(run, tmp_path: Path) -> None:
-    path = tmp_path / "log.csv"
-    rows = "".join(f"{k / 100},0,0,0,0,1,0\n" for k in range(200))
-    path.write_text(f"time_s,outer_deg,middle_deg,inner_deg,ax_g,ay_g,az_g\n{rows}")
-    code, out, err = run("replay", path, "--axes", "y z x", "--gravity", "9.81")
-    assert (code, out) == (2, "") and "are samples, 0.01 s apart" in err and "kf-calib record run.mcap" in err
+def test_samples_in_a_spreadsheet_are_to_be_saved_as_csv(run, tmp_path: Path) -> None:
+    openpyxl = pytest.importorskip("openpyxl", reason="openpyxl is not there")
+    book = openpyxl.Workbook()
+    book.active.append(["time_s", "outer_deg", "middle_deg", "inner_deg", "ax_g", "ay_g", "az_g"])
+    for k in range(200):
+        book.active.append([k / 100, 0, 0, 0, 0, 1, 0])
+    book.save(tmp_path / "log.xlsx")
+    for command in (("replay", tmp_path / "log.xlsx", "--axes", "y z x", "--gravity", "9.81"),
+                    ("info", tmp_path / "log.xlsx")):  # fmt: skip
+        code, out, err = run(*command)
+        assert (code, out) == (2, "") and "are samples, 0.01 s apart" in err and "in a CSV file" in err
 
 
 def test_a_recording_has_no_columns(run) -> None:
@@ -63,7 +68,7 @@ def test_a_recording_has_no_columns(run) -> None:
 
 OF_SAMPLES = [("--settle-s", "1"), ("--still-deg", "1"), ("--no-gate",), ("--gate-sigma", "5"), ("--accel-topic", "/a"),
               ("--pose-topic", "/a"), ("--temperature-topic", "/a"), ("--field", "accel=/a:b"), ("--max-chunk-mb", "9"),
-              ("--joints", "a b c"), ("--no-angles",)]  # fmt: skip
+              ("--joints", "a b c")]  # fmt: skip
 
 
 @pytest.mark.parametrize("option", OF_SAMPLES, ids=lambda option: option[0])
@@ -75,7 +80,7 @@ def test_options_of_samples_are_refused_for_a_table(option: tuple[str, ...], run
 
 def test_what_1_g_is_does_not_act_on_a_recording(run) -> None:
     code, _, err = run("replay", RECORDINGS / "hidden.mcap", "--g-unit", "local")
-    assert code == 2 and "is no table (.csv, .xlsx), on which --g-unit has nothing to act" in err
+    assert code == 2 and "is no table (.csv, .xlsx) and no log in lines of text, on which --g-unit has nothing" in err
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.effects import SensorEffect, Stimulus, effect_named, names
+from kf_calib.effects import Bearer, SensorEffect, Stimulus, effect_named, names
 from kf_calib.errors import InputError
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.calibration import calibrate, evaluate
@@ -57,6 +57,11 @@ INVISIBLE = {  # exactly: wrong g is a common scale, the innermost zero a misali
     "encoder-harmonic-1:y": {"s1_y", "c1_y"},
     "encoder-harmonic-2:y": {"s2_y", "c2_y"},
 }
+OF_THE_BENCH = (
+    "encoder-offset", "encoder-scale", "encoder-harmonic-1", "encoder-harmonic-2", "axis-nonorthogonality", "base-tilt",
+    "base-tilt-drift", "earth-rotation", "gravity-error", "flexure", "uneven-flexure", "latency",
+)  # fmt: skip
+OF_EITHER = ("magnetic", "sinusoid", "vibration-rectification", "platform-drift", "lever-arm")
 NOT_SIZED = {"vibration-rectification", "dead-zone", "bias-walk"}
 """Needs readings fast enough to resolve vibration; a width; not the same in two runs."""
 CHEAP = plan_of(24, dwell_s=8.0, seed=4)
@@ -99,6 +104,14 @@ def values(result: Calibration) -> dict[str, tuple[float | None, float | None]]:
 
 def with_effect(name: str, source: Simulation) -> Calibration:
     return calibrate(source, Settings(effects=(name,)))
+
+
+@pytest.mark.parametrize("name", names(BENCH))
+def test_physics_says_what_can_have_an_effect(name: str) -> None:
+    """The platform and what turns and tilts it are of the bench, what is in an accelerometer is of sensors."""
+    kind = name.partition(":")[0]
+    expected = Bearer.BENCH if kind in OF_THE_BENCH else Bearer.EITHER if kind in OF_EITHER else Bearer.SENSORS
+    assert effect_named(name, BENCH).borne_by is expected
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in {*INVISIBLE, *OWN_TEST}])

@@ -20,6 +20,7 @@ from kf_calib import effects
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.cli import main
 from kf_calib.effects import (
+    Bearer,
     FrameEffect,
     SensorEffect,
     as_text,
@@ -306,6 +307,17 @@ def test_bad_files_are_one_sentence(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match=says.replace("(", r"\(").replace(")", r"\)")) as raised:
         load_file(path)
     assert "\n" not in str(raised.value)
+
+
+def test_an_effect_of_the_users_is_of_either_unless_it_says(tmp_path: Path) -> None:
+    path = tmp_path / "mine.py"
+    own = TEN_LINES.replace("Bend", "Wobble").replace("    unit", "    borne_by = Bearer.BENCH\n    unit")
+    path.write_text(TEN_LINES + own.replace("import SensorEffect", "import Bearer, SensorEffect"))
+    load_file(path)
+    assert effect_named("bend", BENCH).borne_by is Bearer.EITHER
+    assert effect_named("wobble", BENCH).borne_by is Bearer.BENCH
+    assert effect_named("mine = a*p", BENCH).borne_by is Bearer.EITHER
+    assert effect_named("mine:z = sin(3*q_z)", BENCH).borne_by is Bearer.EITHER
 
 
 def test_a_frame_effect_of_the_users_passes(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations, product
 
@@ -18,6 +19,8 @@ from kf_calib.bench.keys import UP
 from kf_calib.errors import BlunderError, InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.setup_blunders import common_scale
+from kf_calib.sources.tables.opening import open_table
+from kf_calib.sources.tables.table import Table
 
 
 def reordered(*channels: int):
@@ -165,3 +168,60 @@ def test_degrees_of_a_noisy_encoder_in_which_nothing_stands_still() -> None:
     run = short_run(encoder_sigma_deg=0.02, angle_hz=50.0)
     with pytest.raises(InputError, match=r"look like degrees \(--angle-unit deg\)"):
         calibrate(Altered(run, poses=lambda _, q: np.degrees(q)))
+
+
+FACES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
+
+
+def faces_in_order(order: Sequence[str], reversed_channel: int, seed: int) -> Table:
+    """Means of six faces by sensors of 0.3 % and 10 mg, 1 mrad from square, with one channel reversed."""
+    rng = np.random.default_rng(seed)
+    sensitivity = np.eye(3) * (1.0 + 0.003 * rng.normal(size=3)) + 1e-3 * rng.normal(size=(3, 3))
+    means = 9.81 * (np.array([FACES[name] for name in order], float) @ sensitivity.T + 0.01 * rng.normal(size=3))
+    means[:, reversed_channel - 1] *= -1.0
+    columns = {"face": list(order), **{f"a{axis}_mps2": means[:, k] for k, axis in enumerate("xyz")}}
+    return open_table(columns, {"gravity_mps2": "9.81"})
+
+
+@pytest.mark.parametrize("channel", [1, 2, 3])
+def test_a_reversed_channel_is_told_in_whatever_order_the_faces_come(channel: int) -> None:
+    """Where the first dwells lie along one axis, the signs of the other two channels do not show in them; that is no
+    change in the course of the run."""
+    channels = ["1", "2", "3"]
+    channels[channel - 1] = f"-{channel}"
+    orders = list(permutations(FACES))
+    for seed, order in enumerate(orders[channel :: len(orders) // 24]):
+        with pytest.raises(BlunderError) as told:
+            calibrate(faces_in_order(order, channel, seed))
+        assert f"channel {channel} reversed? Try --channels {','.join(channels)}." in str(told.value)
+
+
+@pytest.mark.parametrize("channel", [1, 2, 3])
+def test_a_reversed_channel_in_a_run_that_begins_along_z_is_told(channel: int) -> None:
+    """Twelve orientations after four along z: outer gimbal about z, inner about x, y up."""
+    rng = np.random.default_rng(channel)
+    outer = np.concatenate([np.zeros(4), rng.uniform(0.0, 360.0, 12)])
+    inner = np.concatenate([[90.0, 270.0, 90.0, 270.0], rng.uniform(0.0, 360.0, 12)])
+    bench = Bench(parse_axes("z x"), 9.81)
+    force = bench.specific_force(np.zeros(16), np.radians(np.column_stack([outer, inner])))
+    assert np.abs(force[:4, 2]) == pytest.approx(9.81)
+    means = force + rng.normal(0.0, 0.02, 3)
+    means[:, channel - 1] *= -1.0
+    columns = {
+        "outer [deg]": outer,
+        "inner [deg]": inner,
+        **{f"a{axis}_mps2": means[:, k] for k, axis in enumerate("xyz")},
+    }
+    with pytest.raises(BlunderError, match=f"channel {channel} reversed"):
+        calibrate(open_table(columns, {"axes": "z x", "gravity_mps2": "9.81"}))
+
+
+def test_channels_that_are_exchanged_late_are_still_a_change_in_the_course_of_the_run() -> None:
+    rng = np.random.default_rng(7)
+    order = [*FACES, *FACES, *FACES]
+    means = 9.81 * np.array([FACES[name] for name in order], float) + rng.normal(0.0, 0.05, 3)
+    means += rng.normal(0.0, 1e-3, means.shape)
+    means[14:] = means[14:, [1, 0, 2]]  # the last +y, -y, +z, -z
+    columns = {"face": order, **{f"a{axis}_mps2": means[:, k] for k, axis in enumerate("xyz")}}
+    with pytest.raises(BlunderError, match=r"up to dwell 14 channels are as stated, from dwell 15 on .* exchanged"):
+        calibrate(open_table(columns, {"gravity_mps2": "9.81"}))

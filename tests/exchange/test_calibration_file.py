@@ -18,6 +18,7 @@ from helpers.calibrations import SENSORS, simulated
 from helpers.paths import ROOT
 
 import kf_calib
+from kf_calib.bench import paper_parameters
 from kf_calib.bench.bench import Bench
 from kf_calib.errors import InputError
 from kf_calib.exchange import calibration_file, models
@@ -133,6 +134,39 @@ def put(*path: str | int, value: object) -> Callable[[dict[str, Any]], None]:
     return change
 
 
+def scaled_covariance(factor: float) -> Callable[[dict[str, Any]], None]:
+    def change(content: dict[str, Any]) -> None:
+        content["state"]["covariance"] = (factor * np.array(content["state"]["covariance"])).tolist()
+
+    return change
+
+
+def correlated(content: dict[str, Any]) -> None:
+    """Symmetric, of positive variances, and no covariance: a correlation of 2."""
+    covariance = content["state"]["covariance"]
+    covariance[1][2] = covariance[2][1] = 2.0 * math.sqrt(covariance[1][1] * covariance[2][2])
+
+
+def mean_temperature_of(mean_c: float) -> Callable[[dict[str, Any]], None]:
+    def change(content: dict[str, Any]) -> None:
+        names = ("temperature_min_c", "temperature_mean_c", "temperature_max_c")
+        content["conditions"] |= dict(zip(names, (20.0, mean_c, 30.0), strict=True))
+
+    return change
+
+
+def dependent_axes(content: dict[str, Any]) -> None:
+    """Accelerometers 1 and 3 along one axis, and every number that follows from it as it must be."""
+    state = np.array(content["state"]["values"])
+    state[8:11] = state[0:3]
+    content["state"]["values"] = state.tolist()
+    jacobian = paper_parameters.jacobian(state[:12])
+    covariance = jacobian @ np.array(content["state"]["covariance"])[:12, :12] @ jacobian.T
+    sigmas, values = np.sqrt(np.diag(covariance)), paper_parameters.parameters_of(state[:12])
+    for own, value, sigma in zip(content["parameters"], values.tolist(), sigmas.tolist(), strict=False):
+        own |= {"value": value, "sigma": sigma}
+
+
 BROKEN: dict[str, tuple[str | Callable[[dict[str, Any]], None], str]] = {
     "empty": ("", "is no JSON"),
     "text": ("hello", "is no JSON"),
@@ -147,6 +181,44 @@ BROKEN: dict[str, tuple[str | Callable[[dict[str, Any]], None], str]] = {
     "huge": (put("state", "values", 0, value=1e300), "parameters say theta1"),
     "huge variance": (put("state", "covariance", 0, 0, value=1e308), "numbers that no calibration has"),
     "negative variance": (put("state", "covariance", 0, 0, value=-1.0), "is no covariance"),
+    "zero variance": (scaled_covariance(0.0), "no positive variance of sx1"),
+    "another covariance": (scaled_covariance(4.0), "parameters say theta1 has sigma"),
+    "not positive definite": (correlated, "is no covariance: it has a negative variance"),
+    "another sigma": (put("parameters", 3, "sigma", value=1.0), "parameters say b1 has sigma 1.0, but its covariance"),
+    "another coefficient": (put("parameters", 12, "value", value=96170384.0), "= 96170384.0, but its state says"),
+    "another sigma of a coefficient": (put("parameters", 12, "sigma", value=1e-30), "has sigma 1e-30"),
+    "another unit of a coefficient": (put("parameters", 12, "unit", value="1"), "after the twelve, as its effects"),
+    "another symbol": (put("parameters", 12, "symbol", value="q1"), "after the twelve, as the state has"),
+    "a parameter too few": (lambda content: content["parameters"].pop(), "after the twelve"),
+    "a parameter too many": (
+        lambda content: content["parameters"].append(content["parameters"][12] | {"symbol": "x"}),
+        "after the twelve, as its effects",
+    ),
+    "another nominal value": (put("parameters", 0, "nominal", value=0.1), "theta1 is nominally 0.1, but its bench"),
+    "a constant left out": (put("effects", 1, "constant", value=None), "warm-up has the constant None"),
+    "a constant out of its range": (put("effects", 1, "constant", value=1e9), "has the constant 1000000000.0"),
+    "a constant of an effect without": (put("effects", 0, "constant", value=3.0), "has the constant 3.0"),
+    "determined and not": (put("state", "undetermined", value=["tauWarm", "b1"]), "whether b1 was determined"),
+    "an unknown symbol": (put("state", "undetermined", 0, value="zz"), "state.undetermined names zz"),
+    "an effect twice": (put("effects", 2, "text", value="second-order"), "effects names 'second-order' twice"),
+    "effects without coefficients": (
+        lambda content: content["effects"].extend({"text": f"f{k} = fx*T", "constant": None} for k in range(90)),
+        "there are 93 effects, but only",
+    ),
+    "no date": (put("conditions", "began", value="yesterday"), "conditions.began is 'yesterday', which is no date"),
+    "no date of saving": (put("provenance", "created", value="1"), "provenance.created is '1', which is no date"),
+    "a date beyond time": (put("conditions", "began", value="9999-12-31T23:59:59+00:00"), "is no date"),
+    "a duration beyond time": (put("conditions", "duration_s", value=1e300), "conditions.duration_s"),
+    "a negative count": (put("conditions", "dwells", 0, "readings", value=-5), "conditions.dwells.0.readings"),
+    "negative degrees of freedom": (put("consistency", "dof", value=-3), "consistency.dof"),
+    "a probability above 1": (put("consistency", "p_value", value=1.5), "consistency.p_value"),
+    "a verdict of its own": (put("consistency", "p_value", value=1e-9), "which is not what its p_value says"),
+    "a gimbal too many": (put("conditions", "dwells", 0, "gimbal_deg", value=[0.0] * 4), "has 4 gimbal angles"),
+    "a dwell that ends first": (put("conditions", "dwells", 1, "end_s", value=-9.0), "number 2 ends before it begins"),
+    "a mean that is none": (mean_temperature_of(99.0), "a mean temperature that is not between"),
+    "a line end in a text": (put("provenance", "created", value="2026-01-01\n#include"), "provenance.created"),
+    "a tab in a text": (put("provenance", "versions", "kf_calib", value="1\t1"), "provenance.versions.kf_calib"),
+    "axes in a plane": (dependent_axes, "three input axes that lie in one plane"),
     "not symmetric": (put("state", "covariance", 0, 1, value=1.0), "is no symmetric matrix"),
     "too small": (put("state", "covariance", value=[[1.0]]), "is no symmetric matrix"),
     "text for a list": (put("effects", value="second-order"), "effects: Input should be a valid list"),

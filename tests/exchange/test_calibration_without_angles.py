@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 from helpers.by_hand import by_hand
 from helpers.paths import RECORDINGS
+from helpers.synthetic import SYMBOLS, plan_of
+from scipy import stats
 
 import kf_calib
+from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.errors import InputError
 from kf_calib.estimation.settings import Settings
 from kf_calib.exchange import calibration_file
@@ -19,6 +22,11 @@ from kf_calib.exchange.certificate import content, statement
 from kf_calib.exchange.exports import TARGETS, exported
 from kf_calib.exchange.history import history
 from kf_calib.exchange.verification import verify
+from kf_calib.sources.simulation.by_hand import ByHand
+from kf_calib.sources.simulation.noise_processes import TrueNoise
+from kf_calib.sources.simulation.sensors import Sensors
+from kf_calib.sources.simulation.simulator import Simulation
+from kf_calib.sources.simulation.visit_plans import Visit
 
 FRAME = ["theta1", "phi1", "nu2"]
 
@@ -81,6 +89,29 @@ def test_six_faces_are_saved_with_axes_taken_for_square(tmp_path: Path) -> None:
     saved = calibration_file.read(tmp_path / "six.json")
     assert set(saved.fixed.values()) == {"frame", "square"} and saved.model().square
     assert np.isfinite(saved.correction()(np.array([[0.0, 9.81, 0.0]]), 25.0)).all()
+
+
+def _with_axis_3_off_square(off_deg: float, seed: int, plan: list[Visit]) -> ByHand:
+    """A run of a board whose axes are square but for one."""
+    bench = Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+    square = dict.fromkeys(SYMBOLS, 0.0) | dict.fromkeys(("K1", "K2", "K3"), 1.0)
+    sensors = Sensors(square | {"b1": 0.01, "b2": 0.02, "b3": 0.03, "phi3": np.radians(off_deg - 90.0)})
+    noise = TrueNoise(white_mps2=2e-4)
+    return ByHand(Simulation(bench, sensors, noise, plan, sample_hz=50.0, slew_rate_degps=180.0, seed=seed))
+
+
+@pytest.mark.parametrize(("off_deg", "holds"), [(0.0, True), (1.0, True), (2.0, True), (6.0, False)])
+def test_axes_that_were_taken_for_square_may_be_a_degree_or_two_off(off_deg: float, holds: bool) -> None:
+    """With means sure to 2 ug, which a degree off square changes by 17 mg."""
+    six = [Visit(each, 4.0) for each in ((0.0, 0.0, 0.0), (0.0, 180.0, 0.0), (0.0, 90.0, 0.0), (0.0, -90.0, 0.0),
+                                         (0.0, 0.0, 90.0), (0.0, 0.0, -90.0))]  # fmt: skip
+    saved = calibration_file.saved(kf_calib.calibrate(_with_axis_3_off_square(off_deg, 1, six)))
+    assert "square" in saved.fixed.values()
+    new = _with_axis_3_off_square(off_deg, 2, plan_of(20, dwell_s=4.0, seed=2))
+    found = verify(saved, saved.model(bench=new.bench), new)
+    assert found.holds == holds and found.dof == 20
+    if off_deg == 1.0:  # one sigma: the square of that beside the scatter of as many means as poses
+        assert stats.chi2.sf(found.statistic, found.dof) > 0.01
 
 
 @pytest.mark.parametrize("to", sorted(TARGETS))

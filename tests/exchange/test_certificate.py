@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
+from datetime import UTC, datetime
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,8 @@ def cal(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The calibration of a recording, as a file."""
     path = tmp_path_factory.mktemp("cal") / "cal.json"
     own = calibrate(ROOT / "recordings" / "navigation_24.mcap")
-    calibration_file.write(path, calibration_file.saved(own, "navigation_24.mcap", "0" * 64, 1_750_000_000 * 10**9))
+    began = datetime(2025, 6, 15, 15, 6, 40, tzinfo=UTC)
+    calibration_file.write(path, calibration_file.saved(own, "navigation_24.mcap", "0" * 64, began))
     return path
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import re
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from kf_calib.errors import InputError, UnobservableError
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.exports import TARGETS, exported
 from kf_calib.exchange.exports.affine import AffineTarget
+from kf_calib.exchange.exports.quoting import in_cell
 
 
 def px4(text: str) -> Formula:
@@ -132,6 +134,44 @@ READERS: dict[str, Callable[[str], Formula]] = {
 }  # fmt: skip
 ROUNDING = {"px4": 3e-6, "ardupilot": 3e-6, "vectornav": 3e-6}
 """Of programs that count with 32 bits, m/s^2."""
+
+
+HOSTILE = "x\n1\t1\tCOM_ARM_WO_GPS\t1\t6\\\r*/ __attribute__((constructor)) ?\u2028=cmd|'/c calc'!A1"
+
+
+def _hostile() -> calibration_file.SavedCalibration:
+    """A calibration with texts that no file can have, as reading refuses them: exports must not rely on that."""
+    own = saved()
+    made = own.provenance.model_copy(
+        update={"recording": HOSTILE, "created": HOSTILE, "versions": {"kf_calib": HOSTILE}}
+    )
+    parameters = [each.model_copy(update={"symbol": f"={HOSTILE}", "unit": f"@{HOSTILE}"}) for each in own.parameters]
+    return own.model_copy(update={"provenance": made, "parameters": parameters})
+
+
+@pytest.mark.parametrize("to", TARGETS)
+def test_no_text_of_a_file_is_more_than_text_in_an_export(to: str) -> None:
+    good, bad = (exported(own, own.correction(), to, lossy=True).text() for own in (saved(), _hostile()))
+    if to == "csv":
+        cells = [cell for row in csv.reader(good.splitlines()) for cell in row]
+        risky = [cell for row in csv.reader(io.StringIO(bad, newline="")) for cell in row]
+        assert len(risky) == len(cells)
+        assert not [cell for cell in risky if cell[:1] in ("=", "@", "+", "\t", "\r") and cell]
+        assert all(re.fullmatch(r"-[0-9.e-]+", cell) for cell in risky if cell.startswith("-"))
+        return
+    marks = {"c": "//", "imucal": '    "comment":'}
+
+    def told(text: str) -> list[str]:
+        return [line for line in text.splitlines() if not line.startswith(marks.get(to, "#"))]
+
+    assert told(bad) == told(good) and len(bad.splitlines()) == len(good.splitlines())
+    assert all(each.isprintable() or each in "\n\r\t" for each in bad) and "\\" not in bad
+
+
+@pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@SUM(A1)", " =1", "\uff1d1", "\uff0b1"])
+def test_a_cell_never_begins_a_formula(text: str) -> None:
+    assert in_cell(text) == f"'{text}"
+    assert in_cell("") == "" and in_cell("m/s^2") == "m/s^2"
 
 
 def test_the_command_names_the_programs_there_are() -> None:
@@ -258,6 +298,7 @@ def test_parameters_that_the_run_did_not_determine_are_refused(run: Any, tmp_pat
     """In one sentence, for every program; a coefficient of an effect that is not corrected does not matter."""
     content = saved().model_dump(mode="json")
     content["state"]["undetermined"] = ["phi1"]
+    content["parameters"][1] |= {"value": None, "sigma": None}
     (tmp_path / "cal.json").write_text(json.dumps(content))
     for to in TARGETS:
         code, out, err = run("export", tmp_path / "cal.json", "--to", to, "-o", tmp_path / "out", "--lossy")

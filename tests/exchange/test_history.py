@@ -133,6 +133,52 @@ def test_two_calibrations_have_no_drift() -> None:
     assert own.level_sigma > 3e-6  # repeatability, of which they show something
 
 
+@pytest.mark.parametrize(("step_day", "says"), [(4 / 1440, "span 12 min"), (0.2, "span 14.4 h")])
+def test_runs_of_one_day_show_repeatability_and_no_drift(step_day: float, says: str) -> None:
+    values = [1.0, 1.00002, 0.99999, 1.00001]
+    found = history([at(step_day * k, value, 1e-6) for k, value in enumerate(values)], {"K1": 1e-3})
+    own = found.tracks[0]
+    assert own.drift is None and own.drift_sigma is None and own.walk == 0.0
+    assert own.repeatability == pytest.approx(np.std(values, ddof=1), rel=0.5)
+    assert own.level_sigma == pytest.approx(np.std(values, ddof=1) / 2.0, rel=0.5)
+    assert found.due is None and len(found.warnings) == 1 and says in found.warnings[0]
+    assert history([at(step_day * k, value, 1e-6) for k, value in enumerate(values)], {"K1": 1e-6}).due_by == "K1"
+
+
+def test_scatter_within_minutes_is_no_walk_of_a_month() -> None:
+    """Three runs at once tell the repeatability; with that, and a run a month before, the drift is that of a line."""
+    days, values, sigma = np.array([0.0, 30.0, 30.001, 30.002]), np.array([1.0, 1.00002, 0.99999, 1.00001]), 1e-6
+    own = history([at(*each, sigma) for each in zip(days, values, strict=True)]).tracks[0]
+    scatter = np.std(values[1:], ddof=1)
+    assert own.drift == pytest.approx((values[1:].mean() - 1.0) / 30.0, abs=0.2 * scatter / 30.0)
+    assert own.drift_sigma < 3.0 * scatter * np.sqrt(4.0 / 3.0) / 30.0
+
+
+def test_a_span_of_days_says_how_far_a_year_is() -> None:
+    short, long = (history([at(step * k, 1.0 + 1e-6 * k**2, 1e-6) for k in range(4)]) for step in (1.0, 30.0))
+    assert short.tracks[0].drift is not None
+    assert "span 3.0 days" in short.warnings[0] and "122-fold" in short.warnings[0]
+    assert long.warnings == ()
+
+
+def test_a_file_without_the_date_of_its_run_is_dated_by_its_computation_with_a_sentence() -> None:
+    first, second = at(0.0, 1.0, 1e-6), at(400.0, 1.0, 1e-6)
+    undated = first.model_copy(
+        update={
+            "conditions": first.conditions.model_copy(update={"began": None}),
+            "provenance": first.provenance.model_copy(
+                update={"created": "2024-03-01T00:00:00+00:00", "recording": "old.mcap"}
+            ),
+        }
+    )
+    found = history([second, undated])
+    assert [f"{date:%Y-%m-%d}" for date in found.dates] == ["2024-03-01", "2025-02-04"]
+    assert found.warnings[0].startswith("1 of the 2 calibrations do not say when their runs began")
+    assert "old.mcap, 2024-03-01" in found.warnings[0]
+    assert "--date" in found.warnings[0]
+    assert not any("does not say" in said for said in history([first, second]).warnings)
+
+
 def test_what_is_no_history_is_refused() -> None:
     first, second = at(0.0, 1.0, 1e-6, "A"), at(30.0, 1.0, 1e-6, "B")
     for given, says in (

@@ -109,7 +109,10 @@ def test_what_needs_temperatures_of_dwells_is_left_out_and_said(saved: SavedCali
         "covariance": np.pad(np.array(saved.state.covariance), (0, 3)).tolist(),
     })  # fmt: skip
     effect = calibration_file.SavedEffect(text="thermal-bias")
-    own = saved.model_copy(update={"state": state, "effects": [effect]})
+    alphas = [calibration_file.SavedParameter(symbol=symbol, value=0.0, sigma=None, unit="m/s^2/K", nominal=0.0)
+              for symbol in state.symbols[-3:]]  # fmt: skip
+    parameters = [*saved.parameters, *alphas]
+    own = saved.model_copy(update={"state": state, "effects": [effect], "parameters": parameters})
     found = budget(own, own.model(), [TypeB(effect="gravity-error", size="1 ppm")])
     assert found.left_out == ("thermal-bias",)
 

@@ -10,7 +10,7 @@ import pytest
 from helpers.calibrations import BENCH, simulated, with_result
 from helpers.long_runs import slow
 from helpers.paths import ROOT
-from scipy import stats
+from scipy import optimize, spatial, stats
 
 import kf_calib
 from kf_calib.bench.bench import Bench
@@ -18,6 +18,7 @@ from kf_calib.errors import UnobservableError
 from kf_calib.exchange import calibration_file, verification
 from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.exchange.verification import Verification, verify
+from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
 
@@ -43,6 +44,85 @@ def test_p_values_are_uniform_where_nothing_has_moved(count: int, runs: int) -> 
         assert 0.95 < float(np.std(scores)) < 1.05
     false_alarms = sum(not each.holds for each in found)
     assert false_alarms <= stats.binom.ppf(0.999, runs, verification.LEVEL)
+
+
+def test_the_misfit_is_that_of_the_new_run_by_itself_and_that_of_the_two_states_together() -> None:
+    """Least squares with the old state as prior, taken apart: both terms from the two calibrations alone."""
+    found, new = verified(3), kf_calib.calibrate(simulated(10_003))
+    between = new.estimate.state - np.array(saved(3).state.values)
+    both = np.array(saved(3).state.covariance) + new.estimate.covariance
+    expected = new.consistency.statistic + between @ np.linalg.solve(both, between)
+    assert found.statistic == pytest.approx(expected, rel=1e-6) and found.dof == new.consistency.dof + 12 == 27
+    residuals = new.carried.means.readings - new.carried.means.design @ np.array(saved(3).state.values)
+    assert found.residual_rms_mps2 == pytest.approx(np.linalg.norm(residuals) / residuals.size**0.5, rel=1e-6)
+
+
+def test_the_p_value_of_a_move_is_two_sided_and_counts_how_many_are_compared() -> None:
+    found, new = verified(3, K2=3e-6), kf_calib.calibrate(simulated(10_003, moved={"K2": 3e-6}))
+    old = {each.symbol: each for each in saved(3).parameters}
+    for move in found.moves:
+        own = new.parameters[move.symbol]
+        assert (move.old, move.new) == (old[move.symbol].value, pytest.approx(own.value, rel=1e-9))
+        assert move.difference == move.new - move.old
+        assert move.sigma == pytest.approx((old[move.symbol].sigma ** 2 + own.sigma**2) ** 0.5, rel=1e-6)
+        alone = 2.0 * stats.norm.sf(abs(move.difference) / move.sigma)
+        assert move.p_value == pytest.approx(1.0 - (1.0 - alone) ** 12, rel=1e-9)
+    p_values = [move.p_value for move in found.moves]
+    assert len(p_values) == 12 and p_values == sorted(p_values)
+    assert found.p_value == pytest.approx(2.0 * min(p_values[0], stats.chi2.sf(found.statistic, found.dof)), rel=1e-9)
+
+
+def test_a_hundredth_is_the_level_for_the_whole_and_half_of_it_for_what_has_moved() -> None:
+    found = [verified(15, K2=size) for size in (3.0e-6, 3.1e-6)]
+    p_values = [each.p_value for each in found]
+    assert any(0.005 < p < 0.01 for p in p_values) and any(0.01 < p < 0.02 for p in p_values)
+    assert [each.holds for each in found] == [p >= 0.01 for p in p_values]
+    clearest = [each.moves[0].p_value for each in found]
+    assert any(0.0025 < p < 0.005 for p in clearest) and any(0.005 < p < 0.01 for p in clearest)
+    assert [bool(each.moved) for each in found] == [p < 0.005 for p in clearest]
+
+
+def test_the_worst_error_is_the_greatest_over_all_directions_by_an_optimizer() -> None:
+    """And its sigma is propagated from S f + b of the old and the new state in closed form."""
+    found, new = verified(3, K2=8e-6), kf_calib.calibrate(simulated(10_003, moved={"K2": 8e-6}))
+    states = np.array(saved(3).state.values), new.estimate.state
+    (old, old_bias), (now, bias) = ((own.reshape(3, 4)[:, :3], own.reshape(3, 4)[:, 3]) for own in states)
+
+    def error(direction: np.ndarray) -> np.ndarray:
+        force = BENCH.gravity_mps2 * direction / np.linalg.norm(direction)
+        return np.linalg.solve(old, now @ force + bias - old_bias) - force
+
+    tries = [optimize.minimize(lambda x: -np.linalg.norm(error(x)), start, tol=1e-12)
+             for start in np.vstack([np.eye(3), -np.eye(3)])]  # fmt: skip
+    best = min(tries, key=lambda each: each.fun)
+    assert found.worst_mps2 == pytest.approx(-best.fun, rel=1e-3)
+    force = BENCH.gravity_mps2 * best.x / np.linalg.norm(best.x)
+    along = np.linalg.solve(old.T, error(best.x) / -best.fun)
+    gradient = np.kron(along, np.append(force, 1.0))
+    variance = gradient @ (np.array(saved(3).state.covariance) + new.estimate.covariance) @ gradient
+    assert found.worst_sigma_mps2 == pytest.approx(variance**0.5, rel=0.02)
+
+
+def test_directions_cover_the_sphere_evenly() -> None:
+    points = verification._sphere(4000)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(points.mean(axis=0), 0.0, atol=1e-3)
+    np.testing.assert_allclose(points.T @ points / 4000, np.eye(3) / 3.0, atol=1e-3)
+    anywhere = np.random.default_rng(0).normal(size=(2000, 3))
+    nearest = spatial.KDTree(points).query(anywhere / np.linalg.norm(anywhere, axis=1)[:, None])[0]
+    assert nearest.max() < 1.3 * np.sqrt(4.0 * np.pi / 4000)  # of the side of a square of one point's share
+
+
+@pytest.mark.parametrize(("low_c", "high_c", "told"), [(24.5, 30.0, False), (26.5, 30.0, True), (20.0, 24.5, False),
+                                                       (20.0, 23.5, True)])  # fmt: skip
+def test_a_temperature_more_than_a_degree_beyond_that_of_the_calibration_is_told(
+    low_c: float, high_c: float, told: bool
+) -> None:
+    """The new run is at 25 °C."""
+    limits = {"temperature_min_c": low_c, "temperature_max_c": high_c}
+    own = saved(0).model_copy(update={"conditions": saved(0).conditions.model_copy(update=limits)})
+    found = verify(own, own.model(), simulated(1, 3, ambient=Ambient(25.0, sigma_c=0.0)))
+    assert any("a difference may be the temperature's" in said for said in found.warnings) == told
 
 
 def test_the_parameter_that_moved_is_found_and_named() -> None:

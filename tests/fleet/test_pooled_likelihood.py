@@ -5,17 +5,25 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.run_factors import campaign_of, run_factor_of
+from scipy.linalg import block_diag
 from scipy.special import logsumexp
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import chi2, multivariate_normal, norm
 
 from kf_calib.fleet.campaign import Campaign
 from kf_calib.fleet.evidence import log_evidence, log_evidence_of_modes, modes, posterior, sizes
-from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
-from kf_calib.fleet.population import Own, population
+from kf_calib.fleet.own_coefficients import Own, OwnAndCommon
+from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Sums, Term
+from kf_calib.fleet.population import population
 from kf_calib.fleet.shape import SHARES
 from kf_calib.fleet.shape_about_mean import about_mean
 from kf_calib.fleet.shape_about_zero import POWERS, about_zero
 from kf_calib.fleet.some_units import SomeUnits
+
+
+def beside_nothing(own: Own) -> OwnAndCommon:
+    """What units tell where nothing is common to them."""
+    count, width = own.score.shape
+    return OwnAndCommon(own, np.zeros((count, width, 0)), Sums(np.zeros((0, 0)), np.zeros(0)), np.zeros(0))
 
 
 def test_log_evidence_is_the_ratio_of_normal_densities() -> None:
@@ -73,15 +81,98 @@ def test_spread_is_that_of_an_analysis_of_variance_where_units_are_alike() -> No
     """Balanced units of unit information: REML is the variance of the estimates less that of their noise."""
     estimates = np.random.default_rng(2).normal(0.5, 2.0, 50)
     own = Own([""] * 50, np.ones((50, 1, 1)), estimates[:, None])
-    found = population(own, 64.0)
-    assert found.spread == pytest.approx(np.sqrt(np.var(estimates, ddof=1) - 1.0), rel=0.03)
+    found = population(beside_nothing(own), np.ones(50, bool), 64.0)
+    assert found is not None and found.spread == pytest.approx(np.sqrt(np.var(estimates, ddof=1) - 1.0), rel=0.03)
     assert found.mean[0] == pytest.approx(estimates.mean(), rel=1e-6)
     assert found.spread_interval[0] < 2.0 < found.spread_interval[1]
 
 
 def test_no_spread_is_found_in_noise() -> None:
     estimates = np.random.default_rng(3).normal(0.0, 0.9, 50)
-    assert population(Own([""] * 50, np.ones((50, 1, 1)), estimates[:, None]), 64.0).spread < 0.1
+    own = Own([""] * 50, np.ones((50, 1, 1)), estimates[:, None])
+    found = population(beside_nothing(own), np.ones(50, bool), 64.0)
+    assert found is not None and found.spread < 0.1 and found.spread_interval[0] == 0.0
+
+
+def bent_units() -> tuple[OwnAndCommon, list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """What five units tell of their second-order terms beside the flexure of one bench, and the rows this is from:
+    columns of the bench, of the units, and readings."""
+    runs = [run_factor_of(k, lambda _: {"flexure": np.array([3.0, -2.0, 5.0])}) for k in range(5)]
+    campaign = Campaign(runs)
+    groups = {group.name: group for group in campaign.groups}
+    terms = PooledTerms([Term(groups["flexure"], Attribution.BENCH, 1.0).free()], 1)
+    told = OwnAndCommon.joined([OwnAndCommon.of(groups["second-order"], terms, part) for part in campaign.units()])
+
+    def columns(name: str, run: int) -> np.ndarray:
+        places = [runs[run].places[f"{name}/{symbol}"] for symbol in groups[name].symbols]
+        return runs[run].factor[runs[run].width :, places] * groups[name].sigma
+
+    of_bench, of_units = ([columns(name, k) for k in range(5)] for name in ("flexure", "second-order"))
+    return told, of_bench, of_units, [run.factor[run.width :, -1] for run in runs]
+
+
+def test_coefficients_of_units_are_those_of_one_least_squares_in_which_all_are_free() -> None:
+    told, of_bench, of_units, readings = bent_units()
+    rows = np.hstack([np.vstack(of_bench), block_diag(*of_units)])
+    truth = np.linalg.lstsq(rows, np.concatenate(readings), rcond=None)[0]
+    covariance = np.linalg.inv(rows.T @ rows)
+    for k, (mean, own) in enumerate(told.integrated().estimates()):
+        place = slice(3 + 3 * k, 6 + 3 * k)
+        np.testing.assert_allclose(mean, truth[place], rtol=1e-6)
+        np.testing.assert_allclose(own, covariance[place, place], rtol=1e-6, atol=1e-9)
+
+
+def test_population_beside_a_bench_is_that_of_generalised_least_squares() -> None:
+    """Mean, its covariance and the ends of the interval, of four of five units, from the covariance of all readings."""
+    told, of_bench, of_units, readings = bent_units()
+    members = np.arange(5) != 2
+    found = population(told, members, 64.0)
+    assert found is not None
+    free = np.zeros((sum(map(len, readings)), 3))
+    free[len(readings[0]) + len(readings[1]) :][: len(readings[2])] = of_units[2]
+    mean = np.vstack([rows * here for rows, here in zip(of_units, members, strict=True)])
+    fixed, whole = np.hstack([mean, np.vstack(of_bench), free]), np.concatenate(readings)
+
+    def fit(spread: float) -> tuple[np.ndarray, np.ndarray, float]:
+        covariance = np.eye(len(whole)) + spread**2 * block_diag(
+            *(rows @ rows.T * here for rows, here in zip(of_units, members, strict=True))
+        )
+        weight = np.linalg.inv(covariance)
+        inverse = np.linalg.inv(fixed.T @ weight @ fixed)
+        estimate = inverse @ fixed.T @ weight @ whole
+        left = whole - fixed @ estimate
+        return estimate[:3], inverse[:3, :3], float(left @ weight @ left)
+
+    estimate, covariance, _ = fit(found.spread)
+    np.testing.assert_allclose(found.mean, estimate, rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-5, atol=1e-8)
+    apart = fit(1e5)[2]  # what no spread explains
+    assert found.spread_interval[1] > 0.0
+    for spread, tail in zip(found.spread_interval, (0.975, 0.025), strict=True):
+        misfit = fit(spread)[2] - apart
+        if spread:
+            assert misfit == pytest.approx(chi2.ppf(tail, 9), rel=1e-3)
+        else:
+            assert misfit < chi2.ppf(tail, 9)
+
+
+@pytest.mark.parametrize("units", [2, 3, 8])
+def test_interval_of_the_spread_holds_the_truth_however_few_the_units(units: int) -> None:
+    """Of one coefficient with unequal sigmas, and a spread as large as these: 95 % of 200, but for 3.5 sigma."""
+    rng, inside, spread = np.random.default_rng(units), 0, 1.0
+    for _ in range(200):
+        sigmas = rng.uniform(0.3, 2.0, units)
+        values = rng.normal(3.0, np.hypot(spread, sigmas))
+        own = Own([""] * units, sigmas[:, None, None] ** -2, (values / sigmas**2)[:, None])
+        found = population(beside_nothing(own), np.ones(units, bool), 64.0)
+        assert found is not None
+        inside += found.spread_interval[0] <= spread <= found.spread_interval[1]
+    assert 180 <= inside <= 199
+
+
+def test_one_unit_has_no_spread() -> None:
+    own = Own(["a", "b"], np.ones((2, 1, 1)), np.ones((2, 1)))
+    assert population(beside_nothing(own), np.array([True, False]), 64.0) is None
 
 
 def test_posterior_without_information_is_the_prior() -> None:

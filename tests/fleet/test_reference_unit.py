@@ -32,6 +32,7 @@ def without_serial(content: dict[str, Any]) -> None:
 def without_scale(content: dict[str, Any]) -> None:
     content["provenance"]["bench"]["block_serial"] = "A"
     content["parameters"][2] |= {"value": None, "sigma": None}
+    content["state"]["undetermined"] = ["K1"]
 
 
 def without_format(content: dict[str, Any]) -> None:

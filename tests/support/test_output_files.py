@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import multiprocessing
 import os
 import random
 import signal
@@ -11,7 +12,9 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -233,6 +236,67 @@ def test_a_file_that_comes_to_be_meanwhile_is_left_alone(here: Path) -> None:
     with pytest.raises(InputError, match="came to be during the run"):
         outputs.write(here / "new", lambda path: path.write_bytes(b""))
     assert (here / "new").read_bytes() == MINE
+
+
+def _write_at_once(path: Path, barrier: Any, results: Any) -> None:
+    """In a process of its own: write a file that nobody has yet, at the same moment as others."""
+    outputs, content = Outputs({"-o": path}), f"of process {os.getpid()}" * 1000
+    barrier.wait()
+    try:
+        outputs.write(path, lambda path: write_whole(path, content.encode()))
+        results.put((content, ""))
+    except InputError as error:
+        results.put(("", str(error)))
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_of_many_that_write_a_new_name_at_once_one_succeeds(
+    tmp_path: Path, links: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The others say so, and their results take the place of none; also where a file system has no links."""
+    if not links:
+        monkeypatch.setattr(os, "link", _no_links)
+    context = multiprocessing.get_context("fork")
+    for number in range(10):
+        path, barrier, results = tmp_path / f"{number}.json", context.Barrier(4), context.Queue()
+        writers = [context.Process(target=_write_at_once, args=(path, barrier, results)) for _ in range(4)]
+        for each in writers:
+            each.start()
+        told = [results.get(timeout=60) for _ in writers]
+        for each in writers:
+            each.join()
+        (content,) = (content for content, _ in told if content)
+        assert path.read_text() == content
+        assert sum("came to be during the run and was left as it is" in said for _, said in told) == 3
+    assert len(list(tmp_path.iterdir())) == 10
+
+
+def _no_links(*_: object) -> None:
+    raise OSError(errno.EPERM, "Operation not permitted")
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    """And nothing else: not what a process writes that goes on, nor one of another machine."""
+    program = (
+        "import sys, time; from pathlib import Path; from kf_calib.support.output_files import whole\n"
+        "with whole(Path(sys.argv[1])) as part: part.write_text('half'); print(flush=True); time.sleep(600)"
+    )
+    words = [sys.executable, "-c", program, str(tmp_path / "out.json")]
+    begin = partial(subprocess.Popen, words, stdout=subprocess.PIPE)
+    with begin() as killed, begin() as other:
+        for child in (killed, other):
+            child.stdout.read(1)
+        killed.kill()
+        killed.wait()
+        elsewhere = tmp_path / f".kf-calib-00000000-{killed.pid}-00000000.part"
+        elsewhere.write_text("half")
+        assert len(list(tmp_path.glob(".kf-calib-*.part"))) == 3
+        Outputs({"-o": tmp_path / "another.json"})
+        assert {path.name.split("-")[3] for path in tmp_path.iterdir()} == {str(other.pid), str(killed.pid)}
+        assert elsewhere.exists()
+        other.kill()
+    Outputs({"-o": tmp_path / "another.json"})
+    assert list(tmp_path.iterdir()) == [elsewhere]
 
 
 @pytest.mark.parametrize("name", ["device", "link"])

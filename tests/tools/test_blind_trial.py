@@ -144,7 +144,7 @@ def test_an_interrupted_trial_is_resumed_and_trials_are_pooled(tmp_path: Path, m
 
 @pytest.mark.slow
 def test_a_rival_of_the_best_frequency_is_in_the_ambiguity_set() -> None:
-    """The temperature swings, and a sinusoid of just its period explains a little more than the rate of temperature."""
+    """The temperature swings, and a sinusoid of just its period explains as much as the rate of temperature."""
     options = (
         "--grade", "mems", "--orientations", "36", "--dwell-s", "120", "--sample-hz", "10", "--angle-hz", "4",
         "--slew-degps", "60", "--temperature-swing", "10", "--temperature-period-s", "700", "--warm-up-c", "0",
@@ -152,4 +152,4 @@ def test_a_rival_of_the_best_frequency_is_in_the_ambiguity_set() -> None:
     )  # fmt: skip
     task = Task("benches@one", "diagnose", 2611311100044, ("thermal-rate=15sigma",), options, "0.002")
     found = play_trial(task)
-    assert found.first == "sinusoid" and found.held, found.ambiguity
+    assert {"thermal-rate", "sinusoid"} <= set(found.ambiguity) and found.held, found.ambiguity

@@ -6,6 +6,7 @@ import io
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import UTC, datetime
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,8 @@ def path(found: kf_calib.Diagnosis, tmp_path_factory: pytest.TempPathFactory) ->
     bench = replace(found.before.bench, notes={"block_serial": EVIL, "note": MORE_EVIL})
     before = replace(found.before, bench=bench, warnings=(EVIL, MORE_EVIL))
     place = tmp_path_factory.mktemp("report") / "report.html"
-    page = page_of(replace(found, before=before), [Measured(MORE_EVIL, "6e21", 1750000000 * 10**9)], [EVIL], [EVIL])
+    measured = Measured(MORE_EVIL, "6e21", datetime(2025, 6, 15, tzinfo=UTC))
+    page = page_of(replace(found, before=before), [measured], [EVIL], [EVIL])
     save(page, place)
     return place
 

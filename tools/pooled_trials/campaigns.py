@@ -8,17 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects import described
+from kf_calib.effects import Bearer, described
 from kf_calib.fleet.run_factor import RunFactor
 from pooled_trials.runs import simulated
 
 UNITS = 40
-KINDS = ("noise", "bench", "repaired", "sensors", "population", "half", "half-large", "same-in-all", "own-of-each")
+KINDS = ("noise", "bench", "repaired", "sensors", "population", "half", "half-large", "same-in-all")
 """Nothing; one vector of the bench, or one from some run on; each unit its own of one size, or drawn about a mean; half
-of the units, at 2 to 3 or at 6 sigma; a sensor's effect that is the same in all units; a bench's effect that is each
-unit's own."""
-_OF_BENCH = ("bench", "repaired", "own-of-each")
-_COMMON = ("bench", "repaired", "same-in-all")
+of the units, at 2 to 3 or at 6 sigma; a sensor's effect that is the same in all units of the type."""
+_OF_BENCH = ("bench", "repaired")
+_ALIKE = (*_OF_BENCH, "same-in-all")
 _SEEN = 1e-6
 
 
@@ -35,7 +34,12 @@ class Truth:
     @property
     def common(self) -> bool:
         """Whether the bench has it."""
-        return self.kind in _COMMON
+        return self.kind in _OF_BENCH
+
+    @property
+    def alike(self) -> bool:
+        """Whether it is the same in all units."""
+        return self.kind in _ALIKE
 
     @property
     def units(self) -> set[str]:
@@ -54,12 +58,8 @@ def fitting(kind: str, runs: Sequence[RunFactor]) -> list[str]:
         return [""]
     first = runs[0]
     names = [name for name, own in first.effects.items() if all(_left(first, column) for column in own)]
-    return [name for name in names if _is_of_bench(name) == (kind in _OF_BENCH)]
-
-
-def _is_of_bench(name: str) -> bool:
-    effect = described(name)
-    return effect is not None and effect.of_the_bench
+    bearer = Bearer.BENCH if kind in _OF_BENCH else Bearer.SENSORS
+    return [name for name in names if (effect := described(name)) is not None and effect.borne_by is bearer]
 
 
 def _left(run: RunFactor, column: str) -> bool:
@@ -84,7 +84,7 @@ def draw(kind: str, effect: str, runs: Sequence[RunFactor], rng: np.random.Gener
     def scaled(vector: Floats, run: RunFactor) -> Floats:
         return vector * sigmas / np.linalg.norm(signal(run, effect, vector))
 
-    if kind in _COMMON:
+    if kind in _ALIKE:
         first = int(rng.integers(10, len(runs) - 9)) if kind == "repaired" else 0
         own = np.tile(scaled(rng.standard_normal(count), runs[0]), (len(runs), 1))
         own[:first] = 0.0

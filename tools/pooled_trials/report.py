@@ -47,9 +47,7 @@ def _reliability(outcomes: Sequence[dict[str, Any]]) -> Table:
     out = Table("probability", "from", "to", "number", "mean", "true", title="How reliable the probabilities are")
     sides = [each for each in outcomes if "of_bench" in each]
     pairs: dict[str, list[tuple[float, bool]]] = {
-        "that the effect is the bench's": [
-            (each["of_bench"], each["kind"] in ("bench", "repaired", "same-in-all")) for each in sides
-        ],
+        "that the effect is the bench's": [(each["of_bench"], each["kind"] in ("bench", "repaired")) for each in sides],
         "of the effect that was named": [(each["probability"], each["exactly"]) for each in sides],
         "that a unit has the effect": [
             (chance, has) for each in outcomes for chance, has in each.get("units", []) if "covers" in each

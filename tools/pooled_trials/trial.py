@@ -54,7 +54,7 @@ def _means(truth: Truth, finding: Finding, runs: Sequence[RunFactor]) -> bool:
     places = [[run.places[column] for column in run.effects[finding.effect]] for run in runs]
     columns = [run.factor[run.width :, own] for run, own in zip(runs, places, strict=True)]
     hidden = [signal(run, truth.effect, own) for run, own in zip(runs, truth.coefficients, strict=True)]
-    if truth.common:
+    if truth.alike:
         first = truth.repaired or 0
         parts = [(np.vstack(columns[first:]), np.concatenate(hidden[first:]))]
     else:

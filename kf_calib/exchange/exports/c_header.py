@@ -21,6 +21,7 @@ from kf_calib.effects.expression import Expression
 from kf_calib.effects.formula import Formula, quantities
 from kf_calib.errors import InputError
 from kf_calib.exchange.exports.c_expression import HELPERS, MATH, Piece, in_c, number
+from kf_calib.exchange.exports.quoting import in_comment
 from kf_calib.exchange.exports.target import Target
 
 _OWN_NAMES = ("a", "p", "o", "T", "constant", "before", "after")
@@ -46,11 +47,11 @@ class CHeader(Target):
         ])  # fmt: skip
 
     def _comments(self) -> Iterator[str]:
-        names = ["alignment", "scale factor", "bias", *map(str, self.correction.effects)]
+        names = ["alignment", "scale factor", "bias", *(in_comment(str(effect)) for effect in self.correction.effects)]
         yield f"// Specific force, m/s^2, from a reading, m/s^2: {self.origin}."
         yield f"// Corrected for {', '.join(names)}."
         for name in self.correction.left_out:
-            yield f"// Not corrected for {name}."
+            yield f"// Not corrected for {in_comment(name)}."
 
     def _body(self, sums: list[str]) -> Iterator[str]:
         correction, used = self.correction, "".join(sums)

@@ -12,6 +12,7 @@ import csv
 import io
 from collections.abc import Iterator
 
+from kf_calib.exchange.exports.quoting import in_cell
 from kf_calib.exchange.exports.target import Target
 
 
@@ -29,7 +30,7 @@ class Table(Target):
 
     def _rows(self) -> Iterator[tuple[str, object, object, str]]:
         for own in self.saved.parameters:
-            yield own.symbol, own.value, own.sigma, own.unit
+            yield in_cell(own.symbol), own.value, own.sigma, in_cell(own.unit)
         for effect in self.correction.effects:
             if effect.unknown is not None and not effect.smooth:  # that of a smooth one is among the parameters
                 yield effect.unknown.symbol, effect.value, None, effect.unknown.unit

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from abc import ABC, abstractmethod
 from functools import cached_property
 from typing import ClassVar
@@ -11,6 +10,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.correction import Correction
 from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.exchange.exports.force_grid import ErrorLeft, ForceGrid, force_grid
+from kf_calib.exchange.exports.quoting import in_comment
 
 
 class Target(ABC):
@@ -56,7 +56,8 @@ class Target(ABC):
 
     @property
     def origin(self) -> str:
-        """Where the numbers come from, in letters that are harmless in a comment of any language."""
+        """Where the numbers come from, fit for a comment of any of the formats."""
         made = self.saved.provenance
-        name = re.sub(r"[^\w.+-]+", "_", made.recording) or "a live run"
-        return f"calibration of {name} by kf_calib {made.versions.get('kf_calib', '')}, {made.created}"
+        name = in_comment(made.recording) or "a live run"
+        version, created = in_comment(made.versions.get("kf_calib", "")), in_comment(made.created)
+        return f"calibration of {name} by kf_calib {version}, {created}"

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import re
+from itertools import takewhile
 from pathlib import Path
 
 from kf_calib.errors import InputError
+from kf_calib.support.plain_text import cut
 
 _NUMBERED = re.compile(r"(.*)_(\d+)")
-_SHOWN = 6  # names in a message
-_LISTED = re.compile(r"^( *)relative_file_paths:\s*\n((?:\1 *- .*(?:\n|$))+)", re.MULTILINE)
+_SHOWN, _LONGEST_NAME = 6, 100  # names in a message, characters of one
+_LISTED, _LARGEST_METADATA = "relative_file_paths:", 10_000_000
 
 
 def files_of(path: Path) -> list[Path]:
@@ -18,11 +20,11 @@ def files_of(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     listed = _files_in_metadata(path / "metadata.yaml")
-    lost = [name for name in listed if not (path / name).is_file()]
+    lost = [cut(name, _LONGEST_NAME) for name in listed if not _is_file(path / name)]
     if lost:
+        names = ", ".join(lost[:_SHOWN]) + " ..." * (len(lost) > _SHOWN)
         raise InputError(
-            f"{path} lacks {', '.join(lost)}, which its metadata.yaml names: bring the whole bag, or give one of its "
-            "files."
+            f"{path} lacks {names}, which its metadata.yaml names: bring the whole bag, or give one of its files."
         )
     files = [path / name for name in listed if _is_part(name)] or _lying_in(path)
     if not files:
@@ -35,6 +37,14 @@ def files_of(path: Path) -> list[Path]:
             f"{' ...' * (len(files) > _SHOWN)}) and no metadata.yaml that makes them one: give one of them."
         )
     return files
+
+
+def _is_file(path: Path) -> bool:
+    """Whether there is such a file; a name that no file system allows is of none."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
 
 
 def _lying_in(path: Path) -> list[Path]:
@@ -57,11 +67,13 @@ def _place(file: Path) -> tuple[str, int]:
 def _files_in_metadata(metadata: Path) -> list[str]:
     """The files that a bag's metadata.yaml lists, in order; none where there is no such file."""
     try:
-        found = _LISTED.search(metadata.read_text(encoding="utf-8", errors="replace"))
+        with metadata.open(encoding="utf-8", errors="replace") as file:
+            lines = file.read(_LARGEST_METADATA).split("\n")
     except OSError:
         return []
-    names = re.findall(r"^ *- *(.+?) *$", found[2], re.MULTILINE) if found else []
-    return [Path(name.strip("'\"")).name for name in names]
+    begin = next((k for k, line in enumerate(lines) if line.strip() == _LISTED), len(lines))
+    items = takewhile(lambda line: line.startswith("- "), (line.strip() for line in lines[begin + 1 :]))
+    return [Path(item[2:].strip().strip("'\"")).name for item in items]
 
 
 def fingerprint(path: Path) -> str:

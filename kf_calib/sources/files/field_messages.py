@@ -61,19 +61,26 @@ class FieldDecoder:
         kept, stamps, values = list[int](), list[int](), list[list[float]]()
         for start in at.tolist():
             try:
-                message = self._parse(buffer[start : start + size])
+                message, numbers = self._read(buffer[start : start + size])
             except _UnreadError as error:
                 if not self._time:
                     raise
                 self._unread.append(str(error))
                 continue
-            numbers = self._chosen(self._fields.numbers(message), self._fields.labels(message))
             if numbers is not None:
                 kept.append(start)
                 stamps.append(self._stamp(message, buffer, start))
                 values.append(numbers)
         table = np.array(values, float).reshape(len(values), self.width)
         return np.array(kept, np.int64), Stream(np.array(stamps, np.int64), table)
+
+    def _read(self, data: bytes) -> tuple[Any, list[float] | None]:
+        """A message, and the numbers in it that are sought."""
+        message = self._parse(data)
+        try:
+            return message, self._chosen(self._fields.numbers(message), self._fields.labels(message))
+        except RecursionError:
+            raise _UnreadError(f"a message is nested too deeply: {_ANEW}") from None
 
     def _chosen(self, numbers: list[float], names: tuple[str, ...]) -> list[float] | None:
         if self._joints and names:
@@ -144,7 +151,7 @@ def _of_protobuf(schema: Schema | None) -> _Parse:
         for file in files:
             add(file)
         kind = GetMessageClass(pool.FindMessageTypeByName(name))
-    except (DecodeError, TypeError, KeyError):
+    except Exception:  # of many kinds, for the schema may say anything
         raise FieldError(f"its schema {name!r} does not say what its protobuf messages are: record it anew") from None
 
     def parse(data: bytes) -> Any:

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import cached_property
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,8 @@ _GRAMMAR = re.compile(r"(?P<quantity>\w+)=(?P<topic>[^:@]+):(?P<paths>[^@]+?)(?:
 _PATH = re.compile(r"[\w.-]+")
 _SHOWN = 12  # names in a message
 _INT64 = 1 << 63
+_MOST_PATHS, _DEEPEST = 1000, 12
+_LONGEST_TIME = 64  # characters of one in ISO 8601
 
 
 class FieldError(ValueError):
@@ -130,16 +133,21 @@ def time_ns(message: Any, path: str) -> int:
     return _within(parts[0] * 1_000_000_000 + parts[1], path)
 
 
-def paths_of(message: Any, before: str = "") -> Iterator[str]:
-    """Paths to all that is in a message; of a list of objects those in its first."""
+def paths_of(message: Any) -> Iterator[str]:
+    """Paths to all that is in a message, as far as one is told of; of a list of objects those in its first."""
+    return islice(_paths_of(message), _MOST_PATHS)
+
+
+def _paths_of(message: Any, before: str = "", depth: int = 0) -> Iterator[str]:
+    """As ``paths_of``; a type of protobuf that holds itself has no end."""
     if _is_list(message):
         message = message[0] if len(message) and _is_object(message[0]) else None
-    if not _is_object(message):
+    if depth == _DEEPEST or not _is_object(message):
         yield from [before] if before else []
         return
     for name in _names_in(message):
         value = message[name] if isinstance(message, Mapping) else getattr(message, name)
-        yield from paths_of(value, f"{before}.{name}" if before else str(name))
+        yield from _paths_of(value, f"{before}.{name}" if before else str(name), depth + 1)
 
 
 def _exactly(value: float, unit: int, path: str) -> int:
@@ -159,7 +167,7 @@ def _within(value: int, path: str) -> int:
 def _time_of_text(text: str, path: str) -> int:
     """As in ISO 8601, in UTC."""
     try:
-        stamp = np.datetime64(re.sub(r"(Z|[+-]00:?00)$", "", text), "ns")
+        stamp = np.datetime64(re.sub(r"(Z|[+-]00:?00)$", "", text[:_LONGEST_TIME]), "ns")
     except ValueError:
         stamp = np.datetime64("NaT")
     if np.isnat(stamp):
@@ -183,11 +191,14 @@ def _number(value: Any, path: str) -> float:
 
 
 def _flat(value: Any) -> Iterator[Any]:
-    if not _is_list(value):
-        yield value
-        return
-    for each in value:
-        yield from _flat(each)
+    """All that is in lists of lists, which may be nested deeply."""
+    waiting = [value]
+    while waiting:
+        first = waiting.pop()
+        if _is_list(first):
+            waiting += reversed(first)
+        else:
+            yield first
 
 
 def _at(value: Any, steps: Sequence[str], path: str) -> Any:

@@ -11,18 +11,17 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from kf_calib.errors import InputError
 from kf_calib.sources.files.bags import files_of
 from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, fields_by_role
 from kf_calib.sources.files.field_messages import CDR, ENCODINGS, parser_of
 from kf_calib.sources.files.fields import FieldError, paths_of
-from kf_calib.sources.files.foreign import HEAD_BYTES, is_lines
 from kf_calib.sources.files.lines import Lines
 from kf_calib.sources.files.mcap_chunks import MAX_CHUNK_MB
 from kf_calib.sources.files.mcap_file import McapFile, Warn
 from kf_calib.sources.files.mcap_messages import MessageFinder
 from kf_calib.sources.files.record_files import RecordFile, open_record_file
 from kf_calib.sources.files.sqlite_bag import SqliteBag
+from kf_calib.sources.units import Units
 from kf_calib.support.extras import MissingExtraError
 
 Times = NDArray[np.int64]
@@ -100,7 +99,8 @@ class Topic:
 @dataclass
 class Inventory:
     """What a recording's files hold. has_readings: of an accelerometer, by a schema that is known. has_angles: the
-    platform is described by angles; None: it is not described in a schema that is known."""
+    platform is described by angles; None: it is not described in a schema that is known. angles: how many, where that
+    is known."""
 
     path: Path
     format: str
@@ -111,23 +111,20 @@ class Inventory:
     has_readings: bool
     has_angles: bool | None
     warnings: list[str]
+    angles: int | None = None
 
     @property
     def is_lines(self) -> bool:
         return self.format == "lines"
 
 
-def inventory_of(
-    path: Path, columns: Mapping[str, str] = MappingProxyType({}), fields: Sequence[str] = ()
-) -> Inventory:
-    """All of a file or a bag's folder, read once. columns: our names of a table's. fields: as of a ``Recording``.
+def inventory_of(path: Path, fields: Sequence[str] = ()) -> Inventory:
+    """All of a file or a bag's folder, read once. fields: as of a ``Recording``.
 
     Raises InputError.
     """
     stated = fields_by_role(fields)
     files = files_of(path)
-    if len(files) == 1 and _holds_lines(files[0]):
-        return _of_lines(files[0], columns)
     warnings = list[str]()
     parts = [open_record_file(file, int(MAX_CHUNK_MB * (1 << 20)), USABLE_SCHEMAS) for file in files]
     topics, bench, has_readings, has_angles = dict[str, Topic](), dict[str, str](), False, None
@@ -146,18 +143,14 @@ def inventory_of(
     return Inventory(path, kind, files, size, list(topics.values()), bench, has_readings, has_angles, warnings)
 
 
-def _holds_lines(file: Path) -> bool:
-    try:
-        with file.open("rb") as opened:
-            return is_lines(opened.read(HEAD_BYTES))
-    except FileNotFoundError:
-        raise InputError(f"{file} does not exist: check the path.") from None
-    except OSError as error:
-        raise InputError(f"{file} cannot be read ({error.strerror}): check its permissions.") from None
+def inventory_of_lines(
+    path: Path, columns: Mapping[str, str] = MappingProxyType({}), units: Units | None = None
+) -> Inventory:
+    """All of a log in lines of text, read once. columns, units: as of ``Lines``.
 
-
-def _of_lines(path: Path, columns: Mapping[str, str]) -> Inventory:
-    lines = Lines(path, columns=columns)
+    Raises InputError.
+    """
+    lines = Lines(path, columns=columns, units=units, angles=False)
     topics = [Topic(name, "", "") for name in ("readings", "platform", "temperature")]
     for batch in lines.batches():
         for topic, stream in zip(topics, (batch.accel, batch.pose, batch.temperature), strict=True):
@@ -166,10 +159,11 @@ def _of_lines(path: Path, columns: Mapping[str, str]) -> Inventory:
         topic.settle()
     said = lines.described
     assert said
-    topics[1].name = "platform angles" if said.has_angles else "platform attitude"
+    has_angles = said.has_angles if topics[1].count else None
+    topics[1].name = "platform angles" if has_angles else "platform attitude"
     met = [topic for topic in topics if topic.count]
-    size = path.stat().st_size
-    return Inventory(path, "lines", [path], size, met, said.metadata, True, said.has_angles, lines.warnings)
+    return Inventory(path, "lines", [path], path.stat().st_size, met, said.metadata, True, has_angles, lines.warnings,
+                     said.pose_width if has_angles else None)  # fmt: skip
 
 
 def _count(file: RecordFile, contents: Contents, topics: dict[str, Topic], warn: Warn) -> None:

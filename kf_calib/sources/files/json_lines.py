@@ -20,6 +20,7 @@ from kf_calib.sources.files.line_parts import (
     number_of,
     stamp_ns,
 )
+from kf_calib.sources.units import Units
 
 _ACCEL = {f"accel_{unit}": factor for unit, factor in ACCEL_UNITS.items()}
 _ANGLES = {"angles_rad": 1.0, "angles_deg": math.pi / 180.0}
@@ -46,9 +47,9 @@ class JsonLines(LineReader):
         (ArithmeticError, "a number is out of range"),
     )
 
-    def __init__(self, columns: Mapping[str, str], account: Account) -> None:
+    def __init__(self, columns: Mapping[str, str], account: Account, units: Units | None = None) -> None:
         super().__init__(account)
-        self._columns = columns
+        self._columns, self._scale = columns, units.accel_scale if units else 1.0
         keys = [*_ACCEL, *(theirs for theirs, ours in columns.items() if ours in _ACCEL)]
         self._find_readings = re.compile(rf'("(?:{"|".join(map(re.escape, keys))})"\s*:\s*)\[[^][]*\]')
         self._is_first = True
@@ -62,7 +63,7 @@ class JsonLines(LineReader):
         entry = json.loads(line)
         names = {self._columns.get(key, key): key for key in entry}
         name = next(each for each in _ACCEL if each in names and entry[names[each]] is not None)
-        values = [value / _ACCEL[name] for value in readings_mps2]
+        values = [value / (_ACCEL[name] * self._scale) for value in readings_mps2]
         if len(self._find_readings.findall(line)) == 1:  # in its place, so that all other text stays as it is
             return self._find_readings.sub(lambda found: found[1] + json.dumps(values), line)
         return json.dumps(entry | {names[name]: values}, ensure_ascii=False)
@@ -118,6 +119,7 @@ class JsonLines(LineReader):
                 values = _numbers(entry[name], name)
                 if len(values) != 3:
                     raise LineError(f"{name} has {len(values)} numbers, not 3")
+                factor *= self._scale
                 return values if factor == 1.0 else [factor * value for value in values]
         return None
 

@@ -84,7 +84,8 @@ class LineRows:
 class LineReader(ABC):
     """Reads lines block by block; those that cannot be used are put down in the account.
 
-    ``metadata``: of the bench, as strings. ``has_angles``: poses are angles; ``pose_width``: numbers of one.
+    ``metadata``: of the bench, as strings. ``has_angles``: poses are angles; ``pose_width``: numbers of one. ``said``:
+    what was taken for what, where that is not plain.
     """
 
     _faults: ClassVar[tuple[tuple[type[Exception], str], ...]]
@@ -94,6 +95,7 @@ class LineReader(ABC):
         self.metadata: dict[str, str] = {}
         self.has_angles = True
         self.pose_width = 0
+        self.said = list[str]()
         self._account = account
 
     @property
@@ -107,6 +109,7 @@ class LineReader(ABC):
 
     def read(self, lines: Sequence[str], first_line: int) -> Batch:
         """The batch of consecutive lines, the first of them of that number."""
+        self._begin_block(lines)
         accel, pose, temperature = LineRows(), LineRows(), LineRows()
         faults = tuple(kind for kind, _ in self._faults)
         for number, line in enumerate(lines, start=first_line):
@@ -120,6 +123,9 @@ class LineReader(ABC):
                 reason = next(reason for kind, reason in self._faults if isinstance(error, kind))
                 self._account.refuse(number, reason)
         return Batch(accel.stream(3), pose.stream(self.pose_width), temperature.stream(1))
+
+    def _begin_block(self, lines: Sequence[str]) -> None:  # noqa: B027 (not every reader has to look ahead)
+        """Called with the lines before any of them is read."""
 
     @abstractmethod
     def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:

@@ -7,8 +7,8 @@ Bytes are taken as they arrive and cut into lines here; memory is that of one bl
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -17,14 +17,23 @@ from typing import BinaryIO, Protocol
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.gravity_alone import bench_without_angles, without_poses
 from kf_calib.bench.streams import Batch
-from kf_calib.errors import BenchError, InputError
+from kf_calib.errors import BenchError, CountsError, InputError
+from kf_calib.sources.files.csv_columns import CsvColumns
+from kf_calib.sources.files.csv_heading import Heading
 from kf_calib.sources.files.csv_lines import CsvLines
 from kf_calib.sources.files.joints import as_columns
 from kf_calib.sources.files.json_lines import JsonLines
 from kf_calib.sources.files.line_parts import Account, LineReader
+from kf_calib.sources.files.text_file import TextFile
+from kf_calib.sources.tables.columns import HOW
+from kf_calib.sources.units import Units
+from kf_calib.support.plain_text import cut
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _BLOCK_BYTES = 1 << 18
 LONGEST_LINE_BYTES = 1 << 20
+_TELLING_ROWS = 8  # of CSV, at the beginning of a stream
+OpenReader = Callable[[Sequence[str], Account], tuple[LineReader, int]]
 _SURVEY_LINES = 1_000_000  # without a pose in them, none will come
 
 
@@ -33,8 +42,9 @@ class Lines:
 
     source: path of a file, or a binary stream, which is read as data arrive. overrides: bench metadata keys that win
     over those on the first line. columns: our name for each foreign column or key, for example
-    ``{"acc_x[g]": "ax_g"}``. name: what messages call a stream. angles: False to do without platform angles; poses that
-    come are then left out. Raises InputError where the lines cannot be used.
+    ``{"acc_x[g]": "ax_g"}``. name: what messages call a stream. units: where the header names none, and the size of a
+    count. angles: False to do without platform angles; poses that come are then left out. Raises InputError where the
+    lines cannot be used.
     """
 
     def __init__(
@@ -44,13 +54,17 @@ class Lines:
         columns: Mapping[str, str] = MappingProxyType({}),
         name: str = "standard input",
         *,
+        units: Units | None = None,
         angles: bool = True,
     ) -> None:
         self._path = Path(source) if isinstance(source, str | PathLike) else None
         self._stream = None if isinstance(source, str | PathLike) else source
         self.name = str(self._path) if self._path else name
         self._angles, self._said = angles, list[str]()
-        self._overrides, self._columns = overrides, {**as_columns(overrides.get("joints", "")), **columns}
+        self._overrides, self._stated = overrides, columns
+        self._columns = {**as_columns(overrides.get("joints", "")), **columns}
+        self._units = units or Units()
+        self._begin_ns: int | None = None
         self._bench: Bench | None = None
         self._waiting: _Passage | None = None  # begun to learn of the bench, not yet iterated
         self._latest: _Passage | None = None
@@ -59,15 +73,20 @@ class Lines:
     def bench(self) -> Bench:
         """The bench; a stream is read for it up to the first pose, which shows how the platform is described."""
         if self._bench is None:
-            self._waiting = self._begin()
-            with self._waiting.closed_on_failure():
-                self._bench = self._describe_bench(self._waiting)
+            passage = self._begin()
+            with passage.closed_on_failure():
+                self._bench = self._describe_bench(passage)
+            if self._path:  # it is read from its beginning again, if it is
+                passage.close()
+            else:
+                self._waiting = passage
         return self._bench
 
     @property
     def warnings(self) -> list[str]:
-        account = self._latest.account if self._latest else Account()
-        return [*self._said, *(f"{self.name}: {sentence}" for sentence in account.sentences())]
+        if self._latest is None:
+            return self._said
+        return [*self._said, *(f"{self.name}: {sentence}" for sentence in self._latest.sentences())]
 
     @property
     def fraction(self) -> float:
@@ -80,7 +99,17 @@ class Lines:
     def batches(self) -> Iterator[Batch]:
         """What the lines hold, whatever the bench may be."""
         passage, self._waiting = self._waiting or self._begin(), None
-        return iter(passage)
+        for batch in passage:
+            if self._begin_ns is None and len(batch.accel):
+                self._begin_ns = int(batch.accel.time_ns[0])
+            yield batch
+
+    def begin_ns(self) -> int | None:
+        """Stamp of the first reading; None where there is none. Reads a file as far as to there, unless it has been
+        read."""
+        if self._begin_ns is None and self._path:
+            next((batch for batch in self if len(batch.accel)), None)
+        return self._begin_ns
 
     @property
     def described(self) -> Described | None:
@@ -90,17 +119,25 @@ class Lines:
     def _begin(self) -> _Passage:
         try:
             if self._path:
-                stream, size = self._path.open("rb"), self._path.stat().st_size
+                stream: BinaryIO | TextFile = TextFile(self._path)
             elif self._stream is not None:
-                stream, size, self._stream = self._stream, None, None
+                stream, self._stream = self._stream, None
             else:
                 raise InputError(f"{self.name} can be read only once: record it to a file to read it again.")
         except OSError as error:
             raise InputError(f"{self.name}: cannot be read ({error.strerror}).") from None
-        self._latest = _Passage(self.name, stream, size, self._columns, self._angles)
+        self._latest = _Passage(self.name, stream, self._open_reader, self._angles)
         with self._latest.closed_on_failure():
             self._latest.survey()
         return self._latest
+
+    def _open_reader(self, lines: Sequence[str], account: Account) -> tuple[LineReader, int]:
+        if self._stated and not is_json(lines[0]):
+            _refuse_absent(self._stated, Heading.of(lines).header)
+        local_mps2 = STANDARD_GRAVITY_MPS2
+        if self._units.g == "local":
+            local_mps2 = bench_without_angles(self.name, self._overrides)[0].gravity_mps2
+        return reader_for(lines, self._columns, account, angles=self._angles, units=self._units, local_mps2=local_mps2)
 
     def _describe_bench(self, passage: _Passage) -> Bench:
         if self._angles:
@@ -169,12 +206,36 @@ class Cutter:
         return b"\n".join(lines).decode("utf-8", errors="replace").split("\n")
 
 
-def reader_for(first: str, columns: Mapping[str, str], account: Account, angles: bool = True) -> LineReader:
-    """The reader that the first line asks for; angles: whether a pose is wanted.
+def reader_for(
+    lines: Sequence[str],
+    columns: Mapping[str, str],
+    account: Account,
+    *,
+    angles: bool = True,
+    units: Units | None = None,
+    local_mps2: float = STANDARD_GRAVITY_MPS2,
+) -> tuple[LineReader, int]:
+    """The reader that the first lines ask for, and how many of these are its heading.
 
-    Raises InputError for a header that does not say what is needed.
+    lines: the first of them is not empty. angles: whether a pose is wanted. Raises InputError for a header that does
+    not say what is needed.
     """
-    return JsonLines(columns, account) if first[0] in "{[" else CsvLines(first, columns, account, angles)
+    if is_json(lines[0]):
+        return JsonLines(columns, account, units), 0
+    heading = Heading.of(lines)
+    return CsvLines(CsvColumns.of(heading, columns, units, local_mps2), account, angles), heading.lines
+
+
+def is_json(first: str) -> bool:
+    """Whether the first line that is not empty begins JSON lines."""
+    return first.lstrip("\ufeff \t")[:1] in ("{", "[")
+
+
+def _refuse_absent(stated: Mapping[str, str], header: Sequence[str]) -> None:
+    if absent := next((theirs for theirs in stated if theirs not in header), None):
+        raise InputError(
+            f"has no column {cut(absent, 60)!r} (--column), it has {cut(', '.join(map(repr, header)), 300)}."
+        )
 
 
 class _Passage:
@@ -182,14 +243,20 @@ class _Passage:
 
     parser: LineReader
 
-    def __init__(self, name: str, stream: BinaryIO, size: int | None, columns: Mapping[str, str], angles: bool) -> None:
+    def __init__(self, name: str, stream: BinaryIO | TextFile, open_reader: OpenReader, angles: bool) -> None:
         self.account, self._angles = Account(), angles
-        self.fraction = 0.0 if size else math.nan
-        self._name, self._columns, self._size, self._stream = name, columns, size, stream
-        self._is_ours = size is not None  # a file opened here
+        self._name, self._stream, self._open_reader = name, stream, open_reader
+        self._file = stream if isinstance(stream, TextFile) else None
+        self.fraction = 0.0 if self._file else math.nan
         self._blocks = self._split(stream)
-        self._ahead = list[Batch]()
+        self._ahead, self._said = list[Batch](), list[str]()
         self._has_accel = self._has_pose = False
+
+    def sentences(self) -> list[str]:
+        """What was taken for what, where that is not plain, and what was not used."""
+        told = f"{'; '.join(self._said)}. {HOW}." if self._said else ""
+        trouble = self._file.trouble if self._file else ""
+        return [sentence for sentence in (told, trouble) if sentence] + self.account.sentences()
 
     @contextmanager
     def closed_on_failure(self) -> Iterator[None]:
@@ -197,9 +264,13 @@ class _Passage:
         try:
             yield
         except BaseException:
-            if self._is_ours:
-                self._stream.close()
+            self.close()
             raise
+
+    def close(self) -> None:
+        """Closes a file opened here."""
+        if self._file:
+            self._file.close()
 
     def survey(self) -> None:
         """Reads up to the first pose, if there must be one, and keeps what it has read."""
@@ -211,38 +282,43 @@ class _Passage:
             self._ahead.append(batch)
 
     def __iter__(self) -> Iterator[Batch]:
-        while self._ahead:
-            yield self._ahead.pop(0)
-        while (batch := self._next_batch()) is not None:
-            yield batch
+        try:
+            while self._ahead:
+                yield self._ahead.pop(0)
+            while (batch := self._next_batch()) is not None:
+                yield batch
+        finally:
+            self.close()
         met = {"readings": self._has_accel, "platform angles": self._has_pose or not self._angles}
         for what, is_met in met.items():
             if not is_met:
                 raise self._unusable(what)
 
     def _open_parser(self) -> None:
+        """Reads the first lines; of CSV some rows as well, which tell what the header may not."""
+        first = list[str]()
         for lines in self._blocks:
-            for i, line in enumerate(lines):
-                text = line.lstrip("\ufeff").strip()
-                if text:
-                    self._start(text, lines[i:], i)
-                    return
-            self.account.lines += len(lines)
-        raise InputError(f"{self._name} holds no lines: check that the logger wrote any.")
+            first += lines
+            blank = next((k for k, line in enumerate(first) if line.lstrip("\ufeff").strip()), len(first))
+            self.account.lines += blank
+            del first[:blank]
+            if len(first) > _TELLING_ROWS or (first and is_json(first[0])):
+                break
+        if not first:
+            raise InputError(f"{self._name} holds no lines: check that the logger wrote any.")
+        self._start(first)
 
-    def _start(self, first: str, lines: list[str], before: int) -> None:
-        """Chooses the parser by the first line and has it read the rest of the first block."""
-        self.account.lines += before
+    def _start(self, lines: list[str]) -> None:
+        """Chooses the parser by the first lines and has it read the rest of the first block."""
         try:
-            self.parser = reader_for(first, self._columns, self.account, self._angles)
+            self.parser, heading = self._open_reader(lines, self.account)
+        except CountsError as error:
+            raise CountsError(f"{self._name}: {error}", error.scale) from None
         except InputError as error:
             raise InputError(f"{self._name}: {error}") from None
-        rows = lines[1:]
-        if isinstance(self.parser, CsvLines):  # the header has been read
-            self.account.lines += 1
-        else:
-            rows = [first, *rows]
-        self._ahead.append(self._parse(rows))
+        self._said = self.parser.said
+        self.account.lines += heading
+        self._ahead.append(self._parse(lines[heading:]))
 
     def _next_batch(self) -> Batch | None:
         lines = next(self._blocks, None)
@@ -255,23 +331,21 @@ class _Passage:
         self._has_pose |= len(batch.pose) > 0
         return batch
 
-    def _split(self, stream: BinaryIO) -> Iterator[list[str]]:
+    def _split(self, stream: BinaryIO | TextFile) -> Iterator[list[str]]:
         """Whole lines, block by block as they arrive."""
-        cutter, position = Cutter(self.account), 0
+        cutter = Cutter(self.account)
         for block in self._read(stream):
-            position += len(block)
             if lines := cutter.push(block):
-                self.fraction = min(position / self._size, 1.0) if self._size else math.nan
+                self.fraction = self._file.fraction if self._file else math.nan
                 yield lines
         if lines := cutter.rest():
             yield lines
         self.fraction = 1.0
 
-    def _read(self, stream: BinaryIO) -> Iterator[bytes]:
+    def _read(self, stream: BinaryIO | TextFile) -> Iterator[bytes]:
         read = getattr(stream, "read1", stream.read)  # read1 does not wait until a whole block has come
-        with stream if self._is_ours else nullcontext():
-            while block := self._read_block(read):
-                yield block
+        while block := self._read_block(read):
+            yield block
 
     def _read_block(self, read: Callable[[int], bytes]) -> bytes:
         try:
@@ -281,4 +355,6 @@ class _Passage:
 
     def _unusable(self, what: str) -> InputError:
         found = "".join(f"; {sentence.rstrip('.')}" for sentence in self.account.sentences())
-        return InputError(f"{self._name}: no {what} in {self.account.lines} lines{found}: {self.parser.advice}.")
+        without = ", or do without (--no-angles)" if what == "platform angles" else ""
+        said = f"{self._name}: no {what} in {self.account.lines} lines{found}"
+        return InputError(f"{said}: {self.parser.advice}{without}.")

@@ -140,6 +140,8 @@ class Recorder:
             self._flush()
             self._writer.add_metadata(name, dict(facts))
             self._flush()
+            if not self.readings:
+                self._head = self.size
 
     def end_dwell(self) -> None:
         """Brings all samples so far to the disk: they are safe when this returns."""

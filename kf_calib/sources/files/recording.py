@@ -10,6 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -21,7 +22,7 @@ from mcap.records import Metadata
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.gravity_alone import bench_without_angles
-from kf_calib.bench.streams import Batch, Source, Stream
+from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.bags import files_of
 from kf_calib.sources.files.cdr import CdrError, Decoder
@@ -44,13 +45,15 @@ from kf_calib.sources.files.mcap_file import Warn
 from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, RecordBlock
 from kf_calib.sources.files.packed_messages import are_packed, unpacked
 from kf_calib.sources.files.record_files import RecordFile, open_record_file
-from kf_calib.sources.tables.opening import is_table, open_table
+from kf_calib.support import dates
 
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
 GAP_RECORD = "kf_calib.gap"
 """Metadata record at a place where the link to the bench was down: after_ns, seconds, reason."""
 CLOCK_RECORD = "kf_calib.clock"
 """Where the bench's clock was set: after_ns, begin_ns (the first new stamp), shift_ns (from there on), reason."""
+RUN_RECORD = "kf_calib.run"
+"""Before the first reading, where stamps are no dates: when the computer received it (received, ISO 8601)."""
 _MARKS = {GAP_RECORD: "the link to the bench was lost", CLOCK_RECORD: "the bench's clock was set during the run"}
 
 
@@ -85,6 +88,8 @@ class Recording:
     ) -> None:
         self.path = Path(path)
         self.fraction, self._begin_ns = 0.0, None
+        self.received: datetime | None = None
+        """When the first reading was received, as far as that is recorded; known when it has been read."""
         self._accel_scale, self._angle_scale = np.asarray(accel_scale, float), angle_scale
         self._stated = fields_by_role(fields)
         wanted = {READINGS: accel_topic, POSES: pose_topic, TEMPERATURES: temperature_topic}
@@ -138,7 +143,7 @@ class Recording:
             for end, batch in self._part(file, passage, decoders, growing and file is parts.files[-1]):
                 self.fraction = math.nan if growing else min((begun + end) / parts.size, 1.0)
                 if self._begin_ns is None and len(batch.accel):
-                    self._begin_ns = int(batch.accel.time_ns[0])
+                    self._begin_ns, self.received = int(batch.accel.time_ns[0]), passage.received
                 if growing or len(batch.accel) or len(batch.pose) or len(batch.temperature):
                     yield batch
             passage.account(file.summary.message_counts if file.summary else {}, self.warnings.append)
@@ -266,13 +271,6 @@ class _Decoders:
         return self.known[role]
 
 
-def opened(source: Source | str | PathLike[str]) -> Source:
-    """The source itself, or the recording or table at a path."""
-    if not isinstance(source, str | PathLike):
-        return source
-    return open_table(source) if is_table(source) else Recording(source)
-
-
 class _Passage:
     """One reading of a file from its start, with the account of the messages met."""
 
@@ -301,6 +299,15 @@ class _Passage:
             self._met[group.channel] += len(group.at)
         in_cdr = (group for group in messages.groups if self._is_in_cdr(group.channel))
         return self._unpacked(block, messages) if are_packed(block, in_cdr) else (block, messages)
+
+    @property
+    def received(self) -> datetime | None:
+        """When the first reading was received; None where no record so far says it."""
+        try:
+            said = next((mark.metadata["received"] for mark in self._marks if mark.name == RUN_RECORD), None)
+            return None if said is None else dates.read(said)
+        except (KeyError, ValueError):
+            return None
 
     def _is_in_cdr(self, number: int) -> bool:
         channel = self.contents.channels.get(number)
@@ -361,14 +368,14 @@ def _scaled(stream: Stream, scale: Floats | float) -> Stream:
 
 
 def _mark(opcode: int, content: bytes) -> list[Metadata]:
-    """A record that says what happened to the link or the clock; none of any other."""
+    """A record that says what happened to the link or the clock, or when the run began; none of any other."""
     if opcode != Opcode.METADATA:
         return []
     try:
         record = parse(Metadata.read, content)
     except DamagedError:  # told already
         return []
-    return [record] if record.name in _MARKS else []
+    return [record] if record.name in (*_MARKS, RUN_RECORD) else []
 
 
 def _ignore(_: str) -> None:

@@ -9,6 +9,7 @@ taken in. See docs/live.md for the URLs and what a bench has to send.
 """
 
 from kf_calib.sources.live.opening import files_of, open_live
-from kf_calib.sources.live.source import LiveSource, Status
+from kf_calib.sources.live.source import LiveSource
+from kf_calib.sources.live.status import Status
 
 __all__ = ["LiveSource", "Status", "files_of", "open_live"]

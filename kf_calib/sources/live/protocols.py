@@ -7,6 +7,8 @@ from collections.abc import Mapping
 
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
+from kf_calib.sources.files.csv_columns import CsvColumns
+from kf_calib.sources.files.csv_heading import Heading
 from kf_calib.sources.files.csv_lines import CsvLines
 from kf_calib.sources.files.json_lines import JsonLines
 from kf_calib.sources.files.line_parts import Account, LineReader
@@ -33,7 +35,7 @@ class LineProtocol:
         self._header = header.strip()
         self.reader: LineReader | None = None
         if self._header:
-            self.reader = CsvLines(self._header, columns, account, angles)
+            self.reader = self._csv(self._header, account, angles)
         self._is_first = False
 
     def push(self, block: bytes) -> Batch:
@@ -86,10 +88,13 @@ class LineProtocol:
                 self._account.refuse(self._account.lines, "it is neither a JSON object nor a header of CSV")
         return []
 
+    def _csv(self, header: str, account: Account, angles: bool) -> CsvLines:
+        return CsvLines(CsvColumns.of(Heading.of([header]), self._columns), account, angles)
+
     def _has_readings(self, header: str) -> bool:
         """Whether a header lacks nothing but angles."""
         try:
-            CsvLines(header, self._columns, Account(), angles=False)
+            self._csv(header, Account(), angles=False)
         except InputError:
             return False
         return True
@@ -112,7 +117,7 @@ class LineProtocol:
         try:
             if self._angles and len(cells) < _FEWEST_CELLS and not self._has_readings(text):
                 return False
-            self.reader, self._header = CsvLines(text, self._columns, self._account, self._angles), text
+            self.reader, self._header = self._csv(text, self._account, self._angles), text
         except InputError as error:
             raise InputError(f"{self._name}: {error}") from None
         self._account.lines += 1

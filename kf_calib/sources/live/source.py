@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -15,10 +16,12 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.sources.files.recorder import Recorder
-from kf_calib.sources.files.recording import CLOCK_RECORD, GAP_RECORD
+from kf_calib.sources.files.recording import CLOCK_RECORD, GAP_RECORD, RUN_RECORD
 from kf_calib.sources.live.clock import Clock, Restart
 from kf_calib.sources.live.continuity import Continuity
 from kf_calib.sources.live.feed import Feed, Lost, Regained
+from kf_calib.sources.live.status import Status
+from kf_calib.support import dates
 from kf_calib.support.output_files import refuse
 
 _FLUSH_S = 0.5  # with the time that flushing takes, less than the second that a kill may cost
@@ -28,60 +31,6 @@ QUEUED = 200_000
 _TAKEN = 1 << 16  # samples of one batch, where several wait
 _RATE_S = 2.0
 _LATEST_NS = (1 << 31) * 1_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Status:
-    """A live source at one moment.
-
-    link: connecting, live, lost (being tried again) or ended; trouble: why it is down. rate_hz: readings a second, of
-    the last two seconds. samples: readings; poses: angle messages. refused: lines or frames that could not be used,
-    with the reason of the first. gaps: places where the stamps leap or the link broke; missing: readings lost on the
-    way, exact where the bench numbers its frames, else what the gaps have room for. clock_restarts: how often the
-    bench's clock was set during the run; left_out: readings whose stamps are damaged or not later than those before
-    them, which the evaluation leaves out; clock_trouble: what is wrong with the clock, or was. dropped: readings that
-    the consumer was too slow for and that are in no recording; waiting: readings on their way to it. recorded: readings
-    in whole chunks of the recording; sync_age_s: age of the newest that the disk is known to hold, None without an open
-    recording; recording_trouble: why it ended early.
-    """
-
-    link: str = "connecting"
-    trouble: str = ""
-    rate_hz: float = 0.0
-    samples: int = 0
-    poses: int = 0
-    temperatures: int = 0
-    refused: int = 0
-    first_refusal: str = ""
-    gaps: int = 0
-    missing: int = 0
-    clock_restarts: int = 0
-    left_out: int = 0
-    clock_trouble: str = ""
-    dropped: int = 0
-    waiting: int = 0
-    reconnects: int = 0
-    bytes: int = 0
-    recorded: int = 0
-    sync_age_s: float | None = None
-    recording_trouble: str = ""
-
-    def sentences(self) -> list[str]:
-        """What a user must know once the run has ended."""
-        said = [
-            (self.reconnects, f"the link was lost and regained {self.reconnects} times"),
-            (self.missing, f"{self.missing} readings were lost on the way, in {self.gaps} gaps"),
-            (self.clock_trouble, self.clock_trouble),
-            (
-                self.left_out,
-                f"{self.left_out} readings have stamps that are damaged or not later than those before them, and are "
-                "left out: check the bench's clock",
-            ),
-            (self.dropped, f"{self.dropped} readings came faster than they could be evaluated and were left out"),
-            (self.recording_trouble, self.recording_trouble.removesuffix(".")),
-            (self.trouble, self.trouble.removesuffix(".")),
-        ]
-        return [f"{text}." for condition, text in said if condition]
 
 
 @dataclass
@@ -157,6 +106,9 @@ class LiveSource:
         self._recorder: Recorder | None = None
         self._recording_trouble = ""
         self._bench: Bench | None = None
+        self._begin_ns: int | None = None
+        self.received: datetime | None = None
+        """When the first reading came, where its stamp is no date, from a bench that is read as it speaks."""
         self._failure: BaseException | None = None
         self._is_finished = self._is_exhausted = False
         self._worker = threading.Thread(target=self._work, name="acquisition", daemon=True)
@@ -211,6 +163,10 @@ class LiveSource:
     @property
     def _is_recording(self) -> bool:
         return self._recorder is not None and not self._recording_trouble and not self._is_finished
+
+    def begin_ns(self) -> int | None:
+        """Stamp of the first reading; None where none has come yet."""
+        return self._begin_ns
 
     def stop(self) -> None:
         """Ends the iteration after what has come; from any thread, or a signal handler."""
@@ -317,6 +273,7 @@ class LiveSource:
                 return
             if not (self._feed.patient or queue.fits(size)) and queue.behind_from is None:
                 queue.behind_from = self._store_if_open(Recorder.flush)
+            self._note_begin(batch.accel)
             self._store_if_open(lambda recorder: recorder.write(batch))
             self._count(batch)
             while self._feed.patient and not queue.fits(size) and not self._feed.stopping:
@@ -324,6 +281,14 @@ class LiveSource:
                 self._store_if_open(Recorder.tick)
             self._hand_on(batch, size)
             self._lock.notify_all()
+
+    def _note_begin(self, accel: Stream) -> None:
+        if self._begin_ns is None and len(accel):
+            self._begin_ns = int(accel.time_ns[0])
+            if dates.of_stamp(self._begin_ns) is None and not self._feed.patient:
+                self.received = datetime.now(UTC)
+                facts = {"received": dates.written(self.received)}
+                self._store_if_open(lambda recorder: recorder.mark(RUN_RECORD, facts))
 
     def _hand_on(self, batch: Batch, size: int) -> None:
         queue = self._queue

@@ -62,6 +62,11 @@ class Columns:
         return ", ".join(repr(cut(self.grid.header[k], 40)) for k in places)
 
     @property
+    def orientation(self) -> str:
+        """How orientations are told: ``face``, ``attitude`` or ``angles``; empty if they are not."""
+        return "face" if self.has("face") else "attitude" if self.has(*QUATERNION) else "angles" if self.angles else ""
+
+    @property
     def unused(self) -> list[int]:
         """Indices of the columns that mean nothing here."""
         return [k for k, own in enumerate(self.meanings) if not own.ours and self.grid.header[k]]
@@ -106,10 +111,9 @@ class Columns:
         """Find faces, stamps and readings by what stands in columns whose names say nothing."""
         for k in range(len(self.meanings)):
             own, cells = self.meanings[k].ours, self.grid.column(k)
-            are_faces = [isinstance(cell, str) and face_of(cell) is not None for cell in cells]
-            if k not in stated and own == "face" and not any(are_faces):
+            if k not in stated and own == "face" and not any(map(_is_face, cells)):
                 self.meanings[k] = Meaning("", "")
-            if k not in stated and all(are_faces) and own in ("", "angle") and not self.has("face"):
+            if k not in stated and own in ("", "angle") and not self.has("face") and all(map(_is_face, cells)):
                 self._guess(k, "face")
             if k not in stated and own == "" and not self.has("time") and self._are_stamps(k):
                 self._guess(k, "time")
@@ -151,6 +155,10 @@ class Columns:
                     f"{self.grid.name}: columns {one!r} and {other!r} are both taken for {ours}: leave one out by "
                     f"--column {other + '=-'!r}; {HOW}."
                 )
+
+
+def _is_face(cell: Cell) -> bool:
+    return isinstance(cell, str) and face_of(cell) is not None
 
 
 def _meanings(grid: Grid, stated: Mapping[str, str]) -> list[Meaning]:

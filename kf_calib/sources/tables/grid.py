@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -12,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from kf_calib.errors import InputError
+from kf_calib.sources.tables.spreadsheet import sheets_of
 from kf_calib.sources.tables.words import is_unit
-from kf_calib.support.extras import need
 from kf_calib.support.plain_text import cut
 
 Cell = str | float | datetime | None
@@ -23,7 +22,11 @@ TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
 EXCEL_SUFFIXES = (".xlsx", ".xlsm")
 OLD_SUFFIXES = (".xls", ".ods")
 _LARGEST = (5_000_000, 50_000_000)  # bytes, of text and of a spreadsheet, which may hold pictures
+_SHOWN = 6  # rows in a message
+_LONGEST_CELL = 300  # characters; a longer one is a remark, of which the middle is left out
+_MOST_COLUMNS, _MOST_CELLS = 1000, 2_000_000
 _DELIMITERS = ";\t,|"
+_TELLING = 200  # lines by which the delimiter is told
 
 
 @dataclass(frozen=True)
@@ -78,10 +81,12 @@ def _of_text(path: Path) -> Grid:
     first, _, rest = text.partition("\n")
     if first.lower().startswith("sep=") and len(first.strip()) == 5:
         delimiter, text, skipped = first.strip()[-1], rest, 1
-    delimiter = delimiter or _delimiter(text)
+    delimiter = delimiter or delimiter_of(
+        [line for line in text.splitlines()[:200] if line.strip() and not line.startswith("#")]
+    )
     try:
         reader = csv.reader(text.splitlines(), delimiter=delimiter, skipinitialspace=True)
-        lines = [(reader.line_num + skipped, [cell.strip() or None for cell in row]) for row in reader]
+        lines = [(reader.line_num + skipped, [_text(cell) for cell in row]) for row in reader]
     except csv.Error as error:
         raise InputError(f"{path}: is no CSV file ({error}): save the table as CSV or .xlsx.") from None
     lines = [line for line in lines if not (line[1] and str(line[1][0] or "").startswith("#"))]
@@ -101,12 +106,11 @@ def _decoded(path: Path, content: bytes) -> str:
         return content.decode("cp1252", errors="replace")
 
 
-def _delimiter(text: str) -> str:
-    """Return the delimiter with which the most lines have the same number of cells, two or more."""
-    lines = [line for line in text.splitlines()[:200] if line.strip() and not line.startswith("#")]
+def delimiter_of(lines: Sequence[str]) -> str:
+    """The delimiter with which the most of some lines have the same number of cells, two or more."""
 
     def fitness(delimiter: str) -> int:
-        widths = [len(row) for row in csv.reader(lines, delimiter=delimiter) if len(row) > 1]
+        widths = [len(row) for row in csv.reader(lines[:_TELLING], delimiter=delimiter) if len(row) > 1]
         return max(map(widths.count, set(widths)), default=0)
 
     try:
@@ -116,25 +120,24 @@ def _delimiter(text: str) -> str:
 
 
 def _of_excel(path: Path) -> Grid:
-    """Return the cells of the first sheet of an Excel file that holds any."""
-    need("openpyxl", "tables", f"reading {path}")
-    import openpyxl
-    from openpyxl.utils.exceptions import InvalidFileException
-
-    try:
-        with path.open("rb") as file:
-            book = openpyxl.load_workbook(file, read_only=True, data_only=True)
-            sheets = [(sheet.title, list(sheet.iter_rows(values_only=True))) for sheet in book.worksheets]
-    except (InvalidFileException, zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
-        raise InputError(f"{path}: is no Excel file that can be read ({cut(str(error), 80)}): save it again.") from None
-    filled = [(name, rows) for name, rows in sheets if any(cell is not None for row in rows for cell in row)]
-    if not filled:
-        raise InputError(f"{path}: all sheets are empty: write a header and a row for each orientation.")
-    name, rows = filled[0]
-    others = ", ".join(repr(other) for other, _ in filled[1:])
-    lines = [(k + 1, [_cell(value) for value in row]) for k, row in enumerate(rows)]
-    remark = f"sheet {name!r} was read, not {others}; put the table on the first sheet"
-    return replace(_headed(str(path), lines), remarks=(remark,) if others else ())
+    """Return the cells of the first visible sheet of an Excel file that holds any."""
+    sheets = sheets_of(path)
+    seen = [sheet for sheet in sheets if not sheet.hidden]
+    if not seen:
+        hidden = f" that can be seen ({sheets[0].name!r} is hidden)" if sheets else ""
+        raise InputError(f"{path}: all sheets{hidden} are empty: write a header and a row for each orientation.")
+    lines = [(number, [_cell(value) for value in row]) for number, row in seen[0].lines]
+    others = ", ".join(repr(sheet.name) for sheet in seen[1:])
+    hidden = ", ".join(repr(sheet.name) for sheet in sheets if sheet.hidden)
+    remarks = [f"sheet {seen[0].name!r} was read, not {others}; put the table on the first sheet"] if others else []
+    remarks += [f"{hidden} was not read, as it is hidden"] if hidden else []
+    if rows := seen[0].left_out:
+        numbers = ", ".join(map(str, rows[:_SHOWN])) + " ..." * (len(rows) > _SHOWN)
+        one = len(rows) == 1
+        remarks.append(
+            f"row{'s' * (not one)} {numbers} {'was' if one else 'were'} not read, as hidden rows are no data"
+        )
+    return replace(_headed(str(path), lines), remarks=tuple(remarks))
 
 
 def _of_columns(table: Any) -> Grid:
@@ -168,15 +171,20 @@ def _cell(value: Any) -> Cell:
     if value is None or value != value:  # NaN and NaT
         return None
     if isinstance(value, datetime) or (isinstance(value, str) and value.strip()):
-        return value.strip() if isinstance(value, str) else value
+        return _text(value) if isinstance(value, str) else value
     if isinstance(value, str):
         return None
     if isinstance(value, bytes):
-        return value.decode(errors="replace").strip() or None
+        return _text(value.decode(errors="replace"))
     try:
         return float(value) if not isinstance(value, bool) else str(value)
-    except (TypeError, ValueError):
-        return str(value)
+    except (TypeError, ValueError, OverflowError):
+        return _text(str(value))
+
+
+def _text(cell: str) -> str | None:
+    """Return the text of a cell, None where it is blank; of bounded length, as it is looked at in many ways."""
+    return cut(cell.strip(), _LONGEST_CELL) or None
 
 
 def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
@@ -190,6 +198,9 @@ def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
     width = max(k + 1 for k, cell in enumerate(cells) if cell is not None)
     header = ["" if cell is None else str(cell) for cell in cells[:width]]
     rows = filled[1:]
+    if width > _MOST_COLUMNS or width * len(rows) > _MOST_CELLS:
+        raise InputError(f"{name}: has {width} columns and {len(rows)} rows, more than any table of orientations: "
+                         "leave out what is not part of it.")  # fmt: skip
     if rows and all(cell is None or (isinstance(cell, str) and is_unit(cell)) for cell in rows[0][1]):
         units = [*rows[0][1], *[None] * width]
         header = [f"{title} [{unit}]" if unit else title for title, unit in zip(header, units, strict=False)]

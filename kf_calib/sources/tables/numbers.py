@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -31,21 +32,48 @@ class Numbers:
         seen = dict[str, tuple[int, int]]()
         for k, row in enumerate(grid.rows):
             for j, cell in enumerate(row):
-                if isinstance(cell, str) and _NUMBER.fullmatch(cell) and (decimal := _decimal_of(cell)):
+                if not isinstance(cell, str) or not _shows_another(cell, seen):
+                    continue
+                if _NUMBER.fullmatch(cell) and (decimal := _decimal_of(cell)):
                     seen.setdefault(decimal, (k, j))
         if len(seen) == 2:
             (_, (k, j)), (other, _) = sorted(seen.items(), key=lambda item: item[1])[::-1]
             raise grid.refuse(k, grid.header[j], grid.rows[k][j], f"other numbers of the table have decimals after "
                               f"{other!r}: write all of them in one way")  # fmt: skip
         decimal = next(iter(seen), "")
-        cells = [cell for row in grid.rows for cell in row if isinstance(cell, str) and _NUMBER.fullmatch(cell)]
-        if not decimal and grid.is_semicolon and any("," in cell for cell in cells):
-            decimal = ","
+        if not decimal and grid.is_semicolon:
+            cells = (cell for row in grid.rows for cell in row if isinstance(cell, str) and "," in cell)
+            decimal = "," if any(_NUMBER.fullmatch(cell) for cell in cells) else ""
         return cls(",", ".") if decimal == "," else cls()
+
+    @classmethod
+    def told_by(cls, cells: Iterable[str], *, commas_count: bool) -> Numbers | None:
+        """How numbers are written by the first cell that shows it; None where none does.
+
+        commas_count: whether a comma in a cell that could be either is one before decimals, since it separates no
+        cells.
+        """
+        could_be = False
+        for cell in cells:
+            if ("," in cell or "." in cell) and _NUMBER.fullmatch(cell):
+                if decimal := _decimal_of(cell):
+                    return _DECIMAL_COMMA if decimal == "," else DECIMAL_POINT
+                could_be |= commas_count and "," in cell
+        return _DECIMAL_COMMA if could_be else None
+
+    def with_point(self, cell: str) -> str:
+        """A number with a point before its decimals; raises ValueError where it has separators of thousands."""
+        if self.decimal == ".":
+            return cell
+        if "." in cell:
+            raise ValueError
+        return cell.replace(",", ".")
 
     def value(self, cell: Cell) -> float:
         """The number in a cell; raises ValueError where there is none."""
-        if isinstance(cell, str):
+        if isinstance(cell, str) and self.decimal == "." and _is_plain(cell):
+            cell = float(cell)
+        elif isinstance(cell, str):
             text = cell.translate(_SPACES).replace("−", "-")
             whole, _, rest = text.partition(self.decimal)
             if self.thousands in rest or self.decimal in rest:
@@ -65,6 +93,23 @@ class Numbers:
     def example(self) -> str:
         """A number as it would be read."""
         return f"9{self.decimal}80665"
+
+
+DECIMAL_POINT = Numbers()
+_DECIMAL_COMMA = Numbers(",", ".")
+
+
+_PLAIN = frozenset("0123456789.+-eE")
+
+
+def _is_plain(cell: str) -> bool:
+    """Whether a number is written as programs write it; raises no error for what is none."""
+    return _PLAIN.issuperset(cell)
+
+
+def _shows_another(cell: str, seen: Container[str]) -> bool:
+    """Whether a cell may show another sign before decimals than those that were seen."""
+    return ("." in cell and "." not in seen) or ("," in cell and "," not in seen)
 
 
 def _decimal_of(cell: str) -> str:
@@ -89,17 +134,13 @@ def stamps_of(grid: Grid, name: str, cells: list[Cell], or_else: str = "") -> li
 
     Raises InputError for a cell that is none; or_else: what else to do then.
     """
-    texts = [cell for cell in cells if isinstance(cell, str)]
-    parts = [found.groups() for text in texts if (found := _LOCAL.fullmatch(text))]
-    month_first = any(int(part[1]) > 12 for part in parts) or (
-        any(part[7] for part in parts) and not any(int(part[0]) > 12 for part in parts if len(part[0]) <= 2)
-    )
+    month_first = month_comes_first([cell for cell in cells if isinstance(cell, str)])
     wanted = "write a stamp such as 2026-05-04T13:45:00+02:00 or 04.05.2026 13:45:00, or seconds"
     wanted += f", or {or_else}" if or_else else ""
     out = list[datetime]()
     for row, cell in enumerate(cells):
         try:
-            out.append(cell if isinstance(cell, datetime) else _stamp(str(cell or ""), month_first))
+            out.append(cell if isinstance(cell, datetime) else stamp_of(str(cell or ""), month_first))
         except ValueError:
             raise grid.refuse(row, name, cell, wanted) from None
         if (out[row].tzinfo is None) != (out[0].tzinfo is None):
@@ -107,8 +148,16 @@ def stamps_of(grid: Grid, name: str, cells: list[Cell], or_else: str = "") -> li
     return out
 
 
-def _stamp(text: str, month_first: bool) -> datetime:
-    """Return one stamp; raises ValueError."""
+def month_comes_first(texts: Sequence[str]) -> bool:
+    """Whether local stamps have the month before the day, by all of them."""
+    parts = [found.groups() for text in texts if (found := _LOCAL.fullmatch(text))]
+    return any(int(part[1]) > 12 for part in parts) or (
+        any(part[7] for part in parts) and not any(int(part[0]) > 12 for part in parts if len(part[0]) <= 2)
+    )
+
+
+def stamp_of(text: str, month_first: bool) -> datetime:
+    """The stamp that a text says; raises ValueError where it says none."""
     try:
         return datetime.fromisoformat(text)
     except ValueError:

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
-from os import PathLike
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -14,52 +11,26 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, parse_axes
+from kf_calib.bench.gravity_alone import bench_without_angles
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.tables.columns import HOW, KNOWN, QUATERNION, READINGS, SPREADS, Columns
-from kf_calib.sources.tables.grid import EXCEL_SUFFIXES, MCAP, OLD_SUFFIXES, TEXT_SUFFIXES, ZIP, grid_of
+from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
 from kf_calib.sources.tables.orientation import Orientation
 from kf_calib.sources.tables.table import Table
 from kf_calib.sources.tables.times import Times
-from kf_calib.sources.tables.words import ACCEL, ANGLE, face_of
+from kf_calib.sources.tables.words import ANGLE, NO_HEADER, are_numbers, face_of
+from kf_calib.sources.units import Units, mps2_per, reading_units
+from kf_calib.support.plain_text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
-_UNIT_BY_SIZE = (("g", 0.5, 2.0), ("m/s2", 5.0, 20.0), ("mg", 500.0, 2000.0))
 _SAMPLES, _FAST_S = 50, 1.0
 _NOTHING = ("-", "–", "—", "n/a", "na", "nan", "#n/a", "null", "none", "?")
 """What people write where there is no temperature."""
 _SHOWN = 6  # rows in a message
+_UNKNOWN = (0.0, 0.0, 0.0, 1.0)
+"""The attitude that stands for those that are not known."""
 _UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-
-
-@dataclass(frozen=True)
-class Units:
-    """Units where the header names none; None: guessed from the numbers.
-
-    accel_scale: size of one count, in ``accel`` (m/s^2 if that is None). g: m/s^2 that 1 g stands for, or ``local``.
-    """
-
-    accel: str | None = None
-    accel_scale: float = 1.0
-    angle: str | None = None
-    g: str | float = STANDARD_GRAVITY_MPS2
-
-
-def is_table(path: str | PathLike[str]) -> bool:
-    """Whether a file is a table by its beginning and its name: CSV or a spreadsheet, and no recording."""
-    own = Path(path)
-    if not own.is_file():
-        return False
-    with own.open("rb") as file:
-        start = file.read(8)
-    suffixes = (*TEXT_SUFFIXES, *EXCEL_SUFFIXES, *OLD_SUFFIXES)
-    is_other = start.startswith(MCAP) or start.lstrip(b"\xef\xbb\xbf \r\n").startswith((b"{", b"["))  # JSON lines
-    return start.startswith(ZIP) or (own.suffix.lower() in suffixes and not is_other)
-
-
-def is_text(path: str | PathLike[str]) -> bool:
-    """Whether a table is no spreadsheet, by its name."""
-    return Path(path).suffix.lower() not in (*EXCEL_SUFFIXES, *OLD_SUFFIXES)
 
 
 def open_table(
@@ -71,6 +42,7 @@ def open_table(
     accel_scale: float = 1.0,
     angle_unit: str | None = None,
     g_unit: str | float = STANDARD_GRAVITY_MPS2,
+    angles: bool = True,
 ) -> Table:
     """A table of orientations as a source: a row a dwell, with its mean readings and its angles, attitude or face.
 
@@ -80,29 +52,30 @@ def open_table(
     - accel_unit, angle_unit: units where the header names none; guessed from the numbers if None.
     - accel_scale: size of one count, in ``accel_unit`` (m/s^2 if that is None).
     - g_unit: m/s^2 that 1 g in the table stands for, or ``local`` for the gravity of the bench.
+    - angles: False to do without angles, attitudes and faces; those that the table has are not used.
 
     Raises InputError where a cell, or what the columns are, cannot be understood.
     """
     grid = grid_of(table)
     numbers = Numbers.of(grid)
     found = Columns.of(grid, columns, numbers)
-    return Opening(found, overrides, Units(accel_unit, accel_scale, angle_unit, g_unit)).table()
+    return Opening(found, overrides, Units(accel_unit, accel_scale, angle_unit, g_unit), angles=angles).table()
 
 
 class Opening:
     """One opening of a table; ``said`` collects what was taken for what, ``by_size`` units of columns that the size of
-    their numbers told; has_unit: whether it is known what the readings are in."""
+    their numbers told; has_unit: whether it is known what the readings are in. angles: whether orientations count."""
 
-    def __init__(self, columns: Columns, overrides: Mapping[str, str], units: Units) -> None:
+    def __init__(self, columns: Columns, overrides: Mapping[str, str], units: Units, *, angles: bool = True) -> None:
         self.columns, self.grid, self.said = columns, columns.grid, list[str]()
         self.overrides, self.units, self.by_size = overrides, units, dict[int, str]()
-        self.has_unit = True
+        self.has_unit, self.angles = True, angles
         self.warnings = [f"{self.grid.name}: {remark}." for remark in self.grid.remarks]
 
     def table(self) -> Table:
         """The table; what is read first is what is most often missing."""
         elapsed_s = self.times.elapsed_s
-        self._refuse_samples()
+        self.refuse_samples()
         self._refuse_missing()
         self._say_times()
         pose = self._poses()
@@ -130,7 +103,7 @@ class Opening:
 
     @property
     def are_samples(self) -> bool:
-        """Whether the rows are a time series, which has to be recorded first."""
+        """Whether the rows are a time series."""
         if self.columns.has("count") or self.columns.has("face") or self.columns.places("sd", *SPREADS):
             return False
         return len(self.grid.rows) > _SAMPLES and self._step_s < _FAST_S
@@ -139,14 +112,12 @@ class Opening:
     def _step_s(self) -> float:
         return float(np.median(np.diff(self.times.elapsed_s)))
 
-    def _refuse_samples(self) -> None:
+    def refuse_samples(self) -> None:
+        """Raise InputError for a time series."""
         if self.are_samples:
-            save = "" if is_text(self.grid.name) else "save them as CSV, and "
-            name = str(Path(self.grid.name).with_suffix(".csv"))
             raise InputError(
                 f"{self.grid.name}: its {len(self.grid.rows)} rows are samples, {self._step_s:.3g} s apart, and no "
-                f"table with a row a dwell: {save}make a recording of them, kf-calib record run.mcap {name} "
-                "(docs/own_csv.md), and evaluate that."
+                "table with a row a dwell: evaluate them as a log of samples in a CSV file (docs/own_csv.md)."
             )
 
     def _say_times(self) -> None:
@@ -160,6 +131,8 @@ class Opening:
 
     def _refuse_missing(self) -> None:
         columns, header = self.columns, ", ".join(map(repr, self.grid.header))
+        if are_numbers(self.grid.header):
+            raise InputError(f"{self.grid.name}: {NO_HEADER}: {cut(','.join(self.grid.header), 60)!r}.")
         missing = [ours for ours in READINGS if not columns.has(ours)]
         if missing:
             raise InputError(
@@ -167,16 +140,21 @@ class Opening:
                 f"{' and '.join(ours[1] for ours in missing)} among {header[:300]}: name it, for example --column "
                 f"'{_left_over(columns)}={missing[0]}_g' (known: {KNOWN})."
             )
-        if not (columns.angles or columns.has("face") or columns.has(*QUATERNION)):
+        if self.angles and not columns.orientation:
             raise InputError(
                 f"{self.grid.name}: no column was recognised as gimbal angles, attitude or face among {header[:300]}: "
                 f"name it, for example --column '{_left_over(columns)}=face' with cells such as +x or -z, or "
-                f"=outer_deg (known: {KNOWN})."
+                f"=outer_deg (known: {KNOWN}), or do without orientations (--no-angles)."
             )
 
     def _poses(self) -> Floats:
-        """Return angles in rad (n, k), or quaternions (n, 4) of attitudes or faces."""
+        """Return angles in rad (n, k), or quaternions (n, 4) of attitudes or faces; where orientations do not count,
+        one that stands for those that are not known."""
         columns = self.columns
+        if not self.angles:
+            if unused := columns.angles or columns.places("face", *QUATERNION):
+                self.warnings.append(f"{self.grid.name}: {columns.named(unused)}: not used, without angles.")
+            return np.tile(_UNKNOWN, (len(self.grid.rows), 1))
         if self.units.angle and not columns.angles:
             raise InputError(f"{self.grid.name}: has no gimbal angles, so leave out --angle-unit.")
         if columns.has("face"):
@@ -226,7 +204,11 @@ class Opening:
         return ANGLE[unit] * values
 
     def _bench(self) -> Bench:
-        has_angles = not (self.columns.has("face") or self.columns.has(*QUATERNION))
+        if not self.angles:
+            bench, said = bench_without_angles(self.grid.name, self.overrides)
+            self.warnings += said
+            return bench
+        has_angles = self.columns.orientation == "angles"
         if has_angles and (axes := self.overrides.get("axes")):
             known, count = len(parse_axes(axes)), len(self.columns.angles)
             if known != count:
@@ -249,23 +231,13 @@ class Opening:
     def _accel_factors(self, places: list[int], values: Floats, bench: Bench) -> tuple[Floats, str]:
         """Return the factors (3,) from columns of readings to m/s^2, and the unit in words."""
         named = [self.columns.meanings[place].unit for place in places]
-        stated = self.units.accel
-        self._refuse_other_unit(places, named, stated, "accel")
-        size = float(np.median(np.linalg.norm(values, axis=1))) * self.units.accel_scale
-        by_size = next((unit for unit, low, high in _UNIT_BY_SIZE if low < size < high), "count")
-        self.has_unit = bool(stated) or self.units.accel_scale != 1.0 or "count" not in (by_size, *named)
-        units = [unit if unit not in ("", "count") else stated or ("m/s2" if unit else by_size) for unit in named]
-        factors = np.array([ACCEL[unit] * (self._g(bench) / STANDARD_GRAVITY_MPS2 if unit.endswith("g") else 1.0)
-                            for unit in units])  # fmt: skip
-        guessed = any(unit == "" for unit in named) and not stated
-        self.by_size |= {place: units[k] for k, place in enumerate(places) if not named[k] and not stated}
-        words = " and ".join(dict.fromkeys({"m/s2": "m/s^2", "count": "counts"}.get(unit, unit) for unit in units))
-        if self.units.accel_scale != 1.0 or "count" in named:
-            words = f"counts of {self.units.accel_scale:g} {words}"
-        words += " by their size (--accel-unit)" * guessed
-        if any(unit.endswith("g") for unit in units):
-            words += f", 1 g = {self._g(bench):.7g} m/s^2 (--g-unit)"
-        return factors * self.units.accel_scale, words
+        self._refuse_other_unit(places, named, self.units.accel, "accel")
+        norm = float(np.median(np.linalg.norm(values, axis=1)))
+        told = reading_units(named, norm, self.units, bench.gravity_mps2)
+        self.has_unit = told.is_known
+        if told.by_size:
+            self.by_size |= {place: told.units[k] for k, place in enumerate(places) if not named[k]}
+        return told.factors, told.words
 
     def _refuse_other_unit(self, places: list[int], named: list[str], stated: str | None, what: str) -> None:
         """Raise InputError if an option states another unit than the name of a column."""
@@ -275,18 +247,6 @@ class Opening:
                     f"{self.grid.name}: column {self.grid.header[place]!r} is in {unit} by its name, and --{what}-unit "
                     f"is {stated}: leave out --{what}-unit, or rename the column by --column."
                 )
-
-    def _g(self, bench: Bench) -> float:
-        """Return what 1 g stands for, m/s^2."""
-        if self.units.g == "local":
-            return bench.gravity_mps2
-        try:
-            size = float(self.units.g)
-        except ValueError:
-            size = 0.0
-        if not 9.0 < size < 10.0:
-            raise InputError(f"--g-unit is {self.units.g!r}: give m/s^2 from 9 to 10, such as 9.80665, or local.")
-        return size
 
     def _spreads(self, bench: Bench) -> tuple[Floats | None, list[int]]:
         """Return standard deviations (n, 3) and counts; None and ones where either is not given."""
@@ -314,8 +274,7 @@ class Opening:
         means = np.column_stack([columns.values(place) for place in readings])
         factors, _ = self._accel_factors(readings, means, bench)
         if own[0] and own[0] != "count":
-            factors = np.array([ACCEL[unit] * (self._g(bench) / STANDARD_GRAVITY_MPS2 if unit.endswith("g") else 1.0)
-                                for unit in own])  # fmt: skip
+            factors = mps2_per([unit or own[0] for unit in own], self.units, bench.gravity_mps2)
         return values * factors, self._counts()
 
     def _counts(self) -> list[int]:

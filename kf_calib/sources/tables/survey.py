@@ -10,11 +10,12 @@ from types import MappingProxyType
 import numpy as np
 
 from kf_calib.errors import InputError
-from kf_calib.sources.tables.columns import QUATERNION, Columns
+from kf_calib.sources.tables.columns import Columns
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
-from kf_calib.sources.tables.opening import Opening, Units
+from kf_calib.sources.tables.opening import Opening
 from kf_calib.sources.tables.table import Table
+from kf_calib.sources.units import Units
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 LEAST = 4
@@ -43,7 +44,8 @@ class ColumnFound:
 class RowFound:
     """An orientation: its dwell's number, its row in the table, its middle since the first, and what was written down.
 
-    pose: gimbal angles in rad, or attitude. readings: how many were averaged; None where it is not known.
+    pose: gimbal angles in rad, or attitude; empty without angles. up (3,): the unit vector along the mean readings.
+    readings: how many were averaged; None where it is not known.
     """
 
     number: int
@@ -51,6 +53,7 @@ class RowFound:
     at_s: float
     face: str | None
     pose: tuple[float, ...]
+    up: tuple[float, float, float]
     norm_mps2: float
     readings: int | None
     temperature_c: float
@@ -60,9 +63,10 @@ class RowFound:
 class Survey:
     """What is in a table.
 
-    orientation: ``angles``, ``attitude`` or ``face``; empty where no column tells it. trouble: why it cannot be
-    evaluated; empty if it can, else there are no rows. has_sigma: whether the noise is written down.
-    has_unit: whether it is known what the readings are in.
+    orientation: ``angles``, ``attitude`` or ``face``; empty where no column tells it, or none is used. trouble: why it
+    cannot be evaluated; empty if it can, else there are no rows. has_sigma: whether the noise is written down.
+    has_unit: whether it is known what the readings are in. angles: number of gimbal angles. is_by_hand: whether no
+    column tells an orientation.
     """
 
     path: Path
@@ -74,6 +78,8 @@ class Survey:
     has_unit: bool
     trouble: str
     warnings: list[str]
+    angles: int
+    is_by_hand: bool
 
 
 def survey(
@@ -81,27 +87,33 @@ def survey(
     overrides: Mapping[str, str] = MappingProxyType({}),
     columns: Mapping[str, str] = MappingProxyType({}),
     units: Units | None = None,
-) -> Survey | None:
-    """What is in a table; None where its rows are samples. What is not stated of the bench does not matter here.
+    *,
+    angles: bool = True,
+) -> Survey:
+    """What is in a table. What is not stated of the bench does not matter here. angles: whether orientations count, if
+    there are any.
 
-    Raises InputError where not even the columns can be understood.
+    Raises InputError where not even the columns can be understood, or the rows are samples.
     """
     units = units or Units()
     grid = grid_of(path)
     found = Columns.of(grid, columns, Numbers.of(grid))
-    opening = Opening(found, _complete(overrides, len(found.angles)), units)
-    if opening.are_samples:
-        return None
+    angles = angles and bool(found.orientation)
+    opening = Opening(found, _complete(overrides, len(found.angles)), units, angles=angles)
+    opening.refuse_samples()
     table, trouble = None, ""
     try:
         table = opening.table()
     except InputError as error:
         trouble = str(error)
-    kind = "face" if found.has("face") else "attitude" if found.has(*QUATERNION) else "angles" if found.angles else ""
+    kind = found.orientation if angles else ""
     has_sigma = table is not None and table.orientations[0].sigma_mps2 is not None
-    rows = _rows(table, found) if table else []
+    rows = _rows(table, found, angles) if table else []
     own = _columns(found, opening.by_size, set(columns))
-    return Survey(path, own, len(grid.rows), kind, rows, has_sigma, opening.has_unit, trouble, list(opening.warnings))
+    return Survey(
+        path, own, len(grid.rows), kind, rows, has_sigma, opening.has_unit, trouble, list(opening.warnings),
+        len(found.angles), not found.orientation,
+    )  # fmt: skip
 
 
 def _complete(overrides: Mapping[str, str], angles: int) -> dict[str, str]:
@@ -129,12 +141,15 @@ def _columns(found: Columns, by_size: Mapping[int, str], stated: set[str]) -> li
     return out
 
 
-def _rows(table: Table, found: Columns) -> list[RowFound]:
-    faces = found.grid.column(found.places("face")[0]) if found.has("face") else [None] * len(found.grid.rows)
-    return [
-        RowFound(
-            k + 1, row, own.elapsed_s, None if face is None else str(face), tuple(map(float, own.pose)),
-            float(np.linalg.norm(own.mean_mps2)), None if own.sigma_mps2 is None else own.count, own.temperature_c,
-        )
-        for k, (row, face, own) in enumerate(zip(found.grid.numbers, faces, table.orientations, strict=True))
-    ]  # fmt: skip
+def _rows(table: Table, found: Columns, angles: bool) -> list[RowFound]:
+    has_faces = angles and found.has("face")
+    faces = found.grid.column(found.places("face")[0]) if has_faces else [None] * len(found.grid.rows)
+    out = list[RowFound]()
+    for k, (row, face, own) in enumerate(zip(found.grid.numbers, faces, table.orientations, strict=True)):
+        norm = float(np.linalg.norm(own.mean_mps2))
+        x, y, z = (own.mean_mps2 / max(norm, 1e-300)).tolist()
+        pose = tuple(map(float, own.pose)) if angles else ()
+        readings = None if own.sigma_mps2 is None else own.count
+        name = None if face is None else str(face)
+        out.append(RowFound(k + 1, row, own.elapsed_s, name, pose, (x, y, z), norm, readings, own.temperature_c))
+    return out

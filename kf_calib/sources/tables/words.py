@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from kf_calib.support.units import WORDS
@@ -32,8 +33,9 @@ _SPREAD = _words(
     "sd std stdev stddev sigma s rms dev deviation standardabweichung streuung stabw stdabw noise rauschen"
 )
 _READING = _words(
-    "a acc accel acceleration accelerometer accelerometers beschleunigung f force specific reading readings mean avg "
-    "average mittel mittelwert m sensor channel ch kanal messwert out output signal value wert raw"
+    "a acc accl accel acceleration accelerometer accelerometers beschleunigung beschl f force specific reading "
+    "readings imu linear mean avg average mittel mittelwert m sensor channel ch kanal messwert out output signal "
+    "value wert raw"
 )
 _ANGLE = _words(
     "outer middle inner aussen mitte mittlerer innen innere innerer aeussere ausserer angle winkel gimbal roll pitch "
@@ -44,6 +46,8 @@ _LENGTH = _words("dwell duration dauer length lange")
 _TEMPERATURE = _words("temp temperature temperatur t")
 _COUNT = _words("count counts n samples num number anzahl messungen stichprobe readings werte")
 _FACE = _words("face side seite position pose orientation lage richtung direction flache")
+_RATE = re.compile(r"(?:deg|degrees?|rad|radians?|°)\s*(?:/|p|per)\s*s|dps")
+_CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
 _FACES = re.compile(r"['’]?([+\-−–]?)\s*([xyz123])\s*([+\-−–]?|up|down|oben|unten)", re.IGNORECASE)
 
 
@@ -62,11 +66,26 @@ def is_unit(text: str) -> bool:
     return text.strip("[]() ").lower() in _OF_WORD or text.strip() in ("-", "1")
 
 
+NO_HEADER = "has no header: name the columns in a first line, such as time_s,ax_g,ay_g,az_g; it begins with"
+
+
+def are_numbers(header: Iterable[str]) -> bool:
+    """Whether what should be names of columns are numbers: there is no header."""
+    return all(re.fullmatch(r"[+\-−]?[\d.,]+(?:[eE][+\-]?\d+)?", name.strip()) for name in header)
+
+
 def meaning_of(name: str) -> Meaning:
     """What the name of a column says."""
+    told = _meaning_of(name)
+    return told if told.ours or not _CAMEL.search(name) else _meaning_of(_CAMEL.sub(" ", name))
+
+
+def _meaning_of(name: str) -> Meaning:
     own = name.strip().lower()
     if own in ("qx", "qy", "qz", "qw", "-"):
         return Meaning("" if own == "-" else own, "")
+    if _RATE.search(own):
+        return Meaning("", "")
     text, unit = _unit_of(own)
     tokens = _tokens(text)
     channel = next((each for each in tokens if each in "xyz123"), "")
@@ -84,7 +103,7 @@ def meaning_of(name: str) -> Meaning:
         return Meaning("angle", unit if unit in ANGLE else "", rank)
     if words & _SPREAD or {"standard", "deviation"} <= words:
         return Meaning(f"s{channel}" if channel else "sd", unit if unit in ACCEL else "")
-    if channel and (words & _READING or not words):
+    if channel and (words & _READING or not words or unit in ACCEL):
         return Meaning(f"a{channel}", unit if unit in ACCEL else "")
     if words & _FACE:
         return Meaning("face", "")

@@ -3,7 +3,7 @@
     from kf_calib.views.report.contents import page_of
     from kf_calib.views.report.page import save
 
-    measured = Measured("run.mcap", sha256, begin_ns)
+    measured = Measured("run.mcap", sha256, began)
     save(page_of(found, [measured], ["kf-calib report run.mcap"]), Path("report.html"))
 
 The page holds all that it needs, and asks the network for nothing: figures as SVG, the residual explorer with uPlot.

@@ -4,29 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.results import Calibration
 
-_DAWN_NS = 946_684_800 * 10**9  # the year 2000: what is stamped before is no date but a time since some start
 _NOTES = {"block_serial": "Sensor block", "bench": "Bench", "operator": "Operator", "note": "Note"}
 
 
 @dataclass(frozen=True)
 class Measured:
-    """The recording of a result. begin_ns: stamp of its first reading, where it is known."""
+    """The recording of a result. began: when its run did, where that is known."""
 
     name: str
     sha256: str
-    begin_ns: int | None = None
+    began: datetime | None = None
 
     @property
     def date(self) -> str:
-        """When it was begun, in words; empty where its clock did not know the date."""
-        if self.begin_ns is None or self.begin_ns < _DAWN_NS:
-            return ""
-        return f"{datetime.fromtimestamp(self.begin_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC, by its stamps"
+        """When it was begun, in words; empty where nothing tells."""
+        return "" if self.began is None else f"{self.began:%Y-%m-%d %H:%M:%S} UTC"
 
 
 def facts(measured: Measured, result: Calibration) -> list[tuple[str, str]]:

@@ -105,7 +105,7 @@ def without_messages(folder: Path) -> Path:
 
 
 BROKEN: dict[str, tuple[Callable[[Path], Path], tuple[str, ...], str]] = {
-    "no tables": (altered("DROP TABLE messages"), (), "cannot be read as a ROS 2 bag (no such table"),
+    "no tables": (altered("DROP TABLE messages"), (), "cannot be read as a ROS 2 bag (it has no table messages)"),
     "other tables": (altered("ALTER TABLE topics RENAME COLUMN type TO k"), (), "no such column: type"),
     "no topics": (altered("DELETE FROM topics"), (), "has no accelerometer topic"),
     "no messages": (without_messages, (), "holds no accelerometer readings"),
@@ -117,7 +117,7 @@ BROKEN: dict[str, tuple[Callable[[Path], Path], tuple[str, ...], str]] = {
     "messages of another type": (altered("UPDATE topics SET type='sensor_msgs/msg/Imu' WHERE id=3",
                                          "DELETE FROM topics WHERE id=1"), (), "/temperature cannot be used: "),
     "short messages": (altered("UPDATE messages SET data=substr(data, 1, 30)"), (), "cannot be used: "),
-    "no bytes": (altered("UPDATE messages SET data=zeroblob(0)"), (), "cannot be used: "),
+    "no bytes": (altered("UPDATE messages SET data=zeroblob(0)"), (), "holds no accelerometer readings"),
     "text for bytes": (altered("UPDATE messages SET data='nothing'"), (), "cannot be used: "),
     "big-endian": (altered("UPDATE messages SET data=CAST(x'00000000' || substr(data, 5) AS BLOB)"), (),
                    "only 00 01 (little-endian CDR"),
@@ -130,7 +130,7 @@ BROKEN: dict[str, tuple[Callable[[Path], Path], tuple[str, ...], str]] = {
     "a bag of ROS 1": (content(b"#ROSBAG V2.0\n....", "old.bag"), (), "is a bag of ROS 1: convert it by"),
     "the head of an MCAP file": (content(b"\x89MCAP0\r\n"), (), "has no accelerometer topic"),
     "an MCAP file cut short": (cut(0.01, sqlite=False), (), "and is not whole"),
-    "lines of text": (content(b'{"time_s": 1}\n', "a.jsonl"), (), "holds lines of text: record them first, by"),
+    "lines of text": (content(b'{"time_s": 1}\n', "a.jsonl"), (), "no platform angles in 1 lines: name"),
     "schemas of another language": (official(schema_encoding="flatbuffer"), (), "can be read: convert the file"),
     "messages of ROS 1": (official(encoding="ros1", schema_encoding="ros1msg"), (), "topic /accelerometer has 'ros1'"),
     "JSON that is none": (in_json(b"{acc"), BY_FIELDS, "a message is not JSON, it begins with b'{acc'"),

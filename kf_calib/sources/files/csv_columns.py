@@ -1,0 +1,385 @@
+"""Which columns of a log of samples are what, how its stamps and numbers are written, and in which units.
+
+Names of docs/format.md are known to the letter, and go before all others; other names are understood as in tables of
+orientations. What no name tells is told by the first rows, where there are any: the unit of the readings by their
+size, that of a time by its steps, the sign before decimals.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from decimal import Decimal
+from functools import cached_property
+from operator import mul
+
+import numpy as np
+
+from kf_calib.errors import CountsError, InputError
+from kf_calib.sources.files.csv_heading import Heading
+from kf_calib.sources.files.line_parts import LineError, number_of, stamp_ns
+from kf_calib.sources.tables.columns import QUATERNION, READINGS, SPREADS
+from kf_calib.sources.tables.numbers import DECIMAL_POINT, Numbers, month_comes_first, stamp_of
+from kf_calib.sources.tables.words import ANGLE, NO_HEADER, TIME, Meaning, are_numbers, meaning_of
+from kf_calib.sources.units import Units, reading_units
+from kf_calib.support.plain_text import cut
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2
+
+EXAMPLE = "time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c"
+_EXACT = re.compile(
+    r"time_(ns|us|ms|s)|a[xyz]_(mps2|g|mg|ug)|q[xyzw]|(outer|middle|inner)_(deg|rad)|temperature_c", re.IGNORECASE
+)
+_LIKELY = re.compile(r"a|x|y|z|raw", re.IGNORECASE)
+_TIME_ALONE = ("t", "sec", "secs", "millis", "micros")
+_OF_EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+"""From which size on a stamp without a unit is one since 1970 in this unit."""
+_FASTEST_TABLE_S = 1.0
+_MANY, _ALIKE_RAD, _MOST = 500, 0.1, 0.9
+_MARKS_OF_TABLES = ("count", "face", "sd", *SPREADS)
+
+Row = Sequence[str]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Where a quantity stands in a row, and the factors that bring it to our units."""
+
+    at: tuple[int, ...] = ()
+    factors: tuple[float, ...] = ()
+
+    def values(self, row: Row, header: Sequence[str], numbers: Numbers) -> list[float] | None:
+        """The quantity, None where it is not measured. Raises LineError where it cannot be used."""
+        cells = [row[at] for at in self.at]
+        if not all(cells):
+            if any(cells):
+                raise LineError("some components of a vector are missing")
+            return None
+        values = [_number(cell, numbers) for cell in cells]
+        if not math.isfinite(sum(values)):
+            place, cell = next(
+                (at, cell) for at, cell, value in zip(self.at, cells, values, strict=True) if not math.isfinite(value)
+            )
+            raise LineError(f"column {cut(header[place], 40)!r} is {cut(cell, 40)!r}, which is no number")
+        return list(map(mul, values, self.factors))
+
+
+def _number(cell: str, numbers: Numbers) -> float:
+    """Return the number in a cell, NaN where there is none."""
+    try:
+        return number_of(cell if numbers.decimal == "." else numbers.with_point(cell))
+    except LineError:
+        raise
+    except ValueError:
+        try:
+            return numbers.value(cell)
+        except (ValueError, OverflowError):
+            return math.nan
+
+
+@dataclass(frozen=True)
+class Stamps:
+    """How a row's time is written: a number of a unit, or the stamp of a calendar, in one column or in two.
+
+    decimals: of a unit in nanoseconds; factor: how many of it one is. is_date: whether it is a stamp; month_first: how
+    it is written.
+    """
+
+    at: tuple[int, ...]
+    decimals: int = 9
+    factor: int = 1
+    is_date: bool = False
+    month_first: bool = False
+
+    def ns(self, row: Row, header: Sequence[str], numbers: Numbers) -> int:
+        """The stamp of a row in nanoseconds. Raises LineError where it has none."""
+        cell = row[self.at[0]] if len(self.at) == 1 else " ".join(row[at] for at in self.at)
+        try:
+            if self.is_date:
+                return _date_ns(cell, self.month_first)
+            return stamp_ns(self.factor * Decimal(numbers.with_point(cell)), self.decimals)
+        except LineError:
+            raise
+        except (ValueError, ArithmeticError):
+            raise LineError(f"column {cut(header[self.at[0]], 40)!r} is {cut(cell, 40)!r}, which is no time") from None
+
+
+def _date_ns(cell: str, month_first: bool) -> int:
+    stamp = stamp_of(cell, month_first)
+    since = (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
+    return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
+
+
+@dataclass
+class CsvColumns:
+    """The columns of a log by its header and, where the header does not tell, its first rows.
+
+    header: names as they stand in the file; names: as they are to be understood. delimiter: between cells. said: what
+    was taken for what, where that is not plain from the names.
+    """
+
+    header: Sequence[str]
+    names: Sequence[str]
+    delimiter: str
+    rows: Sequence[Row]
+    units: Units
+    local_mps2: float
+    said: list[str] = field(default_factory=list[str])
+    _meanings: list[Meaning] = field(default_factory=list[Meaning])
+
+    @classmethod
+    def of(
+        cls,
+        heading: Heading,
+        stated: Mapping[str, str],
+        units: Units | None = None,
+        local_mps2: float = STANDARD_GRAVITY_MPS2,
+    ) -> CsvColumns:
+        """stated: our name for each foreign one; ``-`` leaves a column out. local_mps2: gravity of the place, where a g
+        is that. Raises InputError for names used twice."""
+        header = heading.header
+        names = ["" if stated.get(name) == "-" else stated.get(name, name) for name in header]
+        lower = [name.lower() for name in names]
+        if repeated := next((name for name in lower if name and lower.count(name) > 1), None):
+            raise InputError(f"two columns are named {repeated!r}: rename or remove one of them.")
+        if are_numbers(header):
+            raise InputError(f"{NO_HEADER}: {cut(','.join(header), 60)!r}.")
+        full = [row for row in heading.rows if len(row) == len(names)]
+        columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2)
+        columns._meanings = [meaning_of(name) for name in names]
+        return columns
+
+    @property
+    def marks_of_a_table(self) -> bool:
+        """Whether there is what only a table of dwells has: numbers of readings, deviations, faces."""
+        return any(own.ours in _MARKS_OF_TABLES for own in self._meanings)
+
+    @cached_property
+    def numbers(self) -> Numbers | None:
+        """How the numbers are written; None where no row tells yet."""
+        return self.numbers_in(self.rows)
+
+    def numbers_in(self, rows: Sequence[Row]) -> Numbers | None:
+        """How the numbers in rows are written; None where these do not tell."""
+        used = [at for at, own in enumerate(self._meanings) if own.ours]
+        cells = (row[at] for row in rows if len(row) == len(self.names) for at in used)
+        return Numbers.told_by(cells, commas_count=self.delimiter != ",")
+
+    @property
+    def step_s(self) -> float:
+        """The usual step from row to row, s; NaN where no time can be told."""
+        try:
+            stamps = self._stamps_of_rows(self.time())
+        except InputError:
+            return math.nan
+        steps = np.abs(np.diff(np.array(stamps, float)))
+        return float(np.median(steps)) / 1e9 if len(steps) else math.nan
+
+    @property
+    def are_alike(self) -> bool:
+        """Whether the readings of nearly all rows are as those before, as of a sensor that lies still between turns; a
+        row a dwell would change from one to the next."""
+        places = [at for ours in READINGS for at, own in enumerate(self._meanings) if own.ours == ours]
+        if len(places) != 3 or len(self.rows) < _MANY:
+            return False
+        numbers = self.numbers or DECIMAL_POINT
+        values = np.array([[_number(row[at], numbers) for at in places] for row in self.rows])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            unit = values / np.linalg.norm(values, axis=1, keepdims=True)
+            return bool((np.linalg.norm(np.diff(unit, axis=0), axis=1) < _ALIKE_RAD).mean() > _MOST)
+
+    def time(self) -> Stamps:
+        """How the time is written. Raises InputError where no column tells it, or not in which unit."""
+        places = [at for at, own in enumerate(self._meanings) if own.ours == "time"]
+        places = places or [at for at, name in enumerate(self.names) if name.strip().lower() in _TIME_ALONE]
+        if not places:
+            raise InputError(f"no column gives the time: name it time_s or time_ns; {self.wanted}, not {self._seen}.")
+        exact = [at for at in places if _EXACT.fullmatch(self.names[at])]
+        united = [at for at in places if self._meanings[at].unit]
+        place = (exact or united or places)[0]
+        unit = self._meanings[place].unit or {"millis": "ms", "micros": "us"}.get(self.names[place].strip().lower(), "")
+        cells = [row[place] for row in self.rows if row[place]]
+        values = [_number(cell, self.numbers or DECIMAL_POINT) for cell in cells]
+        if not unit and cells and math.isnan(values[0]):
+            return self._dates(places[:2] if place == places[0] else [place])
+        unit = unit or self._unit_of_time(place, values)
+        decimals = {"ns": 0, "us": 3, "ms": 6}.get(unit, 9)
+        if not exact:
+            self.said.append(f"time from {self._quoted([place])} in {unit}")
+        return Stamps((place,), decimals, round(TIME[unit]) if decimals == 9 else 1)
+
+    def accel(self) -> Quantity:
+        """The three readings. Raises InputError where their columns or their units are not told."""
+        chosen = [self._one(ours) for ours in READINGS]
+        places = [at for at in chosen if at is not None]
+        advice = "name them ax_mps2, ay_mps2, az_mps2 (or ax_g, ax_mg ...)"
+        if len(places) < 3:
+            raise InputError(f"no columns give the three readings with their unit: {advice}, not {self._seen}.")
+        named = [self._meanings[at].unit for at in places]
+        for at, unit in zip(places, named, strict=True):
+            if self.units.accel and unit not in ("", "count", self.units.accel):
+                raise InputError(
+                    f"column {self.header[at]!r} is in {unit} by its name, and --accel-unit is {self.units.accel}: "
+                    "leave out --accel-unit, or rename the column by --column."
+                )
+        norm = self._usual_norm(places)
+        if "" in named and not self.units.accel and math.isnan(norm):
+            raise InputError(f"no columns give the three readings with their unit: {advice}, not {self._seen}.")
+        told = reading_units(named, norm, self.units, self.local_mps2)
+        if not told.is_known:
+            scale = STANDARD_GRAVITY_MPS2 / norm if norm > 0.0 else math.nan
+            raise CountsError(
+                f"the readings in {self._quoted(places)} have a size of {norm:.3g}, so they are counts: give the size "
+                "of one by --accel-scale, in m/s^2 or what --accel-unit says.", scale
+            )  # fmt: skip
+        is_stated = self.units.accel is not None or self.units.accel_scale != 1.0
+        if is_stated or not all(_EXACT.fullmatch(self.names[at]) for at in places):
+            self.said.insert(0, f"readings from {self._quoted(places)} in {told.words}")
+        return Quantity(tuple(places), tuple(told.factors.tolist()))
+
+    @property
+    def has_usual_gimbals(self) -> bool:
+        """Whether a column is named as a gimbal or in a unit of angles, so that it goes before an attitude."""
+        return any(own.ours == "angle" and (own.rank or own.unit) for own in self._meanings)
+
+    def gimbals(self, *, needed: bool) -> Quantity:
+        """The angles by the usual names, else every column of an angle in the order of the header; none where there is
+        none. Raises InputError where their unit is not told and they are needed."""
+        places = [at for at, own in enumerate(self._meanings) if own.ours == "angle"]
+        ranked = sorted((at for at in places if self._meanings[at].rank), key=lambda at: self._meanings[at].rank)
+        places = ranked or places
+        if len({self._meanings[at].rank for at in ranked}) < len(ranked):
+            raise InputError(f"{self._quoted(ranked)} name a gimbal twice: leave one out by --column THEIRS=-.")
+        units = [self._meanings[at].unit for at in places]
+        if "" in units:
+            unit = self.units.angle or self._unit_of_angles(places)
+            if not unit and not needed:
+                return Quantity()
+            if not unit:
+                raise self.without_angles()
+            units = [own or unit for own in units]
+            self.said.append(f"gimbal angles, outer to inner, from {self._quoted(places)} in {unit}")
+        elif self.units.angle and set(units) - {self.units.angle}:
+            raise InputError(
+                f"{self._quoted(places)} are in {' and '.join(sorted(set(units)))} by their names, and --angle-unit is "
+                f"{self.units.angle}: leave out --angle-unit."
+            )
+        elif not all(_EXACT.fullmatch(self.names[at]) for at in places):
+            self.said.append(f"gimbal angles, outer to inner, from {self._quoted(places)}")
+        return Quantity(tuple(places), tuple(ANGLE[unit] for unit in units))
+
+    def quaternion(self) -> Quantity:
+        """The attitude; nothing where its four columns are not there."""
+        places = [self._one(ours) for ours in QUATERNION]
+        return Quantity() if None in places else Quantity(tuple(at for at in places if at is not None), (1.0,) * 4)
+
+    def temperature(self) -> tuple[Quantity, str]:
+        """The temperature, if there is one, and its unit: ``c``, ``k`` or ``f``."""
+        at = self._one("temperature")
+        if at is None:
+            return Quantity(), "c"
+        if not _EXACT.fullmatch(self.names[at]):
+            self.said.append(f"temperature from {self._quoted([at])} in {(self._meanings[at].unit or 'c').upper()}")
+        return Quantity((at,), (1.0,)), self._meanings[at].unit or "c"
+
+    @property
+    def wanted(self) -> str:
+        """How columns have to be named."""
+        return f"a header such as {EXAMPLE} is wanted"
+
+    def without_angles(self) -> InputError:
+        """That no angles are there, or none whose unit is known."""
+        places = [at for at, own in enumerate(self._meanings) if own.ours == "angle"]
+        name = self.header[places[0]] if places else ""
+        example = f", for example by --column '{name}=outer_deg'" if places else ""
+        return InputError(
+            f"no columns give the platform's angles with their unit: name them outer_deg, inner_deg ... or "
+            f"outer_rad ..., outer gimbal first{example} (or the attitude qx, qy, qz, qw), not {self._seen}; or use "
+            "none (--no-angles)."
+        )
+
+    def _one(self, ours: str) -> int | None:
+        """Return the column of a quantity that is there once; names of the format go before others, then such as begin
+        like one of readings. Raises InputError where two are left."""
+        places = [at for at, own in enumerate(self._meanings) if own.ours == ours]
+        for likely in (_EXACT.fullmatch, _LIKELY.match):
+            places = [at for at in places if likely(self.names[at].strip())] or places
+        if len(places) > 1:
+            other = self.header[places[1]]
+            raise InputError(
+                f"columns {self._quoted(places)} are all taken for {ours}: leave out what it is not by "
+                f"--column {other + '=-'!r}."
+            )
+        return places[0] if places else None
+
+    def _usual_norm(self, places: Sequence[int]) -> float:
+        """Return the median size of the readings in the first rows, NaN where there are none."""
+        numbers = self.numbers or DECIMAL_POINT
+        values = np.array([[_number(row[at], numbers) for at in places] for row in self.rows])
+        norms = np.linalg.norm(values, axis=1) if len(values) else np.empty(0)
+        norms = norms[np.isfinite(norms)]
+        return float(np.median(norms)) if len(norms) else math.nan
+
+    def _unit_of_time(self, place: int, values: Sequence[float]) -> str:
+        """Return the unit of stamps whose name tells none, by their size or their steps."""
+        known = np.array([value for value in values if math.isfinite(value)])
+        size = float(np.abs(known).max(initial=0.0))
+        if unit := next((unit for least, unit in _OF_EPOCH if size >= least), ""):
+            return unit
+        if len(known) > 1 and 0.0 < float(np.median(np.abs(np.diff(known)))) < _FASTEST_TABLE_S:
+            return "s"
+        name = self.header[place]
+        raise InputError(
+            f"no column gives the time with its unit: say which {name!r} has, for example --column '{name}=time_ms'; "
+            f"{self.wanted}, not {self._seen}."
+        )
+
+    def _unit_of_angles(self, places: Sequence[int]) -> str:
+        """Return the unit of angles whose names tell none, empty where their size does not tell it either."""
+        numbers = self.numbers or DECIMAL_POINT
+        values = [_number(row[at], numbers) for row in self.rows for at in places if row[at]]
+        if any(abs(value) > 2.0 * math.pi for value in values):
+            return "deg"
+        return ""
+
+    def _dates(self, places: Sequence[int]) -> Stamps:
+        """How stamps of a calendar are written; of two columns the second may give the time of day."""
+        cells = [[row[at] for row in self.rows if all(row[at] for at in places)] for at in places]
+        joined = [" ".join(own) for own in zip(*cells, strict=True)]
+        month_first = month_comes_first(joined)
+        for chosen, texts in ((places, joined), (places[:1], cells[0])):
+            if texts and _is_date(texts[0], month_first):
+                self.said.append(f"time from {self._quoted(chosen)}")
+                return Stamps(tuple(chosen), is_date=True, month_first=month_first)
+        raise InputError(
+            f"no column gives the time: {self._quoted(places[:1])} is {cut(cells[0][0] if cells[0] else '', 40)!r}, "
+            "write seconds, or stamps such as 2026-05-04T13:45:00.010+02:00."
+        )
+
+    def _stamps_of_rows(self, time: Stamps) -> list[int]:
+        out, numbers = list[int](), self.numbers or DECIMAL_POINT
+        for row in self.rows:
+            try:
+                out.append(time.ns(row, self.header, numbers))
+            except LineError:
+                continue
+        return out
+
+    def _quoted(self, places: Sequence[int]) -> str:
+        return ", ".join(repr(cut(self.header[at], 40)) for at in places)
+
+    @property
+    def _seen(self) -> str:
+        shown = ",".join(self.header[:12])
+        return repr(shown if len(shown) <= 120 else shown[:120] + "...")
+
+
+def _is_date(text: str, month_first: bool) -> bool:
+    reading: Callable[[str, bool], object] = stamp_of
+    try:
+        reading(text, month_first)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,86 @@
+"""What a file is, and the source that reads it: a recording, a log of samples, or a table of mean readings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from enum import Enum
+from os import PathLike
+from pathlib import Path
+from types import MappingProxyType
+
+from kf_calib.bench.streams import Source
+from kf_calib.errors import InputError
+from kf_calib.sources.files.csv_columns import CsvColumns
+from kf_calib.sources.files.csv_heading import Heading
+from kf_calib.sources.files.foreign import HEAD_BYTES, is_lines
+from kf_calib.sources.files.lines import Lines, is_json
+from kf_calib.sources.files.recording import Recording
+from kf_calib.sources.files.text_file import head_of
+from kf_calib.sources.tables.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
+from kf_calib.sources.tables.opening import open_table
+
+_FEWEST_SAMPLES = 50
+_SLOWEST_S = 1.0
+"""Rows that are closer are samples, not dwells."""
+
+
+class Kind(Enum):
+    """What a file holds.
+
+    - RECORDING: messages in MCAP or SQLite, or nothing that is known.
+    - SAMPLES: lines of CSV or JSON, one or more for each sample.
+    - TABLE: a row of means for each dwell, in CSV or a spreadsheet.
+    """
+
+    RECORDING = "recording"
+    SAMPLES = "samples"
+    TABLE = "table"
+
+
+def kind_of(path: str | PathLike[str], columns: Mapping[str, str] = MappingProxyType({})) -> Kind:
+    """What a file is, by its beginning; columns: our names of foreign ones, as far as they are stated."""
+    file = Path(path)
+    if not file.is_file():
+        return Kind.RECORDING
+    try:
+        head = head_of(file)
+    except OSError:  # said where the file is opened to be read
+        return Kind.RECORDING
+    suffix = Path(file.stem if file.suffix.lower() == ".gz" else file).suffix.lower()
+    if head.startswith(ZIP) or suffix in OLD_SUFFIXES:
+        return Kind.TABLE
+    if not (suffix in TEXT_SUFFIXES or is_lines(head[:HEAD_BYTES])):
+        return Kind.RECORDING
+    lines = head.decode("utf-8", errors="replace").splitlines()
+    first = next((k for k, line in enumerate(lines) if line.lstrip("\ufeff").strip()), None)
+    if first is None:
+        return Kind.TABLE
+    if is_json(lines[first]):
+        return Kind.SAMPLES
+    return Kind.SAMPLES if _are_samples(lines[first:-1] or lines[first:], columns) else Kind.TABLE
+
+
+def _are_samples(lines: list[str], stated: Mapping[str, str]) -> bool:
+    """Whether the rows under a header are a time series: many, and close in time."""
+    try:
+        columns = CsvColumns.of(Heading.of(lines), stated)
+    except InputError:
+        return False
+    if columns.marks_of_a_table or len(columns.rows) <= _FEWEST_SAMPLES:
+        return False
+    step_s = columns.step_s
+    return columns.are_alike if math.isnan(step_s) else step_s < _SLOWEST_S
+
+
+def opened(source: Source | str | PathLike[str]) -> Source:
+    """The source itself, or that of the file at a path."""
+    if not isinstance(source, str | PathLike):
+        return source
+    match kind_of(source):
+        case Kind.TABLE:
+            return open_table(source)
+        case Kind.SAMPLES:
+            return Lines(source)
+        case Kind.RECORDING:
+            return Recording(source)

@@ -1,0 +1,126 @@
+"""The cells of an Excel file, which is a zip archive of XML: what it says of its own size is not believed.
+
+A file of a few kB can unpack to gigabytes, name a cell in the last row and column, or say that it has one row where it
+has seven. All of it is bounded before and while it is read, and what no program writes is refused.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+import warnings
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kf_calib.errors import InputError
+from kf_calib.support.extras import need
+from kf_calib.support.plain_text import cut
+
+if TYPE_CHECKING:
+    from openpyxl.worksheet._read_only import ReadOnlyWorksheet
+
+Line = tuple[int, list[Any]]
+"""Number of a row in its sheet, from 1, and its cells up to the last that is filled."""
+_MOST_ROWS = 1 << 20  # of a sheet of Excel
+_MOST_VISITED = 20_000_000  # cells of a sheet, empty ones too
+_MOST_FILLED = 2_000_000  # cells from the first to the last of each row
+_MOST_BYTES, _MOST_TAGS = 64_000_000, 2_000_000  # unpacked, of all parts but pictures; a tag takes some 120 bytes
+_PICTURES = "xl/media/"
+_ROW = re.compile(rb'<(?:\w+:)?row\b[^<>]*?\sr\s*=\s*["\'](\d{1,9})["\']')
+_HIDDEN_ROW = re.compile(
+    rb'<(?:\w+:)?row\b(?=[^<>]*?\shidden\s*=\s*["\'](?:1|true)["\'])[^<>]*?\sr\s*=\s*["\'](\d{1,9})["\']'
+)
+_LONG_FORMAT = re.compile(rb"formatCode\s*=\s*([\"'])[^\"'<>]{1000}")  # of a number; Excel's have at most 255 letters
+_DECLARED = (b"<!DOCTYPE", b"<!ENTITY", b"<\0!\0D\0", b"\0<\0!\0D")  # in UTF-8, and in both kinds of UTF-16
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A sheet of a file: what is filled in it and not hidden. left_out: numbers of filled rows that are hidden, by hand
+    or by a filter."""
+
+    name: str
+    hidden: bool
+    lines: list[Line]
+    left_out: list[int]
+
+
+def sheets_of(path: Path) -> list[Sheet]:
+    """All sheets of an Excel file that hold anything, in its order. Raises InputError, with the path, where it cannot
+    be read."""
+    need("openpyxl", "tables", f"reading {path}")
+    import openpyxl
+
+    try:
+        with path.open("rb") as file:
+            _refuse_unfit(file)
+            with warnings.catch_warnings(action="ignore"):  # of what openpyxl leaves out, which no cell is part of
+                book = openpyxl.load_workbook(file, read_only=True, data_only=True)
+                sheets = [_sheet(sheet, _hidden_rows(file, sheet)) for sheet in book.worksheets]
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except Exception as error:  # what openpyxl raises for a damaged file depends on where the damage is
+        said = cut(" ".join(str(error).split()), 80) or type(error).__name__
+        raise InputError(f"{path}: is no Excel file that can be read ({said}): save it again.") from None
+    return [sheet for sheet in sheets if sheet.lines]
+
+
+def _refuse_unfit(file: Any) -> None:
+    """Raise InputError for an archive that unpacks to too much, or whose XML is none of a spreadsheet."""
+    size, tags = 0, 0
+    with zipfile.ZipFile(file) as archive:
+        for part in archive.infolist():
+            size += part.file_size  # no more than this is ever unpacked
+            if size > _MOST_BYTES and not part.filename.startswith(_PICTURES):
+                raise InputError("unpacks to more than any table of orientations: leave out what is not part of it.")
+            if part.filename.startswith(_PICTURES):
+                size -= part.file_size
+                continue
+            content = archive.read(part)
+            tags += content.count(b"<")
+            if tags > _MOST_TAGS:
+                raise InputError("has more cells than any table of orientations: leave out what is not part of it.")
+            _refuse_part(content)
+    file.seek(0)
+
+
+def _refuse_part(content: bytes) -> None:
+    if any(word in content for word in _DECLARED):
+        raise InputError("has XML that declares entities, as no spreadsheet does: save it again.")
+    if _LONG_FORMAT.search(content):
+        raise InputError("has a number format longer than Excel allows: save it again.")
+    numbers = list(map(int, _ROW.findall(content)))
+    if any(after <= before for before, after in itertools.pairwise(numbers)):
+        raise InputError("has rows that are out of order, which would be lost: save it again.")
+
+
+def _hidden_rows(file: Any, sheet: ReadOnlyWorksheet) -> set[int]:
+    """Return the numbers of the rows that are hidden, which openpyxl does not tell where it reads row by row."""
+    with zipfile.ZipFile(file) as archive:
+        content = archive.read(sheet._worksheet_path.lstrip("/"))  # pyright: ignore[reportPrivateUsage]
+    return set(map(int, _HIDDEN_ROW.findall(content)))
+
+
+def _sheet(sheet: ReadOnlyWorksheet, hidden_rows: set[int]) -> Sheet:
+    lines = _lines(sheet)
+    seen = [line for line in lines if line[0] not in hidden_rows]
+    left_out = [number for number, _ in lines if number in hidden_rows]
+    return Sheet(sheet.title, sheet.sheet_state != "visible", seen, left_out)
+
+
+def _lines(sheet: ReadOnlyWorksheet) -> list[Line]:
+    """Return the rows of a sheet that hold anything."""
+    sheet.reset_dimensions()  # what the file says of its size may be wrong
+    lines, visited, filled = list[Line](), 0, 0
+    for number, row in enumerate(sheet.iter_rows(values_only=True), 1):
+        visited += 1 + len(row)
+        last = max((k for k, cell in enumerate(row, 1) if cell is not None), default=0)
+        filled += last
+        if number > _MOST_ROWS or visited > _MOST_VISITED or filled > _MOST_FILLED:
+            raise InputError(f"sheet {sheet.title!r} has more cells than any table of orientations: leave out what is "
+                             "not part of it, empty rows and columns too.")  # fmt: skip
+        if last:
+            lines.append((number, list(row[:last])))
+    return lines

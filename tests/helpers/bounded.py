@@ -1,0 +1,44 @@
+"""A limit of time and memory for one case: a hostile file fails its test, and not the machine."""
+
+from __future__ import annotations
+
+import re
+import resource
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+class TooLongError(BaseException):
+    """No error that a program may take for one of its own."""
+
+
+@contextmanager
+def bounded(seconds: float = 20.0, megabytes: float = 600.0) -> Iterator[None]:
+    """What runs inside takes no longer, and at its peak no more memory than there was before and ``megabytes``."""
+    Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
+    before, taken = _status("VmRSS"), _status("VmSize")
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (int((taken + 2.0 * megabytes) * 2**20), hard))
+    handler = signal.signal(signal.SIGALRM, _too_long)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, handler)
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+    grown = _status("VmHWM") - before
+    assert grown < megabytes, f"it took {grown:.0f} MB"
+
+
+def _too_long(*_: object) -> None:
+    raise TooLongError
+
+
+def _status(key: str) -> float:
+    """A size of this process, MB."""
+    found = re.search(rf"{key}:\s*(\d+) kB", Path("/proc/self/status").read_text())
+    assert found
+    return int(found[1]) / 1024.0

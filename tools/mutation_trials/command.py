@@ -1,0 +1,85 @@
+"""The command: draws changes, has them made, and tells which were noticed."""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mutation_trials.changes import Change, changes_in
+from mutation_trials.runner import Runner, copied
+
+ROOT = Path(__file__).resolve().parents[2]
+_ABOUT = """
+An operator, a comparison or a constant is changed at random in a private copy of the checkout. The fast tests of the
+package that execute its line are run until one fails, then those of other folders that import the module. A change
+at which they fail, or take ten times as long, is noticed. What survives changes no result, or shows that a test is
+missing: which of the two, a reader decides. Give --line to try the changes of a line.
+"""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One change of a module, and the test that noticed it; empty: none."""
+
+    path: Path
+    change: Change
+    seconds: float
+    noticed_by: str
+
+    def __str__(self) -> str:
+        cells = (self.path, self.change.line, self.change, f"{self.seconds:.0f} s", self.noticed_by or "SURVIVED")
+        return "\t".join(map(str, cells))
+
+
+def drawn(paths: Sequence[Path], count: int, seed: int, line: int | None = None) -> list[tuple[Path, Change]]:
+    """Changes drawn from all that are possible in modules, in the order of the modules."""
+    every = [(path, change) for path in paths for change in changes_in((ROOT / path).read_text())
+             if line is None or change.line == line]  # fmt: skip
+    return sorted(random.Random(seed).sample(every, min(count, len(every))))
+
+
+def modules(names: Sequence[str]) -> list[Path]:
+    """The modules at paths, which may be folders, relative to the checkout."""
+    places = [(ROOT / name).resolve() for name in names]
+    paths = [path for place in places for path in (sorted(place.rglob("*.py")) if place.is_dir() else [place])]
+    return [path.relative_to(ROOT) for path in paths]
+
+
+def counts(trials: Sequence[Trial]) -> str:
+    """How many were noticed, by folder."""
+    total = Counter(trial.path.parent for trial in trials)
+    noticed = Counter(trial.path.parent for trial in trials if trial.noticed_by)
+    return "\n".join(f"{folder}: {noticed[folder]} of {total[folder]} changes noticed" for folder in sorted(total))
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Print a line a change, and the counts."""
+    parser = argparse.ArgumentParser(description=__doc__, epilog=_ABOUT)
+    parser.add_argument("paths", nargs="+", help="modules or folders, relative to the checkout")
+    parser.add_argument("--count", type=int, default=sys.maxsize, help="changes to draw (all, where it is left out)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--line", type=int, help="only changes of this line")
+    parser.add_argument("--own", action="store_true", help="only the tests of the package, none of other folders")
+    parser.add_argument("-o", "--out", type=Path, help="write the table here, too")
+    options = parser.parse_args(words)
+    tasks = drawn(modules(options.paths), options.count, options.seed, options.line)
+    trials = list[Trial]()
+    with tempfile.TemporaryDirectory(prefix="mutation") as folder:
+        copy = copied(ROOT, Path(folder))
+        for package in sorted({path.parts[:2] for path, _ in tasks}):
+            with Runner(copy, Path(*package), not options.own) as runner:
+                for path, change in (task for task in tasks if task[0].parts[:2] == package):
+                    begun_s = time.monotonic()
+                    noticed_by = runner.noticed_by(path, change)
+                    trials.append(Trial(path, change, time.monotonic() - begun_s, noticed_by))
+                    print(trials[-1], flush=True)
+                    if options.out is not None:
+                        options.out.write_text("".join(f"{trial}\n" for trial in trials))
+    print(counts(trials))
