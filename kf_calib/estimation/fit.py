@@ -25,8 +25,9 @@ from kf_calib.errors import UnobservableError
 from kf_calib.estimation import free_attitude, square_root_information
 from kf_calib.estimation.attitude import facing_readings, without_attitude
 from kf_calib.estimation.dwell_columns import Carried, Means, candidate_columns, stimulus_of
+from kf_calib.estimation.flicker import flicker_within
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
-from kf_calib.estimation.noise_model import ATTITUDE_UNKNOWN_RAD, FLOOR_MPS2, Noise, steps, within_dwells
+from kf_calib.estimation.noise_model import ATTITUDE_UNKNOWN_RAD, FLOOR_MPS2, Noise, slow_waves, steps, within_dwells
 from kf_calib.estimation.nuisance_states import along_force, sensitivities_of
 from kf_calib.estimation.relinearisation import SETTLED, UNSETTLED, descended, left_to_settle, linearised
 from kf_calib.estimation.reml import Part, gain_of, misfit, restoring_gains, with_dwell_parts, with_shared_noise
@@ -134,14 +135,34 @@ class Fit:
             out += self._considered(
                 [0.5 * (a - b) @ carried.state[part, None] for a, b in zip(more, less, strict=True)]
             )
+        if (flicker_mps2 := self.noise.flicker_mps2) is not None and carried.model.effects:
+            out += self._considered_of_effects(flicker_mps2)
         return out
+
+    def _considered_of_effects(self, flicker_mps2: Floats) -> Floats:
+        """Return B (p, p) of the waves of 1/f noise that are slower than a dwell, as far as they enter the coefficients
+        of effects: noise that is alike in consecutive dwells looks like a drift, and the scatter from dwell to dwell
+        has all of it for the twelve parameters, which do not."""
+        columns, sigma = slow_waves(self.carried.turned, flicker_mps2)
+        extra = self._considered([values * sigma for values in columns])
+        factor = square_root_information.accumulate(self.all_rows(), self.steps)[:-1]
+        covariance = square_root_information.solve(factor, self.carried.model.nominal_state())[1]
+        gained = (covariance @ extra @ covariance)[STATE_COUNT:, STATE_COUNT:]
+        seen = np.zeros_like(extra)
+        seen[STATE_COUNT:, STATE_COUNT:] = gained
+        sizes = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        sizes = np.where(sizes > 0.0, sizes, 1.0)
+        inverse = np.linalg.pinv(covariance / np.outer(sizes, sizes), hermitian=True) / np.outer(sizes, sizes)
+        return inverse @ seen @ inverse
 
     def _considered(self, changes: Sequence[Floats]) -> Floats:
         """Return B (p, p) of considered constants from the changes (pieces, K nodes, 3, c) of each dwell's readings by
         1 sigma of each."""
         carried, count = self.carried, self.carried.model.count
         columns = [np.concatenate(both, axis=3) for both in zip(carried.columns, changes, strict=True)]
-        rows = square_root_information.whiten(carried.turned, columns, self.noise.weights, carried.state)
+        rows = square_root_information.whiten(
+            carried.turned, columns, self.noise.weights, carried.state, flicker_mps2=self.noise.flicker_mps2
+        )
         upper = square_root_information.accumulate(rows, self.steps)
         gains = upper[:count, :count].T @ upper[:count, count:-1]
         return gains @ gains.T
@@ -204,7 +225,9 @@ class Fit:
 
     def _whitened(self, noise: Noise) -> list[Floats]:
         carried = self.carried
-        rows = square_root_information.whiten(carried.turned, carried.columns, noise, carried.state)
+        rows = square_root_information.whiten(
+            carried.turned, carried.columns, noise, carried.state, flicker_mps2=noise.flicker_mps2
+        )
         return square_root_information.with_frame(rows, carried.model, noise)
 
 
@@ -252,6 +275,8 @@ def fit(
         means, prior = with_shared_noise(carried.dwells, within, carried.means)
         noise, sizes = with_dwell_parts(within, means, state, *stated, walks=model.walks, near=sizes, prior=prior)
         noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
+        flicker_mps2 = flicker_within(carried, noise)
+        noise = replace(noise, flicker_mps2=flicker_mps2 if flicker_mps2.any() else None)
         turning = noise.weights.setting_rad > 0.0
         fitted = replace(fitted, carried=carried, noise=noise)
         if model.walks or noise.attitude_unknown:

@@ -27,8 +27,7 @@ from kf_calib.estimation.attitude import added_by, bent_effects, matrix_of
 from kf_calib.estimation.dwell_columns import Carried, Means, stimulus_of
 from kf_calib.estimation.measurement_model import FRAME, SQUARE, STATE_COUNT
 from kf_calib.estimation.noise_model import Noise
-from kf_calib.estimation.nuisance_states import nuisance_sigmas
-from kf_calib.estimation.samples import Samples
+from kf_calib.estimation.samples import Samples, all_nuisance_sigmas
 
 DIRECTIONS: dict[str, Floats] = {
     " ".join(f"{'+' if sign > 0 else '-'}{axis}" for sign, axis in zip(signs, "xyz", strict=True) if sign): (
@@ -195,7 +194,7 @@ def most_informative(covariance: Floats, state: Floats, gravity_mps2: float) -> 
 
 def holding_frame(samples: Iterable[Samples], carried: Carried, noise: Noise) -> Iterator[Samples]:
     """Yield first a reading of each state that is fixed at zero, times g, then the samples."""
-    fixed, sigmas = carried.model.fixed, nuisance_sigmas(noise)
+    fixed, sigmas = carried.model.fixed, all_nuisance_sigmas(noise)
     if fixed:
         observation = np.zeros((len(fixed), 1, carried.model.count))
         observation[np.arange(len(fixed)), 0, list(fixed)] = carried.model.bench.gravity_mps2

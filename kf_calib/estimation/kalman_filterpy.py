@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise
-from kf_calib.estimation.nuisance_states import nuisance_sigmas
-from kf_calib.estimation.samples import Samples
+from kf_calib.estimation.samples import Samples, all_nuisance_sigmas
 
 _DIFFUSE = 1e5
 """Sigma of a diffuse prior, in sigmas of one reading: wide enough not to bias, narrow enough for double precision."""
@@ -62,7 +61,7 @@ def estimate(
     else:
         root = np.linalg.cholesky(prior_covariance * np.outer(scale, scale))
     channels = 1 if noise.attitude_unknown else 3
-    kf = _Filter(form, nominal_state * scale, root, nuisance_sigmas(noise), channels)
+    kf = _Filter(form, nominal_state * scale, root, all_nuisance_sigmas(noise), channels)
     place, nis, done, previous_s = (-1, False), 0.0, 0, math.nan
     for piece in samples:
         if (piece.dwell, piece.moving) != place:

@@ -63,6 +63,7 @@ class Noise:
     - walk_spread: the sigma of ln q; None if q was stated or is zero.
     - sensitivity_mps2_per_k (3, 8): change of the readings per K on the regressors 1, f and T, T f
       (``thermometer_error``); None where the noise of the thermometer does not matter.
+    - flicker_mps2 (3,): sqrt(h) of 1/f noise within dwells (``flicker``); None for none.
     - within_seen: whether readings within dwells showed their noise; in a table of means alone they do not.
     """
 
@@ -79,6 +80,7 @@ class Noise:
     walk_spread: float | None = None
     within_seen: bool = True
     sensitivity_mps2_per_k: Floats | None = None
+    flicker_mps2: Floats | None = None
 
     def __post_init__(self) -> None:
         if self.scatter_mps2 is None:  # pyright: ignore[reportUnnecessaryComparison]
@@ -248,7 +250,12 @@ def slow_scatter(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floa
     s^2 = h ln D about their common mean, and the component sqrt(2) cos(pi k t / T) of a run of length T has the
     variance h / k. The columns are these components for k = 1 ... 6, constant within a dwell.
     """
-    channels = np.flatnonzero(noise.scatter_mps2 > 0)
+    return slow_waves(dwells, flicker_sigma(noise, len(dwells)))
+
+
+def slow_waves(dwells: Sequence[DwellFactor], flicker_mps2: Floats) -> tuple[list[Floats], Floats]:
+    """The same for 1/f noise with sqrt(h) = ``flicker_mps2`` (3,); none for an accelerometer without it."""
+    channels = np.flatnonzero(flicker_mps2 > 0)
     if len(dwells) < 4 or not channels.size:
         return [np.zeros((len(dwell.pieces), dwell.width, 3, 0)) for dwell in dwells], np.zeros(0)
     start, span = dwells[0].start_s, dwells[-1].end_s - dwells[0].start_s
@@ -258,7 +265,7 @@ def slow_scatter(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floa
         at = (0.5 * (dwell.start_s + dwell.end_s) - start) / span
         own[:, :3, channels, np.arange(len(channels))] = np.sqrt(2.0) * np.cos(np.pi * orders * at)
         out.append(own.reshape(*own.shape[:3], -1))
-    sigma = flicker_sigma(noise, len(dwells))[channels, None] / np.sqrt(orders)
+    sigma = flicker_mps2[channels, None] / np.sqrt(orders)
     return out, sigma.ravel()
 
 

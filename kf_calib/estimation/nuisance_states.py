@@ -17,7 +17,21 @@ from kf_calib.dwells.rows import REGRESSORS
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.dwell_columns import bending_of
 from kf_calib.estimation.measurement_model import STATE_COUNT
-from kf_calib.estimation.noise_model import Noise
+from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise
+
+SLOW = np.arange(1, 5)
+"""Numbers of half cycles of the slow waves of 1/f noise in a dwell."""
+
+
+def flicker_waves(dwell: DwellFactor) -> Floats:
+    """sqrt(2) cos(pi k t / T) over a dwell of length T at its nodes, (pieces, nodes, k)."""
+    at = np.array([piece.nodes.elapsed_s for piece in dwell.pieces]) - dwell.start_s
+    return np.sqrt(2.0) * np.cos(np.pi * SLOW * (at / max(dwell.end_s - dwell.start_s, 1e-9))[..., None])
+
+
+def flicker_sigmas(flicker_mps2: Floats) -> Floats:
+    """Prior sigmas (3 k,) of the amplitudes of the slow waves of each accelerometer, from sqrt(h) (3,)."""
+    return np.outer(np.maximum(flicker_mps2, FLOOR_MPS2), 1.0 / np.sqrt(SLOW)).ravel()
 
 
 def tangents(force: Floats) -> Floats:

@@ -373,7 +373,9 @@ class Calibration:
             before, extra_before = factor, extra
             for part in dwell.prefixes():
                 own = [columns[: len(part.pieces)]]
-                rows = square_root_information.whiten([part], own, self.noise.weights, state)[0]
+                rows = square_root_information.whiten(
+                    [part], own, self.noise.weights, state, flicker_mps2=self.noise.flicker_mps2
+                )[0]
                 walked = np.array([pause, steps([part], self.noise)[0, 1]])
                 factor, _ = square_root_information.update(before, rows, walked)
                 extra = extra_before + considered_information(self.noise, means_of([part], own), state)[0]
@@ -386,7 +388,9 @@ class Calibration:
         fitted, (factor, extra) = self.fit, self.reached
         both, state = [fitted.dwells[-1], dwell], self.carried.state
         own = columns_of(both, self.model, state)[1:]
-        rows = square_root_information.whiten([dwell], own, self.noise.weights, state)[0]
+        rows = square_root_information.whiten(
+            [dwell], own, self.noise.weights, state, flicker_mps2=self.noise.flicker_mps2
+        )[0]
         factor, _ = square_root_information.update(factor, rows, steps(both, self.noise)[-1])
         extra = extra + considered_information(self.noise, means_of([dwell], own), state)[0]
         return estimate_of(factor, self.model.nominal_state(), extra)

@@ -11,7 +11,20 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.rows import Rows, basis, on_basis
 from kf_calib.estimation.dwell_columns import Carried, has_turns, turning_mps2
 from kf_calib.estimation.noise_model import Noise
-from kf_calib.estimation.nuisance_states import along_force, nuisance_map, nuisance_sigmas, sensitivities_of
+from kf_calib.estimation.nuisance_states import (
+    along_force,
+    flicker_sigmas,
+    flicker_waves,
+    nuisance_map,
+    nuisance_sigmas,
+    sensitivities_of,
+)
+
+
+def all_nuisance_sigmas(noise: Noise) -> Floats:
+    """Prior sigmas (q,) of the nuisance states of a dwell, those of the slow waves of 1/f noise last."""
+    sigmas = nuisance_sigmas(noise)
+    return sigmas if noise.flicker_mps2 is None else np.append(sigmas, flicker_sigmas(noise.flicker_mps2))
 
 
 @dataclass(frozen=True)
@@ -53,8 +66,11 @@ class Samples:
 def samples_of(rows: Iterable[Rows], carried: Carried, noise: Noise) -> Iterator[Samples]:
     """Yield samples from a second pass over the rows, with the columns of the first."""
     every, columns = [*carried.turned, *carried.slews], [*carried.columns, *carried.slew_columns]
-    known = {(dwell.number, dwell.moving): (dwell, iter(own)) for dwell, own in zip(every, columns, strict=True)}
-    sigmas = nuisance_sigmas(noise)
+    known = {
+        (dwell.number, dwell.moving): (dwell, iter(zip(own, flicker_waves(dwell), strict=True)))
+        for dwell, own in zip(every, columns, strict=True)
+    }
+    sigmas = all_nuisance_sigmas(noise)
     for block in rows:
         if (block.dwell, block.moving) not in known:
             continue
@@ -62,7 +78,7 @@ def samples_of(rows: Iterable[Rows], carried: Carried, noise: Noise) -> Iterator
         along = along_force([dwell], sensitivities_of([dwell], carried.state))[0] if noise.attitude_unknown else None
         regressor_map = nuisance_map([dwell], noise, carried.state)[0]
         for part, u, _ in block.pieces:
-            own = next(pieces)
+            own, waves = next(pieces)
             functions = basis(u, block.elapsed_s[part], carried.carrier_hz)
             observation = (functions.T @ on_basis(own.reshape(len(own), -1))).reshape(len(u), *own.shape[1:])
             regressors, readings = block.columns[part], block.readings[part]
@@ -74,6 +90,10 @@ def samples_of(rows: Iterable[Rows], carried: Carried, noise: Noise) -> Iterator
                 if has_turns(dwell):
                     readings = readings + turning_mps2(dwell, force, carried.state)
             nuisances = np.einsum("nc,icq->niq", regressors, regressor_map)
+            if noise.flicker_mps2 is not None:
+                course = functions[:3].T @ on_basis(waves)
+                slow = np.eye(3)[None, :, :, None] * course[:, None, None, :]  # those of each accelerometer its own
+                nuisances = np.concatenate([nuisances, slow.reshape(len(u), 3, -1)], axis=2)
             sigma_mps2 = noise.of(block.moving).effective_sigma_mps2
             residual_mps2 = readings - observation @ carried.state
             samples = Samples(

@@ -21,11 +21,18 @@ from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
 from kf_calib.estimation import random_walk
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
-from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, flicker_sigma, shared_noise, slow_scatter
-from kf_calib.estimation.nuisance_states import along_force, nuisance_map, nuisance_sigmas, sensitivities_of
+from kf_calib.estimation.noise_model import Noise, flicker_sigma, shared_noise, slow_scatter
+from kf_calib.estimation.nuisance_states import (
+    SLOW,
+    along_force,
+    flicker_sigmas,
+    flicker_waves,
+    nuisance_map,
+    nuisance_sigmas,
+    sensitivities_of,
+)
 from kf_calib.estimation.prior import Prior
 
-_SLOW = np.arange(1, 5)
 _STILL = np.zeros(2)
 _USUAL = 24  # columns of candidates that are whitened together in a long run
 _AT_ONCE = 1 << 17  # numbers that are processed together, so that they stay in the cache
@@ -97,16 +104,16 @@ def _weighted(
     last.
     """
     sigma, priors = noise.effective_sigma_mps2, nuisance_sigmas(noise)
-    offsets, slow = len(priors), 0 if flicker_mps2 is None else len(_SLOW)
+    offsets, slow = len(priors), 0 if flicker_mps2 is None else len(SLOW)
     if flicker_mps2 is not None:
-        priors = np.append(priors, np.outer(np.maximum(flicker_mps2, FLOOR_MPS2), 1.0 / np.sqrt(_SLOW)))
+        priors = np.append(priors, flicker_sigmas(flicker_mps2))
     count, (many, pieces, functions, _, width) = len(priors), columns.shape
     inside, size = 3 if noise.walk_mps2_per_sqrt_s else 0, pieces * functions
     triangles = np.array([dwell.triangles for dwell in dwells])
     carried = triangles[:, :, :functions, :functions]
     regressors = np.array([dwell.regressors for dwell in dwells])
     nuisances = nuisance_map(dwells, noise, state)[:, :, None]
-    waves = carried[..., :3] @ on_basis(np.array([_waves(dwell) for dwell in dwells])) if slow else None
+    waves = carried[..., :3] @ on_basis(np.array([flicker_waves(dwell) for dwell in dwells])) if slow else None
     parts = np.zeros((many, 3, size, count + inside + width + 1))
     for i in range(3):
         part = parts[:, i]
@@ -212,7 +219,7 @@ class MisfitColumns:
     def __init__(self, dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> None:
         self._sigma, shared = noise.effective_sigma_mps2, len(shared_noise(dwells, noise)[1])
         flicker = flicker_of_scatter(dwells, noise)
-        priors = len(nuisance_sigmas(noise)) + (0 if flicker is None else 3 * len(_SLOW))
+        priors = len(nuisance_sigmas(noise)) + (0 if flicker is None else 3 * len(SLOW))
         counts = np.array([len(dwell.pieces) for dwell in dwells])
         channels = 1 if noise.attitude_unknown else 3
         lengths = channels * counts * [dwell.width for dwell in dwells] + priors
@@ -259,12 +266,6 @@ def with_frame(rows: list[Floats], model: Model, noise: Noise, first: int = 0) -
     for k, place in enumerate(model.fixed):
         own[k, inside + place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2[0]
     return [*rows[:first], np.vstack([own, rows[first]]), *rows[first + 1 :]]
-
-
-def _waves(dwell: DwellFactor) -> Floats:
-    """Return sqrt(2) cos(pi k t / T) over a dwell of length T at its nodes, (pieces, nodes, k)."""
-    at = np.array([piece.nodes.elapsed_s for piece in dwell.pieces]) - dwell.start_s
-    return np.sqrt(2.0) * np.cos(np.pi * _SLOW * (at / max(dwell.end_s - dwell.start_s, 1e-9))[..., None])
 
 
 def _units(columns: Sequence[Floats]) -> Floats:
