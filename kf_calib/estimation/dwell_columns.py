@@ -27,21 +27,27 @@ _VIBRATING = 15.0  # mean squared deviation of the variances in units of sigma; 
 def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> Stimulus:
     """The conditions at the nodes of all pieces of all dwells and slews, in order; rotations are linearised at
     ``state``. Poses are NaN where no angles are used."""
-    known = _conditions(dwells) | _turned_conditions(dwells)
+    known = _conditions(dwells)
+    known = known | _turned_conditions(dwells, known)
     if not bench.angles:
         known = known | {key: np.full_like(known[key], np.nan) for key in ("pose", "previous_pose")}
     return Stimulus(bench=bench, sensitivity=state[:12].reshape(3, 4)[:, :3], **known)
 
 
-def _turned_conditions(dwells: Sequence[DwellFactor]) -> dict[str, Any]:
-    """Return the specific force (m, 3) that is felt at the nodes of turned dwells, and by what it is turned there."""
+def _turned_conditions(dwells: Sequence[DwellFactor], known: dict[str, Any]) -> dict[str, Any]:
+    """Return the specific force (m, 3) that is felt at the nodes of turned dwells, and by what it is turned there.
+
+    The last step stays that of the poses: where a pose changes nothing along an axis, its sign is not that of noise.
+    """
     if all(dwell.turned_rad is None and dwell.attitude is None for dwell in dwells):
         return {}
     counts, still = [3 * len(dwell.pieces) for dwell in dwells], np.zeros(3)
     turns = [still if dwell.turned_rad is None else dwell.turned_rad for dwell in dwells]
     attitudes = [still if dwell.attitude is None else dwell.attitude.rotation_rad for dwell in dwells]
+    felt = np.concatenate([dwell.felt(dwell.nodes.force_mps2) for dwell in dwells])
     return {
-        "force_mps2": np.concatenate([dwell.felt(dwell.nodes.force_mps2) for dwell in dwells]),
+        "force_mps2": felt,
+        "previous_force_mps2": known["previous_force_mps2"] + felt - known["force_mps2"],
         "turned_rad": np.repeat(turns, counts, axis=0),
         "attitude_rad": np.repeat(attitudes, counts, axis=0),
     }

@@ -255,19 +255,21 @@ def fit(
     for number in range(_most_passes(model)):
         if number == 1 and model.unknowns:
             model, searching = _placed(fitted), True
-            fitted = replace(fitted, carried=linearised(fitted, model, fitted.carried.state))
+            fitted = replace(fitted, carried=linearised(fitted.carried, fitted.noise, model, fitted.carried.state))
         if number and model.stepped:
             model, spreads = _averaged(fitted)
-            fitted = replace(fitted, carried=linearised(fitted, model, fitted.carried.state), spreads=spreads)
+            carried = linearised(fitted.carried, fitted.noise, model, fitted.carried.state)
+            fitted = replace(fitted, carried=carried, spreads=spreads)
         state, moved = _solved(fitted)
         if not (bench.angles or _sensible(state)):
             if must_settle:
                 raise UnobservableError(_not_sensible(model))
             return fitted
-        reach, left = _reach(fitted), left_to_settle(fitted, state)
+        reach, left = _reach(fitted), _left_to_settle(fitted, state)
         if searching:
             model = model.moved(np.clip(moved, -reach, reach))
-        carried, state = descended(fitted, model, state)
+        carried = _moved_to(fitted, model, state)
+        state = carried.state
         stated = _setting_deg(dwells, bench), bench.scatter_sigma_mps2
         within = replace(
             within, sensitivity_mps2_per_k=sensitivity_to_temperature(carried, within.effective_sigma_mps2)
@@ -347,7 +349,8 @@ def _begun(dwells: list[DwellFactor], model: Model, slews: Sequence[DwellFactor]
     free_attitude.refuse_poses(begun.carried, noise)
     settled = _settled(begun)
     if free_attitude.tells_angles(settled.carried, noise):
-        settled = _settled(Fit(linearised(settled, Model(model.bench), settled.carried.state), noise))
+        bare = Model(model.bench)
+        settled = _settled(Fit(linearised(settled.carried, noise, bare, settled.carried.state), noise))
     state = np.append(settled.carried.state, np.zeros(model.count - STATE_COUNT))
     whole = replace(model, square=settled.carried.model.square)
     return Fit(Carried(settled.dwells, whole, state), noise)
@@ -359,11 +362,31 @@ def _settled(fitted: Fit) -> Fit:
         state = fitted.state
         if not _sensible(state):
             break
-        left = left_to_settle(fitted, state)
-        fitted = replace(fitted, carried=descended(fitted, fitted.carried.model, state)[0])
+        left = _left_to_settle(fitted, state)
+        fitted = replace(fitted, carried=_moved_to(fitted, fitted.carried.model, state))
         if left < SETTLED:
             return fitted
     raise UnobservableError(_not_sensible(fitted.carried.model))
+
+
+def _left_to_settle(fitted: Fit, state: Floats) -> float:
+    """Return by how many sigmas the fit moves from its linearisation; 0 where no attitude moves with it."""
+    turning = fitted.noise.weights.setting_rad > 0.0
+    return left_to_settle(state, fitted.carried.state, fitted.sigma) if turning else 0.0
+
+
+def _moved_to(fitted: Fit, model: Model, state: Floats) -> Carried:
+    """Return the dwells linearised at a state; nearer where attitudes are not known and the misfit would grow."""
+    carried, noise = fitted.carried, fitted.noise
+    if model is carried.model and noise.attitude_unknown and not noise.walk_mps2_per_sqrt_s:
+        return descended(carried, noise, state, lambda there: _misfit(replace(fitted, carried=there)))
+    return linearised(carried, noise, model, state)
+
+
+def _misfit(fitted: Fit) -> float:
+    """Return chi-squared of a linearisation at its own state."""
+    state = fitted.carried.state
+    return float(sum(np.sum((rows[:, -1] - rows[:, :-1] @ state) ** 2) for rows in fitted.all_rows()))
 
 
 def _sensible(state: Floats) -> bool:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -14,9 +12,6 @@ from kf_calib.estimation.attitude import at_their_modes, facing_readings
 from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.noise_model import Noise
-
-if TYPE_CHECKING:
-    from kf_calib.estimation.fit import Fit
 
 SETTLED = 1e-4
 """In sigmas of each state: a smaller step ends the search."""
@@ -28,12 +23,8 @@ _TURNS = 4  # most times that attitudes are found at a given state
 _STILL_RAD = 1e-7
 
 
-def linearised(fitted: Fit, model: Model, state: Floats) -> Carried:
-    """The dwells of a fit with the columns of a model at a state, and attitudes where the readings show them there."""
-    return _once(fitted.carried, fitted.noise, model, state)
-
-
-def _once(carried: Carried, noise: Noise, model: Model, state: Floats) -> Carried:
+def linearised(carried: Carried, noise: Noise, model: Model, state: Floats) -> Carried:
+    """The dwells with the columns of a model at a state, and attitudes where the readings show them there."""
     known = state if len(state) == carried.model.count else carried.state
     return Carried(at_their_modes(carried, noise, known), model, state, carried.slews)
 
@@ -52,39 +43,37 @@ def carried_at(dwells: Sequence[DwellFactor], model: Model, state: Floats, noise
         dwells = facing_readings(dwells, state, model.bench.gravity_mps2)
     carried = Carried(dwells, model, state)
     for _ in range(_TURNS if noise.setting_rad else 1):
-        before, carried = carried, _once(carried, noise, model, state)
+        before, carried = carried, linearised(carried, noise, model, state)
         if _farthest_rad(before, carried) < _STILL_RAD:
             break
     return carried
 
 
-def left_to_settle(fitted: Fit, state: Floats) -> float:
-    """By how many of their sigmas the states move from where the fit is linearised; 0 where no attitude moves."""
-    if not fitted.noise.weights.setting_rad:
-        return 0.0
-    return float((np.abs(state - fitted.carried.state) / np.where(fitted.sigma > 0, fitted.sigma, np.inf)).max())
+def at_its_mode(dwell: DwellFactor, before: DwellFactor, model: Model, state: Floats, noise: Noise) -> DwellFactor:
+    """A dwell that follows the dwell ``before``, with its attitude where its readings show it at a state that is
+    known: the iterated update of a filter by one dwell."""
+    if not noise.setting_rad:
+        return dwell
+    return carried_at([before, dwell], model, state, noise).dwells[-1]
 
 
-def descended(fitted: Fit, model: Model, state: Floats) -> tuple[Carried, Floats]:
-    """The dwells linearised at ``state``, or on the way to it where the misfit is less there, and that state.
+def left_to_settle(state: Floats, before: Floats, sigma: Floats) -> float:
+    """By how many of their sigmas (p,) the states moved at most; those without a sigma are not determined."""
+    return float((np.abs(state - before) / np.where(sigma > 0, sigma, np.inf)).max())
 
-    The misfit of a state is the sum of squares of all readings and all setting errors over their sigmas.
+
+def descended(carried: Carried, noise: Noise, state: Floats, misfit: Callable[[Carried], float]) -> Carried:
+    """The dwells linearised at ``state``, or on the way to it where the misfit is less there.
+
+    misfit: of a linearisation at its own state, the sum of squares of all readings and all setting errors over their
+    sigmas.
     """
-    carried, begin = linearised(fitted, model, state), fitted.carried.state
-    searching = fitted.noise.attitude_unknown and model is fitted.carried.model
-    if not searching or fitted.noise.walk_mps2_per_sqrt_s:
-        return carried, state
-    highest = _misfit(fitted, fitted.carried) * (1.0 + _UPHILL)
-    nearest, share = carried, 1.0
-    for _ in range(_HALVES):
-        if _misfit(fitted, nearest) <= highest:
-            return nearest, nearest.state
+    model, begin, share = carried.model, carried.state, 1.0
+    highest = misfit(carried) * (1.0 + _UPHILL)
+    nearest = linearised(carried, noise, model, state)
+    for _ in range(_HALVES - 1):
+        if misfit(nearest) <= highest:
+            break
         share *= 0.5
-        nearest = linearised(fitted, model, begin + share * (state - begin))
-    return nearest, nearest.state
-
-
-def _misfit(fitted: Fit, carried: Carried) -> float:
-    """Return chi-squared of a linearisation at its own state, in the noise of the fit."""
-    rows = replace(fitted, carried=carried).all_rows()
-    return float(sum(np.sum((r[:, -1] - r[:, :-1] @ carried.state) ** 2) for r in rows))
+        nearest = linearised(carried, noise, model, begin + share * (state - begin))
+    return nearest

@@ -18,10 +18,11 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.correction import Corrected, Correction
 from kf_calib.estimation.cross_validation import HeldOut, held_out
-from kf_calib.estimation.dwell_columns import Carried, columns_of, means_of
+from kf_calib.estimation.dwell_columns import Carried, means_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import ATTITUDE_UNKNOWN_RAD, Noise, considered_information, steps
+from kf_calib.estimation.relinearisation import at_its_mode
 from kf_calib.estimation.residual_table import residual_table, table_as
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings
@@ -386,8 +387,11 @@ class Calibration:
     def during(self, dwell: DwellFactor) -> Estimate:
         """The estimate as if ``dwell``, which follows the run and is not yet complete, ended now."""
         fitted, (factor, extra) = self.fit, self.reached
-        both, state = [fitted.dwells[-1], dwell], self.carried.state
-        own = columns_of(both, self.model, state)[1:]
+        state, last = self.carried.state, fitted.dwells[-1]
+        dwell = at_its_mode(dwell, last, self.model, state, self.noise.weights)
+        both = [last, dwell]
+        linearised = Carried(both, self.model, state)
+        dwell, own = linearised.turned[-1], linearised.columns[1:]
         rows = square_root_information.whiten(
             [dwell], own, self.noise.weights, state, flicker_mps2=self.noise.flicker_mps2
         )[0]

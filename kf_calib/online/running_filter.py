@@ -31,6 +31,7 @@ from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import Noise, steps
 from kf_calib.estimation.prior import Prior
+from kf_calib.estimation.relinearisation import at_its_mode, carried_at
 from kf_calib.estimation.score_test import Scan, project
 
 
@@ -73,7 +74,8 @@ class Running:
         at = np.concatenate([state[:STATE_COUNT], np.zeros(every.count - STATE_COUNT)])
         inside = tuple(str(effect) for effect in model.effects)
         empty = np.zeros((every.count, every.count + 1))
-        return cls(Carried(dwells, every, at), inside, noise, prior or Prior(), empty)._rebuild()
+        carried = carried_at(dwells, every, at, noise.weights)
+        return cls(carried, inside, noise, prior or Prior(), empty)._rebuild()
 
     @property
     def dwells(self) -> list[DwellFactor]:
@@ -97,6 +99,7 @@ class Running:
         It is one update, unless the dwell changes what is known of the conditions in earlier dwells; then the factor is
         built again. exact: False leaves earlier dwells as they were known when they closed.
         """
+        dwell = at_its_mode(dwell, self.dwells[-1], self.carried.model, self.about, self.noise.weights)
         if exact:
             carried = Carried([*self.dwells, dwell], self.carried.model, self.about)
             if not all(map(np.array_equal, self.carried.columns, carried.columns[:-1])):
