@@ -110,10 +110,10 @@ def _refuse_part(content: bytes) -> None:
         raise InputError("has rows that are out of order, which would be lost: save it again.")
 
 
-def _hidden_rows(file: Any, sheet: ReadOnlyWorksheet) -> set[int]:
+def _hidden_rows(file: Any, sheet: Any) -> set[int]:
     """Return the numbers of the rows that are hidden, which openpyxl does not tell where it reads row by row."""
     with zipfile.ZipFile(file) as archive:
-        content = archive.read(sheet._worksheet_path.lstrip("/"))  # pyright: ignore[reportPrivateUsage]
+        content = archive.read(sheet._worksheet_path.lstrip("/"))
     return set(map(int, _HIDDEN_ROW.findall(content)))
 
 
