@@ -224,7 +224,7 @@ def test_a_file_is_told_by_what_is_in_it(name: str, content: bytes, kind: Kind, 
 def test_a_log_is_read_again_for_every_pass_and_engines_agree(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_text("time_s,ax_mps2,ay_mps2,az_mps2\n" + rows(lambda t, f, _: (t, *f)))
-    compared = kf_calib.compare(Lines(path, {"gravity_mps2": "9.81"}, angles=False))
+    compared = kf_calib.compare(kf_calib.open_log(path, {"gravity_mps2": "9.81"}, angles=False))
     assert compared.max_difference_sigma < 1e-5
 
 
