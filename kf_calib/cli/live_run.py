@@ -112,9 +112,10 @@ class LiveRun:
     def nothing_came(self) -> str:
         """That no reading came, and what came instead, if that is why nothing can be said; else empty."""
         status = self.source.status
-        came = status.samples or (self.session is None and status.bytes)  # what came may say more before the run began
-        if came or not isinstance(self.error, KfCalibError):
+        if status.samples or not isinstance(self.error, KfCalibError):
             return ""
+        if self.session is None and (status.bytes or self.error is not self.source.failure):
+            return ""  # what came, or what was asked for, is why it could not begin
         kinds = {"angle": status.poses, "temperature": status.temperatures, "refused line": status.refused}
         counts = [f"{count} {what}{'s' * (count > 1)}" for what, count in kinds.items() if count]
         instead = f", but {' and '.join(counts)}" if counts else ""

@@ -130,7 +130,7 @@ def _lines(sheet: ReadOnlyWorksheet) -> list[Line]:
     lines, visited, filled = list[Line](), 0, 0
     for number, row in enumerate(sheet.iter_rows(values_only=True), 1):
         visited += 1 + len(row)
-        last = max((k for k, cell in enumerate(row, 1) if cell is not None), default=0)
+        last = max((k for k, cell in enumerate(row, 1) if cell is not None), default=0) if row else 0
         filled += last
         if number > _MOST_ROWS or visited > _MOST_VISITED or filled > _MOST_FILLED:
             raise InputError(f"sheet {sheet.title!r} has more cells than any table of orientations: leave out what is "
