@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from kf_calib.online.running_filter import Running
     from kf_calib.online.sequential_test import Watch
     from kf_calib.online.session import Session
+    from kf_calib.sources.files.lines import Lines as open_log
     from kf_calib.sources.files.recorder import Recorder
     from kf_calib.sources.files.recording import Recording as open_recording
     from kf_calib.sources.tables.opening import open_table
@@ -78,6 +79,7 @@ _HOMES = {
     "Running": ("online.running_filter", "Running"),
     "Session": ("online.session", "Session"),
     "Recorder": ("sources.files.recorder", "Recorder"),
+    "open_log": ("sources.files.lines", "Lines"),
     "open_recording": ("sources.files.recording", "Recording"),
     "open_table": ("sources.tables.opening", "open_table"),
     "save_view": ("views.rerun", "save"),
@@ -92,7 +94,7 @@ __all__ = [
     "Bench", "Calibration", "Corrected", "Correction", "Diagnosis", "Fleet", "Improvement", "InputError",
     "KfCalibError", "Parameter", "Recorder", "Refits", "Running", "SavedCalibration", "Session", "Settings",
     "UnobservableError", "Watch", "calibrate", "compare", "diagnose", "improve", "open_calibration", "open_fleet",
-    "open_recording", "open_table", "plot", "save_calibration", "save_view", "shown_in",
+    "open_log", "open_recording", "open_table", "plot", "save_calibration", "save_view", "shown_in",
 ]  # fmt: skip
 
 

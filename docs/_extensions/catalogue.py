@@ -40,10 +40,12 @@ def _name(effect: dict[str, Any]) -> str:
 
 
 def _overview(every: list[list[dict[str, Any]]]) -> Iterator[str]:
-    yield from ("## All effects", "", "| effect | what it is | borne by | confused with, shown by |", "|---|---|---|---|")
+    heads = "| effect | what it is | borne by | confused with, shown by |"
+    yield from ("## All effects", "", heads, "|---|---|---|---|")
     for own in every:
         first = own[0]
-        yield f"| [`{_name(first)}`](#{_name(first)}) | {first['title']} | {first['borne_by']} | {_plain(first['confused_with'])} |"
+        link, confused = f"[`{_name(first)}`](#{_name(first)})", _plain(first["confused_with"])
+        yield f"| {link} | {first['title']} | {first['borne_by']} | {confused} |"
 
 
 def _details(every: list[list[dict[str, Any]]]) -> Iterator[str]:

@@ -40,7 +40,7 @@ from kf_calib.cli.options import (
     units_option,
 )
 from kf_calib.cli.signals import answered
-from kf_calib.errors import KfCalibError
+from kf_calib.errors import InputError, KfCalibError
 from kf_calib.support.plain_text import sentence
 
 if TYPE_CHECKING:
@@ -296,6 +296,8 @@ def _on_screen(run: LiveRun, name: str, record: Path | None) -> None:
 def _outcome(run: LiveRun, as_json: bool) -> Judgement | HandJudgement | None:
     """The last judgement, after its summary; None where a run that was ended had nothing to evaluate yet."""
     if run.error is not None:
+        if said := run.nothing_came:
+            raise InputError(said)
         if not (run.stopped and isinstance(run.error, KfCalibError)):
             raise run.error
         if as_json:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kf_calib.cli.echo import Printer, complain
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, KfCalibError
 
 if TYPE_CHECKING:
     from kf_calib.bench.streams import Source
@@ -108,15 +108,30 @@ class LiveRun:
         except InputError as error:
             self.session.say(str(error))
 
+    @property
+    def nothing_came(self) -> str:
+        """That no reading came, and what came instead, if that is why nothing can be said; else empty."""
+        status = self.source.status
+        if status.samples or not isinstance(self.error, KfCalibError):
+            return ""
+        if self.session is None and (status.bytes or self.error is not self.source.failure):
+            return ""  # what came, or what was asked for, is why it could not begin
+        kinds = {"angle": status.poses, "temperature": status.temperatures, "refused line": status.refused}
+        counts = [f"{count} {what}{'s' * (count > 1)}" for what, count in kinds.items() if count]
+        instead = f", but {' and '.join(counts)}" if counts else ""
+        refusal = f" (the first: {status.first_refusal})" if status.first_refusal else ""
+        recorded = "nothing was recorded: " if self._record else ""
+        return (f"{recorded}no reading came from {self.source.name}{instead}{refusal}: check that the bench is on and "
+                "sends readings.")  # fmt: skip
+
     def recording(self) -> Source | None:
         """What was recorded of the run; None where nothing was, or not all."""
         from kf_calib.sources.files.recording import Recording
 
-        return (
-            Recording(self._record, angles=self.source.bench.angles)
-            if self._record and not self.source.status.recording_trouble
-            else None
-        )
+        status = self.source.status
+        if self._record is None or status.recording_trouble or not status.samples:
+            return None
+        return Recording(self._record, angles=self.source.bench.angles)
 
     def _work(self, every: bool) -> None:
         try:

@@ -22,6 +22,8 @@ from kf_calib.support.tail_probabilities import sidak
 
 _CELL_S = 0.125  # largest length of a cell, unless readings are less frequent
 _LONGEST = 1 << 15  # cells of a dwell that are kept at most: more than an hour
+MOST_CELLS = 1 << 17
+"""Cells of a run that are kept: four and a half hours, which take 4 MB."""
 _LONGEST_RUN = 1 << 20  # cells of a run that are transformed at most: a day and a half
 _FEWEST_CYCLES = 1.5  # per dwell; of a slower oscillation a parabola takes more than half
 _HIGHEST = 0.75  # highest frequency, as a share of half the rate of cells

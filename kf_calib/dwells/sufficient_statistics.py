@@ -24,9 +24,11 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import turn
-from kf_calib.dwells.coherent_tone import Cells, Trace, tone
+from kf_calib.dwells.attitude_error import AttitudeError
+from kf_calib.dwells.coherent_tone import MOST_CELLS, Cells, Trace, tone
 from kf_calib.dwells.line_spectrum import Line, Spectrum, lines
 from kf_calib.dwells.orthonormal_parabola import orthonormal_parabola
+from kf_calib.dwells.pieces import MOST_PIECES, Piece, coarsened
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.rows import Nodes, Rows, basis, parabola
 from kf_calib.dwells.walk_path import WalkPath, walk_path_of
@@ -69,49 +71,10 @@ class Autocovariance:
         return cls(products, np.maximum(count - np.arange(_LAGS + 1), 0).astype(float), count, 1)
 
 
-@dataclass(frozen=True)
-class Piece:
-    """One piece of a dwell.
-
-    - triangle (K + 3, K + 3): the triangular factor of [1 u u^2 ... | z1 z2 z3].
-    - nodes: the conditions at its three nodes.
-    - count: number of readings, or of averages of them, that were folded.
-    - carrier_hz: frequency of the carrier; 0 for none.
-    - taken: number of readings that ``count`` stands for.
-    """
-
-    triangle: Floats
-    nodes: Nodes
-    count: int
-    carrier_hz: float = 0.0
-    taken: int = 0
-
-
 _OF_CONDITIONS = ("nodes", "squares", "counts", "variances", "walk", "shaking", "count", "pose")
 """Cached properties of a dwell that stay if the means of its readings change."""
 _OF_READINGS = (*_OF_CONDITIONS, "triangles", "factor", "means")
 """Cached properties of a dwell that stay if its force is turned."""
-
-
-@dataclass(frozen=True)
-class AttitudeError:
-    """What the readings show of a dwell's setting error, the rotation alpha by which it stands off its pose.
-
-    - rotation_rad (3,): the rotation vector across the force at which the dwell is linearised.
-    - variance_rad2: sum of the variances of its two components across the force, which shorten the mean of the force:
-      E[R(alpha) f] = (1 - variance / 2) R(mode) f.
-    - bending (3, 3): by how much the effects of the model change the mean readings per unit of the force, m/s^2 per
-      m/s^2; it adds to the sensitivities by which a small rotation shows.
-    """
-
-    rotation_rad: Floats
-    variance_rad2: float = 0.0
-    bending: Floats | None = None
-
-    @property
-    def length(self) -> float:
-        """Length of the mean force over that of the force."""
-        return 1.0 - 0.5 * self.variance_rad2
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -427,7 +390,11 @@ class _Growing:
         """Add a block of the last dwell or of a new one."""
         if self._last(block.number) is None:
             self.folded.append(block)
-        elif block.autocovariance.count:  # merged now, since ``autocovariance_count`` reads the count from the dwell
+            return
+        if self._count + len(block.pieces) > MOST_PIECES and not block.moving:
+            last = self.folded[-1]
+            self._folded[-1] = replace(last, pieces=coarsened(last.pieces))
+        if block.autocovariance.count:  # merged now, since ``autocovariance_count`` reads the count from the dwell
             self._folded[-1] = self._folded[-1].merge([block])
         else:
             self._blocks.append(block)
@@ -446,6 +413,11 @@ class _Growing:
             self._blocks = []
         return self._folded
 
+    @property
+    def _count(self) -> int:
+        """Number of pieces of the last dwell."""
+        return len(self._folded[-1].pieces) + sum(len(block.pieces) for block in self._blocks)
+
     def _last(self, number: int) -> DwellFactor | None:
         """Return the last dwell if it has this number, else None."""
         return self._folded[-1] if self._folded and self._folded[-1].number == number else None
@@ -458,6 +430,7 @@ class Folder:
         self._dwells, self._slews = _Growing(), _Growing()
         self.carrier_hz = carrier_hz
         self._cells: Cells | None = None
+        self._traced = 0
 
     @property
     def dwells(self) -> list[DwellFactor]:
@@ -490,6 +463,7 @@ class Folder:
             own, spectrum = Autocovariance.of(left), Spectrum.of(left, rows.elapsed_s)
             block = replace(block, autocovariance=own, spectrum=spectrum)
         self._cells = self._cells or Cells.of(rows.elapsed_s)
-        if self._cells and not rows.moving and not block.averaged:
+        if self._cells and not rows.moving and not block.averaged and self._traced < MOST_CELLS:
             block = replace(block, trace=Trace.of(readings, rows.elapsed_s, self._cells))
+            self._traced += len(block.trace)
         growing.add(block)

@@ -14,8 +14,10 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.dwells.coherent_tone import Trace
+from kf_calib.dwells.line_spectrum import Spectrum
 from kf_calib.dwells.rows import REGRESSORS, Nodes, Rows
-from kf_calib.dwells.sufficient_statistics import DwellFactor, Piece
+from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor, Piece
 
 LEAST_COUNT = 8
 """A standard deviation of fewer readings counts as if there were more readings of more noise: the same sigma of the
@@ -48,8 +50,9 @@ class Known(Protocol):
 def dwells_of(table: Sequence[Known], bench: Bench) -> list[DwellFactor]:
     """The sufficient statistics of each row of a table."""
     times = _times(table)
+    nothing = Autocovariance(), Spectrum(), Trace()  # known of any of them; the same for all, since each takes 2 kB
     return [
-        DwellFactor(k + 1, (_piece(own, nodes, bench, times),))
+        DwellFactor(k + 1, (_piece(own, nodes, bench, times),), *nothing)
         for k, (own, nodes) in enumerate(zip(table, _nodes(table, bench), strict=True))
     ]
 

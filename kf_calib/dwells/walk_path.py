@@ -80,6 +80,10 @@ def _root(begins_s: Floats, ends_s: Floats, counts: Sequence[int]) -> tuple[Floa
     return out, level
 
 
+_MANY = 1 << 14
+"""Readings of a piece above which the moments of a walk are those of a continuous one, to 1e-4 of them."""
+
+
 @lru_cache(maxsize=4096)
 def _moments(count: int) -> tuple[Floats, float]:
     """Return moments of a walk with unit steps over ``count`` readings that begins at zero.
@@ -87,6 +91,9 @@ def _moments(count: int) -> tuple[Floats, float]:
     They are the covariance (4, 4) of the coefficients of its parabola on 1, u, u^2 and of its last value, and the mean
     sum of squares about the parabola.
     """
+    if count > _MANY:  # of so many readings, it grows with their number, and the mean square with that of its square
+        covariance, squares = _moments(_MANY)
+        return covariance * (count / _MANY), squares * (count / _MANY) ** 2
     u = np.linspace(-1.0, 1.0, count)
     design = np.column_stack([np.ones(count), u, u * u]) if count > 1 else np.array([[1.0, 0.0, 0.0]])
     last = np.zeros((count, 1))

@@ -15,7 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.sufficient_statistics import AttitudeError, DwellFactor
+from kf_calib.dwells.attitude_error import AttitudeError
+from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect, FrameEffect, Stimulus
 from kf_calib.estimation.dwell_columns import Carried, Means, stimulus_of
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import add
 
 import numpy as np
 
@@ -20,19 +23,35 @@ from kf_calib.estimation.prior import Prior
 SAME_POSE_DEG = 1.0
 """Dwells whose directions of gravity and poses differ by less than this are visits of one orientation."""
 
+_ROUNDING = 1.0 + 1e-9  # by which cells are larger, so that nearer ones are never two apart
+
 
 def orientations(dwells: Sequence[DwellFactor]) -> list[list[int]]:
     """Indices of the dwells grouped by orientation, that is by direction of gravity in the platform and by pose."""
     means = np.array([dwell.means for dwell in dwells])
     direction = means[:, 1:4] / np.linalg.norm(means[:, 1:4], axis=1, keepdims=True)
-    place = np.column_stack([direction, [dwell.pose for dwell in dwells]])
-    groups, heads = list[list[int]](), np.empty_like(place)
-    for k, here in enumerate(place):
-        near = np.abs(heads[: len(groups)] - here).max(axis=1, initial=0.0) < np.radians(SAME_POSE_DEG)
+    return grouped(np.column_stack([direction, [dwell.pose for dwell in dwells]]), math.radians(SAME_POSE_DEG))
+
+
+def grouped(places: Floats, apart: float) -> list[list[int]]:
+    """Indices of places (D, k) in groups: each joins the first group whose first place is nearer than ``apart`` in
+    every coordinate.
+
+    Groups are looked up by the cell of their first place in the three coordinates that differ most.
+    """
+    widest = np.argsort(-np.ptp(places, axis=0))[:3]
+    cells: list[list[int]] = np.floor(places[:, widest] / (apart * _ROUNDING)).astype(int).tolist()
+    around = list(itertools.product((-1, 0, 1), repeat=len(widest)))
+    groups, at = list[list[int]](), dict[tuple[int, ...], list[int]]()
+    for k, cell in enumerate(cells):
+        nearby = (at.get(tuple(map(add, cell, step)), ()) for step in around)
+        candidates = sorted(itertools.chain.from_iterable(nearby))
+        heads = places[[groups[number][0] for number in candidates]]
+        near = np.abs(heads - places[k]).max(axis=1, initial=0.0) < apart
         if near.any():
-            groups[int(near.argmax())].append(k)
+            groups[candidates[int(near.argmax())]].append(k)
         else:
-            heads[len(groups)] = here
+            at.setdefault(tuple(cell), []).append(len(groups))
             groups.append([k])
     return groups
 

@@ -321,8 +321,10 @@ def _checked(path: Path, content: dict[str, Any]) -> SavedCalibration:
 
 def _said(error: ValidationError) -> str:
     """The first thing that does not fit, and where."""
-    first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+    first = error.errors(include_url=False, include_input=False)[0]
     place, said = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
+    if first["type"] == "string_pattern_mismatch" and "sha256" not in first["loc"]:
+        said = "it must be text on one line, without control characters"
     return f"{cut(place, 100)}: {said}" if place else said
 
 

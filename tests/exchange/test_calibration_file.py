@@ -216,7 +216,10 @@ BROKEN: dict[str, tuple[str | Callable[[dict[str, Any]], None], str]] = {
     "a gimbal too many": (put("conditions", "dwells", 0, "gimbal_deg", value=[0.0] * 4), "has 4 gimbal angles"),
     "a dwell that ends first": (put("conditions", "dwells", 1, "end_s", value=-9.0), "number 2 ends before it begins"),
     "a mean that is none": (mean_temperature_of(99.0), "a mean temperature that is not between"),
-    "a line end in a text": (put("provenance", "created", value="2026-01-01\n#include"), "provenance.created"),
+    "a line end in a text": (
+        put("provenance", "created", value="2026-01-01\n#include"),
+        "provenance.created: it must be text on one line, without control characters",
+    ),
     "a tab in a text": (put("provenance", "versions", "kf_calib", value="1\t1"), "provenance.versions.kf_calib"),
     "axes in a plane": (dependent_axes, "three input axes that lie in one plane"),
     "not symmetric": (put("state", "covariance", 0, 1, value=1.0), "is no symmetric matrix"),

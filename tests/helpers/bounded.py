@@ -16,18 +16,19 @@ class TooLongError(BaseException):
 
 @contextmanager
 def bounded(seconds: float = 20.0, megabytes: float = 600.0) -> Iterator[None]:
-    """What runs inside takes no longer, and at its peak no more memory than there was before and ``megabytes``."""
+    """What runs inside takes no more ``seconds`` of the processor, and at its peak no more memory than there was before
+    and ``megabytes``."""
     Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
     before, taken = _status("VmRSS"), _status("VmSize")
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (int((taken + 2.0 * megabytes) * 2**20), hard))
-    handler = signal.signal(signal.SIGALRM, _too_long)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    handler = signal.signal(signal.SIGPROF, _too_long)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, handler)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, handler)
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
     grown = _status("VmHWM") - before
     assert grown < megabytes, f"it took {grown:.0f} MB"

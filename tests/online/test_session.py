@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -31,6 +32,7 @@ from kf_calib.bench.streams import Batch
 from kf_calib.cli import cli
 from kf_calib.cli.echo import Printer
 from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.dwells.pieces import MOST_PIECES
 from kf_calib.dwells.sufficient_statistics import Folder
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
@@ -243,7 +245,6 @@ def test_a_failing_evaluation_still_reads_the_source_to_its_end() -> None:
 
 def test_memory_is_that_of_the_dwells() -> None:
     """Ten times the samples in the same dwells: no more is kept of them."""
-    import tracemalloc
 
     def kept(count: int) -> int:
         session = Session(Run(dwells=3, count=count, rate_hz=1000.0, batch=500))
@@ -256,6 +257,36 @@ def test_memory_is_that_of_the_dwells() -> None:
 
     kept(5_000)
     assert kept(50_000) < kept(5_000) + 1_000_000
+
+
+def test_memory_of_a_bench_that_stands_for_thirty_hours_is_flat() -> None:
+    """What is kept of a dwell does not grow with its length: pieces are merged, and its trace ends."""
+    session = Session(Run(dwells=1, count=1_080_000, rate_hz=10.0, batch=1800))
+    kept = list[int]()
+    tracemalloc.start()
+    for number, batch in enumerate(session.source):
+        session._take(batch)
+        if number in (200, 599):  # after 10 h and 30 h
+            dwells = session._passed.folder.dwells
+            kept.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    assert len(dwells) == 1 and len(dwells[0].pieces) <= MOST_PIECES and dwells[0].count > 1_000_000
+    assert kept[1] < kept[0] + 300_000
+
+
+def test_pieces_that_are_merged_do_not_depend_on_how_readings_come() -> None:
+    """However often a run is looked at, and in whatever batches it comes."""
+    folded = list[list[Any]]()
+    for batch, looks in ((1800, 1), (777, 10_000)):
+        session = Session(Run(dwells=1, count=300_000, rate_hz=10.0, batch=batch))
+        for number, each in enumerate(session.source):
+            session._take(each)
+            if number % looks == 0:
+                assert session._passed.folder.dwells is not None
+        session._finish()
+        (dwell,) = session._passed.folder.dwells
+        folded.append([(piece.count, *piece.triangle.ravel(), *piece.nodes.elapsed_s) for piece in dwell.pieces])
+    assert len(folded[0]) <= MOST_PIECES and folded[0] == folded[1]
 
 
 def test_screen_lines_and_objects_of_a_standing() -> None:

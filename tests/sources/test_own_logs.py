@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import random
 import shlex
 import tracemalloc
 from collections.abc import Callable, Sequence
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.long_runs import slow
 from helpers.paths import ROOT
 from helpers.recordings import read
 
@@ -21,6 +23,7 @@ from kf_calib.errors import InputError
 from kf_calib.sources.files.lines import Lines
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.opening import Kind, kind_of, opened
+from kf_calib.sources.tables.survey import survey
 
 FACES = ROOT / "recordings" / "mems_faces.mcap"
 REAL = Path("/work/shared/real")
@@ -224,7 +227,7 @@ def test_a_file_is_told_by_what_is_in_it(name: str, content: bytes, kind: Kind, 
 def test_a_log_is_read_again_for_every_pass_and_engines_agree(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_text("time_s,ax_mps2,ay_mps2,az_mps2\n" + rows(lambda t, f, _: (t, *f)))
-    compared = kf_calib.compare(Lines(path, {"gravity_mps2": "9.81"}, angles=False))
+    compared = kf_calib.compare(kf_calib.open_log(path, {"gravity_mps2": "9.81"}, angles=False))
     assert compared.max_difference_sigma < 1e-5
 
 
@@ -244,7 +247,7 @@ def test_a_packed_file_is_unpacked_piece_by_piece(tmp_path: Path) -> None:
     bomb = tmp_path / "log.csv.gz"
     with gzip.open(bomb, "wb", 1) as file:
         for _ in range(64):
-            file.write(b"\n" * (1 << 20))
+            file.write(b" " * (1 << 20))
     tracemalloc.start()
     with pytest.raises(InputError, match="holds no lines"):
         list(Lines(bomb, {"gravity_mps2": "9.81"}, angles=False))
@@ -328,3 +331,60 @@ def test_real_logs_are_evaluated_as_they_are(name: str, poses: int, run: Any) ->
     assert all(0.8 * G < dwell["norm_mps2"] < 1.2 * G for dwell in found["dwells"])
     values = parameters(run, *command)
     assert all(0.9 < values[f"K{k}"]["value"] < 1.1 for k in (1, 2, 3))
+
+
+# -- damage --
+
+SCRAPS = (
+    b'"',
+    b";",
+    b",",
+    b"\n",
+    b"\0",
+    b"\xff",
+    b"e999",
+    b"e-999",
+    b"nan",
+    b"-",
+    b"[g]",
+    b"\r",
+    b"\t",
+    b"#",
+    b"9999-01-01",
+)
+
+
+def damaged(content: bytes, rng: random.Random) -> bytes:
+    """A file with bytes changed, lost, repeated, or put in."""
+    out = bytearray(content)
+    for _ in range(rng.choice((1, 2, 5, 30))):
+        at, what = rng.randrange(len(out)), rng.random()
+        if what < 0.4:
+            out[at] = rng.randrange(256)
+        elif what < 0.6:
+            del out[at : at + rng.randrange(1, 50)]
+        else:
+            out[at:at] = rng.choice(SCRAPS) if what < 0.8 else out[max(0, at - 80) : at]
+    return bytes(out) or b"x"
+
+
+@pytest.mark.parametrize("seed", [1, *slow(*range(2, 20))])
+def test_a_damaged_log_or_table_raises_nothing_but_input_errors(seed: int, tmp_path: Path) -> None:
+    rng, path = random.Random(seed), tmp_path / "damaged.csv"
+    plain = [content[:6000] for content, _ in (WITH_ANGLES | BY_READINGS).values() if not content.startswith(b"\x1f")]
+    plain += [gzip.compress(plain[0]), (ROOT / "recordings" / "twelve_poses.csv").read_bytes()]
+    kinds = set[Kind]()
+    for _ in range(100):
+        path.write_bytes(damaged(rng.choice(plain), rng))
+        kind = kind_of(path)
+        kinds.add(kind)
+        for angles in (True, False):
+            bench = {"axes": "y z x", "gravity_mps2": "9.81"}
+            try:
+                if kind is Kind.SAMPLES:
+                    list(Lines(path, bench, angles=angles))
+                elif kind is Kind.TABLE:
+                    survey(path, bench, angles=angles)
+            except InputError as error:
+                assert "\n" not in str(error) and len(str(error)) < 1200
+    assert {Kind.SAMPLES, Kind.TABLE} <= kinds

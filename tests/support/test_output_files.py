@@ -401,8 +401,21 @@ def test_a_live_run_without_a_reading_leaves_the_earlier_recording(run, here: Pa
     Path("poses.csv").write_text("time_s,ax_g,ay_g,az_g,outer_deg,middle_deg,inner_deg\n" + "1,,,,0,0,0\n" * 20)
     Path("out.mcap").write_bytes(MINE)
     words = ["--axes", "y z x", "--gravity", "9.81", "--idle-s", "0.5", "--record", "out.mcap", "--overwrite"]
-    assert run("live", "poses.csv", *words)[0] == 2
+    code, printed, err = run("live", "poses.csv", *words)
+    assert (code, printed) == (2, "") and "nothing was recorded: no reading came from poses.csv, but 20 angles" in err
     assert Path("out.mcap").read_bytes() == MINE and not list(here.glob(".*"))
+
+
+@pytest.mark.parametrize("as_json", [[], ["--json"]])
+@pytest.mark.parametrize(("text", "instead"), [
+    (b"", ""), (b"time_s,ax_g,ay_g,az_g,outer_deg\n1,,,,0\n", ", but 1 angle"),
+])  # fmt: skip
+def test_a_live_run_to_which_nothing_came_says_so(here: Path, as_json: list[str], text: bytes, instead: str) -> None:
+    words = ["live", "-", "--axes", "y", "--gravity", "9.81", "--record", "out.mcap", *as_json]
+    done = subprocess.run([sys.executable, "-m", "kf_calib", *words], input=text, capture_output=True)
+    said = f"kf-calib: nothing was recorded: no reading came from standard input{instead}: check that the bench is on"
+    assert done.returncode == 2 and said in done.stderr.decode() and done.stderr.count(b"\n") == 1
+    assert not done.stdout and not Path("out.mcap").exists()
 
 
 def test_an_earlier_recording_stays_until_readings_of_the_new_one_are_on_the_disk(tmp_path: Path) -> None:

@@ -79,6 +79,14 @@ def _number(cell: str, numbers: Numbers) -> float:
             return math.nan
 
 
+def _told(cell: str, numbers: Numbers) -> float:
+    """Return what a cell of the first rows tells, NaN where its line will be refused."""
+    try:
+        return _number(cell, numbers)
+    except LineError:
+        return math.nan
+
+
 @dataclass(frozen=True)
 class Stamps:
     """How a row's time is written: a number of a unit, or the stamp of a calendar, in one column or in two.
@@ -109,7 +117,7 @@ class Stamps:
 def _date_ns(cell: str, month_first: bool) -> int:
     stamp = stamp_of(cell, month_first)
     since = (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
+    return stamp_ns((since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000, 0)
 
 
 @dataclass
@@ -185,7 +193,7 @@ class CsvColumns:
         if len(places) != 3 or len(self.rows) < _MANY:
             return False
         numbers = self.numbers or DECIMAL_POINT
-        values = np.array([[_number(row[at], numbers) for at in places] for row in self.rows])
+        values = np.array([[_told(row[at], numbers) for at in places] for row in self.rows])
         with np.errstate(invalid="ignore", divide="ignore"):
             unit = values / np.linalg.norm(values, axis=1, keepdims=True)
             return bool((np.linalg.norm(np.diff(unit, axis=0), axis=1) < _ALIKE_RAD).mean() > _MOST)
@@ -201,7 +209,7 @@ class CsvColumns:
         place = (exact or united or places)[0]
         unit = self._meanings[place].unit or {"millis": "ms", "micros": "us"}.get(self.names[place].strip().lower(), "")
         cells = [row[place] for row in self.rows if row[place]]
-        values = [_number(cell, self.numbers or DECIMAL_POINT) for cell in cells]
+        values = [_told(cell, self.numbers or DECIMAL_POINT) for cell in cells]
         if not unit and cells and math.isnan(values[0]):
             return self._dates(places[:2] if place == places[0] else [place])
         unit = unit or self._unit_of_time(place, values)
@@ -317,7 +325,7 @@ class CsvColumns:
     def _usual_norm(self, places: Sequence[int]) -> float:
         """Return the median size of the readings in the first rows, NaN where there are none."""
         numbers = self.numbers or DECIMAL_POINT
-        values = np.array([[_number(row[at], numbers) for at in places] for row in self.rows])
+        values = np.array([[_told(row[at], numbers) for at in places] for row in self.rows])
         norms = np.linalg.norm(values, axis=1) if len(values) else np.empty(0)
         norms = norms[np.isfinite(norms)]
         return float(np.median(norms)) if len(norms) else math.nan
@@ -339,7 +347,7 @@ class CsvColumns:
     def _unit_of_angles(self, places: Sequence[int]) -> str:
         """Return the unit of angles whose names tell none, empty where their size does not tell it either."""
         numbers = self.numbers or DECIMAL_POINT
-        values = [_number(row[at], numbers) for row in self.rows for at in places if row[at]]
+        values = [_told(row[at], numbers) for row in self.rows for at in places if row[at]]
         if any(abs(value) > 2.0 * math.pi for value in values):
             return "deg"
         return ""

@@ -37,7 +37,9 @@ class Heading(NamedTuple):
         if rows and _are_units(rows[0]):
             units, at = [*rows.pop(0), *[""] * len(header)], at + 1
             header = [f"{name} [{unit}]" if unit else name for name, unit in zip(header, units, strict=False)]
-        return cls(header, delimiter, at + 1, rows)
+        while header and not header[-1]:  # a delimiter at the end of the line
+            header.pop()
+        return cls(header, delimiter, at + 1, [without_empty_end(row, len(header)) for row in rows])
 
 
 def _is_header(line: str, delimiter: str) -> bool:
@@ -50,6 +52,11 @@ def _is_header(line: str, delimiter: str) -> bool:
 def _are_units(cells: Sequence[str]) -> bool:
     has_letters = any(character.isalpha() for cell in cells for character in cell)
     return has_letters and all(not cell or is_unit(cell) for cell in cells)
+
+
+def without_empty_end(row: list[str], count: int) -> list[str]:
+    """A row without empty cells beyond so many, as of a delimiter at the end of the line."""
+    return row[:count] if len(row) > count and not any(cell.strip() for cell in row[count:]) else row
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:

@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 
 from kf_calib.sources.files.csv_columns import CsvColumns
-from kf_calib.sources.files.csv_heading import cells_of
+from kf_calib.sources.files.csv_heading import cells_of, without_empty_end
 from kf_calib.sources.files.line_parts import Account, LineError, LineReader, LineRows
 from kf_calib.sources.tables.numbers import DECIMAL_POINT
 
@@ -66,7 +66,7 @@ class CsvLines(LineReader):
         return line.split(self._delimiter) if is_plain else cells_of(line, self._delimiter)
 
     def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
-        row = self._cells(line)
+        row = without_empty_end(self._cells(line), len(self._header))
         if len(row) != len(self._header):
             raise LineError(f"it has {len(row)} cells, the header has {len(self._header)}")
         numbers = self._numbers or DECIMAL_POINT

@@ -23,6 +23,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.sources.files import cdr
+from kf_calib.sources.files.chunk_indexes import keep_packed
 from kf_calib.sources.files.contents import (
     ACCEL_TOPIC,
     ANGLES_TOPIC,
@@ -82,6 +83,7 @@ class Recorder:
         self._disk = ThreadPoolExecutor(1, "disk") if background else None
         self._pending: Future[None] | None = None
         self._writer = Writer(self._file, chunk_size=chunk_size, enable_data_crcs=True)
+        keep_packed(self._writer)
         self._joints = bench.joints or gimbal_names(len(bench.axes))
         self._channels = (
             _Channel(ACCEL_TOPIC, cdr.IMU, cdr.imu_message("accelerometer")),

@@ -128,6 +128,11 @@ class LiveSource:
         return [*self._feed.warnings, *(f"{self.name}: {said}" for said in self.status.sentences())]
 
     @property
+    def failure(self) -> BaseException | None:
+        """What ended it, where it did not end by itself."""
+        return self._failure
+
+    @property
     def fraction(self) -> float:
         return self._feed.fraction
 

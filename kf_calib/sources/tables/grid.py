@@ -21,7 +21,7 @@ ZIP, MCAP = b"PK\x03\x04", b"\x89MCAP"
 TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
 EXCEL_SUFFIXES = (".xlsx", ".xlsm")
 OLD_SUFFIXES = (".xls", ".ods")
-_LARGEST = (5_000_000, 50_000_000)  # bytes, of text and of a spreadsheet, which may hold pictures
+_LARGEST = (50_000_000, 50_000_000)  # bytes, of text and of a spreadsheet, which may hold pictures
 _SHOWN = 6  # rows in a message
 _LONGEST_CELL = 300  # characters; a longer one is a remark, of which the middle is left out
 _MOST_COLUMNS, _MOST_CELLS = 1000, 2_000_000
@@ -67,8 +67,8 @@ def grid_of(table: Any) -> Grid:
         is_excel = start.startswith(ZIP)
         if path.stat().st_size > _LARGEST[is_excel]:
             raise InputError(
-                f"{path}: is larger than a table of orientations can be: if it holds samples, make a recording of "
-                f"them, kf-calib record run.mcap {path.with_suffix('.csv')} (docs/own_csv.md)."
+                f"{path}: is larger than a table of orientations can be: leave out what is not part of it; if it holds "
+                "samples, save them as CSV with a column of time (docs/own_csv.md)."
             )
         return _of_excel(path) if is_excel else _of_text(path)
     return _of_columns(table)

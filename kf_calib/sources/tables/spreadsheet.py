@@ -27,7 +27,9 @@ _MOST_ROWS = 1 << 20  # of a sheet of Excel
 _MOST_VISITED = 20_000_000  # cells of a sheet, empty ones too
 _MOST_FILLED = 2_000_000  # cells from the first to the last of each row
 _MOST_BYTES, _MOST_TAGS = 64_000_000, 2_000_000  # unpacked, of all parts but pictures; a tag takes some 120 bytes
-_PICTURES = "xl/media/"
+_MOST_TAGS_OF_SHEETS, _MOST_TAGS_OF_A_ROW = 10_000_000, 200_000  # rows are forgotten one by one as they are read
+_PICTURES, _SHEETS = "xl/media/", "xl/worksheets/"
+_BEGIN_OF_ROW = re.compile(rb"<(?:\w+:)?row\b")
 _ROW = re.compile(rb'<(?:\w+:)?row\b[^<>]*?\sr\s*=\s*["\'](\d{1,9})["\']')
 _HIDDEN_ROW = re.compile(
     rb'<(?:\w+:)?row\b(?=[^<>]*?\shidden\s*=\s*["\'](?:1|true)["\'])[^<>]*?\sr\s*=\s*["\'](\d{1,9})["\']'
@@ -69,7 +71,7 @@ def sheets_of(path: Path) -> list[Sheet]:
 
 def _refuse_unfit(file: Any) -> None:
     """Raise InputError for an archive that unpacks to too much, or whose XML is none of a spreadsheet."""
-    size, tags = 0, 0
+    size, tags, tags_of_sheets = 0, 0, 0
     with zipfile.ZipFile(file) as archive:
         for part in archive.infolist():
             size += part.file_size  # no more than this is ever unpacked
@@ -79,11 +81,23 @@ def _refuse_unfit(file: Any) -> None:
                 size -= part.file_size
                 continue
             content = archive.read(part)
-            tags += content.count(b"<")
-            if tags > _MOST_TAGS:
+            is_sheet, count = part.filename.startswith(_SHEETS), content.count(b"<")
+            tags += _most_tags_of_a_row(content) if is_sheet else count
+            tags_of_sheets += count if is_sheet else 0
+            if tags > _MOST_TAGS or tags_of_sheets > _MOST_TAGS_OF_SHEETS:
                 raise InputError("has more cells than any table of orientations: leave out what is not part of it.")
             _refuse_part(content)
     file.seek(0)
+
+
+def _most_tags_of_a_row(content: bytes) -> int:
+    """Return the largest number of tags from the beginning of a row, or of the sheet, to that of the next row.
+
+    It is as if there were too many in all if there are more than Excel has columns for.
+    """
+    begins = [0, *(found.start() for found in _BEGIN_OF_ROW.finditer(content)), len(content)]
+    most = max(content.count(b"<", begin, end) for begin, end in itertools.pairwise(begins))
+    return most if most <= _MOST_TAGS_OF_A_ROW else _MOST_TAGS + 1
 
 
 def _refuse_part(content: bytes) -> None:
@@ -96,10 +110,10 @@ def _refuse_part(content: bytes) -> None:
         raise InputError("has rows that are out of order, which would be lost: save it again.")
 
 
-def _hidden_rows(file: Any, sheet: ReadOnlyWorksheet) -> set[int]:
+def _hidden_rows(file: Any, sheet: Any) -> set[int]:
     """Return the numbers of the rows that are hidden, which openpyxl does not tell where it reads row by row."""
     with zipfile.ZipFile(file) as archive:
-        content = archive.read(sheet._worksheet_path.lstrip("/"))  # pyright: ignore[reportPrivateUsage]
+        content = archive.read(sheet._worksheet_path.lstrip("/"))
     return set(map(int, _HIDDEN_ROW.findall(content)))
 
 
@@ -116,7 +130,7 @@ def _lines(sheet: ReadOnlyWorksheet) -> list[Line]:
     lines, visited, filled = list[Line](), 0, 0
     for number, row in enumerate(sheet.iter_rows(values_only=True), 1):
         visited += 1 + len(row)
-        last = max((k for k, cell in enumerate(row, 1) if cell is not None), default=0)
+        last = max((k for k, cell in enumerate(row, 1) if cell is not None), default=0) if row else 0
         filled += last
         if number > _MOST_ROWS or visited > _MOST_VISITED or filled > _MOST_FILLED:
             raise InputError(f"sheet {sheet.title!r} has more cells than any table of orientations: leave out what is "

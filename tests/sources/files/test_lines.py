@@ -365,3 +365,24 @@ def test_a_bench_that_is_not_described_is_asked_for():
 def test_a_file_that_is_not_there_is_named(tmp_path):
     with pytest.raises(InputError, match=r"absent\.csv: cannot be read"):
         list(Lines(tmp_path / "absent.csv", BENCH))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "time_s,ax_g,ay_g,az_g\n1.5,0.25,1,-0.5,\n2.5,0.25,1,-0.5,\n",
+        "time_s,ax_g,ay_g,az_g,\n1.5,0.25,1,-0.5,\n2.5,0.25,1,-0.5\n",
+        "time_s;ax_g;ay_g;az_g;\n1,5;0,25;1;-0,5;;\n2,5;0,25;1;-0,5;\n",
+        '"time_s","ax_g","ay_g","az_g"\n"1,5","0,25","1","-0,5"\n"2,5","0,25","1","-0,5"\n',
+        "time_s|ax_g|ay_g|az_g\n1.5|0.25|1|-0.5\n2.5|0.25|1|-0.5\n",
+        "time_s\tax_g\tay_g\taz_g\n1,5\t0,25\t1\t-0,5\n2,5\t0,25\t1\t−0,5\n",
+        "sep=;\ntime_s;ax_g;ay_g;az_g\n1,5;0,25;1;-0,5\n2,5;0,25;1;-0,5\n",
+        "Time [s] , ax_g , ay_g , az_g\n 1.5 , 0.25 , 1 , -0.5\n 2.5 , 0.25 , 1 , -0.5\n",
+    ],
+)
+def test_the_same_rows_written_in_another_way_are_the_same(text: str) -> None:
+    source = lines_of(text, {"gravity_mps2": "9.81"}, angles=False)
+    batch = read(source)
+    assert batch.accel.time_ns.tolist() == [1_500_000_000, 2_500_000_000]
+    np.testing.assert_allclose(batch.accel.values / 9.80665, [[0.25, 1.0, -0.5]] * 2, rtol=1e-12)
+    assert not any("malformed" in said for said in source.warnings)

@@ -81,6 +81,26 @@ def test_profile_metadata_and_order_are_as_the_format_says(tmp_path: Path) -> No
     assert times == sorted(times)
 
 
+def test_a_run_of_many_chunks_is_indexed_as_the_writer_does_it_in_few_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same file to the byte; a run of thirty hours has 200 000 chunks."""
+    files, batch = dict[str, bytes](), made_batch(2_000)
+    for name in ("packed", "plain"):
+        if name == "plain":
+            monkeypatch.setattr(recorder_module, "keep_packed", lambda _: None)
+        with Recorder(tmp_path / name, BENCH) as recorder:
+            for k in range(2_000):
+                part = slice(k, k + 1)
+                recorder.write(Batch(batch.accel[part], batch.pose[part]))
+                recorder.flush()
+            indexes = vars(recorder._writer)["_Writer__chunk_indices"]
+            if name == "packed":
+                assert len(indexes._packed) < 100 * 2_000
+        files[name] = (tmp_path / name).read_bytes()
+    assert files["packed"] == files["plain"] and len(decoded(tmp_path / "packed")) == len(batch.accel) + len(batch.pose)
+
+
 @pytest.mark.parametrize(
     ("axes", "names"),
     [("z", ["axis0"]), ("y z", ["outer", "inner"]), ("x y z x", ["axis0", "axis1", "axis2", "axis3"])],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 from helpers.paths import ROOT
 
 import kf_calib
+from kf_calib.dwells.tabulated import dwells_of
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import filterpy_estimate
 from kf_calib.sources.tables.orientation import Orientation
@@ -299,3 +301,17 @@ def test_names_of_columns_are_understood(name: str, ours: str, unit: str) -> Non
 )  # fmt: skip
 def test_faces_are_read(text: str, face: tuple[int, int] | None) -> None:
     assert face_of(text) == face
+
+
+def test_rows_are_read_and_folded_in_a_time_that_grows_with_their_number(tmp_path: Path) -> None:
+    def lasting_s(count: int) -> float:
+        rows = (f"{60 * k},{k % 360},{7 * k % 360},0.0{k % 10}1,1.001,-0.5,0.5,900" for k in range(count))
+        header = "time [s],outer [deg],inner [deg],ax [g],ay [g],az [g],sd [mg],count"
+        (tmp_path / "long.csv").write_text("\n".join([header, *rows]))
+        begin = time.process_time()
+        table = kf_calib.open_table(tmp_path / "long.csv", {"axes": "z x", "gravity_mps2": "9.81"})
+        assert len(dwells_of(table.orientations, table.bench)) == count
+        return time.process_time() - begin
+
+    lasting_s(500)
+    assert lasting_s(8000) < 8.0 * lasting_s(2000)  # four times as many

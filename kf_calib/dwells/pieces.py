@@ -1,0 +1,109 @@
+"""The pieces of a dwell; of one that lasts for hours they are merged, so that what is kept of it is bounded.
+
+The basis of two pieces together is a linear map of that of either, so that their triangles are merged without loss of
+a reading. What is lost is that columns were parabolas over either, and are one over both. Pieces stay as short after
+the arrival as they were, and none becomes longer than the time since then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.qr import triangle
+from kf_calib.dwells.rows import Nodes, basis, parabola
+
+MOST_PIECES = 256
+"""Pieces of a dwell, at most; at 3 kHz as many last almost six minutes."""
+_LEFT = MOST_PIECES // 4  # pieces of equal length that are left, at most twice as many
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One piece of a dwell.
+
+    - triangle (K + 3, K + 3): the triangular factor of [1 u u^2 ... | z1 z2 z3].
+    - nodes: the conditions at its three nodes.
+    - count: number of readings, or of averages of them, that were folded.
+    - carrier_hz: frequency of the carrier; 0 for none.
+    - taken: number of readings that ``count`` stands for.
+    """
+
+    triangle: Floats
+    nodes: Nodes
+    count: int
+    carrier_hz: float = 0.0
+    taken: int = 0
+
+
+def coarsened(pieces: Sequence[Piece]) -> tuple[Piece, ...]:
+    """Pieces in order of time, merged to at most half of ``MOST_PIECES`` and those shortly after the arrival."""
+    begin, end = pieces[0].nodes.elapsed_s[0], pieces[-1].nodes.elapsed_s[-1]
+    return tuple(merged(group) for group in _groups(pieces, float(end - begin) / _LEFT))
+
+
+def _groups(pieces: Sequence[Piece], longest_s: float) -> Iterator[list[Piece]]:
+    """Yield neighbours that together last no longer than ``longest_s``, nor than it is since the arrival."""
+    group = [pieces[0]]
+    for piece in pieces[1:]:
+        first = group[0].nodes
+        length_s = piece.nodes.elapsed_s[-1] - first.elapsed_s[0]
+        if length_s > min(longest_s, first.since_arrival_s[0]):
+            yield group
+            group = []
+        group.append(piece)
+    yield group
+
+
+def merged(pieces: Sequence[Piece]) -> Piece:
+    """One piece of consecutive ones."""
+    if len(pieces) == 1:
+        return pieces[0]
+    begin, end = pieces[0].nodes.elapsed_s[0], pieces[-1].nodes.elapsed_s[-1]
+    middle, half = 0.5 * (begin + end), max(0.5 * float(end - begin), 1e-9)
+    width = pieces[0].triangle.shape[1] - 3
+    stacked = np.vstack([_on(piece, middle, half, width) for piece in pieces])
+    return replace(
+        pieces[0], triangle=triangle(stacked), nodes=_nodes(pieces, np.array([begin, middle, end])),
+        count=sum(piece.count for piece in pieces), taken=sum(piece.taken for piece in pieces),
+    )  # fmt: skip
+
+
+def _centre(nodes: Nodes) -> tuple[float, float]:
+    """The middle of a piece, and half of its length."""
+    return float(nodes.elapsed_s[1]), max(0.5 * float(nodes.elapsed_s[-1] - nodes.elapsed_s[0]), 1e-9)
+
+
+def _on(piece: Piece, middle: float, half: float, width: int) -> Floats:
+    """The triangle of a piece on the basis of a longer one: U = shift + share u, so 1, U, U^2 follow from 1, u, u^2."""
+    own_middle, own_half = _centre(piece.nodes)
+    shift, share = (own_middle - middle) / half, own_half / half
+    turn = np.array([[1.0, shift, shift**2], [0.0, share, 2.0 * shift * share], [0.0, 0.0, share**2]])
+    out = piece.triangle.copy()
+    for first in range(0, width, 3):  # on a carrier its cosine and sine have the same three
+        out[:, first : first + 3] = piece.triangle[:, first : first + 3] @ turn
+    return out
+
+
+def _nodes(pieces: Sequence[Piece], at_s: Floats) -> Nodes:
+    """The conditions at the beginning, the middle and the end of consecutive pieces."""
+    first, last = pieces[0].nodes, pieces[-1].nodes
+    amid = next(piece.nodes for piece in pieces if piece.nodes.elapsed_s[-1] >= at_s[1])
+    centre, half = _centre(amid)
+    place = basis(np.array([max((at_s[1] - centre) / half, -1.0)]))[:, 0]  # -1: in a gap, the piece after it
+
+    def told(name: str) -> Floats | None:
+        values = getattr(amid, name)
+        if values is None:
+            return None
+        between = place @ parabola(values.reshape(3, -1))
+        return np.array([getattr(first, name)[0], between.reshape(values.shape[1:]), getattr(last, name)[-1]])
+
+    since_s = at_s - first.elapsed_s[0] + first.since_arrival_s[0]
+    force, pose, warmth = told("force_mps2"), told("pose"), told("temperature_c")
+    assert force is not None and pose is not None and warmth is not None
+    return Nodes(at_s, since_s, force, pose, warmth, told("rate_radps"), told("rate_change_radps2"),
+                 told("variance_mps2_2"))  # fmt: skip

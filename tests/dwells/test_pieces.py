@@ -1,0 +1,74 @@
+"""Merged pieces are those that the same readings give at once, and a dwell of hours has a bounded number of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells import walk_path
+from kf_calib.dwells.pieces import MOST_PIECES, Piece, coarsened, merged
+from kf_calib.dwells.qr import triangle
+from kf_calib.dwells.rows import Nodes, basis
+
+
+def piece_of(time_s: Floats, readings: Floats, arrival_s: float = 0.0, carrier_hz: float = 0.0) -> Piece:
+    """A piece folded from readings (n, 3), its temperature a parabola of time."""
+    middle, half = 0.5 * (time_s[0] + time_s[-1]), 0.5 * (time_s[-1] - time_s[0])
+    rows = np.vstack([basis((time_s - middle) / half, time_s, carrier_hz), readings.T]).T
+    at = np.array([time_s[0], middle, time_s[-1]])
+    nodes = Nodes(
+        at, at - arrival_s, np.tile([0.0, 9.81, 0.0], (3, 1)), np.zeros((3, 3)), 20.0 + 0.1 * at + 3e-4 * at**2
+    )
+    return Piece(triangle(rows), nodes, len(time_s), carrier_hz, len(time_s))
+
+
+def standing(hours: float, rate_hz: float = 0.5, block_s: float = 20.0) -> Iterator[Piece]:
+    """Pieces of a dwell, block by block."""
+    rng, count = np.random.default_rng(0), int(block_s * rate_hz)
+    for number in range(int(hours * 3600.0 / block_s)):
+        time_s = number * block_s + np.arange(count) / rate_hz
+        yield piece_of(time_s, rng.normal(size=(count, 3)))
+
+
+@pytest.mark.parametrize("carrier_hz", [0.0, 0.013])
+def test_merged_pieces_are_those_that_the_readings_give_at_once(carrier_hz: float) -> None:
+    """Of unequal lengths, with a gap between; the triangle is unique but for the signs of its rows."""
+    rng = np.random.default_rng(1)
+    time_s = np.concatenate([np.arange(100.0, 130.0), np.arange(130.0, 190.0), np.arange(200.0, 260.0)])
+    readings = rng.normal(9.81, 1e-3, (len(time_s), 3))
+    parts = [slice(0, 30), slice(30, 90), slice(90, 150)]
+    one = merged([piece_of(time_s[own], readings[own], 90.0, carrier_hz) for own in parts])
+    whole = piece_of(time_s, readings, 90.0, carrier_hz)
+    np.testing.assert_allclose(one.triangle.T @ one.triangle, whole.triangle.T @ whole.triangle, rtol=1e-10, atol=1e-9)
+    for name in ("elapsed_s", "since_arrival_s", "force_mps2", "pose", "temperature_c"):
+        np.testing.assert_allclose(getattr(one.nodes, name), getattr(whole.nodes, name), rtol=1e-12, err_msg=name)
+    assert (one.count, one.taken, one.carrier_hz) == (150, 150, carrier_hz)
+
+
+def test_a_dwell_of_days_has_a_bounded_number_of_pieces() -> None:
+    """Short after the arrival and even later, each reading in one of them."""
+    kept, total = list[Piece](), 0
+    for piece in standing(hours=72.0):
+        if len(kept) == MOST_PIECES:
+            kept = list(coarsened(kept))
+            assert len(kept) <= MOST_PIECES // 2 + 16
+        kept.append(piece)
+        total += piece.count
+    lengths = np.array([piece.nodes.elapsed_s[-1] - piece.nodes.elapsed_s[0] for piece in kept])
+    begins = np.array([piece.nodes.since_arrival_s[0] for piece in kept])
+    assert sum(piece.count for piece in kept) == total and (np.diff(begins) > 0.0).all()
+    assert lengths[0] < 20.0 and (lengths[1:] <= np.maximum(begins[1:], 20.0)).all()
+    assert lengths.max() < 72.0 * 3600.0 / 32.0
+
+
+def test_moments_of_a_walk_over_many_readings_are_those_that_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    count = 40_000
+    covariance, squares = walk_path._moments(count)
+    monkeypatch.setattr(walk_path, "_MANY", count)
+    whole, whole_squares = walk_path._moments.__wrapped__(count)
+    scale = np.sqrt(np.diag(whole))
+    assert covariance.shape == (4, 4) and np.abs((covariance - whole) / scale / scale[:, None]).max() < 2e-4
+    assert squares == pytest.approx(whole_squares, rel=2e-4)
