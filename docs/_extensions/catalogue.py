@@ -40,10 +40,12 @@ def _name(effect: dict[str, Any]) -> str:
 
 
 def _overview(every: list[list[dict[str, Any]]]) -> Iterator[str]:
-    yield from ("## All effects", "", "| effect | what it is | borne by | confused with, shown by |", "|---|---|---|---|")
+    yield from ("## All effects", "")
+    yield from ("| effect | what it is | borne by | confused with, shown by |", "|---|---|---|---|")
     for own in every:
         first = own[0]
-        yield f"| [`{_name(first)}`](#{_name(first)}) | {first['title']} | {first['borne_by']} | {_plain(first['confused_with'])} |"
+        name, confused = _name(first), _plain(first["confused_with"])
+        yield f"| [`{name}`](#{name}) | {first['title']} | {first['borne_by']} | {confused} |"
 
 
 def _details(every: list[list[dict[str, Any]]]) -> Iterator[str]:
