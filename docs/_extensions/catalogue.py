@@ -40,12 +40,12 @@ def _name(effect: dict[str, Any]) -> str:
 
 
 def _overview(every: list[list[dict[str, Any]]]) -> Iterator[str]:
-    heads = "| effect | what it is | borne by | confused with, shown by |"
-    yield from ("## All effects", "", heads, "|---|---|---|---|")
+    yield from ("## All effects", "")
+    yield from ("| effect | what it is | borne by | confused with, shown by |", "|---|---|---|---|")
     for own in every:
         first = own[0]
-        link, confused = f"[`{_name(first)}`](#{_name(first)})", _plain(first["confused_with"])
-        yield f"| {link} | {first['title']} | {first['borne_by']} | {confused} |"
+        name, confused = _name(first), _plain(first["confused_with"])
+        yield f"| [`{name}`](#{name}) | {first['title']} | {first['borne_by']} | {confused} |"
 
 
 def _details(every: list[list[dict[str, Any]]]) -> Iterator[str]:

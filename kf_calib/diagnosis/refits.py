@@ -10,6 +10,7 @@ from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates, candidate_frame
 from kf_calib.diagnosis.unknown_effect import Family, families
 from kf_calib.effects import Effect
+from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate, evaluate_fit
 from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.measurement_model import Model
@@ -85,8 +86,18 @@ class Refits:
 def calibration_of(
     run: Calibration | Source | str | PathLike[str], refits: Refits | None = None
 ) -> tuple[Calibration, Refits]:
-    """A calibration, or that of a recording, source or path, and its refits: those given or new ones."""
+    """A calibration, or that of a recording, source or path, and its refits: those given or new ones. Raises InputError
+    for one that cannot be diagnosed."""
     if isinstance(run, Calibration):
-        return run, refits or Refits()
-    source = opened(run)
-    return calibrate(source), refits or Refits(source)
+        before, source = run, None
+    else:
+        source = opened(run)
+        before = calibrate(source)
+    noise = before.noise
+    if not (before.bench.angles or noise.within_seen or noise.scatter_stated):
+        raise InputError(
+            "means without angles and without standard deviations leave one number a pose, from which the size of the "
+            "noise is taken, so that no misfit can be diagnosed: give standard deviation and number of readings in "
+            "each row, or state --scatter-sigma."
+        )
+    return before, refits or Refits(source)

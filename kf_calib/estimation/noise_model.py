@@ -285,17 +285,19 @@ def flicker_sigma(noise: Noise, dwells: int) -> Floats:
     return noise.scatter_mps2 / np.sqrt(np.log(max(dwells, 2)))
 
 
-def mean_covariances(noise: Noise, means: Means, state: Floats) -> Floats:
+def mean_covariances(noise: Noise, means: Means, state: Floats, misfit_mps2: float = 0.0) -> Floats:
     """Covariances (D, 3, 3) of the dwells' mean readings about the model.
 
       diag(kappa sigma_w^2 / n + sigma_s^2) + sigma_alpha^2 S (|f|^2 I - f f^T) S^T
 
     S holds the sensitivities of the accelerometers in its rows, f is the specific force. An attitude that is not known
-    counts as a sigma_alpha so large that it leaves the size of f alone.
+    counts as a sigma_alpha so large that it leaves the size of f alone, also where the noise is not known yet and is to
+    be estimated from a misfit of this rms size.
     """
     own = noise.effective_sigma_mps2**2 / means.counts[:, None] + noise.scatter_mps2**2
     size = np.linalg.norm(means.force_mps2, axis=1).max()
-    setting_rad = _TURNED * np.sqrt(own.max()) / size if noise.attitude_unknown else noise.setting_rad
+    unknown_rad = _TURNED * max(float(np.sqrt(own.max())), misfit_mps2) / size
+    setting_rad = unknown_rad if noise.attitude_unknown else noise.setting_rad
     return own[:, :, None] * np.eye(3) + setting_rad**2 * setting_covariances(means, state)
 
 

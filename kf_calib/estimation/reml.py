@@ -199,9 +199,10 @@ def directions(force_mps2: Floats) -> int:
     return len(np.unique(np.round(unit, 2) + 0.0, axis=0))
 
 
-def degrees_of_freedom(means: Means) -> int:
-    """Degrees of freedom of the dwells' means beside the model's coefficients."""
-    return means.readings.size - _reduce(means)[0].design.shape[2]
+def degrees_of_freedom(means: Means, free: bool = False) -> int:
+    """Degrees of freedom of the dwells' means beside the model's coefficients; free: attitudes are not known, and a
+    dwell tells one number."""
+    return (len(means.readings) if free else means.readings.size) - _reduce(means)[0].design.shape[2]
 
 
 def likelihood_of(noise: Noise, parts: Collection[Part], means: Means, state: Floats, prior: Floats) -> Likelihood:
@@ -307,7 +308,8 @@ def _likelihood(
         "walk": walk,
     }
     fixed = (
-        _conditional_covariances(mean_covariances(noise, means, state), path) + noise.walk_mps2_per_sqrt_s**2 * walk[0]
+        _conditional_covariances(mean_covariances(noise, means, state, float(units["common"][0])), path)
+        + noise.walk_mps2_per_sqrt_s**2 * walk[0]
     )
     alone = Restricted(
         rows.reshape(3 * count, -1), np.zeros((0, rows.shape[2])) if prior is None else prior, fixed, walk[:0]

@@ -117,6 +117,86 @@ def test_angles_are_interpolated_the_short_way_round() -> None:
     assert np.cos(middle[0, 0]) == pytest.approx(1.0)
 
 
+def test_angles_beyond_the_ends_and_between_stamps() -> None:
+    """Against numpy's own interpolation; a stamp that comes twice is no division by zero."""
+    times, rng = np.array([5, 10, 10, 30, 40]) * 10**9, np.random.default_rng(4)
+    poses = rng.normal(size=(5, 2))
+    at = np.array([0, 5, 7, 20, 33, 40, 99]) * 10**9
+    own = interpolate_pose(at, times, poses, False)
+    kept = np.array([0, 2, 3, 4])
+    expected = np.column_stack([np.interp(at, times[kept], column[kept]) for column in poses.T])
+    np.testing.assert_allclose(own[at >= 10 * 10**9], expected[at >= 10 * 10**9], atol=1e-14)
+    np.testing.assert_allclose(own[:2], poses[[0, 0]], atol=1e-14)
+
+
+def test_quaternions_are_brought_to_one_sign_and_stay_what_they_were() -> None:
+    """All at once, and in parts: signs are remembered from part to part."""
+    rng = np.random.default_rng(5)
+    smooth = 1.5 * Rotation.from_rotvec(np.outer(np.arange(12), [0.05, 0.1, -0.2])).as_quat()
+    recorded = smooth * rng.choice([-1.0, 1.0], (12, 1))
+    whole, signs = unwrap_pose(recorded, True)
+    np.testing.assert_allclose(whole, smooth * np.sign(recorded[0] @ smooth[0]), atol=1e-14)
+    assert set(signs.ravel()) <= {-1.0, 1.0}
+    first, said = unwrap_pose(recorded[:5], True)
+    rest, _ = unwrap_pose(recorded[5:], True, (recorded[4], said[-1]))
+    np.testing.assert_array_equal(np.vstack([first, rest]), whole)
+
+
+def test_angles_are_made_continuous_as_numpy_does_it() -> None:
+    angles = np.cumsum(np.random.default_rng(6).uniform(-3.0, 3.0, (40, 3)), axis=0)
+    folded = np.angle(np.exp(1j * angles))
+    whole, turns = unwrap_pose(folded, False)
+    np.testing.assert_allclose(whole, np.unwrap(folded, axis=0), atol=1e-12)
+    np.testing.assert_array_equal(turns, np.rint(turns))
+    first, said = unwrap_pose(folded[:17], False)
+    rest, _ = unwrap_pose(folded[17:], False, (folded[16], said[-1]))
+    np.testing.assert_array_equal(np.vstack([first, rest]), whole)
+
+
+@pytest.mark.parametrize(
+    ("axes", "letters"),
+    [("y z x", ("y", "z", "x")), ("-y z", ("y", "z")), ("y", ("y",)), ("y z y", ()), ("y 1,1,0", ()), ("y -y", ())],
+)
+def test_axes_have_letters_where_all_differ(axes: str, letters: tuple[str, ...]) -> None:
+    assert Bench(parse_axes(axes), G).axis_letters == letters
+
+
+def test_distance_of_angles_is_that_of_the_gimbal_that_turns_most() -> None:
+    assert pose_distance(np.array([0.1, 0.2, 0.3]), np.array([0.2, -0.3, 0.3]), False) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("number", [0.5, 1e-12])
+def test_length_of_an_axis_does_not_matter_and_a_unit_vector_stays(number: float) -> None:
+    ((x, y, z),) = parse_axes(f"{3 * number!r},0,{4 * number!r}")
+    assert (x, y, z) == pytest.approx((0.6, 0.0, 0.8), abs=1e-15)
+    length = math.hypot(0.6, 0.8) * (1.0 + 3e-13)
+    assert parse_axes(f"{0.6 * length!r},0,{0.8 * length!r}") == ((0.6 * length, 0.0, 0.8 * length),)
+    assert math.hypot(*parse_axes("0.6000001,0,0.8")[0]) == pytest.approx(1.0, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("key", "inside", "outside"),
+    [
+        ("gravity_mps2", ("1", "30"), ("0.99", "30.1")),
+        ("latitude_deg", ("-90", "90"), ("-90.1", "90.1")),
+        ("height_m", ("-12000", "100000"), ("-12001", "100001")),
+        ("azimuth_deg", ("-360", "360"), ("-361", "361")),
+        ("angle_sigma_deg", ("0", "180"), ("-1e-9", "181")),
+        ("scatter_sigma_mps2", ("0", "100"), ("-1e-9", "101")),
+        ("square_sigma_deg", ("1e-4", "45"), ("0", "9e-5", "46")),
+        ("nominal", ('{"theta1": 6.3}', '{"phi3": -6.3}', '{"K2": -10}', '{"b1": 100}', '{"nu2": 0.78}'),
+         ('{"theta1": 6.4}', '{"phi3": -6.4}', '{"K2": 10.1}', '{"b1": -101}', '{"nu2": -0.79}')),
+    ],
+)  # fmt: skip
+def test_limits_of_keys_are_those_of_the_page(key: str, inside: tuple[str, ...], outside: tuple[str, ...]) -> None:
+    keys = {"axes": "y z x", "gravity_mps2": "9.81"}
+    for value in inside:
+        Bench.from_metadata({**keys, key: value})
+    for value in outside:
+        with pytest.raises(BenchError, match=key):
+            Bench.from_metadata({**keys, key: value})
+
+
 @pytest.mark.parametrize(
     "metadata, says",
     [

@@ -48,6 +48,7 @@ _COUNT = _words("count counts n samples num number anzahl messungen stichprobe r
 _FACE = _words("face side seite position pose orientation lage richtung direction flache")
 _RATE = re.compile(r"(?:deg|degrees?|rad|radians?|°)\s*(?:/|p|per)\s*s|dps")
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
+_LONGEST = 300  # characters of a name: it is looked at in many ways
 _FACES = re.compile(r"['’]?([+\-−–]?)\s*([xyz123])\s*([+\-−–]?|up|down|oben|unten)", re.IGNORECASE)
 
 
@@ -75,7 +76,8 @@ def are_numbers(header: Iterable[str]) -> bool:
 
 
 def meaning_of(name: str) -> Meaning:
-    """What the name of a column says."""
+    """What the name of a column says; nothing, where it is longer than any name."""
+    name = name if len(name) <= _LONGEST else ""
     told = _meaning_of(name)
     return told if told.ours or not _CAMEL.search(name) else _meaning_of(_CAMEL.sub(" ", name))
 

@@ -17,7 +17,9 @@ from helpers.long_runs import slow
 
 import kf_calib
 from kf_calib.errors import InputError, KfCalibError
+from kf_calib.sources.opening import Kind, kind_of
 from kf_calib.sources.tables.table import Table
+from kf_calib.sources.tables.words import meaning_of
 
 HEADER = ["time [s]", "outer [deg]", "inner [deg]", "ax [g]", "ay [g]", "az [g]"]
 ROWS = [[0, 0, 0, 0.003, 1.001, -0.002], [60, 90, 0, 1.002, 0.002, 0.001], [120, 180, 0, -0.001, -0.999, 0.004],
@@ -136,6 +138,16 @@ def test_a_long_cell_of_text_takes_no_time(cell: str, tmp_path: Path) -> None:
                 kf_calib.open_table(path, {"axes": "z x", "gravity_mps2": "9.81"})
             except InputError as error:
                 assert len(str(error)) < 1500
+
+
+@pytest.mark.parametrize("name", ["(" * 100_000, "a" + " " * 100_000 + "[g", "x" * 100_000, "a," * 50_000])
+def test_a_log_with_a_long_name_takes_no_time(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    rows = "".join(f"{k / 100},0,9.81,0,0,1\n" for k in range(2000))
+    path.write_text(f'time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,"{name}"\n{rows}')
+    with bounded(seconds=5.0):
+        assert kind_of(path) in Kind
+        assert meaning_of(name).ours == ""
 
 
 def test_a_table_of_a_wide_header_and_many_rows_is_refused(tmp_path: Path) -> None:
