@@ -18,15 +18,20 @@ from kf_calib.sources.files.recording import Recording
 
 
 def scan_columns(
-    path: Path, wanted: Sequence[str] | None = None, white_mps2: float | None = None, slow_lines: bool = False
+    path: Path,
+    wanted: Sequence[str] | None = None,
+    white_mps2: float | None = None,
+    slow_lines: bool = False,
+    exact_poses: bool = False,
 ) -> tuple[dict[str, list[Candidate]], Floats]:
     """Return the candidates by name, and the residual in the same orthonormal frame.
 
     path: of the recording. wanted: names of effects (None: all that have columns, oscillations excepted). white_mps2:
     sigma of the white noise to assume in place of the estimated one. slow_lines: take an oscillation at the frequencies
-    at which the program looks for slow ones, not at those of a grid.
+    at which the program looks for slow ones, not at those of a grid. exact_poses: take the poses as they are stated, as
+    what is equal in these differs by the setting errors of a run otherwise.
     """
-    result = calibrate(Recording(path))
+    result = calibrate(Recording(path, {"angle_sigma_deg": "0"} if exact_poses else {}))
     noise = result.noise.judging
     if white_mps2 is not None:
         noise = dataclasses.replace(noise, sigma_mps2=np.full(3, white_mps2), inflation=np.ones(3))
@@ -36,7 +41,7 @@ def scan_columns(
 
 def candidates(path: Path, wanted: Sequence[str] | None = None) -> dict[str, list[Candidate]]:
     """Return the columns of effects in a recording, by name, without what the twelve parameters absorb."""
-    return scan_columns(path, wanted)[0]
+    return scan_columns(path, wanted, exact_poses=True)[0]
 
 
 def column_effects(result: Calibration, wanted: Sequence[str] | None = None, slow_lines: bool = False) -> list[Effect]:
