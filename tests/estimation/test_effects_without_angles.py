@@ -89,7 +89,7 @@ def calibrated(name: str, seed: int) -> tuple[Calibration, np.ndarray]:
     means += rng.normal(size=means.shape) * SIGMA_MPS2
     white = SIGMA_MPS2 * np.sqrt(COUNT)
     table = [
-        Mean(mean, time_s[k], 25.0 + warmth_k[k], np.zeros(4),
+        Mean(mean, time_s[k], 25.0 + warmth_k[k], np.array([0.0, 0.0, 0.0, 1.0]),
              white * np.sqrt(rng.chisquare(COUNT - 3, 3) / (COUNT - 3)))
         for k, mean in enumerate(means)
     ]  # fmt: skip
