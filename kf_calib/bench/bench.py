@@ -304,6 +304,12 @@ def turn(vector: Floats, axis: Floats, angle_rad: Floats | float) -> Floats:
     return along + cos * (vector - along) + sin * across
 
 
+def turn_by(vector: Floats, rotation_rad: Floats) -> Floats:
+    """The vector (3,) or vectors (n, 3) turned by a rotation vector (3,); the same ones if it is zero."""
+    angle_rad = float(np.linalg.norm(rotation_rad))
+    return turn(vector, rotation_rad / angle_rad, angle_rad) if angle_rad else vector
+
+
 def _turn_by_quaternion(vector: Floats, imaginary: Floats, real: Floats) -> Floats:
     """Rotate vectors by quaternions given by their imaginary and real parts."""
     shape = np.broadcast_shapes(vector.shape, imaginary.shape)

@@ -10,10 +10,10 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation.attitude import facing_readings
+from kf_calib.estimation.attitude import facing_readings, force_shown
 from kf_calib.estimation.dwell_columns import Carried
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.free_attitude import DIRECTIONS, covariance_of, felt, most_informative, undetermined
+from kf_calib.estimation.free_attitude import DIRECTIONS, covariance_of, most_informative, undetermined
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.noise_model import within_dwells
 
@@ -45,7 +45,7 @@ class Sides:
         noise = within_dwells(dwells) if fitted is None else fitted.noise
         facing = facing_readings(dwells, state, bench.gravity_mps2)
         covariance = covariance_of(Carried(facing, model, state), noise, bench.square_rad)
-        force = felt(np.array([dwell.means[4:] for dwell in dwells]), state)
+        force = force_shown(np.array([dwell.means[4:] for dwell in dwells]), state)
         up = force / np.linalg.norm(force, axis=1, keepdims=True)
         following = most_informative(covariance, state, bench.gravity_mps2)
         numbers = tuple(dwell.number for dwell in dwells)

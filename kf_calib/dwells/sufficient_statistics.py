@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.bench.bench import turn
+from kf_calib.bench.bench import turn_by
 from kf_calib.dwells.attitude_error import AttitudeError
 from kf_calib.dwells.coherent_tone import MOST_CELLS, Cells, Trace, tone
 from kf_calib.dwells.line_spectrum import Line, Spectrum, lines
@@ -165,9 +165,9 @@ class DwellFactor:
     def felt(self, force_mps2: Floats) -> Floats:
         """The specific force (n, 3) that is felt where the angles show this one."""
         if self.turned_rad is not None:
-            force_mps2 = _rotated(force_mps2, self.turned_rad)
+            force_mps2 = turn_by(force_mps2, self.turned_rad)
         if self.attitude is not None:
-            force_mps2 = self.attitude.length * _rotated(force_mps2, self.attitude.rotation_rad)
+            force_mps2 = self.attitude.length * turn_by(force_mps2, self.attitude.rotation_rad)
         return force_mps2
 
     @cached_property
@@ -328,12 +328,6 @@ def _square_factor(stacked: Floats) -> Floats:
     if len(stacked) < width:
         stacked = np.vstack([stacked, np.zeros((width - len(stacked), width))])
     return triangle(stacked)
-
-
-def _rotated(force_mps2: Floats, rotation_rad: Floats) -> Floats:
-    """Return forces (n, 3) turned by a rotation vector (3,)."""
-    angle_rad = float(np.linalg.norm(rotation_rad))
-    return turn(force_mps2, rotation_rad / angle_rad, angle_rad) if angle_rad else force_mps2
 
 
 def rate_or_zero(rate: Floats | None) -> Floats:

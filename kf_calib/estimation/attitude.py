@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import turn_by
 from kf_calib.dwells.attitude_error import AttitudeError
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect, FrameEffect, Stimulus
@@ -45,7 +46,7 @@ def at_their_modes(carried: Carried, noise: Noise, state: Floats) -> list[DwellF
     out = list[DwellFactor]()
     for k, (dwell, turned) in enumerate(zip(carried.dwells, carried.turned, strict=True)):
         before = np.zeros(3) if dwell.attitude is None else dwell.attitude.rotation_rad
-        force = rotated(forces[k], _limited(moved[k] - before))
+        force = turn_by(forces[k], _limited(moved[k] - before))
         attitude = AttitudeError(np.zeros(3), float(variances[k]), bendings[k])
         if noise.attitude_unknown:
             variance_rad2 = variances[k] + _wander_rad2(dwell, noise, state, force)
@@ -132,17 +133,7 @@ def added_by(effects: Sequence[Effect], stimulus: Stimulus, model: Model, state:
 
 def matrix_of(rotation_rad: Floats) -> Floats:
     """The rotation matrix (3, 3) of a rotation vector (3,)."""
-    return np.array([rotated(axis, rotation_rad) for axis in np.eye(3)]).T
-
-
-def rotated(vector: Floats, rotation_rad: Floats) -> Floats:
-    """A vector (3,) turned by a rotation vector (3,)."""
-    angle_rad = float(np.linalg.norm(rotation_rad))
-    if not angle_rad:
-        return vector
-    axis = rotation_rad / angle_rad
-    along = (axis @ vector) * axis
-    return along + np.cos(angle_rad) * (vector - along) + np.sin(angle_rad) * np.cross(axis, vector)
+    return np.array([turn_by(axis, rotation_rad) for axis in np.eye(3)]).T
 
 
 def rotation_between(one: Floats, other: Floats) -> Floats:
@@ -179,13 +170,17 @@ def _pose(unit: Floats) -> Floats:
     return quaternion / np.linalg.norm(quaternion)
 
 
+def force_shown(readings: Floats, state: Floats) -> Floats:
+    """Specific force (D, 3) by the mean readings (D, 3) alone: S^-1 (z - b)."""
+    affine = state[:STATE_COUNT].reshape(3, 4)
+    return np.asarray(np.linalg.solve(affine[:, :3], (readings - affine[:, 3]).T).T, float)
+
+
 def facing_readings(dwells: Sequence[DwellFactor], state: Floats, gravity_mps2: float) -> list[DwellFactor]:
     """The dwells with the specific force that their mean readings alone show at ``state``, S^-1 (z - b) with the size
     of g: where the search for attitudes that are not known begins."""
-    affine = state[:STATE_COUNT].reshape(3, 4)
-    out = list[DwellFactor]()
-    for dwell in dwells:
-        force = np.linalg.solve(affine[:, :3], dwell.means[4:] - affine[:, 3])
+    out, forces = list[DwellFactor](), force_shown(np.array([dwell.means[4:] for dwell in dwells]), state)
+    for dwell, force in zip(dwells, forces, strict=True):
         before = dwell.came_from
         facing = with_force(dwell, gravity_mps2 * force / np.linalg.norm(force))
         if before is not None:

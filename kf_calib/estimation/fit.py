@@ -145,8 +145,7 @@ class Fit:
         has all of it for the twelve parameters, which do not."""
         columns, sigma = slow_waves(self.carried.turned, flicker_mps2)
         extra = self._considered([values * sigma for values in columns])
-        factor = square_root_information.accumulate(self.all_rows(), self.steps)[:-1]
-        covariance = square_root_information.solve(factor, self.carried.model.nominal_state())[1]
+        covariance = self._solution[1]
         gained = (covariance @ extra @ covariance)[STATE_COUNT:, STATE_COUNT:]
         seen = np.zeros_like(extra)
         seen[STATE_COUNT:, STATE_COUNT:] = gained

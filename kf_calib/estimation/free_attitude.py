@@ -1,10 +1,8 @@
 """Calibration without angles: of each dwell only the size of the specific force is known, |f| = g.
 
-The setting error of a dwell is then unbounded: two rotations, about axes across f, are nuisance states of any size. At
-the current state the specific force of a dwell is f = g unit(S^-1 (z - b - e)), where S holds the sensitivities in its
-rows, b the biases, z the mean readings and e what effects add to these; the rows are linearised there, and of a dwell's
-three readings the one combination n = S^-T f / g is left that no rotation changes. Force and state are found in turn
-(``fit``). Within a dwell the block does not turn, so that changes of all three readings are left.
+Nothing is known of the attitude of a dwell, nor that it stays the same within the dwell, and of the three readings one
+combination is left that no rotation changes (``nuisance_states.along_force``); force and state are found in turn
+(``attitude``, ``fit``). This module says what the poses of such a run determine, and which pose would tell more.
 
 A common rotation of all axes shows in no |f|. The frame is therefore that of the sensors: accelerometer 1 is its x
 axis, accelerometer 2 lies in its plane of x and y. Nine parameters are left: three scale factors, three biases, and
@@ -41,12 +39,6 @@ DIRECTIONS: dict[str, Floats] = {
 _NINE = [k for k in range(STATE_COUNT) if k not in FRAME]
 _HOPELESS_SCALE, _HOPELESS_MPS2 = 0.2, 2.0
 _TRIAD_STEP_RAD = 1e-4
-
-
-def felt(readings: Floats, state: Floats) -> Floats:
-    """Specific force (D, 3) by the mean readings (D, 3) alone: S^-1 (z - b)."""
-    affine = state[:STATE_COUNT].reshape(3, 4)
-    return np.asarray(np.linalg.solve(affine[:, :3], (readings - affine[:, 3]).T).T, float)
 
 
 def weights_of_size(means: Means, state: Floats) -> Floats:
