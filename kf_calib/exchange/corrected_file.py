@@ -51,7 +51,7 @@ def apply_to_file(
         copied, told = _half(on_progress, 0.0), _half(on_progress, 0.5)
         appender = TopicAppender(source, file, CALIBRATED_TOPIC, cdr.IMU, _template(correction), copied)
         for readings, temperature_c in _pairs(recording, thermometer, told):
-            values = correction(readings.values, temperature_c)
+            values = correction.of_readings(readings.values, temperature_c)
             appender.add(Stream(readings.time_ns, values))
             count, bad = count + len(values), bad + int(np.count_nonzero(~np.isfinite(values).all(axis=1)))
         appender.finish()

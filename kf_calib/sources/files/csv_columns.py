@@ -18,6 +18,7 @@ from operator import mul
 
 import numpy as np
 
+from kf_calib.bench.raw_input import PLAIN, RawInput
 from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.files.csv_heading import Heading
 from kf_calib.sources.files.line_parts import LineError, number_of, stamp_ns
@@ -135,6 +136,7 @@ class CsvColumns:
     units: Units
     local_mps2: float
     said: list[str] = field(default_factory=list[str])
+    raw: RawInput = PLAIN
     _meanings: list[Meaning] = field(default_factory=list[Meaning])
 
     @classmethod
@@ -219,7 +221,9 @@ class CsvColumns:
         return Stamps((place,), decimals, round(TIME[unit]) if decimals == 9 else 1)
 
     def accel(self) -> Quantity:
-        """The three readings. Raises InputError where their columns or their units are not told."""
+        """The three readings as they are written; ``raw`` tells then what in.
+
+        Raises InputError where their columns or their units are not told."""
         chosen = [self._one(ours) for ours in READINGS]
         places = [at for at in chosen if at is not None]
         advice = "name them ax_mps2, ay_mps2, az_mps2 (or ax_g, ax_mg ...)"
@@ -233,7 +237,7 @@ class CsvColumns:
                     "leave out --accel-unit, or rename the column by --column."
                 )
         norm = self._usual_norm(places)
-        if "" in named and not self.units.accel and math.isnan(norm):
+        if "" in named and not (self.units.accel or self.units.as_default(named, norm)) and math.isnan(norm):
             raise InputError(f"no columns give the three readings with their unit: {advice}, not {self._seen}.")
         told = reading_units(named, norm, self.units, self.local_mps2)
         if not told.is_known:
@@ -245,7 +249,8 @@ class CsvColumns:
         is_stated = self.units.accel is not None or self.units.accel_scale != 1.0
         if is_stated or not all(_EXACT.fullmatch(self.names[at]) for at in places):
             self.said.insert(0, f"readings from {self._quoted(places)} in {told.words}")
-        return Quantity(tuple(places), tuple(told.factors.tolist()))
+        self.raw = told.raw
+        return Quantity(tuple(places), (1.0, 1.0, 1.0))
 
     @property
     def has_usual_gimbals(self) -> bool:

@@ -27,6 +27,7 @@ class CsvLines(LineReader):
         super().__init__(account)
         self._columns, self._delimiter, self._header = columns, columns.delimiter, columns.header
         self._time, self._accel = columns.time(), columns.accel()
+        self.raw = columns.raw
         self._numbers = columns.numbers
         attitude = columns.quaternion()
         self.has_angles = columns.has_usual_gimbals or not attitude.at
