@@ -191,6 +191,8 @@ class RawInput:
         )
 
     def __str__(self) -> str:
+        if self.is_plain:
+            return "readings in m/s^2, in the order of the accelerometers"
         order = "channels in the order of the accelerometers"
         if self.channels != CHANNELS:
             order = f"accelerometers 1, 2, 3 on channels {', '.join(map(str, self.channels))}"

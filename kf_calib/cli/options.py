@@ -280,14 +280,14 @@ def recording_of(path: Path, options: Mapping[str, Any], input: RawInput | None 
     columns, angles = dict(map(pair, options["columns"])), not options["no_angles"]
     match kind_of(path, columns):
         case Kind.TABLE:
-            _refuse_given(OF_MESSAGES + OF_DWELLS, f"{path} is a table of mean readings")
+            refuse_given(OF_MESSAGES + OF_DWELLS, f"{path} is a table of mean readings")
             stated = {name: options[name] for name in ("angle_unit", "g_unit")}
             return open_table(path, overrides(options), columns=columns, angles=angles, input=input, **stated)
         case Kind.SAMPLES:
-            _refuse_given(OF_MESSAGES, f"{path} is a log in lines of text")
+            refuse_given(OF_MESSAGES, f"{path} is a log in lines of text")
             return Lines(path, overrides(options), columns, units=units_of(options, input), angles=angles)
         case Kind.RECORDING:
-            _refuse_given(_OF_TEXT, f"{path} is no table (.csv, .xlsx) and no log in lines of text")
+            refuse_given(_OF_TEXT, f"{path} is no table (.csv, .xlsx) and no log in lines of text")
             return messages_of(path, options, angles, input)
 
 
@@ -297,7 +297,7 @@ OF_DWELLS = ("joints", "settle_s", "still_deg", "gate", "gate_sigma")
 """Options that act on text and spreadsheets only, on files of messages only, and where dwells are to be found."""
 
 
-def _refuse_given(names: Sequence[str], what: str) -> None:
+def refuse_given(names: Sequence[str], what: str) -> None:
     """Raise InputError for the first of these options that the command line has.
 
     In a worker of a fleet there is no command line: of recordings of several kinds, an option acts on those it can.
@@ -309,6 +309,25 @@ def _refuse_given(names: Sequence[str], what: str) -> None:
         if param.name in names and ctx.get_parameter_source(param.name) is ParameterSource.COMMANDLINE:
             name = [*param.opts, *param.secondary_opts][-1 if ctx.params[param.name] is False else 0]
             raise InputError(f"{what}, on which {name} has nothing to act: leave it out.")
+
+
+def recording_kind(path: Path, options: Mapping[str, Any]) -> str:
+    """What a file is: ``recording``, ``samples`` or ``table``."""
+    from kf_calib.sources.opening import kind_of
+
+    return kind_of(path, dict(map(pair, options["columns"]))).value
+
+
+def merged_for_table(path: Path, options: Mapping[str, Any], input: RawInput) -> tuple[dict[str, str], Units]:
+    """Bench keys and units of a table of what the device of a calibration sends."""
+    from kf_calib.bench.raw_input import merged
+
+    keys = overrides(options)
+    try:
+        order = merged({}, keys, "", input).get("channels")
+    except BenchError as error:
+        raise BenchError(f"{path}: {error}") from None
+    return keys if order is None else keys | {"channels": order}, units_of(options, input)
 
 
 def units_of(options: Mapping[str, Any], input: RawInput | None = None) -> Units:

@@ -113,6 +113,10 @@ class LineReader(ABC):
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
         """A line that was read and holds readings, with these in their place; all else in it stays as it is."""
 
+    def heading_of_forces(self, heading: Sequence[str]) -> list[str]:
+        """The heading of lines in which specific force stands in the place of readings."""
+        return list(heading)
+
     def read(self, lines: Sequence[str], first_line: int) -> Batch:
         """The batch of consecutive lines, the first of them of that number."""
         self._begin_block(lines)
