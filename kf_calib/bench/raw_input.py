@@ -186,7 +186,7 @@ class RawInput:
     def formula(self) -> str:
         """Readings in m/s^2 from the raw numbers of channels 1, 2, 3, as formulas."""
         return ", ".join(
-            f"{axis} = {math.copysign(1.0, channel) * self.factors[abs(channel) - 1]:.9g} channel{abs(channel)}"
+            f"{axis} = {math.copysign(1.0, channel) * self.factors[abs(channel) - 1]:.12g} channel{abs(channel)}"
             for axis, channel in zip("xyz", self.channels, strict=True)
         )
 

@@ -122,10 +122,10 @@ def vectornav(text: str) -> Formula:
 
 
 def table(text: str) -> Formula:
-    """The matrix and the biases of the table."""
+    """The matrix and the offsets of the table."""
     value = {row["name"]: float(row["value"]) for row in csv.DictReader(text.splitlines())}
     c = np.array([[value[f"C{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)])
-    return lambda readings, _: (readings - [value["b1"], value["b2"], value["b3"]]) @ c.T
+    return lambda readings, _: (readings - [value["o1"], value["o2"], value["o3"]]) @ c.T
 
 
 READERS: dict[str, Callable[[str], Formula]] = {

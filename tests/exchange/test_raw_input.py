@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 import openpyxl
 import pytest
+from exchange.test_c_header import compiled, compiled_only
+from exchange.test_exports import READERS, ROUNDING
 from helpers.altered import short_run
 from helpers.stated_sensors import correction, samples, saved
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 import kf_calib
-from exchange.test_c_header import compiled, compiled_only
-from exchange.test_exports import READERS, ROUNDING
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.raw_input import UNITS, RawInput, merged
 from kf_calib.bench.streams import Batch, Stream
@@ -80,7 +80,8 @@ def test_every_program_takes_raw_readings_of_any_wiring_and_size(to: str) -> Non
             assert target.to_be_done_before and to in ("px4", "ardupilot", "imu_tk")
             given = _done_before(target.to_be_done_before, given)
         found = READERS[to](target.text())(given, temperature)
-        np.testing.assert_allclose(found, force, rtol=0, atol=ROUNDING.get(to, 1e-12) * (3 if to in ROUNDING else 1))
+        close = 2.0 * ROUNDING.get(to, 1e-12 if target.folds else 1e-10)  # 32 bits; digits of the sentence
+        np.testing.assert_allclose(found, force, rtol=0, atol=close)
         if to not in ("imu_tk", "vectornav"):
             assert str(target.input) in target.text().replace("\\u00b2", "2") or to == "csv"
 
@@ -192,8 +193,10 @@ def test_every_way_in_gives_the_same_specific_force(
     correct = kf_calib.open_calibration(device.calibration).correction()
     assert correct.input == device.input
     expected = correct(device.raw)
-    size = np.linalg.norm(expected, axis=1)
-    assert np.median(np.abs(size / 9.81 - 1.0)) < 1e-4  # whatever the device: in motion, too, as it turns slowly
+    last = np.linalg.norm(expected[-20:], axis=1)  # the run ends at rest
+    np.testing.assert_allclose(last, 9.81, rtol=5e-5)
+    count_mps2 = float(device.input.factors.max()) if device.raw.dtype == np.int32 else 1e-9
+    np.testing.assert_allclose(expected, correct.of_readings(device.force), rtol=0, atol=2.0 * count_mps2)
     folder, cal, close = device.calibration.parent, device.calibration, dict(rtol=0, atol=1e-11)
 
     lines = folder / "lines.csv"
@@ -214,7 +217,8 @@ def test_every_way_in_gives_the_same_specific_force(
     assert buffer.getvalue() == (tmp_path / "lines.csv").read_bytes()
 
     key = {"g": "accel_g", "m/s2": "accel_mps2"}[device.input.unit]
-    objects = [json.dumps({"time_ns": int(t), key: own.tolist()}) for t, own in zip(device.time_ns, device.raw)]
+    pairs = zip(device.time_ns.tolist(), device.raw.tolist(), strict=True)
+    objects = [json.dumps({"time_ns": time_ns, key: own}) for time_ns, own in pairs]
     (tmp_path / "in.jsonl").write_text("\n".join(objects))
     assert run("apply", cal, tmp_path / "in.jsonl", "-o", tmp_path / "out.jsonl")[0] == 0
     found = np.array([json.loads(line)[key] for line in (tmp_path / "out.jsonl").read_text().splitlines()])
@@ -235,7 +239,7 @@ def test_every_way_in_gives_the_same_specific_force(
 
     book = openpyxl.Workbook()
     sheet: Any = book.active
-    sheet.append(["when", "time_s", *{"g": ("ax_g", "ay_g", "az_g")}.get(device.input.unit, ("ax", "ay", "az"))])
+    sheet.append(["when", "time_s", "ax", "ay", "az"])
     chosen = range(0, len(device.raw), 40)
     for k in chosen:
         sheet.append([f"row {k}", 60.0 * k, *(float(each) for each in device.raw[k])])
@@ -257,7 +261,7 @@ def test_the_recording_holds_readings_and_says_what_they_were_made_of(device: Ta
     assert f"channels = {device.input.order}" in said and "converted = true" in said
 
 
-def test_an_option_that_contradicts_what_is_stored_is_refused_with_both(device: Taken, run: Any, tmp_path: Path) -> None:
+def test_an_option_that_contradicts_what_is_stored_is_refused(device: Taken, run: Any, tmp_path: Path) -> None:
     cal, folder = device.calibration, device.calibration.parent
     for words in (("replay", folder / "run.mcap"), ("apply", cal, folder / "run.mcap", "-o", tmp_path / "o.mcap"),
                   ("apply", cal, folder / "lines.csv", "-o", tmp_path / "o.csv"),
