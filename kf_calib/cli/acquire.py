@@ -241,7 +241,7 @@ def _size(count: int) -> str:
     epilog=examples(
         'record run.mcap bench.csv --axes "y z x" --gravity 9.8123',
         'record run.mcap - --bench bench.toml --column "acc x [g]=ax_g" < bench.csv',
-        'record run.mcap counts.csv --bench bench.toml --accel-scale 3.9e-6 --accel-unit g --channels 1,-2,3',
+        "record run.mcap counts.csv --bench bench.toml --accel-scale 3.9e-6 --accel-unit g --channels 1,-2,3",
     )
 )
 @click.argument("out", type=OutputFile())

@@ -94,13 +94,16 @@ def apply(
         return _apply_to_lines(_correction(calibration, options)[1], options, unchecked)
     if out is None:
         raise click.UsageError("a recording is corrected to a copy: name it by -o OUT (standard input by -).")
+    kind = recording_kind(recording, options)
+    if kind != "recording" and out.suffix == ".mcap":
+        raise InputError(f"{recording} holds lines of text or a table, and its copy, too: name {out} as such a file.")
     outputs = claimed(overwrite=overwrite)
     saved, correction = _correction(calibration, options)
     options["gravity_mps2"] = options["gravity_mps2"] or saved.bench.gravity_mps2
     done = list[Any]()
     with progress(f"correcting {recording.name}", as_json) as tick:
         outputs.write(out, lambda path: done.append(_applied(correction, recording, path, options, unchecked, tick)))
-    (found, warnings), topic = done[0], recording_kind(recording, options) == "recording"
+    (found, warnings), topic = done[0], kind == "recording"
     if as_json:
         print_json(views.applied_object(correction, found, out, warnings, topic))
     else:
