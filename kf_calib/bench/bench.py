@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kf_calib.bench.arrays import Floats, Times
+from kf_calib.bench.raw_input import PLAIN, RawInput
 from kf_calib.errors import BenchError
 from kf_calib.support.plain_text import cut
 
@@ -33,7 +34,6 @@ EARTH_RATE_RADPS = 7.292115e-5
 
 Vector = tuple[float, float, float]
 _LETTERS: dict[str, Vector] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-CHANNELS = (1, 2, 3)
 
 
 def normal_gravity(latitude_deg: float, height_m: float = 0.0) -> float:
@@ -81,22 +81,6 @@ def _parse_axis(word: str) -> Vector:
     return (numbers[0] / length, numbers[1] / length, numbers[2] / length)
 
 
-def parse_channels(text: str) -> tuple[int, int, int]:
-    """The channel of the recording that belongs to each accelerometer, from text such as ``"1,-2,3"``; a minus reverses
-    its sign."""
-    words = text.strip("[] ").replace(",", " ").split()
-    try:
-        first, second, third = (int(word) for word in words)
-    except ValueError:
-        first, second, third = 0, 0, 0
-    if sorted(map(abs, (first, second, third))) != [1, 2, 3]:
-        raise BenchError(
-            f"channels {cut(text, 60)!r} name no order: give the channel of accelerometer 1, 2 and 3, each once, with "
-            "a minus where it is reversed, for example --channels 1,-2,3."
-        )
-    return first, second, third
-
-
 def _format_axis(axis: Vector) -> str:
     """Write an axis as a letter if it is a coordinate axis, else as three numbers."""
     for letter, unit in _LETTERS.items():
@@ -123,7 +107,7 @@ class Bench:
     - nominal: nominal parameters that differ from the paper's, in rad, 1 and m/s^2.
     - notes: free text such as the serial number of the block, and the date of the run where it is stated.
     - up: the axis that points up when all angles are zero. The azimuth is that of x, or of y if x is vertical.
-    - channels: the channel of the recording for accelerometers 1, 2, 3, negative if its sign is reversed.
+    - input: what the device sends, of which the readings are made; a recording holds the readings.
     - joints: names of the gimbals' joints, outer to inner, if angles come as joint states; empty if their names tell.
     - angles: whether angles or attitudes are used. Without them only the size of gravity is known (``free_attitude``).
     - square_sigma_deg: how square the axes of the accelerometers are, one standard deviation; None for 1 deg.
@@ -140,7 +124,7 @@ class Bench:
     nominal: Mapping[str, float] = field(default_factory=dict[str, float])
     notes: Mapping[str, str] = field(default_factory=dict[str, str])
     up: str = "y"
-    channels: tuple[int, int, int] = CHANNELS
+    input: RawInput = PLAIN
     joints: tuple[str, ...] = ()
     angles: bool = True
     square_sigma_deg: float | None = None
@@ -206,7 +190,7 @@ class Bench:
             joints=tuple(given.get("joints", "").replace(",", " ").split()) if has_angles else (),
             notes={key: given[key] for key in NOTES if given.get(key)},
             up=given.get("up", "y"),
-            channels=parse_channels(given.get("channels", "1,2,3")),
+            input=RawInput.from_metadata(given),
             **numbers,
         )
 
@@ -223,7 +207,7 @@ class Bench:
             **{key: repr(float(value)) for key, value in numbers.items() if value is not None},
             **({"nominal": json.dumps(dict(self.nominal))} if self.nominal else {}),
             **({"up": self.up} if self.up != "y" else {}),
-            **({"channels": ",".join(map(str, self.channels))} if self.channels != CHANNELS else {}),
+            **self.input.to_metadata(),
             **self.notes,
         }
 
@@ -231,13 +215,6 @@ class Bench:
         """Attitude matrices C_bp (n, 3, 3) of poses (n, k): gimbal angles in rad, or quaternions x y z w."""
         columns = [self.to_platform(np.eye(3)[:, i], np.asarray(pose, float)) for i in range(3)]
         return np.stack(columns, axis=1)  # row i of C_bp is bench axis i in platform coordinates
-
-    def readings(self, channels: Floats) -> Floats:
-        """Readings (n, 3) of accelerometers 1, 2, 3 from the channels (n, 3) of a recording."""
-        if self.channels == CHANNELS:
-            return channels
-        places = np.array(self.channels)
-        return channels[:, np.abs(places) - 1] * np.sign(places)
 
     def to_platform(self, vector: Floats, pose: Floats) -> Floats:
         """C_bp^T vector (n, 3): a bench vector (3,) or (n, 3) in platform coordinates at poses (n, k)."""

@@ -12,6 +12,7 @@ from numbers import Real
 from typing import Any, NamedTuple
 
 from kf_calib.bench import paper_parameters
+from kf_calib.bench.raw_input import CONVERTED, RESTATE, UNITS, text_of
 from kf_calib.errors import BenchError, how_to_write
 from kf_calib.support import dates
 from kf_calib.support.plain_text import COMMANDS, LONGEST, cut
@@ -105,7 +106,12 @@ KEYS: Mapping[str, Key] = {
     "format_version": Key(partial(_one_of, (FORMAT_VERSION,)), "1, all that this program reads: update kf_calib"),
     "axes": Key(_text, 'axes, outer to inner, such as "y z x"'),
     "joints": Key(_text, 'names, outer to inner, such as "outer middle inner"'),
-    "channels": Key(_text, 'the channels of accelerometers 1, 2, 3, such as "1,-2,3"'),
+    "channels": Key(partial(text_of, "channels"), 'the channels of accelerometers 1, 2, 3, such as "1,-2,3"'),
+    "accel_scale": Key(partial(text_of, "accel_scale"), "the size of one count, positive, or one for each channel"),
+    "accel_unit": Key(partial(text_of, "accel_unit"), f"the unit of the raw readings, one of {', '.join(UNITS)}"),
+    CONVERTED: Key(partial(_one_of, ("true",)), "true, or left out: the samples are readings of the accelerometers "
+                   "already, and no raw input"),
+    RESTATE: Key(partial(_one_of, ("true",)), "true, or left out: a raw input that is stated goes before the file's"),
     "up": Key(
         partial(_one_of, UP),
         f"the axis that points up when all angles are zero, one of {', '.join(UP)}: z for sensors and angles as ROS "

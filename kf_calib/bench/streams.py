@@ -57,9 +57,14 @@ class Stream:
 class Batch:
     """A stretch of the raw streams as they arrived, each with its own stamps; any of them may be empty."""
 
-    accel: Stream  # readings (n, 3), m/s^2
+    accel: Stream  # readings (n, 3) of accelerometers 1, 2, 3, m/s^2
     pose: Stream  # (m, k) rad, or (m, 4) quaternion x y z w
     temperature: Stream = field(default_factory=lambda: Stream.empty(1))  # (l, 1) degC
+
+
+def with_accel(batch: Batch, readings_mps2: Floats) -> Batch:
+    """The batch with other readings (n, 3) at the same times."""
+    return Batch(Stream(batch.accel.time_ns, readings_mps2), batch.pose, batch.temperature)
 
 
 class Source(Protocol):

@@ -22,6 +22,7 @@ from kf_calib.cli.options import (
     bench_options,
     columns_option,
     examples,
+    input_options,
     json_option,
     no_angles_option,
     overrides,
@@ -240,12 +241,14 @@ def _size(count: int) -> str:
     epilog=examples(
         'record run.mcap bench.csv --axes "y z x" --gravity 9.8123',
         'record run.mcap - --bench bench.toml --column "acc x [g]=ax_g" < bench.csv',
+        "record run.mcap counts.csv --bench bench.toml --accel-scale 3.9e-6 --accel-unit g --channels 1,-2,3",
     )
 )
 @click.argument("out", type=OutputFile())
 @click.argument("lines", type=click.Path(path_type=Path, allow_dash=True), default="-")
 @no_angles_option
 @columns_option
+@input_options
 @bench_options
 @overwrite_option
 @json_option

@@ -3,107 +3,171 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import rich_click as click
 
-from kf_calib.cli.acquire import pair
 from kf_calib.cli.echo import complain
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.options import (
+    BENCH_OPTIONS,
+    INPUT,
+    OF_MESSAGES,
     OUTPUT,
     dwell_options,
     effects_from_option,
     examples,
     json_option,
+    merged_for_table,
     messages_of,
+    overrides,
     overwrite_option,
+    pair,
     print_json,
     progress,
+    recording_kind,
     recording_of,
     recording_options,
+    refuse_given,
     show,
     strict_option,
     trust_option,
+    units_of,
     units_option,
     used_of,
 )
 from kf_calib.cli.pictures import Pictures, figure_options, figures_of
 from kf_calib.errors import InputError, KfCalibError
+from kf_calib.support.output_files import whole
 
 if TYPE_CHECKING:
     from kf_calib.estimation.correction import Correction
     from kf_calib.exchange.calibration_file import SavedCalibration
+    from kf_calib.exchange.corrected_file import Applied
+    from kf_calib.exchange.corrected_lines import CorrectedLines
+    from kf_calib.sources.files.text_file import TextFile
 
 _BLOCK_BYTES = 1 << 16
 _file = partial(click.argument, type=click.Path(path_type=Path))
 
 
 @click.command(
-    epilog=examples("apply cal.json flight.mcap -o flight_calibrated.mcap", "apply cal.json - < lines.csv > out.csv")
+    epilog=examples(
+        "apply cal.json flight.mcap -o flight_calibrated.mcap",
+        "apply cal.json log.csv -o log_calibrated.csv",
+        "apply cal.json - < lines.csv > out.csv",
+    )
 )
 @_file("calibration", metavar="CAL")
 @_file("recording", metavar="REC")
-@output_option("-o", "--out", metavar="OUT.mcap", panel=OUTPUT,
-               help="The copy, with /accelerometer/calibrated beside the raw topic.")  # fmt: skip
+@output_option("-o", "--out", metavar="OUT", panel=OUTPUT,
+               help="The copy: of a recording with /accelerometer/calibrated beside the raw topic, of a log or a table "
+               "with specific force in the place of the readings.")  # fmt: skip
+@click.option("--unchecked", is_flag=True, panel=INPUT,
+              help="Correct the readings though their norm at rest does not fit the calibration.")  # fmt: skip
 @recording_options
 @effects_from_option
 @trust_option
 @overwrite_option
 @units_option
 @json_option
-def apply(calibration: Path, recording: Path, out: Path | None, overwrite: bool, as_json: bool, **options: Any) -> None:
-    """Correct the readings of a recording: specific force in the frame of the block, as one more topic of a copy.
+def apply(
+    calibration: Path, recording: Path, out: Path | None, unchecked: bool, overwrite: bool, as_json: bool,
+    **options: Any,
+) -> None:  # fmt: skip
+    """Correct the readings of a recording: specific force in the frame of the block, in a copy.
 
-    REC may be any recording of the block; it needs no platform angles. Of - (standard input), lines of JSON or CSV are
-    corrected as they come, and written to standard output. Effects that depend on more than specific force and
-    temperature cannot be corrected so; they are left out and named.
+    REC may be any recording, log or table of the block, of what its device sends: the calibration knows order, signs
+    and size of its channels. It needs no platform angles. Of - (standard input), lines of JSON or CSV are corrected as
+    they come, and written to standard output. Effects that depend on more than specific force and temperature cannot be
+    corrected so; they are left out and named.
     """  # fmt: skip
-    columns = dict(map(pair, options.pop("columns")))
+    from kf_calib.views import exchange as views
+
     if recording == Path("-"):
         if out is not None or as_json:
             raise click.UsageError("lines of standard input are corrected to standard output: leave out -o and --json.")
-        return _apply_to_lines(_correction(calibration, options)[1], columns)
-    if out is None or columns:
-        raise click.UsageError("a recording is corrected to a copy: name it by -o OUT.mcap, and leave out --column.")
-    from kf_calib.exchange.corrected_file import apply_to_file
-    from kf_calib.sources.opening import Kind, kind_of
-    from kf_calib.views import exchange as views
-
-    if (kind := kind_of(recording)) is Kind.SAMPLES:
-        raise InputError(
-            f"{recording} holds lines of text: correct them to standard output, by kf-calib apply {calibration} - < "
-            f"{recording}, or record them first (kf-calib record)."
-        )
-    if kind is Kind.TABLE:
-        raise InputError(
-            f"{recording} is no recording of samples: apply corrects MCAP files, bags, and lines of samples from "
-            "standard input (apply CAL - < LINES); mean readings are corrected in Python, by "
-            "kf_calib.open_calibration(CAL).correction()(readings)."
-        )
+        refuse_given(_OF_FILES, "lines of standard input are read as they come")
+        return _apply_to_lines(_correction(calibration, options)[1], options, unchecked)
+    if out is None:
+        raise click.UsageError("a recording is corrected to a copy: name it by -o OUT (standard input by -).")
+    kind = recording_kind(recording, options)
+    if kind != "recording" and out.suffix == ".mcap":
+        raise InputError(f"{recording} holds lines of text or a table, and its copy, too: name {out} as such a file.")
     outputs = claimed(overwrite=overwrite)
     saved, correction = _correction(calibration, options)
     options["gravity_mps2"] = options["gravity_mps2"] or saved.bench.gravity_mps2
-    source = messages_of(recording, options, angles=False)
-    found = []
+    done = list[Any]()
     with progress(f"correcting {recording.name}", as_json) as tick:
-        outputs.write(out, lambda path: found.append(apply_to_file(correction, source, path, tick)))
+        outputs.write(out, lambda path: done.append(_applied(correction, recording, path, options, unchecked, tick)))
+    (found, warnings), topic = done[0], kind == "recording"
     if as_json:
-        print_json(views.applied_object(correction, found[0], out, source.warnings))
+        print_json(views.applied_object(correction, found, out, warnings, topic))
     else:
-        show(views.applied_report(correction, found[0], out, source.warnings))
+        show(views.applied_report(correction, found, out, warnings, topic))
 
 
-def _apply_to_lines(correction: Correction, columns: Mapping[str, str]) -> None:
-    """Correct lines of standard input as they come."""
+_OF_FILES = (*OF_MESSAGES, *(key for key in BENCH_OPTIONS if key != "channels"), "angle_unit", "no_angles")
+"""Options on which lines of standard input have nothing to act."""
+
+
+def _applied(
+    correction: Correction, path: Path, out: Path, options: Mapping[str, Any], unchecked: bool,
+    tick: Callable[[float], None],
+) -> tuple[Applied, list[str]]:  # fmt: skip
+    """Write the copy of a file; what was corrected, and what is to be told."""
+    from kf_calib.exchange.corrected_file import Applied, apply_to_file
+    from kf_calib.exchange.corrected_table import apply_to_table
+
+    columns = dict(map(pair, options["columns"]))
+    match recording_kind(path, options):
+        case "samples":
+            lines = _lines(correction, options, str(path), unchecked)
+            with whole(out) as part, part.open("wb") as file, _bytes_of(path) as source:
+                while block := source.read(_BLOCK_BYTES):
+                    file.write(lines.push(block))
+                file.write(lines.rest())
+            return Applied(lines.readings, 0, None), lines.warnings
+        case "table":
+            keys, units = merged_for_table(path, options, correction.input)
+            return apply_to_table(correction, path, out, keys, columns, units, unchecked=unchecked), []
+        case _:
+            if columns:
+                raise InputError(f"{path} is no log and no table, on which --column has nothing to act: leave it out.")
+            source = messages_of(path, options, angles=False, input=correction.input)
+            found = apply_to_file(correction, source, out, tick, unchecked=unchecked)
+            return found, source.warnings
+
+
+def _bytes_of(path: Path) -> BinaryIO | TextFile:
+    """A log as it is, byte for byte; one that is packed, or written in UTF-16, in UTF-8."""
+    from kf_calib.sources.files.text_file import TextFile
+
+    try:
+        with path.open("rb") as file:
+            start = file.read(2)
+        return TextFile(path) if start in (b"\x1f\x8b", b"\xff\xfe", b"\xfe\xff") else path.open("rb")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+
+
+def _lines(correction: Correction, options: Mapping[str, Any], name: str, unchecked: bool) -> CorrectedLines:
+    """What corrects lines."""
     from kf_calib.exchange.corrected_lines import CorrectedLines
 
+    stated, columns = overrides(options), dict(map(pair, options["columns"]))
+    units = units_of(options, correction.input)
+    return CorrectedLines(correction, columns, stated, name=name, units=units, unchecked=unchecked)
+
+
+def _apply_to_lines(correction: Correction, options: Mapping[str, Any], unchecked: bool) -> None:
+    """Correct lines of standard input as they come."""
     for name, why in correction.left_out.items():
         complain(f"{name} is not corrected: {why}")
-    lines = CorrectedLines(correction, columns)
+    lines = _lines(correction, options, "standard input", unchecked)
     read = getattr(sys.stdin.buffer, "read1", sys.stdin.buffer.read)  # read1 does not wait for a whole block
     while block := read(_BLOCK_BYTES):
         _write_out(lines.push(block))
@@ -161,7 +225,7 @@ def verify(ctx: click.Context, calibration: Path, recording: Path, strict: bool,
 
     saved = _read(calibration, options)
     verification.refuse_incomplete(saved)
-    source = recording_of(recording, options)
+    source = recording_of(recording, options, saved.bench.input)
     model = saved.model(calibration, options["effects_from"], options["trust"], source.bench)
     with progress(f"verifying with {recording.name}", as_json) as tick:
         found = verification.verify(saved, model, source, Settings(**used_of(options)), tick)

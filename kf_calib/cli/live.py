@@ -23,6 +23,7 @@ from kf_calib.cli.options import (
     columns_option,
     examples,
     filter_options,
+    input_options,
     json_line,
     json_option,
     no_angles_option,
@@ -108,6 +109,7 @@ _REFRESH_S = 0.25
     panel=INPUT,
     help="End the run when nothing has come for so long.",
 )
+@input_options
 @bench_options
 @filter_options
 @overwrite_option

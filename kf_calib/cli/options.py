@@ -23,6 +23,7 @@ from kf_calib.errors import BenchError, InputError
 from kf_calib.support.units import shown_in, si
 
 if TYPE_CHECKING:
+    from kf_calib.bench.raw_input import RawInput
     from kf_calib.diagnosis.results import Diagnosis
     from kf_calib.diagnosis.stepwise_selection import Improvement
     from kf_calib.estimation.bench_model import BenchModel
@@ -49,7 +50,7 @@ BENCH_OPTIONS = {
     "up": ("--up", str, "AXIS", "Axis that points up when all angles are zero: y (the default; accelerometer 2 reads "
            "+g), z as in ROS, x, -x, -y or -z."),
     "channels": ("--channels", str, "N,N,N", "Which channel accelerometer 1, 2, 3 is, with a minus where its sign is "
-                 "reversed: 1,-2,3."),
+                 "reversed: 1,-2,3; a calibration remembers it."),
     "gravity_mps2": ("--gravity", NUMBER, "M/S^2", "Local gravity, m/s^2."),
     "latitude_deg": ("--latitude", NUMBER, "DEG", "Latitude, deg; gives normal gravity where --gravity is not stated."),
     "height_m": ("--height", NUMBER, "M", "Height, m, for normal gravity; 0 where it is not stated."),
@@ -106,13 +107,25 @@ no_angles_option = click.option(
 )  # fmt: skip
 
 
+def input_options(command: F) -> F:
+    """What the device sends: the unit of its readings, the size of a count; ``--channels`` is of the bench's keys."""
+    options = [
+        click.option("--accel-unit", type=click.Choice(_ACCEL_UNITS), show_default="m/s2; in text, as the header or "
+                     "the numbers tell", help="Unit of the readings; a calibration remembers it.", panel=INPUT),
+        click.option("--accel-scale", type=POSITIVE, show_default="1", panel=INPUT,
+                     help="Size of one count, in the unit of the readings; a calibration remembers it."),
+        click.option("--restate-input", is_flag=True, panel=INPUT,
+                     help="What is stated of channels, unit and count was wrong: the options go before it."),
+    ]  # fmt: skip
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
 def recording_options(command: F) -> F:
     """How to read a recording: the bench, unit of the readings, and topics."""
     options = [
-        click.option("--accel-unit", type=click.Choice(_ACCEL_UNITS), show_default="m/s2; in text, as the header or "
-                     "the numbers tell", help="Unit of the readings.", panel=INPUT),
-        click.option("--accel-scale", type=NUMBER, default=1.0, show_default=True,
-                     help="Size of one count, in the unit of the readings.", panel=INPUT),
+        input_options,
         click.option("--angle-unit", type=click.Choice(_ANGLE_UNITS), show_default="rad; in text, as the header or "
                      "the numbers tell", help="Unit of the gimbal angles.", panel=INPUT),
         no_angles_option,
@@ -237,7 +250,8 @@ def overrides(options: Mapping[str, Any]) -> dict[str, str]:
     if options["bench_file"]:
         keys |= _bench_from_toml(options["bench_file"])
     keys |= {key: str(options[key]) for key in BENCH_OPTIONS if options[key] is not None}
-    return keys
+    keys |= {key: str(options[key]) for key in ("accel_unit", "accel_scale") if options.get(key) is not None}
+    return keys | ({"restate_input": "true"} if options.get("restate_input") else {})
 
 
 def _bench_from_toml(path: Path) -> dict[str, str]:
@@ -257,8 +271,8 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
     return keys
 
 
-def recording_of(path: Path, options: Mapping[str, Any]) -> Recording | Lines | Table:
-    """The recording, log of samples or table at a path."""
+def recording_of(path: Path, options: Mapping[str, Any], input: RawInput | None = None) -> Recording | Lines | Table:
+    """The recording, log of samples or table at a path; input: what the device sends, where nothing else states it."""
     from kf_calib.sources.files.lines import Lines
     from kf_calib.sources.opening import Kind, kind_of
     from kf_calib.sources.tables.opening import open_table
@@ -266,15 +280,15 @@ def recording_of(path: Path, options: Mapping[str, Any]) -> Recording | Lines | 
     columns, angles = dict(map(pair, options["columns"])), not options["no_angles"]
     match kind_of(path, columns):
         case Kind.TABLE:
-            _refuse_given(OF_MESSAGES + OF_DWELLS, f"{path} is a table of mean readings")
-            stated = {name: options[name] for name in ("accel_unit", "accel_scale", "angle_unit", "g_unit")}
-            return open_table(path, overrides(options), columns=columns, angles=angles, **stated)
+            refuse_given(OF_MESSAGES + OF_DWELLS, f"{path} is a table of mean readings")
+            stated = {name: options[name] for name in ("angle_unit", "g_unit")}
+            return open_table(path, overrides(options), columns=columns, angles=angles, input=input, **stated)
         case Kind.SAMPLES:
-            _refuse_given(OF_MESSAGES, f"{path} is a log in lines of text")
-            return Lines(path, overrides(options), columns, units=units_of(options), angles=angles)
+            refuse_given(OF_MESSAGES, f"{path} is a log in lines of text")
+            return Lines(path, overrides(options), columns, units=units_of(options, input), angles=angles)
         case Kind.RECORDING:
-            _refuse_given(_OF_TEXT, f"{path} is no table (.csv, .xlsx) and no log in lines of text")
-            return messages_of(path, options, angles)
+            refuse_given(_OF_TEXT, f"{path} is no table (.csv, .xlsx) and no log in lines of text")
+            return messages_of(path, options, angles, input)
 
 
 _OF_TEXT = ("columns", "g_unit")
@@ -283,7 +297,7 @@ OF_DWELLS = ("joints", "settle_s", "still_deg", "gate", "gate_sigma")
 """Options that act on text and spreadsheets only, on files of messages only, and where dwells are to be found."""
 
 
-def _refuse_given(names: Sequence[str], what: str) -> None:
+def refuse_given(names: Sequence[str], what: str) -> None:
     """Raise InputError for the first of these options that the command line has.
 
     In a worker of a fleet there is no command line: of recordings of several kinds, an option acts on those it can.
@@ -297,21 +311,40 @@ def _refuse_given(names: Sequence[str], what: str) -> None:
             raise InputError(f"{what}, on which {name} has nothing to act: leave it out.")
 
 
-def units_of(options: Mapping[str, Any]) -> Units:
+def recording_kind(path: Path, options: Mapping[str, Any]) -> str:
+    """What a file is: ``recording``, ``samples`` or ``table``."""
+    from kf_calib.sources.opening import kind_of
+
+    return kind_of(path, dict(map(pair, options["columns"]))).value
+
+
+def merged_for_table(path: Path, options: Mapping[str, Any], input: RawInput) -> tuple[dict[str, str], Units]:
+    """Bench keys and units of a table of what the device of a calibration sends."""
+    from kf_calib.bench.raw_input import merged
+
+    keys = overrides(options)
+    try:
+        order = merged({}, keys, "", input).get("channels")
+    except BenchError as error:
+        raise BenchError(f"{path}: {error}") from None
+    return keys if order is None else keys | {"channels": order}, units_of(options, input)
+
+
+def units_of(options: Mapping[str, Any], input: RawInput | None = None) -> Units:
     """Units of a table or a log, as the options state them."""
     from kf_calib.sources.units import Units
 
-    return Units(options["accel_unit"], options["accel_scale"], options["angle_unit"], options["g_unit"])
+    return Units.of(overrides(options), options["angle_unit"], options["g_unit"], input)
 
 
-def messages_of(path: Path, options: Mapping[str, Any], angles: bool) -> Recording:
+def messages_of(path: Path, options: Mapping[str, Any], angles: bool, input: RawInput | None = None) -> Recording:
     """The recording of samples at a path, as the options say it is to be read; angles: whether it must have angles."""
     from kf_calib.sources.files.recording import Recording
 
     return Recording(
         path,
         overrides(options),
-        si(f"1 {options['accel_unit'] or 'm/s2'}") * options["accel_scale"],
+        input=input,
         angle_scale=si(f"1 {options['angle_unit'] or 'rad'}"),
         accel_topic=options["accel_topic"],
         pose_topic=options["pose_topic"],

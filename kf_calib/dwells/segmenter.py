@@ -110,7 +110,6 @@ class Segmenter:
         before."""
         if not final:
             self.tally.read += len(batch.accel)
-            batch = replace(batch, accel=Stream(batch.accel.time_ns, self.bench.readings(batch.accel.values)))
         self._take_readings(batch.accel)
         self._take_poses(batch.pose, final)
         if len(batch.temperature):

@@ -63,7 +63,7 @@ def rows_of(table: Sequence[Known], bench: Bench) -> Iterator[Rows]:
     times = _times(table)
     for k, (own, nodes) in enumerate(zip(table, _nodes(table, bench), strict=True)):
         count = own.count * times
-        readings = np.tile(bench.readings(own.mean_mps2[None]), (count, 1))
+        readings = np.tile(own.mean_mps2, (count, 1))
         columns = np.tile(nodes.regressors[:1], (count, 1))
         assert columns.shape[1] == len(REGRESSORS)
         piece = slice(0, count), np.zeros(count), nodes
@@ -91,10 +91,10 @@ def _nodes(table: Sequence[Known], bench: Bench) -> Iterator[Nodes]:
 
 def _piece(own: Known, nodes: Nodes, bench: Bench, times: int) -> Piece:
     """Return the one piece of a dwell."""
-    count, mean = own.count * times, bench.readings(own.mean_mps2[None])[0]
+    count, mean = own.count * times, own.mean_mps2
     triangle = np.zeros((_CURVE + 3, _CURVE + 3))
     triangle[0, 0], triangle[0, _CURVE:] = math.sqrt(count), math.sqrt(count) * mean
     if own.sigma_mps2 is not None:  # about a parabola, since that is what the noise model takes it for
-        sigma = np.abs(bench.readings(own.sigma_mps2[None]))[0] * math.sqrt(times * (count - _CURVE))
+        sigma = own.sigma_mps2 * math.sqrt(times * (count - _CURVE))
         triangle[_CURVE:, _CURVE:] = np.diag(sigma)
     return Piece(triangle, nodes, count, 0.0, own.count)

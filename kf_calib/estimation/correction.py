@@ -1,4 +1,4 @@
-"""Specific force from readings: what a calibration is for.
+"""Specific force from raw readings: what a calibration is for.
 
 The reading of accelerometer i is s_i . f + b_i + e_i(f, T), with effects e of the model. With rows s_i of S,
 
@@ -23,6 +23,7 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.raw_input import RawInput
 from kf_calib.effects import Effect
 from kf_calib.effects.inputs import beyond_force_and_temperature, depends_on_temperature, stimulus_of
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C, Stimulus
@@ -55,7 +56,7 @@ class Corrected:
 class Correction:
     """The inverse of the measurement model; raises UnobservableError if the run did not determine all of it.
 
-    - bench: by which effects know gravity and gimbals.
+    - bench: by which effects know gravity and gimbals, and what the device sends (``input``).
     - model: the fitted model, each effect with its constants.
     - state (p,), covariance (p, p): the estimate.
     - noise_mps2 (3,): sigma of a reading.
@@ -120,22 +121,37 @@ class Correction:
         """S^-1 (3, 3), which turns readings without bias into specific force."""
         return np.asarray(np.linalg.inv(self.sensitivity), float)
 
-    def __call__(self, readings_mps2: Floats, temperature_c: Floats | float | None = None) -> Floats:
-        """Specific force (n, 3) in the frame of the block, m/s^2, from readings (n, 3) and temperatures (n,), degC.
+    @property
+    def input(self) -> RawInput:
+        """What the device sends, which is what ``__call__`` takes."""
+        return self.bench.input
+
+    def __call__(self, raw: Floats, temperature_c: Floats | float | None = None) -> Floats:
+        """Specific force (n, 3) in the frame of the block, m/s^2, from raw readings (n, 3) as the device sends them
+        (``input``) and temperatures (n,), degC.
 
         Raises InputError if an effect needs the temperature and there is none.
         """
-        readings = _numbers("readings", readings_mps2)
-        if readings.shape == (3,):
-            readings = readings[None]
-        if readings.ndim != 2 or readings.shape[1] != 3:
-            raise InputError(f"readings have the shape {readings.shape}: give (n, 3), in m/s^2.")
+        return self.of_readings(self.input.readings(self._three_columns(raw, self.input.unit_words)), temperature_c)
+
+    def of_readings(self, readings_mps2: Floats, temperature_c: Floats | float | None = None) -> Floats:
+        """The same from readings (n, 3) of accelerometers 1, 2, 3 in m/s^2, such as a recording holds."""
+        readings = self._three_columns(readings_mps2, "m/s^2")
         temperature = self._temperature(temperature_c, len(readings))
         out = np.empty_like(readings)
         for first in range(0, len(readings), _BLOCK):
             part = slice(first, first + _BLOCK)
             out[part] = self._corrected(readings[part], temperature[part])
         return out
+
+    def _three_columns(self, values: object, unit: str) -> Floats:
+        """Return readings as (n, 3)."""
+        readings = _numbers("readings", values)
+        if readings.shape == (3,):
+            readings = readings[None]
+        if readings.ndim != 2 or readings.shape[1] != 3:
+            raise InputError(f"readings have the shape {readings.shape}: give (n, 3), in {unit}.")
+        return readings
 
     def _temperature(self, temperature_c: Floats | float | None, count: int) -> Floats:
         """Return temperatures (n,); the reference where none is needed."""
@@ -197,14 +213,14 @@ class Correction:
             out += effect.added(stimulus, self.state[part.start : part.start + len(effect.coefficients)])
         return out
 
-    def corrected(self, readings_mps2: Floats, temperature_c: Floats | float | None = None) -> Corrected:
+    def corrected(self, raw: Floats, temperature_c: Floats | float | None = None) -> Corrected:
         """As ``__call__``, with the uncertainty of each corrected reading."""
-        force = self(readings_mps2, temperature_c)
+        force = self(raw, temperature_c)
         noise = self.matrix @ np.diag(self.noise_mps2**2) @ self.matrix.T
         return Corrected(force, self.sigma_of(force, temperature_c), np.sqrt(np.diag(noise)), self.left_out)
 
     def predicted(self, force_mps2: Floats, temperature_c: Floats | float | None = None) -> Floats:
-        """Readings (n, 3) of this specific force (n, 3): what ``__call__`` inverts."""
+        """Readings (n, 3), m/s^2, of this specific force (n, 3): what ``of_readings`` inverts."""
         temperature = self._temperature(temperature_c, len(force_mps2))
         stimulus = stimulus_of(force_mps2, temperature, self.bench, self.sensitivity)
         return force_mps2 @ self.sensitivity.T + self.bias_mps2 + self._added(stimulus)

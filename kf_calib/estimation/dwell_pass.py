@@ -11,6 +11,7 @@ import numpy as np
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Source
+from kf_calib.bench.wrong_unit import wrong_unit
 from kf_calib.dwells import tabulated, window_average
 from kf_calib.dwells.blocks import LARGEST_RAD, Block, Tally
 from kf_calib.dwells.rest_in_readings import segmenter_of
@@ -24,7 +25,6 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import ReadingsMonitor
 from kf_calib.sources.tables.table import Table
-from kf_calib.support.units import WORDS
 
 LEAST_READINGS = 8
 """Of a dwell that is used: fewer do not show their own noise."""
@@ -126,17 +126,7 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
         if bench.angles:
             setup_blunders.refuse(dwells, bench)
         return
-    measured = level * bench.gravity_mps2
-    for unit in ("g", "mg", "ug"):
-        if 0.8 <= measured * WORDS["m/s^2"][unit] / bench.gravity_mps2 <= 1.25:
-            raise InputError(
-                f"the readings have a norm of {measured:.4g} at rest, which is gravity in {unit}, not in m/s^2: "
-                f"state it with --accel-unit {unit}."
-            )
-    raise InputError(
-        f"the readings have a norm of {measured:.4g} at rest where gravity is {bench.gravity_mps2:.4g} m/s^2: they "
-        "look like counts; give the size of one count in m/s^2 with --accel-scale."
-    )
+    raise InputError(f"{wrong_unit(level, bench.input, bench.gravity_mps2)}.")
 
 
 def _refuse_restless(dwells: list[DwellFactor], tally: Tally) -> None:

@@ -331,12 +331,12 @@ class Calibration:
             self.undetermined,
         )  # fmt: skip
 
-    def apply(self, readings_mps2: Floats, temperature_c: Floats | float | None = None) -> Corrected:
-        """Specific force from readings (n, 3) of the block, m/s^2, with its uncertainty.
+    def apply(self, raw: Floats, temperature_c: Floats | float | None = None) -> Corrected:
+        """Specific force from raw readings (n, 3) as the device sends them (``bench.input``), with its uncertainty.
 
         temperature_c: of each reading (n,), or of all; needed where an effect of the model depends on it.
         """
-        return self.correction.corrected(readings_mps2, temperature_c)
+        return self.correction.corrected(raw, temperature_c)
 
     @property
     def undetermined(self) -> tuple[str, ...]:

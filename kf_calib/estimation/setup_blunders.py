@@ -24,8 +24,9 @@ import numpy as np
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, Mask
-from kf_calib.bench.bench import CHANNELS, Bench
+from kf_calib.bench.bench import Bench
 from kf_calib.bench.mountings import Mounting, mountings
+from kf_calib.bench.raw_input import CHANNELS
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.errors import BlunderError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -175,7 +176,7 @@ def _refuse_silent(means: Means, stated: Mounting) -> None:
     readings, count = means.readings, len(means.readings)
     expected = means.force(stated) @ _nominal(stated.bench).T
     same = np.abs(readings - readings[-1]) <= _STUCK * np.abs(readings[-1])
-    for i, channel in enumerate(map(abs, stated.bench.channels)):
+    for i, channel in enumerate(map(abs, stated.bench.input.channels)):
         first = count - int(np.argmin(np.append(same[::-1, i], False)))
         if count - first >= 3 and np.ptp(expected[first:, i]) > _CHANGED:
             since = f"from dwell {means.numbers[first]} on (at {means.middle_s[first]:.0f} s)" if first else "all along"
@@ -197,8 +198,8 @@ def _refuse_wrong_gain(found: Affine, bench: Bench) -> None:
         if not _GAIN[0] < scale < _GAIN[1]:
             others = " and ".join(f"{other:.3g}" for other in np.delete(found.scales, i))
             raise BlunderError(
-                f"channel {abs(bench.channels[i])} feels {scale:.3g} times gravity, the others {others}: check its "
-                "unit and its range; all channels must be in one unit."
+                f"channel {abs(bench.input.channels[i])} feels {scale:.3g} times gravity, the others {others}: check "
+                "its unit and its range; all channels must be in one unit."
             )
 
 
@@ -259,7 +260,7 @@ def _what_is_wrong(found: Affine | None, bench: Bench) -> str:
     readings."""
     if found is None:
         return "the readings show the platform in many orientations, the angles in few"
-    cosines, numbers = np.diag(found.cosines), [abs(channel) for channel in bench.channels]
+    cosines, numbers = np.diag(found.cosines), [abs(channel) for channel in bench.input.channels]
     opposite = [channel for channel, cosine in zip(numbers, cosines, strict=True) if cosine < -_FARTHEST]
     out = list[str]()
     if opposite:
@@ -291,7 +292,7 @@ def _reasons(stated: Bench, mending: Mending) -> list[str]:
     out, channels = list(mending.mounting.words), mending.channels
     moved = [k for k, channel in enumerate(channels, 1) if abs(channel) != k]
     negative = sorted(-channel for channel in channels if channel < 0)
-    if stated.channels != CHANNELS and (moved or negative):
+    if stated.input.channels != CHANNELS and (moved or negative):
         return [*out, f"accelerometers 1, 2, 3 are channels {_wired(stated, channels)}"]
     if len(moved) == 2:
         out.append(f"channels {moved[0]} and {moved[1]} are exchanged")
@@ -306,7 +307,9 @@ def _reasons(stated: Bench, mending: Mending) -> list[str]:
 
 def _wired(stated: Bench, channels: Channels) -> str:
     """Return the option's value for channels in the order and with the signs ``channels``, relative to those stated."""
-    return ",".join(str(int(math.copysign(1, channel)) * stated.channels[abs(channel) - 1]) for channel in channels)
+    return ",".join(
+        str(int(math.copysign(1, channel)) * stated.input.channels[abs(channel) - 1]) for channel in channels
+    )
 
 
 def _advice(stated: Bench, mending: Mending) -> str:
@@ -319,7 +322,7 @@ def _advice(stated: Bench, mending: Mending) -> str:
     if mounting.angle_unit < 1.0:
         options.append("--angle-unit deg")
     if mending.channels != CHANNELS:
-        options.append(f"--channels {_wired(stated, mending.channels)}")
+        options.append(f"--channels {_wired(stated, mending.channels)}{stated.input.restating}")
     if stated.axes and mounting.order != tuple(range(len(stated.axes))):
         words.append("--joints with the names of the angles, outer to inner")
     if mounting.angle_unit > 1.0:
@@ -377,7 +380,8 @@ def common_scale(scales: Floats, sigmas: Floats, bench: Bench) -> str:
     if abs(level - (1.0 / factor - 1.0)) < max(5.0 * float(sigmas.max()), _ALIKE * abs(level)):
         return (
             f"{said} readings in units of local gravity ({bench.gravity_mps2:.6g} m/s^2) are taken for such of "
-            f"standard gravity ({STANDARD_GRAVITY_MPS2}): if they are, state --accel-scale {factor:.7f}."
+            f"standard gravity ({STANDARD_GRAVITY_MPS2}): if they are, state "
+            f"--accel-scale {factor * bench.input.sizes[0]:.8g}{bench.input.restating}."
         )
     seen_mps2 = bench.gravity_mps2 * (1.0 + level)
     return f"{said} gravity is not {bench.gravity_mps2:.6g} m/s^2 as stated, but {seen_mps2:.6g}."

@@ -18,6 +18,7 @@ from kf_calib.bench.streams import Batch, Stream
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
+from kf_calib.exchange.norm_at_rest import NormAtRest
 from kf_calib.sources.files import cdr
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
 from kf_calib.sources.files.mcap_append import TopicAppender, source_file
@@ -38,12 +39,19 @@ class Applied:
 
 
 def apply_to_file(
-    correction: Correction, recording: Recording, out: Path, on_progress: Callable[[float], None] | None = None
+    correction: Correction,
+    recording: Recording,
+    out: Path,
+    on_progress: Callable[[float], None] | None = None,
+    *,
+    unchecked: bool = False,
 ) -> Applied:
-    """Write the copy to ``out``, wholly or not at all.
+    """Write the copy to ``out``, wholly or not at all; unchecked: though the norm at rest may not be gravity.
 
-    Raises InputError where the recording cannot be read, is not whole, or has no temperature where an effect needs one.
+    Raises InputError where the recording cannot be read, is not whole, has no temperature where an effect needs one, or
+    holds other readings than it is taken for.
     """
+    norm = NormAtRest(correction)
     thermometer = _Thermometer(bool(correction.needs_temperature))
     count = bad = 0
     source = source_file(recording.path)
@@ -51,9 +59,16 @@ def apply_to_file(
         copied, told = _half(on_progress, 0.0), _half(on_progress, 0.5)
         appender = TopicAppender(source, file, CALIBRATED_TOPIC, cdr.IMU, _template(correction), copied)
         for readings, temperature_c in _pairs(recording, thermometer, told):
-            values = correction(readings.values, temperature_c)
+            values = correction.of_readings(readings.values, temperature_c)
+            norm.add(readings)
             appender.add(Stream(readings.time_ns, values))
             count, bad = count + len(values), bad + int(np.count_nonzero(~np.isfinite(values).all(axis=1)))
+        if not unchecked and (said := norm.misfit(recording.bench.input, final=True)):
+            raise InputError(f"{recording.path}: {said}.")
+        if bad == count > 0:
+            raise InputError(f"{recording.path}: none of the {count} readings is what the calibration's device can "
+                             f"send ({correction.input}): state what they are, by --accel-unit, --accel-scale and "
+                             "--channels.")  # fmt: skip
         appender.finish()
     return Applied(count, bad, thermometer.extremes)
 

@@ -1,45 +1,72 @@
-"""Lines of JSON or CSV with the readings in them corrected, as they come: the same lines otherwise (docs/format.md)."""
+"""Lines of JSON or CSV with the readings in them corrected, as they come: byte for byte the same lines otherwise
+(docs/format.md)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
 
+from kf_calib.bench.raw_input import PLAIN, RawInput
+from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
+from kf_calib.exchange.norm_at_rest import NormAtRest
 from kf_calib.sources.files.line_parts import Account, LineReader
-from kf_calib.sources.files.lines import Cutter, reader_for
+from kf_calib.sources.files.lines import LONGEST_LINE_BYTES, is_json, reader_for, stated_of
+from kf_calib.sources.units import Units
+
+_TELLING_LINES = 9
+"""Of CSV: the heading and rows that tell what it does not."""
+Line = tuple[int, str, str]
+"""Number of a line, its text, and what ends it."""
 
 
 class CorrectedLines:
     """Corrects lines that come in blocks of bytes; memory is that of one block and one line.
 
-    A header, the description of a bench, angles and temperatures pass as they are. Lines that cannot be used are left
-    out and counted, as are readings that come before the first temperature where one is needed. columns: our name for
-    each foreign column or key. readings: how many have been corrected.
+    A heading, the description of a bench, angles and temperatures pass as they are. Lines that cannot be used are left
+    out and counted, as are readings that come before the first temperature where one is needed. overrides: bench keys
+    that state what the device sends, where that is not what the calibration says. columns: our name for each foreign
+    column or key. name: what messages call the lines. unchecked: whether a norm at rest that is not gravity may be.
+    readings: how many have been corrected. Raises InputError where the readings are not what they are taken for.
     """
 
-    def __init__(self, correction: Correction, columns: Mapping[str, str] = MappingProxyType({})) -> None:
-        self._correct, self._columns = correction, columns
+    def __init__(
+        self,
+        correction: Correction,
+        columns: Mapping[str, str] = MappingProxyType({}),
+        overrides: Mapping[str, str] = MappingProxyType({}),
+        *,
+        name: str = "standard input",
+        units: Units | None = None,
+        unchecked: bool = False,
+    ) -> None:
+        self._correction, self._columns, self._overrides, self._name = correction, columns, overrides, name
+        self._units = units or Units.of(overrides, input=correction.input)
         self._needs_temperature = bool(correction.needs_temperature)
-        self._account, self._reader, self._temperature_c = Account(), None, np.nan
-        self._cutter = Cutter(self._account)
+        self._account, self._temperature_c = Account(), np.nan
+        self._cutter = _Cutter(self._account)
+        self._waiting = list[Line]()  # while it is not known what the lines are
         self._reader: LineReader | None = None
+        self._input: RawInput | None = None
+        self._norm = None if unchecked else NormAtRest(correction)
         self.readings = 0
 
     def push(self, block: bytes) -> bytes:
         """The lines that end in ``block``, corrected."""
-        return self._corrected(self._cutter.push(block))
+        return self._corrected(self._cutter.push(block), ended=False)
 
     def rest(self) -> bytes:
         """The line without an end, if there is one. Raises InputError where no readings have come at all."""
-        last = self._corrected(self._cutter.rest())
+        last = self._corrected(self._cutter.rest(), ended=True)
         if not self.readings:
             advice = f": {self._reader.advice}" if self._reader else ": check that the logger wrote any"
             found = "".join(f"; {sentence.rstrip('.')}" for sentence in self.warnings)
-            raise InputError(f"standard input: no readings to correct in {self._account.lines} lines{found}{advice}.")
+            raise InputError(f"{self._name}: no readings to correct in {self._account.lines} lines{found}{advice}.")
+        if self._norm is not None:
+            self._checked(final=True)
         return last
 
     @property
@@ -48,54 +75,137 @@ class CorrectedLines:
         self._account.unknown.clear()
         return self._account.sentences()
 
-    def _corrected(self, lines: list[str]) -> bytes:
+    @property
+    def input(self) -> RawInput:
+        """What the lines hold, as far as that is known."""
+        return self._input or PLAIN
+
+    def _corrected(self, lines: list[Line], ended: bool) -> bytes:
         """Return lines, corrected; the readings of all of them at once."""
-        raw = list[tuple[int, str, list[float], float]]()  # number, line, readings, temperature
         out = dict[int, str]()
-        for number, line in enumerate(lines, self._account.lines + 1):
-            for readings in self._read(line, number):
-                if readings is None:
-                    out[number] = line
-                else:
-                    raw.append((number, line, readings, self._temperature_c))
-        self._account.lines += len(lines)
-        if raw:
-            values = np.array([readings for _, _, readings, _ in raw])
-            forces = self._correct(values, np.array([temperature for *_, temperature in raw]))
-            for (number, line, *_), force in zip(raw, forces, strict=True):
-                self._put(out, number, line, force.tolist())
-        return "".join(f"{out[number]}\n" for number in sorted(out)).encode()
-
-    def _put(self, out: dict[int, str], number: int, line: str, force: list[float]) -> None:
-        """Add a corrected line."""
-        assert self._reader is not None
-        if not np.isfinite(force).all():
-            self._account.refuse(number, "no specific force gives these readings")
-            return
-        out[number] = self._reader.with_readings(line, force)
-        self.readings += 1
-
-    def _read(self, line: str, number: int) -> Iterator[list[float] | None]:
-        """Yield the readings of a line; None: it has none, and passes; nothing where it is left out."""
+        for number, text, end in self._started(lines, ended, out):
+            out[number] = text + end
+        lines, self._waiting = self._waiting, []
         if self._reader is None:
-            text = line.lstrip("\ufeff").strip()
-            if not text:
-                return
-            try:
-                self._reader, _ = reader_for([text], self._columns, self._account, angles=False)
-            except InputError as error:
-                raise InputError(f"standard input: {error}") from None
-            if text[0] not in "{[":  # the header
-                yield None
-                return
+            self._waiting = lines
+            return _bytes(out)
+        raw = list[tuple[Line, int, list[float], float]]()  # line, stamp, readings, temperature
+        for line in lines:
+            for time_ns, readings in self._read(line, out):
+                raw.append((line, time_ns, readings, self._temperature_c))
+        if raw:
+            self._put(out, raw)
+        return _bytes(out)
+
+    def _started(self, lines: list[Line], ended: bool, out: dict[int, str]) -> list[Line]:
+        """Add lines to those that wait, and return what of them is a heading, once it is known what they are."""
+        self._account.lines = self._cutter.number
+        self._waiting += lines
+        if self._reader is not None:
+            return []
+        blank = next((k for k, line in enumerate(self._waiting) if line[1].lstrip("\ufeff").strip()), None)
+        if blank is None:
+            return []
+        told = self._waiting[blank:]
+        if not (ended or len(told) >= _TELLING_LINES or is_json(told[0][1])):
+            return []
+        try:
+            self._reader, count = reader_for(
+                [text for _, text, _ in told], self._columns, self._account, angles=False, units=self._units
+            )
+        except InputError as error:
+            raise InputError(f"{self._name}: {error}") from None
+        texts = self._reader.heading_of_forces([text for _, text, _ in told[:count]])
+        heading = [(number, text, end) for (number, _, end), text in zip(told[:count], texts, strict=True)]
+        self._waiting, passed = told[count:], self._waiting[:blank]
+        return passed + heading
+
+    def _read(self, line: Line, out: dict[int, str]) -> Iterator[tuple[int, list[float]]]:
+        """Yield the stamp and the readings of a line; one that has none passes, one that cannot be used is left out."""
+        assert self._reader is not None
+        number, text, end = line
         before = self._account.malformed
-        batch = self._reader.read([line], number)
+        batch = self._reader.read([text.lstrip("\ufeff")], number)
         if len(batch.temperature):
             self._temperature_c = float(batch.temperature.values[-1, 0])
         if not len(batch.accel):
             if self._account.malformed == before:
-                yield None
+                out[number] = text + end
         elif self._needs_temperature and np.isnan(self._temperature_c):
             self._account.refuse(number, "it came before the first temperature, which the calibration needs")
         else:
-            yield batch.accel.values[0].tolist()
+            yield int(batch.accel.time_ns[0]), batch.accel.values[0].tolist()
+
+    def _put(self, out: dict[int, str], raw: Sequence[tuple[Line, int, list[float], float]]) -> None:
+        """Add corrected lines."""
+        assert self._reader is not None
+        if self._input is None:
+            stated = stated_of(self._name, self._reader, self._overrides, self._correction.input)
+            self._input = RawInput.from_metadata(stated)
+        readings = self._input.readings(np.array([values for _, _, values, _ in raw]))
+        forces = self._correction.of_readings(readings, np.array([temperature for *_, temperature in raw]))
+        if self._norm is not None:
+            self._norm.add(Stream(np.array([time_ns for _, time_ns, *_ in raw]), readings))
+            self._checked(final=False)
+        for ((number, text, end), *_), force in zip(raw, forces, strict=True):
+            if np.isfinite(force).all():
+                out[number] = self._reader.with_readings(text, force.tolist()) + end
+                self.readings += 1
+            else:
+                self._account.refuse(number, "no specific force gives these readings")
+
+    def _checked(self, final: bool) -> None:
+        """Raise InputError where the norm at rest shows that the readings are not what they are taken for."""
+        assert self._norm is not None
+        if said := self._norm.misfit(self.input, final):
+            raise InputError(f"{self._name}: {said}.")
+
+
+class _Cutter:
+    """Bytes as they come, cut into lines that keep their ends; one that is too long is left out and counted."""
+
+    def __init__(self, account: Account) -> None:
+        self._account, self._tail, self._is_cut = account, bytearray(), False
+        self.number = 0
+        """Lines that have ended."""
+
+    def push(self, block: bytes) -> list[Line]:
+        """The lines that end in ``block``."""
+        first, *others = block.split(b"\n")
+        if not others:
+            self._keep(first)
+            return []
+        *whole, last = others
+        lines = [self._line(bytes(self._tail) + first, b"\n"), *(self._line(line, b"\n") for line in whole)]
+        self._tail.clear()
+        self._keep(last)
+        return [line for line in lines if line is not None]
+
+    def rest(self) -> list[Line]:
+        """The line without an end, if there is one."""
+        last = self._line(bytes(self._tail), b"") if self._tail or self._is_cut else None
+        self._tail.clear()
+        return [] if last is None else [last]
+
+    def _keep(self, piece: bytes) -> None:
+        """What comes of a line that is too long already is not kept."""
+        self._is_cut |= len(self._tail) + len(piece) > LONGEST_LINE_BYTES
+        if self._is_cut:
+            self._tail.clear()
+        else:
+            self._tail += piece
+
+    def _line(self, content: bytes, end: bytes) -> Line | None:
+        self.number += 1
+        if self._is_cut or len(content) > LONGEST_LINE_BYTES:
+            self._is_cut = False
+            self._account.refuse(self.number, "it is longer than 1 MiB")
+            return None
+        if content.endswith(b"\r"):
+            content, end = content[:-1], b"\r" + end
+        return self.number, content.decode("utf-8", errors="surrogateescape"), end.decode()
+
+
+def _bytes(lines: Mapping[int, str]) -> bytes:
+    """The lines in their order; bytes that are no UTF-8 are what they were."""
+    return "".join(lines[number] for number in sorted(lines)).encode("utf-8", errors="surrogateescape")

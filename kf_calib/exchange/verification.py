@@ -247,7 +247,7 @@ def _worst(saved: SavedCalibration, model: Model, new: Calibration) -> tuple[flo
     except UnobservableError:
         return None, None
     force, temperature = new.bench.gravity_mps2 * _sphere(_DIRECTIONS), REFERENCE_TEMPERATURE_C
-    errors = old(now.predicted(force, temperature), temperature) - force
+    errors = old.of_readings(now.predicted(force, temperature), temperature) - force
     worst = int(np.argmax(np.linalg.norm(errors, axis=1)))
     size = float(np.linalg.norm(errors[worst]))
     along = errors[worst] / max(size, 1e-300)

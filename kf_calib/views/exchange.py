@@ -25,12 +25,14 @@ from kf_calib.views.terminal import note
 _SHOWN = 12
 
 
-def applied_object(correction: Correction, found: Applied, out: Path, warnings: Sequence[str]) -> dict[str, Any]:
+def applied_object(
+    correction: Correction, found: Applied, out: Path, warnings: Sequence[str], topic: bool = True
+) -> dict[str, Any]:
     """The JSON object of ``apply``."""
     return clean(
         {
             "out": str(out),
-            "topic": CALIBRATED_TOPIC,
+            "topic": CALIBRATED_TOPIC if topic else None,
             "readings": found.readings,
             "not_finite": found.not_finite,
             "corrected": [str(effect) for effect in correction.effects],
@@ -42,10 +44,13 @@ def applied_object(correction: Correction, found: Applied, out: Path, warnings: 
     )
 
 
-def applied_report(correction: Correction, found: Applied, out: Path, warnings: Sequence[str]) -> RenderableType:
+def applied_report(
+    correction: Correction, found: Applied, out: Path, warnings: Sequence[str], topic: bool = True
+) -> RenderableType:
     """The report of ``apply``."""
+    place = f"{CALIBRATED_TOPIC} in {out}" if topic else str(out)
     names = ", ".join(["alignment, scale factor and bias", *map(str, correction.effects)])
-    lines = [Text(f"{found.readings} readings corrected for {names}: {CALIBRATED_TOPIC} in {out}.", style="bold")]
+    lines = [Text(f"{found.readings} readings corrected for {names}: {place}.", style="bold")]
     unit = shown("m/s^2")
     sigma = ", ".join(unit.number(each, 2) for each in correction.worst_sigma_mps2)
     lines.append(Text(f"Uncertainty by the calibration (1σ, at most, at 1 g): {sigma} {unit.label} along x, y, z."))

@@ -23,6 +23,8 @@ def exported_object(target: Target, to: str, out: Path) -> dict[str, Any]:
             "format": to,
             "lost": list(target.lost),
             "left_out": target.correction.left_out,
+            "takes": str(target.input),
+            "to_be_done_before": target.to_be_done_before or None,
             "error_left_rms_mps2": None if left is None else left.rms_mps2,
             "error_left_worst_mps2": None if left is None else left.worst_mps2,
             "warnings": list(target.remarks),
@@ -33,6 +35,10 @@ def exported_object(target: Target, to: str, out: Path) -> dict[str, Any]:
 def exported_report(target: Target, out: Path) -> RenderableType:
     """The report of ``export``."""
     lines = [Text(f"{out} is the calibration for {target.title}.", style="bold")]
+    if not target.correction.input.is_plain:
+        lines.append(Text(f"It takes {target.input}."))
+    if target.to_be_done_before:
+        lines.append(note(f"to be made before of what the device sends: {target.to_be_done_before}"))
     if target.error_left is None:
         lines.append(Text("It holds all of it."))
     else:

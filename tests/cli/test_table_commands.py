@@ -87,7 +87,6 @@ def test_what_1_g_is_does_not_act_on_a_recording(run) -> None:
     ("words", "says"),
     [
         (("record", "made.mcap", TWELVE), "is a table of orientations, with a row a dwell, and is evaluated as it is"),
-        (("apply", "cal.json", TWELVE, "-o", "made.mcap"), "mean readings are corrected in Python, by kf_calib.open_"),
         (("plan", "--recording", "faces.csv", "--gravity", "9.81"), "say which gimbals are to be turned, for example"),
         (("replay", *OPTIONS, "--angle-unit", "rad"), "'außen [°]' is in deg by its name, and --angle-unit is rad"),
         (("replay", "faces.csv", "--gravity", "9.81", "--angle-unit", "rad"), "has no gimbal angles, so leave out"),

@@ -14,8 +14,9 @@ from helpers.altered import Altered, short_run
 from helpers.long_runs import slow
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.bench.bench import Bench, parse_axes, parse_channels
+from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.keys import UP
+from kf_calib.bench.raw_input import RawInput, parse_channels
 from kf_calib.errors import BlunderError, InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.setup_blunders import common_scale
@@ -42,8 +43,8 @@ def mended(bench: Bench, message: str) -> list[Bench]:
         words = shlex.split(options.rstrip("."))
         keys = dict(zip(words[::2], words[1::2], strict=True))
         axes = parse_axes(keys["--axes"]) if "--axes" in keys else bench.axes
-        channels = parse_channels(keys["--channels"]) if "--channels" in keys else bench.channels
-        out.append(replace(bench, axes=axes, channels=channels, up=keys.get("--up", bench.up)))
+        channels = parse_channels(keys["--channels"]) if "--channels" in keys else bench.input.channels
+        out.append(replace(bench, axes=axes, input=RawInput(channels), up=keys.get("--up", bench.up)))
     return out
 
 
@@ -71,7 +72,7 @@ def test_each_of_47_wrong_wirings_is_refused_and_its_mending_mends(channels: tup
         source.bench = bench
         result = calibrate(source)
         assert result.consistency.consistent
-    source.bench = replace(run.bench, channels=channels)
+    source.bench = replace(run.bench, input=RawInput(channels))
     found = calibrate(source).parameters
     for symbol, expected in run.sensors.parameters.items():
         assert found[symbol].value == pytest.approx(expected, abs=6 * found[symbol].sigma)

@@ -213,4 +213,17 @@ def test_standard_input_without_readings_is_refused_in_a_sentence(
 def test_standard_input_and_a_copy_exclude_each_other(folder: Path, run: Any) -> None:
     for words in (("-", "-o", "x.mcap"), ("-", "--json"), (RECORDING,)):
         code, _, err = run("apply", folder / "cal.json", *words)
-        assert code == 2 and "leave out" in err
+        assert code == 2 and ("leave out" in err or "name it by -o OUT" in err)
+
+
+def test_all_other_bytes_stay_as_they_are(folder: Path) -> None:
+    """Ends of lines, bytes that are no UTF-8, quotes and blanks; a line beyond 1 MiB is left out and counted."""
+    lines = CorrectedLines(kf_calib.open_calibration(folder / "cal.json").correction())
+    head = b"\r\ntime_s, note ,ax_g,ay_g,az_g\r\n"
+    rows = [b'%d, "caf\xe9 ""x""" ,0, 1 ,"0"\r\n' % k for k in range(12)]
+    long = b"12," + b"x" * (1 << 20) + b",0,1,0\r\n"
+    given = head + b"".join(rows[:6]) + long + b"\n" + b"".join(rows[6:])
+    out = b"".join(lines.push(given[k : k + 5000]) for k in range(0, len(given), 5000)) + lines.rest()
+    assert out.startswith(head) and out.count(b"\r\n") == 2 + 12 and out.count(b"\n") == 2 + 12 + 1
+    assert [line.rsplit(b",", 3)[0] for line in out.splitlines()[2:8]] == [row.rsplit(b",", 3)[0] for row in rows[:6]]
+    assert lines.readings == 12 and "(first line 9: it is longer than 1 MiB)" in lines.warnings[0]

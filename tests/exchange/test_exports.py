@@ -122,10 +122,10 @@ def vectornav(text: str) -> Formula:
 
 
 def table(text: str) -> Formula:
-    """The matrix and the biases of the table."""
+    """The matrix and the offsets of the table."""
     value = {row["name"]: float(row["value"]) for row in csv.DictReader(text.splitlines())}
     c = np.array([[value[f"C{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)])
-    return lambda readings, _: (readings - [value["b1"], value["b2"], value["b3"]]) @ c.T
+    return lambda readings, _: (readings - [value["o1"], value["o2"], value["o3"]]) @ c.T
 
 
 READERS: dict[str, Callable[[str], Formula]] = {
@@ -258,7 +258,7 @@ def test_no_other_offset_and_scale_leave_a_smaller_error(to: str) -> None:
     readings = own.predicted(force, temperature)
     assert isinstance(target, AffineTarget)
     affine = target.affine
-    offset, scale = affine.offset_mps2, np.diag(affine.matrix)
+    offset, scale = affine.offset, np.diag(affine.matrix)
 
     def rms(offset: np.ndarray, scale: np.ndarray) -> float:
         return float(np.sqrt(np.mean(((readings - offset) * scale - force) ** 2)))
@@ -338,7 +338,8 @@ def test_the_table_has_every_parameter_coefficient_and_constant(run: Any, tmp_pa
     assert code == 0, err
     rows = {row["name"]: row for row in csv.DictReader((tmp_path / "out.csv").read_text().splitlines())}
     expected = {*paper_parameters.SYMBOLS, "K2_1", "K2_2", "K2_3"}
-    assert rows.keys() == expected | {f"C{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)}
+    expected |= {f"{name}{i}" for name in ("channel", "count", "o") for i in (1, 2, 3)}
+    assert rows.keys() == expected | {f"{name}{i}{j}" for name in "CE" for i in (1, 2, 3) for j in (1, 2, 3)}
     assert "dZone,0.0001,,m/s^2" in exported(saved(), correction("dead-zone"), "csv").text().splitlines()
     for own in calibration_file.read(cal).parameters:
         assert float(rows[own.symbol]["value"]) == own.value and rows[own.symbol]["unit"] == own.unit

@@ -23,7 +23,7 @@ def short_run(keys: Mapping[str, str] | None = None, **options: Any) -> Simulati
 
 
 class Altered:
-    """A source with other readings, other poses, or another bench than it was made with."""
+    """A source with other raw readings, other poses, or another bench than it was made with."""
 
     def __init__(
         self, source: Source, readings: Change | None = None, poses: Change | None = None, bench: Bench | None = None
@@ -34,7 +34,10 @@ class Altered:
 
     def __iter__(self) -> Iterator[Batch]:
         for batch in self.source:
-            yield Batch(_changed(batch.accel, self.readings), _changed(batch.pose, self.poses), batch.temperature)
+            raw = Stream(batch.accel.time_ns, self.source.bench.input.raw(batch.accel.values))
+            changed = _changed(raw, self.readings)
+            accel = Stream(changed.time_ns, self.bench.input.readings(changed.values))
+            yield Batch(accel, _changed(batch.pose, self.poses), batch.temperature)
 
 
 def _same(_: Floats, values: Floats) -> Floats:

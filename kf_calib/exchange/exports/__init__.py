@@ -2,7 +2,8 @@
 
     exports.exported(saved, correction, "px4", lossy=True).text()
 
-All take readings in m/s^2 and give specific force in the frame of the block, m/s^2.
+All give specific force in the frame of the block, m/s^2, from raw readings as the device sends them; those that have
+no room for order, sign and size take readings in m/s^2, and say how to make them.
 """
 
 from __future__ import annotations
@@ -36,6 +37,12 @@ def exported(saved: SavedCalibration, correction: Correction, to: str, lossy: bo
     ``lossy``.
     """
     target = TARGETS[to](saved, correction)
+    if target.to_be_done_before and not lossy:
+        raise InputError(
+            f"{target.title} takes readings in m/s^2 in the order of the accelerometers, and the device sends "
+            f"{correction.input}: make them before, {target.to_be_done_before}, and say so by --lossy, or export to c "
+            "or csv, which take what the device sends."
+        )
     if target.error_left is not None and not lossy:
         unit, (rms, worst) = shown("m/s^2"), target.error_left
         raise InputError(

@@ -27,15 +27,16 @@ _POWERS = 3
 
 @dataclass(frozen=True, eq=False)
 class Affine:
-    """matrix (3, 3), offset (3,); drift (powers, 3): coefficients of u, u^2 ...; none where there is no drift."""
+    """matrix (3, 3), m/s^2 a unit of what is read; offset (3,) in that unit; drift (powers, 3): coefficients of u, u^2
+    ...; none where there is no drift."""
 
     matrix: Floats
-    offset_mps2: Floats
+    offset: Floats
     drift: Floats
     reference_c: float
 
     def __call__(self, readings_mps2: Floats, temperature_c: Floats) -> Floats:
-        return (readings_mps2 - self.offset_mps2 - self.drift_at(temperature_c)) @ self.matrix.T
+        return (readings_mps2 - self.offset - self.drift_at(temperature_c)) @ self.matrix.T
 
     def drift_at(self, temperature_c: Floats | float) -> Floats:
         """The drift (n, 3) at temperatures (n,)."""
@@ -53,12 +54,22 @@ class AffineTarget(Target):
 
     @cached_property
     def affine(self) -> Affine:
-        """The numbers that the program is given."""
+        """The numbers that the program is given: they turn raw readings into specific force, where it folds."""
+        own = self._of_readings
+        if self.input.is_plain:
+            return own
+        a = self.input.matrix
+        inverse = np.asarray(np.linalg.inv(a), float)
+        return Affine(own.matrix @ a, inverse @ own.offset, own.drift @ inverse.T, own.reference_c)
+
+    @cached_property
+    def _of_readings(self) -> Affine:
+        """The numbers that turn readings in m/s^2 into specific force."""
         fitted = self._fitted
         return fitted if self.bias else Affine(fitted.matrix, np.zeros(3), fitted.drift, fitted.reference_c)
 
     def corrected(self, readings_mps2: Floats, temperature_c: Floats) -> Floats:
-        return self.affine(readings_mps2, temperature_c)
+        return self._of_readings(readings_mps2, temperature_c)
 
     @property
     def lost(self) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ _RANGES = {"OFFS": (-3.5, 3.5, "m/s^2"), "SCAL": (0.8, 1.2, "")}
 class ArduPilot(AffineTarget):
     """Diagonal matrix, offset, cubic of the temperature."""
 
-    title, diagonal, thermal = "ArduPilot", True, True
+    title, diagonal, thermal, folds = "ArduPilot", True, True, False
     reference_c: ClassVar[float] = 35.0
 
     def text(self) -> str:
@@ -34,12 +34,12 @@ class ArduPilot(AffineTarget):
             if not low <= value <= high:
                 raise InputError(f"{name} would be {value:.3g}, and ArduPilot takes {low} to {high} {unit}".rstrip()
                                  + ": look for a wrong channel, sign or unit in the calibrating run.")  # fmt: skip
-        return "\n".join([f"# {self.origin}.", *(f"{name},{value:.9g}" for name, value in values.items()), ""])
+        return "\n".join([*self.heading, *(f"{name},{value:.9g}" for name, value in values.items()), ""])
 
     def _values(self) -> Iterator[tuple[str, float]]:
         affine, grid = self.affine, self.grid
         at_c = float(np.clip(affine.reference_c, grid.low_c, grid.high_c))
-        offset = affine.offset_mps2 + affine.drift_at(at_c)[0]
+        offset = affine.offset + affine.drift_at(at_c)[0]
         for i, axis in enumerate("XYZ"):
             yield f"INS_ACCOFFS_{axis}", float(offset[i])
             yield f"INS_ACCSCAL_{axis}", float(affine.matrix[i, i])

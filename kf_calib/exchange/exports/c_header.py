@@ -4,8 +4,9 @@
 
     f = C (reading - b - e(f, T)),   T = temperature_c - 25 degC
 
-begun at C (reading - b) and repeated as often as the last digits need, which is a fixed number. C99, doubles; reading
-and out in m/s^2 (they may be the same array), temperature in degC, NaN where it is not known.
+begun at C (reading - b) and repeated as often as the last digits need, which is a fixed number. The function takes what
+the device sends: order, sign and size of its channels are in it. C99, doubles; out in m/s^2 (it may be the same array),
+temperature in degC, NaN where it is not known.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ class CHeader(Target):
 
     def _comments(self) -> Iterator[str]:
         names = ["alignment", "scale factor", "bias", *(in_comment(str(effect)) for effect in self.correction.effects)]
-        yield f"// Specific force, m/s^2, from a reading, m/s^2: {self.origin}."
+        yield f"// Specific force, m/s^2, from a raw reading: {self.origin}."
+        yield f"// It {self.takes}."
         yield f"// Corrected for {', '.join(names)}."
         for name in self.correction.left_out:
             yield f"// Not corrected for {in_comment(name)}."
@@ -56,7 +58,7 @@ class CHeader(Target):
     def _body(self, sums: list[str]) -> Iterator[str]:
         correction, used = self.correction, "".join(sums)
         yield f"static const double c[3][3] = {_array(correction.matrix)};"
-        bias = ", ".join(f"reading[{i}] - {number(float(b))}" for i, b in enumerate(correction.bias_mps2))
+        bias = ", ".join(f"{self._reading(i)} - {number(float(b))}" for i, b in enumerate(correction.bias_mps2))
         yield f"const double z[3] = {{{bias}}};"
         if not used:
             yield "(void)temperature_c;"
@@ -77,6 +79,12 @@ class CHeader(Target):
         yield f"    for (int i = 0; i < 3; i++) f[i] = {_product('c[i]', 'z', 'e')};"
         yield "}"
         yield "for (int i = 0; i < 3; i++) out[i] = f[i];"
+
+    def _reading(self, i: int) -> str:
+        """The reading of accelerometer i, from 0, in m/s^2."""
+        column = abs(self.input.channels[i]) - 1
+        factor = float(self.input.matrix[i, column])
+        return f"reading[{column}]" if factor == 1.0 else f"{number(factor)} * reading[{column}]"
 
     def _matrices(self, used: str) -> dict[str, Floats]:
         """Return what the specific force is multiplied by: a along the input axes, r as it is read."""

@@ -18,5 +18,5 @@ class ImuCalib(AffineTarget):
 
     def text(self) -> str:
         matrix = self.affine.matrix
-        bias = matrix @ self.affine.offset_mps2
-        return f"# {self.origin}.\nSM: {matrix.ravel().tolist()}\nbias: {bias.tolist()}\n"
+        bias = matrix @ self.affine.offset
+        return "\n".join([*self.heading, f"SM: {matrix.ravel().tolist()}", f"bias: {bias.tolist()}", ""])

@@ -12,6 +12,7 @@ import json
 
 import numpy as np
 
+from kf_calib.bench.raw_input import PLAIN
 from kf_calib.exchange.exports.affine import AffineTarget
 
 
@@ -24,8 +25,14 @@ class Imucal(AffineTarget):
         sensitivity = np.linalg.inv(self.affine.matrix)
         scale = np.linalg.norm(sensitivity, axis=1)
         none, same = np.zeros((3, 3)), np.eye(3)
-        matrices = {"K_a": np.diag(scale), "R_a": sensitivity / scale[:, None], "b_a": self.affine.offset_mps2,
+        matrices = {"K_a": np.diag(scale), "R_a": sensitivity / scale[:, None], "b_a": self.affine.offset,
                     "K_g": same, "R_g": same, "K_ga": none, "b_g": none[0]}  # fmt: skip
-        units = {"acc_unit": "m/s^2", "gyr_unit": None, "from_acc_unit": "m/s^2", "from_gyr_unit": None}
-        content = units | {"comment": self.origin} | {name: each.tolist() for name, each in matrices.items()}
+        matrices = {name: own.tolist() for name, own in matrices.items()}
+        units = {"acc_unit": "m/s^2", "gyr_unit": None, "from_acc_unit": self._unit, "from_gyr_unit": None}
+        content = units | {"comment": f"{self.origin}; {self.takes}"} | matrices
         return json.dumps(content | {"cal_type": "Ferraris", "_format_version": "2.0.0"}, indent=4) + "\n"
+
+    @property
+    def _unit(self) -> str:
+        """What raw readings are in, for imucal to compare with what it is called with."""
+        return self.input.unit_words if self.input.sizes == PLAIN.sizes else "counts"

@@ -21,5 +21,12 @@ class Kalibr(AffineTarget):
 
     def text(self) -> str:
         rows = np.linalg.inv(self.affine.matrix).tolist()
-        lines = [f"# {self.origin}.", "imu0:", "  accelerometers:", "    M:", *(f"    - {row}" for row in rows)]
+        lines = [
+            f"# {self.origin}.",
+            f"# It {self.takes}.",
+            "imu0:",
+            "  accelerometers:",
+            "    M:",
+            *(f"    - {row}" for row in rows),
+        ]
         return "\n".join([*lines, "  model: scale-misalignment", ""])

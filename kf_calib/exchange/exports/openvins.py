@@ -27,7 +27,7 @@ class OpenVins(AffineTarget):
         lines = [
             line for name, own in matrices.items() for line in (f"  {name}:", *(f"    - {r}" for r in own.tolist()))
         ]
-        return "\n".join(["%YAML:1.0", f"# {self.origin}.", "imu0:", '  model: "kalibr"', *lines, ""])
+        return "\n".join(["%YAML:1.0", *self.heading, "imu0:", '  model: "kalibr"', *lines, ""])
 
 
 def rotation_and_lower(matrix: Floats) -> tuple[Floats, Floats]:

@@ -23,7 +23,7 @@ _LEAST_CHANGE = 0.01
 class Px4(AffineTarget):
     """Diagonal matrix, offset, cubic of the temperature."""
 
-    title, diagonal, thermal = "PX4", True, True
+    title, diagonal, thermal, folds = "PX4", True, True, False
 
     def text(self) -> str:
         scale = np.diag(self.affine.matrix)
@@ -31,13 +31,13 @@ class Px4(AffineTarget):
             raise InputError(f"PX4 takes no scale factor of {scale.min():.3g}: state in --channels of the calibrating "
                              "run which channel is which accelerometer, with its sign.")  # fmt: skip
         lines = [f"1\t1\t{name}\t{value:.9g}\t{6 if isinstance(value, int) else 9}" for name, value in self._values()]
-        head = [f"# {self.origin}.", "# For the accelerometer whose device id is in CAL_ACC0_ID (and TC_A0_ID).",
+        head = [*self.heading, "# For the accelerometer whose device id is in CAL_ACC0_ID (and TC_A0_ID).",
                 "#", "# Vehicle-Id Component-Id Name Value Type"]  # fmt: skip
         return "\n".join([*head, *lines, ""])
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        changes = self.affine.offset_mps2, np.diag(self.affine.matrix) - 1.0
+        changes = self.affine.offset, np.diag(self.affine.matrix) - 1.0
         if min(np.linalg.norm(change) for change in changes) > _LEAST_CHANGE:
             return ()
         return (f"some releases of PX4 ignore offsets, or changes of scale factors, below {_LEAST_CHANGE} (length of "
@@ -46,7 +46,7 @@ class Px4(AffineTarget):
     def _values(self) -> Iterator[tuple[str, float]]:
         affine, grid = self.affine, self.grid
         for i, axis in enumerate("XYZ"):
-            yield f"CAL_ACC0_{axis}OFF", float(affine.offset_mps2[i])
+            yield f"CAL_ACC0_{axis}OFF", float(affine.offset[i])
             yield f"CAL_ACC0_{axis}SCALE", float(affine.matrix[i, i])
         if not self.drifts:
             return

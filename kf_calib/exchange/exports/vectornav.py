@@ -9,10 +9,17 @@ The register holds reals of 32 bits. The sensor keeps it over a restart after $V
 
 from __future__ import annotations
 
+import math
 from functools import reduce
 from operator import xor
 
 from kf_calib.exchange.exports.affine import AffineTarget
+
+
+def _decimal(number: float) -> str:
+    """The number without an exponent, to nine decimals or, where it is small, nine digits."""
+    exponent = math.floor(math.log10(abs(number))) if number else 0
+    return f"{number:.{max(9, 8 - exponent)}f}"
 
 
 class VectorNav(AffineTarget):
@@ -21,6 +28,6 @@ class VectorNav(AffineTarget):
     title = "VectorNav"
 
     def text(self) -> str:
-        numbers = [*self.affine.matrix.ravel(), *self.affine.offset_mps2]
-        command = ",".join(["VNWRG", "25", *(f"{each:.9f}" for each in numbers)])
+        numbers = [*self.affine.matrix.ravel(), *self.affine.offset]
+        command = ",".join(["VNWRG", "25", *map(_decimal, numbers)])
         return f"${command}*{reduce(xor, command.encode()):02X}\r\n"

@@ -18,6 +18,7 @@ from operator import mul
 
 import numpy as np
 
+from kf_calib.bench.raw_input import PLAIN, UNITS, RawInput
 from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.files.csv_heading import Heading
 from kf_calib.sources.files.line_parts import LineError, number_of, stamp_ns
@@ -125,7 +126,9 @@ class CsvColumns:
     """The columns of a log by its header and, where the header does not tell, its first rows.
 
     header: names as they stand in the file; names: as they are to be understood. delimiter: between cells. said: what
-    was taken for what, where that is not plain from the names.
+    was taken for what, where that is not plain from the names. raw: what the readings are in. written_mps2: the unit in
+    which specific force takes the place of readings, m/s^2: that of their names; without_unit: columns of counts whose
+    names tell none, which then are in m/s^2.
     """
 
     header: Sequence[str]
@@ -135,6 +138,9 @@ class CsvColumns:
     units: Units
     local_mps2: float
     said: list[str] = field(default_factory=list[str])
+    raw: RawInput = PLAIN
+    written_mps2: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    without_unit: tuple[int, ...] = ()
     _meanings: list[Meaning] = field(default_factory=list[Meaning])
 
     @classmethod
@@ -219,7 +225,9 @@ class CsvColumns:
         return Stamps((place,), decimals, round(TIME[unit]) if decimals == 9 else 1)
 
     def accel(self) -> Quantity:
-        """The three readings. Raises InputError where their columns or their units are not told."""
+        """The three readings as they are written; ``raw`` tells then what in.
+
+        Raises InputError where their columns or their units are not told."""
         chosen = [self._one(ours) for ours in READINGS]
         places = [at for at in chosen if at is not None]
         advice = "name them ax_mps2, ay_mps2, az_mps2 (or ax_g, ax_mg ...)"
@@ -233,7 +241,7 @@ class CsvColumns:
                     "leave out --accel-unit, or rename the column by --column."
                 )
         norm = self._usual_norm(places)
-        if "" in named and not self.units.accel and math.isnan(norm):
+        if "" in named and not (self.units.accel or self.units.as_default(named, norm)) and math.isnan(norm):
             raise InputError(f"no columns give the three readings with their unit: {advice}, not {self._seen}.")
         told = reading_units(named, norm, self.units, self.local_mps2)
         if not told.is_known:
@@ -245,7 +253,15 @@ class CsvColumns:
         is_stated = self.units.accel is not None or self.units.accel_scale != 1.0
         if is_stated or not all(_EXACT.fullmatch(self.names[at]) for at in places):
             self.said.insert(0, f"readings from {self._quoted(places)} in {told.words}")
-        return Quantity(tuple(places), tuple(told.factors.tolist()))
+        self.raw, scale = told.raw, self.units.accel_scale
+        are_counts = scale != 1.0 or "count" in named or self.raw.sizes != PLAIN.sizes
+        written = np.ones(3) if are_counts else self.raw.factors
+        for k, unit in enumerate(named):
+            written[k] = UNITS.get(unit, 1.0) if are_counts else written[k]
+        self.written_mps2 = (float(written[0]), float(written[1]), float(written[2]))
+        bare = [at for at, unit in zip(places, named, strict=True) if unit not in UNITS]
+        self.without_unit = tuple(bare) if are_counts else ()
+        return Quantity(tuple(places), (1.0, 1.0, 1.0))
 
     @property
     def has_usual_gimbals(self) -> bool:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from kf_calib.sources.files.csv_columns import CsvColumns
 from kf_calib.sources.files.csv_heading import cells_of, without_empty_end
@@ -27,6 +25,7 @@ class CsvLines(LineReader):
         super().__init__(account)
         self._columns, self._delimiter, self._header = columns, columns.delimiter, columns.header
         self._time, self._accel = columns.time(), columns.accel()
+        self.raw = columns.raw
         self._numbers = columns.numbers
         attitude = columns.quaternion()
         self.has_angles = columns.has_usual_gimbals or not attitude.at
@@ -46,16 +45,31 @@ class CsvLines(LineReader):
         return self._columns.wanted
 
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
-        is_quoted = '"' in line
-        row = next(csv.reader([line], delimiter=self._delimiter)) if is_quoted else line.split(self._delimiter)
         decimal = (self._numbers or DECIMAL_POINT).decimal
-        for at, factor, value in zip(self._accel.at, self._accel.factors, readings_mps2, strict=True):
-            row[at] = repr(value / factor).replace(".", decimal)
-        if not is_quoted:
-            return self._delimiter.join(row)
-        out = io.StringIO()
-        csv.writer(out, delimiter=self._delimiter, lineterminator="").writerow(row)
-        return out.getvalue()
+        texts = [
+            repr(value / unit).replace(".", decimal)
+            for value, unit in zip(readings_mps2, self._columns.written_mps2, strict=True)
+        ]
+        return self._replaced(line, dict(zip(self._accel.at, texts, strict=True)))
+
+    def heading_of_forces(self, heading: Sequence[str]) -> list[str]:
+        names = {at: f"a{'xyz'[self._accel.at.index(at)]}_mps2" for at in self._columns.without_unit}
+        out, is_named = list(heading), False
+        for k, line in enumerate(heading):
+            cells = cells_of(line.lstrip("\ufeff"), self._delimiter)
+            if not names or len(cells) < len(self._header) or not cells[self._accel.at[0]]:
+                continue
+            out[k] = self._replaced(line, dict.fromkeys(names, "m/s^2") if is_named else names)
+            is_named = True
+        return out
+
+    def _replaced(self, line: str, texts: Mapping[int, str]) -> str:
+        """A line with other texts in these cells, and all else as it stands."""
+        spans = cell_spans(line, self._delimiter)
+        for at in sorted(texts, reverse=True):
+            start, end = spans[at]
+            line = line[:start] + texts[at] + line[end:]
+        return line
 
     def _begin_block(self, lines: Sequence[str]) -> None:
         if self._numbers is None:
@@ -82,3 +96,26 @@ class CsvLines(LineReader):
         accel.add(time_ns, readings)
         pose.add(time_ns, angles)
         temperature.add(time_ns, degrees)
+
+
+def cell_spans(line: str, delimiter: str) -> list[tuple[int, int]]:
+    """Where the cells of a line stand, with their quotes and without blanks around them."""
+    out, at = list[tuple[int, int]](), 0
+    while True:
+        end = _quote_end(line, at) if line[at : at + 1] == '"' else at
+        end = line.find(delimiter, end)
+        end = len(line) if end < 0 else end
+        cell = line[at:end]
+        out.append((at + len(cell) - len(cell.lstrip()), end - len(cell) + len(cell.rstrip())))
+        if end == len(line):
+            return out
+        at = end + 1
+
+
+def _quote_end(line: str, at: int) -> int:
+    """The place behind the quote that ends what the one at ``at`` begins; the end of the line where none does."""
+    while (at := line.find('"', at + 1)) >= 0:
+        if line[at + 1 : at + 2] != '"':
+            return at + 1
+        at += 1
+    return len(line)

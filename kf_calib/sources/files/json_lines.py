@@ -10,6 +10,7 @@ from decimal import Decimal
 from typing import Any
 
 from kf_calib.bench.bench import metadata_of
+from kf_calib.bench.raw_input import UNITS, parse_unit
 from kf_calib.sources.files.line_parts import (
     ACCEL_UNITS,
     TIME_DECIMALS,
@@ -20,15 +21,17 @@ from kf_calib.sources.files.line_parts import (
     number_of,
     stamp_ns,
 )
-from kf_calib.sources.units import Units
 
 _ACCEL = {f"accel_{unit}": factor for unit, factor in ACCEL_UNITS.items()}
+_BARE = ("accel", "accel_counts", "accel_raw")
+"""Readings whose name tells no unit: options state it."""
 _ANGLES = {"angles_rad": 1.0, "angles_deg": math.pi / 180.0}
 _ATTITUDE = "attitude_xyzw"
 _TEMPERATURE = "temperature_c"
-_KNOWN = frozenset([*TIME_DECIMALS, *_ACCEL, *_ANGLES, _ATTITUDE, _TEMPERATURE])
+_KNOWN = frozenset([*TIME_DECIMALS, *_ACCEL, *_BARE, *_ANGLES, _ATTITUDE, _TEMPERATURE])
 
 
+_value_at = json.JSONDecoder().raw_decode
 _decode_exactly = json.JSONDecoder(parse_float=Decimal).decode
 _decode_with_care = json.JSONDecoder(parse_float=number_of).decode
 _find_tiny = re.compile(r"[0-9][eE]-[0-9]{3}").search  # a number as small as this is rare, and may be two
@@ -38,7 +41,8 @@ class JsonLines(LineReader):
     """Reads JSON lines block by block.
 
     ``columns`` renames foreign keys. ``metadata`` is the first line's ``{"bench": ...}`` as strings. The first pose
-    settles whether poses are angles (``has_angles``) and how many (``pose_width``, 0 until then).
+    settles whether poses are angles (``has_angles``) and how many (``pose_width``, 0 until then); the first readings
+    settle the unit that all are brought to.
     """
 
     _faults = (
@@ -47,11 +51,9 @@ class JsonLines(LineReader):
         (ArithmeticError, "a number is out of range"),
     )
 
-    def __init__(self, columns: Mapping[str, str], account: Account, units: Units | None = None) -> None:
+    def __init__(self, columns: Mapping[str, str], account: Account) -> None:
         super().__init__(account)
-        self._columns, self._scale = columns, units.accel_scale if units else 1.0
-        keys = [*_ACCEL, *(theirs for theirs, ours in columns.items() if ours in _ACCEL)]
-        self._find_readings = re.compile(rf'("(?:{"|".join(map(re.escape, keys))})"\s*:\s*)\[[^][]*\]')
+        self._columns = columns
         self._is_first = True
 
     @property
@@ -62,11 +64,11 @@ class JsonLines(LineReader):
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
         entry = json.loads(line)
         names = {self._columns.get(key, key): key for key in entry}
-        name = next(each for each in _ACCEL if each in names and entry[names[each]] is not None)
-        values = [value / (_ACCEL[name] * self._scale) for value in readings_mps2]
-        if len(self._find_readings.findall(line)) == 1:  # in its place, so that all other text stays as it is
-            return self._find_readings.sub(lambda found: found[1] + json.dumps(values), line)
-        return json.dumps(entry | {names[name]: values}, ensure_ascii=False)
+        name = next(each for each in (*_ACCEL, *_BARE) if each in names and entry[names[each]] is not None)
+        values = json.dumps([value / _ACCEL.get(name, 1.0) for value in readings_mps2])
+        (key_start, key_end), (start, end) = _spans(line)[names[name]]
+        key = line[key_start:key_end] if name in _ACCEL else '"accel_mps2"'
+        return line[:key_start] + key + line[key_end:start] + values + line[end:]
 
     def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
         if not line.lstrip().startswith("{"):  # found out at a tenth of the cost, where a link brings much of it
@@ -114,14 +116,19 @@ class JsonLines(LineReader):
         return stamp_ns(number, TIME_DECIMALS[name])
 
     def _readings(self, entry: dict[str, Any]) -> list[float] | None:
-        for name, factor in _ACCEL.items():
-            if entry.get(name) is not None:
-                values = _numbers(entry[name], name)
-                if len(values) != 3:
-                    raise LineError(f"{name} has {len(values)} numbers, not 3")
-                factor *= self._scale
-                return values if factor == 1.0 else [factor * value for value in values]
-        return None
+        name = next((name for name in (*_ACCEL, *_BARE) if entry.get(name) is not None), None)
+        if name is None:
+            return None
+        values = _numbers(entry[name], name)
+        if len(values) != 3:
+            raise LineError(f"{name} has {len(values)} numbers, not 3")
+        is_bare = name in _BARE
+        if self.unit is None and not self.is_bare:
+            self.unit, self.is_bare = (None if is_bare else parse_unit(name.removeprefix("accel_"))), is_bare
+        if is_bare != self.is_bare:
+            raise LineError(f"{name} is not like the readings before it")
+        factor = 1.0 if self.unit is None else _ACCEL[name] / UNITS[self.unit]
+        return values if factor == 1.0 else [factor * value for value in values]
 
     def _pose(self, entry: dict[str, Any]) -> tuple[list[float] | None, bool]:
         """The pose, if any, and whether it is made of angles."""
@@ -141,6 +148,25 @@ class JsonLines(LineReader):
         if self.pose_width and (len(values), has_angles) != (self.pose_width, self.has_angles):
             raise LineError(f"{name} is not like the poses before it")
         return values
+
+
+def _spans(line: str) -> dict[str, tuple[tuple[int, int], tuple[int, int]]]:
+    """Where each key of an object stands in its line, with its quotes, and where its value does; the last of a name."""
+    out, at = dict[str, tuple[tuple[int, int], tuple[int, int]]](), line.index("{") + 1
+    while line[at := _skip(line, at, " \t\r\n,")] != "}":
+        name, end = _value_at(line, at)
+        start = _skip(line, end, " \t\r\n:")
+        _, behind = _value_at(line, start)
+        out[name] = (at, end), (start, behind)
+        at = behind
+    return out
+
+
+def _skip(line: str, at: int, passed: str) -> int:
+    """The next place in a line of none of these characters."""
+    while line[at] in passed:
+        at += 1
+    return at
 
 
 def _numbers(values: Any, name: str) -> list[float]:

@@ -11,6 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from kf_calib.bench.raw_input import RawInput
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.support.units import WORDS
 
@@ -84,8 +85,10 @@ class LineRows:
 class LineReader(ABC):
     """Reads lines block by block; those that cannot be used are put down in the account.
 
-    ``metadata``: of the bench, as strings. ``has_angles``: poses are angles; ``pose_width``: numbers of one. ``said``:
-    what was taken for what, where that is not plain.
+    Readings are in batches as they stand in the lines. ``raw``: what they are in, where that is settled, ``unit``: by
+    their names; None where they name none (``is_bare``), or none has come yet. ``metadata``: of the bench, as strings.
+    ``has_angles``: poses are angles; ``pose_width``: numbers of one. ``said``: what was taken for what, where that is
+    not plain.
     """
 
     _faults: ClassVar[tuple[tuple[type[Exception], str], ...]]
@@ -95,6 +98,9 @@ class LineReader(ABC):
         self.metadata: dict[str, str] = {}
         self.has_angles = True
         self.pose_width = 0
+        self.raw: RawInput | None = None
+        self.unit: str | None = None
+        self.is_bare = False
         self.said = list[str]()
         self._account = account
 
@@ -106,6 +112,10 @@ class LineReader(ABC):
     @abstractmethod
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
         """A line that was read and holds readings, with these in their place; all else in it stays as it is."""
+
+    def heading_of_forces(self, heading: Sequence[str]) -> list[str]:
+        """The heading of lines in which specific force stands in the place of readings."""
+        return list(heading)
 
     def read(self, lines: Sequence[str], first_line: int) -> Batch:
         """The batch of consecutive lines, the first of them of that number."""

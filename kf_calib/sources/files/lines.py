@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -16,7 +17,8 @@ from typing import BinaryIO, Protocol
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.gravity_alone import bench_without_angles, without_poses
-from kf_calib.bench.streams import Batch
+from kf_calib.bench.raw_input import CONVERTED, PLAIN, RESTATE, RawInput, merged
+from kf_calib.bench.streams import Batch, with_accel
 from kf_calib.errors import BenchError, CountsError, InputError
 from kf_calib.sources.files.csv_columns import CsvColumns
 from kf_calib.sources.files.csv_heading import Heading
@@ -63,7 +65,7 @@ class Lines:
         self._angles, self._said = angles, list[str]()
         self._overrides, self._stated = overrides, columns
         self._columns = {**as_columns(overrides.get("joints", "")), **columns}
-        self._units = units or Units()
+        self._units = units or Units.of(overrides)
         self._begin_ns: int | None = None
         self._bench: Bench | None = None
         self._waiting: _Passage | None = None  # begun to learn of the bench, not yet iterated
@@ -93,11 +95,12 @@ class Lines:
         return self._latest.fraction if self._latest else 0.0
 
     def __iter__(self) -> Iterator[Batch]:
-        _ = self.bench  # so that a bench that cannot be used is told first
-        return self.batches() if self._angles else map(without_poses, self.batches())
+        readings = self.bench.input.readings  # here, so that a bench that cannot be used is told first
+        converted = (with_accel(batch, readings(batch.accel.values)) for batch in self.batches())
+        return converted if self._angles else map(without_poses, converted)
 
     def batches(self) -> Iterator[Batch]:
-        """What the lines hold, whatever the bench may be."""
+        """What the lines hold, whatever the bench may be: raw readings."""
         passage, self._waiting = self._waiting or self._begin(), None
         for batch in passage:
             if self._begin_ns is None and len(batch.accel):
@@ -140,9 +143,11 @@ class Lines:
         return reader_for(lines, self._columns, account, angles=self._angles, units=self._units, local_mps2=local_mps2)
 
     def _describe_bench(self, passage: _Passage) -> Bench:
+        default = self._units.input
         if self._angles:
-            return bench_of(self.name, passage.parser, self._overrides)
-        bench, self._said = bench_without_angles(self.name, {**passage.parser.metadata, **self._overrides})
+            return bench_of(self.name, passage.parser, self._overrides, default)
+        stated = stated_of(self.name, passage.parser, self._overrides, default)
+        bench, self._said = bench_without_angles(self.name, stated)
         return bench
 
 
@@ -152,12 +157,50 @@ class Described(Protocol):
     metadata: dict[str, str]
     has_angles: bool
     pose_width: int
+    raw: RawInput | None
+    unit: str | None
+    is_bare: bool
 
 
-def bench_of(name: str, reader: Described, overrides: Mapping[str, str]) -> Bench:
-    """The bench, once a pose has been read. Raises InputError where it cannot be that one."""
+def stated_of(
+    name: str, reader: Described, overrides: Mapping[str, str], default: RawInput | None = None
+) -> dict[str, str]:
+    """The bench keys that what came, options and the names of the readings state; default: the raw input where neither
+    what came nor options state one.
+
+    Raises BenchError where they contradict each other, or no unit is stated.
+    """
+    by_name = {} if reader.unit is None else {"accel_unit": reader.unit}
+    if reader.raw is not None:
+        by_name = reader.raw.to_metadata() or PLAIN.scale_metadata()
+        by_name.pop("channels", None)
+    elif default is not None and default.sizes == PLAIN.sizes and reader.unit is not None:
+        default = replace(default, unit=reader.unit)  # a unit, which the names state anew
     try:
-        bench = Bench.from_metadata({**reader.metadata, **overrides}, reader.has_angles)
+        stated = merged(reader.metadata, overrides, "the first line", default)
+        now = RawInput.from_metadata(stated)
+    except BenchError as error:
+        raise BenchError(f"{name}: {error}") from None
+    if CONVERTED in stated:
+        raise BenchError(f"{name}: lines hold what the device sends: leave out {CONVERTED} in the bench's keys.")
+    if reader.unit is not None and "accel_unit" in stated and now.unit != reader.unit and RESTATE not in overrides:
+        raise BenchError(
+            f"{name}: the readings are in {reader.unit} by their names, and stated is {now.unit_words}: rename them by "
+            "--column, or where their names are wrong, give --accel-unit and --restate-input."
+        )
+    if reader.is_bare and not {"accel_unit", "accel_scale"} & set(stated):
+        raise BenchError(
+            f"{name}: the names of the readings do not tell their unit: name them accel_mps2 (or accel_g ...), or give "
+            "it by --accel-unit, and the size of counts by --accel-scale."
+        )
+    return stated | by_name if reader.raw is not None else by_name | stated
+
+
+def bench_of(name: str, reader: Described, overrides: Mapping[str, str], default: RawInput | None = None) -> Bench:
+    """The bench, once a pose has been read. Raises InputError where it cannot be that one."""
+    stated = stated_of(name, reader, overrides, default)
+    try:
+        bench = Bench.from_metadata(stated, reader.has_angles)
     except BenchError as error:
         raise BenchError(f"{name}: {error}") from error
     if bench.pose_width != reader.pose_width:
@@ -221,7 +264,7 @@ def reader_for(
     not say what is needed.
     """
     if is_json(lines[0]):
-        return JsonLines(columns, account, units), 0
+        return JsonLines(columns, account), 0
     heading = Heading.of(lines)
     return CsvLines(CsvColumns.of(heading, columns, units, local_mps2), account, angles), heading.lines
 
@@ -273,13 +316,20 @@ class _Passage:
             self._file.close()
 
     def survey(self) -> None:
-        """Reads up to the first pose, if there must be one, and keeps what it has read."""
+        """Reads up to the first readings and pose, if there must be one, and keeps what it has read."""
         self._open_parser()
-        while self._angles and not self.parser.pose_width:
+        while lacking := self._lacking:
             batch = self._next_batch()
             if batch is None or self.account.lines > _SURVEY_LINES:
-                raise self._unusable("platform angles")
+                raise self._unusable(lacking)
             self._ahead.append(batch)
+
+    @property
+    def _lacking(self) -> str:
+        """What has not come yet of that by which the bench is described; nothing where all has."""
+        if self._angles and not self.parser.pose_width:
+            return "platform angles"
+        return "" if self._has_accel else "readings"
 
     def __iter__(self) -> Iterator[Batch]:
         try:

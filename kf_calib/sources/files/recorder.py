@@ -20,6 +20,7 @@ from mcap.records import Channel, Schema
 from mcap.writer import Writer
 
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.raw_input import CONVERTED
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.sources.files import cdr
@@ -93,7 +94,7 @@ class Recorder:
             _Channel(TEMPERATURE_TOPIC, cdr.TEMPERATURE, cdr.temperature_message("accelerometer")),
         )
         self._head: float = math.inf  # bytes of the file before the first reading
-        metadata = bench.to_metadata()
+        metadata = bench.to_metadata() | ({} if bench.input.is_plain else {CONVERTED: "true"})
         self._described = metadata | {CHECKSUM_KEY: bench_checksum(metadata)}
         with self._storing():
             self._writer.start(profile="ros2")

@@ -19,9 +19,9 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
-from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.gravity_alone import bench_without_angles
+from kf_calib.bench.raw_input import Conversion, RawInput, conversion, merged
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.bags import files_of
@@ -62,8 +62,9 @@ class Recording:
 
     path: a file, or the folder of a ROS 2 bag, whose files follow each other. overrides: bench metadata keys
     (docs/format.md) that win over those in the file.
-    accel_scale: factor on the readings, one for all or one a sensor (9.80665 for a file in g). angle_scale: factor on
-    the gimbal angles (0.017453 for a file in degrees).
+    accel_scale: m/s^2 of one unit of the readings, of all or of each channel (9.80665 for a file in g); the bench keys
+    accel_scale and accel_unit say the same. angle_scale: factor on the gimbal angles (0.017453 for a file in degrees).
+    input: what the device sends, where neither the file nor the overrides state it.
     accel_topic, pose_topic, temperature_topic: which to use where the file has several of the kind.
     fields: where the numbers are in messages of another type, for example ``"accel=/imu:acc.x,acc.y,acc.z"``
     (docs/bags.md).
@@ -76,8 +77,9 @@ class Recording:
         self,
         path: str | PathLike[str],
         overrides: Mapping[str, str] = MappingProxyType({}),
-        accel_scale: float | tuple[float, float, float] = 1.0,
+        accel_scale: float | tuple[float, float, float] | None = None,
         *,
+        input: RawInput | None = None,
         angle_scale: float = 1.0,
         accel_topic: str | None = None,
         pose_topic: str | None = None,
@@ -90,7 +92,7 @@ class Recording:
         self.fraction, self._begin_ns = 0.0, None
         self.received: datetime | None = None
         """When the first reading was received, as far as that is recorded; known when it has been read."""
-        self._accel_scale, self._angle_scale = np.asarray(accel_scale, float), angle_scale
+        self._angle_scale = angle_scale
         self._stated = fields_by_role(fields)
         wanted = {READINGS: accel_topic, POSES: pose_topic, TEMPERATURES: temperature_topic}
         self._wanted = wanted | {role: stated.topic for role, stated in self._stated.items()}
@@ -111,7 +113,9 @@ class Recording:
             )
             self._pose = self._require(POSES, advice)
         self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])  # optional, but not to be guessed
-        self.bench = self._describe_bench(overrides)
+        if accel_scale is not None:
+            overrides = {**overrides, **RawInput.of_factors(accel_scale).scale_metadata()}
+        self.bench, self._convert = self._describe_bench(overrides, input)
         self._opening_warnings = len(self.warnings)
 
     def __iter__(self) -> Iterator[Batch]:
@@ -167,11 +171,14 @@ class Recording:
             if not temperature and (topic := self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])):
                 temperature = passage.track(topic, decoders.of(TEMPERATURES, topic))
             batch = Batch(
-                _scaled(accel.read(block, messages), self._accel_scale),
+                self._converted(accel.read(block, messages)),
                 _scaled(pose.read(block, messages), self._angle_scale) if pose else Stream.empty(self.bench.pose_width),
                 temperature.read(block, messages) if temperature else Stream.empty(1),
             )
             yield block.end, batch
+
+    def _converted(self, stream: Stream) -> Stream:
+        return Stream(stream.time_ns, self._convert(stream.values))
 
     def _warn_of_damage(self, said: str) -> None:
         if len(self.warnings) < _MOST_DAMAGES:
@@ -225,25 +232,36 @@ class Recording:
         self._parts.having(topic).refuse_unreadable(role, topic)
         return topic
 
-    def _describe_bench(self, overrides: Mapping[str, str]) -> Bench:
+    def _describe_bench(self, overrides: Mapping[str, str], default: RawInput | None) -> tuple[Bench, Conversion]:
+        """The bench, and how the numbers of the file become readings."""
         recorded, is_damaged = self._parts.bench
         damage = f"{self.path}: the description of the bench in it is damaged"
         if is_damaged:
             self.warnings.append(f"{damage}: only what options give is used.")
+        stated = self._keys_of_bench(recorded, overrides, default)
         if self._pose is None:
-            bench, said = bench_without_angles(str(self.path), {**recorded, **overrides})
+            bench, said = bench_without_angles(str(self.path), stated)
             self.warnings += said
-            return bench
+            return bench, conversion(recorded, stated)
         has_angles = self._parts.having(self._pose).has_angles(self._pose)
         if not has_angles and self._angle_scale != 1.0:
             raise InputError(
                 f"{self.path}: topic {self._pose} has attitudes, which have no unit: leave out --angle-unit."
             )
         try:
-            return Bench.from_metadata({**recorded, **overrides}, has_angles)
+            return Bench.from_metadata(stated, has_angles), conversion(recorded, stated)
         except BenchError as error:
             where = f"{damage}, so give it by options" if is_damaged else str(self.path)
             raise BenchError(f"{where}: {error}") from error
+
+    def _keys_of_bench(
+        self, recorded: Mapping[str, str], overrides: Mapping[str, str], default: RawInput | None
+    ) -> dict[str, str]:
+        """The keys of the bench: those of the file, and of options over them."""
+        try:
+            return merged(recorded, overrides, "the recording", default)
+        except BenchError as error:
+            raise BenchError(f"{self.path}: {error}") from None
 
 
 def _look_up_bench(file: RecordFile, contents: Contents, position: int) -> None:
@@ -362,7 +380,7 @@ class _Track:
         return Stream(joined.time_ns[order], joined.values[order])
 
 
-def _scaled(stream: Stream, scale: Floats | float) -> Stream:
+def _scaled(stream: Stream, scale: float) -> Stream:
     with np.errstate(over="ignore"):  # what damage has made too large becomes infinite, and is counted as such
         return Stream(stream.time_ns, stream.values * scale)
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats, Mask, Times
 from kf_calib.bench.bench import metadata_of
+from kf_calib.bench.raw_input import RawInput
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.sources.files.line_parts import Account
 
@@ -118,6 +119,9 @@ class FrameReader:
     def __init__(self, account: Account) -> None:
         self.metadata: dict[str, str] = {}
         self.has_angles, self.pose_width, self.lost = True, 0, 0
+        self.raw: RawInput | None = None
+        self.unit: str | None = None  # m/s^2, where no option states another
+        self.is_bare = False
         self._account = account
         account.what = "frames"
         self._tail = b""

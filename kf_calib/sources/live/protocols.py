@@ -15,6 +15,7 @@ from kf_calib.sources.files.line_parts import Account, LineReader
 from kf_calib.sources.files.lines import Cutter
 from kf_calib.sources.live.feed import nothing
 from kf_calib.sources.live.frames import FrameReader
+from kf_calib.sources.units import Units
 
 _FEWEST_CELLS = 5  # time, readings and an angle
 _MOST_LINES = 2000  # without a beginning among them
@@ -29,8 +30,11 @@ class LineProtocol:
     not say what is needed.
     """
 
-    def __init__(self, name: str, columns: Mapping[str, str], header: str, account: Account, angles: bool) -> None:
+    def __init__(
+        self, name: str, columns: Mapping[str, str], header: str, account: Account, angles: bool, units: Units
+    ) -> None:  # fmt: skip
         self._name, self._columns, self._account, self._angles = name, columns, account, angles
+        self._units = units
         self._cutter = Cutter(account)
         self._header = header.strip()
         self.reader: LineReader | None = None
@@ -89,7 +93,7 @@ class LineProtocol:
         return []
 
     def _csv(self, header: str, account: Account, angles: bool) -> CsvLines:
-        return CsvLines(CsvColumns.of(Heading.of([header]), self._columns), account, angles)
+        return CsvLines(CsvColumns.of(Heading.of([header]), self._columns, self._units), account, angles)
 
     def _has_readings(self, header: str) -> bool:
         """Whether a header lacks nothing but angles."""
@@ -128,10 +132,12 @@ class LineProtocol:
 class Protocol:
     """Finds out what the bytes are, then reads them."""
 
-    def __init__(self, name: str, columns: Mapping[str, str], header: str, angles: bool = True) -> None:
+    def __init__(
+        self, name: str, columns: Mapping[str, str], header: str, angles: bool = True, units: Units | None = None
+    ) -> None:
         self.account = Account()
         self._name = name
-        self._lines: LineProtocol | None = LineProtocol(name, columns, header, self.account, angles)
+        self._lines: LineProtocol | None = LineProtocol(name, columns, header, self.account, angles, units or Units())
         self._frames: FrameReader | None = None
         self._held = b""
         self._seen = 0

@@ -12,12 +12,14 @@ from dataclasses import dataclass
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.gravity_alone import bench_without_angles, without_poses
-from kf_calib.bench.streams import Batch, Stream
+from kf_calib.bench.raw_input import PLAIN
+from kf_calib.bench.streams import Batch, Stream, with_accel
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.files.lines import bench_of
+from kf_calib.sources.files.lines import Described, bench_of, stated_of
 from kf_calib.sources.live.feed import IDLE_S, Feed, Lost, Regained, nothing
 from kf_calib.sources.live.links import Link
 from kf_calib.sources.live.protocols import Protocol
+from kf_calib.sources.units import Units
 
 _PACE_S = 0.012  # between reads: many small ones cost more than they bring; a serial port holds 4 KB meanwhile
 _INBOX_BYTES = 1 << 25
@@ -77,7 +79,7 @@ class StreamedFeed(Feed):
         self._came_s = self._stopped_s = math.inf
         self._outage: _Outage | None = None
         self._left_bytes = self._poses_left_out = 0
-        self._protocol = Protocol(name, columns, header, angles)
+        self._protocol, self._input = Protocol(name, columns, header, angles, Units.of(overrides)), PLAIN
         self._ahead = deque[Batch | Lost | Regained]()
         self._inbox = deque[bytes | Lost | Regained | _Ended]()
         self._inbox_bytes = 0
@@ -96,10 +98,10 @@ class StreamedFeed(Feed):
 
     def begin(self) -> Bench:
         self._reader.start()
-        ahead, first_s = 0, math.inf
+        ahead, readings, first_s = 0, 0, math.inf
         for item in self._items:
             if isinstance(item, Batch):
-                ahead += len(item.accel) + len(item.temperature)
+                ahead, readings = ahead + len(item.accel) + len(item.temperature), readings + len(item.accel)
                 first_s = min(first_s, time.monotonic()) if ahead else first_s
             if not isinstance(item, Batch) or len(item.accel) or len(item.pose) or len(item.temperature):
                 self._ahead.append(item)  # not what says that nothing came, which would pile up
@@ -107,21 +109,26 @@ class StreamedFeed(Feed):
             if reader is None:
                 continue
             if not self._angles:
-                if ahead:
-                    return self._bench_without_angles(reader.metadata)
+                if readings:
+                    return self._converting(self._bench_without_angles(reader))
                 continue
             if not reader.pose_width and time.monotonic() - first_s > _POSE_WAIT_S:
                 reader.pose_width = self._stated_width(reader.metadata)
-            if reader.pose_width:
-                return bench_of(self.name, reader, self._overrides)
+            if reader.pose_width and readings:  # their names tell a unit
+                return self._converting(bench_of(self.name, reader, self._overrides))
             if ahead > _MOST_AHEAD:
                 break
         raise self._protocol.unusable(
             "no platform angles (--no-angles does without them)" if self._angles else "no readings"
         )
 
-    def _bench_without_angles(self, metadata: Mapping[str, str]) -> Bench:
-        bench, self._said = bench_without_angles(self.name, {**metadata, **self._overrides})
+    def _bench_without_angles(self, reader: Described) -> Bench:
+        bench, self._said = bench_without_angles(self.name, stated_of(self.name, reader, self._overrides))
+        return bench
+
+    def _converting(self, bench: Bench) -> Bench:
+        """The bench, whose raw input all readings are converted by from now on."""
+        self._input = bench.input
         return bench
 
     def _stated_width(self, metadata: Mapping[str, str]) -> int:
@@ -143,6 +150,7 @@ class StreamedFeed(Feed):
         """What is handed on: batches with poses of this width, or none where no angles are used."""
         if not isinstance(item, Batch):
             return item
+        item = with_accel(item, self._input.readings(item.accel.values))
         if self._angles:
             return _with_pose_width(item, width)
         self._poses_left_out += len(item.pose)

@@ -180,7 +180,7 @@ class Simulation:
             for step in steps:
                 step(state)
             values[start:end] = state.reading_mps2
-        return Stream(START_NS + time_ns, _channels(values, self.bench.channels))
+        return Stream(START_NS + time_ns, values)
 
     def _state(self, time_ns: Times) -> State:
         dwell = int(self.motion.locate(time_ns[:1])[0][0])
@@ -232,14 +232,6 @@ class _Clock:
     def between(self, start_ns: int, end_ns: int) -> Times:
         """The stamps from ``start_ns`` on that lie before ``end_ns``."""
         return np.arange(self.first_at(start_ns), self.first_at(end_ns)) * self.period_ns
-
-
-def _channels(readings: Floats, wired: tuple[int, int, int]) -> Floats:
-    """What comes out of the three channels (n, 3) where accelerometer i is wired to channel |wired[i]|, by its sign."""
-    out = np.empty_like(readings)
-    for accelerometer, channel in enumerate(wired):
-        out[:, abs(channel) - 1] = readings[:, accelerometer] if channel > 0 else -readings[:, accelerometer]
-    return out
 
 
 def _refuse_impossible(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.gravity_alone import bench_without_angles
+from kf_calib.bench.raw_input import PLAIN, RawInput, merged
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.tables.columns import HOW, KNOWN, QUATERNION, READINGS, SPREADS, Columns
 from kf_calib.sources.tables.grid import grid_of
@@ -39,10 +41,11 @@ def open_table(
     *,
     columns: Mapping[str, str] = MappingProxyType({}),
     accel_unit: str | None = None,
-    accel_scale: float = 1.0,
+    accel_scale: float | None = None,
     angle_unit: str | None = None,
     g_unit: str | float = STANDARD_GRAVITY_MPS2,
     angles: bool = True,
+    input: RawInput | None = None,
 ) -> Table:
     """A table of orientations as a source: a row a dwell, with its mean readings and its angles, attitude or face.
 
@@ -52,6 +55,7 @@ def open_table(
     - accel_unit, angle_unit: units where the header names none; guessed from the numbers if None.
     - accel_scale: size of one count, in ``accel_unit`` (m/s^2 if that is None).
     - g_unit: m/s^2 that 1 g in the table stands for, or ``local`` for the gravity of the bench.
+    - input: what the device sends, where neither the header nor the other arguments say it.
     - angles: False to do without angles, attitudes and faces; those that the table has are not used.
 
     Raises InputError where a cell, or what the columns are, cannot be understood.
@@ -59,17 +63,25 @@ def open_table(
     grid = grid_of(table)
     numbers = Numbers.of(grid)
     found = Columns.of(grid, columns, numbers)
-    return Opening(found, overrides, Units(accel_unit, accel_scale, angle_unit, g_unit), angles=angles).table()
+    given = {"accel_unit": accel_unit, "accel_scale": accel_scale}
+    keys = {**overrides, **{key: str(value) for key, value in given.items() if value is not None}}
+    try:
+        order = merged({}, keys, "", input).get("channels")
+        units = Units.of(keys, angle_unit, g_unit, input)
+    except BenchError as error:
+        raise BenchError(f"{grid.name}: {error}") from None
+    return Opening(found, keys if order is None else keys | {"channels": order}, units, angles=angles).table()
 
 
 class Opening:
     """One opening of a table; ``said`` collects what was taken for what, ``by_size`` units of columns that the size of
-    their numbers told; has_unit: whether it is known what the readings are in. angles: whether orientations count."""
+    their numbers told; raw: what the readings are in; has_unit: whether that is known. angles: whether orientations
+    count."""
 
     def __init__(self, columns: Columns, overrides: Mapping[str, str], units: Units, *, angles: bool = True) -> None:
         self.columns, self.grid, self.said = columns, columns.grid, list[str]()
         self.overrides, self.units, self.by_size = overrides, units, dict[int, str]()
-        self.has_unit, self.angles = True, angles
+        self.has_unit, self.angles, self.raw = True, angles, PLAIN
         self.warnings = [f"{self.grid.name}: {remark}." for remark in self.grid.remarks]
 
     def table(self) -> Table:
@@ -82,6 +94,9 @@ class Opening:
         bench = self._bench()
         means = self._readings(bench)
         sigmas, counts = self._spreads(bench)
+        bench = replace(bench, input=replace(self.raw, channels=bench.input.channels))
+        means = bench.input.ordered(means)
+        sigmas = None if sigmas is None else np.abs(bench.input.ordered(sigmas))
         warmth = self._temperatures()
         rows = [
             Orientation(mean, own, at_s, None if sigmas is None else sigmas[k], count, float(warmth[k]))
@@ -235,9 +250,10 @@ class Opening:
         norm = float(np.median(np.linalg.norm(values, axis=1)))
         told = reading_units(named, norm, self.units, bench.gravity_mps2)
         self.has_unit = told.is_known
+        self.raw = told.raw
         if told.by_size:
             self.by_size |= {place: told.units[k] for k, place in enumerate(places) if not named[k]}
-        return told.factors, told.words
+        return told.raw.factors, told.words
 
     def _refuse_other_unit(self, places: list[int], named: list[str], stated: str | None, what: str) -> None:
         """Raise InputError if an option states another unit than the name of a column."""

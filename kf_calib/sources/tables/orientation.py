@@ -11,7 +11,7 @@ from kf_calib.bench.arrays import Floats
 class Orientation:
     """A dwell as a table has it: conditions and mean readings.
 
-    - mean_mps2 (3,): mean readings of the channels.
+    - mean_mps2 (3,): mean readings of accelerometers 1, 2, 3.
     - pose (k,): gimbal angles, rad, or quaternion.
     - elapsed_s: time of its middle since the first row.
     - sigma_mps2 (3,): standard deviation of the readings about their mean; None where it is not known.

@@ -342,7 +342,11 @@ def test_a_live_stream_is_read_as_it_arrives():
         ("time_s,ax_g,ay_g,az_g,outer\n1,1,1,1,1", "name them outer_deg"),
         ("time_s,ax_g,ay_g,az_g,ax_g,outer_deg\n", "two columns are named 'ax_g'"),
         ("time_s,ax_g,ay_g,az_g,outer_deg\n1,1,1,1,1", "1 angles and the bench has 3 axes"),
-        (json_text({"time_ns": 1, "accel": [1, 2, 3]}), "'accel'.*name the readings accel_mps2 or accel_g"),
+        (
+            json_text({"time_ns": 1, "acc": [1, 2, 3], "angles_rad": [1]}),
+            "'acc'.*name the readings accel_mps2 or accel",
+        ),
+        (json_text({"time_ns": 1, "accel": [1, 2, 3], "angles_rad": [1]}), "do not tell their unit: name them"),
         (json_text({"time_ns": 1, "accel_g": [1, 2, 3]}), "no platform angles in 1 lines"),
         (json_text({"time_ns": 1, "angles_rad": [1, 2, 3]}), "no readings in 1 lines"),
         ("{]\n", "no platform angles in 1 lines; 1 of 1 lines were malformed"),

@@ -1,0 +1,267 @@
+"""What a device sends, and how it becomes readings of accelerometers 1, 2, 3 in m/s^2.
+
+    reading_i = sign_i * size * unit * raw number of channel |channels_i|
+
+This is stated once, as bench keys: by options of ``record``, ``live`` or ``replay``, or in the bench file. A recording
+made by this program holds the readings (``converted``), and says what they were made of; a calibration says of which
+device it is. Of a device whose numbers are the readings already, nothing is written down.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.errors import BenchError
+from kf_calib.support.plain_text import cut
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2
+
+CHANNELS = (1, 2, 3)
+UNITS = {
+    "m/s2": 1.0, "g": STANDARD_GRAVITY_MPS2, "mg": 1e-3 * STANDARD_GRAVITY_MPS2, "ug": 1e-6 * STANDARD_GRAVITY_MPS2,
+}  # fmt: skip
+"""Units of raw readings, in m/s^2."""
+LABELS = {"m/s2": "m/s^2", "g": "g", "mg": "mg", "ug": "ug"}
+OPTIONS = {"channels": "--channels", "accel_scale": "--accel-scale", "accel_unit": "--accel-unit"}
+"""The bench keys that state a raw input, and the options that do."""
+CONVERTED, RESTATE = "converted", "restate_input"
+
+
+def parse_channels(text: str) -> tuple[int, int, int]:
+    """The channel of the recording that belongs to each accelerometer, from text such as ``"1,-2,3"``; a minus reverses
+    its sign."""
+    words = text.strip("[] ").replace(",", " ").split()
+    try:
+        first, second, third = (int(word) for word in words)
+    except ValueError:
+        first, second, third = 0, 0, 0
+    if sorted(map(abs, (first, second, third))) != [1, 2, 3]:
+        raise BenchError(
+            f"channels {cut(text, 60)!r} name no order: give the channel of accelerometer 1, 2 and 3, each once, with "
+            "a minus where it is reversed, for example --channels 1,-2,3."
+        )
+    return first, second, third
+
+
+def parse_scale(text: str) -> tuple[float, float, float]:
+    """The size of one count of channels 1, 2, 3 from one number for all or three; raises BenchError."""
+    words = text.strip("[] ").replace(",", " ").split()
+    try:
+        sizes = [float(word) for word in words]
+    except ValueError:
+        sizes = []
+    sizes = sizes * 3 if len(sizes) == 1 else sizes
+    if len(sizes) != 3 or not all(0.0 < size < math.inf for size in sizes):
+        raise BenchError(
+            f"accel_scale is {cut(text, 60)!r}: give the size of one count, a positive number for all channels or one "
+            "for each, in the unit of the readings, for example --accel-scale 3.9e-6 (--channels reverses signs)."
+        )
+    return sizes[0], sizes[1], sizes[2]
+
+
+def parse_unit(text: str) -> str:
+    """The name in ``UNITS`` of a unit as people write it; raises BenchError."""
+    unit = text.strip().replace("^", "").replace("µ", "u").replace("μ", "u").replace("²", "2").replace("mps2", "m/s2")
+    if unit not in UNITS:
+        raise BenchError(f"accel_unit is {cut(text, 60)!r}: give one of {', '.join(UNITS)}.")
+    return unit
+
+
+@dataclass(frozen=True)
+class RawInput:
+    """The raw readings of a device.
+
+    - channels: for accelerometers 1, 2, 3 the channel that it is read on, negative where its sign is reversed.
+    - sizes: of one count of channels 1, 2, 3, in ``unit``; 1 where the numbers are in the unit itself.
+    - unit: one of ``UNITS``.
+    """
+
+    channels: tuple[int, int, int] = CHANNELS
+    sizes: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    unit: str = "m/s2"
+
+    def __post_init__(self) -> None:
+        parse_channels(",".join(map(str, self.channels)))
+        parse_scale(",".join(map(repr, self.sizes)))
+        parse_unit(self.unit)
+
+    @classmethod
+    def from_metadata(cls, stated: Mapping[str, Any]) -> RawInput:
+        """The raw input that bench keys state; raises BenchError."""
+        return cls(
+            parse_channels(str(stated.get("channels", "1,2,3"))),
+            parse_scale(str(stated.get("accel_scale", "1"))),
+            parse_unit(str(stated.get("accel_unit", "m/s2"))),
+        )
+
+    @classmethod
+    def of_factors(cls, factors: float | Sequence[float]) -> RawInput:
+        """Channels in the order of the accelerometers; factors: m/s^2 of one count, of all or each, with its sign."""
+        x, y, z = np.broadcast_to(np.asarray(factors, float), 3).tolist()
+        first, second, third = (int(math.copysign(k, factor)) for k, factor in zip(CHANNELS, (x, y, z), strict=True))
+        return cls((first, second, third), (abs(x), abs(y), abs(z)))
+
+    def to_metadata(self) -> dict[str, str]:
+        """The bench keys that state it; none where the device sends readings."""
+        if self.is_plain:
+            return {}
+        return {"channels": self.order, "accel_scale": self.scale, "accel_unit": self.unit}
+
+    def scale_metadata(self) -> dict[str, str]:
+        """The bench keys that state the size of a count, and which channel is which only where that is said, too."""
+        order = {} if self.channels == CHANNELS else {"channels": self.order}
+        return order | {"accel_scale": self.scale, "accel_unit": self.unit}
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the raw numbers are the readings."""
+        return self == PLAIN
+
+    @property
+    def restating(self) -> str:
+        """The option that an advice to state another one needs, after a blank; nothing where none is stated yet."""
+        return "" if self.is_plain else " --restate-input"
+
+    @property
+    def order(self) -> str:
+        """The channels as text."""
+        return ",".join(map(str, self.channels))
+
+    @property
+    def scale(self) -> str:
+        """The size of one count as text: one number for all channels where they have the same."""
+        return ",".join(map(repr, self.sizes[:1] if len(set(self.sizes)) == 1 else self.sizes))
+
+    @property
+    def factors(self) -> Floats:
+        """m/s^2 of one raw unit of channels 1, 2, 3."""
+        return np.array(self.sizes) * UNITS[self.unit]
+
+    @cached_property
+    def matrix(self) -> Floats:
+        """A (3, 3): readings = A raw."""
+        places = np.array(self.channels)
+        out = np.zeros((3, 3))
+        out[np.arange(3), np.abs(places) - 1] = np.sign(places) * self.factors[np.abs(places) - 1]
+        return out
+
+    def readings(self, raw: Floats) -> Floats:
+        """Readings (n, 3), m/s^2, of accelerometers 1, 2, 3 from raw numbers (n, 3) of channels 1, 2, 3."""
+        if self.is_plain:
+            return raw
+        with np.errstate(over="ignore"):  # what damage has made too large becomes infinite, and is counted as such
+            return self.ordered(raw * self.factors)
+
+    def ordered(self, channels: Floats) -> Floats:
+        """Channels (n, 3) in the order and with the signs of the accelerometers, not scaled."""
+        if self.channels == CHANNELS:
+            return channels
+        places = np.array(self.channels)
+        return channels[:, np.abs(places) - 1] * np.sign(places)
+
+    def raw(self, readings: Floats) -> Floats:
+        """Raw numbers (n, 3) of channels 1, 2, 3 that give these readings (n, 3): what ``readings`` inverts."""
+        out = np.empty_like(readings)
+        for accelerometer, channel in enumerate(self.channels):
+            out[:, abs(channel) - 1] = math.copysign(1.0, channel) * readings[:, accelerometer]
+        return out / self.factors
+
+    @property
+    def unit_words(self) -> str:
+        """What one raw number is: a unit, or a count of a size."""
+        label = LABELS[self.unit]
+        if self.sizes == (1.0, 1.0, 1.0):
+            return label
+        one = len(set(self.sizes)) == 1
+        return f"counts of {self.scale} {label}" if one else f"counts of {', '.join(map(repr, self.sizes))} {label}"
+
+    @property
+    def formula(self) -> str:
+        """Readings in m/s^2 from the raw numbers of channels 1, 2, 3, as formulas."""
+        return ", ".join(
+            f"{axis} = {math.copysign(1.0, channel) * self.factors[abs(channel) - 1]:.12g} channel{abs(channel)}"
+            for axis, channel in zip("xyz", self.channels, strict=True)
+        )
+
+    def __str__(self) -> str:
+        if self.is_plain:
+            return "readings in m/s^2, in the order of the accelerometers"
+        order = "channels in the order of the accelerometers"
+        if self.channels != CHANNELS:
+            order = f"accelerometers 1, 2, 3 on channels {', '.join(map(str, self.channels))}"
+        return f"raw readings in {self.unit_words}, {order}"
+
+
+PLAIN = RawInput()
+"""Of a device that sends the readings themselves, in m/s^2."""
+
+
+def text_of(key: str, value: Any) -> str:
+    """The text of a key of a raw input from text, a number or a list of JSON or TOML; raises ValueError."""
+    if isinstance(value, list | tuple):
+        value = ",".join(map(repr, value))
+    if isinstance(value, Real) and not isinstance(value, bool) and key == "accel_scale":
+        value = repr(float(value))
+    if not isinstance(value, str):
+        raise ValueError("it must be text")
+    try:
+        made = RawInput.from_metadata({key: value.strip()})
+    except BenchError as error:
+        raise ValueError(str(error)) from None
+    return {"channels": made.order, "accel_scale": made.scale, "accel_unit": made.unit}[key]
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """From the numbers of a file to readings.
+
+    - device: the raw input of the device that the file is of.
+    - made_by: what the numbers have been converted by already; None where they are raw.
+    """
+
+    device: RawInput
+    made_by: RawInput | None = None
+
+    def __call__(self, numbers: Floats) -> Floats:
+        """Readings (n, 3), m/s^2, of accelerometers 1, 2, 3 from the numbers (n, 3) of the file."""
+        if self.made_by == self.device:
+            return numbers
+        return self.device.readings(numbers if self.made_by is None else self.made_by.raw(numbers))
+
+
+def merged(
+    recorded: Mapping[str, Any], overrides: Mapping[str, Any], what: str, default: RawInput | None = None
+) -> dict[str, Any]:
+    """Bench keys of a file (``what``) with those of options over them; default: the raw input where it states none.
+
+    Raises BenchError where options state another raw input than what is stated already, unless they restate it
+    (``restate_input``).
+    """
+    stated = dict(recorded)
+    if default is not None and not default.is_plain and not set(OPTIONS) & set(recorded):
+        stated, what = stated | default.to_metadata(), "the calibration"
+    shared = () if overrides.get(RESTATE) == "true" else set(OPTIONS) & set(stated) & set(overrides)
+    for key in sorted(shared):
+        try:
+            there, here = text_of(key, stated[key]), text_of(key, overrides[key])
+        except ValueError:
+            continue  # told where the bench is made of it
+        if there != here:
+            raise BenchError(
+                f"{OPTIONS[key]} is {here}, and {what} states {there}: leave it out, or where what is stated is "
+                "wrong, say so by --restate-input."
+            )
+    return {**stated, **overrides}
+
+
+def conversion(recorded: Mapping[str, Any], stated: Mapping[str, Any]) -> Conversion:
+    """How the numbers of a file become readings; recorded: its bench keys, stated: those with what options say."""
+    is_converted = recorded.get(CONVERTED) == "true"
+    return Conversion(RawInput.from_metadata(stated), RawInput.from_metadata(recorded) if is_converted else None)

@@ -1,0 +1,323 @@
+"""From what a device sends to corrected readings: three devices, every way in and every way out."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import json
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import openpyxl
+import pytest
+from exchange.test_c_header import compiled, compiled_only
+from exchange.test_exports import READERS, ROUNDING
+from helpers.altered import short_run
+from helpers.stated_sensors import correction, samples, saved
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+import kf_calib
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.raw_input import UNITS, RawInput, merged
+from kf_calib.bench.streams import Batch, Stream
+from kf_calib.errors import BenchError
+from kf_calib.exchange.exports import exported
+from kf_calib.sources.files.recorder import Recorder
+
+ORDERS = [
+    tuple(sign * place for sign, place in zip(signs, places, strict=True))
+    for places in itertools.permutations((1, 2, 3))
+    for signs in itertools.product((1, -1), repeat=3)
+]
+SCALES = [1e-9, 2.5e-7, 3.9e-6, 1 / 16384, 1e-3, 0.061, 1.0, 1.7, 42.0, 1e5]
+
+
+def devices() -> Iterator[tuple[str, RawInput]]:
+    """Counts of a data acquisition, with one channel reversed and two swapped; readings in g; readings in m/s^2."""
+    yield "counts", RawInput((2, -1, 3), (3.9e-6, 3.9e-6, 3.9e-6), "g")
+    yield "g", RawInput((1, -2, 3), unit="g")
+    yield "m/s2", RawInput((3, 1, 2))
+
+
+@pytest.mark.parametrize("channels", ORDERS, ids=str)
+def test_a_raw_input_is_its_matrix_and_can_be_undone(channels: Any) -> None:
+    raw = np.random.default_rng(1).normal(size=(50, 3)) * 1e4
+    for scale, unit in itertools.product(SCALES, UNITS):
+        own = RawInput(channels, (scale, scale, scale), unit)
+        readings = own.readings(raw)
+        np.testing.assert_allclose(readings, raw @ own.matrix.T, rtol=1e-14)
+        np.testing.assert_allclose(own.raw(readings), raw, rtol=1e-14)
+        for i, channel in enumerate(channels):  # as it is said: accelerometer i is channel |channels_i|
+            expected = np.sign(channel) * raw[:, abs(channel) - 1] * scale * UNITS[unit]
+            np.testing.assert_allclose(readings[:, i], expected, rtol=1e-14)
+        assert RawInput.from_metadata(own.to_metadata()) == own
+
+
+@pytest.mark.parametrize("to", READERS)
+def test_every_program_takes_raw_readings_of_any_wiring_and_size(to: str) -> None:
+    """By the formula of the program; one that has no room for it takes readings in m/s^2, and says what to do."""
+    own = correction(
+        turned=0.0 if to in ("px4", "ardupilot") else 1e-2, bias=0.0 if to in ("kalibr", "openvins") else 0.05
+    )
+    content = saved()
+    own = content.correction() if to == "csv" else own
+    force, temperature = samples(200)
+    readings = own.predicted(force, temperature)
+    for channels, scale in itertools.product(ORDERS, SCALES):
+        made = RawInput(channels, (scale, scale, scale), "g")
+        wired = replace(own, bench=replace(own.bench, input=made))
+        target = exported(content, wired, to, lossy=True)
+        given = made.raw(readings)
+        if not target.folds:
+            assert target.to_be_done_before and to in ("px4", "ardupilot", "imu_tk")
+            given = _done_before(target.to_be_done_before, given)
+        found = READERS[to](target.text())(given, temperature)
+        close = 2.0 * ROUNDING.get(to, 1e-12 if target.folds else 1e-10)  # 32 bits; digits of the sentence
+        np.testing.assert_allclose(found, force, rtol=0, atol=close)
+        if to not in ("imu_tk", "vectornav"):
+            assert str(target.input) in target.text().replace("\\u00b2", "2") or to == "csv"
+
+
+def _done_before(said: str, raw: np.ndarray) -> np.ndarray:
+    """Readings made of raw ones as the sentence says: x = 3.8e-05 channel2, y = ..."""
+    terms = re.findall(r"[xyz] = (\S+) channel([123])", said)
+    return np.column_stack([float(size) * raw[:, int(channel) - 1] for size, channel in terms])
+
+
+@compiled_only
+@pytest.mark.parametrize("k", range(0, 480, 61))
+def test_the_function_in_c_takes_raw_readings(k: int, tmp_path: Path) -> None:
+    channels, scale = ORDERS[k // 10], SCALES[k % 10]
+    made = RawInput(channels, (scale, scale, scale), "mg")
+    own = correction("second-order", "thermal-bias")
+    own = replace(own, bench=replace(own.bench, input=made))
+    force, temperature = samples(500)
+    raw = made.raw(own.predicted(force, temperature))
+    text = exported(saved(), own, "c").text()
+    assert f"// It takes {made}." in text
+    np.testing.assert_allclose(compiled(text, tmp_path)(raw, temperature), force, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(own(raw, temperature), force, rtol=0, atol=1e-11)
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A device on the bench: what it sends in a run (time, raw, angles), and the calibration made of it."""
+
+    input: RawInput
+    time_ns: np.ndarray
+    raw: np.ndarray
+    pose: Stream
+    force: np.ndarray
+    calibration: Path
+    options: tuple[str, ...]
+
+    def rows(self, header: str) -> str:
+        """CSV lines of all readings, with the last angles before each."""
+        at = np.clip(np.searchsorted(self.pose.time_ns, self.time_ns, side="right") - 1, 0, None)
+        angles = np.degrees(self.pose.values[at])
+        lines = [
+            ",".join([str(int(stamp)), *(repr(each) for each in [*own.tolist(), *turn.tolist()])])
+            for stamp, own, turn in zip(self.time_ns, self.raw, angles, strict=True)
+        ]
+        return "\n".join([f"time_ns,{header},outer_deg,middle_deg,inner_deg", *lines, ""])
+
+
+@pytest.fixture(scope="module", params=list(devices()), ids=lambda param: param[0])
+def device(request: Any, tmp_path_factory: pytest.TempPathFactory, run: Any) -> Taken:
+    """Recorded from lines, with what it sends stated once, and calibrated with no further word."""
+    name, own = request.param
+    folder = tmp_path_factory.mktemp(name.replace("/", "_"))
+    source = short_run(count=16, dwell_s=2.0, sample_hz=50.0, seed=4)
+    batches = list(source)
+    accel = Stream.joined([batch.accel for batch in batches])
+    raw = own.raw(accel.values)
+    raw = np.rint(raw).astype(np.int32) if own.sizes != RawInput().sizes else raw
+    options = ["--channels", own.order]
+    if own.sizes != RawInput().sizes:
+        options += ["--accel-scale", own.scale, "--accel-unit", own.unit]
+    pose = Stream.joined([batch.pose for batch in batches])
+    taken = Taken(own, accel.time_ns, raw, pose, accel.values, folder / "cal.json", tuple(options))
+    header = {"counts": "ax,ay,az", "g": "ax_g,ay_g,az_g", "m/s2": "ax_mps2,ay_mps2,az_mps2"}[name]
+    (folder / "lines.csv").write_text(taken.rows(header))
+    words = ("record", folder / "run.mcap", folder / "lines.csv", "--axes", "y z x", "--gravity", "9.81", *options)
+    code, _, err = run(*words)
+    assert code == 0, err
+    code, said, err = run("replay", folder / "run.mcap", "--save", taken.calibration)
+    assert code == 0, err
+    assert str(own) in said  # printed, so that a wrong word is seen
+    return taken
+
+
+@pytest.fixture(scope="module")
+def run() -> Any:
+    """The command line, as it is called."""
+    from contextlib import redirect_stderr, redirect_stdout
+
+    from kf_calib.cli import main
+
+    def called(*words: Any) -> tuple[int, str, str]:
+        out, err = io.StringIO(), io.StringIO()
+        with redirect_stdout(out), redirect_stderr(err):
+            try:
+                with pytest.MonkeyPatch.context() as patch:
+                    patch.setattr("sys.argv", ["kf-calib", *map(str, words)])
+                    main()
+                code: Any = 0
+            except SystemExit as end:
+                code = end.code
+        return int(code or 0), out.getvalue(), err.getvalue()
+
+    return called
+
+
+def forces_in_csv(text: str) -> np.ndarray:
+    """Specific force in m/s^2 from lines with the unit in their header."""
+    rows = list(csv.DictReader(text.splitlines()))
+    unit = next(name.partition("_")[2] for name in rows[0] if name.startswith("ax"))
+    factor = {"mps2": 1.0, "g": 9.80665}[unit]
+    return factor * np.array([[float(row[f"a{axis}_{unit}"]) for axis in "xyz"] for row in rows])
+
+
+def test_every_way_in_gives_the_same_specific_force(
+    device: Taken, run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """CSV, JSON lines, MCAP as it came and as it was recorded, standard input, Excel, Python: nothing is said again."""
+    correct = kf_calib.open_calibration(device.calibration).correction()
+    assert correct.input == device.input
+    expected = correct(device.raw)
+    last = np.linalg.norm(expected[-20:], axis=1)  # the run ends at rest
+    np.testing.assert_allclose(last, 9.81, rtol=5e-5)
+    count_mps2 = float(device.input.factors.max()) if device.raw.dtype == np.int32 else 1e-9
+    np.testing.assert_allclose(expected, correct.of_readings(device.force), rtol=0, atol=2.0 * count_mps2)
+    folder, cal, close = device.calibration.parent, device.calibration, dict(rtol=0, atol=1e-11)
+
+    lines = folder / "lines.csv"
+    assert run("apply", cal, lines, "-o", tmp_path / "lines.csv")[0] == 0
+    text = (tmp_path / "lines.csv").read_text()
+    np.testing.assert_allclose(forces_in_csv(text), expected, **close)
+    assert [line.split(",")[0] for line in text.splitlines()] == [
+        line.split(",")[0] for line in lines.read_text().splitlines()
+    ]
+
+    buffer = io.BytesIO()
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=io.BytesIO(lines.read_bytes())))
+    monkeypatch.setattr(sys, "stdout", SimpleNamespace(buffer=buffer, isatty=lambda: False, flush=lambda: None))
+    from kf_calib.cli.exchange import apply
+
+    apply.main([str(cal), "-"], standalone_mode=False)
+    monkeypatch.undo()
+    assert buffer.getvalue() == (tmp_path / "lines.csv").read_bytes()
+
+    key = {"g": "accel_g", "m/s2": "accel_mps2"}[device.input.unit]
+    pairs = zip(device.time_ns.tolist(), device.raw.tolist(), strict=True)
+    objects = [json.dumps({"time_ns": time_ns, key: own}) for time_ns, own in pairs]
+    (tmp_path / "in.jsonl").write_text("\n".join(objects))
+    assert run("apply", cal, tmp_path / "in.jsonl", "-o", tmp_path / "out.jsonl")[0] == 0
+    found = np.array([json.loads(line)[key] for line in (tmp_path / "out.jsonl").read_text().splitlines()])
+    np.testing.assert_allclose(found * UNITS[device.input.unit], expected, **close)
+
+    with Recorder(tmp_path / "raw.mcap", Bench((), 9.81, angles=False)) as recorder:  # as a driver writes it: no keys
+        recorder.write(Batch(Stream(device.time_ns, device.raw.astype(float)), Stream.empty(4)))
+    for recording in (tmp_path / "raw.mcap", folder / "run.mcap"):
+        out = tmp_path / f"out_{recording.name}"
+        code, _, err = run("apply", cal, recording, "-o", out)
+        assert code == 0, err
+        with out.open("rb") as file:
+            every = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(
+                ["/accelerometer/calibrated"]
+            )
+            found = np.array([[v.x, v.y, v.z] for v in (each.decoded_message.linear_acceleration for each in every)])
+        np.testing.assert_allclose(found, expected, **close)
+
+    book = openpyxl.Workbook()
+    sheet: Any = book.active
+    sheet.append(["when", "time_s", "ax", "ay", "az"])
+    chosen = range(0, len(device.raw), 40)
+    for k in chosen:
+        sheet.append([f"row {k}", 60.0 * k, *(float(each) for each in device.raw[k])])
+    book.save(tmp_path / "means.xlsx")
+    code, _, err = run("apply", cal, tmp_path / "means.xlsx", "-o", tmp_path / "out.xlsx")
+    assert code == 0, err
+    rows = list(openpyxl.load_workbook(tmp_path / "out.xlsx").active.values)  # type: ignore[union-attr]
+    assert rows[0] == ("when", "time_s", "ax_mps2", "ay_mps2", "az_mps2") and rows[2][0] == "row 40"
+    np.testing.assert_allclose([row[2:] for row in rows[1:]], expected[list(chosen)], **close)
+
+
+def test_the_recording_holds_readings_and_says_what_they_were_made_of(device: Taken, run: Any) -> None:
+    path = device.calibration.parent / "run.mcap"
+    recording = kf_calib.open_recording(path)
+    assert recording.bench.input == device.input
+    held = Stream.joined([batch.accel for batch in recording])
+    np.testing.assert_allclose(held.values, device.input.readings(device.raw), rtol=1e-13)
+    _, said, _ = run("info", path)
+    assert f"channels = {device.input.order}" in said and "converted = true" in said
+
+
+def test_an_option_that_contradicts_what_is_stored_is_refused(device: Taken, run: Any, tmp_path: Path) -> None:
+    cal, folder = device.calibration, device.calibration.parent
+    for words in (("replay", folder / "run.mcap"), ("apply", cal, folder / "run.mcap", "-o", tmp_path / "o.mcap"),
+                  ("apply", cal, folder / "lines.csv", "-o", tmp_path / "o.csv"),
+                  ("verify", cal, folder / "run.mcap")):  # fmt: skip
+        code, _, err = run(*words, "--channels", "1,2,-3")
+        assert code == 2 and f"1,2,-3, and the {'calibration' if 'lines' in str(words) else 'recording'}" in err
+        assert f"states {device.input.order}" in err and "--restate-input" in err and err.count("\n") == 1
+    assert run("replay", folder / "run.mcap", *device.options)[0] == 0  # to repeat it does no harm
+
+
+def test_what_was_stated_wrongly_can_be_restated(device: Taken, run: Any, tmp_path: Path) -> None:
+    wrong = ["--channels", "1,2,3", *device.options[2:]]
+    folder = device.calibration.parent
+    words = ("record", tmp_path / "wrong.mcap", folder / "lines.csv", "--axes", "y z x", "--gravity", "9.81", *wrong)
+    assert run(*words)[0] == 0
+    code, _, err = run("replay", tmp_path / "wrong.mcap")
+    assert code == 2 and f"--channels {device.input.order}" in err
+    _, one, err = run("replay", tmp_path / "wrong.mcap", "--channels", device.input.order, "--restate-input", "--json")
+    _, other, _ = run("replay", folder / "run.mcap", "--json")
+    for mine, theirs in zip(json.loads(one)["parameters"], json.loads(other)["parameters"], strict=True):
+        assert mine["value"] == pytest.approx(theirs["value"], rel=1e-9, abs=1e-10)
+
+
+def test_readings_of_another_unit_are_refused_with_the_likely_cause(device: Taken, run: Any, tmp_path: Path) -> None:
+    factor = 1e3 if device.input.sizes == RawInput().sizes else 1e-3
+    with Recorder(tmp_path / "other.mcap", Bench((), 9.81, angles=False)) as recorder:
+        recorder.write(Batch(Stream(device.time_ns, factor * device.raw), Stream.empty(4)))
+    code, _, err = run("apply", device.calibration, tmp_path / "other.mcap", "-o", tmp_path / "out.mcap")
+    assert code == 2 and "have a norm of" in err and "--accel-" in err and err.count("\n") == 1
+    assert not (tmp_path / "out.mcap").exists()
+    assert run("apply", device.calibration, tmp_path / "other.mcap", "-o", tmp_path / "o.mcap", "--unchecked")[0] == 0
+
+
+def test_another_order_of_channels_shows_in_the_norm_at_rest(run: Any, tmp_path: Path) -> None:
+    source = short_run(count=16, dwell_s=2.0, seed=4, grade="mems")
+    with Recorder(tmp_path / "run.mcap", source.bench) as recorder:
+        batches = list(source)
+        for batch in batches:
+            recorder.write(batch)
+    assert run("replay", tmp_path / "run.mcap", "--save", tmp_path / "cal.json")[0] == 0
+    accel = Stream.joined([batch.accel for batch in batches])
+    for channels, refused in (((1, -2, 3), True), ((2, 1, 3), True), ((1, 2, 3), False)):
+        path = tmp_path / f"{channels}.mcap"
+        with Recorder(path, Bench((), 9.81, angles=False)) as recorder:
+            recorder.write(Batch(Stream(accel.time_ns, RawInput(channels).raw(accel.values)), Stream.empty(4)))
+        code, _, err = run("apply", tmp_path / "cal.json", path, "-o", tmp_path / f"o{channels}.mcap")
+        assert code == (2 if refused else 0)
+        assert not refused or f"--channels {RawInput(channels).order}" in err
+
+
+def test_what_a_later_statement_may_say() -> None:
+    stated = RawInput((1, -2, 3), (3.9e-6,) * 3, "g").to_metadata()
+    assert merged(stated, {"accel_scale": "0.0000039", "accel_unit": "g"}, "it")["accel_scale"] == "0.0000039"
+    with pytest.raises(BenchError, match=r"--accel-unit is m/s2, and it states g"):
+        merged(stated, {"accel_unit": "m/s2"}, "it")
+    assert merged(stated, {"accel_unit": "m/s2", "restate_input": "true"}, "it")["accel_unit"] == "m/s2"
+    assert merged({}, {"axes": "y"}, "it", RawInput.from_metadata(stated))["channels"] == "1,-2,3"
+    with pytest.raises(BenchError, match="and the calibration states 1,-2,3"):
+        merged({}, {"channels": "1,2,3"}, "it", RawInput.from_metadata(stated))
