@@ -16,6 +16,7 @@ from click import get_current_context  # rich_click declares that there may be n
 from kf_calib.cli.echo import complain, echo
 from kf_calib.cli.failures import sentence
 from kf_calib.cli.files import Delivery, claimed, delivery
+from kf_calib.cli.numbers import POSITIVE
 from kf_calib.cli.options import (
     MODEL,
     OUTPUT,
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from kf_calib.estimation.results import Calibration
     from kf_calib.fleet.batch import Progress
     from kf_calib.fleet.bench_model_files import BenchModelFiles
+    from kf_calib.fleet.evaluation import Evaluation
     from kf_calib.fleet.overview import FleetOverview
     from kf_calib.fleet.reference_unit import ReferenceUnit
     from kf_calib.fleet.run_list import Run
@@ -110,6 +112,8 @@ def _content(value: Any) -> Any:
               help="Number of processes on this machine.")  # fmt: skip
 @click.option("--scheduler", metavar="URL", panel=WORK,
               help="A scheduler of Dask whose workers do it, for example tcp://host:8786.")  # fmt: skip
+@click.option("--limit-s", type=POSITIVE, default=3600.0, show_default=True, metavar="S",
+              panel=WORK, help="Seconds that one run may take; if it takes longer, its row says so.")  # fmt: skip
 @click.option("--pooled/--no-pooled", default=True, show_default=True, panel=MODEL,
               help="Whether two runs or more are diagnosed together: errors of the bench, of sensors.")  # fmt: skip
 @click.option("--reference-unit", type=click.Path(path_type=Path), metavar="CAL.json", panel=MODEL,
@@ -128,6 +132,7 @@ def fleet(
     out: Path,
     workers: int | None,
     scheduler: str | None,
+    limit_s: float,
     pooled: bool,
     reference_unit: Path | None,
     targets: tuple[str, ...],
@@ -153,6 +158,7 @@ def fleet(
         raise click.UsageError("--reference-unit is for the diagnosis of all runs together: leave out --no-pooled.")
     from kf_calib.bench.targets import targets_of
     from kf_calib.fleet.bench_model_files import BenchModelFiles
+    from kf_calib.fleet.evaluation import Evaluation
     from kf_calib.fleet.results import Fleet, populations
     from kf_calib.fleet.run_list import runs_of
     from kf_calib.views import fleet as views
@@ -162,7 +168,8 @@ def fleet(
         import kf_calib.views.figures  # noqa: F401  # what is not installed is told before the work
     wanted, reference = targets_of(targets), _reference(reference_unit)
     commands = _checked(options)
-    done = _evaluated(commands, runs_of(runs), out, workers, scheduler, as_json)
+    evaluation = Evaluation(commands, commands.checksum, limit_s)
+    done = _evaluated(evaluation, runs_of(runs), out, workers, scheduler, as_json)
     found = Fleet(out)
     with progress("diagnosing the runs together", as_json):
         overview = found.overview(wanted, pooled=pooled, reference_unit=reference)
@@ -223,14 +230,13 @@ def _checked(options: Mapping[str, Any]) -> SingleCommands:
 
 
 def _evaluated(
-    commands: SingleCommands, runs: Sequence[Run], out: Path, workers: int | None, scheduler: str | None, quiet: bool
+    evaluation: Evaluation, runs: Sequence[Run], out: Path, workers: int | None, scheduler: str | None, quiet: bool
 ) -> Progress:
     """Evaluate the runs that are not in the table yet; where it is stopped, all that is done is kept."""
     import dask.system
 
     from kf_calib.fleet.batch import evaluate_all
     from kf_calib.fleet.cluster import cluster
-    from kf_calib.fleet.evaluation import Evaluation
     from kf_calib.fleet.store import Store
 
     store, interrupt = Store(out), Interrupter()
@@ -243,7 +249,7 @@ def _evaluated(
 
         try:
             with cluster(workers or dask.system.CPU_COUNT, scheduler) as client:
-                return evaluate_all(client, Evaluation(commands, commands.checksum), runs, store, tell)
+                return evaluate_all(client, evaluation, runs, store, tell)
         except KeyboardInterrupt:
             complain(f"stopped: {out} has {len(store.known())} runs so far, and the same command goes on from there.")
             raise

@@ -24,7 +24,8 @@ class Progress:
     """How far a fleet has come.
 
     total: runs named. kept: of these, runs that were in the table with the same content and settings. evaluated: runs
-    that were evaluated now, failed: those of them that failed. cpu_s: processor time that they took.
+    that were evaluated now, failed: those of them that failed. cpu_s: processor time that they took. notes: sentences
+    on rows of the table that are of no use.
     """
 
     total: int
@@ -32,6 +33,7 @@ class Progress:
     evaluated: int = 0
     failed: int = 0
     cpu_s: float = 0.0
+    notes: tuple[str, ...] = ()
 
     @property
     def done(self) -> int:
@@ -51,9 +53,9 @@ def evaluate_all(
     Runs that failed because their file could not be fetched, or because their process ended, are tried again; others
     would fail again.
     """
-    known = store.known()
+    known, notes = store.checked()
     waiting = deque(run for run in runs if not _is_done(run, known.get(run.place), evaluation))
-    progress = Progress(len(runs), kept=len(runs) - len(waiting))
+    progress = Progress(len(runs), kept=len(runs) - len(waiting), notes=tuple(notes))
     on_progress(progress)
     for rows, kept in _evaluated(client, evaluation, waiting, known):
         store.append(rows)
@@ -104,6 +106,7 @@ def _row(future: Future[Any], run: Run, evaluation: Evaluation) -> Row | None:
         return future.result()
     if isinstance(error, KilledWorker):
         times = error.allowed_failures + 1
-        said = f"{run.place}: the process that evaluated it was ended {times} times: give the workers more memory."
+        more = "give the workers more memory, or the run more time (--limit-s)"
+        said = f"{run.place}: the process that evaluated it was ended {times} times: {more}."
         return begun(run, evaluation.settings_of(run)) | {"error": said}
     raise KfCalibError(f"{run.place}: no worker could evaluate it ({' '.join(str(error).split())}).") from error

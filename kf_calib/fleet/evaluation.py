@@ -19,9 +19,13 @@ from kf_calib.fleet.local_copy import local_copy
 from kf_calib.fleet.run_factor import run_factor
 from kf_calib.fleet.run_list import Run
 from kf_calib.fleet.run_row import Row
+from kf_calib.fleet.time_limit import OverTime, in_time
 from kf_calib.sources.files.bags import fingerprint
 from kf_calib.sources.run_date import run_date
 from kf_calib.support.threads import one_blas_thread
+
+LIMIT_S = 3600.0
+"""How long a run may take unless somebody says otherwise."""
 
 
 class Commands(Protocol):
@@ -46,11 +50,12 @@ class Commands(Protocol):
 class Evaluation:
     """How each run of a fleet is evaluated; calling it evaluates one.
 
-    settings: checksum of all that the numbers depend on besides the recording.
+    settings: checksum of all that the numbers depend on besides the recording. limit_s: how long a run may take.
     """
 
     commands: Commands
     settings: str
+    limit_s: float = LIMIT_S
 
     def settings_of(self, run: Run) -> str:
         """Checksum of all that the row of a run depends on besides its recording: what a list says of it, too."""
@@ -64,10 +69,21 @@ class Evaluation:
         sentence in the row."""
         row, begun_s = begun(run, self.settings_of(run)), time.process_time()
         try:
+            if not in_time(self.limit_s, lambda: self._changed(row, run, known_sha256)):
+                return None
+        except OverTime:
+            said = f"was not evaluated in {self.limit_s:g} s, and stopped"
+            row["error"] = f"{run.place}: {said}: give it more time (--limit-s), or leave it out."
+            row["sha256"] = None  # with more time it may come to an end
+        return row | {"cpu_s": time.process_time() - begun_s, "evaluated": datetime.now(UTC)}
+
+    def _changed(self, row: Row, run: Run, known_sha256: str | None) -> bool:
+        """Fill in the row of a run, and tell whether its content is not the one that is known."""
+        try:
             with local_copy(run) as path, one_blas_thread():
                 row["sha256"] = fingerprint(path)
                 if row["sha256"] == known_sha256:
-                    return None
+                    return False
                 try:
                     self._evaluate(row, path)
                 except Exception as error:
@@ -75,7 +91,7 @@ class Evaluation:
                 _call_by_place(row, path, run)
         except Exception as error:  # could not be fetched
             row["error"] = self.commands.sentence(error)
-        return row | {"cpu_s": time.process_time() - begun_s, "evaluated": datetime.now(UTC)}
+        return True
 
     def _evaluate(self, row: Row, path: Path) -> None:
         """Fill in the row as far as the evaluation comes."""

@@ -118,7 +118,7 @@ def _version(info: Mapping[str, Any]) -> str:
 
 def _listed(files: Any, path: str) -> list[dict[str, str]] | None:
     """Return the lines of a list as columns; None where the file is no list."""
-    if not path.endswith((".txt", ".csv")):
+    if not path.endswith((".txt", ".csv")) or files.info(path)["type"] == "other":  # a pipe, say
         return None
     with files.open(path, "r", encoding="utf-8-sig", newline="") as file:
         if path.endswith(".txt"):

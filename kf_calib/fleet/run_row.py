@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats
-from kf_calib.fleet.run_factor import RunFactor
+from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.fleet.run_factor import STATES, RunFactor
 
 _WORDS = pa.list_(pa.string())
 _PARAMETER = pa.struct({
@@ -93,6 +94,27 @@ def factor_of(row: Mapping[str, Any]) -> RunFactor | None:
         kept["rows"], {each["effect"]: each["value"] for each in kept["constants"]}, np.asarray(kept["nominal"]),
         kept["noise_estimated"],
     )  # fmt: skip
+
+
+def are_whole(factors: pa.StructArray) -> Mask:
+    """Which factors (n,) have as many numbers as their columns ask for, all of them finite; that of a run that failed,
+    which has none, counts as whole."""
+    lengths = {name: _lengths(factors.field(name)) for name in ("columns", "upper", "nominal", "constants")}
+    size, width = lengths["columns"] + 1, factors.field("width").fill_null(-1).to_numpy(zero_copy_only=False)
+    right = (lengths["upper"] == size * (size + 1) // 2) & (lengths["nominal"] == len(STATES))
+    right &= (lengths["constants"] >= 0) & (width >= 0) & (width < size)
+    for name in ("rows", "noise_estimated"):
+        right &= factors.field(name).is_valid().to_numpy(zero_copy_only=False)
+    numbers = factors.field("upper").flatten().to_numpy(zero_copy_only=False)
+    bad = np.concatenate([[0], np.cumsum(~np.isfinite(numbers))])
+    ends = np.concatenate([[0], np.cumsum(np.maximum(lengths["upper"], 0))])
+    right &= np.diff(bad[ends]) == 0
+    return right | factors.is_null().to_numpy(zero_copy_only=False)
+
+
+def _lengths(lists: pa.ListArray) -> NDArray[np.int64]:
+    """Return the lengths (n,) of lists, -1 where there is none."""
+    return lists.value_lengths().fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
 
 
 def _upper(packed: Floats, size: int) -> Floats:

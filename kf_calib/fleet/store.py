@@ -3,7 +3,8 @@
 Rows are appended as small Arrow files, which take a hundredth of the time of Parquet, and merged into Parquet from time
 to time and at the end. Every file is written beside its place and renamed when it is whole: whoever reads the folder,
 at any time and however the writer ended, finds whole files only, and all that was finished. What else lies in the
-folder is somebody's own, and neither read nor removed: files of the table are known by their names.
+folder is somebody's own, and neither read nor removed: files of the table are known by their names and columns. A row
+that does not say of which run it is or when that was evaluated, or whose factor is not whole, counts as not there.
 """
 
 from __future__ import annotations
@@ -16,17 +17,19 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from kf_calib.errors import InputError
-from kf_calib.fleet.run_row import SCHEMA, Row
+from kf_calib.fleet.run_row import SCHEMA, Row, are_whole
 from kf_calib.support.file_lock import lock, writer
 from kf_calib.support.output_files import whole
 
 _SMALL, _LARGE = "*.arrow", "*.parquet"
 _OWN_NAME = re.compile(r"runs-\d{20}-\d+")
+_KNOWN = ["run", "evaluated", "version", "sha256", "settings"]
 _MOST_SMALL = 256
 """Small files that are merged while a fleet is being evaluated."""
 
@@ -53,6 +56,7 @@ class Store:
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "runs"
         self._written = 0
+        self._tables = dict[Path, bool]()
 
     @property
     def exists(self) -> bool:
@@ -94,12 +98,27 @@ class Store:
 
     def known(self) -> dict[str, Known]:
         """What the table has of each run."""
-        out = dict[str, Known]()
-        for batch in _rows(self._every, ["run", "evaluated", "version", "sha256", "settings"], _MANY):
-            for row in batch.to_pylist():
-                if row["run"] not in out or out[row["run"]].evaluated <= row["evaluated"]:
-                    out[row["run"]] = Known(row["evaluated"], row["version"], row["sha256"], row["settings"])
-        return out
+        return _latest(_rows(self._every, _KNOWN, _MANY))
+
+    def checked(self) -> tuple[dict[str, Known], list[str]]:
+        """The same of rows with whole factors, for which all are read, and sentences on what counts as not there."""
+        lost = 0
+
+        def whole_rows() -> Iterator[pa.RecordBatch]:
+            nonlocal lost
+            for batch in _all_rows(self._every, [*_KNOWN, "factor"], AT_ONCE):
+                sound = _sound(batch)
+                lost += batch.num_rows - sound.num_rows
+                yield sound.select(_KNOWN)
+
+        known = _latest(whole_rows())
+        notes = [f"{file} has not the columns of a table of runs, and is passed over: move it away."
+                 for file in self._named() if not self._is_table(file)]  # fmt: skip
+        if lost:
+            rows = "1 row of the table is not whole: its run is" if lost == 1 else (
+                f"{lost} rows of the table are not whole: their runs are")  # fmt: skip
+            notes.append(f"{self.folder}: {rows} evaluated again, if they are among those named.")
+        return known, notes
 
     def batches(self, columns: Sequence[str], rows: int = _MANY) -> Iterator[pa.RecordBatch]:
         """The newest row of each run, so many at a time; memory is that of one batch and the names of the runs."""
@@ -117,11 +136,43 @@ class Store:
         return [*self._files(_LARGE), *self._files(_SMALL)]
 
     def _files(self, kind: str) -> list[Path]:
-        return sorted(file for file in self.folder.glob(kind) if _OWN_NAME.fullmatch(file.stem))
+        return [file for file in self._named() if file.match(kind) and self._is_table(file)]
+
+    def _named(self) -> list[Path]:
+        """Return the files that have names of the table's."""
+        named = (file for kind in (_LARGE, _SMALL) for file in self.folder.glob(kind) if _OWN_NAME.fullmatch(file.stem))
+        return sorted(file for file in named if file.is_file())
+
+    def _is_table(self, file: Path) -> bool:
+        """Tell whether a file has columns of the table; one that is damaged is said to be when its rows are read."""
+        if file not in self._tables:
+            try:
+                schema = pq.read_schema(file) if file.match(_LARGE) else _schema_of_small(file)
+            except (pa.ArrowException, OSError):
+                return True
+            types = {field.name: field.type for field in schema}
+            alike = all(types[field.name].equals(field.type) for field in SCHEMA if field.name in types)
+            self._tables[file] = alike and {"run", "evaluated"} <= types.keys()
+        return self._tables[file]
 
     def _new(self, kind: str) -> Path:
         self._written += 1
         return self.folder / kind.replace("*", f"runs-{time.time_ns():020d}-{self._written}")
+
+
+def _schema_of_small(file: Path) -> pa.Schema:
+    with pa.OSFile(str(file)) as opened:
+        return pa.ipc.open_file(opened).schema
+
+
+def _latest(batches: Iterable[pa.RecordBatch]) -> dict[str, Known]:
+    """Return what the newest row of each run says of it."""
+    out = dict[str, Known]()
+    for batch in batches:
+        for row in batch.to_pylist():
+            if row["run"] not in out or out[row["run"]].evaluated <= row["evaluated"]:
+                out[row["run"]] = Known(row["evaluated"], row["version"], row["sha256"], row["settings"])
+    return out
 
 
 def _newest(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterator[pa.RecordBatch]:
@@ -150,7 +201,22 @@ def _together(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
         yield pa.Table.from_batches(waiting)
 
 
+def _sound(batch: pa.RecordBatch) -> pa.RecordBatch:
+    """Return the rows of a batch that say of which run they are and when it was evaluated, with whole factors."""
+    kept = np.ones(batch.num_rows, bool)
+    for name in ("run", "evaluated"):
+        kept &= batch[name].is_valid().to_numpy(zero_copy_only=False)
+    if "factor" in batch.schema.names:
+        kept &= are_whole(batch["factor"])
+    return batch if kept.all() else batch.filter(pa.array(kept))
+
+
 def _rows(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterator[pa.RecordBatch]:
+    """Yield the sound rows of some files; ``run`` and ``evaluated`` are among the columns."""
+    return map(_sound, _all_rows(files, columns, rows))
+
+
+def _all_rows(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterator[pa.RecordBatch]:
     """Yield all rows of some files; raises InputError where one of them is damaged."""
     for kind, form in ((_LARGE, "parquet"), (_SMALL, "ipc")):
         if own := [str(file) for file in files if file.match(kind)]:

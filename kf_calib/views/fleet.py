@@ -49,7 +49,7 @@ def fleet_object(
             "pooled": pooled_objects(overview.pooled) if overview.pooled else None,
             "bench_models": [str(path) for path in bench_models],
             "another_look": [vars(each) for each in overview.looks],
-            "remarks": list(overview.remarks),
+            "remarks": [*done.notes, *overview.remarks],
         }
     )
 
@@ -69,6 +69,7 @@ def fleet_report(
         Text(f"{done.evaluated} evaluated now{each}; {done.kept} were there already."),
         *([_population_table(populations)] if populations else []),
     ]
+    parts += [note(said) for said in done.notes]
     parts += [note(error if run in error else f"{run}: {error}") for run, error in [*failures.items()][:_SHOWN]]
     if len(failures) > _SHOWN:
         parts.append(note(f"{len(failures) - _SHOWN} more runs failed: the column error of the table says why"))

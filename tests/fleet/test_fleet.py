@@ -20,10 +20,9 @@ import dask.config
 import pytest
 from distributed import Client
 from fleet_generator import Campaign, record
-from helpers.fleet_workers import threads, used
+from helpers.fleet_workers import evaluation, threads, used
 
 import kf_calib
-from kf_calib.cli.evaluate import replay
 from kf_calib.cli.fleet import SingleCommands
 from kf_calib.errors import InputError
 from kf_calib.fleet import cluster
@@ -62,13 +61,6 @@ def store(tmp_path: Path) -> Iterator[Store]:
     own = Store(tmp_path / "fleet")
     with own.taken():
         yield own
-
-
-def evaluation(**given: Any) -> Evaluation:
-    usual = replay.make_context("replay", ["run.mcap"]).params
-    own = ("recording", "overwrite", "strict", "as_json", "save", "save_model")
-    commands = SingleCommands({key: value for key, value in usual.items() if key not in own} | given)
-    return Evaluation(commands, commands.checksum)
 
 
 @pytest.mark.usefixtures("at_once")

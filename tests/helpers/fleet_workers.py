@@ -1,14 +1,18 @@
-"""Workers of the command fleet that are threads of this process: they start at once."""
+"""Workers of the command fleet that are threads of this process, which start at once, and what they evaluate."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 from distributed import Client, LocalCluster
 
+from kf_calib.cli.evaluate import replay
+from kf_calib.cli.fleet import SingleCommands
 from kf_calib.fleet import cluster
+from kf_calib.fleet.evaluation import Evaluation
 
 
 @contextmanager
@@ -31,3 +35,11 @@ def used(client: Client) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cluster, "cluster", running)
         yield
+
+
+def evaluation(**given: Any) -> Evaluation:
+    """What ``kf-calib fleet`` does with each run, with some options."""
+    usual = replay.make_context("replay", ["run.mcap"]).params
+    own = ("recording", "overwrite", "strict", "as_json", "save", "save_model")
+    commands = SingleCommands({key: value for key, value in usual.items() if key not in own} | given)
+    return Evaluation(commands, commands.checksum)

@@ -67,6 +67,8 @@ def _place(file: Path) -> tuple[str, int]:
 def _files_in_metadata(metadata: Path) -> list[str]:
     """The files that a bag's metadata.yaml lists, in order; none where there is no such file."""
     try:
+        if not metadata.is_file():
+            return []
         with metadata.open(encoding="utf-8", errors="replace") as file:
             lines = file.read(_LARGEST_METADATA).split("\n")
     except OSError:

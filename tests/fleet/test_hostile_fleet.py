@@ -1,0 +1,222 @@
+"""Runs that never end, pipes with names of recordings, and tables that somebody else wrote: the fleet goes on."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from distributed import Client
+from fleet_generator import Campaign, record
+from helpers.fleet_workers import evaluation, threads, used
+
+import kf_calib
+from kf_calib.cli.fleet import SingleCommands
+from kf_calib.fleet import cluster
+from kf_calib.fleet.batch import evaluate_all
+from kf_calib.fleet.evaluation import Evaluation
+from kf_calib.fleet.run_list import Run, runs_of
+from kf_calib.fleet.run_row import SCHEMA
+from kf_calib.fleet.store import Store
+from kf_calib.fleet.time_limit import OverTime, in_time
+
+pytestmark = pytest.mark.xdist_group("fleet")
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs of two units."""
+    own = Campaign(tmp_path_factory.mktemp("campaign"), runs=2, units=2, benches=1, dwells=6, dwell_s=3.0)
+    for number in range(own.runs):
+        record(own, number)
+    return own.folder / "runs"
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Client]:
+    with threads() as own:
+        yield own
+
+
+@pytest.fixture
+def runs(recordings: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(recordings, tmp_path / "runs")
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    own = Store(tmp_path / "fleet")
+    with own.taken():
+        yield own
+
+
+class _Endless(SingleCommands):
+    """Never comes to an end with one of the runs."""
+
+    def replay(self, path: Path) -> Any:
+        while path.stem == "run-000001":
+            time.sleep(0.01)
+        return super().replay(path)
+
+
+class _Deaf(SingleCommands):
+    """Waits in the system for what never comes, with one of the runs."""
+
+    def replay(self, path: Path) -> Any:
+        if path.stem == "run-000001":
+            os.read(os.pipe()[0], 1)
+        return super().replay(path)
+
+
+def with_limit(kind: type[SingleCommands], limit_s: float) -> Evaluation:
+    usual = evaluation()
+    return Evaluation(kind(usual.commands.options), usual.settings, limit_s)
+
+
+def test_a_run_that_never_ends_is_a_row_that_says_so_and_is_tried_again(
+    runs: Path, client: Client, store: Store, tmp_path: Path
+) -> None:
+    named = runs_of([str(runs)])
+    progress = evaluate_all(client, with_limit(_Endless, 5.0), named, store)
+    assert (progress.evaluated, progress.failed) == (2, 1)
+    ((place, said),) = kf_calib.open_fleet(tmp_path / "fleet").failures().items()
+    assert place.endswith("run-000001.mcap")
+    assert said == f"{place}: was not evaluated in 5 s, and stopped: give it more time (--limit-s), or leave it out."
+    again = evaluate_all(client, evaluation(), named, store)
+    assert (again.evaluated, again.kept, again.failed) == (1, 1, 0)
+
+
+@pytest.mark.slow
+def test_a_run_that_waits_in_the_system_is_ended_with_its_process(runs: Path, store: Store, tmp_path: Path) -> None:
+    with cluster.cluster(1) as own:
+        progress = evaluate_all(own, with_limit(_Deaf, 5.0), runs_of([str(runs)]), store)
+    assert (progress.evaluated, progress.failed) == (2, 1)
+    (said,) = kf_calib.open_fleet(tmp_path / "fleet").failures().values()
+    assert "was ended 3 times: give the workers more memory, or the run more time (--limit-s)." in said
+
+
+def test_work_that_ends_in_time_is_left_alone_and_work_that_does_not_is_stopped() -> None:
+    before = threading.active_count()
+    assert [in_time(30.0, lambda: 7) for _ in range(200)] == [7] * 200
+    begun_s, swallowed = time.monotonic(), list[Exception]()
+
+    def endless() -> None:
+        while True:
+            try:
+                math.sqrt(time.monotonic())
+            except Exception as error:
+                swallowed.append(error)
+
+    with pytest.raises(OverTime):
+        in_time(0.2, endless)
+    assert time.monotonic() - begun_s < 10.0 and not swallowed
+    for _ in range(300):  # at the very moment at which it ends
+        with suppress(OverTime):
+            in_time(0.001, lambda: time.sleep(0.001))
+        for _ in range(100):  # nothing comes late
+            time.sleep(0.0)
+    deadline_s = time.monotonic() + 20.0
+    while threading.active_count() > before and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    assert threading.active_count() <= before
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names")
+def test_a_pipe_with_the_name_of_a_recording_is_refused_and_the_others_are_evaluated(
+    runs: Path, client: Client, run: Any, tmp_path: Path
+) -> None:
+    pipes = [runs / "live.mcap", runs / "table.csv", tmp_path / "list.txt"]
+    bag = runs / "bag"
+    bag.mkdir()
+    for pipe in [*pipes, bag / "metadata.yaml", bag / "part_0.mcap"]:
+        os.mkfifo(pipe)
+    (runs / "zeros.mcap").symlink_to("/dev/zero")
+    with used(client):
+        code, _, err = run("fleet", runs, *pipes, "-o", tmp_path / "fleet", "--no-pooled")
+    assert code == 0, err
+    table = kf_calib.open_fleet(tmp_path / "fleet")
+    failures = {Path(place).name: said for place, said in table.failures().items()}
+    assert len(table) == 7 and set(failures) == {*(pipe.name for pipe in pipes), "zeros.mcap", "bag"}
+    for pipe in pipes:
+        assert failures[pipe.name] == f"{pipe}: is a pipe, which may never end: name a recording on a disk."
+    assert "zeros.mcap: is a device, which may never end" in failures["zeros.mcap"]
+    assert "holds no .mcap and no .db3 file" in failures["bag"]
+
+
+def rewritten(store: Store, change: Callable[[list[dict[str, Any]]], None]) -> Path:
+    """Change the rows of the table as somebody else might."""
+    (file,) = store.folder.glob("*.parquet")
+    rows = pq.read_table(file).to_pylist()
+    change(rows)
+    pq.write_table(pa.Table.from_pylist(rows, SCHEMA), file)
+    return file
+
+
+def _nameless(rows: list[dict[str, Any]]) -> None:
+    rows[0]["run"] = None
+
+
+def _undated(rows: list[dict[str, Any]]) -> None:
+    rows[0]["evaluated"] = None
+
+
+def _short(rows: list[dict[str, Any]]) -> None:
+    rows[0]["factor"]["upper"] = rows[0]["factor"]["upper"][:-3]
+
+
+def _not_finite(rows: list[dict[str, Any]]) -> None:
+    rows[0]["factor"]["upper"][5] = math.nan
+
+
+def _without_columns(rows: list[dict[str, Any]]) -> None:
+    rows[0]["factor"]["columns"] = None
+
+
+@pytest.mark.parametrize("change", [_nameless, _undated, _short, _not_finite, _without_columns])
+def test_a_row_that_is_not_whole_is_evaluated_again_and_the_fleet_goes_on(
+    change: Callable[[list[dict[str, Any]]], None], runs: Path, client: Client, store: Store, tmp_path: Path
+) -> None:
+    named = runs_of([str(runs)])
+    evaluate_all(client, evaluation(), named, store)
+    rewritten(store, change)
+    again = evaluate_all(client, evaluation(), named, store)
+    assert (again.evaluated, again.kept, again.failed) == (1, 1, 0)
+    assert "1 row of the table is not whole: its run is evaluated again" in again.notes[0]
+    table = kf_calib.open_fleet(tmp_path / "fleet")
+    assert len(table) == 2 and len(list(table.factors())) == 2 and table.overview().pooled is not None
+    last = evaluate_all(client, evaluation(), named, store)
+    assert (last.evaluated, last.kept, last.notes) == (0, 2, ())
+
+
+@pytest.mark.parametrize("columns", [{"run": [1, 2]}, {"a": ["b"]}, {"run": ["x"], "evaluated": ["yesterday"]}])
+def test_a_table_of_another_form_is_passed_over_and_stays(
+    columns: dict[str, list[Any]], runs: Path, client: Client, run: Any, tmp_path: Path
+) -> None:
+    own = tmp_path / "fleet"
+    (own / "runs").mkdir(parents=True)
+    other = own / "runs" / "runs-00000000000000000001-1.parquet"
+    pq.write_table(pa.table(columns), other)
+    before = other.read_bytes()
+    with used(client):
+        code, out, err = run("fleet", runs, "-o", own, "--no-pooled")
+    assert code == 0, err
+    assert "has not the columns of a table of runs" in " ".join(out.split()) and other.read_bytes() == before
+    assert len(kf_calib.open_fleet(own)) == 2
+
+
+def test_a_row_of_another_run_without_a_factor_counts(store: Store, tmp_path: Path) -> None:
+    """As of one that failed, which no pooled diagnosis can read."""
+    row = dict.fromkeys(SCHEMA.names) | {"run": "gone.mcap", "evaluated": datetime.now(UTC) - timedelta(days=1)}
+    store.append([row | {"error": "gone"}])
+    known, notes = store.checked()
+    assert set(known) == {"gone.mcap"} and notes == [] and Run("gone.mcap").place in known
