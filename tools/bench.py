@@ -91,7 +91,7 @@ def scanned(dwells: list[Any], bench: Any, effects: list[Any]) -> Sequence[Any]:
     from kf_calib.estimation.score_test import scan
 
     fitted = fit(dwells, Model(bench))
-    return scan(fitted.carried, fitted.noise, effects).candidates
+    return scan(fitted.linearised, fitted.noise, effects).candidates
 
 
 def fold_and_scan(path: Path) -> tuple[int, int]:

@@ -195,7 +195,7 @@ def _plan_by_hand(options: Mapping[str, Any], as_json: bool) -> None:
         counts, noise = [dwell.count for dwell in before.dwells], before.noise
         sigma = math.hypot(noise.effective_sigma_mps2.mean() / math.sqrt(sum(counts) / len(counts)),
                            noise.scatter_mps2.mean())  # fmt: skip
-        made = HandPlan.of(options["count"] or 1, before.carried.model, sigma, before)
+        made = HandPlan.of(options["count"] or 1, before.linearised.model, sigma, before)
     else:
         keys = {"gravity_mps2": "9.80665", **overrides(options)}
         bench = replace(Bench.from_metadata(keys, has_angles=False), angles=False, nominal={"theta1": 0, "theta3": 0})

@@ -28,9 +28,9 @@ class HandPlan:
     @classmethod
     def of(cls, count: int, model: Model, mean_mps2: float, before: Fit | None = None) -> HandPlan:
         """The plan of ``count`` poses after a run or from nothing; ``mean_mps2``: sigma of a pose's mean reading."""
-        state = model.nominal_state() if before is None else before.carried.state
+        state = model.nominal_state() if before is None else before.linearised.state
         square_rad = model.bench.square_rad
-        covariance = weak_covariance() if before is None else covariance_of(before.carried, before.noise, square_rad)
+        covariance = weak_covariance() if before is None else covariance_of(before.linearised, before.noise, square_rad)
         gravity, up, sigmas = model.bench.gravity_mps2, list[str](), [_sigmas(covariance, state)]
         for _ in range(count):
             up.append(most_informative(covariance, state, gravity))

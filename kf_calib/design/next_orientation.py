@@ -104,7 +104,7 @@ def to_show(fitted: Fit, hidden: Sequence[Effect]) -> tuple[Advice, int] | None:
     if poses is None or not hidden:
         return None
     factor, (rows,) = _with_next(fitted, hidden, poses)
-    width, shown = fitted.carried.model.count, np.zeros(len(poses))
+    width, shown = fitted.linearised.model.count, np.zeros(len(poses))
     ends = np.cumsum([width, *(len(effect.coefficients) for effect in hidden)]).tolist()
     scales = np.array([coefficient.scale for effect in hidden for coefficient in effect.coefficients])
     for start, end in itertools.pairwise(ends):
@@ -161,8 +161,8 @@ def course(fitted: Fit, sizes: Floats, count: int = _STEPS) -> Course | None:
     if poses is None:
         return None
     factor, (rows,) = _with_next(fitted, [], poses, fitted.noise)
-    jacobian = paper_parameters.jacobian(fitted.carried.state[:STATE_COUNT])
-    at_least = np.diag(1.0 / np.maximum(fitted.carried.sizes, 1.0))  # keeps all sigmas finite, at the size of g
+    jacobian = paper_parameters.jacobian(fitted.linearised.state[:STATE_COUNT])
+    at_least = np.diag(1.0 / np.maximum(fitted.linearised.sizes, 1.0))  # keeps all sigmas finite, at the size of g
     root = np.asarray(np.linalg.inv(triangle(np.vstack([factor, at_least]))), float)
     sigmas, first = [_sigmas(root, jacobian)], 0
     for number in range(count):
@@ -178,7 +178,7 @@ def course(fitted: Fit, sizes: Floats, count: int = _STEPS) -> Course | None:
 
 def _each_s(fitted: Fit) -> float:
     """Return the usual duration of a dwell and the slew to it, s."""
-    ends_s = fitted.carried.means.ends_s
+    ends_s = fitted.linearised.means.ends_s
     lengths = np.diff(ends_s[:, 0]) if len(ends_s) > 1 else np.ptp(ends_s, axis=1) + _WAY_S
     return float(np.median(lengths))
 
@@ -207,7 +207,7 @@ def _poses(fitted: Fit) -> Floats | None:
 
     They are multiples of 45 deg and random others; the present pose is excluded, since it would not be set anew.
     """
-    count = len(fitted.carried.model.bench.axes)
+    count = len(fitted.linearised.model.bench.axes)
     if not count:
         return None
     rng = np.random.default_rng(0)
@@ -227,10 +227,10 @@ def _with_next(
 ) -> tuple[Floats, Floats]:
     """Return the triangular factor of [H | G] of the run so far, and the whitened rows (w, m, 3, p + q) of a dwell's
     mean after each wait at each pose."""
-    carried, noise = fitted.carried, noise or fitted.noise.judging
-    model, state = carried.model, carried.state
-    added = candidate_columns(carried.turned, effects, model.bench, state)
-    columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
-    upper = accumulate(whiten(carried.turned, columns, noise, state), steps(carried.dwells, noise))
+    linearised, noise = fitted.linearised, noise or fitted.noise.for_goodness_of_fit
+    model, state = linearised.model, linearised.state
+    added = candidate_columns(linearised.dwells_at_state, effects, model.bench, state)
+    columns = [np.concatenate([own, more], axis=3) for own, more in zip(linearised.columns, added, strict=True)]
+    upper = accumulate(whiten(linearised.dwells_at_state, columns, noise, state), steps(linearised.dwells, noise))
     prospect = replace(Prospect.following(fitted), noise=noise)
     return upper[:-1, :-1], np.array([prospect.columns(effects, poses, float(wait_s)) for wait_s in waits_s])

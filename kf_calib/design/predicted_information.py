@@ -98,24 +98,24 @@ class Prospect:
     def following(cls, fitted: Fit) -> Prospect:
         """The prospect after a run so far, with dwells like those of the run; the information from the run is not
         included."""
-        carried, last = fitted.carried, fitted.dwells[-1]
+        linearised, last = fitted.linearised, fitted.dwells[-1]
         dwell_s = float(np.median([dwell.end_s - dwell.start_s for dwell in fitted.dwells]))
         temperature_c = float(last.pieces[-1].nodes.temperature_c[-1])
         before = Last(last.end_s, last.pose, last.means[1:4], temperature_c, last.variances[-1])
-        readings, nothing = float(np.median(carried.means.counts)), np.zeros((carried.model.count,) * 2)
+        readings, nothing = float(np.median(linearised.means.counts)), np.zeros((linearised.model.count,) * 2)
         pauses_s = [after.start_s - dwell.end_s for dwell, after in itertools.pairwise(fitted.dwells)]
         pause_s = float(np.median(pauses_s)) if pauses_s else PAUSE_S
-        return cls(carried.model, carried.state, fitted.noise, readings, dwell_s, nothing, before, pause_s)
+        return cls(linearised.model, linearised.state, fitted.noise, readings, dwell_s, nothing, before, pause_s)
 
     @classmethod
     def after(cls, fitted: Fit, prior: Prior | None = None) -> Prospect:
         """The prospect after a run so far, with the information from it: the filter's own factor."""
-        carried, noise, made = fitted.carried, fitted.noise, replace(cls.following(fitted), pause_s=PAUSE_S)
-        first = square_root_information.start(prior or Prior(), carried.model)
+        linearised, noise, made = fitted.linearised, fitted.noise, replace(cls.following(fitted), pause_s=PAUSE_S)
+        first = square_root_information.start(prior or Prior(), linearised.model)
         steps = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)
         waited = noise.walk_mps2_per_sqrt_s**2 * (made.pause_s + made.dwell_s / 3.0)
         known = random_walk.predict(steps[-1].factor, waited)[:, :-1]
-        more = considered_information(noise, carried.means, carried.state).sum(axis=0) + fitted.considered
+        more = considered_information(noise, linearised.means, linearised.state).sum(axis=0) + fitted.considered
         return replace(made, known=_less(known, more))
 
     @cached_property

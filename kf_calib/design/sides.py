@@ -11,7 +11,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.attitude import facing_readings, force_shown
-from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.free_attitude import DIRECTIONS, covariance_of, most_informative, undetermined
 from kf_calib.estimation.measurement_model import Model
@@ -41,10 +41,10 @@ class Sides:
     def of(cls, dwells: Sequence[DwellFactor], bench: Bench, fitted: Fit | None = None) -> Sides:
         """The sides of dwells; fitted: to these or fewer dwells, None where they do not determine it."""
         model = Model(bench)
-        state = model.nominal_state() if fitted is None else fitted.carried.state
+        state = model.nominal_state() if fitted is None else fitted.linearised.state
         noise = within_dwells(dwells) if fitted is None else fitted.noise
         facing = facing_readings(dwells, state, bench.gravity_mps2)
-        covariance = covariance_of(Carried(facing, model, state), noise, bench.square_rad)
+        covariance = covariance_of(LinearisedDwells(facing, model, state), noise, bench.square_rad)
         force = force_shown(np.array([dwell.means[4:] for dwell in dwells]), state)
         up = force / np.linalg.norm(force, axis=1, keepdims=True)
         following = most_informative(covariance, state, bench.gravity_mps2)

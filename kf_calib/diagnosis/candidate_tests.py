@@ -128,7 +128,7 @@ def assess_candidates(
     """
     from scipy.special import chdtrc
 
-    model, agreed = fitted.carried.model, consistency(fitted)
+    model, agreed = fitted.linearised.model, consistency(fitted)
     frame = candidate_frame(fitted, [] if frames is None else frames)
     found = _scanned(fitted, frame)
     statistics = found.statistics
@@ -136,7 +136,7 @@ def assess_candidates(
     best, scores, p_values = dict[str, int](), dict[str, float](), dict[str, float]()
     for k, candidate in enumerate(found.candidates):
         name = str(candidate.effect)
-        score = float(statistics[k]) - chance_fall(candidate, tests) if candidate.dof else -np.inf
+        score = float(statistics[k]) - critical_delta_chi2(candidate, tests) if candidate.dof else -np.inf
         if name not in best or score > scores.get(name, -np.inf):
             best[name] = k
             if candidate.dof:
@@ -146,9 +146,9 @@ def assess_candidates(
     if name:
         # The likelihood uses the chi-squared of the dwells' means. Where the misfit is huge, that exceeds the
         # chi-squared of the scan by up to one per cent, which must not count for the walk.
-        fall = max(2.0 * fitted.walk_gain - max(fitted.misfit - agreed.statistic, 0.0), 0.0)
-        p_values[name] = sidak(0.5 * float(chdtrc(1, fall)), tests)
-        scores[name] = fall - threshold(1, tests)
+        delta_chi2 = max(2.0 * fitted.walk_gain - max(fitted.misfit - agreed.statistic, 0.0), 0.0)
+        p_values[name] = sidak(0.5 * float(chdtrc(1, delta_chi2)), tests)
+        scores[name] = delta_chi2 - threshold(1, tests)
     slewing = slew_effects(model.bench)
     test = CandidateTests(found, best, scores, p_values, agreed.p_value, name, tests, slewing, ())
     return _with_lines(test, fitted, frame)
@@ -156,25 +156,25 @@ def assess_candidates(
 
 def candidate_frame(fitted: Fit, frames: list[Frame]) -> Frame:
     """The frame of the columns of all candidates in the noise of a fit: one of ``frames``, or a new one put there."""
-    carried, noise = fitted.carried, fitted.noise.judging
+    linearised, noise = fitted.linearised, fitted.noise.for_goodness_of_fit
     for known in frames:
-        if known.serves(carried, noise):
+        if known.serves(linearised, noise):
             return known
-    tried = candidates(Model(carried.model.bench))
+    tried = candidates(Model(linearised.model.bench))
     stage.say(f"scanning {len({str(each) for each in tried})} effects")
-    frames[:] = [Frame(carried, noise, tried)]  # only one frame is kept, to save memory
+    frames[:] = [Frame(linearised, noise, tried)]  # only one frame is kept, to save memory
     return frames[0]
 
 
 def _scanned(fitted: Fit, frame: Frame) -> Scan:
     """Return the scan of all candidates and of slow oscillations, of which the best frequency is kept."""
-    carried, effect = fitted.carried, oscillation_of(fitted.carried.model.bench)
-    values = np.zeros(0) if effect is None or carried.model.oscillates else slow_hz(fitted, effect)
+    linearised, effect = fitted.linearised, oscillation_of(fitted.linearised.model.bench)
+    values = np.zeros(0) if effect is None or linearised.model.oscillates else slow_hz(fitted, effect)
     if effect is None or not len(values):
-        return frame.scan(carried)
-    best = values[np.argmax(frame.falls(carried, effect, values))]
+        return frame.scan(linearised)
+    best = values[np.argmax(frame.delta_chi2(linearised, effect, values))]
     near = [effect.at(hz) for hz in best + 0.125 * values[0] * np.arange(-3, 4)]
-    found = frame.scan(carried, near)
+    found = frame.scan(linearised, near)
     others, swinging = found.candidates[: -len(near)], found.candidates[-len(near) :]
     last = swinging[int(np.argmax(found.statistics[-len(near) :]))]
     return replace(found, candidates=(*others, replace(last, tried=len(values))))
@@ -182,7 +182,7 @@ def _scanned(fitted: Fit, frame: Frame) -> Scan:
 
 def slow_hz(fitted: Fit, effect: Effect) -> Floats:
     """Frequencies (Hz) of oscillations too slow to show within dwells: from one cycle per run in half-cycle steps."""
-    stimulus = stimulus_of(fitted.dwells, fitted.carried.model.bench, fitted.carried.state)
+    stimulus = stimulus_of(fitted.dwells, fitted.linearised.model.bench, fitted.linearised.state)
     values = effect.grid(stimulus)[2::2]
     return values[values < min(_searched_hz(fitted.dwells))]
 
@@ -197,8 +197,8 @@ def _with_lines(test: CandidateTests, fitted: Fit, frame: Frame) -> CandidateTes
     """Return the tests with the lines of the spectrum, which count for an oscillation in place of slow frequencies."""
     from scipy.special import chdtri
 
-    effect = oscillation_of(fitted.carried.model.bench)
-    if effect is None or fitted.carried.model.oscillates:
+    effect = oscillation_of(fitted.linearised.model.bench)
+    if effect is None or fitted.linearised.model.oscillates:
         return replace(test, trend=trend(fitted))
     name, slow, (low, high, first) = str(effect), slow_hz(fitted, effect), _searched_hz(fitted.dwells)
     top = float(slow[-1]) if len(slow) else low
@@ -221,7 +221,7 @@ def _with_lines(test: CandidateTests, fitted: Fit, frame: Frame) -> CandidateTes
     )
 
 
-def chance_fall(candidate: Candidate, tests: float) -> float:
+def critical_delta_chi2(candidate: Candidate, tests: float) -> float:
     """The fall of chi-squared that a candidate has to exceed to be significant in the whole run.
 
     An unknown constant counts as one more degree of freedom. Where many of its values were tried as separate tests, it
@@ -273,7 +273,7 @@ def _smallest_p(found: Scan, seen: NDArray[np.intp], seed: int) -> Floats:
 
 def _walking(fitted: Fit) -> str:
     """Return the name of the random walk of the biases, or "" where it is in the model or cannot be tested."""
-    model = fitted.carried.model
+    model = fitted.linearised.model
     if model.walks or len(fitted.dwells) < _FEWEST_WALKED or fitted.noise.walk_mps2_per_sqrt_s:
         return ""
     return walk_named(model.bench)

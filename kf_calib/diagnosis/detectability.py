@@ -65,8 +65,8 @@ def detectable(test: CandidateTests) -> list[Detectable]:
 
 def unseen(fitted: Fit, test: CandidateTests) -> list[Unseen]:
     """The effects of which a run shows nothing, each with the reason; then frequencies that were not searched."""
-    bench, dwells = fitted.carried.model.bench, fitted.dwells
-    stimulus = stimulus_of(dwells, bench, fitted.carried.state)
+    bench, dwells = fitted.linearised.model.bench, fitted.dwells
+    stimulus = stimulus_of(dwells, bench, fitted.linearised.state)
     still = [name for name in test.unseen if name not in test.in_slews_only]
     out = [Unseen(name, _reason(test.candidate(name).effect, stimulus)) for name in still]
     out += [Unseen(name, "shows while the platform turns, and only dwells are tested") for name in test.in_slews_only]

@@ -22,7 +22,7 @@ from scipy.linalg import block_diag
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.qr import triangle
-from kf_calib.estimation.dwell_columns import Carried, Means
+from kf_calib.estimation.dwell_columns import LinearisedDwells, Means
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise
@@ -39,7 +39,7 @@ _FREE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
 _SEEN = 1e-6  # as in ``score_test``: the least share of a column that the model must leave
 
 
-def size_evidence(dof: int, falls: Floats | float) -> Floats:
+def size_evidence(dof: int, delta_chi2: Floats | float) -> Floats:
     """Log Bayes factor of an effect whose size and direction are unknown, against no effect.
 
     The coefficients have the prior N(0, g C) with C the covariance of their estimate, and ln g is uniform from 0 to
@@ -47,9 +47,9 @@ def size_evidence(dof: int, falls: Floats | float) -> Floats:
 
       B = mean over g of (1 + g)^(-k/2) exp(g / (1 + g) F / 2)
 
-    dof: number of coefficients k. falls: fall of chi-squared F with them; a number or an array. Returns ln B.
+    dof: number of coefficients k. delta_chi2: fall of chi-squared F with them; a number or an array. Returns ln B.
     """
-    parts = -0.5 * dof * np.log1p(_SIZES) + 0.5 * np.asarray(falls, float)[..., None] * (_SIZES / (1.0 + _SIZES))
+    parts = -0.5 * dof * np.log1p(_SIZES) + 0.5 * np.asarray(delta_chi2, float)[..., None] * (_SIZES / (1.0 + _SIZES))
     return np.logaddexp.reduce(parts, axis=-1) - math.log(len(_SIZES))
 
 
@@ -58,13 +58,14 @@ class Weighed:
     """The evidence of an explanation with certain parts of the noise free.
 
     - parts: the free parts but for a walk. log: logarithm of the evidence, with the prior of the parts.
-    - sizes: of the free parts, SI. fall: of chi-squared by the added effects, in this noise. dof: their number.
+    - sizes: of the free parts, SI. delta_chi2: fall of chi-squared by the added effects, in this noise. dof: their
+      number.
     """
 
     parts: Parts
     log: float
     sizes: tuple[float, ...]
-    fall: float
+    delta_chi2: float
     dof: int
 
 
@@ -82,7 +83,7 @@ class Evidence:
 
     def __init__(self, before: Fit) -> None:
         noise = before.noise
-        self._fit, self._walks = before, before.carried.model.walks
+        self._fit, self._walks = before, before.linearised.model.walks
         self.noise: Noise = replace(
             noise,
             walk_mps2_per_sqrt_s=0.0 if self._walks else noise.walk_mps2_per_sqrt_s,
@@ -92,7 +93,7 @@ class Evidence:
 
     @cached_property
     def _alone(self) -> _Rows:
-        return self._rows(self._fit.carried, self.noise)[0]
+        return self._rows(self._fit.linearised, self.noise)[0]
 
     def of(self, refit: Fit | None = None, walk: bool = False) -> list[Weighed]:
         """The evidence of the effects that a refit has and the fit has not, for each set of free parts of the noise.
@@ -102,21 +103,22 @@ class Evidence:
         noise, alone = self.noise, self._alone
         if refit is not None and refit.noise.sensitivity_mps2_per_k is not None:
             noise = replace(noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
-            (alone,) = self._rows(self._fit.carried, noise)
+            (alone,) = self._rows(self._fit.linearised, noise)
         averaged = noise
         if refit is not None and refit.dwells[0].averaged != self._fit.dwells[0].averaged:
             # averages have a noise of their own; by that of single readings, of which there are more, it would be small
             averaged = replace(noise, sigma_mps2=refit.noise.sigma_mps2, inflation=refit.noise.inflation)
-        own, *related = [alone] if refit is None else self._rows(refit.carried, averaged, self._relations(refit))
+        own, *related = [alone] if refit is None else self._rows(refit.linearised, averaged, self._relations(refit))
         if refit is not None and not own.dof and not walk:
             own, related, averaged = alone, [], noise  # nothing of it is seen
         own_length, length = (float(np.linalg.norm(each.known[:, -1])) for each in (own, alone))
-        alone = replace(alone, known=_lengthened(alone.known, own_length))
+        alone = replace(alone, known=pad_residual_norm(alone.known, own_length))
         walking: Parts = ("walk",) if walk or self._walks else ()
         every: Parts = (*walking, "setting", "common")
-        without = likelihood_of(noise, every, alone.means, self._fit.carried.state, alone.known)
+        without = likelihood_of(noise, every, alone.means, self._fit.linearised.state, alone.known)
         with_, *with_related = (
-            likelihood_of(averaged, every, rows.means, self._fit.carried.state, rows.known) for rows in (own, *related)
+            likelihood_of(averaged, every, rows.means, self._fit.linearised.state, rows.known)
+            for rows in (own, *related)
         )
         relations = [(likelihood, rows.dof) for likelihood, rows in zip(with_related, related, strict=True)]
         free = self._free(len(alone.means.counts))
@@ -131,7 +133,7 @@ class Evidence:
     def _relations(self, refit: Fit) -> list[Floats]:
         """Return what the added states may be together: matrices (q, k), times k free numbers each; empty where they
         may have any values."""
-        added = refit.carried.model.effects[len(self._fit.carried.model.effects) :]
+        added = refit.linearised.model.effects[len(self._fit.linearised.model.effects) :]
         if not any(effect.relations for effect in added):
             return []
         of_each = [effect.relations or [np.eye(len(effect.states))] for effect in added]
@@ -140,7 +142,7 @@ class Evidence:
     def _free(self, dwells: int) -> Iterator[Parts]:
         """Yield the sets of parts of the noise from dwell to dwell that may be free."""
         yield ()
-        if (1 if self.noise.attitude_unknown else 3) * dwells <= self._fit.carried.model.count:
+        if (1 if self.noise.attitude_unknown else 3) * dwells <= self._fit.linearised.model.count:
             return
         yield ("common",)
         if self.noise.attitude_unknown:  # a rotation of the dwells has no limit anyway
@@ -173,7 +175,7 @@ class Evidence:
             return each.of(parts).at((sizes / np.array([each.units[part][0] for part in parts])) ** 2)
 
         without = at_sizes(alone)
-        fall, log = max(without.misfit - point.misfit, 0.0), self._log_prior(parts) - without.cost
+        delta_chi2, log = max(without.misfit - point.misfit, 0.0), self._log_prior(parts) - without.cost
         if parts:
             curves = np.linalg.eigvalsh(likelihood.curvature(relative))
             log += float(
@@ -183,9 +185,9 @@ class Evidence:
             falls = [(left, max(without.misfit - at_sizes(each).misfit, 0.0)) for each, left in relations]
             log += float(np.logaddexp.reduce([size_evidence(*each) for each in falls])) - math.log(len(falls))
         elif dof:
-            log += float(size_evidence(dof, fall))
+            log += float(size_evidence(dof, delta_chi2))
         beyond: Parts = tuple(part for part in parts if part != "walk")
-        return Weighed(beyond, log, tuple(sizes.tolist()), fall, dof)
+        return Weighed(beyond, log, tuple(sizes.tolist()), delta_chi2, dof)
 
     def _log_prior(self, parts: Parts) -> float:
         """Return the logarithm of the prior probability that these parts of the noise are there and no others."""
@@ -193,17 +195,17 @@ class Evidence:
         chances = {part: _BEYOND if known else _UNSTATED for part, known in stated.items()}
         return sum(math.log(own if part in parts else 1.0 - own) for part, own in chances.items())
 
-    def _rows(self, carried: Carried, noise: Noise, relations: Sequence[Floats] = ()) -> list[_Rows]:
+    def _rows(self, linearised: LinearisedDwells, noise: Noise, relations: Sequence[Floats] = ()) -> list[_Rows]:
         """Return what the likelihood needs, with coefficients of any values and then with each relation of them:
         columns that the model hides are left out, and with an effect that was fitted with a constant the derivative by
         this constant counts as a column, but as no coefficient."""
-        means, shared = with_shared_noise(carried.dwells, noise, carried.means)
-        first, last, count = self._fit.carried.model.count, carried.model.count, means.design.shape[2]
-        within = _within(carried, noise, self._fit.carried.state)
+        means, shared = with_shared_noise(linearised.dwells, noise, linearised.means)
+        first, last, count = self._fit.linearised.model.count, linearised.model.count, means.design.shape[2]
+        within = _within(linearised, noise, self._fit.linearised.state)
         known = np.vstack([shared, np.zeros((len(within), count + 1))])
         places = [*range(STATE_COUNT, last), *range(count + 1 - (within.shape[1] - last + STATE_COUNT), count + 1)]
         known[len(shared) :, places] = within
-        constants, out = sum(place >= first for place in carried.model.unknowns), list[_Rows]()
+        constants, out = sum(place >= first for place in linearised.model.unknowns), list[_Rows]()
         for relation in (np.eye(last - first), *relations):
             turn = _visible(means, noise, known, first, last, relation)
             design, prior = (
@@ -214,7 +216,7 @@ class Evidence:
         return out
 
 
-def _lengthened(known: Floats, length: float) -> Floats:
+def pad_residual_norm(known: Floats, length: float) -> Floats:
     """Return rows of prior knowledge with another length of their last column, by what no other column explains.
 
     Where an oscillation is fitted, more of the readings within dwells is kept than elsewhere.
@@ -224,7 +226,7 @@ def _lengthened(known: Floats, length: float) -> Floats:
     return out
 
 
-def _within(carried: Carried, noise: Noise, state: Floats) -> Floats:
+def _within(linearised: LinearisedDwells, noise: Noise, state: Floats) -> Floats:
     """Return the triangular factor [G | T | z] of what the readings within dwells say of all effects G and of the
     errors T of the temperature.
 
@@ -233,12 +235,12 @@ def _within(carried: Carried, noise: Noise, state: Floats) -> Floats:
     """
     setting_rad = noise.setting_rad if noise.attitude_unknown else 0.0
     free = replace(noise, scatter_mps2=np.full(3, _FREE_MPS2), setting_rad=setting_rad, walk_mps2_per_sqrt_s=0.0)
-    columns = [own[..., STATE_COUNT:] for own in carried.columns]
+    columns = [own[..., STATE_COUNT:] for own in linearised.columns]
     if noise.sensitivity_mps2_per_k is not None:
-        errors = thermometer_errors(carried.turned, noise.sensitivity_mps2_per_k)
+        errors = thermometer_errors(linearised.dwells_at_state, noise.sensitivity_mps2_per_k)
         columns = [np.concatenate(both, axis=3) for both in zip(columns, errors, strict=True)]
-    flicker = flicker_of_scatter(carried.turned, noise)
-    rows = np.concatenate(whiten(carried.turned, columns, free, state, flicker_mps2=flicker, reduced=False))
+    flicker = flicker_of_scatter(linearised.dwells_at_state, noise)
+    rows = np.concatenate(whiten(linearised.dwells_at_state, columns, free, state, flicker_mps2=flicker, reduced=False))
     lacking = max(rows.shape[1] - len(rows), 0)
     return triangle(np.vstack([rows, np.zeros((lacking, rows.shape[1]))]))
 

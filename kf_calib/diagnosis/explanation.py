@@ -60,14 +60,14 @@ class Explanation:
     def contribution_mps2(self) -> Floats:
         """What its effects add to the mean readings (D, 3), before the other parameters take up a part of it."""
         own = self._own
-        added = np.einsum("dip,p->di", self.after.carried.means.design[:, :, own], self.after.estimate.state[own])
+        added = np.einsum("dip,p->di", self.after.linearised.means.design[:, :, own], self.after.estimate.state[own])
         return added + walk_path(self.after)
 
     @cached_property
     def contribution_sigma_mps2(self) -> Floats:
         """Sigma (D, 3) of the contribution, from the covariance of its coefficients."""
         own = self._own
-        design, covariance = self.after.carried.means.design[:, :, own], self.after.estimate.covariance
+        design, covariance = self.after.linearised.means.design[:, :, own], self.after.estimate.covariance
         return np.sqrt(np.einsum("dip,pq,diq->di", design, covariance[np.ix_(own, own)], design))
 
     @cached_property
@@ -78,6 +78,6 @@ class Explanation:
         return np.array([place for part in added for place in range(*part.indices(model.count))], int)
 
 
-def _share(fall: float, dof: int, excess: float) -> float:
+def _share(delta_chi2: float, dof: int, excess: float) -> float:
     """Return the part of the misfit beyond noise that a fall of chi-squared beyond its degrees of freedom explains."""
-    return float(np.clip((fall - dof) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0
+    return float(np.clip((delta_chi2 - dof) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0

@@ -31,7 +31,10 @@ from kf_calib.estimation.score_test import unweighted_left
 
 _NO_NOISE = {True: 0.4, False: 0.1}  # share of an unknown cause in more scatter, by whether noise was stated
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
-_APART, _CURVED = 8.0, 0.02  # rows further behind, in ln and as a share of the evidence, are not refitted
+SCREEN_LOG_BF, NONLINEARITY_MARGIN = (
+    8.0,
+    0.02,
+)  # rows further behind, in ln and as a share of the evidence, are not refitted
 _MOST = {"effect": 8, "turn": 3, "pair": 4, "walk": 3, "formula": 3}
 
 
@@ -55,7 +58,7 @@ def _sum(logs: Sequence[float]) -> float:
 def _least(logs: Iterable[float]) -> float:
     """Return the least evidence by the linear tests with which a row is refitted; large effects are not linear."""
     best = max(logs, default=0.0)
-    return best - _APART - _CURVED * max(best, 0.0)
+    return best - SCREEN_LOG_BF - NONLINEARITY_MARGIN * max(best, 0.0)
 
 
 class Hypotheses:
@@ -83,7 +86,7 @@ class Hypotheses:
         likeliest, known = max(tried, key=lambda row: row.log_evidence), {row.effects for row in tried}
         tried += [self._single(name, effects) for name in likeliest.effects if (name,) not in known]
         tried = [row for row in tried if math.isfinite(row.log_evidence)]
-        least = max(row.log_evidence for row in tried) - _APART
+        least = max(row.log_evidence for row in tried) - SCREEN_LOG_BF
         walks = [row for row in tried if row.effects == (self.walk,) and row.log_evidence > least]
         return table_of([*tried, *(back for walk in walks if self.stated for back in self._returning(walk))])
 
@@ -91,7 +94,7 @@ class Hypotheses:
         """Yield the row of biases that move irregularly and return to their mean after any time, from that of a random
         walk; none where no walk is likelier than none."""
         assert walk.refit is not None
-        gains, times_s = walk.refit.fit.back_gains
+        gains, times_s = walk.refit.fit.gauss_markov_gains
         driver = f"time (irregular, back within about {one_digit_seconds(float(times_s[np.argmax(gains)]))})"
         prior = self._prior("effect", len(self.test.scores), self.walk) + math.log(KINDS["formula"] / KINDS["effect"])
         for own in self.evidence.of(walk.refit.fit, walk=True):
@@ -128,12 +131,12 @@ class Hypotheses:
         found = {name: self._screen(name, self._fall(name)) for name in self.test.scores}
         return dict(sorted(found.items(), key=lambda each: -each[1]))
 
-    def _screen(self, name: str, fall: float) -> float:
+    def _screen(self, name: str, delta_chi2: float) -> float:
         """Return the log Bayes factor of an effect from its fall of chi-squared in the linear tests."""
         if name not in self.test.best:
-            return 0.5 * fall / self.inflation
-        fall = fall / self.inflation
-        return float(size_evidence(self._dof(name), fall)) + self._log_share((name,), fall)
+            return 0.5 * delta_chi2 / self.inflation
+        delta_chi2 = delta_chi2 / self.inflation
+        return float(size_evidence(self._dof(name), delta_chi2)) + self._log_share((name,), delta_chi2)
 
     def _fall(self, name: str) -> float:
         """Return the fall of chi-squared of an effect; of a random walk, twice its gain in likelihood."""
@@ -145,17 +148,17 @@ class Hypotheses:
     def _dof(self, name: str) -> int:
         return self.test.candidate(name).dof if name in self.test.best else 1
 
-    def _log_share(self, names: Sequence[str], fall: float) -> float:
+    def _log_share(self, names: Sequence[str], delta_chi2: float) -> float:
         """Return the log of the mean of likelihood over the values of constants, relative to the best value."""
-        return sum(self._log_share_of(name, fall) for name in names if name in self.test.best)
+        return sum(self._log_share_of(name, delta_chi2) for name in names if name in self.test.best)
 
-    def _log_share_of(self, name: str, fall: float) -> float:
+    def _log_share_of(self, name: str, delta_chi2: float) -> float:
         test = self.test
         own = self._values[name]
         tried = max(len(own), *(test.scan.candidates[k].tried for k in own))
-        falls = test.scan.statistics[own]
-        relative = min(1.0, fall / max(float(falls.max()), 1e-9))
-        return float(np.logaddexp.reduce(0.5 * relative * (falls - falls.max()))) - math.log(tried)
+        deltas = test.scan.statistics[own]
+        relative = min(1.0, delta_chi2 / max(float(deltas.max()), 1e-9))
+        return float(np.logaddexp.reduce(0.5 * relative * (deltas - deltas.max()))) - math.log(tried)
 
     def _effects(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
         """Yield the rows of single effects."""
@@ -178,11 +181,11 @@ class Hypotheses:
         """
         effects = {name: self.test.candidate(name).effect for name in self.test.best}
         effects = {name: effect for name, effect in effects.items() if isinstance(effect, FrameEffect)}
-        carried = self.before.fit.carried
-        left = unweighted_left(carried, list(effects.values()))
-        gains = -0.5 * (3 * len(carried.dwells) - carried.model.count) * np.log(np.maximum(left, 1e-12))
+        linearised = self.before.fit.linearised
+        left = unweighted_left(linearised, list(effects.values()))
+        gains = -0.5 * (3 * len(linearised.dwells) - linearised.model.count) * np.log(np.maximum(left, 1e-12))
         likely = sorted(zip(gains.tolist(), effects, strict=True), reverse=True)[: _MOST["turn"]]
-        return [name for gain, name in likely if gain > max(_APART, likely[0][0] - _APART)]
+        return [name for gain, name in likely if gain > max(SCREEN_LOG_BF, likely[0][0] - SCREEN_LOG_BF)]
 
     def _pairs(self, screened: Mapping[str, float]) -> list[tuple[str, str]]:
         """Return the likeliest pairs, and the likeliest effects beside a random walk."""
@@ -207,22 +210,22 @@ class Hypotheses:
         best alone, and the other at any value."""
         test, out = self.test, dict[tuple[str, str], float]()
         for name in filter(test.best.__contains__, screened):
-            falls, alone = test.scan.beside(test.best[name]) / self.inflation, self._screen(name, self._fall(name))
-            logs = self._evidence(falls)
+            deltas, alone = test.scan.beside(test.best[name]) / self.inflation, self._screen(name, self._fall(name))
+            logs = self._evidence(deltas)
             for other, own in self._values.items():
                 k = own[int(np.argmax(logs[own]))]
-                if other == name or not falls[k] > 0.0:
+                if other == name or not deltas[k] > 0.0:
                     continue
                 both = (name, other) if screened[name] >= screened[other] else (other, name)
-                log = alone + float(logs[k]) + self._log_share_of(other, float(falls[k]))
+                log = alone + float(logs[k]) + self._log_share_of(other, float(deltas[k]))
                 out[both] = max(out.get(both, -math.inf), log)
         return out
 
-    def _evidence(self, falls: Floats) -> Floats:
+    def _evidence(self, deltas: Floats) -> Floats:
         """Return the log Bayes factors (n,) of all candidates of the linear tests from their falls of chi-squared."""
-        dofs, out = np.array([each.dof for each in self.test.scan.candidates]), np.full(len(falls), -math.inf)
+        dofs, out = np.array([each.dof for each in self.test.scan.candidates]), np.full(len(deltas), -math.inf)
         for dof in set(dofs[dofs > 0].tolist()):
-            out[dofs == dof] = size_evidence(dof, falls[dofs == dof])
+            out[dofs == dof] = size_evidence(dof, deltas[dofs == dof])
         return out
 
     @cached_property
@@ -252,7 +255,7 @@ class Hypotheses:
 
     def _over_members(self, own: Sequence[Formulas]) -> Floats:
         """Return the log Bayes factors of the formulas of one driver by the linear tests."""
-        return np.array([float(size_evidence(each.rank, each.fall / self.inflation)) for each in own])
+        return np.array([float(size_evidence(each.rank, each.delta_chi2 / self.inflation)) for each in own])
 
     def _row(self, effects: tuple[str, ...], log_prior: float, formulas: tuple[str, ...] = ()) -> Hypothesis:
         """Return the row of effects or formulas, refitted and weighed."""
@@ -260,12 +263,12 @@ class Hypotheses:
         found = self.evidence.of(refit.fit, walk=self.walk in effects)
         if not found:
             return Hypothesis(effects, formulas, log_evidence=-math.inf)
-        logs = [own.log + self._log_share(effects, own.fall) for own in found]
+        logs = [own.log + self._log_share(effects, own.delta_chi2) for own in found]
         best: Weighed = found[int(np.argmax(logs))]
         walks, log = self.walk in effects, float(np.logaddexp.reduce(logs)) + log_prior
         log += self._within(effects, refit) if walks else 0.0
-        fall = best.fall if best.dof else 2.0 * self.before.fit.walk_gain
-        return Hypothesis(effects, formulas, "", self._families(effects), log, fall, best.dof + walks, refit)
+        delta_chi2 = best.delta_chi2 if best.dof else 2.0 * self.before.fit.walk_gain
+        return Hypothesis(effects, formulas, "", self._families(effects), log, delta_chi2, best.dof + walks, refit)
 
     def _within(self, effects: Sequence[str], refit: Calibration) -> float:
         """Return the log odds of what a walk explains within dwells, where it goes on but has no column: trends that

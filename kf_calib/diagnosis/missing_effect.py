@@ -58,11 +58,11 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
         test = test.without_lines
         found = _explained(refits, before, test)
     if test.vibration and not before.fit.dwells[0].averaged:
-        rested = refits.averaged(before, window_average.window_s(test.vibration))
-        if rested is not None:
-            still = refits.assess(rested)
+        averaged = refits.averaged(before, window_average.window_s(test.vibration))
+        if averaged is not None:
+            still = refits.assess(averaged)
             still = still.without_lines or still  # lines that are left after averaging are vibration, too
-            found = _explained(refits, rested, replace(still, vibration=test.vibration))
+            found = _explained(refits, averaged, replace(still, vibration=test.vibration))
     found = replace(found, back_s=_restoring_time_s(found))
     return replace(found, verdict=verdict_in_words(found) + second_pass_in_words(found))
 
@@ -187,5 +187,5 @@ def _restoring_time_s(found: Diagnosis) -> float | None:
     named; None where no walk was named, or where 1 of 20 true random walks gains as much likelihood."""
     if found.after is None or not found.after.noise.walk_mps2_per_sqrt_s or found.test.walking not in found.missing:
         return None
-    gain, back_s = found.after.fit.back_gain
+    gain, back_s = found.after.fit.gauss_markov_gain
     return back_s if gain > _RETURNS else None

@@ -14,7 +14,7 @@ from kf_calib.errors import UnobservableError
 from kf_calib.estimation.calibration import evaluate
 from kf_calib.estimation.cross_validation import orientations, told_of
 from kf_calib.estimation.noise_model import mean_covariances
-from kf_calib.estimation.relinearisation import carried_at
+from kf_calib.estimation.relinearisation import linearised_at
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.threads import one_blas_thread
 
@@ -51,7 +51,7 @@ def nested_cross_validation(
     for number in range(folds):
         left = sorted(k for group in groups[number::folds] for k in group)
         with one_blas_thread():
-            kept = evaluate(dwells_without(start.fit.dwells, left), start.bench, start.settings, start.carried.slews)
+            kept = evaluate(dwells_without(start.fit.dwells, left), start.bench, start.settings, start.linearised.slews)
         result = improve(kept, accept_first=True).result
         squares, variances = _prediction_errors(start, result, left)
         errors.append(squares)
@@ -72,8 +72,8 @@ def _prediction_errors(start: Calibration, result: Calibration, left: list[int])
             "the orientations without those held out do not determine the model: the honest held-out error needs a "
             "run of more orientations."
         )
-    noise, state = result.noise.judging, result.carried.state
-    means = carried_at(start.fit.dwells, result.model, state, result.noise.weights).means[left]
+    noise, state = result.noise.for_goodness_of_fit, result.linearised.state
+    means = linearised_at(start.fit.dwells, result.model, state, result.noise.weights).means[left]
     spread = means.design @ result.estimate.covariance @ np.swapaxes(means.design, 1, 2)
     spread = spread + mean_covariances(noise.of_readings, means, state)
     told = told_of(means.readings - means.design @ result.estimate.state, spread, means, state, noise.attitude_unknown)

@@ -70,7 +70,7 @@ class Refits:
     def _refit(self, before: Calibration, effects: tuple[str, ...]) -> Calibration:
         """Fit the model with these effects, and read the source again where the statistics of the dwells do not
         suffice."""
-        settings, dwells, slews = replace(before.settings, effects=effects), before.fit.dwells, before.carried.slews
+        settings, dwells, slews = replace(before.settings, effects=effects), before.fit.dwells, before.linearised.slews
         model = Model.of(before.bench, effects, settings.bench_model)
         stage.say(f"refitting with {' + '.join(map(str, model.effects))}" if model.effects else "refitting the twelve")
         averages = model.averages and not all(dwell.averaged for dwell in dwells)

@@ -17,7 +17,7 @@ from kf_calib.effects.formula import formula, quantities
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.residual_table import mean_sigmas, quantity_means
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.score_test import falls_together
+from kf_calib.estimation.score_test import joint_delta_chi2
 from kf_calib.support.tail_probabilities import f_tail
 from kf_calib.support.threads import one_blas_thread
 
@@ -43,16 +43,16 @@ class Driver:
     """A quantity of the bench against which residuals are drawn.
 
     symbol: its name in formulas. words: what it is. unit: its SI unit. values (D, 3): its mean over each dwell, for
-    each accelerometer. fall, dof: decrease of chi-squared by smooth functions of it, and their degrees of freedom.
-    share: part of the misfit beyond noise that they explain beyond what as many arbitrary functions would, 0 to 1; 0 if
-    the model fits. p_value: the chance that as many arbitrary functions explain as much of this misfit.
+    each accelerometer. delta_chi2, dof: decrease of chi-squared by smooth functions of it, and their degrees of
+    freedom. share: part of the misfit beyond noise that they explain beyond what as many arbitrary functions would, 0
+    to 1; 0 if the model fits. p_value: the chance that as many arbitrary functions explain as much of this misfit.
     """
 
     symbol: str
     words: str
     unit: str
     values: Floats
-    fall: float
+    delta_chi2: float
     dof: int
     share: float
     p_value: float
@@ -84,7 +84,7 @@ def misfit_beyond_noise(result: Calibration) -> float:
     return misfit.statistic - misfit.dof if misfit.consistent is False else 0.0
 
 
-def _beyond_chance(fall: float, dof: int, result: Calibration) -> tuple[float, float]:
+def _beyond_chance(delta_chi2: float, dof: int, result: Calibration) -> tuple[float, float]:
     """Return the share of a driver and its p-value.
 
     Of a misfit of n degrees of freedom, any k functions explain k / n on average, however large the misfit is. So chi-
@@ -95,8 +95,8 @@ def _beyond_chance(fall: float, dof: int, result: Calibration) -> tuple[float, f
     rest = misfit.dof - dof
     if not dof or rest <= 0:
         return 0.0, 1.0
-    left = max(misfit.statistic - fall, 0.0) / rest
-    p_value = f_tail(dof, rest, fall / dof / max(left, 1.0))
+    left = max(misfit.statistic - delta_chi2, 0.0) / rest
+    p_value = f_tail(dof, rest, delta_chi2 / dof / max(left, 1.0))
     excess = misfit_beyond_noise(result) / misfit.dof
     return (float(np.clip(1.0 - (left - 1.0) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0), p_value
 
@@ -113,10 +113,12 @@ def _formulas(symbol: str, functions: Sequence[str]) -> list[str]:
 
 def _falls(fitted: Fit, texts: dict[str, list[str]]) -> dict[str, tuple[float, int]]:
     """Return for each driver the decrease of chi-squared by all its functions together, and their rank."""
-    bench = fitted.carried.model.bench
+    bench = fitted.linearised.model.bench
     groups = [[formula(text, bench.axes, bench.gravity_mps2, checked=False) for text in own] for own in texts.values()]
     with one_blas_thread():
-        return dict(zip(texts, falls_together(fitted.carried, fitted.noise.judging, groups), strict=True))
+        return dict(
+            zip(texts, joint_delta_chi2(fitted.linearised, fitted.noise.for_goodness_of_fit, groups), strict=True)
+        )
 
 
 def is_function_of(values: Floats, driver: Driver) -> bool:
@@ -161,7 +163,7 @@ def walk_path(result: Calibration) -> Floats:
     The best linear prediction K (K + R)^-1 r from the residuals r by the final state, where K = q^2 min(T - s, T - t)
     is the covariance of a random walk that is known at its end T, and R that of the means.
     """
-    intensity, means = result.noise.walk_mps2_per_sqrt_s, result.carried.means
+    intensity, means = result.noise.walk_mps2_per_sqrt_s, result.linearised.means
     if not intensity:
         return np.zeros_like(result.residuals_mps2)
     before_end_s = means.ends_s[-1, 1] - means.ends_s.mean(axis=1)

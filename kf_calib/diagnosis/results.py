@@ -96,8 +96,8 @@ class Diagnosis:
     @cached_property
     def residual_ratios(self) -> Floats:
         """Residuals of the dwell means (D, 3), over their sigma."""
-        carried = self.before.carried
-        spread = mean_covariances(self.before.noise.judging.of_readings, carried.means, carried.state)
+        linearised = self.before.linearised
+        spread = mean_covariances(self.before.noise.for_goodness_of_fit.of_readings, linearised.means, linearised.state)
         return self.before.residuals_mps2 / np.sqrt(np.einsum("dii->di", spread))
 
     @cached_property

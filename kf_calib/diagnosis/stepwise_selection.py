@@ -355,15 +355,15 @@ def removals(fitted: Fit) -> tuple[Removal, ...]:
     """
     from scipy.special import chdtrc
 
-    carried = fitted.carried
+    linearised = fitted.linearised
     upper = square_root_information.accumulate(fitted.all_rows(), fitted.steps)
     rank, least, out = square_root_information.rank(upper[:-1]), upper[-1, -1] ** 2, list[Removal]()
-    for effect in carried.model.effects:
+    for effect in linearised.model.effects:
         if not effect.coefficients:  # a random walk is noise, which is judged by its likelihood
             gain = 2.0 * fitted.walk_gain
             out.append(Removal(str(effect), gain, 1, 0.5 * float(chdtrc(1, max(gain, 0.0)))))
             continue
-        rest = np.delete(upper, carried.model.parts[str(effect)], axis=1)
+        rest = np.delete(upper, linearised.model.parts[str(effect)], axis=1)
         corner = square_root_information.accumulate([rest])
         rise, dof = float(max(corner[-1, -1] ** 2 - least, 0.0)), rank - square_root_information.rank(corner[:-1])
         out.append(Removal(str(effect), rise, dof, float(chdtrc(dof, rise)) if dof > 0 else 1.0))
@@ -404,5 +404,5 @@ def _refuse(result: Calibration, text: str) -> None:
     effect = effect_named(text, result.bench)
     if len(merged(result.settings.effects, [text])) == len(result.settings.effects):
         raise InputError(f"{effect} is in the model already: choose another, or drop it first.")
-    if Model(result.bench, (effect,)).dynamic and not result.carried.slews:
+    if Model(result.bench, (effect,)).dynamic and not result.linearised.slews:
         raise InputError(f"{effect} shows in slews only, which were not read: start with --with '{as_text(effect)}'.")

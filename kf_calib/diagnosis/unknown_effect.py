@@ -69,16 +69,16 @@ class Description:
 class Family:
     """Formulas of one driver, tested together as one candidate.
 
-    driver: in words, what the misfit would depend on. texts: the formulas. fall: fall of chi-squared with all of them.
-    rank: number of their columns that can be told from the model. falls: fall of chi-squared with each of them alone.
-    known: whether each of them equals a known effect, or nearly so.
+    driver: in words, what the misfit would depend on. texts: the formulas. delta_chi2: fall of chi-squared with all of
+    them. rank: number of their columns that can be told from the model. each_delta_chi2: fall of chi-squared with each
+    of them alone. known: whether each of them equals a known effect, or nearly so.
     """
 
     driver: str
     texts: tuple[str, ...]
-    fall: float
+    delta_chi2: float
     rank: int
-    falls: tuple[float, ...]
+    each_delta_chi2: tuple[float, ...]
     known: bool = False
 
     @property
@@ -113,7 +113,7 @@ class Family:
         """The fall of chi-squared less its threshold at the level of one family."""
         from scipy.special import chdtri
 
-        return self.fall - float(chdtri(self.dof, _CHANCE)) if self.dof else 0.0
+        return self.delta_chi2 - float(chdtri(self.dof, _CHANCE)) if self.dof else 0.0
 
 
 def describe(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Description | None:
@@ -131,7 +131,7 @@ def describe(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Desc
     best = max(found, key=lambda family: family.score)
     walk, scatter = fitted.walk_gain, fitted.scatter_gain
     irregular = 2.0 * max(walk, scatter)
-    name = "" if fitted.carried.model.walks else walk_named(fitted.carried.model.bench)
+    name = "" if fitted.linearised.model.walks else walk_named(fitted.linearised.model.bench)
     within = name and _goes_on(trend) and (best.score <= 0.0 or _goes_on(_trend_beside(fitted, best)))
     if name and (within or irregular - float(chdtri(1, _CHANCE)) > max(best.score, 0.0)):
         share = irregular / max(excess, irregular, 1.0)
@@ -140,10 +140,10 @@ def describe(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Desc
         return Description(channel_of(residuals), WITHIN if within and not back_s else driver, share, (name,))
     if best.score <= 0.0:
         return None
-    order = np.argsort(best.falls)[::-1]
-    enough = 1 if best.falls[order[0]] > 0.7 * best.fall else len(order)
+    order = np.argsort(best.each_delta_chi2)[::-1]
+    enough = 1 if best.each_delta_chi2[order[0]] > 0.7 * best.delta_chi2 else len(order)
     formulas = tuple(_named(best.texts[k], number) for number, k in enumerate(order[:enough]))
-    share = min((best.fall - best.dof) / excess, 1.0) if excess > 0.0 else 1.0
+    share = min((best.delta_chi2 - best.dof) / excess, 1.0) if excess > 0.0 else 1.0
     return Description(channel_of(residuals), best.driver, share, formulas)
 
 
@@ -154,13 +154,13 @@ def one_digit_seconds(duration_s: float) -> str:
 
 def _back_s(fitted: Fit, walk: str) -> float | None:
     """Return the time constant, s, with which an irregular drift returns, or None if it is no different from a walk."""
-    model = fitted.carried.model
+    model = fitted.linearised.model
     walked = fit(
-        fitted.dwells, model + effect_named(walk, model.bench), 0.0, fitted.carried.slews, must_settle=False
+        fitted.dwells, model + effect_named(walk, model.bench), 0.0, fitted.linearised.slews, must_settle=False
     )
     if not walked.noise.walk_mps2_per_sqrt_s:
         return None
-    gain, back_s = walked.back_gain
+    gain, back_s = walked.gauss_markov_gain
     return back_s if 2.0 * gain > _EQUAL else None
 
 
@@ -171,11 +171,11 @@ def _goes_on(trend: Trend | None) -> bool:
 
 def _trend_beside(fitted: Fit, family: Family) -> Trend | None:
     """Return the test of trends within dwells with the formulas of a family in the model."""
-    model = fitted.carried.model
+    model = fitted.linearised.model
     for text in family.formulas:
         model += effect_named(text, model.bench)
     walk = fitted.noise.walk_mps2_per_sqrt_s
-    return trend_of(fit(fitted.dwells, model, walk, fitted.carried.slews, must_settle=False))
+    return trend_of(fit(fitted.dwells, model, walk, fitted.linearised.slews, must_settle=False))
 
 
 def families(fitted: Fit, known: Sequence[Effect] = (), frame: Frame | None = None) -> list[Family]:
@@ -184,13 +184,13 @@ def families(fitted: Fit, known: Sequence[Effect] = (), frame: Frame | None = No
     fitted: the fit. known: effects with which the formulas are compared. frame: with the columns of most of these
     effects.
     """
-    frame = frame or Frame(fitted.carried, fitted.noise.judging, known)
-    return _tried(fitted, FurtherEffects(frame, fitted.carried, known, _SAME))
+    frame = frame or Frame(fitted.linearised, fitted.noise.for_goodness_of_fit, known)
+    return _tried(fitted, FurtherEffects(frame, fitted.linearised, known, _SAME))
 
 
 def _tried(fitted: Fit, tests: FurtherEffects) -> list[Family]:
     """Return the families with their falls of chi-squared."""
-    bench, tried = fitted.carried.model.bench, list[tuple[str, list[str], list[Effect]]]()
+    bench, tried = fitted.linearised.model.bench, list[tuple[str, list[str], list[Effect]]]()
     for driver, texts in _families(bench, fitted.dwells):
         with contextlib.suppress(InputError):  # a very late jump or fast decay does not show when a formula is checked
             own = [formula(_named(text), bench.axes, bench.gravity_mps2, checked=False) for text in texts]
@@ -198,8 +198,8 @@ def _tried(fitted: Fit, tests: FurtherEffects) -> list[Family]:
     stage.say(f"trying {sum(len(texts) for _, texts, _ in tried)} formulas")
     out, scans = list[Family](), tests.scans([effects for _, _, effects in tried])
     for (driver, texts, _), (scan, known) in zip(tried, scans, strict=True):
-        fall, rank = scan.explained(np.concatenate([each.basis for each in scan.candidates], axis=1))
-        out.append(Family(driver, tuple(texts), fall, rank, tuple(scan.statistics.tolist()), known))
+        delta_chi2, rank = scan.explained(np.concatenate([each.basis for each in scan.candidates], axis=1))
+        out.append(Family(driver, tuple(texts), delta_chi2, rank, tuple(scan.statistics.tolist()), known))
     return out
 
 

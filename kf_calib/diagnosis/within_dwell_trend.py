@@ -21,7 +21,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
-from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.noise_model import Noise, flicker_sigma
 from kf_calib.estimation.thermometer_error import thermometer_errors
@@ -80,30 +80,30 @@ class Trend:
 
 def trend(fitted: Fit) -> Trend | None:
     """The test of trends within dwells in the residuals of a fit; None where it cannot be made."""
-    return trend_beside(fitted.carried, fitted.noise.judging, fitted.state)
+    return trend_beside(fitted.linearised, fitted.noise.for_goodness_of_fit, fitted.state)
 
 
-def trend_beside(carried: Carried, noise: Noise, state: Floats) -> Trend | None:
+def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> Trend | None:
     """The test of trends in the residuals of a model at ``state`` (p,).
 
     The ratio is F distributed: its denominator stands for the uncertainty of the noise itself. From n readings, kappa
     is known with a relative variance of (4 kappa - 2) / n, and the intensity of a walk with that of its own estimate.
 
-    carried: dwells and columns of the model. noise: by which it is judged. Returns None where the dwells are averages,
-    where scatter was not stated, or where no dwell has enough readings.
+    linearised: dwells and columns of the model. noise: by which it is judged. Returns None where the dwells are
+    averages, where scatter was not stated, or where no dwell has enough readings.
     """
     from scipy.special import fdtrc
 
-    dwells = carried.dwells
+    dwells = linearised.dwells
     if dwells[0].averaged or not noise.scatter_stated:
         return None
     sigma, lengths_s = noise.effective_sigma_mps2, np.array([dwell.end_s - dwell.start_s for dwell in dwells])
-    squares, seen = _squares(dwells, _residuals(carried, state))
+    squares, seen = _squares(dwells, _residuals(linearised, state))
     own = (sigma**2 / np.array([[dwell.count] for dwell in dwells]))[:, :, None]
     by_walk, by_flicker = _of_shapes()
     walked = noise.walk_mps2_per_sqrt_s**2 * lengths_s[:, None, None] * by_walk
     by_noise = own + walked + flicker_sigma(noise, len(dwells))[:, None] ** 2 * by_flicker
-    allowed = by_noise + _by_thermometer(carried, noise)
+    allowed = by_noise + _by_thermometer(linearised, noise)
     ratios = np.where(seen[:, None, :], squares / allowed, 0.0)
     count = 3 * int(seen.sum())
     if not count:
@@ -115,24 +115,24 @@ def trend_beside(carried: Carried, noise: Noise, state: Floats) -> Trend | None:
     return Trend(ratio, float(fdtrc(count, 2.0 / unsure, ratio)), ratios.sum(axis=2))
 
 
-def _by_thermometer(carried: Carried, noise: Noise) -> Floats | float:
+def _by_thermometer(linearised: LinearisedDwells, noise: Noise) -> Floats | float:
     """Return the variances (D, 3, degrees) of the coefficients that the error of the temperature gives."""
     if noise.sensitivity_mps2_per_k is None:
         return 0.0
-    errors = thermometer_errors(carried.turned, noise.sensitivity_mps2_per_k)
+    errors = thermometer_errors(linearised.dwells_at_state, noise.sensitivity_mps2_per_k)
     rows = [
         _rows(dwell, own.reshape(*own.shape[:2], 3 * own.shape[3]))
-        for dwell, own in zip(carried.dwells, errors, strict=True)
+        for dwell, own in zip(linearised.dwells, errors, strict=True)
     ]
-    squares, _ = _squares(carried.dwells, rows)
+    squares, _ = _squares(linearised.dwells, rows)
     return squares.reshape(len(rows), 3, -1, _DEGREE).sum(axis=2)
 
 
-def _residuals(carried: Carried, state: Floats) -> list[Floats]:
+def _residuals(linearised: LinearisedDwells, state: Floats) -> list[Floats]:
     """Return the residuals (pieces, K, 3) of each dwell on the rows of its triangles."""
     return [
         dwell.triangles[:, : dwell.width, dwell.width :] - _rows(dwell, columns @ state)
-        for dwell, columns in zip(carried.turned, carried.columns, strict=True)
+        for dwell, columns in zip(linearised.dwells_at_state, linearised.columns, strict=True)
     ]
 
 

@@ -19,7 +19,7 @@ from kf_calib.bench.bench import turn_by
 from kf_calib.dwells.attitude_error import AttitudeError
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect, FrameEffect, Stimulus
-from kf_calib.estimation.dwell_columns import Carried, Means, stimulus_of
+from kf_calib.estimation.dwell_columns import LinearisedDwells, Means, stimulus_of
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import Noise
 from kf_calib.estimation.nuisance_states import rotation_map, tangents
@@ -29,22 +29,22 @@ _ABRUPT = 0.5  # a bending beyond this is a jump of an effect's column, which ha
 _FARTHEST_RAD = 0.3  # of one step of an attitude
 
 
-def at_their_modes(carried: Carried, noise: Noise, state: Floats) -> list[DwellFactor]:
+def at_their_modes(linearised: LinearisedDwells, noise: Noise, state: Floats) -> list[DwellFactor]:
     """The dwells with attitudes at their posterior modes at ``state`` (p,), to first order about where they were.
 
     Dwells stay as they are where no setting error is allowed for. Where it is only considered (``Noise.checked``),
     attitudes stay as recorded, and the force is shorter by what the setting error takes from its mean.
     """
     if not noise.setting_rad:
-        return [without_attitude(dwell) for dwell in carried.dwells]
-    bendings = bendings_of(carried, state)
+        return [without_attitude(dwell) for dwell in linearised.dwells]
+    bendings = bendings_of(linearised, state)
     if not noise.checked:
         known = [AttitudeError(np.zeros(3), 2.0 * noise.setting_rad**2, bending) for bending in bendings]
-        return [d.linearised(d.turned_rad, attitude) for d, attitude in zip(carried.dwells, known, strict=True)]
-    moved, variances = _posterior_rotations(carried.means, noise, state, bendings)
-    forces = carried.means.force_mps2 / np.array([_length(dwell) for dwell in carried.dwells])[:, None]
+        return [d.linearised(d.turned_rad, attitude) for d, attitude in zip(linearised.dwells, known, strict=True)]
+    moved, variances = _posterior_rotations(linearised.means, noise, state, bendings)
+    forces = linearised.means.force_mps2 / np.array([_length(dwell) for dwell in linearised.dwells])[:, None]
     out = list[DwellFactor]()
-    for k, (dwell, turned) in enumerate(zip(carried.dwells, carried.turned, strict=True)):
+    for k, (dwell, turned) in enumerate(zip(linearised.dwells, linearised.dwells_at_state, strict=True)):
         before = np.zeros(3) if dwell.attitude is None else dwell.attitude.rotation_rad
         force = turn_by(forces[k], _limited(moved[k] - before))
         attitude = AttitudeError(np.zeros(3), float(variances[k]), bendings[k])
@@ -93,10 +93,10 @@ def _posterior_rotations(means: Means, noise: Noise, state: Floats, bendings: Fl
     return (axes @ modes)[:, :, 0], np.einsum("dii->d", covariances)
 
 
-def bendings_of(carried: Carried, state: Floats) -> Floats:
+def bendings_of(linearised: LinearisedDwells, state: Floats) -> Floats:
     """By how much the effects of the model change the mean readings of each dwell per unit of force, (D, 3, 3), from
     central differences; zeros for effects that turn the platform, oscillate, or show in slews only."""
-    model, dwells = carried.model, carried.turned
+    model, dwells = linearised.model, linearised.dwells_at_state
     out, bent = np.zeros((len(dwells), 3, 3)), bent_effects(model, state)
     if not bent:
         return out
@@ -153,9 +153,7 @@ def with_force(dwell: DwellFactor, force_mps2: Floats) -> DwellFactor:
     """The dwell with another specific force at all its nodes, and a pose that has it up, of an arbitrary heading."""
     pose = _pose(force_mps2 / np.linalg.norm(force_mps2))
     pieces = (
-        replace(
-            piece, nodes=replace(piece.nodes, force_mps2=np.tile(force_mps2, (3, 1)), pose=np.tile(pose, (3, 1)))
-        )
+        replace(piece, nodes=replace(piece.nodes, force_mps2=np.tile(force_mps2, (3, 1)), pose=np.tile(pose, (3, 1))))
         for piece in dwell.pieces
     )
     return replace(dwell, pieces=tuple(pieces))

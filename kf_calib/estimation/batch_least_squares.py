@@ -20,9 +20,7 @@ from kf_calib.estimation.square_root_information import scale_columns
 _SEEN = 1e-9  # singular values that are smaller relative to the largest are rounding
 
 
-def least_squares(
-    samples: Iterable[Samples], around: Floats
-) -> tuple[Floats, Floats]:
+def least_squares(samples: Iterable[Samples], around: Floats) -> tuple[Floats, Floats]:
     """State (p,) and covariance (p, p) from all samples, with a diffuse prior and without process noise.
 
     Combinations of the state that the samples do not determine keep their value in ``around`` (p,), and their variance

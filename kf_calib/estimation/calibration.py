@@ -25,7 +25,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import of_the_users
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation import kalman_filterpy, square_root_information
-from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.free_attitude import holding_frame
@@ -149,7 +149,7 @@ def _with_outlying(judged: Consistency, outlying: Sequence[OutlyingDwell]) -> Co
 
 def _fit_again(result: Calibration, dwells: list[DwellFactor]) -> Fit:
     """Fit the same model to other dwells."""
-    return fit(dwells, result.model, result.settings.walk_mps2_per_sqrt_s, result.carried.slews)
+    return fit(dwells, result.model, result.settings.walk_mps2_per_sqrt_s, result.linearised.slews)
 
 
 def evaluate(
@@ -166,17 +166,17 @@ def _model(bench: Bench, settings: Settings) -> Model:
 
 def evaluate_fit(fitted: Fit, settings: Settings) -> Calibration:
     """The calibration from a fit: the filter's steps with their innovations, and the test of the misfit."""
-    carried, noise, model = fitted.carried, fitted.noise, fitted.carried.model
+    linearised, noise, model = fitted.linearised, fitted.noise, fitted.linearised.model
     first = square_root_information.start(settings.prior, model)
     steps = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)
-    extra = considered_information(noise, carried.means, carried.state)
+    extra = considered_information(noise, linearised.means, linearised.state)
     final = estimate_of(steps[-1].factor, model.nominal_state(), extra.sum(axis=0) + fitted.considered)
-    residuals = carried.means.readings - carried.means.design @ final.state
+    residuals = linearised.means.readings - linearised.means.design @ final.state
     visits = _visits(fitted, steps, residuals, extra, settings)
     judged = consistency(fitted)
     return Calibration(
         model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))),
-        Tally(), tuple(remarks_on(carried, noise, final, judged, residuals)),
+        Tally(), tuple(remarks_on(linearised, noise, final, judged, residuals)),
     )  # fmt: skip
 
 
@@ -194,11 +194,11 @@ def filterpy_estimate(
     readings. ``on_dwell`` is called with the state (p,) after each dwell.
     """
     prior, model = result.settings.prior, result.model
-    scale = np.concatenate([np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), result.carried.sizes[STATE_COUNT:]])
-    samples = samples_of(Pass(source, result.settings).rows(), result.carried, result.noise.weights)
-    samples = holding_frame(samples, result.carried, result.noise.weights)
+    scale = np.concatenate([np.tile([*[result.bench.gravity_mps2] * 3, 1.0], 3), result.linearised.sizes[STATE_COUNT:]])
+    samples = samples_of(Pass(source, result.settings).rows(), result.linearised, result.noise.weights)
+    samples = holding_frame(samples, result.linearised, result.noise.weights)
     posterior = kalman_filterpy.estimate(
-        _counted(samples, result.carried, on_progress, at_most),
+        _counted(samples, result.linearised, on_progress, at_most),
         result.noise.weights,
         model.nominal_state(),
         None if prior.diffuse else square_root_information.prior_covariance(prior, model),
@@ -210,10 +210,13 @@ def filterpy_estimate(
 
 
 def _counted(
-    samples: Iterable[Samples], carried: Carried, on_progress: Callable[[float], None] | None, at_most: float
+    samples: Iterable[Samples],
+    linearised: LinearisedDwells,
+    on_progress: Callable[[float], None] | None,
+    at_most: float,
 ) -> Iterator[Samples]:
     """Yield the same samples, report the share that is done, and stop after a number of readings."""
-    total, done = sum(dwell.count for dwell in [*carried.dwells, *carried.slews]), 0
+    total, done = sum(dwell.count for dwell in [*linearised.dwells, *linearised.slews]), 0
     for piece in samples:
         yield piece
         done += len(piece.readings)
@@ -248,7 +251,7 @@ def refuse_unseen(result: Calibration) -> None:
 
 def _refuse_without_noise(result: Calibration) -> None:
     """Raise InputError if nothing at all shows how large the noise is, so that no sigma can be given."""
-    noise, free = result.noise, degrees_of_freedom(result.carried.means, not result.bench.angles)
+    noise, free = result.noise, degrees_of_freedom(result.linearised.means, not result.bench.angles)
     setting_stated = noise.setting_stated and result.bench.angles
     if not (noise.within_seen or noise.scatter_stated or setting_stated) and free < FEWEST:
         raise InputError(
@@ -262,10 +265,10 @@ def _visits(
     fitted: Fit, steps: list[FilterStep], residuals: Floats, extra: Floats, settings: Settings
 ) -> tuple[Visit, ...]:
     """Return for each dwell its innovation, its residual and the estimate after it."""
-    carried, means, around = fitted.carried, fitted.carried.means, fitted.carried.model.nominal_state()
-    own, walked = mean_covariances(fitted.noise.of_readings, means, carried.state), to_mean(fitted.steps)
+    linearised, means, around = fitted.linearised, fitted.linearised.means, fitted.linearised.model.nominal_state()
+    own, walked = mean_covariances(fitted.noise.of_readings, means, linearised.state), to_mean(fitted.steps)
     first, extra = (
-        square_root_information.start(settings.prior, carried.model),
+        square_root_information.start(settings.prior, linearised.model),
         np.concatenate([0.0 * extra[:1], extra]),
     )
     factors, extra = np.array([first, *(step.factor for step in steps)]), np.cumsum(extra, axis=0)
@@ -274,7 +277,7 @@ def _visits(
     if walked.any():
         before = [predict(factor, float(step)) for factor, step in zip(factors, walked, strict=False)]
         known = estimates(np.array(before), around, extra[:-1])
-    for k, (dwell, step) in enumerate(zip(carried.dwells, steps, strict=True)):
+    for k, (dwell, step) in enumerate(zip(linearised.dwells, steps, strict=True)):
         innovation, sigma = np.full(3, np.nan), np.full(3, np.nan)
         if not known[k].undetermined.size:
             rows = means.design[k]

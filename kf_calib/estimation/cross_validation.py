@@ -89,7 +89,7 @@ def held_out(fitted: Fit) -> HeldOut | None:
     predicted = (_beside if fitted.noise.walk_mps2_per_sqrt_s else _without)(fitted, orientations(fitted.dwells))
     if predicted is None:
         return None
-    return told_of(*predicted, fitted.carried.means, fitted.carried.state, fitted.noise.attitude_unknown)
+    return told_of(*predicted, fitted.linearised.means, fitted.linearised.state, fitted.noise.attitude_unknown)
 
 
 def told_of(errors_mps2: Floats, covariance: Floats, means: Means, state: Floats, free: bool) -> HeldOut:
@@ -107,15 +107,19 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
 
     The fit without an orientation is found by merging the factors of the orientations before it and after it.
     """
-    carried, noise, around = fitted.carried, fitted.noise.judging, fitted.carried.model.nominal_state()
+    linearised, noise, around = (
+        fitted.linearised,
+        fitted.noise.for_goodness_of_fit,
+        fitted.linearised.model.nominal_state(),
+    )
     noise = noise.of_readings
-    rows = fitted.rows(fitted.noise.judging.weights)
+    rows = fitted.rows(fitted.noise.for_goodness_of_fit.weights)
     extra, own = (
-        considered_information(noise, carried.means, carried.state),
-        mean_covariances(noise, carried.means, carried.state),
+        considered_information(noise, linearised.means, linearised.state),
+        mean_covariances(noise, linearised.means, linearised.state),
     )
     empty = _frame(fitted)
-    slews = square_root_information.update(empty, np.concatenate(fitted.following))[0] if carried.slews else empty
+    slews = square_root_information.update(empty, np.concatenate(fitted.following))[0] if linearised.slews else empty
     heads, tails = [slews], [empty]
     for group in groups[:-1]:
         heads.append(square_root_information.update(heads[-1], np.concatenate([rows[k] for k in group]))[0])
@@ -132,8 +136,8 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
     np.add.at(left_out, place, extra)
     covariance = np.array(covariances)
     covariance = (covariance + covariance @ (extra.sum(axis=0) - left_out) @ covariance)[place]
-    design = carried.means.design
-    errors = carried.means.readings - (design @ np.array(states)[place, :, None])[:, :, 0]
+    design = linearised.means.design
+    errors = linearised.means.readings - (design @ np.array(states)[place, :, None])[:, :, 0]
     return errors, own + design @ covariance @ np.swapaxes(design, 1, 2)
 
 
@@ -143,9 +147,9 @@ def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | Non
     The biases during a dwell are then estimated from the dwells before and after it by a two-filter smoother, with one
     filter forward and one backward in time (Fraser and Potter, 1969).
     """
-    carried, noise, steps = fitted.carried, fitted.noise.judging, fitted.steps
-    rows, means, around = fitted.all_rows(noise.weights), carried.means, carried.model.nominal_state()
-    errors, spreads = np.zeros((len(rows), 3)), mean_covariances(noise.of_readings, means, carried.state)
+    linearised, noise, steps = fitted.linearised, fitted.noise.for_goodness_of_fit, fitted.steps
+    rows, means, around = fitted.all_rows(noise.weights), linearised.means, linearised.model.nominal_state()
+    errors, spreads = np.zeros((len(rows), 3)), mean_covariances(noise.of_readings, means, linearised.state)
     spreads += (steps[:, 1] / 12.0)[:, None, None] * np.eye(3)  # variance of a path's mean about the mean of its ends
     first = _frame(fitted)
     alone, ways = _passes(first, rows, steps, ()), dict[int, list[tuple[int, Floats]]]()
@@ -171,7 +175,7 @@ def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | Non
 
 def _frame(fitted: Fit) -> Floats:
     """Return the factor that knows nothing but the states that are fixed at zero, whichever orientation is left out."""
-    model, noise = fitted.carried.model, fitted.noise
+    model, noise = fitted.linearised.model, fitted.noise
     out = square_root_information.start(Prior(), model)
     for place in model.fixed:
         out[place, place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2.min()

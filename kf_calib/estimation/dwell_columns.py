@@ -203,11 +203,11 @@ def bending_of(dwell: DwellFactor) -> Floats:
     return np.zeros((3, 3)) if known is None else known
 
 
-class Carried:
+class LinearisedDwells:
     """Dwells with the columns of a model: the common input of noise model, filter and diagnosis.
 
-    ``state`` (p,) is where rotations and input axes are linearised. The attribute ``turned`` has the dwells as the
-    function of this name returns them: columns are made from these, and rows are whitened with them. ``slews`` and
+    ``state`` (p,) is where rotations and input axes are linearised. The attribute ``dwells_at_state`` has the dwells as
+    the function of this name returns them: columns are made from these, and rows are whitened with them. ``slews`` and
     ``slew_columns`` belong to the motions and are used only if an effect of the model shows in slews; everything else
     refers to dwells only.
     """
@@ -216,18 +216,22 @@ class Carried:
         self, dwells: Sequence[DwellFactor], model: Model, state: Floats, slews: Sequence[DwellFactor] = ()
     ) -> None:
         self.dwells, self.slews, self.model, self.state = list(dwells), list(slews), model, state
-        self.turned = turned(self.dwells, model, state)
-        every = sorted((*self.turned, *slews), key=lambda each: (each.number, each.moving)) if slews else self.turned
+        self.dwells_at_state = dwells_at_state(self.dwells, model, state)
+        every = (
+            sorted((*self.dwells_at_state, *slews), key=lambda each: (each.number, each.moving))
+            if slews
+            else self.dwells_at_state
+        )
         columns = columns_of(every, model, state)
         self.columns = [own for each, own in zip(every, columns, strict=True) if not each.moving]
         self.slew_columns = [own for each, own in zip(every, columns, strict=True) if each.moving]
 
-    def followed_by(self, dwell: DwellFactor) -> Carried:
+    def followed_by(self, dwell: DwellFactor) -> LinearisedDwells:
         """The same with one more dwell; the columns of the others are not computed again."""
-        out = Carried.__new__(Carried)
+        out = LinearisedDwells.__new__(LinearisedDwells)
         out.dwells, out.slews, out.model, out.state = [*self.dwells, dwell], self.slews, self.model, self.state
-        out.turned = [*self.turned, dwell]
-        last = stimulus_of(out.turned, self.model.bench, self.state).ending(3 * len(dwell.pieces))
+        out.dwells_at_state = [*self.dwells_at_state, dwell]
+        last = stimulus_of(out.dwells_at_state, self.model.bench, self.state).ending(3 * len(dwell.pieces))
         out.columns = [*self.columns, *_by_dwell([dwell], lambda s: self.model.columns(s, self.state), last)]
         out.slew_columns = self.slew_columns
         return out
@@ -235,7 +239,7 @@ class Carried:
     @cached_property
     def means(self) -> Means:
         """The means over each dwell."""
-        return means_of(self.turned, self.columns)
+        return means_of(self.dwells_at_state, self.columns)
 
     @property
     def carrier_hz(self) -> float:
@@ -252,7 +256,7 @@ class Carried:
         return np.where(largest > 0, largest, 1.0)
 
 
-def turned(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[DwellFactor]:
+def dwells_at_state(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[DwellFactor]:
     """The dwells about which a model is linear in the rotations of its dwells.
 
     At ``state`` the effects of the frame turn the specific force f of a dwell by the rotation vector rho, its mean over

@@ -94,10 +94,10 @@ def compare(
         return result.considering(*least_squares(held(samples()), around))
 
     def samples() -> Iterator[Samples]:
-        return samples_of(Pass(source, settings).rows(), result.carried, result.noise.weights)
+        return samples_of(Pass(source, settings).rows(), result.linearised, result.noise.weights)
 
     def held(some: Iterable[Samples]) -> Iterator[Samples]:
-        return holding_frame(some, result.carried, result.noise.weights)
+        return holding_frame(some, result.linearised, result.noise.weights)
 
     stage.say("filterpy, reading by reading")
     filterpy, filterpy_s = _timed(

@@ -24,14 +24,21 @@ from kf_calib.effects import Effect
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation import free_attitude, square_root_information
 from kf_calib.estimation.attitude import facing_readings, without_attitude
-from kf_calib.estimation.dwell_columns import Carried, Means, candidate_columns, stimulus_of
+from kf_calib.estimation.dwell_columns import LinearisedDwells, Means, candidate_columns, stimulus_of
 from kf_calib.estimation.flicker import flicker_within
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import ATTITUDE_UNKNOWN_RAD, FLOOR_MPS2, Noise, slow_waves, steps, within_dwells
 from kf_calib.estimation.nuisance_states import along_force, sensitivities_of
-from kf_calib.estimation.relinearisation import SETTLED, UNSETTLED, descended, left_to_settle, linearised
-from kf_calib.estimation.reml import Part, gain_of, misfit, restoring_gains, with_dwell_parts, with_shared_noise
-from kf_calib.estimation.score_test import falls
+from kf_calib.estimation.relinearisation import SETTLED, UNSETTLED, descended, left_to_settle, relinearised
+from kf_calib.estimation.reml import (
+    Part,
+    estimate_variance_components,
+    gain_of,
+    gauss_markov_gains,
+    misfit,
+    with_shared_noise,
+)
+from kf_calib.estimation.score_test import delta_chi2
 from kf_calib.estimation.thermometer_error import sensitivity_to_temperature, thermometer_errors
 
 _PASSES = 3
@@ -49,14 +56,14 @@ class Fit:
     ``spreads`` gives, by effect, the sigma of ln(value) of each constant without a derivative.
     """
 
-    carried: Carried
+    linearised: LinearisedDwells
     noise: Noise
     spreads: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @property
     def dwells(self) -> list[DwellFactor]:
         """The dwells that were fitted."""
-        return self.carried.dwells
+        return self.linearised.dwells
 
     @property
     def steps(self) -> Floats:
@@ -76,26 +83,30 @@ class Fit:
     @cached_property
     def _solution(self) -> tuple[Floats, Floats, Floats]:
         factor = square_root_information.accumulate(self.all_rows(), self.steps)[:-1]
-        return square_root_information.solve(factor, self.carried.model.nominal_state())
+        return square_root_information.solve(factor, self.linearised.model.nominal_state())
 
     @cached_property
-    def judged(self) -> list[Floats]:
+    def misfit_rows(self) -> list[Floats]:
         """Whitened rows [H | W | z] by which the misfit is judged, see ``square_root_information.misfit_rows``."""
-        carried = self.carried
+        linearised = self.linearised
         rows, _ = square_root_information.misfit_rows(
-            carried.turned, carried.columns, self.noise.judging, carried.state, carried.model.count
+            linearised.dwells_at_state,
+            linearised.columns,
+            self.noise.for_goodness_of_fit,
+            linearised.state,
+            linearised.model.count,
         )
-        return square_root_information.with_frame(rows, carried.model, self.noise, len(rows) - len(self.dwells))
+        return square_root_information.with_frame(rows, linearised.model, self.noise, len(rows) - len(self.dwells))
 
     @cached_property
     def following(self) -> list[Floats]:
         """Whitened rows [H | z] of the slews that follow each dwell; (0, p + 1) where none is used."""
-        carried, noise = self.carried, self.noise.weights.of(moving=True)
-        out = [np.zeros((0, carried.model.count + 1))] * len(self.dwells)
-        if carried.slews:
-            rows = square_root_information.whiten(carried.slews, carried.slew_columns, noise, carried.state)
+        linearised, noise = self.linearised, self.noise.weights.of(moving=True)
+        out = [np.zeros((0, linearised.model.count + 1))] * len(self.dwells)
+        if linearised.slews:
+            rows = square_root_information.whiten(linearised.slews, linearised.slew_columns, noise, linearised.state)
             numbers = [dwell.number for dwell in self.dwells]
-            for slew, own in zip(carried.slews, rows, strict=True):
+            for slew, own in zip(linearised.slews, rows, strict=True):
                 place = bisect.bisect_right(numbers, slew.number) - 1
                 out[place] = np.vstack([out[place], own])
         return out
@@ -118,24 +129,29 @@ class Fit:
         the constant changes by 1 sigma. The constants are considered parameters: known to be uncertain, but not
         estimated (Schmidt-Kalman filter).
         """
-        carried, out = self.carried, np.zeros((self.carried.model.count,) * 2)
-        if carried.model.square:
-            out += self._considered(free_attitude.square_changes(carried))
-        if not carried.model.bench.angles and carried.model.effects:
-            out += self._considered(free_attitude.triad_changes(carried))
+        linearised, out = self.linearised, np.zeros((self.linearised.model.count,) * 2)
+        if linearised.model.square:
+            out += self._considered(free_attitude.square_changes(linearised))
+        if not linearised.model.bench.angles and linearised.model.effects:
+            out += self._considered(free_attitude.triad_changes(linearised))
         if self.noise.sensitivity_mps2_per_k is not None:
-            out += self._considered(thermometer_errors(carried.turned, self.noise.sensitivity_mps2_per_k))
-        for known in carried.model.known:
-            columns = candidate_columns(carried.turned, [known.effect], carried.model.bench, carried.state)
-            out += self._considered([own @ known.root for own in columns])
-        for effect in carried.model.stepped:
-            spread, part = self.spreads.get(str(effect), 0.0), carried.model.parts[str(effect)]
-            ends = [effect.at(effect.value * math.exp(step)) for step in (spread, -spread)]
-            more, less = (candidate_columns(carried.turned, [end], carried.model.bench, carried.state) for end in ends)
-            out += self._considered(
-                [0.5 * (a - b) @ carried.state[part, None] for a, b in zip(more, less, strict=True)]
+            out += self._considered(thermometer_errors(linearised.dwells_at_state, self.noise.sensitivity_mps2_per_k))
+        for known in linearised.model.known:
+            columns = candidate_columns(
+                linearised.dwells_at_state, [known.effect], linearised.model.bench, linearised.state
             )
-        if (flicker_mps2 := self.noise.flicker_mps2) is not None and carried.model.effects:
+            out += self._considered([own @ known.root for own in columns])
+        for effect in linearised.model.stepped:
+            spread, part = self.spreads.get(str(effect), 0.0), linearised.model.parts[str(effect)]
+            ends = [effect.at(effect.value * math.exp(step)) for step in (spread, -spread)]
+            more, less = (
+                candidate_columns(linearised.dwells_at_state, [end], linearised.model.bench, linearised.state)
+                for end in ends
+            )
+            out += self._considered(
+                [0.5 * (a - b) @ linearised.state[part, None] for a, b in zip(more, less, strict=True)]
+            )
+        if (flicker_mps2 := self.noise.flicker_mps2) is not None and linearised.model.effects:
             out += self._considered_of_effects(flicker_mps2)
         return out
 
@@ -143,7 +159,7 @@ class Fit:
         """Return B (p, p) of the waves of 1/f noise that are slower than a dwell, as far as they enter the coefficients
         of effects: noise that is alike in consecutive dwells looks like a drift, and the scatter from dwell to dwell
         has all of it for the twelve parameters, which do not."""
-        columns, sigma = slow_waves(self.carried.turned, flicker_mps2)
+        columns, sigma = slow_waves(self.linearised.dwells_at_state, flicker_mps2)
         extra = self._considered([values * sigma for values in columns])
         covariance = self._solution[1]
         gained = (covariance @ extra @ covariance)[STATE_COUNT:, STATE_COUNT:]
@@ -157,10 +173,14 @@ class Fit:
     def _considered(self, changes: Sequence[Floats]) -> Floats:
         """Return B (p, p) of considered constants from the changes (pieces, K nodes, 3, c) of each dwell's readings by
         1 sigma of each."""
-        carried, count = self.carried, self.carried.model.count
-        columns = [np.concatenate(both, axis=3) for both in zip(carried.columns, changes, strict=True)]
+        linearised, count = self.linearised, self.linearised.model.count
+        columns = [np.concatenate(both, axis=3) for both in zip(linearised.columns, changes, strict=True)]
         rows = square_root_information.whiten(
-            carried.turned, columns, self.noise.weights, carried.state, flicker_mps2=self.noise.flicker_mps2
+            linearised.dwells_at_state,
+            columns,
+            self.noise.weights,
+            linearised.state,
+            flicker_mps2=self.noise.flicker_mps2,
         )
         upper = square_root_information.accumulate(rows, self.steps)
         gains = upper[:count, :count].T @ upper[:count, count:-1]
@@ -184,33 +204,33 @@ class Fit:
     def misfit(self) -> float:
         """Chi-squared of the dwells' means under the same likelihood as ``walk_gain`` and ``scatter_gain``."""
         noise, means, prior = self._wandering
-        return misfit(noise, means, self.carried.state, prior)
+        return misfit(noise, means, self.linearised.state, prior)
 
     def _gain_of(self, part: Part) -> float:
         """Return the gain in log-likelihood of one part of the noise."""
         noise, means, prior = self._wandering
-        return gain_of(part, noise, means, self.carried.state, prior)
+        return gain_of(part, noise, means, self.linearised.state, prior)
 
     @cached_property
     def _wandering(self) -> tuple[Noise, Means, Floats]:
         """Return the noise without a walk, the means with columns for slow scatter, and the prior of these columns."""
-        noise, carried = replace(self.noise.judging, walk_mps2_per_sqrt_s=0.0), self.carried
-        return noise, *with_shared_noise(carried.dwells, noise, carried.means)
+        noise, linearised = replace(self.noise.for_goodness_of_fit, walk_mps2_per_sqrt_s=0.0), self.linearised
+        return noise, *with_shared_noise(linearised.dwells, noise, linearised.means)
 
     @cached_property
-    def back_gains(self) -> tuple[Floats, Floats]:
+    def gauss_markov_gains(self) -> tuple[Floats, Floats]:
         """Gains in log-likelihood (k,) of mean-reverting (Gauss-Markov) walks over the likeliest random walk, and their
         time constants (k,), s.
 
         The slow part of a stated scatter is allowed for.
         """
         _, means, prior = self._wandering
-        return restoring_gains(self.noise.judging, means, self.carried.state, prior)
+        return gauss_markov_gains(self.noise.for_goodness_of_fit, means, self.linearised.state, prior)
 
     @property
-    def back_gain(self) -> tuple[float, float]:
+    def gauss_markov_gain(self) -> tuple[float, float]:
         """The largest of these gains, 0 where none gains anything, and its time constant, s."""
-        gains, times_s = self.back_gains
+        gains, times_s = self.gauss_markov_gains
         best = int(np.argmax(gains))
         return max(float(gains[best]), 0.0), float(times_s[best])
 
@@ -223,11 +243,11 @@ class Fit:
         return self._whitened(self.noise.weights)
 
     def _whitened(self, noise: Noise) -> list[Floats]:
-        carried = self.carried
+        linearised = self.linearised
         rows = square_root_information.whiten(
-            carried.turned, carried.columns, noise, carried.state, flicker_mps2=noise.flicker_mps2
+            linearised.dwells_at_state, linearised.columns, noise, linearised.state, flicker_mps2=noise.flicker_mps2
         )
-        return square_root_information.with_frame(rows, carried.model, noise)
+        return square_root_information.with_frame(rows, linearised.model, noise)
 
 
 def fit(
@@ -249,16 +269,18 @@ def fit(
     """
     slews = [slew for slew in slews if slew.number >= dwells[0].number] if model.dynamic else []
     fitted = _begun(dwells, model, slews, walk_mps2_per_sqrt_s)
-    model, within, bench = fitted.carried.model, fitted.noise, model.bench
+    model, within, bench = fitted.linearised.model, fitted.noise, model.bench
     searching, sizes, left = False, None, 0.0
     for number in range(_most_passes(model)):
         if number == 1 and model.unknowns:
             model, searching = _placed(fitted), True
-            fitted = replace(fitted, carried=linearised(fitted.carried, fitted.noise, model, fitted.carried.state))
+            fitted = replace(
+                fitted, linearised=relinearised(fitted.linearised, fitted.noise, model, fitted.linearised.state)
+            )
         if number and model.stepped:
             model, spreads = _averaged(fitted)
-            carried = linearised(fitted.carried, fitted.noise, model, fitted.carried.state)
-            fitted = replace(fitted, carried=carried, spreads=spreads)
+            linearised = relinearised(fitted.linearised, fitted.noise, model, fitted.linearised.state)
+            fitted = replace(fitted, linearised=linearised, spreads=spreads)
         state, moved = _solved(fitted)
         if not (bench.angles or _sensible(state)):
             if must_settle:
@@ -267,22 +289,24 @@ def fit(
         reach, left = _reach(fitted), _left_to_settle(fitted, state)
         if searching:
             model = model.moved(np.clip(moved, -reach, reach))
-        carried = _moved_to(fitted, model, state)
-        state = carried.state
+        linearised = _moved_to(fitted, model, state)
+        state = linearised.state
         stated = _setting_deg(dwells, bench), bench.scatter_sigma_mps2
         within = replace(
-            within, sensitivity_mps2_per_k=sensitivity_to_temperature(carried, within.effective_sigma_mps2)
+            within, sensitivity_mps2_per_k=sensitivity_to_temperature(linearised, within.effective_sigma_mps2)
         )
-        means, prior = with_shared_noise(carried.dwells, within, carried.means)
-        noise, sizes = with_dwell_parts(within, means, state, *stated, walks=model.walks, near=sizes, prior=prior)
+        means, prior = with_shared_noise(linearised.dwells, within, linearised.means)
+        noise, sizes = estimate_variance_components(
+            within, means, state, *stated, walks=model.walks, start=sizes, prior=prior
+        )
         noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
-        flicker_mps2 = flicker_within(carried, noise)
+        flicker_mps2 = flicker_within(linearised, noise)
         noise = replace(noise, flicker_mps2=flicker_mps2 if flicker_mps2.any() else None)
         turning = noise.weights.setting_rad > 0.0
-        fitted = replace(fitted, carried=carried, noise=noise)
+        fitted = replace(fitted, linearised=linearised, noise=noise)
         if model.walks or noise.attitude_unknown:
-            along = _along(carried, noise)
-            own = within_dwells(carried.dwells, noise.walk_mps2_per_sqrt_s, along)
+            along = _along(linearised, noise)
+            own = within_dwells(linearised.dwells, noise.walk_mps2_per_sqrt_s, along)
             within = replace(within, sigma_mps2=own.sigma_mps2, inflation=own.inflation)
         # a constant without a derivative holds the input axes near their linearisation, so that convergence is slow
         still = (np.abs(moved) <= _STILL * reach).all() and not model.stepped
@@ -293,11 +317,11 @@ def fit(
     return fitted
 
 
-def _along(carried: Carried, noise: Noise) -> Floats | None:
+def _along(linearised: LinearisedDwells, noise: Noise) -> Floats | None:
     """Return the weights (D, 3) of the channels in the size of the force where attitudes are not known, else None."""
     if not noise.attitude_unknown:
         return None
-    return along_force(carried.turned, sensitivities_of(carried.turned, carried.state))
+    return along_force(linearised.dwells_at_state, sensitivities_of(linearised.dwells_at_state, linearised.state))
 
 
 def _not_settled(model: Model) -> str:
@@ -334,7 +358,7 @@ def _begun(dwells: list[DwellFactor], model: Model, slews: Sequence[DwellFactor]
     if model.bench.angles:
         within = replace(within_dwells(dwells, walk_mps2_per_sqrt_s), walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
         dwells = [without_attitude(dwell) for dwell in dwells]
-        return Fit(Carried(dwells, model, model.nominal_state(), slews), within)
+        return Fit(LinearisedDwells(dwells, model, model.nominal_state(), slews), within)
     readings, stated = np.array([dwell.means[4:] for dwell in dwells]), model.bench.scatter_sigma_mps2
     facing_up = readings / np.linalg.norm(readings, axis=1, keepdims=True)
     within = within_dwells(dwells, walk_mps2_per_sqrt_s, facing_up)
@@ -344,15 +368,15 @@ def _begun(dwells: list[DwellFactor], model: Model, slews: Sequence[DwellFactor]
     )  # fmt: skip
     bare = Model(model.bench, square=True)
     facing = facing_readings(dwells, bare.nominal_state(), bare.bench.gravity_mps2)
-    begun = Fit(Carried(facing, bare, bare.nominal_state()), noise)
-    free_attitude.refuse_poses(begun.carried, noise)
+    begun = Fit(LinearisedDwells(facing, bare, bare.nominal_state()), noise)
+    free_attitude.refuse_poses(begun.linearised, noise)
     settled = _settled(begun)
-    if free_attitude.tells_angles(settled.carried, noise):
+    if free_attitude.tells_angles(settled.linearised, noise):
         bare = Model(model.bench)
-        settled = _settled(Fit(linearised(settled.carried, noise, bare, settled.carried.state), noise))
-    state = np.append(settled.carried.state, np.zeros(model.count - STATE_COUNT))
-    whole = replace(model, square=settled.carried.model.square)
-    return Fit(Carried(settled.dwells, whole, state), noise)
+        settled = _settled(Fit(relinearised(settled.linearised, noise, bare, settled.linearised.state), noise))
+    state = np.append(settled.linearised.state, np.zeros(model.count - STATE_COUNT))
+    whole = replace(model, square=settled.linearised.model.square)
+    return Fit(LinearisedDwells(settled.dwells, whole, state), noise)
 
 
 def _settled(fitted: Fit) -> Fit:
@@ -362,29 +386,29 @@ def _settled(fitted: Fit) -> Fit:
         if not _sensible(state):
             break
         left = _left_to_settle(fitted, state)
-        fitted = replace(fitted, carried=_moved_to(fitted, fitted.carried.model, state))
+        fitted = replace(fitted, linearised=_moved_to(fitted, fitted.linearised.model, state))
         if left < SETTLED:
             return fitted
-    raise UnobservableError(_not_sensible(fitted.carried.model))
+    raise UnobservableError(_not_sensible(fitted.linearised.model))
 
 
 def _left_to_settle(fitted: Fit, state: Floats) -> float:
     """Return by how many sigmas the fit moves from its linearisation; 0 where no attitude moves with it."""
     turning = fitted.noise.weights.setting_rad > 0.0
-    return left_to_settle(state, fitted.carried.state, fitted.sigma) if turning else 0.0
+    return left_to_settle(state, fitted.linearised.state, fitted.sigma) if turning else 0.0
 
 
-def _moved_to(fitted: Fit, model: Model, state: Floats) -> Carried:
+def _moved_to(fitted: Fit, model: Model, state: Floats) -> LinearisedDwells:
     """Return the dwells linearised at a state; nearer where attitudes are not known and the misfit would grow."""
-    carried, noise = fitted.carried, fitted.noise
-    if model is carried.model and noise.attitude_unknown and not noise.walk_mps2_per_sqrt_s:
-        return descended(carried, noise, state, lambda there: _misfit(replace(fitted, carried=there)))
-    return linearised(carried, noise, model, state)
+    linearised, noise = fitted.linearised, fitted.noise
+    if model is linearised.model and noise.attitude_unknown and not noise.walk_mps2_per_sqrt_s:
+        return descended(linearised, noise, state, lambda there: _misfit(replace(fitted, linearised=there)))
+    return relinearised(linearised, noise, model, state)
 
 
 def _misfit(fitted: Fit) -> float:
     """Return chi-squared of a linearisation at its own state."""
-    state = fitted.carried.state
+    state = fitted.linearised.state
     return float(sum(np.sum((rows[:, -1] - rows[:, :-1] @ state) ** 2) for rows in fitted.all_rows()))
 
 
@@ -408,7 +432,7 @@ def _solved(fitted: Fit) -> tuple[Floats, Floats]:
     elsewhere."""
     state = fitted.state.copy()
     moved = np.zeros_like(state)
-    places = list(fitted.carried.model.unknowns)
+    places = list(fitted.linearised.model.unknowns)
     moved[places], state[places] = state[places], 0.0
     return state, moved
 
@@ -416,9 +440,9 @@ def _solved(fitted: Fit) -> tuple[Floats, Floats]:
 def _reach(fitted: Fit) -> Floats:
     """Return the largest allowed step (p,) of each state: for an unknown constant by its kind, 1 for the others, which
     are not moved."""
-    model, reach = fitted.carried.model, np.ones(fitted.carried.model.count)
+    model, reach = fitted.linearised.model, np.ones(fitted.linearised.model.count)
     if model.unknowns:
-        stimulus = stimulus_of(fitted.carried.turned, model.bench, fitted.carried.state)
+        stimulus = stimulus_of(fitted.linearised.dwells_at_state, model.bench, fitted.linearised.state)
         for k, effect in model.unknowns.items():
             reach[k] = effect.reach(stimulus)
     return reach
@@ -431,9 +455,9 @@ def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
     residuals is one. The rows are weighted sums over whole slews, so that noise that is correlated along a slew (of
     angles, by vibration) is included.
     """
-    carried, rows = fitted.carried, np.concatenate(fitted.following)
+    linearised, rows = fitted.linearised, np.concatenate(fitted.following)
     squares, counts = np.zeros(3), 0
-    for slew, columns in zip(carried.slews, carried.slew_columns, strict=True):
+    for slew, columns in zip(linearised.slews, linearised.slew_columns, strict=True):
         model = np.moveaxis(columns @ state, 2, 1)  # (pieces, channels, nodes)
         own = slew.triangles[:, :, slew.width :].copy()
         own[:, : slew.width] -= slew.triangles[:, : slew.width, : slew.width] @ on_basis(np.moveaxis(model, 1, 2))
@@ -451,8 +475,8 @@ def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
 
 def _placed(fitted: Fit) -> Model:
     """Return the model with each unknown constant at the grid value at which its effect lowers chi-squared most."""
-    model = fitted.carried.model
-    stimulus = stimulus_of(fitted.carried.turned, model.bench, fitted.carried.state)
+    model = fitted.linearised.model
+    stimulus = stimulus_of(fitted.linearised.dwells_at_state, model.bench, fitted.linearised.state)
     for effect in model.unknowns.values():
         grid = [effect.at(value) for value in effect.grid(stimulus)]
         model = model.with_effect(grid[_best(fitted, model - effect, grid)])
@@ -466,13 +490,13 @@ def _averaged(fitted: Fit) -> tuple[Model, dict[str, float]]:
     The likelihood is exp(decrease of chi^2 / 2) and the prior is flat in ln(value). The likelihood is constant between
     values at which the columns step.
     """
-    model, spreads = fitted.carried.model, dict[str, float]()
-    stimulus = stimulus_of(fitted.carried.turned, model.bench, fitted.carried.state)
+    model, spreads = fitted.linearised.model, dict[str, float]()
+    stimulus = stimulus_of(fitted.linearised.dwells_at_state, model.bench, fitted.linearised.state)
     for effect in model.stepped:
         edges = np.log(effect.edges(stimulus))
         middles, widths = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
-        falls = _falls(fitted, model - effect, [effect.at(value) for value in np.exp(middles)])
-        weights = np.exp(0.5 * (falls - falls.max())) * widths
+        deltas = _falls(fitted, model - effect, [effect.at(value) for value in np.exp(middles)])
+        weights = np.exp(0.5 * (deltas - deltas.max())) * widths
         mean = float(np.average(middles, weights=weights))
         spreads[str(effect)] = float(np.sqrt(np.average((middles - mean) ** 2 + widths**2 / 12.0, weights=weights)))
         model = model.with_effect(effect.at(math.exp(mean)))
@@ -488,6 +512,6 @@ def _best(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> int:
 def _falls(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> Floats:
     """Return the decrease of chi-squared for the same effect at several values, each added to the ``rest`` of the
     model."""
-    parts, state = fitted.carried.model.parts, fitted.carried.state
+    parts, state = fitted.linearised.model.parts, fitted.linearised.state
     state = np.concatenate([state[:STATE_COUNT], *(state[parts[str(effect)]] for effect in rest.effects)])
-    return falls(Carried(fitted.dwells, rest, state), fitted.noise.weights, grid)
+    return delta_chi2(LinearisedDwells(fitted.dwells, rest, state), fitted.noise.weights, grid)

@@ -12,7 +12,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.noise_model import Noise
 from kf_calib.estimation.nuisance_states import SLOW, along_force, flicker_waves, sensitivities_of
 
@@ -20,20 +20,20 @@ _GRID = np.geomspace(1e-3, 1e5, 161)  # of h, in variances of the amplitudes by 
 _CLEAR = 0.5 * 3.84  # gain in log-likelihood over none: 1/f noise that is less clear changes no sigma
 
 
-def flicker_within(carried: Carried, noise: Noise) -> Floats:
+def flicker_within(linearised: LinearisedDwells, noise: Noise) -> Floats:
     """sqrt(h) (3,) of the 1/f noise within dwells; zeros where the dwells do not scatter, or show no slow waves.
 
     The likeliest h of each accelerometer; one for all three where attitudes are not known.
     """
-    if not noise.scatter_mps2.any() or noise.walk_mps2_per_sqrt_s or carried.carrier_hz:
+    if not noise.scatter_mps2.any() or noise.walk_mps2_per_sqrt_s or linearised.carrier_hz:
         return np.zeros(3)
-    channels = np.eye(3)[None].repeat(len(carried.turned), axis=0)
+    channels = np.eye(3)[None].repeat(len(linearised.dwells_at_state), axis=0)
     if noise.attitude_unknown:
-        along = along_force(carried.turned, sensitivities_of(carried.turned, carried.state))
+        along = along_force(linearised.dwells_at_state, sensitivities_of(linearised.dwells_at_state, linearised.state))
         channels = (along / np.linalg.norm(along, axis=1, keepdims=True))[:, None]
     pairs = [
-        _amplitudes(dwell, columns @ carried.state, noise.effective_sigma_mps2, weights)
-        for dwell, columns, weights in zip(carried.turned, carried.columns, channels, strict=True)
+        _amplitudes(dwell, columns @ linearised.state, noise.effective_sigma_mps2, weights)
+        for dwell, columns, weights in zip(linearised.dwells_at_state, linearised.columns, channels, strict=True)
     ]
     amplitudes, variances = (np.array(values) for values in zip(*pairs, strict=True))  # (D, k, c) each
     return np.broadcast_to([_likeliest(amplitudes[..., i], variances[..., i]) for i in range(channels.shape[1])], 3)

@@ -22,7 +22,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.attitude import added_by, bent_effects, matrix_of
-from kf_calib.estimation.dwell_columns import Carried, Means, stimulus_of
+from kf_calib.estimation.dwell_columns import LinearisedDwells, Means, stimulus_of
 from kf_calib.estimation.measurement_model import FRAME, SQUARE, STATE_COUNT
 from kf_calib.estimation.noise_model import Noise
 from kf_calib.estimation.samples import Samples, all_nuisance_sigmas
@@ -56,11 +56,11 @@ def regressors_of(means: Means) -> Floats:
     return out
 
 
-def covariance_of(carried: Carried, noise: Noise, square_rad: float = 1.0) -> Floats:
+def covariance_of(linearised: LinearisedDwells, noise: Noise, square_rad: float = 1.0) -> Floats:
     """Covariance (12, 12) that the dwells give of the nine parameters, with weak knowledge of each: 100 % of a scale
     factor, 10 m/s^2 of a bias, and ``square_rad`` of each angle between axes."""
-    means = carried.means
-    across = weights_of_size(means, carried.state)
+    means = linearised.means
+    across = weights_of_size(means, linearised.state)
     design = np.einsum("di,dip->dp", across, regressors_of(means))
     variance = across**2 @ (noise.scatter_mps2**2) + ((across * noise.effective_sigma_mps2) ** 2).sum(1) / means.counts
     nine = np.ix_(_NINE, _NINE)
@@ -86,28 +86,28 @@ def row_of(up: str, state: Floats, gravity_mps2: float) -> tuple[Floats, Floats]
     return row, np.asarray(across, float)
 
 
-def tells_angles(carried: Carried, noise: Noise) -> bool:
+def tells_angles(linearised: LinearisedDwells, noise: Noise) -> bool:
     """Whether the dwells tell every angle between the axes better than they are known to be square."""
-    covariance, places = covariance_of(carried, noise), list(SQUARE)
-    scale = carried.state[:STATE_COUNT].reshape(3, 4)[:, :3].diagonal()[[1, 2, 2]]
+    covariance, places = covariance_of(linearised, noise), list(SQUARE)
+    scale = linearised.state[:STATE_COUNT].reshape(3, 4)[:, :3].diagonal()[[1, 2, 2]]
     spread = covariance[np.ix_(places, places)] / np.outer(scale, scale)
-    return float(np.linalg.eigvalsh(spread)[-1]) < carried.model.bench.square_rad**2
+    return float(np.linalg.eigvalsh(spread)[-1]) < linearised.model.bench.square_rad**2
 
 
-def square_changes(carried: Carried) -> list[Floats]:
+def square_changes(linearised: LinearisedDwells) -> list[Floats]:
     """Changes (pieces, nodes, 3, 3) of each dwell's readings if one of the three angles between the axes is 1 sigma
     from square."""
-    out, affine = list[Floats](), carried.state[:STATE_COUNT].reshape(3, 4)
-    for dwell in carried.dwells:
+    out, affine = list[Floats](), linearised.state[:STATE_COUNT].reshape(3, 4)
+    for dwell in linearised.dwells:
         force = np.array([piece.nodes.force_mps2 for piece in dwell.pieces])
         own = np.zeros((*force.shape[:2], 3, len(SQUARE)))
         for k, (channel, axis) in enumerate(divmod(place, 4) for place in SQUARE):
-            own[:, :, channel, k] = force[:, :, axis] * affine[channel, channel] * carried.model.bench.square_rad
+            own[:, :, channel, k] = force[:, :, axis] * affine[channel, channel] * linearised.model.bench.square_rad
         out.append(own)
     return out
 
 
-def triad_changes(carried: Carried) -> list[Floats]:
+def triad_changes(linearised: LinearisedDwells) -> list[Floats]:
     """Changes (pieces, nodes, 3, 3) of each dwell's readings by the effects of the model if the pendulous and output
     axes are turned by 1 sigma about each axis of the frame.
 
@@ -115,12 +115,12 @@ def triad_changes(carried: Carried) -> list[Floats]:
     axes do from a square. With square axes, |f| does not tell the three coefficients of some effects from each other;
     what else would is no more than this uncertainty of where their axes are.
     """
-    model, state = carried.model, carried.state
+    model, state = linearised.model, linearised.state
     sensitivity = state[:STATE_COUNT].reshape(3, 4)[:, :3]
     unit = sensitivity / np.linalg.norm(sensitivity, axis=1, keepdims=True)
     off_square = math.sqrt(float(np.mean((unit @ unit.T)[np.triu_indices(3, 1)] ** 2)))
     sigma_rad = max(model.bench.square_rad, off_square)
-    stimulus = stimulus_of(carried.turned, model.bench, state)
+    stimulus = stimulus_of(linearised.dwells_at_state, model.bench, state)
     changes = np.zeros((len(stimulus), 3, 3))
     for axis in range(3):
         ends = list[Floats]()
@@ -133,9 +133,9 @@ def triad_changes(carried: Carried) -> list[Floats]:
             ends.append(added_by(bent_effects(model, state), turned, model, state))
         changes[:, :, axis] = (ends[0] - ends[1]) * (0.5 * sigma_rad / _TRIAD_STEP_RAD)
     shaped = changes.reshape(-1, 3, 3, 3)
-    width = carried.columns[0].shape[1]
+    width = linearised.columns[0].shape[1]
     padded = np.concatenate([shaped, np.zeros((len(shaped), width - 3, 3, 3))], axis=1)
-    return np.split(padded, np.cumsum([len(dwell.pieces) for dwell in carried.dwells])[:-1])
+    return np.split(padded, np.cumsum([len(dwell.pieces) for dwell in linearised.dwells])[:-1])
 
 
 def undetermined(covariance: Floats) -> list[str]:
@@ -145,22 +145,22 @@ def undetermined(covariance: Floats) -> list[str]:
     return poor + [f"b{i + 1}" for i in range(3) if sigma[i, 3] > _HOPELESS_MPS2]
 
 
-def refuse_poses(carried: Carried, noise: Noise) -> None:
+def refuse_poses(linearised: LinearisedDwells, noise: Noise) -> None:
     """Raise UnobservableError if the poses do not determine every scale factor and bias, and say which is missing."""
-    covariance = covariance_of(carried, noise, carried.model.bench.square_rad)
+    covariance = covariance_of(linearised, noise, linearised.model.bench.square_rad)
     if poor := undetermined(covariance):
-        dwells = len(carried.dwells)
-        up = most_informative(covariance, carried.state, carried.model.bench.gravity_mps2)
+        dwells = len(linearised.dwells)
+        up = most_informative(covariance, linearised.state, linearised.model.bench.gravity_mps2)
         raise UnobservableError(
             f"{dwells} pose{'s do' if dwells != 1 else ' does'} not determine {', '.join(poor)}: turn it so that "
             f"{up_in_words(up)}, hold it still, and go on until each axis has pointed up and down."
         )
 
 
-def next_in_words(carried: Carried, noise: Noise) -> str:
+def next_in_words(linearised: LinearisedDwells, noise: Noise) -> str:
     """Which axes should point up next, in words."""
-    covariance = covariance_of(carried, noise, carried.model.bench.square_rad)
-    return up_in_words(most_informative(covariance, carried.state, carried.model.bench.gravity_mps2))
+    covariance = covariance_of(linearised, noise, linearised.model.bench.square_rad)
+    return up_in_words(most_informative(covariance, linearised.state, linearised.model.bench.gravity_mps2))
 
 
 def up_in_words(up: str) -> str:
@@ -184,13 +184,13 @@ def most_informative(covariance: Floats, state: Floats, gravity_mps2: float) -> 
     return best
 
 
-def holding_frame(samples: Iterable[Samples], carried: Carried, noise: Noise) -> Iterator[Samples]:
+def holding_frame(samples: Iterable[Samples], linearised: LinearisedDwells, noise: Noise) -> Iterator[Samples]:
     """Yield first a reading of each state that is fixed at zero, times g, then the samples."""
-    fixed, sigmas = carried.model.fixed, all_nuisance_sigmas(noise)
+    fixed, sigmas = linearised.model.fixed, all_nuisance_sigmas(noise)
     if fixed:
-        observation = np.zeros((len(fixed), 1, carried.model.count))
-        observation[np.arange(len(fixed)), 0, list(fixed)] = carried.model.bench.gravity_mps2
-        number, start_s = carried.dwells[0].number, np.full(len(fixed), carried.dwells[0].start_s)
+        observation = np.zeros((len(fixed), 1, linearised.model.count))
+        observation[np.arange(len(fixed)), 0, list(fixed)] = linearised.model.bench.gravity_mps2
+        number, start_s = linearised.dwells[0].number, np.full(len(fixed), linearised.dwells[0].start_s)
         none, readings = np.zeros((len(fixed), 1, len(sigmas))), np.zeros((len(fixed), 1))
         sigma_mps2 = noise.effective_sigma_mps2[:1]
         yield Samples(number, start_s, observation, none, sigmas, readings, np.zeros((len(fixed), 3)), sigma_mps2)

@@ -16,7 +16,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.qr import triangle
 from kf_calib.effects import Effect
 from kf_calib.estimation.complement import Complement
-from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.score_test import (
     Frame,
     Scan,
@@ -30,14 +30,14 @@ from kf_calib.estimation.score_test import (
 
 
 class FurtherEffects:
-    """Tests of groups of effects beside the model in ``carried``, compared with ``known`` effects.
+    """Tests of groups of effects beside the model in ``linearised``, compared with ``known`` effects.
 
     An effect counts as known if the cosine of the largest angle between it and one of these is above ``cosine``.
     """
 
-    def __init__(self, frame: Frame, carried: Carried, known: Sequence[Effect], cosine: float) -> None:
-        self._frame, self._carried, self._cosine = frame, carried, cosine
-        rows, width = frame.whitened_model(carried)
+    def __init__(self, frame: Frame, linearised: LinearisedDwells, known: Sequence[Effect], cosine: float) -> None:
+        self._frame, self._carried, self._cosine = frame, linearised, cosine
+        rows, width = frame.whitened_model(linearised)
         self._beside = Complement(rows, width)
         self._residual = self._beside.of(rows[:, -1])
         self._known, self._parts = self._bases(known)

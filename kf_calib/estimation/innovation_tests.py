@@ -87,8 +87,8 @@ def innovation_tests(result: Calibration) -> InnovationTests:
 def _ratios(result: Calibration) -> Floats:
     """Return innovations over their sigma (D, 3), also of readings that are predicted while some states are not yet."""
     out = np.array([visit.innovation_mps2 / visit.innovation_sigma_mps2 for visit in result.visits])
-    means, visits = result.carried.means, result.visits
-    own = mean_covariances(result.noise.of_readings, means, result.carried.state)
+    means, visits = result.linearised.means, result.visits
+    own = mean_covariances(result.noise.of_readings, means, result.linearised.state)
     for k in np.flatnonzero(np.isnan(out).any(axis=1) & (np.arange(len(out)) > 0)):
         before, rows = visits[k - 1].estimate, means.design[k]
         lost = before.undetermined / np.linalg.norm(before.undetermined, axis=0)

@@ -97,7 +97,7 @@ class Noise:
         return self if self.checked else replace(self, setting_rad=0.0)
 
     @property
-    def judging(self) -> Noise:
+    def for_goodness_of_fit(self) -> Noise:
         """The noise by which the misfit is judged: without scatter, and an unclear setting error, that were estimated
         from this misfit itself, unless no other noise is known."""
         if not self.within_seen:

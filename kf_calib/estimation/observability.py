@@ -14,7 +14,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.effects import Coefficient, Effect, effect_named, names
-from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.score_test import Candidate, Scan, scan
@@ -87,7 +87,7 @@ def visibility_of(fitted: Fit, effects: Sequence[Effect]) -> list[Visibility]:
     """The visibility of each effect beside the model without it; an unknown constant is at the value at which the
     effect shows best."""
     with one_blas_thread():
-        model = fitted.carried.model
+        model = fitted.linearised.model
         inside = [each for each in effects if str(each) in model.parts]
         seen = {str(each): _beside(fitted, model - each, [each])[0] for each in inside}
         outside = [each for each in effects if str(each) not in seen]
@@ -101,9 +101,9 @@ def _beside(fitted: Fit, model: Model, effects: Sequence[Effect]) -> list[Visibi
     bench, named = model.bench, {str(each) for each in effects}
     others = [effect_named(name, bench) for name in names(bench) if name not in named | set(model.parts)]
     tried = [at for each in (*effects, *others) if not each.no_columns for at in _values(each)]
-    state = np.concatenate([fitted.carried.state[:STATE_COUNT], np.zeros(model.count - STATE_COUNT)])
-    carried = Carried(fitted.dwells, model, state)
-    found = scan(carried, fitted.noise.judging, tried)
+    state = np.concatenate([fitted.linearised.state[:STATE_COUNT], np.zeros(model.count - STATE_COUNT)])
+    linearised = LinearisedDwells(fitted.dwells, model, state)
+    found = scan(linearised, fitted.noise.for_goodness_of_fit, tried)
     return [replace(_sight(found, each), degeneracy=each.degeneracy(bench)) for each in effects]
 
 

@@ -48,12 +48,12 @@ def _may_leave(slow: Fit, line: Line) -> bool:
     What is left is near it, or at one to two cycles a dwell. Otherwise the fit is no more than a drift that the
     oscillation mimics; less than half a cycle a run is no oscillation.
     """
-    dwells, effect = slow.dwells, slow.carried.model.oscillation
+    dwells, effect = slow.dwells, slow.linearised.model.oscillation
     assert effect is not None
     apart = abs(line.frequency_hz - effect.value) * max(dwell.end_s - dwell.start_s for dwell in dwells)
     if apart > _APART or effect.value * (dwells[-1].end_s - dwells[0].start_s) < 0.5:
         return False
-    part = slow.carried.model.parts[str(effect)]
+    part = slow.linearised.model.parts[str(effect)]
     amplitude = float(np.linalg.norm(slow.state[part][: len(effect.coefficients)]))
     seen = float(np.linalg.norm(line.amplitude_mps2))
     return _cycles(slow) >= _SLOW or amplitude**2 * _LEFT > seen**2
@@ -72,7 +72,7 @@ def holds_its_oscillation(fitted: Fit) -> bool:
     and its remainder shows no line.
     """
     dwells = fitted.dwells
-    if not fitted.carried.model.oscillates or dwells[0].carrier_hz:
+    if not fitted.linearised.model.oscillates or dwells[0].carrier_hz:
         return True
     return _cycles(fitted) < _SLOW and not lines_of(dwells)
 
@@ -105,6 +105,6 @@ def _cycles(fitted: Fit) -> float:
 
 def _oscillation_hz(fitted: Fit) -> float:
     """Return the frequency of the model's oscillation."""
-    effect = fitted.carried.model.oscillation
+    effect = fitted.linearised.model.oscillation
     assert effect is not None
     return effect.value

@@ -19,7 +19,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_without
 from kf_calib.estimation.attitude import without_attitude
-from kf_calib.estimation.dwell_columns import Carried, Means, turning_mps2
+from kf_calib.estimation.dwell_columns import LinearisedDwells, Means, turning_mps2
 from kf_calib.estimation.noise_model import lift_rounding, mean_covariances
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Turn
 from kf_calib.support.tail_probabilities import f_tail
@@ -65,15 +65,15 @@ def _test_dwell(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell
     if rest.consistency.consistent is not True:
         return None
     dwells, estimate, noise = result.fit.dwells, rest.estimate, rest.noise
-    carried = Carried([without_attitude(dwell) for dwell in dwells], rest.model, estimate.state)
-    means = carried.means[[k]]
+    linearised = LinearisedDwells([without_attitude(dwell) for dwell in dwells], rest.model, estimate.state)
+    means = linearised.means[[k]]
     error, covariance = means.readings[0] - means.design[0] @ estimate.state, _covariance(rest, means)
     freedom = 1e9 if noise.setting_stated and noise.scatter_stated else max(rest.consistency.dof, 1)
     statistic = float(error @ np.linalg.solve(covariance, error))
     p_value = min(len(dwells) * f_tail(3.0, freedom, statistic / 3.0), 1.0)
     if p_value > _BEYOND_DOUBT:
         return None
-    turns = tuple(_turns(carried.turned[k], means, rest))
+    turns = tuple(_turns(linearised.dwells_at_state[k], means, rest))
     if not turns and np.linalg.norm(error) < _GROSS * result.bench.gravity_mps2:
         return None
     return OutlyingDwell(dwells[k], dwells[k].number, error, p_value, turns, rest)

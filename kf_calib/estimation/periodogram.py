@@ -22,7 +22,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import BIASES
 from kf_calib.effects import Effect
 from kf_calib.estimation import square_root_information
-from kf_calib.estimation.dwell_columns import Carried, candidate_columns, piece_columns, stimulus_of
+from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, piece_columns, stimulus_of
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise, steps
 from kf_calib.estimation.square_root_information import MisfitColumns
@@ -40,25 +40,25 @@ Waves = NDArray[np.complex128]
 class Periodogram:
     """The periodogram of an oscillating ``effect`` at frequencies ``values_hz`` (N,), for given dwells and noise."""
 
-    def __init__(self, carried: Carried, noise: Noise, effect: Effect, values_hz: Floats) -> None:
-        self.values_hz, self.state, self.noise = values_hz, carried.state, noise
-        dwells = carried.dwells
+    def __init__(self, linearised: LinearisedDwells, noise: Noise, effect: Effect, values_hz: Floats) -> None:
+        self.values_hz, self.state, self.noise = values_hz, linearised.state, noise
+        dwells = linearised.dwells
         self._middles_s = np.array([0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells])
         self._same_hz = _SAME_RAD / (2.0 * np.pi * float(np.abs(self._middles_s).max(initial=1e-9)))
         points_hz, self._shares = _points(values_hz, max(dwell.end_s - dwell.start_s for dwell in dwells))
         kinds, self._path = [effect.at(hz) for hz in points_hz], None
         if noise.walk_mps2_per_sqrt_s:
-            self._waves, self._ends, stacked = _waves_beside_walk(carried, noise, kinds)
+            self._waves, self._ends, stacked = _waves_beside_walk(linearised, noise, kinds)
             self._path = _Path(stacked, self._ends, steps(dwells, noise))
         else:
-            self._waves, self._ends = _waves(carried, noise, kinds)
+            self._waves, self._ends = _waves(linearised, noise, kinds)
         middles_s = np.repeat(self._middles_s, np.diff(self._ends))[:, None]
         for k, hz in enumerate(points_hz):
             self._waves[:, k] *= np.exp(-2j * np.pi * hz * middles_s)
         self._squares = self._products_of_waves()
         self._first: _Beside | None = None
 
-    def falls(self, rows: Floats, own: Floats, first: int) -> Floats:
+    def delta_chi2(self, rows: Floats, own: Floats, first: int) -> Floats:
         """Decrease of chi-squared (N,) if the oscillation at each frequency is added to a model.
 
         - rows (r, c): whitened rows [H | E | z]. The columns H, ``first`` of them, have to be the same for every model
@@ -249,10 +249,10 @@ class _Path:
         return bands.reshape(7, -1)
 
 
-def _waves(carried: Carried, noise: Noise, kinds: Sequence[Effect]) -> tuple[Waves, list[int]]:
+def _waves(linearised: LinearisedDwells, noise: Noise, kinds: Sequence[Effect]) -> tuple[Waves, list[int]]:
     """Return the whitened columns (m, points, 3) of oscillations, and where the rows of each dwell begin and end."""
-    whitening = MisfitColumns(carried.turned, noise, carried.state)
-    stimulus = stimulus_of(carried.turned, carried.model.bench, carried.state)
+    whitening = MisfitColumns(linearised.dwells_at_state, noise, linearised.state)
+    stimulus = stimulus_of(linearised.dwells_at_state, linearised.model.bench, linearised.state)
     ends = whitening.ends - whitening.ends[0]
     out = np.empty((int(ends[-1]), len(kinds), 3), np.complex128)
     for k, each in enumerate(kinds):  # one at a time, which saves memory
@@ -261,16 +261,19 @@ def _waves(carried: Carried, noise: Noise, kinds: Sequence[Effect]) -> tuple[Wav
     return out, ends.tolist()
 
 
-def _waves_beside_walk(carried: Carried, noise: Noise, kinds: Sequence[Effect]) -> tuple[Waves, list[int], Floats]:
+def _waves_beside_walk(
+    linearised: LinearisedDwells, noise: Noise, kinds: Sequence[Effect]
+) -> tuple[Waves, list[int], Floats]:
     """Return the same where the biases walk, and the rows [S | H | ...] that have the walk in them."""
-    waves = candidate_columns(carried.turned, kinds, carried.model.bench, carried.state)
+    waves = candidate_columns(linearised.dwells_at_state, kinds, linearised.model.bench, linearised.state)
     columns = [
-        np.concatenate([own[..., :STATE_COUNT], more], axis=3) for own, more in zip(carried.columns, waves, strict=True)
+        np.concatenate([own[..., :STATE_COUNT], more], axis=3)
+        for own, more in zip(linearised.columns, waves, strict=True)
     ]
     rows, width = square_root_information.misfit_rows(
-        carried.turned, columns, noise, carried.state, STATE_COUNT, reduced=False
+        linearised.dwells_at_state, columns, noise, linearised.state, STATE_COUNT, reduced=False
     )
-    rows = rows[len(rows) - len(carried.dwells) :]
+    rows = rows[len(rows) - len(linearised.dwells) :]
     stacked = np.concatenate(rows)
     parts = stacked[:, 3 + width : -1].reshape(len(stacked), len(kinds), 3, 2)
     return parts[..., 1] + 1j * parts[..., 0], np.cumsum([0, *map(len, rows)]).tolist(), stacked

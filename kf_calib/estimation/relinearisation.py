@@ -9,7 +9,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.attitude import at_their_modes, facing_readings
-from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.noise_model import Noise
 
@@ -23,30 +23,28 @@ _TURNS = 4  # most times that attitudes are found at a given state
 _STILL_RAD = 1e-7
 
 
-def linearised(carried: Carried, noise: Noise, model: Model, state: Floats) -> Carried:
+def relinearised(linearised: LinearisedDwells, noise: Noise, model: Model, state: Floats) -> LinearisedDwells:
     """The dwells with the columns of a model at a state, and attitudes where the readings show them there."""
-    known = state if len(state) == carried.model.count else carried.state
-    return Carried(at_their_modes(carried, noise, known), model, state, carried.slews)
+    known = state if len(state) == linearised.model.count else linearised.state
+    return LinearisedDwells(at_their_modes(linearised, noise, known), model, state, linearised.slews)
 
 
-def _farthest_rad(one: Carried, other: Carried) -> float:
+def _farthest_rad(one: LinearisedDwells, other: LinearisedDwells) -> float:
     """Return the largest angle between the forces of two linearisations of the same dwells."""
-    unit, there = (
-        c.means.force_mps2 / np.linalg.norm(c.means.force_mps2, axis=1, keepdims=True) for c in (one, other)
-    )
+    unit, there = (c.means.force_mps2 / np.linalg.norm(c.means.force_mps2, axis=1, keepdims=True) for c in (one, other))
     return float(np.linalg.norm(unit - there, axis=1).max())
 
 
-def carried_at(dwells: Sequence[DwellFactor], model: Model, state: Floats, noise: Noise) -> Carried:
+def linearised_at(dwells: Sequence[DwellFactor], model: Model, state: Floats, noise: Noise) -> LinearisedDwells:
     """Dwells with the columns of a model at a state, and attitudes where the readings show them there."""
     if noise.attitude_unknown:
         dwells = facing_readings(dwells, state, model.bench.gravity_mps2)
-    carried = Carried(dwells, model, state)
+    linearised = LinearisedDwells(dwells, model, state)
     for _ in range(_TURNS if noise.setting_rad else 1):
-        before, carried = carried, linearised(carried, noise, model, state)
-        if _farthest_rad(before, carried) < _STILL_RAD:
+        before, linearised = linearised, relinearised(linearised, noise, model, state)
+        if _farthest_rad(before, linearised) < _STILL_RAD:
             break
-    return carried
+    return linearised
 
 
 def at_its_mode(dwell: DwellFactor, before: DwellFactor, model: Model, state: Floats, noise: Noise) -> DwellFactor:
@@ -54,7 +52,7 @@ def at_its_mode(dwell: DwellFactor, before: DwellFactor, model: Model, state: Fl
     known: the iterated update of a filter by one dwell."""
     if not noise.setting_rad:
         return dwell
-    return carried_at([before, dwell], model, state, noise).dwells[-1]
+    return linearised_at([before, dwell], model, state, noise).dwells[-1]
 
 
 def left_to_settle(state: Floats, before: Floats, sigma: Floats) -> float:
@@ -62,18 +60,20 @@ def left_to_settle(state: Floats, before: Floats, sigma: Floats) -> float:
     return float((np.abs(state - before) / np.where(sigma > 0, sigma, np.inf)).max())
 
 
-def descended(carried: Carried, noise: Noise, state: Floats, misfit: Callable[[Carried], float]) -> Carried:
+def descended(
+    linearised: LinearisedDwells, noise: Noise, state: Floats, misfit: Callable[[LinearisedDwells], float]
+) -> LinearisedDwells:
     """The dwells linearised at ``state``, or on the way to it where the misfit is less there.
 
     misfit: of a linearisation at its own state, the sum of squares of all readings and all setting errors over their
     sigmas.
     """
-    model, begin, share = carried.model, carried.state, 1.0
-    highest = misfit(carried) * (1.0 + _UPHILL)
-    nearest = linearised(carried, noise, model, state)
+    model, begin, share = linearised.model, linearised.state, 1.0
+    highest = misfit(linearised) * (1.0 + _UPHILL)
+    nearest = relinearised(linearised, noise, model, state)
     for _ in range(_HALVES - 1):
         if misfit(nearest) <= highest:
             break
         share *= 0.5
-        nearest = linearised(carried, noise, model, begin + share * (state - begin))
+        nearest = relinearised(linearised, noise, model, begin + share * (state - begin))
     return nearest

@@ -12,7 +12,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.dwells import window_average
 from kf_calib.effects import remarks_of
 from kf_calib.estimation import free_attitude, setup_blunders
-from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.noise_model import TOO_SHORT, Noise
 from kf_calib.estimation.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, directions
 from kf_calib.estimation.results import Consistency, Estimate
@@ -61,11 +61,11 @@ def _beyond_noise(noise: Noise) -> str:
 
 
 def remarks_on(
-    carried: Carried, noise: Noise, estimate: Estimate, judged: Consistency, residuals: Floats
+    linearised: LinearisedDwells, noise: Noise, estimate: Estimate, judged: Consistency, residuals: Floats
 ) -> Iterator[str]:
     """Yield one sentence on each thing that a reader of the numbers must know."""
-    model, dwells = carried.model, carried.dwells
-    if model.dynamic and not carried.slews:
+    model, dwells = linearised.model, linearised.dwells
+    if model.dynamic and not linearised.slews:
         yield (
             f"{' and '.join(map(str, model.dynamic))} cannot be seen in this recording: it needs slew samples, "
             "readings and angles recorded all through the motions, angles at least every half second."
@@ -80,7 +80,7 @@ def remarks_on(
     unseen = [symbol for symbol, hidden in zip(paper_parameters.SYMBOLS, estimate.unseen, strict=True) if hidden]
     unseen += [c.symbol for c, s in zip(model.coefficients, estimate.effect_sigma, strict=True) if np.isnan(s)]
     if not model.bench.angles:
-        yield from _without_angles(carried, noise, judged)
+        yield from _without_angles(linearised, noise, judged)
     elif unseen:
         yield f"these orientations do not determine {', '.join(unseen)}: visit more, spread over the sphere."
     for effect in model.effects:
@@ -112,14 +112,14 @@ def remarks_on(
         slow = "; dwells are too short to tell how slow it is: stay longer in each" if short else ""
         yield f"the noise within a dwell is correlated: sigmas allow for it by inflating its variance by {kappa}{slow}."
     if not noise.checked and noise.scatter_mps2.any() and not noise.scatter_stated:
-        known = directions(carried.means.force_mps2)
+        known = directions(linearised.means.force_mps2)
         yield (
             f"these orientations have gravity in {known} different direction{'s' * (known != 1)}, too few to "
             "distinguish a setting error of the angles from scatter of the sensors: all dwells have the same weight, "
             f"and their whole misfit ({shown('m/s^2').text(noise.scatter_mps2[0], 2)}) enters every sigma. Visit "
             f"{ENOUGH_DIRECTIONS} spread directions to distinguish them."
         )
-    if model.bench.angles and unstated(noise) and degrees_of_freedom(carried.means) < FEWEST:
+    if model.bench.angles and unstated(noise) and degrees_of_freedom(linearised.means) < FEWEST:
         yield (
             f"{len(dwells)} dwell{'s are' if len(dwells) > 1 else ' is'} too few to estimate what was not stated "
             f"({' and '.join(unstated(noise))}): it is taken as zero; if it is not zero, the sigmas are too small."
@@ -130,22 +130,22 @@ def remarks_on(
             f"the angles are noisy themselves: together with the stated setting error of {stated_deg:g} deg, each "
             f"pose is uncertain by {np.degrees(noise.setting_rad):.2g} deg, which is used to weight the dwells."
         )
-    if not noise.setting_stated and noise.judging.setting_rad > 0:
+    if not noise.setting_stated and noise.for_goodness_of_fit.setting_rad > 0:
         yield (
             f"angle_sigma_deg was not stated; {np.degrees(noise.setting_rad):.2g} deg was estimated from the misfit "
             "between dwells, which an effect not in the model could also cause."
         )
 
 
-def _without_angles(carried: Carried, noise: Noise, judged: Consistency) -> Iterator[str]:
+def _without_angles(linearised: LinearisedDwells, noise: Noise, judged: Consistency) -> Iterator[str]:
     """Yield what a reader must know of a run without angles: the frame, and what the poses do not tell."""
-    model, count = carried.model, len(carried.dwells)
+    model, count = linearised.model, len(linearised.dwells)
     yield (
         "no angles are used: of each pose only |f| = g is known. The frame is that of the sensors: x is the axis of "
         "accelerometer 1, and accelerometer 2 lies in the plane of x and y (theta1, phi1 and nu2 are zero by that); "
         "how the block is mounted, left or right hand, cannot be seen."
     )
-    turn = f"next, turn it so that {free_attitude.next_in_words(carried, noise)}"
+    turn = f"next, turn it so that {free_attitude.next_in_words(linearised, noise)}"
     if model.square:
         yield (
             f"these poses do not tell the angles between the axes (nu1, theta3, phi3), which are taken for square to "

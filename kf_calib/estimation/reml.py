@@ -67,14 +67,14 @@ class Likelihood:
         return self.alone.at(np.zeros(0))
 
 
-def with_dwell_parts(
+def estimate_variance_components(
     within: Noise,
     means: Means,
     state: Floats,
     angle_sigma_deg: float | None,
     scatter_mps2: float | None,
     walks: bool = False,
-    near: Mapping[Parts, Floats] | None = None,
+    start: Mapping[Parts, Floats] | None = None,
     prior: Floats | None = None,
 ) -> tuple[Noise, Mapping[Parts, Floats]]:
     """Complete the noise within dwells by setting error, scatter and, if ``walks``, the random walk of the biases.
@@ -92,9 +92,9 @@ def with_dwell_parts(
     - angle_sigma_deg, scatter_mps2: the stated parts; None if not stated.
     - walks: estimate the intensity of a random walk of the biases.
     - prior: rows of prior knowledge about the coefficients, those of ``with_shared_noise``.
-    - near: sizes found before for similar means, which shorten the searches.
+    - start: sizes found before for similar means, which shorten the searches.
 
-    Returns the noise, and the sizes found for each combination, to be passed as ``near`` the next time.
+    Returns the noise, and the sizes found for each combination, to be passed as ``start`` the next time.
     """
     stated = replace(
         within,
@@ -123,7 +123,7 @@ def with_dwell_parts(
         combinations = [parts for parts in combinations if parts == ("setting",)]
     if not combinations:
         return stated, {}
-    return _chosen(stated, likelihood, combinations, without, near or {})
+    return _chosen(stated, likelihood, combinations, without, start or {})
 
 
 def _combinations(stated: Noise, walks: bool) -> list[Parts]:
@@ -137,7 +137,7 @@ def _combinations(stated: Noise, walks: bool) -> list[Parts]:
 
 
 def _chosen(
-    stated: Noise, likelihood: Likelihood, combinations: Sequence[Parts], without: Point, near: Mapping[Parts, Floats]
+    stated: Noise, likelihood: Likelihood, combinations: Sequence[Parts], without: Point, start: Mapping[Parts, Floats]
 ) -> tuple[Noise, Mapping[Parts, Floats]]:
     """Return the noise with the best combination of parts, and the sizes found for each combination.
 
@@ -145,27 +145,27 @@ def _chosen(
     nothing to gain under this bound is not searched.
     """
     charges = {parts: _charge(parts, likelihood) for parts in combinations}
-    best, score, most, found = (), -without.cost, math.inf, dict(near)
+    best, score, most, sizes = (), -without.cost, math.inf, dict(start)
     for parts in [combinations[-1], *sorted(combinations[:-1], key=charges.__getitem__)]:
         if most - charges[parts] <= score:
             continue
-        found[parts], point = likelihood.of(parts).most_likely(near.get(parts))
+        sizes[parts], point = likelihood.of(parts).most_likely(start.get(parts))
         most = -point.cost if parts == combinations[-1] else max(most, -point.cost)
         if -point.cost - charges[parts] > score:
             best, score = parts, -point.cost - charges[parts]
     if not best:
-        return stated, found
+        return stated, sizes
     units = np.concatenate([likelihood.units[part] for part in best])
-    noise = _with(stated, best, units * found[best])
+    noise = _with(stated, best, units * sizes[best])
     if "walk" in best:
-        spread = _last_spread(likelihood.of(best).curvature(found[best]))
+        spread = _last_spread(likelihood.of(best).curvature(sizes[best]))
         noise = replace(noise, walk_spread=spread)
     if "setting" in best:
         rest: Parts = tuple(part for part in best if part != "setting")
         cost = likelihood.of(rest).most_likely()[1].cost if rest else without.cost
-        gain = cost - likelihood.of(best).at(found[best] ** 2).cost
+        gain = cost - likelihood.of(best).at(sizes[best] ** 2).cost
         noise = replace(noise, setting_judged=2.0 * gain > _JUDGED)
-    return noise, found
+    return noise, sizes
 
 
 def _charge(parts: Parts, likelihood: Likelihood) -> float:
@@ -224,7 +224,7 @@ def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats
     return max(likelihood.without().cost - point.cost, 0.0)
 
 
-def restoring_gains(noise: Noise, means: Means, state: Floats, prior: Floats) -> tuple[Floats, Floats]:
+def gauss_markov_gains(noise: Noise, means: Means, state: Floats, prior: Floats) -> tuple[Floats, Floats]:
     """Gains in log-likelihood (k,) of mean-reverting walks over the likeliest random walk, and their time constants
     (k,), s.
 

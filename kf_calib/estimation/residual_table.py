@@ -14,7 +14,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects.formula import quantities
 from kf_calib.errors import InputError
-from kf_calib.estimation.dwell_columns import Carried, stimulus_of
+from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
 from kf_calib.estimation.noise_model import Noise, mean_covariances
 from kf_calib.support.extras import need
 
@@ -40,7 +40,7 @@ class Run(Protocol):
     @property
     def bench(self) -> Bench: ...
     @property
-    def carried(self) -> Carried: ...
+    def linearised(self) -> LinearisedDwells: ...
     @property
     def noise(self) -> Noise: ...
     @property
@@ -51,14 +51,14 @@ class Run(Protocol):
 
 def mean_sigmas(result: Run) -> Floats:
     """Sigma (D, 3) of the mean of each dwell under the noise model, as the misfit is judged, m/s^2."""
-    means, noise = result.carried.means, result.noise.judging.of_readings
-    return np.sqrt(np.einsum("dii->di", mean_covariances(noise, means, result.carried.state)))
+    means, noise = result.linearised.means, result.noise.for_goodness_of_fit.of_readings
+    return np.sqrt(np.einsum("dii->di", mean_covariances(noise, means, result.linearised.state)))
 
 
 def quantity_means(result: Run, names: list[str]) -> dict[str, Floats]:
     """Means (D, 3) over each dwell of quantities that formulas may name, in SI units, for each accelerometer."""
-    dwells, known = result.carried.dwells, quantities(result.bench.axes)
-    stimulus, places = stimulus_of(dwells, result.bench, result.carried.state), _weights(dwells)
+    dwells, known = result.linearised.dwells, quantities(result.bench.axes)
+    stimulus, places = stimulus_of(dwells, result.bench, result.linearised.state), _weights(dwells)
     firsts = np.cumsum([0, *(3 * len(dwell.pieces) for dwell in dwells[:-1])])
     out = dict[str, Floats]()
     for name in names:
@@ -83,7 +83,7 @@ def residual_table(result: Run) -> NDArray[np.void]:
     ``sigma_mps2``: of the mean; ``ratio``: residual over sigma; ``innovation_mps2``, ``innovation_sigma_mps2``: the
     mean less its prediction from the dwells before, NaN while there is none; ``nis``, ``nis_dof``: of the dwell.
     """
-    dwells = result.carried.dwells
+    dwells = result.linearised.dwells
     of = quantity_means(result, ["fx", "fy", "fz", "a", "p", "o", "da", "dT"])
     sigmas, visits = mean_sigmas(result), result.visits
 

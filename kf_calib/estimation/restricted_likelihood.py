@@ -75,14 +75,14 @@ class Restricted:
         information = 0.5 * (moved.T @ moved - within.T @ within)
         return Point(float(cost), misfit, 0.5 * banded.traces(inner, self.shapes), information)
 
-    def most_likely(self, near: Floats | None = None) -> tuple[Floats, Point]:
+    def most_likely(self, start: Floats | None = None) -> tuple[Floats, Point]:
         """The sizes (k,), roots of the variances, at which the likelihood is largest, and the likelihood there.
 
-        The search begins at ones, or at ``near``, which makes it shorter. If it ends far from ``near``, it is repeated
-        from ones, so that ``near`` has no influence on the result.
+        The search begins at ones, or at ``start``, which makes it shorter. If it ends far from ``start``, it is
+        repeated from ones, so that ``start`` has no influence on the result.
         """
-        if near is not None:
-            begin = np.maximum(near, 10.0 * _LEAST)
+        if start is not None:
+            begin = np.maximum(start, 10.0 * _LEAST)
             sizes, point = self._search(begin)
             if (np.abs(np.log(np.maximum(sizes, 10.0 * _LEAST) / begin)) < _NEAR).all():
                 return sizes, point

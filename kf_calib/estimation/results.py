@@ -18,7 +18,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.correction import Corrected, Correction
 from kf_calib.estimation.cross_validation import HeldOut, held_out
-from kf_calib.estimation.dwell_columns import Carried, means_of
+from kf_calib.estimation.dwell_columns import LinearisedDwells, means_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import ATTITUDE_UNKNOWN_RAD, Noise, considered_information, steps
@@ -257,14 +257,14 @@ class Calibration:
         return self.fit.noise
 
     @property
-    def carried(self) -> Carried:
+    def linearised(self) -> LinearisedDwells:
         """The dwells with the columns of the fitted model."""
-        return self.fit.carried
+        return self.fit.linearised
 
     @property
     def model(self) -> Model:
         """The fitted model."""
-        return self.carried.model
+        return self.linearised.model
 
     @property
     def parameters(self) -> dict[str, Parameter]:
@@ -349,7 +349,8 @@ class Calibration:
         """The estimate from another engine's state and covariance, with the considered parameters added to the
         covariance."""
         extra = (
-            considered_information(self.noise, self.carried.means, self.carried.state).sum(axis=0) + self.fit.considered
+            considered_information(self.noise, self.linearised.means, self.linearised.state).sum(axis=0)
+            + self.fit.considered
         )
         return Estimate(state, enlarged(covariance, extra), self.estimate.undetermined)
 
@@ -365,11 +366,11 @@ class Calibration:
     def trace(self) -> Iterator[tuple[float, int, Estimate]]:
         """Yield (elapsed_s, number of the dwell, estimate) several times within each dwell, at growing intervals, and
         at its end."""
-        model, state, around = self.model, self.carried.state, self.model.nominal_state()
+        model, state, around = self.model, self.linearised.state, self.model.nominal_state()
         factor = square_root_information.start(self.settings.prior, model)
         extra = np.zeros((model.count, model.count))
         for index, (dwell, columns, (pause, _)) in enumerate(
-            zip(self.carried.turned, self.carried.columns, self.fit.steps, strict=True)
+            zip(self.linearised.dwells_at_state, self.linearised.columns, self.fit.steps, strict=True)
         ):
             before, extra_before = factor, extra
             for part in dwell.prefixes():
@@ -387,11 +388,11 @@ class Calibration:
     def during(self, dwell: DwellFactor) -> Estimate:
         """The estimate as if ``dwell``, which follows the run and is not yet complete, ended now."""
         fitted, (factor, extra) = self.fit, self.reached
-        state, last = self.carried.state, fitted.dwells[-1]
+        state, last = self.linearised.state, fitted.dwells[-1]
         dwell = at_its_mode(dwell, last, self.model, state, self.noise.weights)
         both = [last, dwell]
-        linearised = Carried(both, self.model, state)
-        dwell, own = linearised.turned[-1], linearised.columns[1:]
+        linearised = LinearisedDwells(both, self.model, state)
+        dwell, own = linearised.dwells_at_state[-1], linearised.columns[1:]
         rows = square_root_information.whiten(
             [dwell], own, self.noise.weights, state, flicker_mps2=self.noise.flicker_mps2
         )[0]
@@ -404,7 +405,7 @@ class Calibration:
         """The filter's factor [R | z] after the last dwell, and the contribution (p, p) of considered parameters."""
         fitted, first = self.fit, square_root_information.start(self.settings.prior, self.model)
         last = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)[-1]
-        extra = considered_information(self.noise, self.carried.means, self.carried.state)
+        extra = considered_information(self.noise, self.linearised.means, self.linearised.state)
         return last.factor, extra.sum(axis=0) + fitted.considered
 
 
@@ -438,11 +439,11 @@ def enlarged(covariance: Floats, extra: Floats) -> Floats:
 
 def consistency(fitted: Fit) -> Consistency:
     """Test whether the dwells agree with the fitted model within the noise by which the misfit is judged."""
-    noise, dwells, rows = fitted.noise, fitted.dwells, fitted.judged
+    noise, dwells, rows = fitted.noise, fitted.dwells, fitted.misfit_rows
     upper = square_root_information.accumulate(rows, fitted.steps)
     statistic = float(upper[-1, -1] ** 2)
     dof = sum(square_root_information.row_rank(own) for own in rows) - square_root_information.rank(upper[:-1])
-    estimated = not noise.setting_stated and noise.judging.setting_rad > 0
+    estimated = not noise.setting_stated and noise.for_goodness_of_fit.setting_rad > 0
     dof -= int(estimated)
     if dof <= 0:
         return Consistency(statistic, 0, None, None)
@@ -460,9 +461,11 @@ def consistency(fitted: Fit) -> Consistency:
 
 def _dof_along_force(fitted: Fit) -> int:
     """Return the degrees of freedom of the sizes of the force, which no setting error changes."""
-    carried, noise = fitted.carried, replace(fitted.noise.judging, setting_rad=ATTITUDE_UNKNOWN_RAD)
-    rows = square_root_information.whiten(carried.turned, carried.columns, noise, carried.state)
-    known = square_root_information.rank(square_root_information.accumulate(rows)[:-1][:, -carried.model.count - 1 :])
+    linearised, noise = fitted.linearised, replace(fitted.noise.for_goodness_of_fit, setting_rad=ATTITUDE_UNKNOWN_RAD)
+    rows = square_root_information.whiten(linearised.dwells_at_state, linearised.columns, noise, linearised.state)
+    known = square_root_information.rank(
+        square_root_information.accumulate(rows)[:-1][:, -linearised.model.count - 1 :]
+    )
     return max(sum(square_root_information.row_rank(dwell_rows) for dwell_rows in rows) - known, 0)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.rows import Rows, basis, on_basis
-from kf_calib.estimation.dwell_columns import Carried, has_turns, turning_mps2
+from kf_calib.estimation.dwell_columns import LinearisedDwells, has_turns, turning_mps2
 from kf_calib.estimation.noise_model import Noise
 from kf_calib.estimation.nuisance_states import (
     along_force,
@@ -63,9 +63,9 @@ class Samples:
         )
 
 
-def samples_of(rows: Iterable[Rows], carried: Carried, noise: Noise) -> Iterator[Samples]:
+def samples_of(rows: Iterable[Rows], linearised: LinearisedDwells, noise: Noise) -> Iterator[Samples]:
     """Yield samples from a second pass over the rows, with the columns of the first."""
-    every, columns = [*carried.turned, *carried.slews], [*carried.columns, *carried.slew_columns]
+    every, columns = [*linearised.dwells_at_state, *linearised.slews], [*linearised.columns, *linearised.slew_columns]
     known = {
         (dwell.number, dwell.moving): (dwell, iter(zip(own, flicker_waves(dwell), strict=True)))
         for dwell, own in zip(every, columns, strict=True)
@@ -75,27 +75,27 @@ def samples_of(rows: Iterable[Rows], carried: Carried, noise: Noise) -> Iterator
         if (block.dwell, block.moving) not in known:
             continue
         dwell, pieces = known[block.dwell, block.moving]
-        along = along_force([dwell], sensitivities_of([dwell], carried.state))[0] if noise.attitude_unknown else None
-        regressor_map = nuisance_map([dwell], noise, carried.state)[0]
+        along = along_force([dwell], sensitivities_of([dwell], linearised.state))[0] if noise.attitude_unknown else None
+        regressor_map = nuisance_map([dwell], noise, linearised.state)[0]
         for part, u, _ in block.pieces:
             own, waves = next(pieces)
-            functions = basis(u, block.elapsed_s[part], carried.carrier_hz)
+            functions = basis(u, block.elapsed_s[part], linearised.carrier_hz)
             observation = (functions.T @ on_basis(own.reshape(len(own), -1))).reshape(len(u), *own.shape[1:])
             regressors, readings = block.columns[part], block.readings[part]
-            if not carried.model.bench.angles:
+            if not linearised.model.bench.angles:
                 regressors = np.tile(dwell.means[:4], (len(u), 1))
             if dwell.attitude is not None or dwell.turned_rad is not None:
                 force = dwell.felt(regressors[:, 1:])
                 regressors = np.hstack([regressors[:, :1], force])
                 if has_turns(dwell):
-                    readings = readings + turning_mps2(dwell, force, carried.state)
+                    readings = readings + turning_mps2(dwell, force, linearised.state)
             nuisances = np.einsum("nc,icq->niq", regressors, regressor_map)
             if noise.flicker_mps2 is not None:
                 course = functions[:3].T @ on_basis(waves)
                 slow = np.eye(3)[None, :, :, None] * course[:, None, None, :]  # those of each accelerometer its own
                 nuisances = np.concatenate([nuisances, slow.reshape(len(u), 3, -1)], axis=2)
             sigma_mps2 = noise.of(block.moving).effective_sigma_mps2
-            residual_mps2 = readings - observation @ carried.state
+            residual_mps2 = readings - observation @ linearised.state
             samples = Samples(
                 block.dwell, block.elapsed_s[part], observation, nuisances, sigmas, readings, residual_mps2,
                 sigma_mps2, block.moving,

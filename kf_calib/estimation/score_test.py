@@ -26,7 +26,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect, Stimulus
 from kf_calib.estimation import random_walk, square_root_information
 from kf_calib.estimation.complement import Complement
-from kf_calib.estimation.dwell_columns import Carried, candidate_columns, means_of, piece_columns, stimulus_of
+from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, means_of, piece_columns, stimulus_of
 from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.noise_model import Noise, steps
 from kf_calib.estimation.periodogram import Periodogram
@@ -158,15 +158,20 @@ class Frame:
     axes remain linearised at ``state``, the state with which the frame was made.
     """
 
-    def __init__(self, carried: Carried, noise: Noise, effects: Sequence[Effect]) -> None:
-        self.dwells, self.noise, self.state, self.effects = carried.turned, noise, carried.state, list(effects)
+    def __init__(self, linearised: LinearisedDwells, noise: Noise, effects: Sequence[Effect]) -> None:
+        self.dwells, self.noise, self.state, self.effects = (
+            linearised.dwells_at_state,
+            noise,
+            linearised.state,
+            list(effects),
+        )
         self.parts = slices(counts_of(effects))
-        self._stimulus = stimulus_of(carried.turned, carried.model.bench, carried.state)
-        self._whitening = None if _inside(noise) else MisfitColumns(carried.turned, noise, carried.state)
-        self.basis, self.coordinates = orthonormal(self.whitened(carried, effects))
+        self._stimulus = stimulus_of(linearised.dwells_at_state, linearised.model.bench, linearised.state)
+        self._whitening = None if _inside(noise) else MisfitColumns(linearised.dwells_at_state, noise, linearised.state)
+        self.basis, self.coordinates = orthonormal(self.whitened(linearised, effects))
         self._periodogram: Periodogram | None = None
         self._lines: dict[float, tuple[Line, ...]] = {}
-        self._last: tuple[Carried, Floats, Floats, int] | None = None
+        self._last: tuple[LinearisedDwells, Floats, Floats, int] | None = None
 
     def has(self, effect: Effect) -> bool:
         """Tell whether the frame contains this effect with its unknown constant at this value."""
@@ -177,26 +182,28 @@ class Frame:
         own = dict(zip(map(_key, self.effects), self.parts, strict=True))
         return self.basis @ np.concatenate([self.coordinates[:, own[_key(each)]] for each in effects], axis=1)
 
-    def whitened(self, carried: Carried, effects: Sequence[Effect]) -> Floats:
+    def whitened(self, linearised: LinearisedDwells, effects: Sequence[Effect]) -> Floats:
         """Whitened columns (m, q) of any effects, computed for a few at a time, which saves memory."""
         sizes, out, first = counts_of(effects), np.zeros((0, 0)), 0
-        for part in batches(sizes, columns_at_once(carried)) or [[]]:
-            own = self._whitened(carried, [effects[k] for k in part])
+        for part in batches(sizes, columns_at_once(linearised)) or [[]]:
+            own = self._whitened(linearised, [effects[k] for k in part])
             out = out if len(out) else np.empty((len(own), sum(sizes)))
             out[:, first : first + own.shape[1]], first = own, first + own.shape[1]
         return out
 
-    def _whitened(self, carried: Carried, effects: Sequence[Effect]) -> Floats:
+    def _whitened(self, linearised: LinearisedDwells, effects: Sequence[Effect]) -> Floats:
         if self._whitening is not None:
             return self._whitening.of(piece_columns(effects, self._stimulus))
         # a walk is whitened by the columns of the biases, which are among the twelve
-        added = candidate_columns(carried.turned, effects, carried.model.bench, self.state, self._stimulus)
+        added = candidate_columns(
+            linearised.dwells_at_state, effects, linearised.model.bench, self.state, self._stimulus
+        )
         both = [
             np.concatenate([own[..., :STATE_COUNT], more], axis=3)
-            for own, more in zip(carried.columns, added, strict=True)
+            for own, more in zip(linearised.columns, added, strict=True)
         ]
-        rows, width = _judged(carried.turned, both, self.noise, self.state, STATE_COUNT)
-        return _stacked(rows, carried.dwells, self.noise)[:, width:-1]
+        rows, width = _judged(linearised.dwells_at_state, both, self.noise, self.state, STATE_COUNT)
+        return _stacked(rows, linearised.dwells, self.noise)[:, width:-1]
 
     def lines(self, level: float) -> tuple[Line, ...]:
         """Oscillations found in the readings at the significance ``level`` (see ``sufficient_statistics.lines_of``);
@@ -205,17 +212,19 @@ class Frame:
             self._lines[level] = lines_of(self.dwells, level)
         return self._lines[level]
 
-    def serves(self, carried: Carried, noise: Noise) -> bool:
+    def serves(self, linearised: LinearisedDwells, noise: Noise) -> bool:
         """Tell whether the frame was made for exactly these dwells and this noise."""
-        same = len(carried.turned) == len(self.dwells) and all(map(_is, carried.turned, self.dwells))
+        same = len(linearised.dwells_at_state) == len(self.dwells) and all(
+            map(_is, linearised.dwells_at_state, self.dwells)
+        )
         return same and all(np.array_equal(getattr(noise, key), getattr(self.noise, key)) for key in _OF_NOISE)
 
-    def scan(self, carried: Carried, more: Sequence[Effect] = ()) -> Scan:
+    def scan(self, linearised: LinearisedDwells, more: Sequence[Effect] = ()) -> Scan:
         """Project the frame's effects, without those that the model contains, and then the effects ``more`` off the
-        model in ``carried``."""
-        kept = [k for k, effect in enumerate(self.effects) if str(effect) not in carried.model.parts]
-        inside, outside, width = self._model(carried)
-        more_inside, more_outside = self._split(self.whitened(carried, more))
+        model in ``linearised``."""
+        kept = [k for k, effect in enumerate(self.effects) if str(effect) not in linearised.model.parts]
+        inside, outside, width = self._model(linearised)
+        more_inside, more_outside = self._split(self.whitened(linearised, more))
         beside = square_root_information.accumulate([np.hstack([outside[:, :-1], more_outside, outside[:, -1:]])])
         own = [self.coordinates[:, self.parts[k]] for k in kept]
         count = sum(each.shape[1] for each in own)
@@ -231,32 +240,32 @@ class Frame:
             counts_of(effects),
         )
 
-    def _model(self, carried: Carried) -> tuple[Floats, Floats, int]:
+    def _model(self, linearised: LinearisedDwells) -> tuple[Floats, Floats, int]:
         """Return the columns [H | W | z] of a model, inside the frame and outside it, and the number of columns before
         z; the result is cached for the next scan of the same model."""
-        if self._last is None or self._last[0] is not carried:
-            rows, width = self.whitened_model(carried)
-            self._last = carried, *self._split(rows), width
+        if self._last is None or self._last[0] is not linearised:
+            rows, width = self.whitened_model(linearised)
+            self._last = linearised, *self._split(rows), width
         return self._last[1:]
 
-    def whitened_model(self, carried: Carried) -> tuple[Floats, int]:
-        """Whitened rows [H | W | z] (m, c) of the model in ``carried``, and the number of columns before z."""
-        return whiten_model(carried, self.noise, [], self.state, self._stimulus)
+    def whitened_model(self, linearised: LinearisedDwells) -> tuple[Floats, int]:
+        """Whitened rows [H | W | z] (m, c) of the model in ``linearised``, and the number of columns before z."""
+        return whiten_model(linearised, self.noise, [], self.state, self._stimulus)
 
     def _split(self, rows: Floats) -> tuple[Floats, Floats]:
         """Split columns (m, c) into their coordinates (r, c) in the frame and the remainder (m, c) orthogonal to it."""
         inside = self.basis.T @ rows
         return inside, rows - self.basis @ inside
 
-    def falls(self, carried: Carried, effect: Effect, values_hz: Floats) -> Floats:
+    def delta_chi2(self, linearised: LinearisedDwells, effect: Effect, values_hz: Floats) -> Floats:
         """Decrease of chi-squared (n,) if an oscillation at each frequency, alone, is added to the model in
-        ``carried``.
+        ``linearised``.
 
         The periodogram is computed at the first call, so ``values_hz`` has to be the same in every call.
         """
         if self._periodogram is None:
-            self._periodogram = Periodogram(carried, self.noise, effect, values_hz)
-        return self._periodogram.falls(*_with_and_without_walk(carried, self.noise, self.state, STATE_COUNT))
+            self._periodogram = Periodogram(linearised, self.noise, effect, values_hz)
+        return self._periodogram.delta_chi2(*_with_and_without_walk(linearised, self.noise, self.state, STATE_COUNT))
 
 
 _OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps2_per_sqrt_s",
@@ -283,9 +292,9 @@ def _is(one: object, other: object) -> bool:
     return one is other
 
 
-def scan(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Scan:
-    """Project ``effects`` off the model in ``carried`` without a frame."""
-    rows, width = whiten_model(carried, noise, effects)
+def scan(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Effect]) -> Scan:
+    """Project ``effects`` off the model in ``linearised`` without a frame."""
+    rows, width = whiten_model(linearised, noise, effects)
     return project(square_root_information.accumulate([rows]), width, effects, counts_of(effects))
 
 
@@ -321,18 +330,18 @@ def _factors(columns: Floats, counts: Sequence[int]) -> list[tuple[Floats, Float
     return out
 
 
-def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
+def delta_chi2(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Effect]) -> Floats:
     """Decrease of chi-squared (n,) if each of many effects of one kind, alone, is added: the ``statistics`` of a scan.
 
     Because nothing else is needed, the rows are not reduced by QR. For n columns in d rows the cost is then
     proportional to d times n instead of d times n^2.
     """
     if effects[0].oscillates and len(effects) > _MANY:
-        many = Periodogram(carried, noise, effects[0], np.array([effect.value for effect in effects]))
-        return many.falls(*_with_and_without_walk(carried, noise, carried.state, carried.model.count))
+        many = Periodogram(linearised, noise, effects[0], np.array([effect.value for effect in effects]))
+        return many.delta_chi2(*_with_and_without_walk(linearised, noise, linearised.state, linearised.model.count))
     out = list[Floats]()
     for part in batches(counts_of(effects), _OF_ONE_KIND):
-        rows, width = whiten_model(carried, noise, [effects[k] for k in part])
+        rows, width = whiten_model(linearised, noise, [effects[k] for k in part])
         sizes, rest = np.linalg.norm(rows[:, width:-1], axis=0), Complement(rows, width).of(rows[:, width:])
         columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
         columns = columns.T.reshape(len(part), -1, len(rest))
@@ -342,14 +351,17 @@ def falls(carried: Carried, noise: Noise, effects: Sequence[Effect]) -> Floats:
     return np.concatenate(out)
 
 
-def unweighted_left(carried: Carried, effects: Sequence[Effect]) -> Floats:
+def unweighted_left(linearised: LinearisedDwells, effects: Sequence[Effect]) -> Floats:
     """The share (n,) of the sum of squares of the residuals of the dwells' means that each effect, added alone, leaves;
     all means of all accelerometers have the same weight."""
-    means, state = carried.means, carried.state
-    own = means_of(carried.turned, candidate_columns(carried.turned, effects, carried.model.bench, state)).design
+    means, state = linearised.means, linearised.state
+    own = means_of(
+        linearised.dwells_at_state,
+        candidate_columns(linearised.dwells_at_state, effects, linearised.model.bench, state),
+    ).design
     design = means.design.reshape(-1, means.design.shape[2])
     columns = np.hstack([own.reshape(len(design), -1), means.readings.reshape(-1, 1)])
-    basis, sizes = _spanned(design / carried.sizes), np.linalg.norm(columns, axis=0)
+    basis, sizes = _spanned(design / linearised.sizes), np.linalg.norm(columns, axis=0)
     rest = columns - basis @ (basis.T @ columns)
     left, rest = rest[:, -1], rest / np.where(sizes > 0, sizes, 1.0)
     found = (np.sum((_spanned(rest[:, part]).T @ left) ** 2) for part in slices(counts_of(effects)))
@@ -362,13 +374,15 @@ def _spanned(columns: Floats) -> Floats:
     return left[:, singular > _SEEN]
 
 
-def falls_together(carried: Carried, noise: Noise, groups: Sequence[Sequence[Effect]]) -> list[tuple[float, int]]:
+def joint_delta_chi2(
+    linearised: LinearisedDwells, noise: Noise, groups: Sequence[Sequence[Effect]]
+) -> list[tuple[float, int]]:
     """Decrease of chi-squared if all effects of a group are added together, and their rank, of each group alone.
 
-    As in ``falls``, rows are not reduced by QR, which would take most of the time in runs of many dwells.
+    As in ``delta_chi2``, rows are not reduced by QR, which would take most of the time in runs of many dwells.
     """
     effects = [effect for group in groups for effect in group]
-    rows, width = whiten_model(carried, noise, effects)
+    rows, width = whiten_model(linearised, noise, effects)
     sizes, rest = np.linalg.norm(rows[:, width:-1], axis=0), Complement(rows, width).of(rows[:, width:])
     columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
     out = list[tuple[float, int]]()
@@ -380,29 +394,29 @@ def falls_together(carried: Carried, noise: Noise, groups: Sequence[Sequence[Eff
 
 
 def whiten_model(
-    carried: Carried,
+    linearised: LinearisedDwells,
     noise: Noise,
     effects: Sequence[Effect],
     state: Floats | None = None,
     stimulus: Stimulus | None = None,
 ) -> tuple[Floats, int]:
-    """Whitened rows [H | W | G | z] (m, c) of the model in ``carried`` and of ``effects``, and the number of columns
+    """Whitened rows [H | W | G | z] (m, c) of the model in ``linearised`` and of ``effects``, and the number of columns
     before G.
 
     - W: columns of the slow part of a stated scatter, see ``square_root_information.misfit_rows``.
-    - state: where small rotations and input axes are linearised; by default at the state in ``carried``.
+    - state: where small rotations and input axes are linearised; by default at the state in ``linearised``.
     - stimulus: the stimulus of the dwells at that state, if it is already known.
     """
-    at, dwells = carried.state if state is None else state, carried.turned
-    added = candidate_columns(dwells, effects, carried.model.bench, at, stimulus)
-    columns = [np.concatenate([own, more], axis=3) for own, more in zip(carried.columns, added, strict=True)]
-    rows, width = _judged(dwells, columns, noise, at, carried.model.count)
+    at, dwells = linearised.state if state is None else state, linearised.dwells_at_state
+    added = candidate_columns(dwells, effects, linearised.model.bench, at, stimulus)
+    columns = [np.concatenate([own, more], axis=3) for own, more in zip(linearised.columns, added, strict=True)]
+    rows, width = _judged(dwells, columns, noise, at, linearised.model.count)
     return _stacked(rows, dwells, noise), width
 
 
-def columns_at_once(carried: Carried) -> int:
+def columns_at_once(linearised: LinearisedDwells) -> int:
     """Number of columns to whiten at a time; it is larger for few dwells, where the overhead of the calls dominates."""
-    return max(_TOGETHER, _CELLS // len(carried.dwells))
+    return max(_TOGETHER, _CELLS // len(linearised.dwells))
 
 
 def batches(sizes: Sequence[int], columns: int) -> list[list[int]]:
@@ -424,12 +438,15 @@ def _stacked(rows: Sequence[Floats], dwells: Sequence[DwellFactor], noise: Noise
     return random_walk.whiten_walk(rows, steps(dwells, noise)) if _inside(noise) else np.concatenate(rows)
 
 
-def _with_and_without_walk(carried: Carried, noise: Noise, state: Floats, width: int) -> tuple[Floats, Floats, int]:
-    """Rows of the model in ``carried`` as ``Periodogram.falls`` needs them: whitened, the walk of the biases taken out;
+def _with_and_without_walk(
+    linearised: LinearisedDwells, noise: Noise, state: Floats, width: int
+) -> tuple[Floats, Floats, int]:
+    """Rows of the model in ``linearised`` as ``Periodogram.delta_chi2`` needs them: whitened, the walk of the biases
+    taken out;
     those of the dwells alone with the walk still in them; and how many columns the first ``width`` become with W."""
-    rows, count = _judged(carried.turned, carried.columns, noise, state, width)
-    of_dwells = np.concatenate(rows[len(rows) - len(carried.dwells) :])
-    return _stacked(rows, carried.dwells, noise), of_dwells[:, _inside(noise) :], count
+    rows, count = _judged(linearised.dwells_at_state, linearised.columns, noise, state, width)
+    of_dwells = np.concatenate(rows[len(rows) - len(linearised.dwells) :])
+    return _stacked(rows, linearised.dwells, noise), of_dwells[:, _inside(noise) :], count
 
 
 def _inside(noise: Noise) -> int:

@@ -110,10 +110,10 @@ def _weighted(
     count, (many, pieces, functions, _, width) = len(priors), columns.shape
     inside, size = 3 if noise.walk_mps2_per_sqrt_s else 0, pieces * functions
     triangles = np.array([dwell.triangles for dwell in dwells])
-    carried = triangles[:, :, :functions, :functions]
+    linearised = triangles[:, :, :functions, :functions]
     regressors = np.array([dwell.regressors for dwell in dwells])
     nuisances = nuisance_map(dwells, noise, state)[:, :, None]
-    waves = carried[..., :3] @ on_basis(np.array([flicker_waves(dwell) for dwell in dwells])) if slow else None
+    waves = linearised[..., :3] @ on_basis(np.array([flicker_waves(dwell) for dwell in dwells])) if slow else None
     parts = np.zeros((many, 3, size, count + inside + width + 1))
     for i in range(3):
         part = parts[:, i]
@@ -121,10 +121,10 @@ def _weighted(
         if waves is not None:
             first = offsets + slow * i
             part[..., first : first + slow] = waves.reshape(many, size, slow)
-        part[..., count + inside : -1] = (carried @ on_basis(columns[..., i, :])).reshape(many, size, width)
+        part[..., count + inside : -1] = (linearised @ on_basis(columns[..., i, :])).reshape(many, size, width)
         readings = triangles[:, :, :functions, functions + i, None]
         if about is not None:
-            readings = readings - carried @ on_basis((columns[..., i, :] @ about)[..., None])
+            readings = readings - linearised @ on_basis((columns[..., i, :] @ about)[..., None])
         part[..., -1] = readings.reshape(many, size)
         if inside:
             part[..., count + i] = [dwell.walk.step for dwell in dwells]

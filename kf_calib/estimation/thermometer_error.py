@@ -15,20 +15,20 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
-from kf_calib.estimation.dwell_columns import Carried, stimulus_of
+from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
 from kf_calib.estimation.temperature_course import temperature_course
 
 _STEP_K = 1e-3
 _MATTERS = 0.1  # share of the sigma of the mean of a dwell above which the error counts
 
 
-def sensitivity_to_temperature(carried: Carried, sigma_mps2: Floats) -> Floats | None:
+def sensitivity_to_temperature(linearised: LinearisedDwells, sigma_mps2: Floats) -> Floats | None:
     """Change of the readings per K (3, 8) on the regressors 1, f, T, T f by the model at its state; None where the
     error of the temperature does not matter.
 
     sigma_mps2 (3,): noise of white readings.
     """
-    dwells, model, state = carried.turned, carried.model, carried.state
+    dwells, model, state = linearised.dwells_at_state, linearised.model, linearised.state
     errors_c = temperature_course(tuple(dwells)).errors_c
     if not errors_c.shape[1] or not model.effects:
         return None

@@ -33,7 +33,7 @@ from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.measurement_model import SQUARE, Model
 from kf_calib.estimation.noise_model import Noise, mean_covariances
-from kf_calib.estimation.relinearisation import carried_at
+from kf_calib.estimation.relinearisation import linearised_at
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.exchange.calibration_file import SavedCalibration
@@ -152,15 +152,15 @@ def _misfit(saved: SavedCalibration, fitted: Fit, noise: Noise, free: Sequence[s
     Without angles the columns turn with the axes: they are those of the state that fits best within the old sigmas,
     found in turn.
     """
-    old, model = np.array(saved.state.values), fitted.carried.model
+    old, model = np.array(saved.state.values), fitted.linearised.model
     if not noise.attitude_unknown:
-        means, at = fitted.carried.means, fitted.carried.state
+        means, at = fitted.linearised.means, fitted.linearised.state
         misfit, _ = _least_misfit(saved, model, means, mean_covariances(noise, means, at), free)
         return misfit, _rms(means, old)
-    means, state, misfit = carried_at(fitted.dwells, model, old, noise).means, old, 0.0
+    means, state, misfit = linearised_at(fitted.dwells, model, old, noise).means, old, 0.0
     rms = _rms(means, old)
     for _ in range(_ROUNDS):
-        means = carried_at(fitted.dwells, model, state, noise).means
+        means = linearised_at(fitted.dwells, model, state, noise).means
         misfit, state = _least_misfit(saved, model, means, mean_covariances(noise, means, state), free)
     return misfit, rms
 

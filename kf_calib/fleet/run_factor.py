@@ -120,11 +120,11 @@ def run_factor(
     fitted: Fit, run: str = "", unit: str | None = None, bench: str | None = None, date: str | None = None
 ) -> RunFactor:
     """The reduced factor of a fit: its model and, where angles are known, all effects of the catalogue."""
-    carried = fitted.carried
-    model, state = carried.model, carried.state
+    linearised = fitted.linearised
+    model, state = linearised.model, linearised.state
     added = candidate_effects(model) if model.bench.angles else []
     with one_blas_thread():
-        rows, before = whiten_model(carried, fitted.noise, added, state)
+        rows, before = whiten_model(linearised, fitted.noise, added, state)
         slow = slice(model.count, before)  # the slow part of a stated scatter, of which the prior is among the rows
         ordered = np.hstack([rows[:, slow], rows[:, : model.count], rows[:, before:]])
         lacking = max(ordered.shape[1] - len(ordered), 0)
@@ -136,7 +136,7 @@ def run_factor(
         columns=tuple(name for k, name in enumerate([*inside, *_names(added)]) if k not in model.fixed),
         width=model.count - len(model.fixed),
         factor=triangle(upper[:, kept]) if model.fixed else upper,
-        rows=3 * sum(min(piece.count, dwell.width) for dwell in carried.dwells for piece in dwell.pieces),
+        rows=3 * sum(min(piece.count, dwell.width) for dwell in linearised.dwells for piece in dwell.pieces),
         constants={str(each): float(each.value) for each in (*model.effects, *added) if each.unknown is not None},
         nominal=Model(model.bench).nominal_state(),
         noise_estimated=_has_estimated_parts(fitted.noise),

@@ -27,11 +27,11 @@ from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect
 from kf_calib.estimation import square_root_information
-from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.measurement_model import STATE_COUNT, Model
 from kf_calib.estimation.noise_model import Noise, steps
 from kf_calib.estimation.prior import Prior
-from kf_calib.estimation.relinearisation import at_its_mode, carried_at
+from kf_calib.estimation.relinearisation import at_its_mode, linearised_at
 from kf_calib.estimation.score_test import Scan, project
 
 
@@ -39,13 +39,13 @@ from kf_calib.estimation.score_test import Scan, project
 class Running:
     """A filter after some dwells of a run; every change gives a new one.
 
-    carried: the dwells so far, with the columns of the model and of all candidates. inside: names of those effects that
-    are in the model. noise, prior: those of the filter. factor (P, P + 1): square-root information factor of all
+    linearised: the dwells so far, with the columns of the model and of all candidates. inside: names of those effects
+    that are in the model. noise, prior: those of the filter. factor (P, P + 1): square-root information factor of all
     columns; its states are differences from ``about``. left: sum of squares that all columns together leave. rows:
     number of whitened rows.
     """
 
-    carried: Carried
+    linearised: LinearisedDwells
     inside: tuple[str, ...]
     noise: Noise
     prior: Prior
@@ -74,24 +74,24 @@ class Running:
         at = np.concatenate([state[:STATE_COUNT], np.zeros(every.count - STATE_COUNT)])
         inside = tuple(str(effect) for effect in model.effects)
         empty = np.zeros((every.count, every.count + 1))
-        carried = carried_at(dwells, every, at, noise.weights)
-        return cls(carried, inside, noise, prior or Prior(), empty)._rebuild()
+        linearised = linearised_at(dwells, every, at, noise.weights)
+        return cls(linearised, inside, noise, prior or Prior(), empty)._rebuild()
 
     @property
     def dwells(self) -> list[DwellFactor]:
         """The dwells so far."""
-        return self.carried.dwells
+        return self.linearised.dwells
 
     @property
     def about(self) -> Floats:
         """The state (P,) from which the states of the factor are counted."""
-        return self.carried.state
+        return self.linearised.state
 
     @cached_property
     def model(self) -> Model:
         """The current model: the twelve parameters and the effects in it, in the order in which they were added."""
-        known = {str(effect): effect for effect in self.carried.model.effects}
-        return Model(self.carried.model.bench, tuple(known[name] for name in self.inside))
+        known = {str(effect): effect for effect in self.linearised.model.effects}
+        return Model(self.linearised.model.bench, tuple(known[name] for name in self.inside))
 
     def after(self, dwell: DwellFactor, exact: bool = True) -> Running:
         """The filter after one more dwell.
@@ -99,15 +99,15 @@ class Running:
         It is one update, unless the dwell changes what is known of the conditions in earlier dwells; then the factor is
         built again. exact: False leaves earlier dwells as they were known when they closed.
         """
-        dwell = at_its_mode(dwell, self.dwells[-1], self.carried.model, self.about, self.noise.weights)
+        dwell = at_its_mode(dwell, self.dwells[-1], self.linearised.model, self.about, self.noise.weights)
         if exact:
-            carried = Carried([*self.dwells, dwell], self.carried.model, self.about)
-            if not all(map(np.array_equal, self.carried.columns, carried.columns[:-1])):
-                return replace(self, carried=carried)._rebuild()
+            linearised = LinearisedDwells([*self.dwells, dwell], self.linearised.model, self.about)
+            if not all(map(np.array_equal, self.linearised.columns, linearised.columns[:-1])):
+                return replace(self, linearised=linearised)._rebuild()
         else:
-            carried = self.carried.followed_by(dwell)
-        more = replace(self, carried=carried)
-        return more._update(more._rows([-1])[0], steps(carried.dwells[-2:], self.noise)[-1])
+            linearised = self.linearised.followed_by(dwell)
+        more = replace(self, linearised=linearised)
+        return more._update(more._rows([-1])[0], steps(linearised.dwells[-2:], self.noise)[-1])
 
     def solved(self) -> tuple[Floats, Floats, Floats]:
         """State (p,) of the model, its covariance (p, p), and a basis (p, q) of the combinations not determined."""
@@ -128,8 +128,8 @@ class Running:
     @cached_property
     def scan(self) -> Scan:
         """The score tests of all effects that are carried but not in the model."""
-        kept, parts = self._model_columns, self.carried.model.parts
-        outside = [effect for effect in self.carried.model.effects if str(effect) not in self.inside]
+        kept, parts = self._model_columns, self.linearised.model.parts
+        outside = [effect for effect in self.linearised.model.effects if str(effect) not in self.inside]
         theirs = [range(*parts[str(effect)].indices(len(self.about))) for effect in outside]
         order = [*kept, *itertools.chain(*theirs), len(self.about)]
         upper = np.vstack([triangle(self.factor[:, order]), np.zeros((1, len(order)))])
@@ -145,7 +145,7 @@ class Running:
     @cached_property
     def _model_columns(self) -> list[int]:
         """Numbers of the columns of the current model among all."""
-        parts, count = self.carried.model.parts, len(self.about)
+        parts, count = self.linearised.model.parts, len(self.about)
         return [*range(STATE_COUNT), *(k for name in self.inside for k in range(*parts[name].indices(count)))]
 
     def _update(self, rows: Floats, walked: Floats) -> Running:
@@ -155,7 +155,7 @@ class Running:
 
     def _rebuild(self) -> Running:
         """Return the same filter with its factor built again from all dwells."""
-        factor = square_root_information.start(self.prior, self.carried.model)
+        factor = square_root_information.start(self.prior, self.linearised.model)
         factor[:, -1] -= factor[:, :-1] @ self.about
         variances = steps(self.dwells, self.noise)
         out = replace(self, factor=factor, left=0.0, rows=0)
@@ -168,5 +168,8 @@ class Running:
     def _rows(self, chosen: Sequence[int] | None = None) -> list[Floats]:
         """Return the whitened rows of all dwells, or of those chosen."""
         chosen = range(len(self.dwells)) if chosen is None else chosen
-        dwells, columns = [self.carried.turned[k] for k in chosen], [self.carried.columns[k] for k in chosen]
+        dwells, columns = (
+            [self.linearised.dwells_at_state[k] for k in chosen],
+            [self.linearised.columns[k] for k in chosen],
+        )
         return square_root_information.whiten(dwells, columns, self.noise.weights, self.about, self.about)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from kf_calib.bench.bench import Bench
-from kf_calib.diagnosis.candidate_tests import LEVEL, REST, SHARE, candidates, chance_fall, independent_tests
+from kf_calib.diagnosis.candidate_tests import LEVEL, REST, SHARE, candidates, critical_delta_chi2, independent_tests
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend_beside
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect
@@ -109,7 +109,7 @@ class Watch:
     @cached_property
     def trend(self) -> Trend | None:
         """The test of trends within dwells; None where spectral lines would give trends as well."""
-        found = trend_beside(self.running.carried, self.running.noise, self.running.state)
+        found = trend_beside(self.running.linearised, self.running.noise, self.running.state)
         shown = found is not None and found.p_value < LEVEL
         return None if shown and lines_of(self.dwells, LEVEL * REST) else found
 
@@ -118,8 +118,8 @@ class Watch:
         """Names of the effects that are significant in the latest test, the one with the highest score first."""
         scan = self.running.scan
         scores = {
-            str(each.effect): float(fall) - chance_fall(each, self.tests)
-            for each, fall in zip(scan.candidates, scan.statistics, strict=True)
+            str(each.effect): float(delta_chi2) - critical_delta_chi2(each, self.tests)
+            for each, delta_chi2 in zip(scan.candidates, scan.statistics, strict=True)
             if each.dof
         }
         return sorted((name for name, score in scores.items() if score > 0), key=lambda name: -scores[name])
@@ -138,16 +138,18 @@ def _begun(
     dwells: Sequence[DwellFactor], bench: Bench, settings: Settings, fitted: Fit | None
 ) -> tuple[Running, int, float]:
     """Return the filter with noise and linearisation from the dwells so far, their number, and the effective tests."""
-    if fitted is None or fitted.carried.slews or len(fitted.dwells) != len(dwells):
+    if fitted is None or fitted.linearised.slews or len(fitted.dwells) != len(dwells):
         fitted = fit(list(dwells), Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s)
-    noise = replace(fitted.noise.judging, checked=True)  # a test of the misfit has to allow for all of a setting error
-    running = Running.over(dwells, fitted.carried.model, noise, fitted.carried.state, _effects_to_watch(fitted))
+    noise = replace(
+        fitted.noise.for_goodness_of_fit, checked=True
+    )  # a test of the misfit has to allow for all of a setting error
+    running = Running.over(dwells, fitted.linearised.model, noise, fitted.linearised.state, _effects_to_watch(fitted))
     return running, len(dwells), independent_tests(running.scan)
 
 
 def _effects_to_watch(fitted: Fit) -> list[Effect]:
     """Return one candidate of each effect; an unknown constant has the middle value of its grid."""
     first = dict[str, list[Effect]]()
-    for effect in candidates(fitted.carried.model):
+    for effect in candidates(fitted.linearised.model):
         first.setdefault(str(effect), []).append(effect)
     return [own[len(own) // 2] for own in first.values()]

@@ -202,8 +202,8 @@ class Judgement:
             return self.advice[0].gimbal_deg, self.advice[1]
         if self.course is None:
             return None
-        symbol, fall = self.course.next_reduction(self.worst)
-        return self.course.gimbal_deg, f"lowers sigma of {symbol} to {fall:.2f} of its value"
+        symbol, factor = self.course.next_reduction(self.worst)
+        return self.course.gimbal_deg, f"lowers sigma of {symbol} to {factor:.2f} of its value"
 
     @cached_property
     def worst(self) -> Floats:
@@ -354,9 +354,9 @@ def current(dwell: DwellFactor, judgement: Judgement | None) -> Current:
 
 def _quiet(dwell: DwellFactor, result: Calibration) -> bool:
     """Tell whether the noise of the dwell's mean is well below the scatter from dwell to dwell."""
-    noise, means = result.noise, result.carried.means[[-1]]
+    noise, means = result.noise, result.linearised.means[[-1]]
     means = replace(means, counts=np.array([float(dwell.count)]))
-    whole = np.diag(mean_covariances(noise, means, result.carried.state)[0])
+    whole = np.diag(mean_covariances(noise, means, result.linearised.state)[0])
     own = noise.effective_sigma_mps2**2 / dwell.count
     return bool((own < _QUIET * (whole - own)).all())
 

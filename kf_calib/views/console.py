@@ -154,7 +154,7 @@ def noise_table(result: Calibration) -> Table:
 
 def noise_origins(result: Calibration) -> tuple[str, str]:
     """Whether scatter and setting error were stated, estimated or not estimated, in words."""
-    noise, few = result.noise, degrees_of_freedom(result.carried.means, not result.bench.angles) < FEWEST
+    noise, few = result.noise, degrees_of_freedom(result.linearised.means, not result.bench.angles) < FEWEST
     scatter = "stated" if noise.scatter_stated else _NOT_ESTIMATED if few else "estimated"
     if noise.attitude_unknown:
         few = len(result.visits) - len(paper_parameters.SYMBOLS) + len(result.fixed) < FEWEST

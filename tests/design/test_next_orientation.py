@@ -18,7 +18,7 @@ PLAN = spread_plan(12, dwell_s=8.0, seed=5)
 
 def separation(result: Calibration, one: Effect, size: Floats, other: Effect) -> float:
     """What of ``one`` of this size neither the model nor ``other`` explains, in sigma."""
-    rival, own = scan(result.carried, result.noise.judging, [other, one]).candidates
+    rival, own = scan(result.linearised, result.noise.for_goodness_of_fit, [other, one]).candidates
     signal = own.columns @ size
     return float(np.linalg.norm(signal - rival.basis @ (rival.basis.T @ signal)))
 
@@ -26,7 +26,7 @@ def separation(result: Calibration, one: Effect, size: Floats, other: Effect) ->
 def advised(one: Effect, other: Effect, sigmas: float = 8.0) -> tuple[Calibration, Floats, Advice]:
     """A run, coefficients of so many sigma in it, and where to go next."""
     result = run(plan=PLAN)
-    (alone,) = scan(result.carried, result.noise.judging, [one]).candidates
+    (alone,) = scan(result.linearised, result.noise.for_goodness_of_fit, [one]).candidates
     even = np.ones(len(one.coefficients))
     size = sigmas * even / np.linalg.norm(alone.columns @ even)
     found = to_tell_apart(result.fit, one, size, [other])

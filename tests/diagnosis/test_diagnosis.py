@@ -117,7 +117,7 @@ def test_six_faces_say_what_they_cannot_see_and_where_to_go() -> None:
 def test_scores_are_falls_of_chi_squared() -> None:
     """The score test against the refit it predicts."""
     before = run("second-order=6sigma")
-    found = scan(before.carried, before.noise.judging, [effect_named("second-order", BENCH)])
+    found = scan(before.linearised, before.noise.for_goodness_of_fit, [effect_named("second-order", BENCH)])
     after = diagnose(before).suspects[0].refit
     assert found.statistics[0] == pytest.approx(before.consistency.statistic - after.consistency.statistic, rel=0.02)
     np.testing.assert_allclose(found.coefficients(found.candidates[0]), after.estimate.effects, rtol=1e-3)

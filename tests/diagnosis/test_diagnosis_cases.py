@@ -330,7 +330,7 @@ def test_a_bias_that_goes_to_and_fro_is_no_walk(seeds: range) -> None:
 @pytest.mark.parametrize("runs", [2, *slow(24)])
 def test_a_walk_rarely_looks_as_if_it_came_back(runs: int) -> None:
     walks = [run("bias-walk=15sigma", seed=seed, dwells=24) for seed in range(runs)]
-    gains = [2.0 * Refits().with_effects(each, ("bias-walk",)).fit.back_gain[0] for each in walks]
+    gains = [2.0 * Refits().with_effects(each, ("bias-walk",)).fit.gauss_markov_gain[0] for each in walks]
     assert sum(gain > 6.63 for gain in gains) <= runs // 24
     assert sum(gain > 0.5 for gain in gains) > runs // 12  # they do differ
 

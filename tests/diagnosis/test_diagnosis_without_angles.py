@@ -63,18 +63,18 @@ def test_what_cannot_be_seen_has_no_column_in_the_size_of_f() -> None:
     """An effect is listed exactly if its columns, along n = S^-T f / g and less what nine parameters explain, vanish;
     those which change within a dwell are seen there, too."""
     result = clean()
-    carried, state = result.carried, result.carried.state
+    linearised, state = result.linearised, result.linearised.state
     listed = {each.name for each in kf_calib.diagnose(result).unseen}
     assert {*ATTITUDE, *ALWAYS, "latency", "lever-arm"} <= listed
-    across = weights_of_size(carried.means, state)
-    model = np.einsum("di,dip->dp", across, carried.means.design)
+    across = weights_of_size(linearised.means, state)
+    model = np.einsum("di,dip->dp", across, linearised.means.design)
     model = model[:, np.abs(model).max(axis=0) > 0.0]
     model /= np.linalg.norm(model, axis=0)
     for name in ("second-order", "third-order", "cross-axis-square", "thermal-bias", "hysteresis", *ATTITUDE, *ALWAYS):
         effect = effect_named(name, result.bench)
-        own = candidate_columns(carried.dwells, [effect], result.bench, state)
+        own = candidate_columns(linearised.dwells, [effect], result.bench, state)
         means = np.array([np.tensordot(dwell.counts / dwell.count, each.mean(axis=1), 1)
-                          for dwell, each in zip(carried.dwells, own, strict=True)])  # fmt: skip
+                          for dwell, each in zip(linearised.dwells, own, strict=True)])  # fmt: skip
         columns = np.einsum("di,diq->dq", across, means)
         left = columns - model @ np.linalg.lstsq(model, columns, rcond=None)[0]
         share = np.linalg.norm(left) / max(float(np.linalg.norm(means)), 1e-300)

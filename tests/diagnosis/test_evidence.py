@@ -55,8 +55,8 @@ def before() -> Calibration:
 def _dense(result: Calibration, scatter_mps2: float) -> tuple[Floats, Floats]:
     """Whitened columns and readings of the means of dwells, by a dense Cholesky factor of each dwell."""
     noise = replace(result.noise, scatter_mps2=np.full(3, scatter_mps2), walk_mps2_per_sqrt_s=0.0)
-    means = result.carried.means
-    lower = np.linalg.cholesky(mean_covariances(noise, means, result.carried.state))
+    means = result.linearised.means
+    lower = np.linalg.cholesky(mean_covariances(noise, means, result.linearised.state))
     columns = np.linalg.solve(lower, np.concatenate([means.design, means.readings[:, :, None]], axis=2))
     flat = columns.reshape(-1, columns.shape[2])
     return flat[:, :-1], flat[:, -1]
@@ -76,7 +76,7 @@ def test_falls_are_those_of_dense_least_squares(before: Calibration) -> None:
         if "setting" in own.parts:
             continue
         fall = _left(*_dense(before, scatter)) - _left(*_dense(refit, scatter))
-        assert own.fall == pytest.approx(fall, rel=2e-3) and own.dof == 3
+        assert own.delta_chi2 == pytest.approx(fall, rel=2e-3) and own.dof == 3
 
 
 def test_scatter_of_unknown_size_is_averaged_out(before: Calibration) -> None:
@@ -87,8 +87,8 @@ def test_scatter_of_unknown_size_is_averaged_out(before: Calibration) -> None:
     def likelihood(scatter: float) -> float:
         columns, readings = _dense(before, scatter)
         noise = replace(before.noise, scatter_mps2=np.full(3, scatter), walk_mps2_per_sqrt_s=0.0)
-        spread = mean_covariances(noise, before.carried.means, before.carried.state)
-        unit = before.carried.means.design.reshape(-1, columns.shape[1])
+        spread = mean_covariances(noise, before.linearised.means, before.linearised.state)
+        unit = before.linearised.means.design.reshape(-1, columns.shape[1])
         basis = np.linalg.svd(unit / np.linalg.norm(unit, axis=0), full_matrices=False)[2].T
         scaled = columns / np.linalg.norm(unit, axis=0) @ basis
         _, log_det = np.linalg.slogdet(scaled.T @ scaled)
@@ -133,8 +133,8 @@ def test_an_oscillation_is_weighed_against_what_needs_no_carrier() -> None:
     refit, evidence = refits.with_effects(before, ("sinusoid",)), Evidence(before.fit)
     assert refit.fit.dwells[0].carrier_hz and not before.fit.dwells[0].carrier_hz
     own, none = (next(each for each in found if not each.parts) for found in (evidence.of(refit.fit), evidence.of()))
-    assert own.dof == 6 and 150.0 < own.fall < 350.0
-    assert own.log - none.log == pytest.approx(float(size_evidence(6, own.fall)), abs=0.1)
+    assert own.dof == 6 and 150.0 < own.delta_chi2 < 350.0
+    assert own.log - none.log == pytest.approx(float(size_evidence(6, own.delta_chi2)), abs=0.1)
 
 
 @pytest.mark.parametrize("seeds", [range(1, 7), *slow(range(1, 41))])

@@ -36,7 +36,7 @@ def test_the_share_of_a_driver_is_that_of_least_squares_on_whitened_means() -> N
     triangular factors. The readings of a dwell are as good as their mean, so the two differ by little."""
     result = run("second-order=15sigma")
     driver = next(each for each in drivers_of(result) if each.symbol == "a")
-    means, sigmas = result.carried.means, mean_sigmas(result)
+    means, sigmas = result.linearised.means, mean_sigmas(result)
     dwells = len(means.readings)
     rows = (means.design / sigmas[:, :, None]).reshape(3 * dwells, -1)
     columns = np.zeros((dwells, 3, 9))
@@ -53,7 +53,7 @@ def test_the_share_of_a_driver_is_that_of_least_squares_on_whitened_means() -> N
 
     fall = left(rows) - left(np.hstack([rows, columns]))
     assert driver.dof == 9
-    assert driver.fall == pytest.approx(fall, rel=1e-3)
+    assert driver.delta_chi2 == pytest.approx(fall, rel=1e-3)
     misfit = result.consistency
     before, after = misfit.statistic / misfit.dof, (misfit.statistic - fall) / (misfit.dof - 9)
     assert driver.share == pytest.approx(1.0 - (after - 1.0) / (before - 1.0), rel=2e-3)
@@ -78,7 +78,7 @@ def test_nothing_has_a_share_where_the_model_fits() -> None:
 
 def test_what_an_explanation_predicts_is_the_difference_of_the_predictions() -> None:
     best = found("second-order=15sigma").explanations[0]
-    before, after = best.before.carried, best.after.carried
+    before, after = best.before.linearised, best.after.linearised
     predicted = [np.einsum("dip,p->di", each.means.design, state) for each, state in (
         (before, best.before.estimate.state), (after, best.after.estimate.state))]  # fmt: skip
     assert best.names == ("second-order",)
@@ -103,10 +103,10 @@ def test_the_band_of_an_effect_covers_as_often_as_it_says(runs: int) -> None:
         after = Refits().with_effects(before, ("second-order",))
         best = Explanation(("second-order",), before, after, True)
         size, own = best.contribution_mps2, best.contribution_sigma_mps2
-        force = before.carried.means.force_mps2
+        force = before.linearised.means.force_mps2
         for i in range(3):
             k = int(np.argmax(own[:, i]))
-            along = np.sum(before.carried.state[:12].reshape(3, 4)[i, :3] * force[k])
+            along = np.sum(before.linearised.state[:12].reshape(3, 4)[i, :3] * force[k])
             error = size[k, i] - truth * along**2
             offsets.append(error / own[k, i])
             inside += abs(error) < own[k, i]

@@ -162,7 +162,7 @@ def test_undo_and_drop(improved: Improvement) -> None:
 
 
 def test_dwells_left_out_are_still_where_others_came_from(quiet: Calibration) -> None:
-    every, state = quiet.fit.dwells, quiet.carried.state
+    every, state = quiet.fit.dwells, quiet.linearised.state
     some = dwells_without(every, {3, 4, 10})
     whole, part = (stimulus_of(dwells, BENCH, state) for dwells in (every, some))
     kept = np.repeat([k not in {3, 4, 10} for k, dwell in enumerate(every) for _ in dwell.pieces], 3)

@@ -80,7 +80,7 @@ def test_intervals_cover(text: str, truth: list[float], runs: int, low: float, h
 
 def test_engines_and_batch_agree() -> None:
     compared = compare(run(["latency=1ms"], dwells=5, sample_hz=10.0), Settings(effects=("latency",)))
-    assert compared.result.carried.slews
+    assert compared.result.linearised.slews
     assert compared.max_difference_sigma <= 1e-6
     assert all(way.max_relative_variance <= 1e-8 for way in compared.ways.values())
 

@@ -22,7 +22,7 @@ from kf_calib.effects import Bearer, SensorEffect, Stimulus, effect_named, names
 from kf_calib.errors import InputError
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.calibration import calibrate, evaluate
-from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.fit import Fit, fit
@@ -331,7 +331,7 @@ def test_left_out_effect_biases_the_twelve_and_the_effect_in_the_model_mends_it(
 
 def estimated(fitted: Fit) -> dict[str, tuple[float, float]]:
     """Value and sigma (NaN: not seen) of all but the twelve, without the rest of a calibration."""
-    model = fitted.carried.model
+    model = fitted.linearised.model
     factor = square_root_information.accumulate(fitted.rows(), fitted.steps)[:-1]
     estimate = Estimate(*square_root_information.solve(factor, model.nominal_state()))
     found, gains = model.natural(estimate.state)
@@ -408,7 +408,7 @@ def test_intervals_of_an_effect_cover_over_300_runs(name: str) -> None:
 def navigation() -> tuple[list[DwellFactor], NoiseModel, Floats]:
     """Dwells at navigation grade, their noise, and the state at which rotations are linearised."""
     dwells = Pass(run(["second-order=4e-6"], 5e-5), Settings()).fold()
-    return dwells, within_dwells(dwells), fit(dwells, Model.of(BENCH, ("thermal-bias",))).carried.state[:12]
+    return dwells, within_dwells(dwells), fit(dwells, Model.of(BENCH, ("thermal-bias",))).linearised.state[:12]
 
 
 @pytest.mark.parametrize("name", ["second-order", "bias-drift", "settling", "hysteresis", "encoder-harmonic-2:z"])
@@ -420,7 +420,7 @@ def test_a_factor_restricted_equals_that_of_fewer_columns(navigation, name: str)
 
     def factor_of(model: Model) -> Floats:
         at = np.concatenate([state, np.zeros(model.count - 12)])
-        rows = square_root_information.whiten(dwells, Carried(dwells, model, at).columns, noise, at, at)
+        rows = square_root_information.whiten(dwells, LinearisedDwells(dwells, model, at).columns, noise, at, at)
         return square_root_information.accumulate(rows)[:-1]
 
     few, chosen = factor_of(small), square_root_information.restrict(factor_of(large), list(range(small.count)))

@@ -192,7 +192,7 @@ def test_dwells_whitened_together_are_those_whitened_alone() -> None:
     dwells = [next(iter(dwell.prefixes())) if k % 3 else dwell for k, dwell in enumerate(dwells)]
     assert len({len(dwell.pieces) for dwell in dwells}) > 1
     fitted = fit(dwells, Model.of(Run(dwells=1).bench, ("bias-drift",)))
-    columns, state = fitted.carried.columns, fitted.carried.state
+    columns, state = fitted.linearised.columns, fitted.linearised.state
     for noise in (fitted.noise, replace(fitted.noise, scatter_mps2=np.full(3, 1e-5), walk_mps2_per_sqrt_s=1e-5)):
         together = square_root_information.whiten(dwells, columns, noise, state, reduced=False)
         for dwell, own, rows in zip(dwells, columns, together, strict=True):
@@ -204,7 +204,7 @@ def test_dwells_whitened_together_are_those_whitened_alone() -> None:
             left, right = rows[:, :-1].T @ rows, whole[:, :-1].T @ whole
             np.testing.assert_allclose(left, right, rtol=0, atol=1e-9 * np.abs(right).max())
     factors = [square_root_information.accumulate(fitted.rows()[:count])[:-1] for count in (1, 3, 14)]
-    around = fitted.carried.model.nominal_state()
+    around = fitted.linearised.model.nominal_state()
     for factor, (state, covariance, lost) in zip(
         factors, square_root_information.solve_all(np.array(factors), around), strict=True
     ):

@@ -39,12 +39,12 @@ def before() -> Calibration:
 
 @pytest.mark.parametrize("walk_mps2", [0.0, 1e-6])
 def test_groups_give_what_one_scan_gives(before: Calibration, walk_mps2: float) -> None:
-    noise = replace(before.noise.judging, walk_mps2_per_sqrt_s=walk_mps2)
+    noise = replace(before.noise.for_goodness_of_fit, walk_mps2_per_sqrt_s=walk_mps2)
     known = [effect_named(name, BENCH) for name in ("second-order", "settling", "cross-coupling-io")]
-    frame = Frame(before.carried, noise, known[:2])
+    frame = Frame(before.linearised, noise, known[:2])
     groups = [[effect_named(text, BENCH) for text in group] for group in GROUPS]
-    tests = FurtherEffects(frame, before.carried, known, 0.99)
-    together = frame.scan(before.carried, [effect for group in groups for effect in group])
+    tests = FurtherEffects(frame, before.linearised, known, 0.99)
+    together = frame.scan(before.linearised, [effect for group in groups for effect in group])
     expected, last = iter(together.candidates[2:]), 2
     for group, (found, is_known) in zip(groups, tests.scans(groups), strict=True):
         own = [next(expected) for _ in group]
@@ -59,27 +59,32 @@ def test_groups_give_what_one_scan_gives(before: Calibration, walk_mps2: float) 
 
 
 def test_an_effect_that_the_frame_lacks_is_known_too(before: Calibration) -> None:
-    frame = Frame(before.carried, before.noise.judging, [])
-    tests = FurtherEffects(frame, before.carried, [effect_named("second-order", BENCH)], 0.99)
+    frame = Frame(before.linearised, before.noise.for_goodness_of_fit, [])
+    tests = FurtherEffects(frame, before.linearised, [effect_named("second-order", BENCH)], 0.99)
     assert [is_known for _, is_known in tests.scans([[effect_named("mine = a*a", BENCH)]])] == [True]
 
 
 def test_an_effect_in_the_model_leaves_nothing_of_its_formula(before: Calibration) -> None:
     fitted = Refits().with_effects(before, ("second-order",)).fit
-    frame = Frame(fitted.carried, fitted.noise.judging, candidates(Model(BENCH)))
-    ((found, is_known),) = FurtherEffects(frame, fitted.carried, [], 0.99).scans([[effect_named("mine = a*a", BENCH)]])
+    frame = Frame(fitted.linearised, fitted.noise.for_goodness_of_fit, candidates(Model(BENCH)))
+    ((found, is_known),) = FurtherEffects(frame, fitted.linearised, [], 0.99).scans(
+        [[effect_named("mine = a*a", BENCH)]]
+    )
     assert found.candidates[0].dof == 0
     assert not is_known
 
 
 @pytest.mark.parametrize("scatter_mps2", [0.0, 1e-5])
 def test_columns_alone_are_those_of_all_rows(before: Calibration, scatter_mps2: float) -> None:
-    carried, noise = before.carried, replace(before.noise.judging, scatter_mps2=np.full(3, scatter_mps2))
+    linearised, noise = (
+        before.linearised,
+        replace(before.noise.for_goodness_of_fit, scatter_mps2=np.full(3, scatter_mps2)),
+    )
     effects = candidates(Model(BENCH))[:9]
-    added = candidate_columns(carried.dwells, effects, BENCH, carried.state)
-    rows, width = misfit_rows(carried.dwells, added, noise, carried.state, 0, reduced=False)
-    found = MisfitColumns(carried.dwells, noise, carried.state)
-    columns = found.of(piece_columns(effects, stimulus_of(carried.dwells, BENCH, carried.state)))
+    added = candidate_columns(linearised.dwells, effects, BENCH, linearised.state)
+    rows, width = misfit_rows(linearised.dwells, added, noise, linearised.state, 0, reduced=False)
+    found = MisfitColumns(linearised.dwells, noise, linearised.state)
+    columns = found.of(piece_columns(effects, stimulus_of(linearised.dwells, BENCH, linearised.state)))
     np.testing.assert_allclose(
         columns, np.concatenate(rows)[:, width:-1], rtol=1e-12, atol=1e-12 * np.abs(columns).max()
     )

@@ -77,7 +77,7 @@ def test_what_is_stated_is_not_estimated() -> None:
 def test_no_other_size_of_the_dwell_parts_is_likelier(seed: int, kind: dict[str, float]) -> None:
     """By the likelihood alone, without the derivative that the search goes by."""
     result = calibrate(Run(seed=seed, dwells=30, stated=False, **kind))
-    noise, means, state = result.noise, result.carried.means, result.carried.state
+    noise, means, state = result.noise, result.linearised.means, result.linearised.state
 
     def likelihood(setting: float, scatter: float) -> float:
         other = replace(noise, setting_rad=noise.setting_rad * setting, scatter_mps2=noise.scatter_mps2 * scatter)

@@ -102,7 +102,7 @@ def test_engines_on_their_way_are_those_of_the_dwells_so_far() -> None:
 def test_running_batch_least_squares_is_that_of_the_first_dwells() -> None:
     run = Run(seed=2, dwells=9, count=80, setting_deg=0.01)
     result = calibrate(run)
-    samples = list(samples_of(Pass(run, result.settings).rows(), result.carried, result.noise.weights))
+    samples = list(samples_of(Pass(run, result.settings).rows(), result.linearised, result.noise.weights))
     around = result.model.nominal_state()
     states = running_states(samples, around)
     for count in (5, 9):

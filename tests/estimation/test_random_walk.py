@@ -78,7 +78,7 @@ def test_the_likelihood_is_that_of_a_dense_covariance(held_s: float) -> None:
     """Against scipy's density of the residuals of the dwell means, the coefficients integrated out; of a walk, and of
     one that comes back."""
     result = fitted(walking(3, dwells=9, setting_deg=1e-4))
-    means, state = result.carried.means, result.carried.state
+    means, state = result.linearised.means, result.linearised.state
     times = []
     for begin, end in means.ends_s:
         times.append(begin + (end - begin) * (np.arange(500) + 0.5) / 500)
@@ -108,7 +108,7 @@ def test_the_likelihood_of_a_walk_is_there_however_large_a_setting_error_is_trie
     """No rotation changes a reading along the force: there the covariance is that of the noise, or of rounding."""
     result = calibrate(Run(seed=3, dwells=24, count=60, white_mps2=1e-6))
     noise = replace(result.noise, setting_rad=np.radians(setting_deg), walk_mps2_per_sqrt_s=1e-9)
-    found = [restricted_log_likelihood(noise, result.carried.means, result.carried.state, held_s=held_s)
+    found = [restricted_log_likelihood(noise, result.linearised.means, result.linearised.state, held_s=held_s)
              for held_s in (np.inf, 50.0)]  # fmt: skip
     assert np.isfinite(found).all()
 
@@ -128,7 +128,7 @@ def test_leaving_an_orientation_out_equals_a_fit_without_it() -> None:
 
 def by_conditioning(result: Calibration) -> tuple[float, float]:
     """Rms held-out error and its expectation from the dense covariance of the dwell means."""
-    means, count, full = result.carried.means, len(result.visits), dense(result)
+    means, count, full = result.linearised.means, len(result.visits), dense(result)
     design, readings = means.design.reshape(3 * count, -1), means.readings.ravel()
     errors, expected = [], []
     for group in ([0], [1], [2], [3], [4, 9], [5], [6], [7], [8], [10], [11]):
@@ -147,13 +147,13 @@ def by_conditioning(result: Calibration) -> tuple[float, float]:
 
 def dense(result: Calibration) -> Floats:
     """Covariance (3 D, 3 D) of the dwells' mean readings about the model, by the moments of a Brownian path."""
-    means, noise = result.carried.means, result.noise
+    means, noise = result.linearised.means, result.noise
     starts, ends = means.ends_s.T
     middle = 0.5 * (starts + ends) - starts[0]
     kernel = np.minimum(middle[:, None], middle[None, :])
     np.fill_diagonal(kernel, starts - starts[0] + (ends - starts) / 3.0)
     full = noise.walk_mps2_per_sqrt_s**2 * np.kron(kernel, np.eye(3))
-    for k, own in enumerate(mean_covariances(noise, means, result.carried.state)):
+    for k, own in enumerate(mean_covariances(noise, means, result.linearised.state)):
         full[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own
     return full
 

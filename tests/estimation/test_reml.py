@@ -14,7 +14,7 @@ from kf_calib.estimation import banded
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_columns import Means
 from kf_calib.estimation.noise_model import Noise
-from kf_calib.estimation.reml import with_dwell_parts
+from kf_calib.estimation.reml import estimate_variance_components
 from kf_calib.estimation.restricted_likelihood import Restricted
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
@@ -154,23 +154,23 @@ def parts_of(noise: Noise) -> Floats:
 
 
 def test_sizes_that_were_found_before_lead_to_the_same_noise(walked: Calibration) -> None:
-    means, state = walked.carried.means, walked.carried.state
+    means, state = walked.linearised.means, walked.linearised.state
     within = replace(walked.noise, walk_mps2_per_sqrt_s=0.0, walk_spread=None)
-    noise, sizes = with_dwell_parts(within, means, state, None, None, walks=True)
+    noise, sizes = estimate_variance_components(within, means, state, None, None, walks=True)
     moved: Means = replace(means, readings=means.readings * (1.0 + 1e-9))
     far = {parts: 50.0 * own for parts, own in sizes.items()}
     assert noise.walk_mps2_per_sqrt_s > 0.0 and noise.scatter_mps2.min() > 0.0
     for near in (sizes, far):
-        again, _ = with_dwell_parts(within, moved, state, None, None, walks=True, near=near)
+        again, _ = estimate_variance_components(within, moved, state, None, None, walks=True, start=near)
         np.testing.assert_allclose(parts_of(again), parts_of(noise), rtol=1e-4)
         assert again.walk_spread == pytest.approx(noise.walk_spread, rel=1e-3)
 
 
 @pytest.mark.parametrize("walk", [0.3, 1.0])
 def test_scatter_is_found_beside_a_walk_that_is_stated(walked: Calibration, walk: float) -> None:
-    means, state = walked.carried.means, walked.carried.state
+    means, state = walked.linearised.means, walked.linearised.state
     within = replace(walked.noise, walk_mps2_per_sqrt_s=walk * walked.noise.walk_mps2_per_sqrt_s, walk_spread=None)
-    noise, _ = with_dwell_parts(within, means, state, 0.0, None)
+    noise, _ = estimate_variance_components(within, means, state, 0.0, None)
     assert noise.walk_mps2_per_sqrt_s == within.walk_mps2_per_sqrt_s
 
     def likelihood(size: float) -> float:

@@ -39,13 +39,13 @@ def run(*hidden: str, seed: int = 5) -> Calibration:
 @pytest.mark.parametrize("walk_mps2", [0.0, 1e-6])
 def test_a_frame_gives_what_a_scan_of_one_model_gives(walk_mps2: float) -> None:
     before = run("second-order=40ug/g^2")
-    noise = replace(before.noise.judging, walk_mps2_per_sqrt_s=walk_mps2)
-    frame = Frame(before.carried, noise, candidates(Model(BENCH)))
+    noise = replace(before.noise.for_goodness_of_fit, walk_mps2_per_sqrt_s=walk_mps2)
+    frame = Frame(before.linearised, noise, candidates(Model(BENCH)))
     more = [effect_named("mine = a*p*o", BENCH)]
     refits = Refits()
     for result in (before, *(refits.with_effects(before, (name,)) for name in ("second-order", "settling"))):
-        found = frame.scan(result.carried, more)
-        alone = scan(result.carried, noise, [*candidates(result.model), *more])
+        found = frame.scan(result.linearised, more)
+        alone = scan(result.linearised, noise, [*candidates(result.model), *more])
         assert [str(each.effect) for each in found.candidates] == [str(each.effect) for each in alone.candidates]
         assert [each.dof for each in found.candidates] == [each.dof for each in alone.candidates]
         # with an effect in the model small rotations are linearised a little elsewhere
@@ -57,10 +57,10 @@ def test_a_frame_gives_what_a_scan_of_one_model_gives(walk_mps2: float) -> None:
 
 def test_a_frame_serves_one_noise_and_one_run() -> None:
     one, other = run(), run(seed=3)
-    frame = Frame(one.carried, one.noise.judging, [])
-    assert frame.serves(one.carried, one.noise.judging)
-    assert not frame.serves(other.carried, one.noise.judging)
-    assert not frame.serves(one.carried, replace(one.noise.judging, setting_rad=1e-5))
+    frame = Frame(one.linearised, one.noise.for_goodness_of_fit, [])
+    assert frame.serves(one.linearised, one.noise.for_goodness_of_fit)
+    assert not frame.serves(other.linearised, one.noise.for_goodness_of_fit)
+    assert not frame.serves(one.linearised, replace(one.noise.for_goodness_of_fit, setting_rad=1e-5))
 
 
 def test_nothing_is_fitted_twice() -> None:

@@ -147,7 +147,7 @@ def test_equals_least_squares_over_the_parameters_and_all_rotations_at_once() ->
         left = (trial.means - felt @ affine[:, :3].T - affine[:, 3]) / sigma
         return np.concatenate([left.ravel(), unknown[12:]])
 
-    start = np.append(result.carried.model.nominal_state(), np.zeros(3 * DWELLS))
+    start = np.append(result.linearised.model.nominal_state(), np.zeros(3 * DWELLS))
     found = least_squares(whitened, start, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=200)
     covariance = np.linalg.inv(found.jac.T @ found.jac)[:12, :12]
     estimated = result.estimate

@@ -18,10 +18,10 @@ from kf_calib.dwells.line_spectrum import Line, Spectrum, lines
 from kf_calib.dwells.sufficient_statistics import less_curve
 from kf_calib.effects import checks, effect_named
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.dwell_columns import Carried, stimulus_of
+from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.score_test import Frame, falls, scan
+from kf_calib.estimation.score_test import Frame, delta_chi2, scan
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.noise_processes import TrueNoise
@@ -98,9 +98,9 @@ def test_many_frequencies_are_tried_as_a_scan_would(scatter_mps2: float, walk_mp
     noise = replace(
         fitted.noise, scatter_mps2=np.full(3, scatter_mps2), scatter_stated=True, walk_mps2_per_sqrt_s=walk_mps2
     )
-    expected = scan(fitted.carried, noise, effects).statistics
+    expected = scan(fitted.linearised, noise, effects).statistics
     assert expected.max() > 10.0
-    np.testing.assert_allclose(falls(fitted.carried, noise, effects), expected, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(delta_chi2(fitted.linearised, noise, effects), expected, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("scatter_mps2", [0.0, 2e-5])
@@ -112,20 +112,22 @@ def test_a_periodogram_gives_what_each_frequency_alone_does(scatter_mps2: float,
         fitted.noise, scatter_mps2=np.full(3, scatter_mps2), scatter_stated=True, walk_mps2_per_sqrt_s=walk_mps2
     )
     values = np.linspace(0.01, 0.5, 400)
-    frame = Frame(fitted.carried, noise, [])
-    twelve = Carried(fitted.dwells, fitted.carried.model - fitted.carried.model.effects[0], fitted.carried.state[:12])
-    for carried in (fitted.carried, twelve):
+    frame = Frame(fitted.linearised, noise, [])
+    twelve = LinearisedDwells(
+        fitted.dwells, fitted.linearised.model - fitted.linearised.model.effects[0], fitted.linearised.state[:12]
+    )
+    for linearised in (fitted.linearised, twelve):
         effects = [effect_named("sinusoid", BENCH).at(value) for value in values[::7]]
-        expected = scan(carried, noise, effects).statistics
+        expected = scan(linearised, noise, effects).statistics
         assert expected.max() > 10.0
-        found = frame.falls(carried, effect_named("sinusoid", BENCH), values)[::7]
+        found = frame.delta_chi2(linearised, effect_named("sinusoid", BENCH), values)[::7]
         np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_columns_are_the_nearest_parabolas() -> None:
     """One and a half cycles in the longest piece, against least squares on dense instants."""
     result, effect = calibrate(run(0.1, 0.0, dwells=6)), effect_named("sinusoid", BENCH).at(0.5)
-    at = stimulus_of(result.fit.dwells, BENCH, result.carried.state)
+    at = stimulus_of(result.fit.dwells, BENCH, result.linearised.state)
     own = effect.columns(at)[:, 0, :2].reshape(-1, 3, 2)
     u = np.linspace(-1.0, 1.0, 20_001)
     for nodes, times in zip(own, at.elapsed_s.reshape(-1, 3), strict=True):
@@ -203,4 +205,4 @@ def test_spectra_add_up() -> None:
 def test_a_stated_scatter_goes_with_a_carrier() -> None:
     """Dwells folded on a carrier have nine nodes a piece; the slow part of the scatter has none of its envelopes."""
     result = calibrate(run(7.3, 1.0, dwells=16, bench=replace(BENCH, scatter_sigma_mps2=1e-5)), WITH)
-    assert result.carried.carrier_hz and np.abs(errors(result, 7.3, 1.0)).max() < 4.0
+    assert result.linearised.carrier_hz and np.abs(errors(result, 7.3, 1.0)).max() < 4.0

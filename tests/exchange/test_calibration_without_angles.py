@@ -53,7 +53,7 @@ def test_it_is_saved_with_its_frame_and_read_as_it_was(path: Path) -> None:
 
 
 def test_it_corrects_readings_to_the_size_of_gravity(path: Path) -> None:
-    correction, means = calibration_file.read(path).correction(path), result().carried.means
+    correction, means = calibration_file.read(path).correction(path), result().linearised.means
     warmth = np.array([np.mean(dwell.nodes.temperature_c) for dwell in result().fit.dwells])
     found = correction(means.readings, warmth)
     sigma = np.sqrt(np.mean(result().noise.sigma_mps2 ** 2) / means.counts.min())

@@ -53,7 +53,7 @@ def test_the_misfit_is_that_of_the_new_run_by_itself_and_that_of_the_two_states_
     both = np.array(saved(3).state.covariance) + new.estimate.covariance
     expected = new.consistency.statistic + between @ np.linalg.solve(both, between)
     assert found.statistic == pytest.approx(expected, rel=1e-6) and found.dof == new.consistency.dof + 12 == 27
-    residuals = new.carried.means.readings - new.carried.means.design @ np.array(saved(3).state.values)
+    residuals = new.linearised.means.readings - new.linearised.means.design @ np.array(saved(3).state.values)
     assert found.residual_rms_mps2 == pytest.approx(np.linalg.norm(residuals) / residuals.size**0.5, rel=1e-6)
 
 

@@ -10,7 +10,7 @@ from helpers.synthetic import Run
 
 from kf_calib.diagnosis.candidate_tests import candidates
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.dwell_columns import Carried
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import scan
 from kf_calib.online.running_filter import Running
@@ -32,11 +32,11 @@ def watched(result: Calibration) -> Watch:
 def test_a_running_scan_is_that_from_the_start() -> None:
     result = quiet(1)
     effects = [each for each in candidates(result.model) if each.unknown is None]
-    dwells, noise = result.fit.dwells, result.noise.judging
-    running = Running.over(dwells[:8], result.model, noise, result.carried.state, effects)
+    dwells, noise = result.fit.dwells, result.noise.for_goodness_of_fit
+    running = Running.over(dwells[:8], result.model, noise, result.linearised.state, effects)
     for dwell in dwells[8:]:
         running = running.after(dwell)
-    expected = scan(result.carried, noise, effects)
+    expected = scan(result.linearised, noise, effects)
     np.testing.assert_allclose(running.scan.statistics, expected.statistics, rtol=1e-6, atol=1e-7)
     statistic, dof = running.misfit
     assert dof == result.consistency.dof or dof > result.consistency.dof  # columns within dwells add rows
@@ -64,8 +64,11 @@ def test_a_dwell_more_has_the_columns_that_the_whole_run_gives_it() -> None:
     dwells, model = result.fit.dwells, result.model
     for effect in candidates(model):
         model = model if str(effect) in model.parts else model + effect
-    state = np.concatenate([result.carried.state[:12], np.zeros(model.count - 12)])
-    more, whole = Carried(dwells[:-1], model, state).followed_by(dwells[-1]), Carried(dwells, model, state)
+    state = np.concatenate([result.linearised.state[:12], np.zeros(model.count - 12)])
+    more, whole = (
+        LinearisedDwells(dwells[:-1], model, state).followed_by(dwells[-1]),
+        LinearisedDwells(dwells, model, state),
+    )
     lagged = model.parts["thermal-lag"]
     assert np.abs(whole.columns[-1][..., lagged]).max() > 0.1
     np.testing.assert_array_equal(more.columns[-1], whole.columns[-1])

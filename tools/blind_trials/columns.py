@@ -32,10 +32,10 @@ def scan_columns(
     what is equal in these differs by the setting errors of a run otherwise.
     """
     result = calibrate(Recording(path, {"angle_sigma_deg": "0"} if exact_poses else {}))
-    noise = result.noise.judging
+    noise = result.noise.for_goodness_of_fit
     if white_mps2 is not None:
         noise = dataclasses.replace(noise, sigma_mps2=np.full(3, white_mps2), inflation=np.ones(3))
-    found = scan(result.fit.carried, noise, column_effects(result, wanted, slow_lines))
+    found = scan(result.fit.linearised, noise, column_effects(result, wanted, slow_lines))
     return group_by_name(found.candidates), found.residual
 
 

@@ -84,7 +84,7 @@ def _candidate_signals(path: Path) -> tuple[dict[str, list[Candidate]], dict[str
     grids = column_effects(result)
     inner = {name: catalogue()[name.split(":")[0]].inner for name in dict.fromkeys(map(str, grids))}
     constants = [effect_named(name, bench).at(own["tau"]) for name, own in inner.items() if "tau" in own]
-    found = scan(result.fit.carried, result.noise.judging, [*grids, *constants, *steps]).candidates
+    found = scan(result.fit.linearised, result.noise.for_goodness_of_fit, [*grids, *constants, *steps]).candidates
     seen = [each for each in found[: len(grids)] if each.dof]
     hidden = {str(each.effect): each for each in found[len(grids) : -len(steps)] if each.dof}
     after = np.array(

@@ -28,7 +28,7 @@ class Explorer:
 
 def explorer(first: Calibration, others: Mapping[str, Floats]) -> Explorer:
     """The explorer of a run; others: residuals (D, 3) that other models leave, m/s^2, by what each is called."""
-    dwells = first.carried.dwells
+    dwells = first.linearised.dwells
     models, unit = {f"{first.model.sum}": first.residuals_mps2, **others}, shown("m/s^2")
     return Explorer(
         _short(

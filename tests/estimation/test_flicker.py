@@ -1,0 +1,105 @@
+"""1/f noise that goes on within the dwells: coefficients are covered by their sigmas, whatever they show in.
+
+The noise has the spectral density h / f, made here from random phases; the readings are made by scipy's rotations.
+The coefficients are truly zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from helpers.long_runs import slow
+from helpers.synthetic import NOMINAL, G, sensitivities
+from scipy.spatial.transform import Rotation
+
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.bench.streams import Batch, Stream
+from kf_calib.effects import effect_named, names
+from kf_calib.estimation.calibration import evaluate
+from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.settings import Settings
+from kf_calib.support.threads import one_blas_thread
+
+BENCH = Bench(axes_of("yzx"), G, latitude_deg=50.0, angle_sigma_deg=0.0)
+DWELLS, DWELL_S, GAP_S, RATE_HZ, POSE_HZ = 24, 60.0, 5.0, 5.0, 0.5
+UG = 1e-6 * G
+UNSEEN = {
+    "vibration-rectification", "bias-walk", "dead-zone", "sinusoid", "gravity-error", "cross-talk", "encoder-offset:y",
+    "encoder-offset:x", "encoder-scale:y", "encoder-harmonic-1:y", "encoder-harmonic-2:y", "warm-up", "thermal-lag",
+}  # fmt: skip
+"""Without coefficients that such a run shows; or, where the effect is not there, with a constant of which nothing is
+known."""
+EFFECTS = [name for name in names(BENCH) if name not in UNSEEN and not effect_named(name, BENCH).dynamic]
+FEW = ["thermal-scale", "bias-drift", "settling"]
+
+
+def one_over_f(rng: np.random.Generator, h: float, count: int) -> np.ndarray:
+    """Noise (count,) of the one-sided spectral density h / f, four times longer waves included."""
+    whole = 4 * count
+    hz = np.fft.rfftfreq(whole, 1.0 / RATE_HZ)
+    density = np.append(0.0, h / hz[1:])
+    amplitudes = np.sqrt(density * whole * RATE_HZ / 4.0)
+    return np.fft.irfft(amplitudes * (rng.normal(size=len(hz)) + 1j * rng.normal(size=len(hz))), whole)[:count]
+
+
+class Source:
+    """A run at random orientations with 1/f noise of ``flicker_ug``, or with scatter from dwell to dwell."""
+
+    warnings: tuple[str, ...] = ()
+    fraction = 1.0
+    bench = BENCH
+
+    def __init__(self, seed: int, flicker_ug: float, scatter_ug: float) -> None:
+        rng = np.random.default_rng([5, seed])
+        self.truth = NOMINAL + rng.normal(size=12) * 1e-3
+        rows, biases = sensitivities(self.truth)
+        time_s = np.arange(int(DWELLS * (DWELL_S + GAP_S) * RATE_HZ)) / RATE_HZ
+        noise = np.stack([one_over_f(rng, (flicker_ug * UG) ** 2, len(time_s)) for _ in range(3)], axis=1)
+        noise += rng.normal(size=noise.shape) * 1e-5 - noise.mean(axis=0)
+        readings = np.full((len(time_s), 3), np.nan)
+        poses = rng.uniform(-np.pi, np.pi, (DWELLS, 3))
+        dwell = (time_s // (DWELL_S + GAP_S)).astype(int)
+        still = time_s - dwell * (DWELL_S + GAP_S) < DWELL_S
+        forces = Rotation.from_euler("YZX", poses).inv().apply([0.0, G, 0.0])
+        levels = forces @ rows.T + biases + rng.normal(size=(DWELLS, 3)) * scatter_ug * UG
+        readings = levels[dwell] + noise
+        t_ns = np.round(time_s * 1e9).astype(np.int64)
+        seldom = still & (np.arange(len(time_s)) % int(RATE_HZ / POSE_HZ) == 0)
+        self._batch = Batch(
+            Stream(t_ns[still], readings[still]),
+            Stream(t_ns[seldom], poses[dwell[seldom]]),
+            Stream(t_ns[::5], (25.0 + 5.0 * np.sin(2 * np.pi * time_s[::5] / (0.4 * time_s[-1])))[:, None]),
+        )
+
+    def __iter__(self) -> Iterator[Batch]:
+        yield self._batch
+
+
+def ratios(name: str, runs: int, flicker_ug: float, scatter_ug: float) -> np.ndarray:
+    """Estimates over their sigmas of the coefficients of an effect that is not there, in so many runs."""
+    told = list[float]()
+    for seed in range(runs):
+        source = Source(seed, flicker_ug, scatter_ug)
+        with one_blas_thread():
+            result = evaluate(Pass(source, Settings()).fold(), BENCH, Settings(effects=(name,)))
+        coefficients = [result.parameters[c.symbol] for c in effect_named(name, BENCH).coefficients]
+        told += [c.value / c.sigma for c in coefficients if c.value is not None and c.sigma]
+    return np.array(told)
+
+
+@pytest.mark.parametrize(
+    "flicker_ug, scatter_ug, name, runs",
+    [
+        *((2.0, 0.0, name, 8) for name in FEW),
+        *slow(*((2.0, 0.0, name, 60) for name in EFFECTS), *((0.0, 2.0, name, 60) for name in FEW)),
+    ],
+)
+def test_coefficients_are_covered(flicker_ug: float, scatter_ug: float, name: str, runs: int) -> None:
+    """Within 2.6 standard deviations of a count of independent ones, of 95 % (runs share waves: half as many)."""
+    told = ratios(name, runs, flicker_ug, scatter_ug)
+    count = 0.5 * len(told)
+    assert count >= 0.4 * runs
+    assert abs(np.mean(np.abs(told) < 1.96) - 0.95) < 2.6 * np.sqrt(0.05 * 0.95 / count)
+    assert abs(np.sqrt(np.mean(told**2)) - 1.0) < 2.6 * np.sqrt(0.5 / count)
