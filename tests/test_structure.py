@@ -20,7 +20,12 @@ MODULES = {
     for path in PACKAGE.rglob("*.py")
 }
 DATA = "recordings"  # a link: the tutorial's recordings come with the package
-CORE = {"bench", "dwells", "effects", "estimation", "design", "diagnosis", "online"}
+CORE = {"bench", "dwells", "effects", "noise", "estimation", "design", "diagnosis", "online"}
+LEVELS = (
+    {"errors"}, {"support"}, {"bench"}, {"effects", "sources"}, {"dwells"}, {"noise"}, {"estimation"},
+    {"exchange", "reproduction", "design"}, {"diagnosis"}, {"fleet", "online"}, {"views"}, {"cli"},
+)  # fmt: skip
+"""The packages from the ground up: a package imports from those of lower levels only."""
 
 
 def imported(path: Path) -> set[str]:
@@ -86,6 +91,15 @@ def test_imports_point_the_way_that_data_flow(own: str) -> None:
                 assert not any(other.startswith("kf_calib.sources.simulation") for other in modules()[module]), module
     if name not in ("cli", "views", "", "__main__"):
         assert "views" not in seen and "cli" not in seen
+
+
+@pytest.mark.parametrize("own", [room for room in ROOMS if room != "kf_calib"])
+def test_a_package_imports_from_lower_levels_only(own: str) -> None:
+    level = {name: number for number, names in enumerate(LEVELS) for name in names}
+    name = own.removeprefix("kf_calib.")
+    if name != "__main__":
+        imported_rooms = {other.removeprefix("kf_calib.") for other in packages()[own]} - {"kf_calib"}
+        assert [other for other in sorted(imported_rooms) if level[other] >= level[name]] == []
 
 
 def test_nothing_lies_beside_the_packages() -> None:

@@ -21,6 +21,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.errors import BenchError
 
 SYMBOLS = ("theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3")
+STATE_COUNT = len(SYMBOLS)
 BIASES = [3, 7, 11]
 """Indices of the three biases in the affine state (s1, b1, s2, b2, s3, b3)."""
 UNITS = ("rad", "rad", "1", "m/s^2") * 3

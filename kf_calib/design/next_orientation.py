@@ -11,6 +11,7 @@ import numpy as np
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.design.gimbal_limits import wrap
 from kf_calib.design.predicted_information import Prospect
 from kf_calib.dwells.qr import triangle
@@ -18,9 +19,8 @@ from kf_calib.effects import Effect
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG
 from kf_calib.estimation.dwell_columns import candidate_columns
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.measurement_model import STATE_COUNT
-from kf_calib.estimation.noise_model import Noise, steps
 from kf_calib.estimation.square_root_information import accumulate, whiten
+from kf_calib.noise.noise_model import Noise, steps
 
 ENOUGH = 6.0
 """Separation in sigma that suffices: of two equally likely effects the wrong one is then chosen once in a thousand

@@ -18,15 +18,17 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.stationarity import Stillness
 from kf_calib.effects import Effect, Stimulus
-from kf_calib.estimation import random_walk, square_root_information
-from kf_calib.estimation.dwell_columns import Means
+from kf_calib.estimation import square_root_information
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.measurement_model import STATE_COUNT, Model, effect_columns
-from kf_calib.estimation.noise_model import Noise, considered_information, lift_rounding, mean_covariances
+from kf_calib.estimation.measurement_model import Model, effect_columns
 from kf_calib.estimation.prior import Prior
+from kf_calib.noise import random_walk
+from kf_calib.noise.means import Means
+from kf_calib.noise.noise_model import Noise, considered_information, lift_rounding, mean_covariances
 
 PAUSE_S = 60.0
 """Pause before the first dwell of a plan that continues a run, and between dwells if the run has a single dwell."""

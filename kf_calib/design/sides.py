@@ -15,7 +15,7 @@ from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.free_attitude import DIRECTIONS, covariance_of, most_informative, undetermined
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.estimation.noise_model import within_dwells
+from kf_calib.noise.noise_model import within_dwells
 
 SAME_SIDE_DEG = 10.0
 """Poses whose directions of gravity differ by less than this are of one side: the second tells little that is new."""

@@ -21,15 +21,16 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.qr import triangle
-from kf_calib.estimation.dwell_columns import LinearisedDwells, Means
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.measurement_model import STATE_COUNT
-from kf_calib.estimation.noise_model import Noise
-from kf_calib.estimation.reml import Likelihood, Part, Parts, likelihood_of, with_shared_noise
-from kf_calib.estimation.restricted_likelihood import Point
 from kf_calib.estimation.square_root_information import flicker_of_scatter, whiten
-from kf_calib.estimation.thermometer_error import thermometer_errors
+from kf_calib.noise.means import Means
+from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.reml import Likelihood, Part, Parts, likelihood_of, with_shared_noise
+from kf_calib.noise.restricted_likelihood import Point
+from kf_calib.noise.thermometer_error import thermometer_errors
 
 _SIZES = np.exp(np.linspace(0.0, math.log(1e14), 120))  # prior variance of a coefficient over that of its estimate
 _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of noise

@@ -18,8 +18,8 @@ from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe, explained_share
 from kf_calib.effects.effect import Grade
-from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration, Parameter
+from kf_calib.noise.noise_model import mean_covariances
 from kf_calib.support.printing import as_html, printed
 from kf_calib.support.units import span
 

@@ -1,1 +1,1 @@
-"""The noise model, the filters, least squares, the fit of a model and its results."""
+"""The measurement model, the filters, least squares, the fit of a model and its results."""

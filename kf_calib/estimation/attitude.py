@@ -16,13 +16,15 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import turn_by
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.attitude_error import AttitudeError
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect, FrameEffect, Stimulus
-from kf_calib.estimation.dwell_columns import LinearisedDwells, Means, stimulus_of
-from kf_calib.estimation.measurement_model import STATE_COUNT, Model
-from kf_calib.estimation.noise_model import Noise
-from kf_calib.estimation.nuisance_states import rotation_map, tangents
+from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.noise.means import Means
+from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.nuisance_states import rotation_map, tangents
 
 _STEP = 1e-6  # relative to g, of the differences that give the bending
 _ABRUPT = 0.5  # a bending beyond this is a jump of an effect's column, which has no derivative

@@ -18,6 +18,7 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.bench.streams import Source
 from kf_calib.dwells import window_average
 from kf_calib.dwells.blocks import Tally
@@ -29,14 +30,11 @@ from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.free_attitude import holding_frame
-from kf_calib.estimation.measurement_model import STATE_COUNT, Model
-from kf_calib.estimation.noise_model import considered_information, mean_covariances
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.oscillation_carrier import fitted_to, on_carrier
 from kf_calib.estimation.outlying_dwell import outlying_dwells, outlying_in_words
-from kf_calib.estimation.random_walk import predict, to_mean
 from kf_calib.estimation.remarks import misfit_remark, remarks_on
-from kf_calib.estimation.reml import FEWEST, degrees_of_freedom
 from kf_calib.estimation.results import (
     Calibration,
     Consistency,
@@ -50,6 +48,9 @@ from kf_calib.estimation.results import (
 from kf_calib.estimation.samples import Samples, samples_of
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.square_root_information import FilterStep
+from kf_calib.noise.noise_model import considered_information, mean_covariances
+from kf_calib.noise.random_walk import predict, to_mean
+from kf_calib.noise.reml import FEWEST, degrees_of_freedom
 from kf_calib.sources.opening import opened
 from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import LEVEL

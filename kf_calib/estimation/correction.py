@@ -23,12 +23,13 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.bench.raw_input import RawInput
 from kf_calib.effects import Effect
 from kf_calib.effects.inputs import beyond_force_and_temperature, depends_on_temperature, stimulus_of
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C, Stimulus
 from kf_calib.errors import InputError, UnobservableError
-from kf_calib.estimation.measurement_model import STATE_COUNT, Model
+from kf_calib.estimation.measurement_model import Model
 
 _BLOCK = 1 << 12  # readings at a time: what is at work stays in the cache
 _MOST_ROUNDS = 20

@@ -6,7 +6,7 @@ import numpy as np
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation.measurement_model import STATE_COUNT
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.estimation.results import Estimate
 
 

@@ -13,12 +13,13 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation import random_walk, square_root_information
-from kf_calib.estimation.dwell_columns import Means
+from kf_calib.estimation import square_root_information
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.free_attitude import weights_of_size
-from kf_calib.estimation.noise_model import considered_information, lift_rounding, mean_covariances
 from kf_calib.estimation.prior import Prior
+from kf_calib.noise import random_walk
+from kf_calib.noise.means import Means
+from kf_calib.noise.noise_model import considered_information, lift_rounding, mean_covariances
 
 SAME_POSE_DEG = 1.0
 """Dwells whose directions of gravity and poses differ by less than this are visits of one orientation."""

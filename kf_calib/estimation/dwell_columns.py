@@ -1,11 +1,10 @@
-"""The columns of models and effects over dwells that are kept as sufficient statistics, their means, and their rows
-sample by sample."""
+"""The columns of models and effects over dwells that are kept as sufficient statistics."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -13,14 +12,17 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.sufficient_statistics import DwellFactor, alike, dwells_before, rate_or_zero
+from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_before, rate_or_zero
 from kf_calib.effects import Effect, FrameEffect, Stimulus
-from kf_calib.estimation.measurement_model import STATE_COUNT, Model, effect_columns
-from kf_calib.estimation.temperature_course import temperature_course
+from kf_calib.estimation.measurement_model import Model, effect_columns
+from kf_calib.noise.means import Means, bending_of, means_of
+from kf_calib.noise.temperature_course import temperature_course
 
 _LITTLE_RAD = 1e-4  # of a setting error of 0.01 deg it leaves 0.2 um/s^2 along the specific force
 _ABSURD_RAD = 0.2  # what hardly determined coefficients may amount to, but no bench
+_STEP_K = 1e-3
 _VIBRATING = 15.0  # mean squared deviation of the variances in units of sigma; autocorrelation alone gives up to 10
 
 
@@ -151,58 +153,6 @@ def _by_piece(columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> Floa
     return np.concatenate(shaped, axis=1) if len(shaped) > 1 else shaped[0]
 
 
-@dataclass(frozen=True, repr=False)
-class Means:
-    """Means over each of D dwells.
-
-    - design (D, 3, p): the model's columns.
-    - readings (D, 3), force_mps2 (D, 3): readings and specific force.
-    - counts (D,): number of readings.
-    - ends_s (D, 2): when each dwell begins and ends.
-    - bending (D, 3, 3): by how much effects change the readings per unit of force (``AttitudeError``).
-    """
-
-    design: Floats
-    readings: Floats
-    force_mps2: Floats
-    counts: Floats
-    ends_s: Floats
-    bending: Floats = field(default_factory=lambda: np.zeros((1, 3, 3)))
-
-    def __getitem__(self, part: int | list[int]) -> Means:
-        known = {each.name: getattr(self, each.name) for each in fields(self)}
-        if len(self.bending) != len(self.counts):
-            del known["bending"]
-        return Means(**{name: values[part] for name, values in known.items()})
-
-    def sensitivities(self, state: Floats) -> Floats:
-        """Change (D, 3, 3) of the mean readings per unit of force at ``state`` (p,), effects included."""
-        return state[:STATE_COUNT].reshape(3, 4)[:, :3] + self.bending
-
-
-def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
-    """The means of dwells with these columns."""
-    design = np.zeros((len(dwells), *columns[0].shape[2:]))
-    for places in alike(dwells):
-        own, batch = np.array([columns[k] for k in places]), [dwells[k] for k in places]
-        triangles, width = np.array([dwell.triangles for dwell in batch]), batch[0].width
-        first = triangles[:, :, 0, :width] / triangles[:, :, :1, 0]  # means of the basis
-        weights = np.array([dwell.counts / dwell.count for dwell in batch])
-        coefficients = on_basis(own.reshape(*own.shape[:3], -1))
-        design[places] = np.einsum("db,dbk,dbkc->dc", weights, first, coefficients).reshape(-1, *own.shape[3:])
-    means = np.array([dwell.means for dwell in dwells])
-    forces = np.array([dwell.felt(own[1:4]) for dwell, own in zip(dwells, means, strict=True)])
-    counts = np.array([dwell.count for dwell in dwells], float)
-    ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
-    return Means(design, means[:, 4:], forces, counts, ends, np.array([bending_of(dwell) for dwell in dwells]))
-
-
-def bending_of(dwell: DwellFactor) -> Floats:
-    """By how much effects change the mean readings of a dwell per unit of force, (3, 3)."""
-    known = None if dwell.attitude is None else dwell.attitude.bending
-    return np.zeros((3, 3)) if known is None else known
-
-
 class LinearisedDwells:
     """Dwells with the columns of a model: the common input of noise model, filter and diagnosis.
 
@@ -254,6 +204,14 @@ class LinearisedDwells:
         for own in (*seen_within, *self.slew_columns):
             largest = np.maximum(largest, np.abs(own).max(axis=(0, 1, 2)))
         return np.where(largest > 0, largest, 1.0)
+
+
+def change_by_temperature(linearised: LinearisedDwells) -> Floats:
+    """Change of the readings per K (m, 3) at the nodes of all dwells, by the model at its state."""
+    model, state = linearised.model, linearised.state
+    stimulus = stimulus_of(linearised.dwells_at_state, model.bench, state)
+    warmer = replace(stimulus, temperature_c=stimulus.temperature_c + _STEP_K)
+    return (model.columns(warmer, state) - model.columns(stimulus, state)) @ state / _STEP_K
 
 
 def dwells_at_state(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[DwellFactor]:

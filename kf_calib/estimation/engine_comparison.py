@@ -18,7 +18,6 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
-from kf_calib.estimation.allan import AllanDeviation, LongestDwells
 from kf_calib.estimation.batch_least_squares import least_squares, running_states
 from kf_calib.estimation.calibration import calibrate, filterpy_estimate
 from kf_calib.estimation.dwell_pass import Pass
@@ -26,6 +25,7 @@ from kf_calib.estimation.free_attitude import holding_frame
 from kf_calib.estimation.results import Calibration, Estimate
 from kf_calib.estimation.samples import Samples, samples_of
 from kf_calib.estimation.settings import Settings
+from kf_calib.noise.allan import AllanDeviation, LongestDwells
 from kf_calib.sources.opening import opened
 from kf_calib.sources.tables.table import Table
 from kf_calib.support import stage
@@ -112,7 +112,7 @@ def compare(
         "batch": Way(least, batch_s, _peak_mb(batch)),
     }
     ways = {name: _against(way, result.estimate) for name, way in ways.items()}
-    longest = LongestDwells(result)
+    longest = LongestDwells(result.fit.dwells, result.noise)
     running = {"filterpy": by_filterpy, "batch": running_states(held(longest.passed_by(samples())), around)}
     differences = {name: _along(states, result) for name, states in running.items()}
     allan = None if isinstance(source, Table) else longest.allan_deviation()

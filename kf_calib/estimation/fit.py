@@ -18,19 +18,22 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation import free_attitude, square_root_information
 from kf_calib.estimation.attitude import facing_readings, without_attitude
-from kf_calib.estimation.dwell_columns import LinearisedDwells, Means, candidate_columns, stimulus_of
-from kf_calib.estimation.flicker import flicker_within
-from kf_calib.estimation.measurement_model import STATE_COUNT, Model
-from kf_calib.estimation.noise_model import ATTITUDE_UNKNOWN_RAD, FLOOR_MPS2, Noise, slow_waves, steps, within_dwells
-from kf_calib.estimation.nuisance_states import along_force, sensitivities_of
+from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, change_by_temperature, stimulus_of
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.relinearisation import SETTLED, UNSETTLED, descended, left_to_settle, relinearised
-from kf_calib.estimation.reml import (
+from kf_calib.estimation.score_test import delta_chi2
+from kf_calib.noise.flicker import flicker_within
+from kf_calib.noise.means import Means
+from kf_calib.noise.noise_model import ATTITUDE_UNKNOWN_RAD, FLOOR_MPS2, Noise, slow_waves, steps, within_dwells
+from kf_calib.noise.nuisance_states import along_force, sensitivities_of
+from kf_calib.noise.reml import (
     Part,
     estimate_variance_components,
     gain_of,
@@ -38,8 +41,7 @@ from kf_calib.estimation.reml import (
     misfit,
     with_shared_noise,
 )
-from kf_calib.estimation.score_test import delta_chi2
-from kf_calib.estimation.thermometer_error import sensitivity_to_temperature, thermometer_errors
+from kf_calib.noise.thermometer_error import sensitivity_to_temperature, thermometer_errors
 
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
@@ -292,15 +294,13 @@ def fit(
         linearised = _moved_to(fitted, model, state)
         state = linearised.state
         stated = _setting_deg(dwells, bench), bench.scatter_sigma_mps2
-        within = replace(
-            within, sensitivity_mps2_per_k=sensitivity_to_temperature(linearised, within.effective_sigma_mps2)
-        )
+        within = replace(within, sensitivity_mps2_per_k=_sensitivity_to_temperature(linearised, within))
         means, prior = with_shared_noise(linearised.dwells, within, linearised.means)
         noise, sizes = estimate_variance_components(
             within, means, state, *stated, walks=model.walks, start=sizes, prior=prior
         )
         noise = replace(noise, slew_sigma_mps2=_slew_sigma(fitted, state) if slews else None)
-        flicker_mps2 = flicker_within(linearised, noise)
+        flicker_mps2 = flicker_within(linearised.dwells_at_state, linearised.columns, state, noise)
         noise = replace(noise, flicker_mps2=flicker_mps2 if flicker_mps2.any() else None)
         turning = noise.weights.setting_rad > 0.0
         fitted = replace(fitted, linearised=linearised, noise=noise)
@@ -315,6 +315,15 @@ def fit(
     if must_settle and not bench.angles and left > UNSETTLED:
         raise UnobservableError(_not_settled(model))
     return fitted
+
+
+def _sensitivity_to_temperature(linearised: LinearisedDwells, within: Noise) -> Floats | None:
+    """Return ``sensitivity_to_temperature`` of the model at its state; None without effects."""
+    if not linearised.model.effects:
+        return None
+    return sensitivity_to_temperature(
+        linearised.dwells_at_state, lambda: change_by_temperature(linearised), within.effective_sigma_mps2
+    )
 
 
 def _along(linearised: LinearisedDwells, noise: Noise) -> Floats | None:

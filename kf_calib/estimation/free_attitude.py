@@ -20,12 +20,14 @@ from dataclasses import replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.attitude import added_by, bent_effects, matrix_of
-from kf_calib.estimation.dwell_columns import LinearisedDwells, Means, stimulus_of
-from kf_calib.estimation.measurement_model import FRAME, SQUARE, STATE_COUNT
-from kf_calib.estimation.noise_model import Noise
+from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
+from kf_calib.estimation.measurement_model import FRAME, SQUARE
 from kf_calib.estimation.samples import Samples, all_nuisance_sigmas
+from kf_calib.noise.means import Means
+from kf_calib.noise.noise_model import Noise
 
 DIRECTIONS: dict[str, Floats] = {
     " ".join(f"{'+' if sign > 0 else '-'}{axis}" for sign, axis in zip(signs, "xyz", strict=True) if sign): (

@@ -11,9 +11,9 @@ from scipy.special import chdtri
 
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.dwells.sufficient_statistics import Autocovariance
-from kf_calib.estimation.autoregression import expected_products
-from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration
+from kf_calib.noise.autoregression import expected_products
+from kf_calib.noise.noise_model import mean_covariances
 
 _MIDDLE = (0.025, 0.975)  # probabilities between which 95 % of all values lie
 _BOUND = 2.0  # sigmas

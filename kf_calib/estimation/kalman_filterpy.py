@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation.measurement_model import STATE_COUNT
-from kf_calib.estimation.noise_model import Noise
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.estimation.samples import Samples, all_nuisance_sigmas
+from kf_calib.noise.noise_model import Noise
 
 _DIFFUSE = 1e5
 """Sigma of a diffuse prior, in sigmas of one reading: wide enough not to bias, narrow enough for double precision."""

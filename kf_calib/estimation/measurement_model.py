@@ -17,6 +17,7 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.effects import Coefficient, Effect, FrameEffect, Stimulus, effect_named
 from kf_calib.errors import InputError
 from kf_calib.estimation.known_effect import KnownEffect
@@ -25,7 +26,6 @@ from kf_calib.support.printing import printed
 if TYPE_CHECKING:  # a replay without a bench model does not import what reads one
     from kf_calib.estimation.bench_model import BenchModel
 
-STATE_COUNT = 12
 _ROUNDING_MPS2 = 1e-13
 FRAME = (1, 2, 6)
 """s1y, s1z, s2z: without angles the frame is that in which accelerometer 1 is x and 2 lies in the plane of x and y."""

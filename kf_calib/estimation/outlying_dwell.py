@@ -19,9 +19,10 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_without
 from kf_calib.estimation.attitude import without_attitude
-from kf_calib.estimation.dwell_columns import LinearisedDwells, Means, turning_mps2
-from kf_calib.estimation.noise_model import lift_rounding, mean_covariances
+from kf_calib.estimation.dwell_columns import LinearisedDwells, turning_mps2
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Turn
+from kf_calib.noise.means import Means
+from kf_calib.noise.noise_model import lift_rounding, mean_covariances
 from kf_calib.support.tail_probabilities import f_tail
 
 _BEYOND_DOUBT = 1e-6  # significance over the whole run; a dwell must be wrong beyond doubt

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.information_share import shares_of
-from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.results import Calibration, Estimate, Parameter, estimate_of
 
 

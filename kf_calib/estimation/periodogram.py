@@ -19,13 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.bench.paper_parameters import BIASES
+from kf_calib.bench.paper_parameters import BIASES, STATE_COUNT
 from kf_calib.effects import Effect
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, piece_columns, stimulus_of
-from kf_calib.estimation.measurement_model import STATE_COUNT
-from kf_calib.estimation.noise_model import Noise, steps
 from kf_calib.estimation.square_root_information import MisfitColumns
+from kf_calib.noise.noise_model import Noise, steps
 
 _SEEN = 1e-6  # a column of which the model leaves less than this share counts as explained
 _NEW = 1e-9  # a smaller share of a column beside those before it is rounding

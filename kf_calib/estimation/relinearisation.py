@@ -11,7 +11,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.attitude import at_their_modes, facing_readings
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.estimation.noise_model import Noise
+from kf_calib.noise.noise_model import Noise
 
 SETTLED = 1e-4
 """In sigmas of each state: a smaller step ends the search."""

@@ -15,7 +15,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects.formula import quantities
 from kf_calib.errors import InputError
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
-from kf_calib.estimation.noise_model import Noise, mean_covariances
+from kf_calib.noise.noise_model import Noise, mean_covariances
 from kf_calib.support.extras import need
 
 _SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0  # weights of begin, middle and end of a piece in its mean

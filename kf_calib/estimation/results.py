@@ -13,19 +13,21 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.correction import Corrected, Correction
 from kf_calib.estimation.cross_validation import HeldOut, held_out
-from kf_calib.estimation.dwell_columns import LinearisedDwells, means_of
+from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.measurement_model import STATE_COUNT, Model
-from kf_calib.estimation.noise_model import ATTITUDE_UNKNOWN_RAD, Noise, considered_information, steps
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.relinearisation import at_its_mode
 from kf_calib.estimation.residual_table import residual_table, table_as
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings
+from kf_calib.noise.means import means_of
+from kf_calib.noise.noise_model import ATTITUDE_UNKNOWN_RAD, Noise, considered_information, steps
 from kf_calib.support.printing import as_html, printed
 from kf_calib.support.tail_probabilities import LEVEL, f_tail
 from kf_calib.support.threads import one_blas_thread

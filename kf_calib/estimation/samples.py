@@ -10,8 +10,8 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.rows import Rows, basis, on_basis
 from kf_calib.estimation.dwell_columns import LinearisedDwells, has_turns, turning_mps2
-from kf_calib.estimation.noise_model import Noise
-from kf_calib.estimation.nuisance_states import (
+from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.nuisance_states import (
     along_force,
     flicker_sigmas,
     flicker_waves,

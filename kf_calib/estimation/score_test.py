@@ -20,17 +20,19 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.line_spectrum import Line
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect, Stimulus
-from kf_calib.estimation import random_walk, square_root_information
+from kf_calib.estimation import square_root_information
 from kf_calib.estimation.complement import Complement
-from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, means_of, piece_columns, stimulus_of
-from kf_calib.estimation.measurement_model import STATE_COUNT
-from kf_calib.estimation.noise_model import Noise, steps
+from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, piece_columns, stimulus_of
 from kf_calib.estimation.periodogram import Periodogram
 from kf_calib.estimation.square_root_information import MisfitColumns
+from kf_calib.noise import random_walk
+from kf_calib.noise.means import means_of
+from kf_calib.noise.noise_model import Noise, steps
 
 _SEEN = 1e-6
 """A candidate is invisible if the model leaves less than this share of its columns."""

@@ -25,7 +25,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.dwells.rows import Rows
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation.noise_model import Noise
+from kf_calib.noise.noise_model import Noise
 from kf_calib.support.units import shown
 
 _SAMPLE = 256  # readings of a dwell whose values are compared; a step below a twentieth of the noise is not noticed

@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
-from kf_calib.estimation import random_walk
-from kf_calib.estimation.measurement_model import STATE_COUNT, Model
-from kf_calib.estimation.noise_model import Noise, flicker_sigma, shared_noise, slow_scatter
-from kf_calib.estimation.nuisance_states import (
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.prior import Prior
+from kf_calib.noise import random_walk
+from kf_calib.noise.noise_model import Noise, flicker_sigma, shared_noise, slow_scatter
+from kf_calib.noise.nuisance_states import (
     SLOW,
     along_force,
     flicker_sigmas,
@@ -31,7 +33,6 @@ from kf_calib.estimation.nuisance_states import (
     nuisance_sigmas,
     sensitivities_of,
 )
-from kf_calib.estimation.prior import Prior
 
 _STILL = np.zeros(2)
 _USUAL = 24  # columns of candidates that are whitened together in a long run

@@ -17,7 +17,8 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.estimation.measurement_model import FRAME, SQUARE, STATE_COUNT, Model
+from kf_calib.bench.paper_parameters import STATE_COUNT
+from kf_calib.estimation.measurement_model import FRAME, SQUARE, Model
 from kf_calib.exchange.calibration_parts import (
     SavedConditions,
     SavedConsistency,

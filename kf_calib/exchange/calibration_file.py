@@ -28,11 +28,12 @@ from kf_calib import effects
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.bench.streams import Source
 from kf_calib.effects.programs import Program
 from kf_calib.errors import BenchError, InputError
 from kf_calib.estimation.correction import Correction
-from kf_calib.estimation.measurement_model import STATE_COUNT, Model
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.model_file import ModelFile
 from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.results import Calibration

@@ -28,15 +28,15 @@ from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import evaluate_fit
 from kf_calib.estimation.correction import Correction
-from kf_calib.estimation.dwell_columns import Means
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.measurement_model import SQUARE, Model
-from kf_calib.estimation.noise_model import Noise, mean_covariances
 from kf_calib.estimation.relinearisation import linearised_at
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.exchange.calibration_file import SavedCalibration
+from kf_calib.noise.means import Means
+from kf_calib.noise.noise_model import Noise, mean_covariances
 from kf_calib.sources.files.bags import fingerprint
 from kf_calib.support.tail_probabilities import chi_squared_tail, sidak
 from kf_calib.support.threads import one_blas_thread

@@ -20,8 +20,8 @@ from kf_calib.dwells.qr import triangle
 from kf_calib.effects import Effect, effect_named, names
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.estimation.noise_model import Noise
 from kf_calib.estimation.score_test import whiten_model
+from kf_calib.noise.noise_model import Noise
 from kf_calib.support.threads import one_blas_thread
 
 STATES = tuple(f"{part}{i}" for i in (1, 2, 3) for part in ("sx", "sy", "sz", "b"))

@@ -12,8 +12,8 @@ from rich.text import Text
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.design.orientation_plan import Plan, papers_sigma
-from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.reproduction.grebenkin2019 import DEVIATIONS
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.units import Unit, shown

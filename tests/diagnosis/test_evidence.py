@@ -17,8 +17,8 @@ from kf_calib.diagnosis.evidence import Evidence, size_evidence
 from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.effects import effect_named
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.noise_model import mean_covariances
 from kf_calib.estimation.results import Calibration
+from kf_calib.noise.noise_model import mean_covariances
 from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES

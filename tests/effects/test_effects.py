@@ -27,11 +27,11 @@ from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.fit import Fit, fit
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.estimation.noise_model import Noise as NoiseModel
-from kf_calib.estimation.noise_model import within_dwells
 from kf_calib.estimation.prior import PRIORS
 from kf_calib.estimation.results import Calibration, Estimate
 from kf_calib.estimation.settings import Settings
+from kf_calib.noise.noise_model import Noise as NoiseModel
+from kf_calib.noise.noise_model import within_dwells
 from kf_calib.online.running_filter import Running
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse

@@ -14,7 +14,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration, consistency
 from kf_calib.estimation.settings import Settings
-from kf_calib.estimation.temperature_course import temperature_course
+from kf_calib.noise.temperature_course import temperature_course
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient

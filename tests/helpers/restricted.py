@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation import reml
-from kf_calib.estimation.dwell_columns import Means
-from kf_calib.estimation.noise_model import Noise
+from kf_calib.noise import reml
+from kf_calib.noise.means import Means
+from kf_calib.noise.noise_model import Noise
 
 
 def restricted_log_likelihood(noise: Noise, means: Means, state: Floats, held_s: float = math.inf) -> float:

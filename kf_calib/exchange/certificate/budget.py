@@ -22,14 +22,15 @@ import numpy as np
 from kf_calib import effects
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.effects import Coefficient, Effect, Stimulus
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.errors import InputError
-from kf_calib.estimation.dwell_columns import Means
-from kf_calib.estimation.measurement_model import STATE_COUNT, Model
-from kf_calib.estimation.noise_model import Noise, lift_rounding, mean_covariances
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.exchange.certificate.statement import DIVISORS, TypeB
+from kf_calib.noise.means import Means
+from kf_calib.noise.noise_model import Noise, lift_rounding, mean_covariances
 from kf_calib.support.units import quantity
 
 COVERAGE = math.erf(math.sqrt(2.0))

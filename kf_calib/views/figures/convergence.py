@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.estimation.innovation_tests import InnovationTests, innovation_tests
-from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.estimation.parameter_history import ParameterHistory, history_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.units import rounded

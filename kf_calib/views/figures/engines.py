@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation.allan import AllanDeviation
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.innovation_tests import InnovationTests, innovation_tests, reading_correlation
 from kf_calib.estimation.results import Calibration
+from kf_calib.noise.allan import AllanDeviation
 from kf_calib.support.units import shown
 from kf_calib.views.figures.convergence import draw_nis
 from kf_calib.views.figures.parameter_panels import MANY

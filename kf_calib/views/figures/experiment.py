@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure, FigureBase
 
-from kf_calib.estimation.measurement_model import STATE_COUNT
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.reproduction.grebenkin2019 import (
     NONOPTIMAL_PRINTED,
     OPTIMAL_PRINTED,

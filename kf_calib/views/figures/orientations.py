@@ -8,8 +8,8 @@ from matplotlib.figure import Figure, FigureBase
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.design.orientation_plan import Plan
-from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.views.figures.directions import number_points, on_map, sphere_map
 from kf_calib.views.figures.parameter_panels import draw_sigmas
 from kf_calib.views.figures.scales import log_scale, whole_numbers, written

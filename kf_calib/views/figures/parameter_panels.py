@@ -10,7 +10,7 @@ from matplotlib.figure import FigureBase
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation.measurement_model import STATE_COUNT
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.views.figures.scales import log_scale, whole_numbers, written
 from kf_calib.views.figures.style import ACCELEROMETERS, ALARM, MARKERS
 from kf_calib.views.figures.symbols import KINDS, Shown, twelve

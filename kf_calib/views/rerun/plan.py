@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import slerp
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.design import optimality_criteria
 from kf_calib.design.orientation_plan import Plan
 from kf_calib.estimation.information_share import shares_of
-from kf_calib.estimation.measurement_model import STATE_COUNT
 from kf_calib.views.plan import gimbal_names, sentences
 from kf_calib.views.rerun.chart import LABEL_HEIGHT, Axis, Chart, frames, power, sheet, thin, write
 from kf_calib.views.rerun.file import rrd_file

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from helpers.synthetic import Run
 
-from kf_calib.estimation.allan import LongestDwells, cluster_sizes, deviations, model_lines
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.engine_comparison import compare
-from kf_calib.estimation.noise_model import Noise
+from kf_calib.noise.allan import LongestDwells, cluster_sizes, deviations, model_lines
+from kf_calib.noise.noise_model import Noise
 
 SIZES = [1, 2, 5, 20, 100]
 
@@ -55,7 +55,7 @@ def test_the_readings_of_a_run_have_the_noise_that_was_put_in() -> None:
 
 
 def test_the_longest_dwell_is_used_whatever_its_length(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("kf_calib.estimation.allan._READINGS", 10)
+    monkeypatch.setattr("kf_calib.noise.allan._READINGS", 10)
     result = calibrate(Run(dwells=6, count=100))
     longest = max(result.fit.dwells, key=lambda dwell: dwell.count)
-    assert list(LongestDwells(result).kept) == [longest.number]
+    assert list(LongestDwells(result.fit.dwells, result.noise).kept) == [longest.number]

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation import banded
-from kf_calib.estimation.noise_model import lift_rounding
+from kf_calib.noise import banded
+from kf_calib.noise.noise_model import lift_rounding
 
 _LEAST = 1e-4  # relative to the size at which a search begins; smaller sizes count as zero
 _NEAR = 0.5  # if ln of a size changes by more, the search did not begin near its end

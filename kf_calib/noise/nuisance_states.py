@@ -13,11 +13,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import REGRESSORS
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation.dwell_columns import bending_of
-from kf_calib.estimation.measurement_model import STATE_COUNT
-from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise
+from kf_calib.noise.means import bending_of
+from kf_calib.noise.noise_model import FLOOR_MPS2, Noise
 
 SLOW = np.arange(1, 5)
 """Numbers of half cycles of the slow waves of 1/f noise in a dwell."""

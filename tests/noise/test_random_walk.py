@@ -14,12 +14,13 @@ from scipy.stats import chi2, multivariate_normal
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Stream
 from kf_calib.dwells import walk_path
-from kf_calib.estimation import random_walk, square_root_information
+from kf_calib.estimation import square_root_information
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.cross_validation import held_out
-from kf_calib.estimation.noise_model import mean_covariances, steps
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
+from kf_calib.noise import random_walk
+from kf_calib.noise.noise_model import mean_covariances, steps
 
 Q = 1e-5
 

@@ -7,39 +7,36 @@ the model at its estimate, as a function of the specific force f and of the temp
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
-from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
-from kf_calib.estimation.temperature_course import temperature_course
+from kf_calib.noise.temperature_course import temperature_course
 
-_STEP_K = 1e-3
 _MATTERS = 0.1  # share of the sigma of the mean of a dwell above which the error counts
 
 
-def sensitivity_to_temperature(linearised: LinearisedDwells, sigma_mps2: Floats) -> Floats | None:
-    """Change of the readings per K (3, 8) on the regressors 1, f, T, T f by the model at its state; None where the
-    error of the temperature does not matter.
+def sensitivity_to_temperature(
+    dwells: Sequence[DwellFactor], change_mps2_per_k: Callable[[], Floats], sigma_mps2: Floats
+) -> Floats | None:
+    """Change of the readings per K (3, 8) on the regressors 1, f, T, T f; None where the error of the temperature does
+    not matter.
 
-    sigma_mps2 (3,): noise of white readings.
+    change_mps2_per_k: gives the change per K (m, 3) at the nodes of all dwells by the model at its state. sigma_mps2
+    (3,): noise of white readings.
     """
-    dwells, model, state = linearised.dwells_at_state, linearised.model, linearised.state
     errors_c = temperature_course(tuple(dwells)).errors_c
-    if not errors_c.shape[1] or not model.effects:
+    if not errors_c.shape[1]:
         return None
-    stimulus = stimulus_of(dwells, model.bench, state)
-    warmer = replace(stimulus, temperature_c=stimulus.temperature_c + _STEP_K)
-    change = (model.columns(warmer, state) - model.columns(stimulus, state)) @ state / _STEP_K
+    change = change_mps2_per_k()
     if not change.any():
         return None
     counts = np.repeat([dwell.count for dwell in dwells], [3 * len(dwell.pieces) for dwell in dwells])
-    added = change**2 * np.sum(errors_c**2, axis=1, keepdims=True) * counts[:, None]
-    if added.max() < (_MATTERS * sigma_mps2.min()) ** 2:
+    variance = change**2 * np.sum(errors_c**2, axis=1, keepdims=True) * counts[:, None]
+    if variance.max() < (_MATTERS * sigma_mps2.min()) ** 2:
         return None
     return np.asarray(np.linalg.lstsq(_regressors(dwells), change, rcond=1e-9)[0].T, float)
 
@@ -50,14 +47,17 @@ def thermometer_errors(dwells: Sequence[DwellFactor], sensitivity_mps2_per_k: Fl
     errors_c = temperature_course(tuple(dwells)).errors_c
     change = (_regressors(dwells) @ sensitivity_mps2_per_k.T)[:, :, None] * errors_c[:, None, :]
     counts = [len(dwell.pieces) for dwell in dwells]
-    out = [np.zeros((count, dwell.width, 3, errors_c.shape[1])) for count, dwell in zip(counts, dwells, strict=True)]
-    for own, part in zip(out, np.split(change, 3 * np.cumsum(counts)[:-1]), strict=True):
-        own[:, :3] = part.reshape(len(own), *own[:, :3].shape[1:])
-    return out
+    parts = np.split(change, 3 * np.cumsum(counts)[:-1])
+    columns = [
+        np.zeros((count, dwell.width, 3, errors_c.shape[1])) for count, dwell in zip(counts, dwells, strict=True)
+    ]
+    for at_nodes, part in zip(columns, parts, strict=True):
+        at_nodes[:, :3] = part.reshape(len(at_nodes), *at_nodes[:, :3].shape[1:])
+    return columns
 
 
 def _regressors(dwells: Sequence[DwellFactor]) -> Floats:
     """Return 1, f, T and T f at the nodes of all dwells, (m, 8)."""
-    own = np.concatenate([dwell.nodes.regressors for dwell in dwells])
+    regressors = np.concatenate([dwell.nodes.regressors for dwell in dwells])
     warmth = temperature_course(tuple(dwells)).temperature_c - REFERENCE_TEMPERATURE_C
-    return np.hstack([own, warmth[:, None] * own])
+    return np.hstack([regressors, warmth[:, None] * regressors])

@@ -10,14 +10,14 @@ from helpers.restricted import restricted_log_likelihood
 from helpers.synthetic import Run
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation import banded
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.dwell_columns import Means
-from kf_calib.estimation.noise_model import Noise
-from kf_calib.estimation.reml import estimate_variance_components
-from kf_calib.estimation.restricted_likelihood import Restricted
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
+from kf_calib.noise import banded
+from kf_calib.noise.means import Means
+from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.reml import estimate_variance_components
+from kf_calib.noise.restricted_likelihood import Restricted
 
 
 def dense(columns: Floats) -> Floats:

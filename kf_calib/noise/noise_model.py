@@ -20,10 +20,10 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells import walk_path, window_average
 from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
-from kf_calib.estimation import random_walk
-from kf_calib.estimation.autoregression import expected_products, unbiased
-from kf_calib.estimation.dwell_columns import Means
-from kf_calib.estimation.thermometer_error import thermometer_errors
+from kf_calib.noise import random_walk
+from kf_calib.noise.autoregression import expected_products, unbiased
+from kf_calib.noise.means import Means
+from kf_calib.noise.thermometer_error import thermometer_errors
 
 FLOOR_MPS2 = 1e-9
 """Least sigma of a reading, used where readings are exactly constant; the rounding of a double is about 1e-15 m/s^2."""

@@ -22,10 +22,10 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation.dwell_columns import Means, means_of
-from kf_calib.estimation.noise_model import FLOOR_MPS2, Noise, mean_covariances, setting_covariances, shared_noise
-from kf_calib.estimation.random_walk import Links, mean_links
-from kf_calib.estimation.restricted_likelihood import Point, Restricted
+from kf_calib.noise.means import Means, means_of
+from kf_calib.noise.noise_model import FLOOR_MPS2, Noise, mean_covariances, setting_covariances, shared_noise
+from kf_calib.noise.random_walk import Links, mean_links
+from kf_calib.noise.restricted_likelihood import Point, Restricted
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
 FEWEST = 6

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation.noise_model import Noise, flicker_sigma
-from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.samples import Samples
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.noise.noise_model import Noise, flicker_sigma
 
 _DWELLS = 5  # as many of the longest are enough
 _LONG = 0.5  # of the longest dwell; shorter ones say nothing of the longest clusters
@@ -69,15 +69,32 @@ def cluster_sizes(longest: int) -> list[int]:
     return sorted({round(2.0**octave) for octave in octaves})
 
 
+class Residuals(Protocol):
+    """What is needed of the samples of one piece: its dwell, whether it moves, times (n,) and residuals (n, 3)."""
+
+    @property
+    def dwell(self) -> int: ...
+    @property
+    def moving(self) -> bool: ...
+    @property
+    def elapsed_s(self) -> Floats: ...
+    @property
+    def residual_mps2(self) -> Floats: ...
+
+
+_S = TypeVar("_S", bound=Residuals)
+
+
 @dataclass
 class LongestDwells:
-    """Collects the readings of the longest dwells of a run from its samples as these pass by."""
+    """Collects the residuals of the longest dwells of a run from its samples as these pass by."""
 
-    result: Calibration
-    kept: dict[int, list[Samples]] = field(default_factory=dict[int, list[Samples]])
+    run: Sequence[DwellFactor]
+    noise: Noise
+    kept: dict[int, list[Residuals]] = field(default_factory=dict[int, list[Residuals]])
 
     def __post_init__(self) -> None:
-        dwells = sorted(self.result.fit.dwells, key=lambda dwell: -dwell.count)[:_DWELLS]
+        dwells = sorted(self.run, key=lambda dwell: -dwell.count)[:_DWELLS]
         total = np.cumsum([dwell.count for dwell in dwells])
         self.kept |= {
             dwell.number: []
@@ -85,7 +102,7 @@ class LongestDwells:
             if dwell is dwells[0] or (dwell.count >= _LONG * dwells[0].count and sum_so_far <= _READINGS)
         }
 
-    def passed_by(self, samples: Iterable[Samples]) -> Iterator[Samples]:
+    def passed_by(self, samples: Iterable[_S]) -> Iterator[_S]:
         """Yield the samples, and keep those of the longest dwells."""
         for piece in samples:
             if piece.dwell in self.kept and not piece.moving:
@@ -96,13 +113,13 @@ class LongestDwells:
         """The Allan deviation of what was collected."""
         series = [np.concatenate([piece.residual_mps2 for piece in pieces]) for pieces in self.kept.values()]
         times = [np.concatenate([piece.elapsed_s for piece in pieces]) for pieces in self.kept.values()]
-        period_s = float(np.median(np.concatenate([np.diff(each) for each in times])))
+        period_s = float(np.median(np.concatenate([np.diff(time_s) for time_s in times])))
         sizes = cluster_sizes(max(map(len, series)))
-        found, clusters = deviations(series, sizes)
+        deviation_mps2, clusters = deviations(series, sizes)
         tau_s, spread = period_s * np.array(sizes), 1.0 / np.sqrt(2.0 * np.maximum(clusters - 1.0, 1.0))
         return AllanDeviation(
-            tuple(sorted(self.kept)), tau_s, found, spread,
-            *model_lines(self.result.noise, np.array(sizes), tau_s, len(self.result.visits)),
+            tuple(sorted(self.kept)), tau_s, deviation_mps2, spread,
+            *model_lines(self.noise, np.array(sizes), tau_s, len(self.run)),
         )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
-from kf_calib.estimation.autoregression import expected_products, unbiased
+from kf_calib.noise.autoregression import expected_products, unbiased
 
 
 @pytest.mark.parametrize("count, phi", [(30, 0.9), (80, 0.5), (200, 0.99), (81, -0.4)])

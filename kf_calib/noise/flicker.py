@@ -7,33 +7,35 @@ h / k, whatever T is. Scatter from dwell to dwell that is 1/f noise goes on with
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation.dwell_columns import LinearisedDwells
-from kf_calib.estimation.noise_model import Noise
-from kf_calib.estimation.nuisance_states import SLOW, along_force, flicker_waves, sensitivities_of
+from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.nuisance_states import SLOW, along_force, flicker_waves, sensitivities_of
 
 _GRID = np.geomspace(1e-3, 1e5, 161)  # of h, in variances of the amplitudes by the noise of the readings
 _CLEAR = 0.5 * 3.84  # gain in log-likelihood over none: 1/f noise that is less clear changes no sigma
 
 
-def flicker_within(linearised: LinearisedDwells, noise: Noise) -> Floats:
+def flicker_within(dwells: Sequence[DwellFactor], columns: Sequence[Floats], state: Floats, noise: Noise) -> Floats:
     """sqrt(h) (3,) of the 1/f noise within dwells; zeros where the dwells do not scatter, or show no slow waves.
 
-    The likeliest h of each accelerometer; one for all three where attitudes are not known.
+    The likeliest h of each accelerometer; one for all three where attitudes are not known. ``columns`` are those of the
+    model at the nodes of each dwell, (pieces, nodes, 3, p), ``state`` (p,) its estimate.
     """
-    if not noise.scatter_mps2.any() or noise.walk_mps2_per_sqrt_s or linearised.carrier_hz:
+    if not noise.scatter_mps2.any() or noise.walk_mps2_per_sqrt_s or dwells[0].carrier_hz:
         return np.zeros(3)
-    channels = np.eye(3)[None].repeat(len(linearised.dwells_at_state), axis=0)
+    channels = np.eye(3)[None].repeat(len(dwells), axis=0)
     if noise.attitude_unknown:
-        along = along_force(linearised.dwells_at_state, sensitivities_of(linearised.dwells_at_state, linearised.state))
+        along = along_force(dwells, sensitivities_of(dwells, state))
         channels = (along / np.linalg.norm(along, axis=1, keepdims=True))[:, None]
     pairs = [
-        _amplitudes(dwell, columns @ linearised.state, noise.effective_sigma_mps2, weights)
-        for dwell, columns, weights in zip(linearised.dwells_at_state, linearised.columns, channels, strict=True)
+        _amplitudes(dwell, design @ state, noise.effective_sigma_mps2, weights)
+        for dwell, design, weights in zip(dwells, columns, channels, strict=True)
     ]
     amplitudes, variances = (np.array(values) for values in zip(*pairs, strict=True))  # (D, k, c) each
     return np.broadcast_to([_likeliest(amplitudes[..., i], variances[..., i]) for i in range(channels.shape[1])], 3)
