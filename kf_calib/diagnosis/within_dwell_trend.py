@@ -89,8 +89,9 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     The ratio is F distributed: its denominator stands for the uncertainty of the noise itself. From n readings, kappa
     is known with a relative variance of (4 kappa - 2) / n, and the intensity of a walk with that of its own estimate.
 
-    linearised: dwells and columns of the model. noise: by which it is judged. Returns None where the dwells are
-    averages, where scatter was not stated, or where no dwell has enough readings.
+    linearised: dwells and columns of the model, without those of its last states where these are zero. noise: by which
+    it is judged. Returns None where the dwells are averages, where scatter was not stated, or where no dwell has enough
+    readings.
     """
     from scipy.special import fdtrc
 
@@ -131,7 +132,7 @@ def _by_thermometer(linearised: LinearisedDwells, noise: Noise) -> Floats | floa
 def _residuals(linearised: LinearisedDwells, state: Floats) -> list[Floats]:
     """Return the residuals (pieces, K, 3) of each dwell on the rows of its triangles."""
     return [
-        dwell.triangles[:, : dwell.width, dwell.width :] - _rows(dwell, columns @ state)
+        dwell.triangles[:, : dwell.width, dwell.width :] - _rows(dwell, columns @ state[: columns.shape[-1]])
         for dwell, columns in zip(linearised.dwells_at_state, linearised.columns, strict=True)
     ]
 

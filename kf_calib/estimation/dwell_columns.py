@@ -186,6 +186,13 @@ class LinearisedDwells:
         out.slew_columns = self.slew_columns
         return out
 
+    def with_columns(self, columns: Sequence[Floats]) -> LinearisedDwells:
+        """The same dwells with other columns (pieces, K nodes, 3, c) of each: those of the first c states alone."""
+        out = LinearisedDwells.__new__(LinearisedDwells)
+        out.dwells, out.slews, out.model, out.state = self.dwells, self.slews, self.model, self.state
+        out.dwells_at_state, out.columns, out.slew_columns = self.dwells_at_state, list(columns), self.slew_columns
+        return out
+
     @cached_property
     def means(self) -> Means:
         """The means over each dwell."""

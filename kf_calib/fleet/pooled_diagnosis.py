@@ -10,6 +10,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.effects import described
+from kf_calib.errors import InputError
 from kf_calib.fleet.attribution import Attributed, attributed, chosen
 from kf_calib.fleet.bench_coefficient import BenchEstimate, DatedSums
 from kf_calib.fleet.campaign import Campaign, Factors, Group
@@ -25,6 +26,10 @@ from kf_calib.support.threads import one_blas_thread
 
 RIVAL = 0.01
 """Probability above which another effect is named as a rival."""
+_ABSURD = (
+    "the runs cannot be diagnosed together, as the factor of at least one has numbers that no run has: evaluate them "
+    "again into a new folder (-o)."
+)
 _MAY_BE = 0.05  # of the probability of an effect: above it all units may have it
 
 
@@ -134,17 +139,19 @@ def pooled_diagnosis(factors: Factors, *, reference_unit: ReferenceUnit | None =
       ``open_fleet("fleet").factors``, so that memory does not grow with their number.
     - reference_unit: a unit whose scale factors are known, so that an error of gravity can be seen.
 
-    Raises InputError if there are no runs.
+    Raises InputError if there are no runs, or if their numbers are none that runs have.
     """
     with one_blas_thread():
-        campaign = Campaign(factors, reference_unit)
-        found = attributed(campaign)
-        names = [term.group.name for term in found.terms]
-        findings = [_finding(campaign, found, k) for k in range(len(names))]
-        rows = _rows(campaign, found, {each.effect: each for each in findings})
+        try:
+            campaign = Campaign(factors, reference_unit)
+            found = attributed(campaign)
+            findings = [_finding(campaign, found, k) for k in range(len(found.terms))]
+            rows = tuple(_rows(campaign, found, {each.effect: each for each in findings}))
+        except np.linalg.LinAlgError:
+            raise InputError(_ABSURD) from None
     units = len({key.unit for key in campaign.keys})
     return PooledDiagnosis(
-        len(campaign.keys), units, tuple(campaign.benches), tuple(findings), tuple(rows), found.rest.none
+        len(campaign.keys), units, tuple(campaign.benches), tuple(findings), rows, found.rest.none
     )
 
 

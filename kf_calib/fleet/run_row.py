@@ -43,6 +43,8 @@ SENTENCES = ("error", "verdict", "replay", "diagnosis")
 """Columns of text that may say where the recording is."""
 
 Row = dict[str, Any]
+_LARGEST = 1e50
+"""Of the numbers of a factor: far beyond those of any run, and products of four are numbers still."""
 _OF_REPLAY = (
     "samples", "dwells", "orientations", "model", "parameters", "residual_rms_mps2", "held_out_rms_mps2",
     "held_out_floor_mps2", "warnings",
@@ -97,7 +99,7 @@ def factor_of(row: Mapping[str, Any]) -> RunFactor | None:
 
 
 def are_whole(factors: pa.StructArray) -> Mask:
-    """Which factors (n,) have as many numbers as their columns ask for, all of them finite; that of a run that failed,
+    """Which factors (n,) have as many numbers as their columns ask for, none of them absurd; that of a run that failed,
     which has none, counts as whole."""
     lengths = {name: _lengths(factors.field(name)) for name in ("columns", "upper", "nominal", "constants")}
     size, width = lengths["columns"] + 1, factors.field("width").fill_null(-1).to_numpy(zero_copy_only=False)
@@ -106,7 +108,7 @@ def are_whole(factors: pa.StructArray) -> Mask:
     for name in ("rows", "noise_estimated"):
         right &= factors.field(name).is_valid().to_numpy(zero_copy_only=False)
     numbers = factors.field("upper").flatten().to_numpy(zero_copy_only=False)
-    bad = np.concatenate([[0], np.cumsum(~np.isfinite(numbers))])
+    bad = np.concatenate([[0], np.cumsum(~(np.abs(numbers) < _LARGEST))])  # not a number is none of these, too
     ends = np.concatenate([[0], np.cumsum(np.maximum(lengths["upper"], 0))])
     right &= np.diff(bad[ends]) == 0
     return right | factors.is_null().to_numpy(zero_copy_only=False)

@@ -14,22 +14,28 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import MAXYEAR, MINYEAR, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
+from kf_calib.bench.arrays import Mask
 from kf_calib.errors import InputError
 from kf_calib.fleet.run_row import SCHEMA, Row, are_whole
 from kf_calib.support.file_lock import lock, writer
 from kf_calib.support.output_files import whole
 
+pc: Any = pyarrow.compute  # its functions are made when it is imported, which no type checker sees
 _SMALL, _LARGE = "*.arrow", "*.parquet"
 _OWN_NAME = re.compile(r"runs-\d{20}-\d+")
 _KNOWN = ["run", "evaluated", "version", "sha256", "settings"]
+_DAMAGE = (pa.ArrowException, OSError, UnicodeDecodeError, MemoryError)
+"""What is raised for a damaged file: names of columns may be no text, and lengths more than there is memory."""
 _MOST_SMALL = 256
 """Small files that are merged while a fleet is being evaluated."""
 
@@ -125,7 +131,9 @@ class Store:
         return _newest(self._every, columns, rows)
 
     def _merge(self, files: Sequence[Path]) -> None:
-        with whole(self._new(_LARGE)) as part, pq.ParquetWriter(part, SCHEMA, compression="zstd") as out:
+        with whole(self._new(_LARGE)) as part, pq.ParquetWriter(
+            part, SCHEMA, compression="zstd", write_page_checksum=True
+        ) as out:
             for batch in _together(_newest(files, SCHEMA.names, AT_ONCE)):
                 out.write_table(batch)
         for file in files:
@@ -148,9 +156,9 @@ class Store:
         if file not in self._tables:
             try:
                 schema = pq.read_schema(file) if file.match(_LARGE) else _schema_of_small(file)
-            except (pa.ArrowException, OSError):
+                types = {field.name: field.type for field in schema}
+            except _DAMAGE:
                 return True
-            types = {field.name: field.type for field in schema}
             alike = all(types[field.name].equals(field.type) for field in SCHEMA if field.name in types)
             self._tables[file] = alike and {"run", "evaluated"} <= types.keys()
         return self._tables[file]
@@ -185,7 +193,7 @@ def _newest(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterato
     for batch in _rows(files, read, rows):
         pairs = zip(batch["run"].to_pylist(), batch["evaluated"].to_pylist(), strict=True)
         kept = [left.get(run) == evaluated and bool(left.pop(run)) for run, evaluated in pairs]
-        yield batch.filter(pa.array(kept)).select(list(columns))
+        yield batch.filter(pa.array(kept, pa.bool_())).select(list(columns))
 
 
 def _together(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
@@ -206,9 +214,17 @@ def _sound(batch: pa.RecordBatch) -> pa.RecordBatch:
     kept = np.ones(batch.num_rows, bool)
     for name in ("run", "evaluated"):
         kept &= batch[name].is_valid().to_numpy(zero_copy_only=False)
+    for name in {"date", "evaluated"} & set(batch.schema.names):
+        kept &= _are_dates(batch[name])
     if "factor" in batch.schema.names:
         kept &= are_whole(batch["factor"])
     return batch if kept.all() else batch.filter(pa.array(kept))
+
+
+def _are_dates(stamps: pa.TimestampArray) -> Mask:
+    """Tell which stamps (n,) are in a year that a date can have, or null."""
+    years = pc.year(stamps.cast(pa.timestamp(stamps.type.unit))).fill_null(1).to_numpy(zero_copy_only=False)
+    return np.asarray((years >= MINYEAR) & (years <= MAXYEAR))
 
 
 def _rows(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterator[pa.RecordBatch]:
@@ -218,14 +234,19 @@ def _rows(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterator[
 
 def _all_rows(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterator[pa.RecordBatch]:
     """Yield all rows of some files; raises InputError where one of them is damaged."""
-    for kind, form in ((_LARGE, "parquet"), (_SMALL, "ipc")):
+    checked = ds.ParquetFileFormat(
+        default_fragment_scan_options=ds.ParquetFragmentScanOptions(page_checksum_verification=True)
+    )
+    for kind, form in ((_LARGE, checked), (_SMALL, "ipc")):
         if own := [str(file) for file in files if file.match(kind)]:
             try:
                 data = ds.dataset(own, schema=SCHEMA, format=form)
                 # with threads each would keep memory of its own, more with every pass over the table
-                yield from data.to_batches(columns=list(columns), batch_size=rows, batch_readahead=1,
-                                           fragment_readahead=1, use_threads=False)  # fmt: skip
-            except (pa.ArrowException, OSError) as error:
+                for batch in data.to_batches(columns=list(columns), batch_size=rows, batch_readahead=1,
+                                             fragment_readahead=1, use_threads=False):  # fmt: skip
+                    batch.validate(full=True)  # a damaged small file ends the process elsewhere
+                    yield batch
+            except _DAMAGE as error:
                 said = " ".join(str(error).split()).rstrip(".")
                 raise InputError(
                     f"a file of the table is damaged ({said}): move it away, and its runs are evaluated again."

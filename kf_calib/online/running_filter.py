@@ -75,8 +75,9 @@ class Running:
         at = np.concatenate([state[:STATE_COUNT], np.zeros(every.count - STATE_COUNT)])
         inside = tuple(str(effect) for effect in model.effects)
         empty = np.zeros((every.count, every.count + 1))
-        linearised = linearised_at(dwells, every, at, noise.weights)
-        return cls(linearised, inside, noise, prior or Prior(), empty)._rebuild()
+        # candidates, at zero, turn no dwell
+        attitudes = linearised_at(dwells, model, at[: model.count], noise.weights).dwells
+        return cls(LinearisedDwells(attitudes, every, at), inside, noise, prior or Prior(), empty)._rebuild()
 
     @property
     def dwells(self) -> list[DwellFactor]:
@@ -109,6 +110,13 @@ class Running:
             linearised = self.linearised.followed_by(dwell)
         more = replace(self, linearised=linearised)
         return more._update(more._rows([-1])[0], steps(linearised.dwells[-2:], self.noise)[-1])
+
+    def lean(self) -> Running:
+        """The same filter without the columns of candidates in its dwells, which fill the memory in a long run. It can
+        go on with ``exact=False`` only."""
+        width = self.model.count
+        columns = [own if own.shape[-1] == width else own[..., :width].copy() for own in self.linearised.columns]
+        return replace(self, linearised=self.linearised.with_columns(columns))
 
     def solved(self) -> tuple[Floats, Floats, Floats]:
         """State (p,) of the model, its covariance (p, p), and a basis (p, q) of the combinations not determined."""
@@ -160,10 +168,8 @@ class Running:
         factor[:, -1] -= factor[:, :-1] @ self.about
         variances = steps(self.dwells, self.noise)
         out = replace(self, factor=factor, left=0.0, rows=0)
-        if not variances.any():
-            return out._update(np.concatenate(self._rows()), variances[0])
-        for own, variance in zip(self._rows(), variances, strict=True):
-            out = out._update(own, variance)
+        for k, variance in enumerate(variances):  # the rows of all dwells together would take much memory
+            out = out._update(self._rows([k])[0], variance)
         return out
 
     def _rows(self, chosen: Sequence[int] | None = None) -> list[Floats]:

@@ -77,7 +77,7 @@ class Watch:
         fitted: the model fitted to all dwells, this one included, where it is known.
         """
         with one_blas_thread():
-            running = self.running.after(dwell, exact=False)  # it is built again when the run has grown by a quarter
+            running = self.running.after(dwell, exact=False).lean()  # it is built again when a quarter has been added
             if len(running.dwells) < _GROWN * self.fitted_at:
                 return replace(self, running=running)._look()
             running, fitted_at, tests = _begun(running.dwells, self.bench, self.settings, fitted)
@@ -143,7 +143,8 @@ def _begun(
     noise = replace(
         fitted.noise.for_goodness_of_fit, checked=True
     )  # a test of the misfit has to allow for all of a setting error
-    running = Running.over(dwells, fitted.linearised.model, noise, fitted.linearised.state, _effects_to_watch(fitted))
+    model, state = fitted.linearised.model, fitted.linearised.state
+    running = Running.over(dwells, model, noise, state, _effects_to_watch(fitted)).lean()
     return running, len(dwells), independent_tests(running.scan)
 
 

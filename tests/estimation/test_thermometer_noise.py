@@ -113,3 +113,11 @@ def assert_as_read(dwells: list[DwellFactor]) -> None:
     course = temperature_course(tuple(dwells))
     np.testing.assert_array_equal(course.temperature_c, np.concatenate([own.nodes.temperature_c for own in dwells]))
     assert course.errors_c.shape[1] == 0
+
+
+@pytest.mark.parametrize("read_c", [25.0, 0.0, 24.9])
+def test_a_thermometer_that_always_reads_the_same_is_taken_at_its_word(read_c: float) -> None:
+    """Of a room at exactly one temperature there is nothing to smooth, and no warning of numpy."""
+    run, ambient = calibrated(0.0 * LARGE, swing_c=0.0, warm_up_c=0.0, sigma_c=0.0, constant_c=read_c)
+    read, smooth, sigma = errors(run.fit.dwells, ambient)
+    assert np.abs([read, smooth]).max() < 1e-12 and not sigma.any()
