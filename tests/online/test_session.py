@@ -274,6 +274,25 @@ def test_memory_of_a_bench_that_stands_for_thirty_hours_is_flat() -> None:
     assert kept[1] < kept[0] + 300_000
 
 
+@pytest.mark.slow
+def test_memory_of_a_run_of_thirty_hours_is_that_of_its_dwells() -> None:
+    """What a judgement keeps of a dwell of an hour does not grow with the columns of all candidates, 1 MB for each."""
+    kept = list[float]()
+    source = Simulation(
+        BENCH, GRADES["navigation"].sensors(5), TrueNoise(white_mps2=5e-5), plan_of(29, dwell_s=3700.0, seed=5),
+        sample_hz=10.0, angle_hz=1.0, slew_rate_degps=180.0, seed=5, batch_samples=4000,
+    )  # fmt: skip
+    session = Session(source)
+    session.listeners.append(lambda _: kept.append(tracemalloc.get_traced_memory()[0] / 1e6))
+    tracemalloc.start()
+    try:
+        session.run()
+    finally:
+        tracemalloc.stop()
+    assert len(kept) == 30
+    assert np.mean(kept[25:29]) - np.mean(kept[10:14]) < 0.75 * 15.0, kept
+
+
 def test_pieces_that_are_merged_do_not_depend_on_how_readings_come() -> None:
     """However often a run is looked at, and in whatever batches it comes."""
     folded = list[list[Any]]()
