@@ -109,10 +109,8 @@ class RawInput:
         return cls((first, second, third), (abs(x), abs(y), abs(z)))
 
     def to_metadata(self) -> dict[str, str]:
-        """The bench keys that state it; none where the device sends readings."""
-        if self.is_plain:
-            return {}
-        return {"channels": self.order, "accel_scale": self.scale, "accel_unit": self.unit}
+        """The bench keys that state it; none where the device sends readings, and no order where it is the usual."""
+        return {} if self.is_plain else self.scale_metadata()
 
     def scale_metadata(self) -> dict[str, str]:
         """The bench keys that state the size of a count, and which channel is which only where that is said, too."""
@@ -124,10 +122,10 @@ class RawInput:
         """Whether the raw numbers are the readings."""
         return self == PLAIN
 
-    @property
-    def restating(self) -> str:
-        """The option that an advice to state another one needs, after a blank; nothing where none is stated yet."""
-        return "" if self.is_plain else " --restate-input"
+    def restating(self, key: str) -> str:
+        """The option that an advice to state another value of a bench key needs, after a blank; nothing where none is
+        stated yet."""
+        return " --restate-input" if key in self.to_metadata() else ""
 
     @property
     def order(self) -> str:
@@ -246,7 +244,7 @@ def merged(
     """
     stated = dict(recorded)
     if default is not None and not default.is_plain and not set(OPTIONS) & set(recorded):
-        stated, what = stated | default.to_metadata(), "the calibration"
+        stated, what = stated | default.to_metadata() | {"channels": default.order}, "the calibration"
     shared = () if overrides.get(RESTATE) == "true" else set(OPTIONS) & set(stated) & set(overrides)
     for key in sorted(shared):
         try:

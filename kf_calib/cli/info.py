@@ -30,7 +30,9 @@ from kf_calib.errors import BenchError, CountsError, KfCalibError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 if TYPE_CHECKING:
+    from kf_calib.bench.raw_input import RawInput
     from kf_calib.bench.streams import Source
+    from kf_calib.bench.wrong_unit import WrongUnit
     from kf_calib.dwells.overview import DwellFound
     from kf_calib.sources.files.inventory import Inventory
     from kf_calib.views.overview import Overview
@@ -90,17 +92,19 @@ def _of_messages(ctx: click.Context, path: Path, options: Mapping[str, Any], tic
     by_hand = inventory.has_readings and inventory.has_angles is None and not any(t.paths for t in inventory.topics)
     lacking = _lacks(bench, inventory.has_angles is not False and not (by_hand or options["no_angles"]))
     missing = {key: _NAMED[key][1] for key in lacking}
-    dwells, warnings = None, list(inventory.warnings)
+    dwells, warnings, wrong = None, list(inventory.warnings), None
     try:
         source = messages_of(path, options, not options["no_angles"])
         dwells = _dwells(source, tick)
         warnings = list(dict.fromkeys([*warnings, *source.warnings]))
+        wrong = _wrong_unit([dwell.norm_mps2 for dwell in dwells], source.bench.input)
     except BenchError as error:
         missing = missing or {"": str(error)}
     except KfCalibError as error:
         missing = {"": str(error), **missing}
     words = _given(ctx, _not_of(ctx, ("columns", "g_unit"))) + _fields(inventory) + [_NAMED[key][0] for key in lacking]
     words += ["--no-angles"] if by_hand and not options["no_angles"] else []
+    missing, words = _with_unit(missing, words, wrong)
     return _overview(inventory, bench, dwells, missing, words, warnings)
 
 
@@ -128,15 +132,48 @@ def _of_lines(
         missing[key] = _NAMED[key][1]
         words.append(axes if key == "axes" else _NAMED[key][0])
     provisional = {"axes": shlex.split(axes)[1]} if angles and inventory.has_angles else {}
-    gravity = {} if bench.get("latitude_deg") else {"gravity_mps2": str(STANDARD_GRAVITY_MPS2)}
-    dwells, warnings = None, list(inventory.warnings)
+    if not bench.get("latitude_deg"):
+        provisional["gravity_mps2"] = str(STANDARD_GRAVITY_MPS2)
+    is_bare = inventory.is_bare and not {"accel_unit", "accel_scale"} & bench.keys()
+    if is_bare:
+        provisional["accel_unit"] = "m/s2"
+    dwells, warnings, wrong = None, list(inventory.warnings), None
     try:
-        source = Lines(path, {**provisional, **gravity, **bench}, renamed, units=units, angles=angles)
+        source = Lines(path, {**provisional, **bench}, renamed, units=units, angles=angles)
         dwells = _dwells(source, tick)
         warnings = list(dict.fromkeys([*warnings, *source.warnings]))
+        wrong = _wrong_unit([dwell.norm_mps2 for dwell in dwells], source.bench.input, are_named=not is_bare)
     except KfCalibError as error:
         missing = {"": str(error), **missing}
+    if is_bare:
+        missing["accel_unit"] = "the unit of the readings, which their names do not tell: --accel-unit or --accel-scale"
+        words.append("--accel-unit m/s2" if wrong is None else wrong.option)
+    else:
+        missing, words = _with_unit(missing, words, wrong)
     return _overview(inventory, bench, dwells, missing, words, warnings)
+
+
+def _wrong_unit(norms_mps2: Sequence[float], taken: RawInput, *, are_named: bool = False) -> WrongUnit | None:
+    """What shows that readings at rest are in another unit than they are taken for; None where nothing does.
+
+    are_named: whether names of columns tell the unit, too.
+    """
+    from kf_calib.bench.wrong_unit import LEVELS, wrong_unit
+
+    level = median(norms_mps2) / STANDARD_GRAVITY_MPS2 if norms_mps2 else 1.0
+    if LEVELS[0] <= level <= LEVELS[1] or level == 0.0:
+        return None
+    wrong = wrong_unit(level, taken, STANDARD_GRAVITY_MPS2)
+    is_named = are_named and "--accel-unit" in wrong.option and "--restate-input" not in wrong.option
+    return wrong._replace(option=wrong.option + " --restate-input") if is_named else wrong
+
+
+def _with_unit(missing: dict[str, str], words: list[str], wrong: WrongUnit | None) -> tuple[dict[str, str], list[str]]:
+    """What is missing, and the words of the command to try, with another unit in place of one that was given."""
+    if wrong is None:
+        return missing, words
+    kept = [word for word in words if word.split()[0] not in wrong.option.split()]
+    return missing | {"accel_unit": wrong.sentence + "."}, [*kept, wrong.option]
 
 
 def _overview(
@@ -179,6 +216,9 @@ def _show_table(
         missing.append("the size of one count of the readings: --accel-scale, in m/s^2 or what --accel-unit says")
         level = median(row.norm_mps2 for row in table.rows)
         words.append(f"--accel-scale {STANDARD_GRAVITY_MPS2 / level:.3g}")
+    elif wrong := _wrong_unit([row.norm_mps2 for row in table.rows], table.input, are_named=True):
+        told, words = _with_unit({}, words, wrong)
+        missing += told.values()
     command = " ".join(["kf-calib replay", _quoted(str(table.path)), *words])
     found = TableOverview(table, bench, missing, command)
     if as_json:

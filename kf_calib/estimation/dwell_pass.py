@@ -11,7 +11,7 @@ import numpy as np
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Source
-from kf_calib.bench.wrong_unit import wrong_unit
+from kf_calib.bench.wrong_unit import LEVELS, wrong_unit
 from kf_calib.dwells import tabulated, window_average
 from kf_calib.dwells.blocks import LARGEST_RAD, Block, Tally
 from kf_calib.dwells.rest_in_readings import segmenter_of
@@ -122,11 +122,11 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
             f"platform must stand still; if it did, raise --still-deg or lower --settle-s{unit}."
         )
     level = float(np.median([np.linalg.norm(dwell.means[4:]) for dwell in dwells])) / bench.gravity_mps2
-    if 0.5 <= level <= 2.0:
+    if LEVELS[0] <= level <= LEVELS[1]:
         if bench.angles:
             setup_blunders.refuse(dwells, bench)
         return
-    raise InputError(f"{wrong_unit(level, bench.input, bench.gravity_mps2)}.")
+    raise InputError(f"{wrong_unit(level, bench.input, bench.gravity_mps2).sentence}.")
 
 
 def _refuse_restless(dwells: list[DwellFactor], tally: Tally) -> None:

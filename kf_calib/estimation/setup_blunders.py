@@ -322,7 +322,7 @@ def _advice(stated: Bench, mending: Mending) -> str:
     if mounting.angle_unit < 1.0:
         options.append("--angle-unit deg")
     if mending.channels != CHANNELS:
-        options.append(f"--channels {_wired(stated, mending.channels)}{stated.input.restating}")
+        options.append(f"--channels {_wired(stated, mending.channels)}{stated.input.restating('channels')}")
     if stated.axes and mounting.order != tuple(range(len(stated.axes))):
         words.append("--joints with the names of the angles, outer to inner")
     if mounting.angle_unit > 1.0:
@@ -381,7 +381,7 @@ def common_scale(scales: Floats, sigmas: Floats, bench: Bench) -> str:
         return (
             f"{said} readings in units of local gravity ({bench.gravity_mps2:.6g} m/s^2) are taken for such of "
             f"standard gravity ({STANDARD_GRAVITY_MPS2}): if they are, state "
-            f"--accel-scale {factor * bench.input.sizes[0]:.8g}{bench.input.restating}."
+            f"--accel-scale {factor * bench.input.sizes[0]:.8g}{bench.input.restating('accel_scale')}."
         )
     seen_mps2 = bench.gravity_mps2 * (1.0 + level)
     return f"{said} gravity is not {bench.gravity_mps2:.6g} m/s^2 as stated, but {seen_mps2:.6g}."

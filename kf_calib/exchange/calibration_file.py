@@ -29,6 +29,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
+from kf_calib.bench.raw_input import RESTATE
 from kf_calib.bench.streams import Source
 from kf_calib.effects.programs import Program
 from kf_calib.errors import BenchError, InputError
@@ -54,7 +55,7 @@ from kf_calib.exchange.calibration_parts import (
     Text,
 )
 from kf_calib.sources.files.bags import fingerprint
-from kf_calib.sources.files.recording import Recording
+from kf_calib.sources.opening import opened
 from kf_calib.sources.run_date import run_date
 from kf_calib.support import dates
 from kf_calib.support.output_files import write_whole
@@ -223,11 +224,11 @@ def save_calibration(
 ) -> None:
     """Save a calibration, for ``open_calibration`` and the commands apply, verify and history.
 
-    source: the recording that it was made from, or its path; its name, checksum and date are saved, too. Raises
-    InputError if the file cannot be written.
+    source: the recording, log or table that it was made from, or its path; its name, checksum and date are saved, too.
+    Raises InputError if the file cannot be written.
     """
-    if isinstance(source, str | os.PathLike):
-        source = Recording(source, result.bench.to_metadata(), angles=False)
+    if source is not None:
+        source = opened(source, result.bench.to_metadata() | {RESTATE: "true"}, angles=False)
     write(Path(path), saved(result) if source is None else of_source(result, source))
 
 

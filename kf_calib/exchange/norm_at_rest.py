@@ -80,7 +80,7 @@ class NormAtRest:
         level = float(np.median(self._norms(means))) / gravity
         if not _LEVEL[0] < level < _LEVEL[1]:
             plain = float(np.median(np.linalg.norm(means, axis=1))) / gravity
-            return f"{wrong_unit(plain, taken, gravity)}; --unchecked corrects it as it is"
+            return f"{wrong_unit(plain, taken, gravity).sentence}; --unchecked corrects it as it is"
         return self._of_order(means, taken) if final else ""
 
     def _norms(self, readings: Floats) -> Floats:

@@ -73,14 +73,16 @@ def _are_samples(lines: list[str], stated: Mapping[str, str]) -> bool:
     return columns.are_alike if math.isnan(step_s) else step_s < _SLOWEST_S
 
 
-def opened(source: Source | str | PathLike[str]) -> Source:
-    """The source itself, or that of the file at a path."""
+def opened(
+    source: Source | str | PathLike[str], overrides: Mapping[str, str] = MappingProxyType({}), *, angles: bool = True
+) -> Source:
+    """The source itself, or that of the file at a path; overrides, angles: as of a ``Recording``."""
     if not isinstance(source, str | PathLike):
         return source
     match kind_of(source):
         case Kind.TABLE:
-            return open_table(source)
+            return open_table(source, overrides, angles=angles)
         case Kind.SAMPLES:
-            return Lines(source)
+            return Lines(source, overrides, angles=angles)
         case Kind.RECORDING:
-            return Recording(source)
+            return Recording(source, overrides, angles=angles)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.bench.raw_input import CHANNELS, PLAIN, UNITS, RawInput
+from kf_calib.bench.raw_input import CHANNELS, PLAIN, RESTATE, UNITS, RawInput
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.tables.words import ACCEL
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -27,7 +27,8 @@ class Units:
     """Units where the header names none; None: guessed from the numbers.
 
     accel_scale: size of one count, in ``accel`` (m/s^2 if that is None). g: m/s^2 that 1 g stands for, or ``local``.
-    input: what the device of a calibration sends, which holds where none of this is stated.
+    input: what the device of a calibration sends, which holds where none of this is stated. is_restated: whether
+    ``accel`` goes before the names of columns.
     """
 
     accel: str | None = None
@@ -35,6 +36,7 @@ class Units:
     angle: str | None = None
     g: str | float = STANDARD_GRAVITY_MPS2
     input: RawInput | None = None
+    is_restated: bool = False
 
     @classmethod
     def of(
@@ -46,7 +48,21 @@ class Units:
         if len(set(stated.sizes)) > 1:
             raise BenchError("accel_scale has a size for each channel: in lines and tables, state one for all.")
         unit = stated.unit if "accel_unit" in keys else None
-        return cls(unit, stated.sizes[0], angle, g, None if {"accel_unit", "accel_scale"} & set(keys) else input)
+        default = None if {"accel_unit", "accel_scale"} & set(keys) else input
+        return cls(unit, stated.sizes[0], angle, g, default, keys.get(RESTATE) == "true")
+
+    def told_by(self, names: Sequence[str], named: Sequence[str]) -> Sequence[str]:
+        """The units of readings (``named``) by the names of their columns, empty where these tell none, or an option
+        restates them. Raises InputError where an option states another one."""
+        if self.accel and self.is_restated:
+            return [""] * len(named)
+        for name, unit in zip(names, named, strict=True):
+            if self.accel and unit not in ("", "count", self.accel):
+                raise InputError(
+                    f"column {name!r} is in {unit} by its name, and --accel-unit is {self.accel}: leave out "
+                    "--accel-unit, rename the column by --column, or where its name is wrong, add --restate-input."
+                )
+        return named
 
     def as_default(self, named: Sequence[str], norm: float) -> bool:
         """Whether readings of this size are what the device of the calibration sends; named: units by their names."""

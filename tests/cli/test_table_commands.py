@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 from helpers.paths import RECORDINGS, ROOT
+
+import kf_calib
+from kf_calib.bench.raw_input import RawInput
+from kf_calib.sources.files.bags import fingerprint
 
 TWELVE = ROOT / "recordings" / "twelve_poses.csv"
 OPTIONS = (TWELVE, "--axes", "y z x", "--gravity", "9.8123")
@@ -134,6 +139,26 @@ def test_info_of_a_table_says_what_was_taken_for_what(run, tmp_path: Path) -> No
     path.write_text(GAPS.replace("999", "foo"))
     code, out, _ = run("info", path)
     assert code == 0 and "Missing: " in out and "row 6, column 'Kanal C' is 'foo'" in " ".join(out.split())
+
+
+@pytest.mark.parametrize("channel", [1, 2, 3])
+def test_a_reversed_channel_of_the_table_of_the_docs_is_told_by_the_option_that_mends_it(
+    channel: int, run, tmp_path: Path
+) -> None:
+    header, *rows = re.findall(r"^(?:face|[+-][xyz]),.*", (ROOT / "docs" / "tables.md").read_text(), re.MULTILINE)
+    for k, row in enumerate(rows):
+        cells = row.split(",")
+        cells[channel] = repr(-float(cells[channel]))
+        rows[k] = ",".join(cells)
+    path = tmp_path / "faces.csv"
+    path.write_text("\n".join([header, *rows]))
+    code, out, err = run("replay", path, "--gravity", "9.81")
+    order = ",".join(str(-k if k == channel else k) for k in (1, 2, 3))
+    assert (code, out) == (2, "") and err.endswith(f"channel {channel} reversed? Try --channels {order}.\n")
+    assert run("replay", path, "--gravity", "9.81", "--channels", order, "--save", tmp_path / "cal.json")[0] == 0
+    saved = kf_calib.open_calibration(tmp_path / "cal.json")
+    assert saved.bench.input == RawInput.from_metadata({"channels": order, "accel_unit": "g"})
+    assert saved.provenance.recording == "faces.csv" and saved.provenance.sha256 == fingerprint(path)
 
 
 def test_counts_get_a_size_to_try(run, tmp_path: Path) -> None:

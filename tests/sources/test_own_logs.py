@@ -160,6 +160,41 @@ def test_counts_get_a_size_to_try(run: Any, tmp_path: Path) -> None:
     assert code == 2 and "so they are counts" in err and err.count("\n") == 1
 
 
+IN_OTHER_UNITS = {
+    "counts under a name in g": ("time_s,ax_g,ay_g,az_g", 2.5e5 / G, "--accel-scale 4.08e-06 --restate-input"),
+    "g under a name in m/s^2": ("time_s,ax_mps2,ay_mps2,az_mps2", 1.0 / G, "--accel-unit g --restate-input"),
+}
+
+
+@pytest.mark.parametrize("how", IN_OTHER_UNITS)
+def test_a_unit_that_is_not_that_of_the_name_is_told_by_the_norm(how: str, run: Any, tmp_path: Path) -> None:
+    """``info`` proposes a command that works, with the user's own options in it but for the wrong one."""
+    header, factor, option = IN_OTHER_UNITS[how]
+    path = tmp_path / "log.csv"
+    path.write_text(header + ",outer_deg,middle_deg,inner_deg\n" + rows(lambda t, f, q: (t, *(factor * f), *q)))
+    found, command = proposed(run, path, *BENCH)
+    assert any("have a norm of" in said for said in found["missing"])
+    assert [*BENCH, *option.split()] == [word for word in command if word not in ("replay", str(path))]
+    values = parameters(run, *command)
+    expected = parameters(run, "replay", FACES, *BENCH)
+    for symbol in ("K1", "K2", "K3"):
+        assert values[symbol]["value"] == pytest.approx(expected[symbol]["value"], rel=0.05)
+    code, _, err = run("replay", path, *BENCH)
+    assert code == 2 and option.split()[0] in err and err.count("\n") == 1
+    if "--accel-unit" in option:
+        code, _, err = run("replay", path, *BENCH, "--accel-unit", "g")
+        assert code == 2 and "in m/s2 by its name" in err and "--restate-input" in err
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.0 / G, 2.5e5], ids=["m/s2", "g", "counts"])
+def test_json_lines_without_a_unit_get_one_to_try(factor: float, run: Any, tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    path.write_text("".join(json.dumps({"time_s": float(t), "accel": (factor * f).tolist(), "angles_deg": q.tolist()})
+                            + "\n" for t, f, q in zip(*samples(), strict=True)))  # fmt: skip
+    _, command = proposed(run, path, *BENCH)
+    assert parameters(run, *command)["K1"]["value"] == pytest.approx(1.0, abs=0.15)
+
+
 def test_two_angles_get_two_axes(run: Any, tmp_path: Path) -> None:
     path = tmp_path / "two.csv"
     path.write_text("time_s,ax_g,ay_g,az_g,outer_deg,inner_deg\n" + rows(lambda t, f, q: (t, *(f / G), *q[1:])))

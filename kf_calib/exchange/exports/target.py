@@ -82,6 +82,6 @@ class Target(ABC):
     def origin(self) -> str:
         """Where the numbers come from, fit for a comment of any of the formats."""
         made = self.saved.provenance
-        name = in_comment(made.recording) or "a live run"
+        name = in_comment(made.recording) or "a run that was not recorded"
         version, created = in_comment(made.versions.get("kf_calib", "")), in_comment(made.created)
         return f"calibration of {name} by kf_calib {version}, {created}"

@@ -230,19 +230,17 @@ class CsvColumns:
         Raises InputError where their columns or their units are not told."""
         chosen = [self._one(ours) for ours in READINGS]
         places = [at for at in chosen if at is not None]
-        advice = "name them ax_mps2, ay_mps2, az_mps2 (or ax_g, ax_mg ...)"
+        advice = f"name them ax_mps2, ay_mps2, az_mps2 (or ax_g, ax_mg ...), not {self._seen}"
         if len(places) < 3:
-            raise InputError(f"no columns give the three readings with their unit: {advice}, not {self._seen}.")
-        named = [self._meanings[at].unit for at in places]
-        for at, unit in zip(places, named, strict=True):
-            if self.units.accel and unit not in ("", "count", self.units.accel):
-                raise InputError(
-                    f"column {self.header[at]!r} is in {unit} by its name, and --accel-unit is {self.units.accel}: "
-                    "leave out --accel-unit, or rename the column by --column."
-                )
+            raise InputError(f"no columns give the three readings with their unit: {advice}.")
+        by_name = [self._meanings[at].unit for at in places]
+        named = self.units.told_by([self.header[at] for at in places], by_name)
         norm = self._usual_norm(places)
         if "" in named and not (self.units.accel or self.units.as_default(named, norm)) and math.isnan(norm):
-            raise InputError(f"no columns give the three readings with their unit: {advice}, not {self._seen}.")
+            raise InputError(
+                f"no columns give the three readings with their unit: {advice}, or state it by --accel-unit, and the "
+                "size of counts by --accel-scale."
+            )
         told = reading_units(named, norm, self.units, self.local_mps2)
         if not told.is_known:
             scale = STANDARD_GRAVITY_MPS2 / norm if norm > 0.0 else math.nan
@@ -254,13 +252,11 @@ class CsvColumns:
         if is_stated or not all(_EXACT.fullmatch(self.names[at]) for at in places):
             self.said.insert(0, f"readings from {self._quoted(places)} in {told.words}")
         self.raw, scale = told.raw, self.units.accel_scale
-        are_counts = scale != 1.0 or "count" in named or self.raw.sizes != PLAIN.sizes
-        written = np.ones(3) if are_counts else self.raw.factors
-        for k, unit in enumerate(named):
-            written[k] = UNITS.get(unit, 1.0) if are_counts else written[k]
-        self.written_mps2 = (float(written[0]), float(written[1]), float(written[2]))
-        bare = [at for at, unit in zip(places, named, strict=True) if unit not in UNITS]
-        self.without_unit = tuple(bare) if are_counts else ()
+        is_rewritten = scale != 1.0 or named != by_name or "count" in named or self.raw.sizes != PLAIN.sizes
+        written = [UNITS.get(unit, 1.0) for unit in by_name] if is_rewritten else self.raw.factors.tolist()
+        self.written_mps2 = (written[0], written[1], written[2])
+        bare = [at for at, unit in zip(places, by_name, strict=True) if unit not in UNITS]
+        self.without_unit = tuple(bare) if is_rewritten else ()
         return Quantity(tuple(places), (1.0, 1.0, 1.0))
 
     @property

@@ -100,7 +100,7 @@ class Topic:
 class Inventory:
     """What a recording's files hold. has_readings: of an accelerometer, by a schema that is known. has_angles: the
     platform is described by angles; None: it is not described in a schema that is known. angles: how many, where that
-    is known."""
+    is known. is_bare: readings are in lines that name no unit."""
 
     path: Path
     format: str
@@ -112,6 +112,7 @@ class Inventory:
     has_angles: bool | None
     warnings: list[str]
     angles: int | None = None
+    is_bare: bool = False
 
     @property
     def is_lines(self) -> bool:
@@ -163,7 +164,7 @@ def inventory_of_lines(
     topics[1].name = "platform angles" if has_angles else "platform attitude"
     met = [topic for topic in topics if topic.count]
     return Inventory(path, "lines", [path], path.stat().st_size, met, said.metadata, True, has_angles, lines.warnings,
-                     said.pose_width if has_angles else None)  # fmt: skip
+                     said.pose_width if has_angles else None, said.is_bare)  # fmt: skip
 
 
 def _count(file: RecordFile, contents: Contents, topics: dict[str, Topic], warn: Warn) -> None:

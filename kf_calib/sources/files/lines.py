@@ -59,9 +59,9 @@ class Lines:
         units: Units | None = None,
         angles: bool = True,
     ) -> None:
-        self._path = Path(source) if isinstance(source, str | PathLike) else None
+        self.path = Path(source) if isinstance(source, str | PathLike) else None
         self._stream = None if isinstance(source, str | PathLike) else source
-        self.name = str(self._path) if self._path else name
+        self.name = str(self.path) if self.path else name
         self._angles, self._said = angles, list[str]()
         self._overrides, self._stated = overrides, columns
         self._columns = {**as_columns(overrides.get("joints", "")), **columns}
@@ -78,7 +78,7 @@ class Lines:
             passage = self._begin()
             with passage.closed_on_failure():
                 self._bench = self._describe_bench(passage)
-            if self._path:  # it is read from its beginning again, if it is
+            if self.path:  # it is read from its beginning again, if it is
                 passage.close()
             else:
                 self._waiting = passage
@@ -110,7 +110,7 @@ class Lines:
     def begin_ns(self) -> int | None:
         """Stamp of the first reading; None where there is none. Reads a file as far as to there, unless it has been
         read."""
-        if self._begin_ns is None and self._path:
+        if self._begin_ns is None and self.path:
             next((batch for batch in self if len(batch.accel)), None)
         return self._begin_ns
 
@@ -121,8 +121,8 @@ class Lines:
 
     def _begin(self) -> _Passage:
         try:
-            if self._path:
-                stream: BinaryIO | TextFile = TextFile(self._path)
+            if self.path:
+                stream: BinaryIO | TextFile = TextFile(self.path)
             elif self._stream is not None:
                 stream, self._stream = self._stream, None
             else:
@@ -172,8 +172,7 @@ def stated_of(
     """
     by_name = {} if reader.unit is None else {"accel_unit": reader.unit}
     if reader.raw is not None:
-        by_name = reader.raw.to_metadata() or PLAIN.scale_metadata()
-        by_name.pop("channels", None)
+        by_name = {"accel_scale": reader.raw.scale, "accel_unit": reader.raw.unit}
     elif default is not None and default.sizes == PLAIN.sizes and reader.unit is not None:
         default = replace(default, unit=reader.unit)  # a unit, which the names state anew
     try:

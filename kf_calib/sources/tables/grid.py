@@ -33,7 +33,7 @@ _TELLING = 200  # lines by which the delimiter is told
 class Grid:
     """A table: name for messages, header, and rows with the number that each has in the file.
 
-    remarks: how the file was read, where that was a choice.
+    remarks: how the file was read, where that was a choice. path: the file, if it is from one.
     """
 
     name: str
@@ -42,6 +42,7 @@ class Grid:
     rows: tuple[tuple[Cell, ...], ...]
     is_semicolon: bool = False
     remarks: tuple[str, ...] = ()
+    path: Path | None = None
 
     def column(self, index: int) -> list[Cell]:
         """The cells of one column."""
@@ -70,7 +71,7 @@ def grid_of(table: Any) -> Grid:
                 f"{path}: is larger than a table of orientations can be: leave out what is not part of it; if it holds "
                 "samples, save them as CSV with a column of time (docs/own_csv.md)."
             )
-        return _of_excel(path) if is_excel else _of_text(path)
+        return replace(_of_excel(path) if is_excel else _of_text(path), path=path)
     return _of_columns(table)
 
 

@@ -106,7 +106,7 @@ class Opening:
             self.said.append(f"not used: {self.columns.named(unused)}")
         by = f" ({self._quoted(self.columns.guessed)} by what stands there)" if self.columns.guessed else ""
         told = f"{self.grid.name}: {'; '.join(self.said)}{by}. {HOW}."
-        return Table(self.grid.name, bench, rows, [*self.warnings, told], self.times.start_ns)
+        return Table(self.grid.name, bench, rows, [*self.warnings, told], self.times.start_ns, self.grid.path)
 
     def _quoted(self, names: list[str]) -> str:
         return ", ".join(map(repr, names))
@@ -211,7 +211,7 @@ class Opening:
                 "in one unit."
             )
         guess = "deg" if np.abs(values).max() > 2.0 * np.pi or np.array_equal(values, np.rint(values)) else "rad"
-        self._refuse_other_unit(places, [columns.meanings[place].unit for place in places], self.units.angle, "angle")
+        self._refuse_other_angle(places)
         unit = next(iter(units), None) or self.units.angle or guess
         how = "" if units or self.units.angle else " by their size (--angle-unit)"
         self.said.append(f"gimbal angles, outer to inner, from {columns.named(places)} in {unit}{how}")
@@ -245,8 +245,11 @@ class Opening:
 
     def _accel_factors(self, places: list[int], values: Floats, bench: Bench) -> tuple[Floats, str]:
         """Return the factors (3,) from columns of readings to m/s^2, and the unit in words."""
-        named = [self.columns.meanings[place].unit for place in places]
-        self._refuse_other_unit(places, named, self.units.accel, "accel")
+        by_name = [self.columns.meanings[place].unit for place in places]
+        try:
+            named = self.units.told_by([self.grid.header[place] for place in places], by_name)
+        except InputError as error:
+            raise InputError(f"{self.grid.name}: {error}") from None
         norm = float(np.median(np.linalg.norm(values, axis=1)))
         told = reading_units(named, norm, self.units, bench.gravity_mps2)
         self.has_unit = told.is_known
@@ -255,13 +258,14 @@ class Opening:
             self.by_size |= {place: told.units[k] for k, place in enumerate(places) if not named[k]}
         return told.raw.factors, told.words
 
-    def _refuse_other_unit(self, places: list[int], named: list[str], stated: str | None, what: str) -> None:
-        """Raise InputError if an option states another unit than the name of a column."""
-        for place, unit in zip(places, named, strict=True):
-            if stated and unit not in ("", "count", stated):
+    def _refuse_other_angle(self, places: list[int]) -> None:
+        """Raise InputError if an option states another unit of angles than the name of a column."""
+        for place in places:
+            unit = self.columns.meanings[place].unit
+            if self.units.angle and unit not in ("", self.units.angle):
                 raise InputError(
-                    f"{self.grid.name}: column {self.grid.header[place]!r} is in {unit} by its name, and --{what}-unit "
-                    f"is {stated}: leave out --{what}-unit, or rename the column by --column."
+                    f"{self.grid.name}: column {self.grid.header[place]!r} is in {unit} by its name, and --angle-unit "
+                    f"is {self.units.angle}: leave out --angle-unit, or rename the column by --column."
                 )
 
     def _spreads(self, bench: Bench) -> tuple[Floats | None, list[int]]:

@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from kf_calib.bench.raw_input import RawInput
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.columns import Columns
 from kf_calib.sources.tables.grid import grid_of
@@ -65,8 +66,8 @@ class Survey:
 
     orientation: ``angles``, ``attitude`` or ``face``; empty where no column tells it, or none is used. trouble: why it
     cannot be evaluated; empty if it can, else there are no rows. has_sigma: whether the noise is written down.
-    has_unit: whether it is known what the readings are in. angles: number of gimbal angles. is_by_hand: whether no
-    column tells an orientation.
+    has_unit: whether it is known what the readings are in, which is ``input``. angles: number of gimbal angles.
+    is_by_hand: whether no column tells an orientation.
     """
 
     path: Path
@@ -76,6 +77,7 @@ class Survey:
     rows: list[RowFound]
     has_sigma: bool
     has_unit: bool
+    input: RawInput
     trouble: str
     warnings: list[str]
     angles: int
@@ -111,8 +113,8 @@ def survey(
     rows = _rows(table, found, angles) if table else []
     own = _columns(found, opening.by_size, set(columns))
     return Survey(
-        path, own, len(grid.rows), kind, rows, has_sigma, opening.has_unit, trouble, list(opening.warnings),
-        len(found.angles), not found.orientation,
+        path, own, len(grid.rows), kind, rows, has_sigma, opening.has_unit, opening.raw, trouble,
+        list(opening.warnings), len(found.angles), not found.orientation,
     )  # fmt: skip
 
 

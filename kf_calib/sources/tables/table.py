@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch
@@ -14,6 +15,7 @@ class Table:
     """Mean readings of dwells, with the bench they were taken on.
 
     name: what messages call it. warnings: how it was understood. start_ns: stamp of the first row, if it has a date.
+    path: the file that it is from, if it is from one.
     """
 
     def __init__(
@@ -23,9 +25,10 @@ class Table:
         orientations: Sequence[Orientation],
         warnings: Sequence[str] = (),
         start_ns: int | None = None,
+        path: Path | None = None,
     ) -> None:
         self.name, self.bench, self.orientations = name, bench, tuple(orientations)
-        self.warnings, self.fraction, self._start_ns = list(warnings), 1.0, start_ns
+        self.warnings, self.fraction, self._start_ns, self.path = list(warnings), 1.0, start_ns, path
 
     def begin_ns(self) -> int | None:
         """Stamp of the first row; None where the table has no date."""
