@@ -86,7 +86,7 @@ def candidates(dwells: list[Any], bench: Any, columns: int = 70) -> list[Any]:
 
 
 def scanned(dwells: list[Any], bench: Any, effects: list[Any]) -> Sequence[Any]:
-    from kf_calib.estimation.fit import fit
+    from kf_calib.estimation.iterated_fit import fit
     from kf_calib.estimation.measurement_model import Model
     from kf_calib.estimation.score_test import scan
 

@@ -12,7 +12,8 @@ from kf_calib.diagnosis.unknown_effect import Family, families
 from kf_calib.effects import Effect
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate, evaluate_fit
-from kf_calib.estimation.fit import Fit, fit
+from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
 from kf_calib.estimation.results import Calibration

@@ -9,7 +9,8 @@ import numpy as np
 from kf_calib.dwells.line_spectrum import Line
 from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder, lines_of
 from kf_calib.estimation.dwell_pass import Pass
-from kf_calib.estimation.fit import Fit, fit
+from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.results import consistency
 from kf_calib.support import stage
 

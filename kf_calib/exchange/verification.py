@@ -29,7 +29,8 @@ from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import evaluate_fit
 from kf_calib.estimation.correction import Correction
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
-from kf_calib.estimation.fit import Fit, fit
+from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import SQUARE, Model
 from kf_calib.estimation.relinearisation import linearised_at
 from kf_calib.estimation.results import Calibration

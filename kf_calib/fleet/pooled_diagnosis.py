@@ -150,9 +150,7 @@ def pooled_diagnosis(factors: Factors, *, reference_unit: ReferenceUnit | None =
         except np.linalg.LinAlgError:
             raise InputError(_ABSURD) from None
     units = len({key.unit for key in campaign.keys})
-    return PooledDiagnosis(
-        len(campaign.keys), units, tuple(campaign.benches), tuple(findings), rows, found.rest.none
-    )
+    return PooledDiagnosis(len(campaign.keys), units, tuple(campaign.benches), tuple(findings), rows, found.rest.none)
 
 
 def _finding(campaign: Campaign, found: Attributed, number: int) -> Finding:

@@ -131,9 +131,10 @@ class Store:
         return _newest(self._every, columns, rows)
 
     def _merge(self, files: Sequence[Path]) -> None:
-        with whole(self._new(_LARGE)) as part, pq.ParquetWriter(
-            part, SCHEMA, compression="zstd", write_page_checksum=True
-        ) as out:
+        with (
+            whole(self._new(_LARGE)) as part,
+            pq.ParquetWriter(part, SCHEMA, compression="zstd", write_page_checksum=True) as out,
+        ):
             for batch in _together(_newest(files, SCHEMA.names, AT_ONCE)):
                 out.write_table(batch)
         for file in files:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Literal
 
@@ -67,63 +67,85 @@ class Likelihood:
         return self.alone.at(np.zeros(0))
 
 
-def estimate_variance_components(
-    within: Noise,
-    means: Means,
-    state: Floats,
-    angle_sigma_deg: float | None,
-    scatter_mps2: float | None,
-    walks: bool = False,
-    start: Mapping[Parts, Floats] | None = None,
-    prior: Floats | None = None,
-) -> tuple[Noise, Mapping[Parts, Floats]]:
-    """Complete the noise within dwells by setting error, scatter and, if ``walks``, the random walk of the biases.
+@dataclass
+class VarianceComponents:
+    """Estimates the setting error, the scatter and the random walk of the biases from the dwells' means.
 
-    Parts that are stated are taken as they are. Of the combinations of the other parts (scatter as one number for all
-    accelerometers or one for each), the one with the largest restricted likelihood is taken, less a charge per number
-    of the scatter: the 1 % point of its likelihood ratio against zero. A walk has a smaller charge, a setting error
-    none. Nothing is
-    estimated with fewer than 6 degrees of freedom between dwells. If there are too few orientations to tell a setting
-    error from scatter, the whole misfit counts as scatter. Where attitudes are not known, a dwell tells one number,
-    and scatter has one size for all accelerometers.
-
-    - within: the noise within dwells.
-    - means: the dwells' means; state (p,): where they are linearised.
-    - angle_sigma_deg, scatter_mps2: the stated parts; None if not stated.
-    - walks: estimate the intensity of a random walk of the biases.
-    - prior: rows of prior knowledge about the coefficients, those of ``with_shared_noise``.
-    - start: sizes found before for similar means, which shorten the searches.
-
-    Returns the noise, and the sizes found for each combination, to be passed as ``start`` the next time.
+    - angle_sigma_deg, scatter_mps2: the stated parts, which are taken as they are; None if not stated.
+    - walks: whether the intensity of a random walk of the biases is estimated.
+    - sizes: those of each combination of parts at the last estimate. The next search begins there, which makes it
+      shorter and has no influence on its result.
     """
-    stated = replace(
-        within,
-        scatter_mps2=np.full(3, scatter_mps2 or 0.0),
-        scatter_stated=scatter_mps2 is not None,
-        walk_mps2_per_sqrt_s=0.0 if walks else within.walk_mps2_per_sqrt_s,
-    )
-    if not within.attitude_unknown:
+
+    angle_sigma_deg: float | None
+    scatter_mps2: float | None
+    walks: bool = False
+    sizes: dict[Parts, Floats] = field(default_factory=dict[Parts, Floats])
+
+    def completed(self, within: Noise, means: Means, state: Floats, prior: Floats | None = None) -> Noise:
+        """The noise within dwells, completed by setting error, scatter and, if ``walks``, the random walk.
+
+        Of the combinations of the parts that are not stated (scatter as one number for all accelerometers or one for
+        each), the one with the largest restricted likelihood is taken, less a charge per number of the scatter: the 1 %
+        point of its likelihood ratio against zero. A walk has a smaller charge, a setting error none. Nothing is
+        estimated with fewer than 6 degrees of freedom between dwells. If there are too few orientations to tell a
+        setting error from scatter, the whole misfit counts as scatter. Where attitudes are not known, a dwell tells one
+        number, and scatter has one size for all accelerometers.
+
+        - means: the dwells' means; state (p,): where they are linearised.
+        - prior: rows of prior knowledge about the coefficients, those of ``with_shared_noise``.
+        """
+        stated = self._stated(within, means)
+        if stated.setting_stated and stated.scatter_stated and not self.walks:
+            return stated
+        reduced = _reduce(means, prior)
+        measured = len(means.readings) if within.attitude_unknown else means.readings.size
+        free = measured + len(reduced.prior) - reduced.means.design.shape[2]
+        if free < FEWEST:
+            return stated
+        combinations = _combinations(stated, self.walks)
+        likelihood = _likelihood(stated.weights, {part for parts in combinations for part in parts}, reduced, state)
+        without = likelihood.without()
+        if not self.walks and chi_squared_tail(free, without.misfit) > 0.1:  # the model already fits
+            combinations = [parts for parts in combinations if parts == ("setting",)]
+        if not combinations:
+            return stated
+        best = self._likeliest(likelihood, combinations, without)
+        return _with_estimates(stated, likelihood, best, self.sizes[best], without) if best else stated
+
+    def _stated(self, within: Noise, means: Means) -> Noise:
+        """Return the noise within dwells with the parts that are stated, and zeros for the others."""
         stated = replace(
-            stated,
-            setting_rad=float(np.radians(angle_sigma_deg or 0.0)),
-            setting_stated=angle_sigma_deg is not None,
-            checked=scatter_mps2 is not None or _setting_is_checked(means.force_mps2),
+            within,
+            scatter_mps2=np.full(3, self.scatter_mps2 or 0.0),
+            scatter_stated=self.scatter_mps2 is not None,
+            walk_mps2_per_sqrt_s=0.0 if self.walks else within.walk_mps2_per_sqrt_s,
         )
-    if stated.setting_stated and stated.scatter_stated and not walks:
-        return stated, {}
-    means, prior = _reduce(means, prior)
-    measured = len(means.readings) if within.attitude_unknown else means.readings.size
-    free = measured + len(prior) - means.design.shape[2]
-    if free < FEWEST:
-        return stated, {}
-    combinations = _combinations(stated, walks)
-    likelihood = _likelihood(stated.weights, {part for parts in combinations for part in parts}, means, state, prior)
-    without = likelihood.without()
-    if not walks and chi_squared_tail(free, without.misfit) > 0.1:  # the model already fits
-        combinations = [parts for parts in combinations if parts == ("setting",)]
-    if not combinations:
-        return stated, {}
-    return _chosen(stated, likelihood, combinations, without, start or {})
+        if within.attitude_unknown:
+            return stated
+        return replace(
+            stated,
+            setting_rad=float(np.radians(self.angle_sigma_deg or 0.0)),
+            setting_stated=self.angle_sigma_deg is not None,
+            checked=self.scatter_mps2 is not None or _setting_is_checked(means.force_mps2),
+        )
+
+    def _likeliest(self, likelihood: Likelihood, combinations: Sequence[Parts], without: Point) -> Parts:
+        """Return the best combination of parts, () if none earns its charge, and keep the sizes of each.
+
+        The last combination contains all others, so that its likelihood bounds theirs. A combination whose charge
+        leaves nothing to gain under this bound is not searched.
+        """
+        charges = {parts: _charge(parts, likelihood) for parts in combinations}
+        best, score, most = (), -without.cost, math.inf
+        for parts in [combinations[-1], *sorted(combinations[:-1], key=charges.__getitem__)]:
+            if most - charges[parts] <= score:
+                continue
+            self.sizes[parts], point = likelihood.of(parts).most_likely(self.sizes.get(parts))
+            most = -point.cost if parts == combinations[-1] else max(most, -point.cost)
+            if -point.cost - charges[parts] > score:
+                best, score = parts, -point.cost - charges[parts]
+        return best
 
 
 def _combinations(stated: Noise, walks: bool) -> list[Parts]:
@@ -136,36 +158,17 @@ def _combinations(stated: Noise, walks: bool) -> list[Parts]:
     return [setting + scatter + walk for walk, setting, scatter in product(walking, settings, scatters)][1:]
 
 
-def _chosen(
-    stated: Noise, likelihood: Likelihood, combinations: Sequence[Parts], without: Point, start: Mapping[Parts, Floats]
-) -> tuple[Noise, Mapping[Parts, Floats]]:
-    """Return the noise with the best combination of parts, and the sizes found for each combination.
-
-    The last combination contains all others, so that its likelihood bounds theirs. A combination whose charge leaves
-    nothing to gain under this bound is not searched.
-    """
-    charges = {parts: _charge(parts, likelihood) for parts in combinations}
-    best, score, most, sizes = (), -without.cost, math.inf, dict(start)
-    for parts in [combinations[-1], *sorted(combinations[:-1], key=charges.__getitem__)]:
-        if most - charges[parts] <= score:
-            continue
-        sizes[parts], point = likelihood.of(parts).most_likely(start.get(parts))
-        most = -point.cost if parts == combinations[-1] else max(most, -point.cost)
-        if -point.cost - charges[parts] > score:
-            best, score = parts, -point.cost - charges[parts]
-    if not best:
-        return stated, sizes
-    units = np.concatenate([likelihood.units[part] for part in best])
-    noise = _with(stated, best, units * sizes[best])
-    if "walk" in best:
-        spread = _last_spread(likelihood.of(best).curvature(sizes[best]))
-        noise = replace(noise, walk_spread=spread)
-    if "setting" in best:
-        rest: Parts = tuple(part for part in best if part != "setting")
+def _with_estimates(stated: Noise, likelihood: Likelihood, parts: Parts, sizes: Floats, without: Point) -> Noise:
+    """Return the noise with its parts at their likeliest sizes, and what is known of these."""
+    noise = _with(stated, parts, np.concatenate([likelihood.units[part] for part in parts]) * sizes)
+    if "walk" in parts:
+        noise = replace(noise, walk_spread=_last_spread(likelihood.of(parts).curvature(sizes)))
+    if "setting" in parts:
+        rest: Parts = tuple(part for part in parts if part != "setting")
         cost = likelihood.of(rest).most_likely()[1].cost if rest else without.cost
-        gain = cost - likelihood.of(best).at(sizes[best] ** 2).cost
+        gain = cost - likelihood.of(parts).at(sizes**2).cost
         noise = replace(noise, setting_judged=2.0 * gain > _JUDGED)
-    return noise, sizes
+    return noise
 
 
 def _charge(parts: Parts, likelihood: Likelihood) -> float:
@@ -202,7 +205,7 @@ def directions(force_mps2: Floats) -> int:
 def degrees_of_freedom(means: Means, free: bool = False) -> int:
     """Degrees of freedom of the dwells' means beside the model's coefficients; free: attitudes are not known, and a
     dwell tells one number."""
-    return (len(means.readings) if free else means.readings.size) - _reduce(means)[0].design.shape[2]
+    return (len(means.readings) if free else means.readings.size) - _reduce(means).means.design.shape[2]
 
 
 def likelihood_of(noise: Noise, parts: Collection[Part], means: Means, state: Floats, prior: Floats) -> Likelihood:
@@ -210,8 +213,7 @@ def likelihood_of(noise: Noise, parts: Collection[Part], means: Means, state: Fl
 
     ``means`` and ``prior`` are those that ``with_shared_noise`` returns; further rows may be added to ``prior``.
     """
-    means, prior = _reduce(means, prior)
-    return _likelihood(noise, parts, means, state, prior)
+    return _likelihood(noise, parts, _reduce(means, prior), state)
 
 
 def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats) -> float:
@@ -231,11 +233,11 @@ def gauss_markov_gains(noise: Noise, means: Means, state: Floats, prior: Floats)
     A mean-reverting walk is a Gauss-Markov process of any variance; with an infinite time constant it is the random
     walk, with a short one scatter. ``means`` and ``prior`` are those that ``with_shared_noise`` returns.
     """
-    (means, prior), still = _reduce(means, prior), replace(noise, walk_mps2_per_sqrt_s=0.0)
+    reduced, still = _reduce(means, prior), replace(noise, walk_mps2_per_sqrt_s=0.0)
     spans_s, run_s = means.ends_s[:, 1] - means.ends_s[:, 0], float(means.ends_s[-1, 1] - means.ends_s[0, 0])
     times_s = np.geomspace(max(float(np.median(spans_s)) / 4.0, run_s * 1e-4), 2.0 * run_s, HELD)
     costs = np.array([
-        _likelihood(still, {"walk"}, means, state, prior, held_s).of(("walk",)).most_likely()[1].cost
+        _likelihood(still, {"walk"}, reduced, state, held_s).of(("walk",)).most_likely()[1].cost
         for held_s in (math.inf, *times_s.tolist())
     ])  # fmt: skip
     return costs[0] - costs[1:], times_s
@@ -258,13 +260,19 @@ def misfit(noise: Noise, means: Means, state: Floats, prior: Floats | None = Non
 
     ``prior`` (q, p + 1) are whitened rows of prior knowledge about the coefficients.
     """
-    means, prior = _reduce(means, prior)
-    return _likelihood(noise, (), means, state, prior).without().misfit
+    return _likelihood(noise, (), _reduce(means, prior), state).without().misfit
 
 
-def _reduce(means: Means, prior: Floats | None = None) -> tuple[Means, Floats]:
-    """Return the means with an orthonormal basis (D, 3, r) in place of the columns without a prior, and the prior's
-    rows.
+@dataclass(frozen=True)
+class _Reduced:
+    """Means with an orthonormal basis (D, 3, r) in place of the columns without a prior, and the rows of the prior."""
+
+    means: Means
+    prior: Floats
+
+
+def _reduce(means: Means, prior: Floats | None = None) -> _Reduced:
+    """Return the means about the basis of those columns that have no prior.
 
     What the basis explains is subtracted from the readings. The change of basis alters the likelihood only by a
     constant, and the rounding of readings of size g no longer matters.
@@ -272,61 +280,62 @@ def _reduce(means: Means, prior: Floats | None = None) -> tuple[Means, Floats]:
     design = means.design.reshape(-1, means.design.shape[2])
     prior = np.zeros((0, design.shape[1] + 1)) if prior is None else prior
     known = prior[:, :-1].any(axis=0)
-    own = design[:, ~known]
-    scale = np.linalg.norm(own, axis=0)
-    left, singular, _ = np.linalg.svd(own / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    free = design[:, ~known]
+    scale = np.linalg.norm(free, axis=0)
+    left, singular, _ = np.linalg.svd(free / np.where(scale > 0, scale, 1.0), full_matrices=False)
     basis = left[:, singular > 1e-9 * singular[0]]
     rest = means.readings.ravel() - basis @ (basis.T @ means.readings.ravel())
     columns = np.hstack([basis, design[:, known]])
     means = replace(means, design=columns.reshape(*means.readings.shape, -1), readings=rest.reshape(-1, 3))
-    return means, np.hstack([np.zeros((len(prior), basis.shape[1])), prior[:, np.append(known, True)]])
+    return _Reduced(means, np.hstack([np.zeros((len(prior), basis.shape[1])), prior[:, np.append(known, True)]]))
 
 
 def _likelihood(
-    noise: Noise,
-    parts: Collection[Part],
-    means: Means,
-    state: Floats,
-    prior: Floats | None = None,
-    held_s: float = math.inf,
+    noise: Noise, parts: Collection[Part], reduced: _Reduced, state: Floats, held_s: float = math.inf
 ) -> Likelihood:
-    """Return the likelihood of means from ``_reduce``, with the parts that may be added."""
-    count, units = len(means.counts), _units(means)
+    """Return the likelihood of the means, with the parts that may be added.
+
+    held_s: time constant with which a walk of the biases reverts to its mean; infinite for a random walk.
+    """
+    means, count, units = reduced.means, len(reduced.means.counts), _units(reduced.means)
     standing = "walk" not in parts and not noise.walk_mps2_per_sqrt_s
     path = Links(*(np.zeros(count - k) for k in (1, 0, 1))) if standing else mean_links(means.ends_s, held_s)
-    design = np.concatenate([means.design, means.readings[:, :, None]], axis=2)
-    rows = design.copy()
-    rows[1:] -= path.share[:, None, None] * design[:-1]
-    each = np.eye(3)[:, None, :, None] * np.eye(3)[:, None, None, :] * np.ones((count, 1, 1))
+    rows = np.concatenate([means.design, means.readings[:, :, None]], axis=2)
+    rows[1:] -= path.share[:, None, None] * rows[:-1].copy()
     walk = np.zeros((1, count, 6, 3))
     walk[0, :, :3] = path.alone[:, None, None] * np.eye(3)
     walk[0, :-1, 3:] = path.beside[:, None, None] * np.eye(3)
-    shapes: dict[Part, Floats] = {
-        "setting": _conditional_covariances(setting_covariances(means, state)[None], path),
-        "common": _conditional_covariances(each.sum(axis=0, keepdims=True), path),
-        "scatter": _conditional_covariances(each, path),
-        "walk": walk,
-    }
-    fixed = (
-        _conditional_covariances(mean_covariances(noise, means, state, float(units["common"][0])), path)
-        + noise.walk_mps2_per_sqrt_s**2 * walk[0]
-    )
+    fixed = mean_covariances(noise, means, state, float(units["common"][0]))
     alone = Restricted(
-        rows.reshape(3 * count, -1), np.zeros((0, rows.shape[2])) if prior is None else prior, fixed, walk[:0]
+        rows.reshape(3 * count, -1),
+        reduced.prior,
+        _conditional_covariances(fixed, path) + noise.walk_mps2_per_sqrt_s**2 * walk[0],
+        walk[:0],
     )
+    shapes = {
+        part: walk if part == "walk" else _conditional_covariances(_shapes(part, means, state), path) for part in parts
+    }
     return Likelihood(alone, {part: units[part][:, None, None, None] ** 2 * shapes[part] for part in parts}, units)
 
 
-def _conditional_covariances(own: Floats, path: Links) -> Floats:
+def _shapes(part: Part, means: Means, state: Floats) -> Floats:
+    """Return the covariances (k, D, 3, 3) of the means that a part contributes per unit of its variances."""
+    if part == "setting":
+        return setting_covariances(means, state)[None]
+    of_each = np.eye(3)[:, None, :, None] * np.eye(3)[:, None, None, :] * np.ones((len(means.counts), 1, 1))
+    return of_each if part == "scatter" else of_each.sum(axis=0, keepdims=True)
+
+
+def _conditional_covariances(covariances: Floats, path: Links) -> Floats:
     """Return the covariances (..., D, 6, 3), in the layout of ``banded``, of means less their share of the mean before.
 
-    ``own`` (..., D, 3, 3) are the covariances of the means themselves, which are independent of each other.
+    ``covariances`` (..., D, 3, 3) are those of the means themselves, which are independent of each other.
     """
-    share, out = path.share[:, None, None], np.zeros((*own.shape[:-2], 6, 3))
-    out[..., :3, :] = own
-    out[..., 1:, :3, :] += share**2 * own[..., :-1, :, :]
-    out[..., :-1, 3:, :] -= share * own[..., :-1, :, :]
-    return out
+    share, banded = path.share[:, None, None], np.zeros((*covariances.shape[:-2], 6, 3))
+    banded[..., :3, :] = covariances
+    banded[..., 1:, :3, :] += share**2 * covariances[..., :-1, :, :]
+    banded[..., :-1, 3:, :] -= share * covariances[..., :-1, :, :]
+    return banded
 
 
 def _units(means: Means) -> dict[Part, Floats]:

@@ -15,7 +15,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.calibration import conclude, evaluate_fit, with_remarks
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
-from kf_calib.estimation.fit import fit
+from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.results import Calibration
 from kf_calib.online.progress import Progress
 from kf_calib.support.threads import one_blas_thread

@@ -22,7 +22,8 @@ from kf_calib.diagnosis.candidate_tests import LEVEL, REST, SHARE, candidates, c
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend_beside
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect
-from kf_calib.estimation.fit import Fit, fit
+from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.running_filter import Running

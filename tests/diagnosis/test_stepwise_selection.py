@@ -25,7 +25,7 @@ from kf_calib.dwells.sufficient_statistics import dwells_without
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import evaluate
 from kf_calib.estimation.dwell_columns import stimulus_of
-from kf_calib.estimation.fit import fit
+from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings

@@ -17,7 +17,7 @@ from kf_calib.estimation import square_root_information
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_pass import Pass
-from kf_calib.estimation.fit import fit
+from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.files.recording import Recording

@@ -13,5 +13,4 @@ from kf_calib.noise.noise_model import Noise
 def restricted_log_likelihood(noise: Noise, means: Means, state: Floats, held_s: float = math.inf) -> float:
     """Of the dwells' means, up to a constant; held_s: time constant with which a walk of the biases reverts to its
     mean, infinite for a random walk."""
-    reduced, prior = reml._reduce(means)  # what the search maximizes
-    return -reml._likelihood(noise, (), reduced, state, prior, held_s).without().cost
+    return -reml._likelihood(noise, (), reml._reduce(means), state, held_s).without().cost  # what the search maximizes

@@ -16,7 +16,7 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.noise import banded
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise
-from kf_calib.noise.reml import estimate_variance_components
+from kf_calib.noise.reml import VarianceComponents
 from kf_calib.noise.restricted_likelihood import Restricted
 
 
@@ -156,12 +156,13 @@ def parts_of(noise: Noise) -> Floats:
 def test_sizes_that_were_found_before_lead_to_the_same_noise(walked: Calibration) -> None:
     means, state = walked.linearised.means, walked.linearised.state
     within = replace(walked.noise, walk_mps2_per_sqrt_s=0.0, walk_spread=None)
-    noise, sizes = estimate_variance_components(within, means, state, None, None, walks=True)
+    components = VarianceComponents(None, None, walks=True)
+    noise = components.completed(within, means, state)
     moved: Means = replace(means, readings=means.readings * (1.0 + 1e-9))
-    far = {parts: 50.0 * own for parts, own in sizes.items()}
+    far = {parts: 50.0 * sizes for parts, sizes in components.sizes.items()}
     assert noise.walk_mps2_per_sqrt_s > 0.0 and noise.scatter_mps2.min() > 0.0
-    for near in (sizes, far):
-        again, _ = estimate_variance_components(within, moved, state, None, None, walks=True, start=near)
+    for start in (components.sizes, far):
+        again = VarianceComponents(None, None, walks=True, sizes=dict(start)).completed(within, moved, state)
         np.testing.assert_allclose(parts_of(again), parts_of(noise), rtol=1e-4)
         assert again.walk_spread == pytest.approx(noise.walk_spread, rel=1e-3)
 
@@ -170,7 +171,7 @@ def test_sizes_that_were_found_before_lead_to_the_same_noise(walked: Calibration
 def test_scatter_is_found_beside_a_walk_that_is_stated(walked: Calibration, walk: float) -> None:
     means, state = walked.linearised.means, walked.linearised.state
     within = replace(walked.noise, walk_mps2_per_sqrt_s=walk * walked.noise.walk_mps2_per_sqrt_s, walk_spread=None)
-    noise, _ = estimate_variance_components(within, means, state, 0.0, None)
+    noise = VarianceComponents(0.0, None).completed(within, means, state)
     assert noise.walk_mps2_per_sqrt_s == within.walk_mps2_per_sqrt_s
 
     def likelihood(size: float) -> float:

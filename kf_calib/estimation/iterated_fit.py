@@ -1,0 +1,273 @@
+"""The iterated fit of the model and the noise model to the dwells; the filter runs on its result.
+
+Small rotations and input axes are linearised at the current estimate, unknown constants of effects are moved
+(``effect_constants``), and the setting error, the scatter and the random walk of the biases are estimated by restricted
+likelihood, in turn until nothing changes any more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.paper_parameters import STATE_COUNT
+from kf_calib.dwells.rows import on_basis
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.errors import UnobservableError
+from kf_calib.estimation import free_attitude, square_root_information
+from kf_calib.estimation.attitude import facing_readings, without_attitude
+from kf_calib.estimation.dwell_columns import LinearisedDwells, change_by_temperature
+from kf_calib.estimation.effect_constants import (
+    averaged_over_posterior,
+    estimate_and_steps,
+    largest_steps,
+    placed_on_grid,
+)
+from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.relinearisation import SETTLED, UNSETTLED, descended, left_to_settle, relinearised
+from kf_calib.noise.flicker import flicker_within
+from kf_calib.noise.noise_model import ATTITUDE_UNKNOWN_RAD, FLOOR_MPS2, Noise, within_dwells
+from kf_calib.noise.nuisance_states import along_force, sensitivities_of
+from kf_calib.noise.reml import VarianceComponents, with_shared_noise
+from kf_calib.noise.thermometer_error import sensitivity_to_temperature
+
+_PASSES = 3
+_PASSES_WITH_UNKNOWNS = 10
+_EXACT_RAD = 1e-9
+_TURNS = 50  # most times that forces and state are found in turn
+_SINGULAR = 100.0
+_STILL = 2.5e-4  # the search ends when no step of ln(value) exceeds this share of its largest allowed step
+
+
+def fit(
+    dwells: list[DwellFactor],
+    model: Model,
+    walk_mps2_per_sqrt_s: float = 0.0,
+    slews: Sequence[DwellFactor] = (),
+    must_settle: bool = True,
+) -> Fit:
+    """Estimate the noise, the linearisation and the model's unknown constants in turn until they no longer change.
+
+    - dwells: the dwells in order of time.
+    - model: the model to fit.
+    - walk_mps2_per_sqrt_s: stated intensity of the random walk of the biases, m/s^2/s^(1/2).
+    - slews: the slews; used only if the model has effects that show in slews only.
+    - must_settle: whether a fit that does not converge is an error; else it is returned as far as it came.
+
+    Raises UnobservableError if the poses tell too little, or if the fit does not converge.
+    """
+    slews = [slew for slew in slews if slew.number >= dwells[0].number] if model.dynamic else []
+    fitted = _begun(dwells, model, slews, walk_mps2_per_sqrt_s)
+    within, bench = fitted.noise, model.bench
+    components = VarianceComponents(_setting_deg(dwells, bench), bench.scatter_sigma_mps2, model.walks)
+    left = 0.0
+    for number in range(_most_passes(model)):
+        fitted = _with_constants_searched(fitted, number)
+        state, constant_steps = estimate_and_steps(fitted)
+        if not (bench.angles or _sensible(state)):
+            if must_settle:
+                raise UnobservableError(_not_sensible(model))
+            return fitted
+        left, reach = _left_to_settle(fitted, state), largest_steps(fitted)
+        linearised = _moved_to(fitted, _with_constants_moved(fitted, constant_steps, reach, number), state)
+        noise = _noise_at(linearised, fitted, within, components)
+        fitted = replace(fitted, linearised=linearised, noise=noise)
+        within = _within_again(fitted, within)
+        # a constant without a derivative holds the input axes near their linearisation, so that convergence is slow
+        still = (np.abs(constant_steps) <= _STILL * reach).all() and not model.stepped
+        turning = noise.weights.setting_rad > 0.0
+        if number >= _PASSES - 1 and still and (left < SETTLED or not turning):
+            return fitted
+    if must_settle and not bench.angles and left > UNSETTLED:
+        raise UnobservableError(_not_settled(model))
+    return fitted
+
+
+def _with_constants_searched(fitted: Fit, number: int) -> Fit:
+    """Return the fit with unknown constants on their grids (after the first pass, ``number`` 0), and those without a
+    derivative averaged over their posterior."""
+    linearised, noise = fitted.linearised, fitted.noise
+    if number == 1 and linearised.model.unknowns:
+        linearised = relinearised(linearised, noise, placed_on_grid(fitted), linearised.state)
+        fitted = replace(fitted, linearised=linearised)
+    if number and linearised.model.stepped:
+        model, spreads = averaged_over_posterior(fitted)
+        fitted = replace(fitted, linearised=relinearised(linearised, noise, model, linearised.state), spreads=spreads)
+    return fitted
+
+
+def _with_constants_moved(fitted: Fit, constant_steps: Floats, reach: Floats, number: int) -> Model:
+    """Return the model with its unknown constants moved by their steps, at most by ``reach``; as it is before they are
+    on their grids."""
+    model = fitted.linearised.model
+    return model.moved(np.clip(constant_steps, -reach, reach)) if number and model.unknowns else model
+
+
+def _noise_at(linearised: LinearisedDwells, before: Fit, within: Noise, components: VarianceComponents) -> Noise:
+    """Return the noise within dwells completed by all that is estimated from the residuals of a linearisation, and by
+    the noise of slews in the fit before it."""
+    within = replace(within, sensitivity_mps2_per_k=_sensitivity_to_temperature(linearised, within))
+    means, prior = with_shared_noise(linearised.dwells, within, linearised.means)
+    noise = components.completed(within, means, linearised.state, prior)
+    noise = replace(noise, slew_sigma_mps2=_slew_sigma(before, linearised.state) if linearised.slews else None)
+    flicker_mps2 = flicker_within(linearised.dwells_at_state, linearised.columns, linearised.state, noise)
+    return replace(noise, flicker_mps2=flicker_mps2 if flicker_mps2.any() else None)
+
+
+def _within_again(fitted: Fit, within: Noise) -> Noise:
+    """Return the noise within dwells; estimated anew where it depends on the walk, or on the direction of the force."""
+    linearised, noise = fitted.linearised, fitted.noise
+    if not (linearised.model.walks or noise.attitude_unknown):
+        return within
+    again = within_dwells(linearised.dwells, noise.walk_mps2_per_sqrt_s, _along(linearised, noise))
+    return replace(within, sigma_mps2=again.sigma_mps2, inflation=again.inflation)
+
+
+def _sensitivity_to_temperature(linearised: LinearisedDwells, within: Noise) -> Floats | None:
+    """Return ``sensitivity_to_temperature`` of the model at its state; None without effects."""
+    if not linearised.model.effects:
+        return None
+    return sensitivity_to_temperature(
+        linearised.dwells_at_state, lambda: change_by_temperature(linearised), within.effective_sigma_mps2
+    )
+
+
+def _along(linearised: LinearisedDwells, noise: Noise) -> Floats | None:
+    """Return the weights (D, 3) of the channels in the size of the force where attitudes are not known, else None."""
+    if not noise.attitude_unknown:
+        return None
+    return along_force(linearised.dwells_at_state, sensitivities_of(linearised.dwells_at_state, linearised.state))
+
+
+def _not_settled(model: Model) -> str:
+    effects = " and ".join(map(str, model.effects))
+    return (
+        "the sizes of the readings at rest do not determine "
+        + (f"{effects} beside the nine parameters: leave {effects} out" if effects else "the nine parameters")
+        + ", or turn it to more sides (the fit does not converge)."
+    )
+
+
+def _not_sensible(model: Model) -> str:
+    if model.effects:
+        return _not_settled(model)
+    return (
+        "the sizes of the readings at rest lead to no sensible set of scale factors, biases and angles: check the unit "
+        "of the readings (--accel-unit) and gravity, and turn it to more sides."
+    )
+
+
+def _most_passes(model: Model) -> int:
+    """Return how often noise, linearisation and constants are estimated in turn at most."""
+    if not model.bench.angles:
+        return _TURNS
+    return _PASSES_WITH_UNKNOWNS
+
+
+def _begun(dwells: list[DwellFactor], model: Model, slews: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float) -> Fit:
+    """Return the fit from which estimation begins: with angles at the nominal state, without at that of the nine
+    parameters alone, or of six with square axes where the poses do not tell the rest.
+
+    Raises UnobservableError if the poses tell too little.
+    """
+    if model.bench.angles:
+        within = replace(within_dwells(dwells, walk_mps2_per_sqrt_s), walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
+        dwells = [without_attitude(dwell) for dwell in dwells]
+        return Fit(LinearisedDwells(dwells, model, model.nominal_state(), slews), within)
+    readings, stated = np.array([dwell.means[4:] for dwell in dwells]), model.bench.scatter_sigma_mps2
+    facing_up = readings / np.linalg.norm(readings, axis=1, keepdims=True)
+    within = within_dwells(dwells, walk_mps2_per_sqrt_s, facing_up)
+    noise = replace(
+        within, walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s, setting_rad=ATTITUDE_UNKNOWN_RAD, setting_stated=True,
+        scatter_mps2=np.full(3, stated or 0.0), scatter_stated=stated is not None,
+    )  # fmt: skip
+    bare = Model(model.bench, square=True)
+    facing = facing_readings(dwells, bare.nominal_state(), bare.bench.gravity_mps2)
+    begun = Fit(LinearisedDwells(facing, bare, bare.nominal_state()), noise)
+    free_attitude.refuse_poses(begun.linearised, noise)
+    settled = _settled(begun)
+    if free_attitude.tells_angles(settled.linearised, noise):
+        bare = Model(model.bench)
+        settled = _settled(Fit(relinearised(settled.linearised, noise, bare, settled.linearised.state), noise))
+    state = np.append(settled.linearised.state, np.zeros(model.count - STATE_COUNT))
+    whole = replace(model, square=settled.linearised.model.square)
+    return Fit(LinearisedDwells(settled.dwells, whole, state), noise)
+
+
+def _settled(fitted: Fit) -> Fit:
+    """Return the fit of the nine parameters with forces and state found in turn until neither moves."""
+    for _ in range(_TURNS):
+        state = fitted.state
+        if not _sensible(state):
+            break
+        left = _left_to_settle(fitted, state)
+        fitted = replace(fitted, linearised=_moved_to(fitted, fitted.linearised.model, state))
+        if left < SETTLED:
+            return fitted
+    raise UnobservableError(_not_sensible(fitted.linearised.model))
+
+
+def _left_to_settle(fitted: Fit, state: Floats) -> float:
+    """Return by how many sigmas the fit moves from its linearisation; 0 where no attitude moves with it."""
+    turning = fitted.noise.weights.setting_rad > 0.0
+    return left_to_settle(state, fitted.linearised.state, fitted.sigma) if turning else 0.0
+
+
+def _moved_to(fitted: Fit, model: Model, state: Floats) -> LinearisedDwells:
+    """Return the dwells linearised at a state; nearer where attitudes are not known and the misfit would grow."""
+    linearised, noise = fitted.linearised, fitted.noise
+    if model is linearised.model and noise.attitude_unknown and not noise.walk_mps2_per_sqrt_s:
+        return descended(linearised, noise, state, lambda there: _misfit(replace(fitted, linearised=there)))
+    return relinearised(linearised, noise, model, state)
+
+
+def _misfit(fitted: Fit) -> float:
+    """Return chi-squared of a linearisation at its own state."""
+    state = fitted.linearised.state
+    return float(sum(np.sum((rows[:, -1] - rows[:, :-1] @ state) ** 2) for rows in fitted.all_rows()))
+
+
+def _sensible(state: Floats) -> bool:
+    """Tell whether a state (p,) tells the specific force from the readings."""
+    sensitivity = state[:STATE_COUNT].reshape(3, 4)[:, :3]
+    return bool(np.isfinite(state).all() and np.linalg.cond(sensitivity) < _SINGULAR)
+
+
+def _setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:
+    """Return the stated setting error, deg, combined with the uncertainty of the dwells' poses from noise of the
+    angles."""
+    pose_rad = float(np.sqrt(np.mean([dwell.pose_sigma_rad**2 for dwell in dwells])))
+    if bench.angle_sigma_deg is None or pose_rad < _EXACT_RAD:
+        return bench.angle_sigma_deg
+    return math.hypot(bench.angle_sigma_deg, math.degrees(pose_rad))
+
+
+def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
+    """Return the sigmas (3,) of white readings that explain the residuals of the slews about ``state``.
+
+    The ratio of the channels is that of their residuals. The level is set so that the mean square of the whitened
+    residuals is one. The rows are weighted sums over whole slews, so that noise that is correlated along a slew (of
+    angles, by vibration) is included.
+    """
+    linearised, rows = fitted.linearised, np.concatenate(fitted.following)
+    squares, counts = np.zeros(3), 0
+    for slew, columns in zip(linearised.slews, linearised.slew_columns, strict=True):
+        model = np.moveaxis(columns @ state, 2, 1)  # (pieces, channels, nodes)
+        own = slew.triangles[:, :, slew.width :].copy()
+        own[:, : slew.width] -= slew.triangles[:, : slew.width, : slew.width] @ on_basis(np.moveaxis(model, 1, 2))
+        squares, counts = squares + (own**2).sum(axis=(0, 1)), counts + slew.count
+    sizes = np.sqrt(squares / counts) + FLOOR_MPS2
+    factor = square_root_information.accumulate(fitted.all_rows(), fitted.steps)[:-1]
+    covariance = square_root_information.solve(factor, state)[1]
+    freedom = square_root_information.row_rank(rows) - float(
+        np.einsum("rp,pq,rq->", rows[:, :-1], covariance, rows[:, :-1])
+    )
+    level = np.linalg.norm(rows[:, -1] - rows[:, :-1] @ state) / np.sqrt(max(freedom, 1.0))
+    before = fitted.noise.of(moving=True).effective_sigma_mps2
+    return np.maximum(level * sizes * np.exp(np.mean(np.log(before / sizes))), FLOOR_MPS2)
