@@ -1,6 +1,6 @@
-"""docs/fleet.png: the Rerun view of a simulated fleet, on a bench that was repaired in the middle of the campaign.
+"""docs/fleet.png: errors of the bench of a simulated fleet; it was repaired in the middle of the campaign.
 
-`.venv/bin/python tools/fleet_picture.py` draws it again, which takes a minute and a graphics driver.
+`.venv/bin/python tools/fleet_picture.py` draws it again, which takes a minute.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from fleet_generator import Campaign, recorded
 from PIL import Image
 
 import kf_calib
-from kf_calib.views.screenshot import screenshot
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "fleet.png"
 _COLOURS = 96
-_SIZE_PX = 1200, 750
+_WIDTH_PX = 1200
 
 
 def main() -> None:
@@ -28,11 +27,11 @@ def main() -> None:
                             of_unit=("second-order=5sigma",), share=0.25, seed=2)  # fmt: skip
         for _ in recorded(campaign, 2):
             pass
-        table, view, picture = (Path(folder, name) for name in ("fleet", "fleet.rrd", "fleet.png"))
+        table, picture = Path(folder, "fleet"), Path(folder, "fleet.png")
         command = [sys.executable, "-m", "kf_calib", "fleet", str(campaign.folder / "runs"), "-o", str(table)]
         subprocess.run([*command, "--no-pooled"], check=True)
-        kf_calib.save_view(kf_calib.open_fleet(table).overview(), view)
-        screenshot(view, picture, _SIZE_PX)
+        figures = kf_calib.plot.figures(kf_calib.open_fleet(table).overview())
+        kf_calib.plot.save(figures["Errors of the bench over time"](), picture, width_px=_WIDTH_PX)
         drawn = Image.open(io.BytesIO(picture.read_bytes())).convert("RGB")
     drawn.quantize(_COLOURS, dither=Image.Dither.NONE).save(PICTURE, optimize=True)
 

@@ -30,13 +30,12 @@ from kf_calib.cli.options import (
     recording_options,
     save_model_option,
     save_option,
-    save_view,
     settings_of,
     show,
     strict_option,
     units_option,
 )
-from kf_calib.cli.pictures import Pictures, figures_of, picture_options
+from kf_calib.cli.pictures import Pictures, figure_options, picture_options
 from kf_calib.cli.report import measured_of, report_option, save_report
 from kf_calib.errors import InputError
 
@@ -91,7 +90,7 @@ def replay(
     with delivery(outputs, as_json) as deliver:
         deliver.calibration(save, result, source)
         deliver.model(save_model, result)
-        pictures.save(deliver, lambda path: save_view(result, path), figures_of(result))
+        pictures.save(deliver, result)
     if strict and result.consistency.consistent is False:
         ctx.exit(1)
 
@@ -100,7 +99,7 @@ def replay(
 @click.argument("recording", type=click.Path(path_type=Path))
 @recording_options
 @filter_options
-@picture_options
+@figure_options
 @report_option
 @overwrite_option
 @units_option
@@ -123,7 +122,7 @@ def compare(recording: Path, report: Path | None, overwrite: bool, as_json: bool
 
         show(comparison_table(compared))
     with delivery(outputs, as_json) as deliver:
-        pictures.save(deliver, lambda path: save_view(compared, path), figures_of(compared))
+        pictures.save(deliver, compared)
         save_report(deliver, report, compared, measured)
 
 
@@ -215,7 +214,7 @@ def diagnose(ctx: click.Context, recording: Path, overwrite: bool, strict: bool,
     else:
         show(views.diagnosis_report(found))
     with delivery(outputs, as_json) as deliver:
-        pictures.save(deliver, lambda path: save_view(found, path), figures_of(found))
+        pictures.save(deliver, found)
     if strict and found.test.consistent is False:
         ctx.exit(1)
 
@@ -313,7 +312,7 @@ def improve(
         deliver.calibration(save, state.result, source)
         deliver.model(save_model, state.result)
         deliver.file(journal_file, lambda path: selection_journal.write(path, state, origin))
-        pictures.save(deliver, lambda path: save_view(state, path), figures_of(state))
+        pictures.save(deliver, state)
         save_report(deliver, report, state, measured, [views.honest_sentence(checked)] if checked else [])
     if strict and state.found.test.consistent is False:
         ctx.exit(1)

@@ -39,7 +39,7 @@ from kf_calib.cli.options import (
     units_option,
     used_of,
 )
-from kf_calib.cli.pictures import Pictures, figure_options, figures_of
+from kf_calib.cli.pictures import Pictures, figure_options
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.support.output_files import whole
 
@@ -268,4 +268,4 @@ def history(
     else:
         show(views.history_report(found))
     with delivery(outputs, as_json) as deliver:
-        pictures.save_figures(deliver, figures_of(found))
+        pictures.save(deliver, found)

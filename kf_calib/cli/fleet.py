@@ -29,13 +29,12 @@ from kf_calib.cli.options import (
     print_json,
     progress,
     recording_options,
-    save_view,
     settings_of,
     show,
     target_option,
     units_option,
 )
-from kf_calib.cli.pictures import Pictures, figures_of, picture_options
+from kf_calib.cli.pictures import Pictures, figure_options
 from kf_calib.cli.report import commands_of, report_option
 from kf_calib.cli.signals import Interrupter, answered
 from kf_calib.errors import InputError
@@ -121,7 +120,7 @@ def _content(value: Any) -> Any:
               "gravity of the bench shows.")  # fmt: skip
 @target_option(panel=OUTPUT)
 @report_option
-@picture_options
+@figure_options
 @overwrite_option
 @recording_options
 @filter_options
@@ -182,7 +181,7 @@ def fleet(
     with delivery(outputs, as_json) as deliver, progress("drawing the pictures", as_json):
         _deliver_bench_models(models, outputs, deliver, as_json)
         deliver.file(report, lambda path: _save_page(overview, commands_again, path))
-        pictures.save(deliver, lambda path: save_view(overview, path), figures_of(overview))
+        pictures.save(deliver, overview)
 
 
 def _save_page(overview: FleetOverview, commands: Sequence[str], path: Path) -> None:

@@ -27,10 +27,8 @@ if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Diagnosis
     from kf_calib.diagnosis.stepwise_selection import Improvement
     from kf_calib.estimation.bench_model import BenchModel
-    from kf_calib.estimation.engine_comparison import Comparison
     from kf_calib.estimation.results import Calibration
     from kf_calib.estimation.settings import Settings
-    from kf_calib.fleet.overview import FleetOverview
     from kf_calib.sources.files.lines import Lines
     from kf_calib.sources.files.recording import Recording
     from kf_calib.sources.tables.table import Table
@@ -418,7 +416,7 @@ def effects_of(options: Mapping[str, Any]) -> tuple[str, ...]:
     return merged(model.effects, options["effects"])
 
 
-def save_view(result: Calibration | Diagnosis | Improvement | Comparison | FleetOverview, path: Path) -> None:
+def save_view(result: Calibration | Diagnosis | Improvement, path: Path) -> None:
     """The Rerun view of a result; Rerun is imported when there is one to save."""
     from kf_calib.views import rerun
 

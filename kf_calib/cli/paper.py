@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import rich_click as click
 
@@ -19,16 +18,13 @@ from kf_calib.cli.options import (
     show,
     units_option,
 )
-from kf_calib.cli.pictures import Pictures, figures_of, picture_options
-
-if TYPE_CHECKING:
-    from kf_calib.reproduction.grebenkin2019 import Experiment
+from kf_calib.cli.pictures import Pictures, figure_options
 
 of_the_run = partial(click.option, panel="Run")
 inferred = partial(click.option, panel="Conditions that the paper does not print: inferred")
 
 
-@click.command(epilog=examples("paper", "paper --repetitions 1000 --rrd paper.rrd"))
+@click.command(epilog=examples("paper", "paper --repetitions 1000 --png paper.png"))
 @of_the_run(
     "--repetitions",
     type=click.IntRange(1, 20000),
@@ -66,7 +62,7 @@ inferred = partial(click.option, panel="Conditions that the paper does not print
     metavar="WORD",
     help="Accelerometers read together, or in turn in each orientation: 123, 132 ... 321.",
 )
-@picture_options
+@figure_options
 @overwrite_option
 @units_option
 @json_option
@@ -90,11 +86,4 @@ def paper(
     else:
         show(views.paper_report(found, searched))
     with delivery(outputs, as_json) as deliver:
-        words = views.markdown(found, searched)
-        pictures.save(deliver, lambda path: _save_view(found, words, path), figures_of(found))
-
-
-def _save_view(found: Experiment, words: str, path: Path) -> None:
-    from kf_calib.views.rerun.experiment import save
-
-    save(found, words, path)
+        pictures.save(deliver, found)

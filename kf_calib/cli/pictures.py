@@ -6,21 +6,18 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from kf_calib.cli.echo import complain
 from kf_calib.cli.files import Delivery, output_option
-from kf_calib.cli.options import OUTPUT, rrd_option
-
-if TYPE_CHECKING:
-    from kf_calib.views.figures import Figures
+from kf_calib.cli.options import OUTPUT, rrd_option, save_view
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """The files that a command is to save; None where it is not asked for."""
+    """The files that a command is to save; None where it is not asked for, or the command does not offer it."""
 
     rrd: Path | None
     screenshot: Path | None
@@ -33,21 +30,17 @@ class Pictures:
         """The pictures among a command's options, which have them no longer."""
         return cls(**{each.name: options.pop(each.name, None) for each in fields(cls)})
 
-    def save(self, deliver: Delivery, view: Callable[[Path], object], figures: Callable[[], Figures]) -> None:
-        """Save what was asked for. view: writes an .rrd file; figures: those of the result, made when they are needed.
+    def save(self, deliver: Delivery, result: Any) -> None:
+        """Save what was asked for of a result; Rerun and matplotlib are imported when they have something to draw.
 
         A viewer that finds no graphics driver is a complaint; all else that fails is told as for any other file.
         """
-        deliver.file(self.rrd, view)
-        self._screenshot(deliver, view)
-        self.save_figures(deliver, figures)
-
-    def save_figures(self, deliver: Delivery, figures: Callable[[], Figures]) -> None:
-        """Save the figures that were asked for."""
+        deliver.file(self.rrd, lambda path: save_view(result, path))
+        self._screenshot(deliver, result)
         for kind, path in (("png", self.png), ("svg", self.svg), ("pdf", self.pdf)):
-            deliver.file(path, lambda path, kind=kind: _save(figures, path, kind))
+            deliver.file(path, lambda path, kind=kind: _save_figures(result, path, kind))
 
-    def _screenshot(self, deliver: Delivery, view: Callable[[Path], object]) -> None:
+    def _screenshot(self, deliver: Delivery, result: Any) -> None:
         from kf_calib.views.screenshot import ScreenshotError, screenshot
 
         rrd = None if self.rrd in deliver.failures else self.rrd
@@ -56,7 +49,7 @@ class Pictures:
             with tempfile.TemporaryDirectory() as folder:
                 drawn = rrd or Path(folder) / "view.rrd"
                 if rrd is None:
-                    view(drawn)
+                    save_view(result, drawn)
                 screenshot(drawn, path)
 
         deliver.file(self.screenshot, draw)
@@ -66,11 +59,11 @@ class Pictures:
             del deliver.failures[self.screenshot]
 
 
-def _save(figures: Callable[[], Figures], path: Path, kind: str) -> None:
+def _save_figures(result: object, path: Path, kind: str) -> None:
     """Save figures as the kind that the option names, whatever the name of the file ends in."""
-    from kf_calib.views.figures import save
+    from kf_calib.views.figures import figures, save
 
-    save(figures(), path, kind)
+    save(figures(result), path, kind)
 
 
 def picture_options(command: F) -> F:
@@ -86,14 +79,3 @@ def figure_options(command: F) -> F:
         text = f"Save the {what} here, drawn by matplotlib."
         command = output_option(f"--{kind}", metavar=f"FILE.{kind}", help=text, panel=OUTPUT)(command)
     return command
-
-
-def figures_of(result: object) -> Callable[[], Figures]:
-    """What makes the figures of a result; matplotlib is imported then."""
-
-    def made() -> Figures:
-        from kf_calib.views.figures import figures
-
-        return figures(result)
-
-    return made

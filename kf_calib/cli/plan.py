@@ -29,14 +29,13 @@ from kf_calib.cli.options import (
     target_option,
     units_option,
 )
-from kf_calib.cli.pictures import Pictures, figures_of, picture_options
+from kf_calib.cli.pictures import Pictures, figure_options
 from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
     from kf_calib.bench.bench import Bench
     from kf_calib.design.gimbal_limits import Reach
     from kf_calib.design.optimality_criteria import Aim
-    from kf_calib.design.orientation_plan import Plan
     from kf_calib.design.predicted_information import Prospect
 
 _USUAL_DWELL_S = 30.0
@@ -85,7 +84,7 @@ def _plan_options(command: F) -> F:
                      help="White noise of a reading, m/s^2, where no recording tells it."),
         output_option("--csv", "csv_file", metavar="FILE.csv", panel=OUTPUT,
                       help="Save the angles, for simulate --plan."),
-        picture_options,
+        figure_options,
         overwrite_option,
     ]  # fmt: skip
     for option in reversed(options):
@@ -136,13 +135,7 @@ def plan(
         show(views.plan_report(made, options["beside_paper"]))
     with delivery(outputs, as_json) as deliver:
         deliver.file(csv_file, lambda path: views.write_csv(made, path))
-        pictures.save(deliver, lambda path: _save_view(made, path), figures_of(made))
-
-
-def _save_view(made: Plan, path: Path) -> None:
-    from kf_calib.views.rerun.plan import save
-
-    save(made, path)
+        pictures.save(deliver, made)
 
 
 def _refuse_contradictions(options: Mapping[str, Any]) -> None:
@@ -155,8 +148,6 @@ def _refuse_contradictions(options: Mapping[str, Any]) -> None:
         "positions",
         "beside_paper",
         "csv_file",
-        "rrd",
-        "screenshot",
         "png",
         "svg",
         "pdf",

@@ -15,19 +15,14 @@ def prior_estimate(result: Calibration) -> Estimate:
     return Estimate(*square_root_information.solve(factor, result.model.nominal_state()))
 
 
-def information_shares(result: Calibration) -> Floats:
-    """Shares (D, 12): by how much each dwell raised 1 / sigma^2 of each parameter, over its final value.
-
-    They are those of the dwells in their order, beside what was known before each: a parameter that is not yet
-    determined has no information, and the dwell that determines it brings all there then is. With what a stated prior
-    brings they sum to 1. A share is negative where biases that walk were lost faster than a dwell found them; a
-    parameter that the run does not determine, or that the prior holds exact, has none (NaN).
-    """
-    estimates = [prior_estimate(result), *(visit.estimate for visit in result.visits)]
-    return shares_of(np.array([estimate.sigma for estimate in estimates]))
-
-
 def shares_of(sigmas: Floats) -> Floats:
-    """The same (n, k) from sigmas (n + 1, k) before the first dwell and after each, NaN where not determined."""
+    """Shares (n, k): by how much each dwell raised 1 / sigma^2 of each parameter, over its final value.
+
+    sigmas (n + 1, k): before the first dwell and after each, NaN where not determined. The shares are those of the
+    dwells in their order, beside what was known before each: a parameter that is not yet determined has no information,
+    and the dwell that determines it brings all there then is. With what a stated prior brings they sum to 1. A share is
+    negative where biases that walk were lost faster than a dwell found them; a parameter that the run does not
+    determine, or that the prior holds exact, has none (NaN).
+    """
     known = np.where(sigmas[-1] > 0.0, sigmas, np.nan)
     return np.diff(np.nan_to_num(known**-2), axis=0) * known[-1] ** 2

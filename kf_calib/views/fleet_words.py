@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import datetime
-
 _LEAST = 1e-6
 
 
@@ -15,8 +13,3 @@ def short_name(unit: str) -> str:
 def chance_words(chance: float) -> str:
     """A chance, for a reader who asks no more than how small it is."""
     return f"{chance:.1g}" if chance >= _LEAST else f"< {_LEAST:.0e}"
-
-
-def day(when: datetime) -> str:
-    """The day of a run."""
-    return f"{when:%Y-%m-%d}"

@@ -124,13 +124,6 @@ def table2(found: Experiment) -> Table:
     return table
 
 
-def markdown(found: Experiment, searched: ConditionSearch) -> str:
-    """The same on one page of Markdown for the Rerun view."""
-    head = "| | optimal % | batch | non-opt. % | batch |\n|:--|--:|--:|--:|--:|\n"
-    rows = [f"| {symbol(name)} | " + " | ".join(np.array(_both(found, name))[[0, 2, 4, 6]]) + " |" for name in _order()]
-    return head + "\n".join(rows) + "\n\n" + "\n\n".join(sentences(found, searched)) + "\n"
-
-
 def _order() -> list[str]:
     """Return the symbols in the order of the paper: angles, scale factors, biases."""
     return [name for unit in dict.fromkeys(paper_parameters.UNITS) for name in _of_unit(unit)]

@@ -340,16 +340,6 @@ def test_the_command_in_words_and_its_refusals(run, tmp_path: Path) -> None:
         assert code == 2 and out == "" and err.count("\n") == 1 and said in err, err
 
 
-def test_the_rerun_view_of_a_plan(tmp_path: Path) -> None:
-    pytest.importorskip("rerun")
-    from kf_calib.views.rerun.plan import save
-
-    path = save(plan(search(), 6, TIMING), tmp_path / "plan.rrd")
-    assert path.stat().st_size > 10_000
-    with pytest.raises(InputError, match="no folder"):
-        save(plan(search(), 6, TIMING), tmp_path / "none" / "plan.rrd")
-
-
 def test_a_plan_says_where_it_leaves_little_to_go_by(run) -> None:
     few = json.loads(run("plan", "--count", 4, "--json")[1])["remarks"]
     assert any("4 directions of gravity × 3 readings = 12 for 12 parameters: nothing is" in said for said in few)

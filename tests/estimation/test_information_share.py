@@ -8,14 +8,21 @@ import numpy as np
 import pytest
 from helpers.paths import ROOT
 
+from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.information_share import information_shares, prior_estimate
+from kf_calib.estimation.information_share import prior_estimate, shares_of
 from kf_calib.estimation.prior import PRIORS
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.files.recording import Recording
 
 RECORDING = ROOT / "recordings" / "navigation_24.mcap"
+
+
+def information_shares(result: Calibration) -> Floats:
+    """Shares (D, 12) of the dwells of a run."""
+    estimates = [prior_estimate(result), *(visit.estimate for visit in result.visits)]
+    return shares_of(np.array([estimate.sigma for estimate in estimates]))
 
 
 @pytest.fixture(scope="module")

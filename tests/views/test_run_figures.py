@@ -207,6 +207,17 @@ def test_table_2_has_the_printed_figures(experiment: Experiment) -> None:
     assert lines["non-optimal: filter, here"] == pytest.approx(experiment.nonoptimal.kalman)
 
 
+def test_design_matrices_have_rows_of_plus_and_minus_g_in_the_optimal_set(experiment: Experiment) -> None:
+    """Each reading of the optimal set has gravity along one axis of the platform; only the Earth turns it elsewhere."""
+    optimal, others = np.split(np.array([axes.get_images()[0].get_array() for axes in
+                                         plot.design_matrices(experiment).get_axes()[:6]]), 2)  # fmt: skip
+    assert optimal.shape == (3, 400, 4)
+    angles_and_scale = np.sort(np.abs(optimal[:, :, :3]), axis=2)
+    expected = np.broadcast_to([0.0, 0.0, 1.0], angles_and_scale.shape)
+    np.testing.assert_allclose(angles_and_scale, expected, atol=1e-4)  # nominal φ is not quite 0
+    assert (optimal[:, :, 3] == 1.0).all() and np.ptp(others[:, :100, 1]) > 0.01
+
+
 def test_sigmas_of_the_experiment_end_at_those_expected(experiment: Experiment) -> None:
     """But for the prior, which is 5e3 times wider in the optimal set."""
     first = plot.falling(experiment).get_axes()[0]

@@ -25,7 +25,7 @@ from kf_calib.views.figures.convergence import convergence, estimates
 from kf_calib.views.figures.detection_limits import detection_limits
 from kf_calib.views.figures.directions import directions
 from kf_calib.views.figures.engines import allan_deviation, three_ways, whiteness
-from kf_calib.views.figures.experiment import falling, table2
+from kf_calib.views.figures.experiment import design_matrices, falling, table2
 from kf_calib.views.figures.history import history
 from kf_calib.views.figures.hypotheses import hypotheses
 from kf_calib.views.figures.improvement import improvement, residuals_of_steps
@@ -107,6 +107,7 @@ def _(found: Experiment) -> Figures:
     return {
         "Table 2 of the paper": lambda: table2(found),
         "Sigma as readings come": lambda: falling(found),
+        "Design matrices of both sets": lambda: design_matrices(found),
     }
 
 

@@ -7,6 +7,7 @@ from matplotlib.figure import Figure, FigureBase
 
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.reproduction.grebenkin2019 import (
+    GRAVITY_MPS2,
     NONOPTIMAL_PRINTED,
     OPTIMAL_PRINTED,
     READINGS,
@@ -85,6 +86,25 @@ def draw_falling(figure: FigureBase, found: Experiment) -> None:
     for axes in panels[3::4]:
         axes.set_xlabel(f"readings ({READINGS} in each orientation)")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+
+
+def design_matrices(found: Experiment) -> Figure:
+    """The design matrices of both sets, as the paper's figure 4: a column a parameter, a row a reading."""
+    with styled():
+        figure = blank(11.0, 5.0)
+        panels = figure.subplots(1, 6, sharey=True)
+        unit = np.array([GRAVITY_MPS2, GRAVITY_MPS2, GRAVITY_MPS2, 1.0])  # of angles and scale factor, of the bias
+        every = [(name, i, column.orientations.design[i] / unit)
+                 for name, (column, _) in zip(_SETS, _tables(found), strict=True) for i in range(3)]  # fmt: skip
+        for axes, (name, i, matrix) in zip(panels, every, strict=True):
+            axes.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto", interpolation="nearest")
+            axes.set_xticks(range(4), [each.label for each in twelve()[4 * i : 4 * i + 4]])
+            axes.set_yticks(range(0, 4 * READINGS + 1, READINGS))
+            axes.grid(visible=False)
+            axes.set_title(f"{name} set" if i == 0 else "")
+        panels[0].set_ylabel(f"reading ({READINGS} in each orientation)")
+        figure.colorbar(panels[0].get_images()[0], ax=panels, label="element of D, g (bias: 1)")
+    return figure
 
 
 def _tables(found: Experiment) -> list[tuple[Column, dict[str, float]]]:

@@ -1,4 +1,4 @@
-"""Which panel stands where when a view is opened: the overview first, each parameter and each channel in a tab."""
+"""Which panel stands where when a view of a run is opened: the overview first, parameters and innovations in tabs."""
 
 from __future__ import annotations
 
@@ -7,49 +7,87 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from kf_calib.bench.bench import Bench, Vector
-from kf_calib.estimation.correlation import largest_correlation
 from kf_calib.estimation.results import Calibration
-from kf_calib.views.rerun.chart import sheet
-from kf_calib.views.rerun.estimates import estimates_sheet
-from kf_calib.views.rerun.names import BENCH_TIME, ORIENTATION
+from kf_calib.support import units
+from kf_calib.views.rerun.names import BENCH_TIME, CHANNELS, GROUPS, ORIENTATION
 from kf_calib.views.rerun.platform import magnified
-from kf_calib.views.rerun.residuals import fit_charts, innovation_charts, predicted
-from kf_calib.views.rerun.series import History
-from kf_calib.views.rerun.sigmas import Falling, overview_sheet, single_sheet
+from kf_calib.views.rerun.series import History, predicted
 
-TIED = 0.3
-"""Largest correlation below which the matrix has nothing to show."""
-TABS = ("Overview", "Sigmas", "Parameters", "Innovations")
 _ENDLESS = rr.TimeRangeBoundary.infinite()
 WHOLE_RUN = rrb.TimeAxis(view_range=rr.TimeRange(start=_ENDLESS, end=_ENDLESS))
 """The same stretch of time in all panels: left to themselves they begin where their own data do."""
 
 
-def layout(result: Calibration, history: History, falling: Falling, timeline: str, tab: str) -> rrb.Blueprint:
-    """The blueprint for a window of about 1600 x 1000, ``tab`` (one of TABS) in front."""
-    tabs = [_overview(result, falling), single_sheet(falling, TABS[1]), estimates_sheet(history, TABS[2])]
-    tabs += [sheet("innovations", TABS[3], innovation_charts(result))] if predicted(result) else []
-    tabs += [_correlation(len(falling.shown))] if largest_correlation(result.estimate) >= TIED else []
+def layout(result: Calibration, history: History, goes_on: bool = False) -> rrb.Blueprint:
+    """The blueprint for a window of about 1600 x 1000, the overview in front; ``goes_on``: more dwells are to come."""
+    tabs = [_overview(result, history, predicted(result) or goes_on), _parameters(history)]
+    tabs += [_innovations(result)] if predicted(result) else []
     return rrb.Blueprint(
-        rrb.Tabs(*tabs, active_tab=min(TABS.index(tab), len(tabs) - 1)),
+        rrb.Tabs(*tabs),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
-        rrb.TimePanel(state="collapsed", timeline=timeline, play_state="following"),
+        rrb.TimePanel(state="collapsed", timeline=ORIENTATION, play_state="following"),
     )
 
 
-def _overview(result: Calibration, falling: Falling) -> rrb.Horizontal:
+def _overview(result: Calibration, history: History, is_predicted: bool) -> rrb.Horizontal:
     return rrb.Horizontal(
-        rrb.Vertical(
-            overview_sheet(falling, "σ by orientation; bars: information brought"), _pose(result), row_shares=[7, 2]
-        ),
-        rrb.Vertical(
-            _platform(result), sheet("fit", "how well each orientation fits", fit_charts(result)), row_shares=[1, 1]
-        ),
+        rrb.Vertical(*_sigmas(history), _pose(result)),
+        rrb.Vertical(_platform(result), *_fit(is_predicted), row_shares=[2, 1, 1] if is_predicted else [1, 1]),
         _summary(),
         column_shares=[5, 4.4, 3.8],
-        name=TABS[0],
+        name="Overview",
     )
+
+
+def _sigmas(history: History) -> list[rrb.TimeSeriesView]:
+    """A panel a kind of parameter, one for the coefficients of effects if there are any."""
+    corner = rrb.Corner2D.RightTop
+    kinds = [(f"{group.title}, {units.shown(group.unit).label}",
+              [k for k, shown in enumerate(history.shown[:12]) if shown.path.rpartition("/")[2] in group.symbols])
+             for group in GROUPS]  # fmt: skip
+    rest = [*range(12, len(history.shown))]
+    kinds += [("coefficients of effects", rest)] if rest else []
+    return [
+        _series([f"{history.shown[k].path}/{curve}" for k in columns for curve in ("log10_sigma", "log10_target")],
+                f"log₁₀ σ of {name}", corner)
+        for name, columns in kinds
+    ]  # fmt: skip
+
+
+def _fit(is_predicted: bool) -> list[rrb.TimeSeriesView]:
+    """How well each orientation fits: innovations and NIS, or residuals where few dwells were predicted."""
+    if not is_predicted:
+        return [_series(["residual/**"], "residuals over σ")]
+    ratios = [f"innovation/{channel}/in_sigma" for channel in CHANNELS]
+    return [
+        _series([*ratios, "innovation/bound"], "innovations over σ"),
+        _series(["nis/**"], "NIS, with the middle 95 % of χ²; red: above"),
+    ]
+
+
+def _parameters(history: History) -> rrb.Grid:
+    """A panel for each parameter and coefficient: what is estimated, with 1 sigma."""
+    panels = [
+        _series([f"{shown.path}/deviation", f"{shown.path}/band"],
+                f"{shown.label}{' − nominal' * (k < 12)} ± σ, {shown.unit}", around=history.late_range(k))
+        for k, shown in enumerate(history.shown)
+    ]  # fmt: skip
+    return rrb.Grid(*panels, grid_columns=4, name="Parameters")
+
+
+def _innovations(result: Calibration) -> rrb.Vertical:
+    """A panel an accelerometer, on the same axes, which show the innovations after a third of the run."""
+    unit, last = units.shown("m/s^2"), result.visits[-1].dwell.number
+    late = [visit for visit in result.visits if visit.dwell.number >= last / 3]
+    bounds = np.array([2.0 * visit.innovation_sigma_mps2 for visit in late])
+    reach = 1.08 * unit.per_si * float(np.nanmax([np.abs([visit.innovation_mps2 for visit in late]), bounds]))
+    panels = [
+        _series([f"innovation/{channel}/value", f"innovation/{channel}/bound"],
+                f"accelerometer {i}: mean of a dwell less its prediction ± 2σ, {unit.label}", around=(-reach, reach))
+        for i, channel in enumerate(CHANNELS, 1)
+    ]  # fmt: skip
+    return rrb.Vertical(*panels, name="Innovations")
 
 
 def _series(
@@ -95,12 +133,3 @@ def _platform(result: Calibration) -> rrb.Spatial3DView:
 
 def _summary() -> rrb.TextDocumentView:
     return rrb.TextDocumentView(origin="summary", name="result")
-
-
-def _correlation(count: int) -> rrb.Spatial2DView:
-    return rrb.Spatial2DView(
-        origin="correlation",
-        contents=["correlation/picture", "correlation/rows", "correlation/columns"],
-        name="Correlation: blue −1, orange +1; grey: not determined",
-        visual_bounds=rrb.VisualBounds2D(x_range=[-1.6, count + 0.1], y_range=[-2.4, count + 0.1]),
-    )

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-import numpy as np
 import rerun as rr
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.support.plain_text import printable
 from kf_calib.support.units import shown
@@ -54,25 +53,28 @@ class EntityGroup:
 GROUPS = EntityGroup("angles", "rad"), EntityGroup("scale factors", "1"), EntityGroup("biases", "m/s^2")
 
 
-def per_si() -> Floats:
-    """Factors (12,) from SI to the units in which the parameters are shown."""
-    return np.array([shown(unit).per_si for unit in paper_parameters.UNITS])
-
-
-def label_of(symbol: str) -> str:
-    """A parameter as it is drawn; a coefficient of an effect as it is called."""
-    return LABELS.get(symbol, printable(symbol))
-
-
 def entity(*parts: str) -> str:
     """The path of an entity, whatever characters are in the names of its parts."""
     return rr.new_entity_path([*parts]).lstrip("/")
 
 
+def number(value: float) -> str:
+    """A value above zero in few characters: ``0.05``, ``5·10⁴``."""
+    if 1e-3 <= value < 1e3:
+        return f"{value:g}"
+    exponent = math.floor(math.log10(value) + 1e-9)
+    power = "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    lead = f"{value / 10.0**exponent:.2g}"
+    return power if lead == "1" else f"{lead}·{power}"
+
+
+def thin(pixels: float) -> float:
+    """A radius in pixels of the screen, whatever the zoom: Rerun takes negative radii for such."""
+    return -pixels
+
+
 def colour_of(symbol: str) -> Colour:
-    """The accelerometer's colour, paler for its second angle; one for all coefficients of effects."""
-    if symbol not in LABELS:
-        return MAUVE
+    """The accelerometer's colour, paler for its second angle."""
     accelerometer, place = divmod(paper_parameters.SYMBOLS.index(symbol), 4)
     return PALE[accelerometer] if place == 1 else ACCELEROMETERS[accelerometer]
 
@@ -93,20 +95,15 @@ class Quantity:
     path: str
 
 
-def twelve() -> tuple[Quantity, ...]:
-    """The twelve parameters in the units that people are shown."""
-    units = {symbol: shown(unit) for symbol, unit in UNIT_OF.items()}
-    return tuple(
-        Quantity(LABELS[symbol], unit.label, unit.per_si, colour_of(symbol), path_of(symbol))
-        for symbol, unit in units.items()
-    )
-
-
 def quantities(model: Model) -> tuple[Quantity, ...]:
-    """The twelve parameters, then the coefficients of the effects in the model."""
+    """The twelve parameters in the units that people are shown, then the coefficients of the effects in the model."""
+    parameters = [
+        Quantity(LABELS[symbol], shown(unit).label, shown(unit).per_si, colour_of(symbol), path_of(symbol))
+        for symbol, unit in UNIT_OF.items()
+    ]
     coefficients = [
         Quantity(printable(each.symbol), printable(shown(each).label), shown(each).per_si, MAUVE,
                  entity("parameters", "effects", each.symbol))
         for each in model.coefficients
     ]  # fmt: skip
-    return (*twelve(), *coefficients)
+    return (*parameters, *coefficients)

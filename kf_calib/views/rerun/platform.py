@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.results import Calibration, Estimate
 from kf_calib.support.units import shown
-from kf_calib.views.rerun.chart import number, power, thin
-from kf_calib.views.rerun.names import ACCELEROMETERS, GOLD, GREY, RED, WHITE
+from kf_calib.views.rerun.names import ACCELEROMETERS, GOLD, GREY, RED, WHITE, number, thin
 from kf_calib.views.rerun.series import above, crowd, ends, nis_band, times
 
 FINAL_SIZE = 0.16  # of the largest final ellipsoid, as a part of the axis' length
@@ -65,7 +64,7 @@ def ellipsoids_of(estimate: Estimate) -> list[Ellipsoid]:
 def magnified(estimate: Estimate) -> str:
     """What the title of the view says of the ellipsoids."""
     factor = magnification(ellipsoids_of(estimate))
-    return f" with 1σ ×{power(factor)}" if factor else ""
+    return f" with 1σ ×{number(factor)}" if factor else ""
 
 
 def _axes(estimate: Estimate) -> Floats:

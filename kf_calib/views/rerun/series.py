@@ -1,4 +1,8 @@
-"""What is a curve or a row of points: parameters and their sigmas, innovations, NIS, gimbal angles."""
+"""What is a curve or a row of points: parameters and their sigmas, innovations, NIS, residuals, gimbal angles.
+
+Rerun draws curves over a timeline, with axes of its own. It has no logarithmic axis: sigmas, which fall over decades,
+are sent as their logarithms to base 10.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +17,7 @@ from scipy.special import chdtri
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.information_share import prior_estimate
+from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Visit
 from kf_calib.support import units
 from kf_calib.views.rerun.names import (
@@ -46,6 +51,16 @@ class History:
     whole: NDArray[np.bool_]
     deviation: Floats
     sigma: Floats
+
+    def late_range(self, k: int) -> tuple[float, float] | None:
+        """The range of the bands of the run's last two thirds, of one column: the first are a thousand times wider."""
+        late = np.isfinite(self.sigma[:, k]) & (self.orientation >= self.orientation[-1] / 3)
+        value, sigma = self.deviation[late, k], self.sigma[late, k]
+        if not len(value):
+            return None
+        low, high = float((value - sigma).min()), float((value + sigma).max())
+        margin = max(0.1 * (high - low), 1e-9 * max(abs(low), abs(high)), 1e-12)
+        return low - margin, high + margin
 
     def _only(self, rows: NDArray[np.bool_]) -> History:
         """Return the same with these rows only."""
@@ -95,17 +110,25 @@ def ends(visits: Sequence[Visit]) -> tuple[Floats, Counts]:
     return np.array([dwell.end_s for dwell in dwells]), np.array([dwell.number for dwell in dwells])
 
 
-def log_parameters(history: History, stream: rr.RecordingStream, styled: bool) -> None:
-    """Sigma, deviation from nominal, and the deviation less and plus one sigma; ``styled``: how they look was sent."""
+def log_parameters(history: History, stream: rr.RecordingStream, target: Floats, styled: bool) -> None:
+    """Sigma, deviation from nominal, and the deviation less and plus one sigma; ``styled``: how they look was sent.
+
+    target (12,): sigmas that are wanted, in SI, NaN where there is none.
+    """
     for k, shown in enumerate(history.shown):
         path, colour, label = shown.path, shown.colour, shown.label
         value, sigma = history.deviation[:, k], history.sigma[:, k]
-        _log_curve(stream, f"{path}/sigma", history, sigma)
+        _log_curve(stream, f"{path}/log10_sigma", history, np.log10(sigma))
         _log_curve(stream, f"{path}/deviation", history, value)
         _log_curve(stream, f"{path}/band", history, np.column_stack([value - sigma, value + sigma]))
+        if k < len(target) and np.isfinite(target[k]):
+            wanted = np.full(len(sigma), np.log10(target[k] * shown.per_si))
+            _log_curve(stream, f"{path}/log10_target", history, wanted)
         if styled:
             continue
-        _style(stream, f"{path}/sigma", rr.SeriesLines(names=label, colors=colour, widths=2.0))
+        named = label if k < 12 else f"{label}, {shown.unit}"
+        _style(stream, f"{path}/log10_sigma", rr.SeriesLines(names=named, colors=colour, widths=2.0))
+        _style(stream, f"{path}/log10_target", rr.SeriesLines(names=f"target {label}", colors=colour, widths=1.0))
         _style(stream, f"{path}/deviation", rr.SeriesLines(names=label, colors=colour, widths=2.0))
         _style(stream, f"{path}/band", rr.SeriesLines(names=["−σ", "+σ"], colors=[GREY] * 2, widths=[1.0] * 2))
 
@@ -167,6 +190,23 @@ def log_nis(visits: Sequence[Visit], stream: rr.RecordingStream, before: int = 0
         _style(stream, f"nis/{name}", _points(name, colour, before + len(visits)))
     _send(stream, "nis/band", elapsed_s, number, band)
     _style(stream, "nis/band", _bounds("2.5 %", "97.5 %"))
+
+
+def predicted(result: Calibration) -> bool:
+    """Were most dwells predicted from those before? Panels of innovations and NIS would else stand nearly empty."""
+    known = [visit.dof > 0 and bool(np.isfinite(visit.innovation_mps2).all()) for visit in result.visits]
+    return 2 * sum(known) >= len(known)
+
+
+def log_residuals(result: Calibration, stream: rr.RecordingStream) -> None:
+    """Residual of each dwell and channel over the sigma of its mean, for runs whose dwells were hardly predicted."""
+    elapsed_s, number = ends(result.visits)
+    ratios = result.residuals_mps2 / mean_sigmas(result)
+    for i, (channel, colour) in enumerate(zip(CHANNELS, ACCELEROMETERS, strict=True)):
+        _send(stream, f"residual/{channel}", elapsed_s, number, ratios[:, i])
+        _style(stream, f"residual/{channel}", _points(channel, colour, len(ratios)))
+    _send(stream, "residual/bound", elapsed_s, number, np.tile([-2.0, 2.0], (len(ratios), 1)))
+    _style(stream, "residual/bound", _bounds("−2σ", "+2σ"))
 
 
 def nis_band(dof: Counts) -> Floats:
