@@ -266,8 +266,8 @@ def command(*words: object) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_command_prints_the_agreed_keys_and_saves_the_view(tmp_path: Path) -> None:
-    done = command("--json", "--repetitions", 50, "--seed", 4, "--rrd", tmp_path / "view.rrd")
+def test_command_prints_the_agreed_keys_and_saves_the_figures(tmp_path: Path) -> None:
+    done = command("--json", "--repetitions", 50, "--seed", 4, "--pdf", tmp_path / "paper.pdf")
     assert done.returncode == 0 and done.stderr == "" and done.stdout.count("\n") == 1
     result = json.loads(done.stdout)
     assert len(result["table2"]) == 12
@@ -278,13 +278,13 @@ def test_command_prints_the_agreed_keys_and_saves_the_view(tmp_path: Path) -> No
         assert row["nonoptimal"] == pytest.approx(row["nonoptimal_kalman"], rel=0.02)
     assert result["conditions"]["inferred"] is True and result["nonoptimal_gravity_fixed"]["rank"] == [3, 3, 3]
     assert result["optimal"]["condition_numbers"] == pytest.approx([9.9135] * 3, abs=1e-3)
-    assert (tmp_path / "view.rrd").stat().st_size > 50_000
+    assert (tmp_path / "paper.pdf").stat().st_size > 50_000
 
 
 @pytest.mark.parametrize(
     "words, says",
     [(["--repetitions", 0], "repetitions"), (["--period-s", 0], "period"), (["--latitude", 90], "latitude"),
-     (["--rrd", "/no/such/folder/x.rrd", "--repetitions", 1], "no folder")],
+     (["--png", "/no/such/folder/x.png", "--repetitions", 1], "no folder")],
 )  # fmt: skip
 def test_bad_usage_is_one_sentence(words: list[object], says: str) -> None:
     done = command(*words)

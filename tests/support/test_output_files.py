@@ -127,22 +127,23 @@ def test_the_file_of_a_standard_stream_is_not_written(here: Path, words: str, st
     assert Path("lines.csv").read_bytes() == before
 
 
-PICTURES = ["--rrd", "--png", "--svg", "--pdf", "--screenshot"]
+FIGURES = ["--png", "--svg", "--pdf"]
+PICTURES = ["--rrd", *FIGURES, "--screenshot"]
 WRITING = [
     ("replay run.mcap", [*PICTURES, "--save", "--save-model"]),
     ("diagnose run.mcap", PICTURES),
-    ("compare run.mcap", [*PICTURES, "--report"]),
+    ("compare run.mcap", [*FIGURES, "--report"]),
     ("improve run.mcap", [*PICTURES, "--save", "--save-model", "--journal", "--report"]),
     ("report run.mcap", ["-o", "--certificate"]),
     ("apply cal.json run.mcap", ["-o"]),
     ("export cal.json --to csv", ["-o"]),
     ("certificate cal.json", ["-o"]),
     ("certificate cal.json -o new.pdf", ["--xml"]),
-    ("plan", ["--csv", *PICTURES]),
-    ("paper --repetitions 1", PICTURES),
+    ("plan", ["--csv", *FIGURES]),
+    ("paper --repetitions 1", FIGURES),
     ("live sim://?speed=100", ["--record", "--rrd", "--save-model", "--save"]),
-    ("history cal.json", ["--png", "--svg", "--pdf"]),
-    ("fleet run.mcap -o fleet", [*PICTURES, "--report"]),
+    ("history cal.json", FIGURES),
+    ("fleet run.mcap -o fleet", [*FIGURES, "--report"]),
     ("record", [""]),
     ("simulate", [""]),
 ]
@@ -320,7 +321,7 @@ FAST = "live sim://?speed=500&orientations=6&dwell_s=5&sample_hz=50&slew_degps=1
 
 
 @pytest.mark.parametrize("words", [
-    "replay run.mcap --rrd", "replay run.mcap --save-model", "plan --count 6 --rrd", f"{FAST} --rrd",
+    "replay run.mcap --rrd", "replay run.mcap --save-model", "plan --count 6 --pdf", f"{FAST} --rrd",
     f"{FAST} --save-model", "replay run.mcap --png",
 ])  # fmt: skip
 def test_a_file_that_finds_no_room_is_told_after_the_result(run, here: Path, words: str) -> None:
