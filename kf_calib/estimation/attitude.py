@@ -45,7 +45,7 @@ def at_their_modes(linearised: LinearisedDwells, noise: Noise, state: Floats) ->
         return [d.linearised(d.turned_rad, attitude) for d, attitude in zip(linearised.dwells, known, strict=True)]
     moved, variances = _posterior_rotations(linearised.means, noise, state, bendings)
     forces = linearised.means.force_mps2 / np.array([_length(dwell) for dwell in linearised.dwells])[:, None]
-    out = list[DwellFactor]()
+    dwells = list[DwellFactor]()
     for k, (dwell, turned) in enumerate(zip(linearised.dwells, linearised.dwells_at_state, strict=True)):
         before = np.zeros(3) if dwell.attitude is None else dwell.attitude.rotation_rad
         force = turn_by(forces[k], _limited(moved[k] - before))
@@ -54,11 +54,11 @@ def at_their_modes(linearised: LinearisedDwells, noise: Noise, state: Floats) ->
             variance_rad2 = variances[k] + _wander_rad2(dwell, noise, state, force)
             attitude = replace(attitude, variance_rad2=float(variance_rad2))
             left_out = dwell.came_from and facing_readings([dwell.came_from], state, float(np.linalg.norm(force)))[0]
-            out.append(replace(with_force(dwell, force), attitude=attitude, came_from=left_out))
+            dwells.append(replace(with_force(dwell, force), attitude=attitude, came_from=left_out))
         else:
             shown = without_attitude(turned).felt(dwell.means[None, 1:4])[0]
-            out.append(dwell.linearised(None, replace(attitude, rotation_rad=rotation_between(shown, force))))
-    return out
+            dwells.append(dwell.linearised(None, replace(attitude, rotation_rad=rotation_between(shown, force))))
+    return dwells
 
 
 def without_attitude(dwell: DwellFactor) -> DwellFactor:
@@ -99,9 +99,9 @@ def bendings_of(linearised: LinearisedDwells, state: Floats) -> Floats:
     """By how much the effects of the model change the mean readings of each dwell per unit of force, (D, 3, 3), from
     central differences; zeros for effects that turn the platform, oscillate, or show in slews only."""
     model, dwells = linearised.model, linearised.dwells_at_state
-    out, bent = np.zeros((len(dwells), 3, 3)), bent_effects(model, state)
+    bendings, bent = np.zeros((len(dwells), 3, 3)), bent_effects(model, state)
     if not bent:
-        return out
+        return bendings
     stimulus = stimulus_of(dwells, model.bench, state)
     step_mps2, firsts = _STEP * model.bench.gravity_mps2, np.cumsum([0, *(3 * len(d.pieces) for d in dwells)])[:-1]
     counts = np.array([3 * len(dwell.pieces) for dwell in dwells])[:, None]
@@ -110,8 +110,8 @@ def bendings_of(linearised: LinearisedDwells, state: Floats) -> Floats:
             added_by(bent, replace(stimulus, force_mps2=stimulus.force_mps2 + step * np.eye(3)[axis]), model, state)
             for step in (step_mps2, -step_mps2)
         )
-        out[:, :, axis] = np.add.reduceat((more - less) / (2.0 * step_mps2), firsts, axis=0) / counts
-    return np.where(np.abs(out) < _ABRUPT, out, 0.0)
+        bendings[:, :, axis] = np.add.reduceat((more - less) / (2.0 * step_mps2), firsts, axis=0) / counts
+    return np.where(np.abs(bendings) < _ABRUPT, bendings, 0.0)
 
 
 def bent_effects(model: Model, state: Floats) -> list[Effect]:
@@ -127,10 +127,10 @@ def bent_effects(model: Model, state: Floats) -> list[Effect]:
 
 def added_by(effects: Sequence[Effect], stimulus: Stimulus, model: Model, state: Floats) -> Floats:
     """What effects of a model add to the readings, (m, 3), with their coefficients in ``state`` (p,)."""
-    out = np.zeros((len(stimulus), 3))
+    added_mps2 = np.zeros((len(stimulus), 3))
     for effect in effects:
-        out += effect.added(stimulus, state[model.parts[str(effect)]][: len(effect.coefficients)])
-    return out
+        added_mps2 += effect.added(stimulus, state[model.parts[str(effect)]][: len(effect.coefficients)])
+    return added_mps2
 
 
 def matrix_of(rotation_rad: Floats) -> Floats:
@@ -179,11 +179,11 @@ def force_shown(readings: Floats, state: Floats) -> Floats:
 def facing_readings(dwells: Sequence[DwellFactor], state: Floats, gravity_mps2: float) -> list[DwellFactor]:
     """The dwells with the specific force that their mean readings alone show at ``state``, S^-1 (z - b) with the size
     of g: where the search for attitudes that are not known begins."""
-    out, forces = list[DwellFactor](), force_shown(np.array([dwell.means[4:] for dwell in dwells]), state)
+    all_facing, forces = list[DwellFactor](), force_shown(np.array([dwell.means[4:] for dwell in dwells]), state)
     for dwell, force in zip(dwells, forces, strict=True):
         before = dwell.came_from
         facing = with_force(dwell, gravity_mps2 * force / np.linalg.norm(force))
         if before is not None:
             facing = replace(facing, came_from=facing_readings([before], state, gravity_mps2)[0])
-        out.append(facing)
-    return out
+        all_facing.append(facing)
+    return all_facing

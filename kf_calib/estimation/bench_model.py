@@ -109,18 +109,18 @@ def read(path: str | Path) -> BenchModel:
     return BenchModel(terms, content.get("bench", ""), content.get("runs", 0))
 
 
-def _term(own: _Term) -> BenchTerm:
+def _term(entry: _Term) -> BenchTerm:
     """Return one term; raises ValueError where its parts do not fit together."""
-    name, count = own["effect"], len(own["symbols"])
-    if len(own["coefficients"]) != count or [len(row) for row in own["covariance"]] != [count] * count:
+    name, count = entry["effect"], len(entry["symbols"])
+    if len(entry["coefficients"]) != count or [len(row) for row in entry["covariance"]] != [count] * count:
         raise ValueError(f"{name} has {count} symbols, so it needs as many coefficients and rows of the covariance")
-    covariance = np.array(own["covariance"])
+    covariance = np.array(entry["covariance"])
     sizes = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     relative = covariance / np.maximum(np.outer(sizes, sizes), 1e-300)
     if not np.allclose(covariance, covariance.T, rtol=_ROUNDING, atol=0.0) or np.linalg.eigvalsh(relative)[0] < -1e-6:
         raise ValueError(f"the covariance of {name} is not one: it must be symmetric, without a negative variance")
-    rows = tuple(tuple(row) for row in own["covariance"])
-    return BenchTerm(name, tuple(own["symbols"]), tuple(own["coefficients"]), rows, own.get("since", ""))
+    rows = tuple(tuple(row) for row in entry["covariance"])
+    return BenchTerm(name, tuple(entry["symbols"]), tuple(entry["coefficients"]), rows, entry.get("since", ""))
 
 
 def _known(term: BenchTerm, bench: Bench) -> KnownEffect:

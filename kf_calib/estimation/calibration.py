@@ -126,18 +126,23 @@ def conclude(
 def with_remarks(result: Calibration, passed: Pass) -> Calibration:
     """The result with the counts and observations of its pass and a sentence on everything that a user must know."""
     outlying = outlying_dwells(result, lambda some: evaluate_fit(_fit_again(result, some), result.settings))
-    own = [effect for effect in result.model.effects if of_the_users(effect)]
-    notes = [f"{sight}." for sight in visibility_of(result.fit, own)]
+    of_users = [effect for effect in result.model.effects if of_the_users(effect)]
+    notes = [f"{sight}." for sight in visibility_of(result.fit, of_users)]
     readings = passed.watch.judged(result.fit.dwells, result.noise)
-    found = [outlying_in_words(outlying)] if outlying else []
+    on_outlying = [outlying_in_words(outlying)] if outlying else []
     misfit = misfit_remark(result.consistency, result.residuals_mps2, result.bench, result.noise)
-    usual = [each for each in result.warnings if each != misfit or not (outlying or readings.saturation)]
+    remarks = [each for each in result.warnings if each != misfit or not (outlying or readings.saturation)]
     counted = [*passed.tally.sentences(), *passed.tally.unmet(passed.settings.stillness)]
     notes += [f"{known.sentence}." for known in result.model.known]
-    said = [*passed.source.warnings, *counted, *readings.warnings, *found, *usual, *notes]
-    judged = result.consistency if not outlying else _with_outlying(result.consistency, outlying)
+    warnings = [*passed.source.warnings, *counted, *readings.warnings, *on_outlying, *remarks, *notes]
+    agreement = result.consistency if not outlying else _with_outlying(result.consistency, outlying)
     return replace(
-        result, tally=passed.tally, readings=readings, warnings=tuple(said), outlying=outlying, consistency=judged
+        result,
+        tally=passed.tally,
+        readings=readings,
+        warnings=tuple(warnings),
+        outlying=outlying,
+        consistency=agreement,
     )
 
 
@@ -268,7 +273,10 @@ def _visits(
 ) -> tuple[Visit, ...]:
     """Return for each dwell its innovation, its residual and the estimate after it."""
     linearised, means, around = fitted.linearised, fitted.linearised.means, fitted.linearised.model.nominal_state()
-    own, walked = mean_covariances(fitted.noise.of_readings, means, linearised.state), to_mean(fitted.steps)
+    noise_covariances, walked = (
+        mean_covariances(fitted.noise.of_readings, means, linearised.state),
+        to_mean(fitted.steps),
+    )
     first, extra = (
         square_root_information.start(settings.prior, linearised.model),
         np.concatenate([0.0 * extra[:1], extra]),
@@ -285,6 +293,6 @@ def _visits(
             rows = means.design[k]
             innovation = means.readings[k] - rows @ known[k].state
             predicted_by = np.maximum(np.diag(rows @ known[k].covariance @ rows.T), 0.0)  # negative by rounding only
-            sigma = np.sqrt(predicted_by + np.diag(own[k]))
+            sigma = np.sqrt(predicted_by + np.diag(noise_covariances[k]))
         visits.append(Visit(dwell, reached[k + 1], step.nis, step.dof, innovation, sigma, residuals[k]))
     return tuple(visits)

@@ -139,11 +139,11 @@ class Correction:
         """The same from readings (n, 3) of accelerometers 1, 2, 3 in m/s^2, such as a recording holds."""
         readings = self._three_columns(readings_mps2, "m/s^2")
         temperature = self._temperature(temperature_c, len(readings))
-        out = np.empty_like(readings)
+        force_mps2 = np.empty_like(readings)
         for first in range(0, len(readings), _BLOCK):
             part = slice(first, first + _BLOCK)
-            out[part] = self._corrected(readings[part], temperature[part])
-        return out
+            force_mps2[part] = self._corrected(readings[part], temperature[part])
+        return force_mps2
 
     def _three_columns(self, values: object, unit: str) -> Floats:
         """Return readings as (n, 3)."""
@@ -208,11 +208,11 @@ class Correction:
 
     def _added(self, stimulus: Stimulus) -> Floats:
         """Return what the effects add to the readings (n, 3)."""
-        out = np.zeros_like(stimulus.force_mps2)
+        added_mps2 = np.zeros_like(stimulus.force_mps2)
         for effect in self.effects:
             part = self._part(effect)
-            out += effect.added(stimulus, self.state[part.start : part.start + len(effect.coefficients)])
-        return out
+            added_mps2 += effect.added(stimulus, self.state[part.start : part.start + len(effect.coefficients)])
+        return added_mps2
 
     def corrected(self, raw: Floats, temperature_c: Floats | float | None = None) -> Corrected:
         """As ``__call__``, with the uncertainty of each corrected reading."""
@@ -235,13 +235,13 @@ class Correction:
         """
         force = np.atleast_2d(np.asarray(force_mps2, float))
         temperature = self._temperature(temperature_c, len(force))
-        out = np.full((len(force), 3, 3), np.nan)
+        covariances = np.full((len(force), 3, 3), np.nan)
         good = np.flatnonzero(np.isfinite(force).all(axis=1) & np.isfinite(temperature))
         for first in range(0, len(good), _BLOCK):
             part = good[first : first + _BLOCK]
             design = self.matrix @ self._design(force[part], temperature[part])
-            out[part] = design @ self._covariance @ np.swapaxes(design, 1, 2)
-        return out + self.matrix @ np.diag(self.noise_mps2**2) @ self.matrix.T if noise else out
+            covariances[part] = design @ self._covariance @ np.swapaxes(design, 1, 2)
+        return covariances + self.matrix @ np.diag(self.noise_mps2**2) @ self.matrix.T if noise else covariances
 
     def _design(self, force: Floats, temperature_c: Floats) -> Floats:
         """Return what a reading changes by the states that are corrected, (n, 3, p)."""

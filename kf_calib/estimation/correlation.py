@@ -13,12 +13,12 @@ from kf_calib.estimation.results import Estimate
 def correlation(estimate: Estimate) -> Floats:
     """Correlations (12 + q, 12 + q) of the twelve parameters and the coefficients of effects; NaN in the rows and
     columns of those that are not determined."""
-    own = estimate.covariance
-    jacobian = np.eye(len(own))
+    covariance = estimate.covariance
+    jacobian = np.eye(len(covariance))
     jacobian[:STATE_COUNT, :STATE_COUNT] = paper_parameters.jacobian(estimate.state[:STATE_COUNT])
-    sigma = np.sqrt(np.diag(jacobian @ own @ jacobian.T))
+    sigma = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
     sigma[np.isnan(np.concatenate([estimate.sigma, estimate.effect_sigma]))] = np.nan
-    return jacobian @ own @ jacobian.T / np.outer(sigma, sigma)
+    return jacobian @ covariance @ jacobian.T / np.outer(sigma, sigma)
 
 
 def largest_correlation(estimate: Estimate) -> float:

@@ -115,7 +115,7 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
     )
     noise = noise.of_readings
     rows = fitted.rows(fitted.noise.for_goodness_of_fit.weights)
-    extra, own = (
+    extra, noise_covariances = (
         considered_information(noise, linearised.means, linearised.state),
         mean_covariances(noise, linearised.means, linearised.state),
     )
@@ -139,7 +139,7 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
     covariance = (covariance + covariance @ (extra.sum(axis=0) - left_out) @ covariance)[place]
     design = linearised.means.design
     errors = linearised.means.readings - (design @ np.array(states)[place, :, None])[:, :, 0]
-    return errors, own + design @ covariance @ np.swapaxes(design, 1, 2)
+    return errors, noise_covariances + design @ covariance @ np.swapaxes(design, 1, 2)
 
 
 def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | None:
@@ -160,12 +160,12 @@ def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | Non
             upper, count = random_walk.advance(heads[k], steps[k], np.hstack([np.zeros((len(around), 3)), tails[k]]))
             order = [*range(count, upper.shape[1] - 1), *range(count), upper.shape[1] - 1]
             ways.setdefault(count, []).append((k, upper[: len(around) + count, order]))
-    for count, own in ways.items():
+    for count, augmented in ways.items():
         half = np.hstack([-0.5 * np.eye(3), np.zeros((3, count - 3))])  # the mean lies half a step before the end
-        found = square_root_information.solve_all(
-            np.array([upper for _, upper in own]), np.append(around, np.zeros(count))
+        estimates = square_root_information.solve_all(
+            np.array([upper for _, upper in augmented]), np.append(around, np.zeros(count))
         )
-        for (k, _), (state, covariance, lost) in zip(own, found, strict=True):
+        for (k, _), (state, covariance, lost) in zip(augmented, estimates, strict=True):
             if lost.size:
                 return None
             design = np.hstack([means.design[k], half])
@@ -177,10 +177,10 @@ def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | Non
 def _frame(fitted: Fit) -> Floats:
     """Return the factor that knows nothing but the states that are fixed at zero, whichever orientation is left out."""
     model, noise = fitted.linearised.model, fitted.noise
-    out = square_root_information.start(Prior(), model)
+    factor = square_root_information.start(Prior(), model)
     for place in model.fixed:
-        out[place, place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2.min()
-    return out
+        factor[place, place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2.min()
+    return factor
 
 
 def _passes(
@@ -188,11 +188,11 @@ def _passes(
 ) -> tuple[list[Floats], list[Floats]]:
     """Return the factors before each dwell from ``first`` and the dwells before it, and those at its end from the
     dwells after it."""
-    known = [own[:0] if k in left_out else own for k, own in enumerate(rows)]
+    known = [of_dwell[:0] if k in left_out else of_dwell for k, of_dwell in enumerate(rows)]
     width, heads, tails = len(first), [first], [np.zeros_like(first)]
-    for own, variances in zip(known[:-1], steps, strict=False):
-        upper, count = random_walk.advance(heads[-1], variances, own)
+    for of_dwell, variances in zip(known[:-1], steps, strict=False):
+        upper, count = random_walk.advance(heads[-1], variances, of_dwell)
         heads.append(upper[count : count + width, count:])
-    for own, variances in zip(known[:0:-1], steps[:0:-1], strict=True):
-        tails.insert(0, random_walk.recede(tails[0], variances, own))
+    for of_dwell, variances in zip(known[:0:-1], steps[:0:-1], strict=True):
+        tails.insert(0, random_walk.recede(tails[0], variances, of_dwell))
     return heads, tails

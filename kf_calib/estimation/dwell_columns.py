@@ -178,20 +178,29 @@ class LinearisedDwells:
 
     def followed_by(self, dwell: DwellFactor) -> LinearisedDwells:
         """The same with one more dwell; the columns of the others are not computed again."""
-        out = LinearisedDwells.__new__(LinearisedDwells)
-        out.dwells, out.slews, out.model, out.state = [*self.dwells, dwell], self.slews, self.model, self.state
-        out.dwells_at_state = [*self.dwells_at_state, dwell]
-        last = stimulus_of(out.dwells_at_state, self.model.bench, self.state).ending(3 * len(dwell.pieces))
-        out.columns = [*self.columns, *_by_dwell([dwell], lambda s: self.model.columns(s, self.state), last)]
-        out.slew_columns = self.slew_columns
-        return out
+        longer = LinearisedDwells.__new__(LinearisedDwells)
+        longer.dwells, longer.slews, longer.model, longer.state = (
+            [*self.dwells, dwell],
+            self.slews,
+            self.model,
+            self.state,
+        )
+        longer.dwells_at_state = [*self.dwells_at_state, dwell]
+        last = stimulus_of(longer.dwells_at_state, self.model.bench, self.state).ending(3 * len(dwell.pieces))
+        longer.columns = [*self.columns, *_by_dwell([dwell], lambda s: self.model.columns(s, self.state), last)]
+        longer.slew_columns = self.slew_columns
+        return longer
 
     def with_columns(self, columns: Sequence[Floats]) -> LinearisedDwells:
         """The same dwells with other columns (pieces, K nodes, 3, c) of each: those of the first c states alone."""
-        out = LinearisedDwells.__new__(LinearisedDwells)
-        out.dwells, out.slews, out.model, out.state = self.dwells, self.slews, self.model, self.state
-        out.dwells_at_state, out.columns, out.slew_columns = self.dwells_at_state, list(columns), self.slew_columns
-        return out
+        other = LinearisedDwells.__new__(LinearisedDwells)
+        other.dwells, other.slews, other.model, other.state = self.dwells, self.slews, self.model, self.state
+        other.dwells_at_state, other.columns, other.slew_columns = (
+            self.dwells_at_state,
+            list(columns),
+            self.slew_columns,
+        )
+        return other
 
     @cached_property
     def means(self) -> Means:
@@ -265,9 +274,9 @@ def has_turns(dwell: DwellFactor) -> bool:
 def turning_mps2(dwell: DwellFactor, force_mps2: Floats, state: Floats) -> Floats:
     """Return by how much the rotations of a turned dwell change readings (n, 3) to first order about the forces (n, 3)
     that are felt: S (rho x g) + (S + B) (alpha x g), with B the bending by effects."""
-    sensitivity, out = state[:STATE_COUNT].reshape(3, 4)[:, :3], np.zeros_like(force_mps2)
+    sensitivity, change = state[:STATE_COUNT].reshape(3, 4)[:, :3], np.zeros_like(force_mps2)
     alpha = np.zeros(3) if dwell.attitude is None else dwell.attitude.rotation_rad
     if dwell.turned_rad is not None:
         rho = dwell.turned_rad + np.cross(alpha, dwell.turned_rad)
-        out += np.cross(rho, force_mps2) @ sensitivity.T
-    return out + np.cross(alpha, force_mps2) @ (sensitivity + bending_of(dwell)).T if alpha.any() else out
+        change += np.cross(rho, force_mps2) @ sensitivity.T
+    return change + np.cross(alpha, force_mps2) @ (sensitivity + bending_of(dwell)).T if alpha.any() else change

@@ -122,13 +122,13 @@ def compare(
 def _along(states: Iterable[Floats], result: Calibration) -> Floats:
     """Return the differences (D, p) of the parameters and coefficients in ``states`` (D, p) from those of the block
     engine after each dwell, in their sigmas then."""
-    out = list[Floats]()
+    differences = list[Floats]()
     for state, visit in zip(states, result.visits, strict=True):
-        own = visit.estimate
-        other = replace(own, state=state)
-        difference = np.append(other.parameters - own.parameters, other.effects - own.effects)
-        out.append(difference / np.append(own.sigma, own.effect_sigma))
-    return np.array(out)
+        of_block = visit.estimate
+        other = replace(of_block, state=state)
+        difference = np.append(other.parameters - of_block.parameters, other.effects - of_block.effects)
+        differences.append(difference / np.append(of_block.sigma, of_block.effect_sigma))
+    return np.array(differences)
 
 
 def _timed(run: Callable[[], Result]) -> tuple[Result, float]:

@@ -52,10 +52,10 @@ def weights_of_size(means: Means, state: Floats) -> Floats:
 
 def regressors_of(means: Means) -> Floats:
     """The columns (D, 3, 12) of all twelve states, those that are fixed as well."""
-    out = np.zeros((len(means.counts), 3, STATE_COUNT))
+    regressors = np.zeros((len(means.counts), 3, STATE_COUNT))
     for i in range(3):
-        out[:, i, 4 * i : 4 * i + 3], out[:, i, 4 * i + 3] = means.force_mps2, 1.0
-    return out
+        regressors[:, i, 4 * i : 4 * i + 3], regressors[:, i, 4 * i + 3] = means.force_mps2, 1.0
+    return regressors
 
 
 def covariance_of(linearised: LinearisedDwells, noise: Noise, square_rad: float = 1.0) -> Floats:
@@ -99,14 +99,14 @@ def tells_angles(linearised: LinearisedDwells, noise: Noise) -> bool:
 def square_changes(linearised: LinearisedDwells) -> list[Floats]:
     """Changes (pieces, nodes, 3, 3) of each dwell's readings if one of the three angles between the axes is 1 sigma
     from square."""
-    out, affine = list[Floats](), linearised.state[:STATE_COUNT].reshape(3, 4)
+    changes, affine = list[Floats](), linearised.state[:STATE_COUNT].reshape(3, 4)
     for dwell in linearised.dwells:
         force = np.array([piece.nodes.force_mps2 for piece in dwell.pieces])
-        own = np.zeros((*force.shape[:2], 3, len(SQUARE)))
+        change = np.zeros((*force.shape[:2], 3, len(SQUARE)))
         for k, (channel, axis) in enumerate(divmod(place, 4) for place in SQUARE):
-            own[:, :, channel, k] = force[:, :, axis] * affine[channel, channel] * linearised.model.bench.square_rad
-        out.append(own)
-    return out
+            change[:, :, channel, k] = force[:, :, axis] * affine[channel, channel] * linearised.model.bench.square_rad
+        changes.append(change)
+    return changes
 
 
 def triad_changes(linearised: LinearisedDwells) -> list[Floats]:

@@ -44,14 +44,14 @@ class FurtherEffects:
 
     def _bases(self, known: Sequence[Effect]) -> tuple[Floats, list[slice]]:
         """Return orthonormal bases (m, k) of what the model leaves of each known effect, and the columns of each."""
-        out, parts, last = np.empty((len(self._residual), sum(counts_of(known)))), list[slice](), 0
+        bases, parts, last = np.empty((len(self._residual), sum(counts_of(known)))), list[slice](), 0
         for some, columns in self._columns(known):
             rest = self._beside.of(columns)
-            for effect, own in zip(some, slices(counts_of(some)), strict=True):
-                found = self._scan([effect], columns[:, own], rest[:, own]).candidates[0]
-                parts.append(slice(last, last + found.dof))
-                out[:, parts[-1]], last = rest[:, own] @ found.inverse, parts[-1].stop
-        return out[:, :last], parts
+            for effect, part in zip(some, slices(counts_of(some)), strict=True):
+                candidate = self._scan([effect], columns[:, part], rest[:, part]).candidates[0]
+                parts.append(slice(last, last + candidate.dof))
+                bases[:, parts[-1]], last = rest[:, part] @ candidate.inverse, parts[-1].stop
+        return bases[:, :last], parts
 
     def _columns(self, known: Sequence[Effect]) -> Iterator[tuple[list[Effect], Floats]]:
         """Yield a few of the known effects at a time with their whitened columns (m, q)."""
@@ -79,13 +79,13 @@ class FurtherEffects:
         upper = triangle(np.column_stack([rest, self._residual]))
         return scan_of(upper, np.linalg.norm(columns, axis=0), effects, counts_of(effects))
 
-    def _is_known(self, found: Scan, products: Floats) -> bool:
+    def _is_known(self, scan: Scan, products: Floats) -> bool:
         """Tell whether each candidate lies within a known effect; products (k, q): of the bases of these with the
         columns."""
-        for each, own in zip(
-            found.candidates, slices(counts_of([each.effect for each in found.candidates])), strict=True
+        for candidate, columns in zip(
+            scan.candidates, slices(counts_of([candidate.effect for candidate in scan.candidates])), strict=True
         ):
-            cosines = (products[:, own] @ each.inverse).T
+            cosines = (products[:, columns] @ candidate.inverse).T
             if not any(is_within(cosines[:, part], self._cosine) for part in self._parts):
                 return False
         return True

@@ -86,16 +86,16 @@ def innovation_tests(result: Calibration) -> InnovationTests:
 
 def _ratios(result: Calibration) -> Floats:
     """Return innovations over their sigma (D, 3), also of readings that are predicted while some states are not yet."""
-    out = np.array([visit.innovation_mps2 / visit.innovation_sigma_mps2 for visit in result.visits])
+    ratios = np.array([visit.innovation_mps2 / visit.innovation_sigma_mps2 for visit in result.visits])
     means, visits = result.linearised.means, result.visits
-    own = mean_covariances(result.noise.of_readings, means, result.linearised.state)
-    for k in np.flatnonzero(np.isnan(out).any(axis=1) & (np.arange(len(out)) > 0)):
+    noise_covariances = mean_covariances(result.noise.of_readings, means, result.linearised.state)
+    for k in np.flatnonzero(np.isnan(ratios).any(axis=1) & (np.arange(len(ratios)) > 0)):
         before, rows = visits[k - 1].estimate, means.design[k]
         lost = before.undetermined / np.linalg.norm(before.undetermined, axis=0)
         seen = np.linalg.norm(rows @ lost, axis=1) < _ROUNDING * np.linalg.norm(rows, axis=1)
-        sigma = np.sqrt(np.diag(rows @ before.covariance @ rows.T) + np.diag(own[k]))
-        out[k] = np.where(seen, (means.readings[k] - rows @ before.state) / sigma, np.nan)
-    return out
+        sigma = np.sqrt(np.diag(rows @ before.covariance @ rows.T) + np.diag(noise_covariances[k]))
+        ratios[k] = np.where(seen, (means.readings[k] - rows @ before.state) / sigma, np.nan)
+    return ratios
 
 
 @dataclass(frozen=True)

@@ -137,12 +137,14 @@ class _Filter:
 
     def enter_dwell(self) -> None:
         """Reset the nuisance states to their prior, independent of everything before."""
-        own = slice(self.count, None)
-        self.kf.x[own] = 0.0
+        nuisances = slice(self.count, None)
+        self.kf.x[nuisances] = 0.0
         matrix, sigma = (self.kf.P, self.dwell_sigmas**2) if self.plain else (self.kf._P1_2, self.dwell_sigmas)
-        matrix[own, :] = 0.0
-        matrix[:, own] = 0.0  # the root is lower triangular: its leading block is the root of the leading covariance
-        matrix[own, own] = np.diag(sigma)
+        matrix[nuisances, :] = 0.0
+        matrix[:, nuisances] = (
+            0.0  # the root is lower triangular: its leading block is the root of the leading covariance
+        )
+        matrix[nuisances, nuisances] = np.diag(sigma)
 
     def walk(self, variance: float) -> None:
         """Do a time update with F = I in which the biases take steps of this variance."""

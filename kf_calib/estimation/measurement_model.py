@@ -172,28 +172,28 @@ class Model:
     def columns(self, stimulus: Stimulus, state: Floats) -> Floats:
         """The design H (m, 3, p): the change of each accelerometer's reading per unit of each state, linearised at
         ``state`` (p,)."""
-        out = np.zeros((len(stimulus), 3, self.count))
+        design = np.zeros((len(stimulus), 3, self.count))
         for i in range(3) if not stimulus.part else ():
-            out[:, i, 4 * i : 4 * i + 3] = stimulus.force_mps2
-            out[:, i, 4 * i + 3] = 1.0
+            design[:, i, 4 * i : 4 * i + 3] = stimulus.force_mps2
+            design[:, i, 4 * i + 3] = 1.0
         for effect in self.effects:
             if not effect.shows_in(stimulus):
                 continue
             part = self.parts[str(effect)]
-            own = slice(part.start, part.start + len(effect.coefficients))
-            out[:, :, own] = effect_columns([effect], stimulus)
-            if own.stop < part.stop:
-                out[:, :, own.stop : part.stop] = effect.derivative(stimulus, state[own])
-        out[:, :, list(self.fixed)] = 0.0
-        return out
+            coefficients = slice(part.start, part.start + len(effect.coefficients))
+            design[:, :, coefficients] = effect_columns([effect], stimulus)
+            if coefficients.stop < part.stop:
+                design[:, :, coefficients.stop : part.stop] = effect.derivative(stimulus, state[coefficients])
+        design[:, :, list(self.fixed)] = 0.0
+        return design
 
     def turned_rad(self, stimulus: Stimulus, state: Floats) -> Floats:
         """Rotation vectors (m, 3) by which the effects at ``state`` (p,) turn the specific force."""
-        out = np.zeros((len(stimulus), 3))
+        rotation_rad = np.zeros((len(stimulus), 3))
         for effect in self.effects:
             if isinstance(effect, FrameEffect) and effect.shows_in(stimulus):
-                out += effect.turned_rad(stimulus, state[self.parts[str(effect)]])
-        return out
+                rotation_rad += effect.turned_rad(stimulus, state[self.parts[str(effect)]])
+        return rotation_rad
 
 
 def effect_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
@@ -203,8 +203,8 @@ def effect_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
     for effect, end, count in zip(effects, last, counts, strict=True):
         if not effect.shows_in(stimulus):
             continue
-        own, scales = effect.columns(stimulus), np.array([coefficient.scale for coefficient in effect.coefficients])
+        added, scales = effect.columns(stimulus), np.array([coefficient.scale for coefficient in effect.coefficients])
         # set to zero what even a large coefficient would not raise above rounding, as for the tilt of a vertical axis,
         # and what depends on an attitude that is not known (NaN), of which nothing can be seen
-        columns[:, :, end - count : end] = np.where(np.abs(own) * scales >= _ROUNDING_MPS2, own, 0.0)
+        columns[:, :, end - count : end] = np.where(np.abs(added) * scales >= _ROUNDING_MPS2, added, 0.0)
     return columns

@@ -74,13 +74,13 @@ class ModelFile:
 
         Raises InputError, with the path, if a file may not be run or cannot be used.
         """
-        found = self.allowed([Path(name) for name in named], trust)
+        allowed = self.allowed([Path(name) for name in named], trust)
         with _telling(self.path):
-            for file in found.files:
+            for file in allowed.files:
                 effects.load_file(file)
             for text in self.effects:
                 effects.refuse_unknown(text)
-        return found.changes
+        return allowed.changes
 
 
 def read(path: str | Path) -> ModelFile:

@@ -113,25 +113,25 @@ def _values(effect: Effect) -> list[Effect]:
     return [effect] if effect.unknown is None else [effect.at(value) for value in effect.unknown.grid(2.0)]
 
 
-def _sight(found: Scan, effect: Effect) -> Visibility:
+def _sight(scan: Scan, effect: Effect) -> Visibility:
     """Return the visibility of one effect from the scan of all."""
     if effect.no_columns:
         return Visibility(effect, None, why=effect.no_columns)
-    own = [each for each in found.candidates if str(each.effect) == str(effect)]
-    tests = len({str(each.effect) for each in found.candidates if each.dof})
+    of_effect = [each for each in scan.candidates if str(each.effect) == str(effect)]
+    tests = len({str(each.effect) for each in scan.candidates if each.dof})
     chance = 0.5 * LEVEL / max(tests, 1)  # half: the misfit as a whole is tested beside
-    sized = [(smallest_size(each, chance), each) for each in own]
+    sized = [(smallest_size(each, chance), each) for each in of_effect]
     size, best = min(sized, key=lambda pair: np.inf if pair[0] is None else pair[0][1])
     if not best.dof:
         return Visibility(best.effect, 0.0)
     overlaps = dict[str, float]()
-    for other in found.candidates:
+    for other in scan.candidates:
         name = str(other.effect)
         if name != str(effect):
             overlaps[name] = max(overlaps.get(name, 0.0), best.overlap(other))
-    near = sorted((pair for pair in overlaps.items() if pair[1] > _CONFUSED), key=lambda pair: -pair[1])[:_NAMED]
+    confused = sorted((pair for pair in overlaps.items() if pair[1] > _CONFUSED), key=lambda pair: -pair[1])[:_NAMED]
     unseen = [c.symbol for c, hidden in zip(best.effect.coefficients, best.hidden, strict=True) if hidden]
-    return Visibility(best.effect, min(best.visibility, 1.0), tuple(unseen), size, tuple(near))
+    return Visibility(best.effect, min(best.visibility, 1.0), tuple(unseen), size, tuple(confused))
 
 
 def smallest_size(candidate: Candidate, chance: float) -> tuple[Coefficient, float] | None:

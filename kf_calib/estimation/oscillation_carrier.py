@@ -30,17 +30,17 @@ def on_carrier(
     the plain dwells. A line of only a few cycles per dwell may be the remainder of a slow oscillation after the
     parabola was removed; where that could leave it, both are tried and the more likely one is taken.
     """
-    seen = lines_of(dwells)
-    if not seen:
+    lines = lines_of(dwells)
+    if not lines:
         plain = plain or fitted_to(passed, dwells)
         return (passed, plain) if holds_its_oscillation(plain) else _nearer(passed, plain, on_progress)
     shortest_s = min(dwell.end_s - dwell.start_s for dwell in dwells if dwell.count > dwells[0].count // 2)
-    found = [_nearer(passed, seen[0].frequency_hz, on_progress)]
-    if seen[0].frequency_hz * shortest_s < _CYCLES:
+    on_carriers = [_nearer(passed, lines[0].frequency_hz, on_progress)]
+    if lines[0].frequency_hz * shortest_s < _CYCLES:
         slow = plain or fitted_to(passed, dwells)
-        if _may_leave(slow, seen[0]):
-            found.append(_nearer(passed, slow, on_progress))
-    return min(found, key=lambda each: _unlikeliness(each[1]))
+        if _may_leave(slow, lines[0]):
+            on_carriers.append(_nearer(passed, slow, on_progress))
+    return min(on_carriers, key=lambda each: _unlikeliness(each[1]))
 
 
 def _may_leave(slow: Fit, line: Line) -> bool:

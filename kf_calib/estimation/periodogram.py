@@ -57,22 +57,24 @@ class Periodogram:
         self._squares = self._products_of_waves()
         self._first: _Beside | None = None
 
-    def delta_chi2(self, rows: Floats, own: Floats, first: int) -> Floats:
+    def delta_chi2(self, rows: Floats, of_dwells: Floats, first: int) -> Floats:
         """Decrease of chi-squared (N,) if the oscillation at each frequency is added to a model.
 
         - rows (r, c): whitened rows [H | E | z]. The columns H, ``first`` of them, have to be the same for every model
           because their products are computed only once.
-        - own (m, c): the same columns in the rows of the dwells alone, before they are whitened with respect to the
-          walk.
+        - of_dwells (m, c): the same columns in the rows of the dwells alone, before they are whitened with respect to
+          the walk.
         """
         if self._first is None:
-            self._first = _Beside.nothing(rows[:, -1], own[:, -1]).with_columns(rows[:, :first], own[:, :first])
-            self._first.known = self._along(np.column_stack([self._first.own, self._first.own_left]))
+            self._first = _Beside.nothing(rows[:, -1], of_dwells[:, -1]).with_columns(
+                rows[:, :first], of_dwells[:, :first]
+            )
+            self._first.known = self._along(np.column_stack([self._first.of_dwells, self._first.left_of_dwells]))
         base = self._first
-        whole = base.with_columns(rows[:, first:-1], own[:, first:-1])
-        added = whole.own[:, base.own.shape[1] :]
+        whole = base.with_columns(rows[:, first:-1], of_dwells[:, first:-1])
+        added = whole.of_dwells[:, base.of_dwells.shape[1] :]
         more = self._along(added)
-        left = base.known[:, :, -1] - more @ (whole.rows[:, base.own.shape[1] :].T @ base.left)
+        left = base.known[:, :, -1] - more @ (whole.rows[:, base.of_dwells.shape[1] :].T @ base.left)
         return self._lowered(np.concatenate([base.known[:, :, :-1], more], axis=2), left)
 
     def _along(self, columns: Floats) -> Floats:
@@ -85,11 +87,11 @@ class Periodogram:
             columns = self._path.freed(columns)
         waves = self._waves.reshape(len(columns), -1)
         sums = np.array([waves[part].T @ columns[part] for part in _parts(self._ends)])  # (D, 3 points, c)
-        out: Waves = np.empty((len(self.values_hz), 3, count), np.complex128)
+        products: Waves = np.empty((len(self.values_hz), 3, count), np.complex128)
         for part, turning in self._turning():
-            found = (turning @ sums.reshape(len(sums), -1)).reshape(len(turning), points, 3, count)
-            out[part] = np.einsum("np,npic->nic", self._shares[part], found)
-        return np.concatenate([out.real, out.imag], axis=1)
+            turned_sums = (turning @ sums.reshape(len(sums), -1)).reshape(len(turning), points, 3, count)
+            products[part] = np.einsum("np,npic->nic", self._shares[part], turned_sums)
+        return np.concatenate([products.real, products.imag], axis=1)
 
     def _lowered(self, along_model: Floats, along_left: Floats) -> Floats:
         """Return the decrease of chi-squared (N,).
@@ -112,19 +114,19 @@ class Periodogram:
         """
         points, same, twice = self._shares.shape[1], 0.0, list[Waves]()
         for part in _parts(self._ends):
-            own = np.ascontiguousarray(np.moveaxis(self._waves[part], 0, 2))  # (points, 3, r)
-            same = same + own.conj() @ np.swapaxes(own, 1, 2)
-            twice.append(own @ np.swapaxes(own, 1, 2))
-        sums, out = np.array(twice).reshape(len(twice), -1), np.empty((len(self.values_hz), 6, 6))
+            waves = np.ascontiguousarray(np.moveaxis(self._waves[part], 0, 2))  # (points, 3, r)
+            same = same + waves.conj() @ np.swapaxes(waves, 1, 2)
+            twice.append(waves @ np.swapaxes(waves, 1, 2))
+        sums, products = np.array(twice).reshape(len(twice), -1), np.empty((len(self.values_hz), 6, 6))
         for part, turning in self._turning():
             double = np.einsum("np,npij->nij", self._shares[part], (turning**2 @ sums).reshape(-1, points, 3, 3))
             single = np.einsum("np,pij->nij", self._shares[part], same)
             plus, minus = 0.5 * (single + double), 0.5 * (single - double)
-            out[part, :3, :3], out[part, 3:, 3:] = plus.real, minus.real
-            out[part, :3, 3:], out[part, 3:, :3] = plus.imag, np.swapaxes(plus.imag, 1, 2)
+            products[part, :3, :3], products[part, 3:, 3:] = plus.real, minus.real
+            products[part, :3, 3:], products[part, 3:, :3] = plus.imag, np.swapaxes(plus.imag, 1, 2)
             if self._path is not None:
-                out[part] -= self._explained_by_path(self._path, part, turning)
-        return out
+                products[part] -= self._explained_by_path(self._path, part, turning)
+        return products
 
     def _explained_by_path(self, path: _Path, part: slice, turning: Waves) -> Floats:
         """Return the part of the products (n, 6, 6) that the random walk of the biases explains, for some
@@ -151,38 +153,38 @@ class Periodogram:
 class _Beside:
     """The orthonormalised columns of a model and the residual of the readings.
 
-    - rows (r, p): the columns in all whitened rows; own (m, p): the same columns in the rows of the dwells alone.
-    - left (r,), own_left (m,): the residual of the readings in both sets of rows.
-    - known: products of the oscillations with ``own`` and ``own_left``.
+    - rows (r, p): the columns in all whitened rows; of_dwells (m, p): the same columns in the rows of the dwells alone.
+    - left (r,), left_of_dwells (m,): the residual of the readings in both sets of rows.
+    - known: products of the oscillations with ``of_dwells`` and ``left_of_dwells``.
     """
 
     rows: Floats
-    own: Floats
+    of_dwells: Floats
     left: Floats
-    own_left: Floats
+    left_of_dwells: Floats
     known: Floats = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
-    def nothing(cls, left: Floats, own_left: Floats) -> _Beside:
+    def nothing(cls, left: Floats, left_of_dwells: Floats) -> _Beside:
         """A model without columns."""
-        return cls(np.zeros((len(left), 0)), np.zeros((len(own_left), 0)), left, own_left)
+        return cls(np.zeros((len(left), 0)), np.zeros((len(left_of_dwells), 0)), left, left_of_dwells)
 
-    def with_columns(self, rows: Floats, own: Floats) -> _Beside:
+    def with_columns(self, rows: Floats, of_dwells: Floats) -> _Beside:
         """The model with further columns, orthogonalised against those it has; what they add nothing to is dropped."""
         scale = np.linalg.norm(rows, axis=0)
         scale = np.where(scale > 0, scale, 1.0)
-        rows, own = rows / scale, own / scale
+        rows, of_dwells = rows / scale, of_dwells / scale
         for _ in range(2):  # projecting twice removes the rounding errors of large components
             share = self.rows.T @ rows
-            rows, own = rows - self.rows @ share, own - self.own @ share
+            rows, of_dwells = rows - self.rows @ share, of_dwells - self.of_dwells @ share
         _, singular, right = np.linalg.svd(rows, full_matrices=False)
         seen = singular > _NEW
         turned = right[seen].T / singular[seen]
-        rows, own, left, own_left = rows @ turned, own @ turned, self.left, self.own_left
+        rows, of_dwells, left, left_of_dwells = rows @ turned, of_dwells @ turned, self.left, self.left_of_dwells
         for _ in range(2):
             share = rows.T @ left
-            left, own_left = left - rows @ share, own_left - own @ share
-        return _Beside(np.hstack([self.rows, rows]), np.hstack([self.own, own]), left, own_left)
+            left, left_of_dwells = left - rows @ share, left_of_dwells - of_dwells @ share
+        return _Beside(np.hstack([self.rows, rows]), np.hstack([self.of_dwells, of_dwells]), left, left_of_dwells)
 
 
 class _Path:
@@ -216,13 +218,13 @@ class _Path:
         """Columns (m, c) with the part that the path explains removed."""
         from scipy.linalg import cho_solve_banded
 
-        found = np.asarray(cho_solve_banded((self._root, True), self.products(columns)), float).reshape(
+        paths = np.asarray(cho_solve_banded((self._root, True), self.products(columns)), float).reshape(
             len(self._ends) - 1, 6, -1
         )
-        out = columns.copy()
-        for part, way in zip(_parts(self._ends), found, strict=True):
-            out[part] -= self._columns[part] @ way
-        return out
+        rest = columns.copy()
+        for part, way in zip(_parts(self._ends), paths, strict=True):
+            rest[part] -= self._columns[part] @ way
+        return rest
 
     def _bands(self, steps: Floats) -> Floats:
         """Return the precision as bands (7, 6 D).
@@ -253,11 +255,11 @@ def _waves(linearised: LinearisedDwells, noise: Noise, kinds: Sequence[Effect]) 
     whitening = MisfitColumns(linearised.dwells_at_state, noise, linearised.state)
     stimulus = stimulus_of(linearised.dwells_at_state, linearised.model.bench, linearised.state)
     ends = whitening.ends - whitening.ends[0]
-    out = np.empty((int(ends[-1]), len(kinds), 3), np.complex128)
+    waves = np.empty((int(ends[-1]), len(kinds), 3), np.complex128)
     for k, each in enumerate(kinds):  # one at a time, which saves memory
         parts = whitening.of(piece_columns([each], stimulus))[whitening.ends[0] :].reshape(-1, 3, 2)
-        out[:, k] = parts[..., 1] + 1j * parts[..., 0]
-    return out, ends.tolist()
+        waves[:, k] = parts[..., 1] + 1j * parts[..., 0]
+    return waves, ends.tolist()
 
 
 def _waves_beside_walk(

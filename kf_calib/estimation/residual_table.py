@@ -58,13 +58,13 @@ def mean_sigmas(result: Run) -> Floats:
 def quantity_means(result: Run, names: list[str]) -> dict[str, Floats]:
     """Means (D, 3) over each dwell of quantities that formulas may name, in SI units, for each accelerometer."""
     dwells, known = result.linearised.dwells, quantities(result.bench.axes)
-    stimulus, places = stimulus_of(dwells, result.bench, result.linearised.state), _weights(dwells)
+    stimulus, weights = stimulus_of(dwells, result.bench, result.linearised.state), _weights(dwells)
     firsts = np.cumsum([0, *(3 * len(dwell.pieces) for dwell in dwells[:-1])])
-    out = dict[str, Floats]()
+    means = dict[str, Floats]()
     for name in names:
         values = np.broadcast_to(known[name].of(stimulus), (len(stimulus), 3))
-        out[name] = np.add.reduceat(values * places[:, None], firsts)
-    return out
+        means[name] = np.add.reduceat(values * weights[:, None], firsts)
+    return means
 
 
 def _weights(dwells: list[DwellFactor]) -> Floats:
@@ -87,25 +87,25 @@ def residual_table(result: Run) -> NDArray[np.void]:
     of = quantity_means(result, ["fx", "fy", "fz", "a", "p", "o", "da", "dT"])
     sigmas, visits = mean_sigmas(result), result.visits
 
-    def each(values: Any) -> Floats:
+    def for_accelerometers(values: Any) -> Floats:
         """Repeat a number of a dwell for its accelerometers."""
         return np.repeat(np.asarray(values), 3)
 
     poses = np.degrees(np.array([dwell.recorded_pose for dwell in dwells]))
     warmth = [float(np.mean(dwell.nodes.temperature_c)) for dwell in dwells]
     columns: dict[str, NDArray[Any]] = {
-        "dwell": each([dwell.number for dwell in dwells]),
+        "dwell": for_accelerometers([dwell.number for dwell in dwells]),
         "accelerometer": np.tile([1, 2, 3], len(dwells)),
-        "start_s": each([dwell.start_s for dwell in dwells]),
-        "end_s": each([dwell.end_s for dwell in dwells]),
-        "readings": each([dwell.count for dwell in dwells]),
-        **{f"gimbal{k + 1}_deg": each(poses[:, k]) for k in range(len(result.bench.axes))},
+        "start_s": for_accelerometers([dwell.start_s for dwell in dwells]),
+        "end_s": for_accelerometers([dwell.end_s for dwell in dwells]),
+        "readings": for_accelerometers([dwell.count for dwell in dwells]),
+        **{f"gimbal{k + 1}_deg": for_accelerometers(poses[:, k]) for k in range(len(result.bench.axes))},
         **{f"force_{axis}_mps2": of[f"f{axis}"].ravel() for axis in "xyz"},
         "along_mps2": of["a"].ravel(),
         "pendulous_mps2": of["p"].ravel(),
         "output_mps2": of["o"].ravel(),
         "step_mps2": of["da"].ravel(),
-        "temperature_c": each(warmth),
+        "temperature_c": for_accelerometers(warmth),
         "temperature_rate_kps": of["dT"].ravel(),
         "mean_mps2": np.concatenate([dwell.means[4:] for dwell in dwells]),
         "residual_mps2": result.residuals_mps2.ravel(),
@@ -113,8 +113,8 @@ def residual_table(result: Run) -> NDArray[np.void]:
         "ratio": (result.residuals_mps2 / sigmas).ravel(),
         "innovation_mps2": np.array([visit.innovation_mps2 for visit in visits]).ravel(),
         "innovation_sigma_mps2": np.array([visit.innovation_sigma_mps2 for visit in visits]).ravel(),
-        "nis": each([visit.nis for visit in visits]),
-        "nis_dof": each([visit.dof for visit in visits]),
+        "nis": for_accelerometers([visit.nis for visit in visits]),
+        "nis_dof": for_accelerometers([visit.dof for visit in visits]),
     }
     table = np.zeros(3 * len(dwells), dtype=[(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():

@@ -232,10 +232,10 @@ class Calibration:
         sensors, or axes that are taken for ``square``."""
         if self.bench.angles:
             return {}
-        out: dict[str, Literal["frame", "square"]] = {"theta1": "frame", "phi1": "frame", "nu2": "frame"}
+        fixed: dict[str, Literal["frame", "square"]] = {"theta1": "frame", "phi1": "frame", "nu2": "frame"}
         if self.model.square:
-            out |= {"nu1": "square", "theta3": "square", "phi3": "square"}
-        return out
+            fixed |= {"nu1": "square", "theta3": "square", "phi3": "square"}
+        return fixed
 
     @cached_property
     def held_out(self) -> HeldOut | None:
@@ -278,7 +278,7 @@ class Calibration:
         if not self.bench.angles:  # |f| tells of some effects little more than that they are not absurdly large
             scales = np.array([coefficient.scale for coefficient in coefficients])
             sigmas = np.where((gains == 1.0) & (sigmas > _WEAK * scales), np.nan, sigmas)
-        found = [
+        rows = [
             *zip(
                 paper_parameters.SYMBOLS,
                 estimate.parameters,
@@ -292,13 +292,13 @@ class Calibration:
         units = [*map(field_unit, paper_parameters.UNITS), *((c.shown_unit, c.per_si) for c in coefficients)]
         if (walk := self.model.intensity) is not None:
             intensity, spread = self.noise.walk_mps2_per_sqrt_s, self.noise.walk_spread
-            found.append((walk.symbol, intensity, intensity * spread if spread else math.nan, 0.0, walk.unit))
+            rows.append((walk.symbol, intensity, intensity * spread if spread else math.nan, 0.0, walk.unit))
             units.append((walk.shown_unit, walk.per_si))
         for effect in self.model.stepped:
             assert effect.unknown is not None
             constant, spread = effect.unknown, self.fit.spreads[str(effect)]
             sigma = effect.value * spread if spread < 1.0 else math.nan  # sigma over value
-            found.append((constant.symbol, effect.value, sigma, 0.0, constant.unit))
+            rows.append((constant.symbol, effect.value, sigma, 0.0, constant.unit))
             units.append((constant.shown_unit, constant.per_si))
         return {
             symbol: Parameter(
@@ -309,7 +309,7 @@ class Calibration:
                 float(expected),
                 *own,
             )
-            for (symbol, value, sigma, expected, unit), own in zip(found, units, strict=True)
+            for (symbol, value, sigma, expected, unit), own in zip(rows, units, strict=True)
         }
 
     def residuals(self, kind: Literal["numpy", "pandas", "polars"] = "numpy") -> Any:
@@ -376,13 +376,13 @@ class Calibration:
         ):
             before, extra_before = factor, extra
             for part in dwell.prefixes():
-                own = [columns[: len(part.pieces)]]
+                columns_so_far = [columns[: len(part.pieces)]]
                 rows = square_root_information.whiten(
-                    [part], own, self.noise.weights, state, flicker_mps2=self.noise.flicker_mps2
+                    [part], columns_so_far, self.noise.weights, state, flicker_mps2=self.noise.flicker_mps2
                 )[0]
                 walked = np.array([pause, steps([part], self.noise)[0, 1]])
                 factor, _ = square_root_information.update(before, rows, walked)
-                extra = extra_before + considered_information(self.noise, means_of([part], own), state)[0]
+                extra = extra_before + considered_information(self.noise, means_of([part], columns_so_far), state)[0]
                 yield part.end_s, dwell.number, estimate_of(factor, around, extra)
             if len(self.fit.following[index]):
                 factor, _ = square_root_information.update(factor, self.fit.following[index])
@@ -394,12 +394,12 @@ class Calibration:
         dwell = at_its_mode(dwell, last, self.model, state, self.noise.weights)
         both = [last, dwell]
         linearised = LinearisedDwells(both, self.model, state)
-        dwell, own = linearised.dwells_at_state[-1], linearised.columns[1:]
+        dwell, last_columns = linearised.dwells_at_state[-1], linearised.columns[1:]
         rows = square_root_information.whiten(
-            [dwell], own, self.noise.weights, state, flicker_mps2=self.noise.flicker_mps2
+            [dwell], last_columns, self.noise.weights, state, flicker_mps2=self.noise.flicker_mps2
         )[0]
         factor, _ = square_root_information.update(factor, rows, steps(both, self.noise)[-1])
-        extra = extra + considered_information(self.noise, means_of([dwell], own), state)[0]
+        extra = extra + considered_information(self.noise, means_of([dwell], last_columns), state)[0]
         return estimate_of(factor, self.model.nominal_state(), extra)
 
     @cached_property

@@ -67,8 +67,8 @@ def samples_of(rows: Iterable[Rows], linearised: LinearisedDwells, noise: Noise)
     """Yield samples from a second pass over the rows, with the columns of the first."""
     every, columns = [*linearised.dwells_at_state, *linearised.slews], [*linearised.columns, *linearised.slew_columns]
     known = {
-        (dwell.number, dwell.moving): (dwell, iter(zip(own, flicker_waves(dwell), strict=True)))
-        for dwell, own in zip(every, columns, strict=True)
+        (dwell.number, dwell.moving): (dwell, iter(zip(at_nodes, flicker_waves(dwell), strict=True)))
+        for dwell, at_nodes in zip(every, columns, strict=True)
     }
     sigmas = all_nuisance_sigmas(noise)
     for block in rows:
@@ -78,9 +78,11 @@ def samples_of(rows: Iterable[Rows], linearised: LinearisedDwells, noise: Noise)
         along = along_force([dwell], sensitivities_of([dwell], linearised.state))[0] if noise.attitude_unknown else None
         regressor_map = nuisance_map([dwell], noise, linearised.state)[0]
         for part, u, _ in block.pieces:
-            own, waves = next(pieces)
+            at_nodes, waves = next(pieces)
             functions = basis(u, block.elapsed_s[part], linearised.carrier_hz)
-            observation = (functions.T @ on_basis(own.reshape(len(own), -1))).reshape(len(u), *own.shape[1:])
+            observation = (functions.T @ on_basis(at_nodes.reshape(len(at_nodes), -1))).reshape(
+                len(u), *at_nodes.shape[1:]
+            )
             regressors, readings = block.columns[part], block.readings[part]
             if not linearised.model.bench.angles:
                 regressors = np.tile(dwell.means[:4], (len(u), 1))

@@ -120,15 +120,15 @@ class Scan:
 
     def beside(self, k: int) -> Floats:
         """Decrease of chi-squared (n,) if each candidate is added beside candidate ``k``; zero for ``k`` itself."""
-        own, out = self.candidates[k].basis, np.zeros(len(self.candidates))
-        rest = self.residual - own @ (own.T @ self.residual)
+        basis, deltas = self.candidates[k].basis, np.zeros(len(self.candidates))
+        rest = self.residual - basis @ (basis.T @ self.residual)
         for places, bases in self._stacked:
-            left = bases - own @ (own.T @ bases)
+            left = bases - basis @ (basis.T @ bases)
             along, gram = rest @ left, np.swapaxes(left, 1, 2) @ left
             values, vectors = np.linalg.eigh(gram)  # squared cosines, of which those near zero are seen no more
             turned = np.einsum("ni,nij->nj", along, vectors)
-            out[places] = np.sum(np.where(values > _SEEN, turned**2 / np.maximum(values, _SEEN), 0.0), axis=1)
-        return out
+            deltas[places] = np.sum(np.where(values > _SEEN, turned**2 / np.maximum(values, _SEEN), 0.0), axis=1)
+        return deltas
 
     @cached_property
     def _stacked(self) -> list[tuple[list[int], Floats]]:
@@ -186,12 +186,12 @@ class Frame:
 
     def whitened(self, linearised: LinearisedDwells, effects: Sequence[Effect]) -> Floats:
         """Whitened columns (m, q) of any effects, computed for a few at a time, which saves memory."""
-        sizes, out, first = counts_of(effects), np.zeros((0, 0)), 0
+        sizes, whitened, first = counts_of(effects), np.zeros((0, 0)), 0
         for part in batches(sizes, columns_at_once(linearised)) or [[]]:
-            own = self._whitened(linearised, [effects[k] for k in part])
-            out = out if len(out) else np.empty((len(own), sum(sizes)))
-            out[:, first : first + own.shape[1]], first = own, first + own.shape[1]
-        return out
+            block = self._whitened(linearised, [effects[k] for k in part])
+            whitened = whitened if len(whitened) else np.empty((len(block), sum(sizes)))
+            whitened[:, first : first + block.shape[1]], first = block, first + block.shape[1]
+        return whitened
 
     def _whitened(self, linearised: LinearisedDwells, effects: Sequence[Effect]) -> Floats:
         if self._whitening is not None:
@@ -224,17 +224,17 @@ class Frame:
     def scan(self, linearised: LinearisedDwells, more: Sequence[Effect] = ()) -> Scan:
         """Project the frame's effects, without those that the model contains, and then the effects ``more`` off the
         model in ``linearised``."""
-        kept = [k for k, effect in enumerate(self.effects) if str(effect) not in linearised.model.parts]
+        chosen = [k for k, effect in enumerate(self.effects) if str(effect) not in linearised.model.parts]
         inside, outside, width = self._model(linearised)
         more_inside, more_outside = self._split(self.whitened(linearised, more))
         beside = square_root_information.accumulate([np.hstack([outside[:, :-1], more_outside, outside[:, -1:]])])
-        own = [self.coordinates[:, self.parts[k]] for k in kept]
-        count = sum(each.shape[1] for each in own)
+        coordinates = [self.coordinates[:, self.parts[k]] for k in chosen]
+        count = sum(each.shape[1] for each in coordinates)
         small = np.vstack([
-            np.hstack([inside[:, :-1], *own, more_inside, inside[:, -1:]]),
+            np.hstack([inside[:, :-1], *coordinates, more_inside, inside[:, -1:]]),
             np.hstack([beside[:, :width], np.zeros((len(beside), count)), beside[:, width:]]),
         ])  # fmt: skip
-        effects = [*(self.effects[k] for k in kept), *more]
+        effects = [*(self.effects[k] for k in chosen), *more]
         return project(
             square_root_information.accumulate([small]),
             width,
@@ -315,21 +315,21 @@ def scan_of(rest: Floats, sizes: Floats, effects: Sequence[Effect], counts: Sequ
     """Make the scan from what a model leaves of a triangular factor [G | z], and the norms of G before."""
     units = np.where(sizes > 0, sizes, 1.0)
     columns, residual = rest[:-1, :-1] / units, rest[:-1, -1]
-    found = list[Candidate]()
+    candidates = list[Candidate]()
     for effect, part, factors in zip(effects, slices(counts), _factors(columns, counts), strict=True):
-        found.append(_candidate(effect, columns[:, part], units[part], *factors))
-    return Scan(tuple(found), residual)
+        candidates.append(_candidate(effect, columns[:, part], units[part], *factors))
+    return Scan(tuple(candidates), residual)
 
 
 def _factors(columns: Floats, counts: Sequence[int]) -> list[tuple[Floats, Floats, Floats]]:
     """Return the singular value decomposition of the columns of each effect, those of as many columns in one call."""
-    parts, out = slices(counts), [(columns, columns, columns)] * len(counts)
+    parts, factors_of_each = slices(counts), [(columns, columns, columns)] * len(counts)
     for count in dict.fromkeys(counts):
         places = [k for k, own in enumerate(counts) if own == count]
         stacked = np.array([columns[:, parts[k]] for k in places])
         for k, *factors in zip(places, *np.linalg.svd(stacked, full_matrices=False), strict=True):
-            out[k] = factors[0], factors[1], factors[2]
-    return out
+            factors_of_each[k] = factors[0], factors[1], factors[2]
+    return factors_of_each
 
 
 def delta_chi2(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Effect]) -> Floats:
@@ -341,7 +341,7 @@ def delta_chi2(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Eff
     if effects[0].oscillates and len(effects) > _MANY:
         many = Periodogram(linearised, noise, effects[0], np.array([effect.value for effect in effects]))
         return many.delta_chi2(*_with_and_without_walk(linearised, noise, linearised.state, linearised.model.count))
-    out = list[Floats]()
+    deltas = list[Floats]()
     for part in batches(counts_of(effects), _OF_ONE_KIND):
         rows, width = whiten_model(linearised, noise, [effects[k] for k in part])
         sizes, rest = np.linalg.norm(rows[:, width:-1], axis=0), Complement(rows, width).of(rows[:, width:])
@@ -349,25 +349,25 @@ def delta_chi2(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Eff
         columns = columns.T.reshape(len(part), -1, len(rest))
         along, gram = columns @ rest[:, -1], columns @ columns.swapaxes(1, 2)
         inverse = np.linalg.pinv(gram, rcond=_SEEN, hermitian=True)
-        out.append(np.einsum("ni,nij,nj->n", along, inverse, along))
-    return np.concatenate(out)
+        deltas.append(np.einsum("ni,nij,nj->n", along, inverse, along))
+    return np.concatenate(deltas)
 
 
 def unweighted_left(linearised: LinearisedDwells, effects: Sequence[Effect]) -> Floats:
     """The share (n,) of the sum of squares of the residuals of the dwells' means that each effect, added alone, leaves;
     all means of all accelerometers have the same weight."""
     means, state = linearised.means, linearised.state
-    own = means_of(
+    added = means_of(
         linearised.dwells_at_state,
         candidate_columns(linearised.dwells_at_state, effects, linearised.model.bench, state),
     ).design
     design = means.design.reshape(-1, means.design.shape[2])
-    columns = np.hstack([own.reshape(len(design), -1), means.readings.reshape(-1, 1)])
+    columns = np.hstack([added.reshape(len(design), -1), means.readings.reshape(-1, 1)])
     basis, sizes = _spanned(design / linearised.sizes), np.linalg.norm(columns, axis=0)
     rest = columns - basis @ (basis.T @ columns)
     left, rest = rest[:, -1], rest / np.where(sizes > 0, sizes, 1.0)
-    found = (np.sum((_spanned(rest[:, part]).T @ left) ** 2) for part in slices(counts_of(effects)))
-    return 1.0 - np.array([*found]) / max(float(left @ left), 1e-300)
+    explained = (np.sum((_spanned(rest[:, part]).T @ left) ** 2) for part in slices(counts_of(effects)))
+    return 1.0 - np.array([*explained]) / max(float(left @ left), 1e-300)
 
 
 def _spanned(columns: Floats) -> Floats:
@@ -387,12 +387,12 @@ def joint_delta_chi2(
     rows, width = whiten_model(linearised, noise, effects)
     sizes, rest = np.linalg.norm(rows[:, width:-1], axis=0), Complement(rows, width).of(rows[:, width:])
     columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
-    out = list[tuple[float, int]]()
+    joint = list[tuple[float, int]]()
     for part in slices([sum(counts_of(group)) for group in groups]):
         left, singular, _ = np.linalg.svd(columns[:, part], full_matrices=False)
         spanned = left[:, singular > _SEEN]
-        out.append((float(np.sum((spanned.T @ rest[:, -1]) ** 2)), spanned.shape[1]))
-    return out
+        joint.append((float(np.sum((spanned.T @ rest[:, -1]) ** 2)), spanned.shape[1]))
+    return joint
 
 
 def whiten_model(

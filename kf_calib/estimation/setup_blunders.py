@@ -128,19 +128,19 @@ def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
     step = -(-len(dwells) // _MOST_DWELLS)
     means, stated = Means.of(dwells[::step]), Mounting.stated(bench)
     _refuse_silent(means, stated)
-    found = _affine(means, stated)
-    if found is None and not _shows_all(means.readings / bench.gravity_mps2):
+    affine = _affine(means, stated)
+    if affine is None and not _shows_all(means.readings / bench.gravity_mps2):
         return
-    if found is not None and found.left < _UNEXPLAINED:
-        if found.is_near():
+    if affine is not None and affine.left < _UNEXPLAINED:
+        if affine.is_near():
             return
-        _refuse_wrong_gain(found, bench)
-    wrong = _what_is_wrong(found, bench)
+        _refuse_wrong_gain(affine, bench)
+    wrong = _what_is_wrong(affine, bench)
     _refuse_exchange(means, stated)
-    mending = _mendings(means, stated, found)
+    mending = _mendings(means, stated, affine)
     if mending:
         raise BlunderError(f"{wrong}: {_question(bench, mending)}")
-    if (found is None or not found.is_near()) and not _one_dwell(means, stated):
+    if (affine is None or not affine.is_near()) and not _one_dwell(means, stated):
         raise BlunderError(
             f"{wrong}, and no order or sign of channels, gimbals or angles brings all axes near nominal: check what "
             "the channels and the angles are, and state --nominal where the block is mounted so."
@@ -235,40 +235,40 @@ _WIRINGS: tuple[Channels, ...] = tuple(
 """The 48 assignments of channels, with signs, to accelerometers."""
 
 
-def _mendings(means: Means, stated: Mounting, found: Affine | None) -> list[Mending]:
+def _mendings(means: Means, stated: Mounting, affine: Affine | None) -> list[Mending]:
     """Return the mountings and assignments with the fewest changes that explain the readings with all axes near
     nominal."""
-    left = _UNEXPLAINED if found is None or found.left < _UNEXPLAINED else max(_BETTER * found.left, 0.01)
-    out, fewest = list[Mending](), _MOST_CHANGES
+    left = _UNEXPLAINED if affine is None or affine.left < _UNEXPLAINED else max(_BETTER * affine.left, 0.01)
+    mendings, fewest = list[Mending](), _MOST_CHANGES
     for mounting in mountings(stated):
         if mounting.changes > fewest:
             break
-        fitted = found if not mounting.changes else _affine(means, mounting)
+        fitted = affine if not mounting.changes else _affine(means, mounting)
         if fitted is None or fitted.left > left:
             continue
         for channels in _WIRINGS:
             mending = Mending(mounting, channels)
             if mending.changes and mending.changes <= fewest and fitted.is_near(channels):
                 fewest = mending.changes
-                out.append(mending)
-    equal = [each for each in out if each.changes == fewest]
+                mendings.append(mending)
+    equal = [each for each in mendings if each.changes == fewest]
     return sorted(equal, key=lambda each: each.mounting.changes > 0 and each.channels != CHANNELS)  # mixed changes last
 
 
-def _what_is_wrong(found: Affine | None, bench: Bench) -> str:
+def _what_is_wrong(affine: Affine | None, bench: Bench) -> str:
     """Name the channels whose axes are far from nominal or, if there are none, say that the angles do not explain the
     readings."""
-    if found is None:
+    if affine is None:
         return "the readings show the platform in many orientations, the angles in few"
-    cosines, numbers = np.diag(found.cosines), [abs(channel) for channel in bench.input.channels]
+    cosines, numbers = np.diag(affine.cosines), [abs(channel) for channel in bench.input.channels]
     opposite = [channel for channel, cosine in zip(numbers, cosines, strict=True) if cosine < -_FARTHEST]
-    out = list[str]()
+    reasons = list[str]()
     if opposite:
-        out.append(f"{_channels(opposite)} -g where +g is expected")
+        reasons.append(f"{_channels(opposite)} -g where +g is expected")
     for channel, cosine in zip(numbers, cosines.tolist(), strict=True):
         if abs(cosine) < _FARTHEST:
-            out.append(f"the axis of channel {channel} lies {math.degrees(math.acos(cosine)):.0f} deg from nominal")
-    return ", ".join(out) or f"the angles do not explain the readings ({found.left:.2g} g rms are left)"
+            reasons.append(f"the axis of channel {channel} lies {math.degrees(math.acos(cosine)):.0f} deg from nominal")
+    return ", ".join(reasons) or f"the angles do not explain the readings ({affine.left:.2g} g rms are left)"
 
 
 def _channels(numbers: Sequence[int]) -> str:
@@ -289,20 +289,20 @@ def _question(stated: Bench, mendings: Sequence[Mending]) -> str:
 
 def _reasons(stated: Bench, mending: Mending) -> list[str]:
     """Return the changes in words."""
-    out, channels = list(mending.mounting.words), mending.channels
+    words, channels = list(mending.mounting.words), mending.channels
     moved = [k for k, channel in enumerate(channels, 1) if abs(channel) != k]
     negative = sorted(-channel for channel in channels if channel < 0)
     if stated.input.channels != CHANNELS and (moved or negative):
-        return [*out, f"accelerometers 1, 2, 3 are channels {_wired(stated, channels)}"]
+        return [*words, f"accelerometers 1, 2, 3 are channels {_wired(stated, channels)}"]
     if len(moved) == 2:
-        out.append(f"channels {moved[0]} and {moved[1]} are exchanged")
+        words.append(f"channels {moved[0]} and {moved[1]} are exchanged")
     elif moved:
-        out.append(f"accelerometers 1, 2, 3 are channels {', '.join(str(abs(channel)) for channel in channels)}")
+        words.append(f"accelerometers 1, 2, 3 are channels {', '.join(str(abs(channel)) for channel in channels)}")
     if len(negative) == 3:
-        out.append("all readings have the opposite sign (acceleration in place of specific force)")
+        words.append("all readings have the opposite sign (acceleration in place of specific force)")
     elif negative:
-        out.append(f"channel {' and '.join(map(str, negative))} reversed")
-    return out
+        words.append(f"channel {' and '.join(map(str, negative))} reversed")
+    return words
 
 
 def _wired(stated: Bench, channels: Channels) -> str:

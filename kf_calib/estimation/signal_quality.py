@@ -135,9 +135,9 @@ class Readings:
     @property
     def findings(self) -> list[str]:
         """All findings, harmless or not, in a few words each."""
-        out = self.outliers
+        outliers = self.outliers
         unit = shown("m/s^2")
-        crowded = f", crowded in {_dwells(out.dwells)}" if out.clustered else ""
+        crowded = f", crowded in {_dwells(outliers.dwells)}" if outliers.clustered else ""
         return [
             *(
                 f"saturation of accelerometer {each.channel} at {each.level_mps2:.4g} m/s^2 in {_dwells(each.dwells)}"
@@ -149,7 +149,7 @@ class Readings:
                 f"{'too coarse' if each.matters else 'harmless'})"
                 for each in self.quantisation
             ),
-            *([f"outliers, {out.count} ({out.share:.2%}){crowded}"] if out.count else []),
+            *([f"outliers, {outliers.count} ({outliers.share:.2%}){crowded}"] if outliers.count else []),
         ]
 
 
@@ -160,7 +160,7 @@ class _Seen:
     - ends (6,): the largest value of each channel and of its negative; stuck (6,): number of readings at these values.
     - count: number of readings.
     - distinct (3,): number of distinct values in ``sampled`` readings; values: some of them, by channel.
-    - rejected: number of rejected readings; out (3,): number by channel.
+    - rejected: number of rejected readings; gated (3,): number by channel.
     """
 
     number: int
@@ -171,7 +171,7 @@ class _Seen:
     sampled: int
     values: list[Floats]
     rejected: int = 0
-    out: Floats = field(default_factory=lambda: np.zeros(3))
+    gated: Floats = field(default_factory=lambda: np.zeros(3))
 
 
 class ReadingsMonitor:
@@ -191,7 +191,7 @@ class ReadingsMonitor:
         seen.count += len(rows.readings)
         if rows.gated is not None:
             seen.rejected += rows.gated.shape[1]
-            seen.out = seen.out + rows.gated.sum(axis=1)
+            seen.gated = seen.gated + rows.gated.sum(axis=1)
 
     def judged(self, dwells: Sequence[DwellFactor], noise: Noise) -> Readings:
         """The defects of a run with these dwells and this noise; none where no readings were seen, as of a table."""
@@ -340,7 +340,7 @@ def _outliers(seen: Sequence[_Seen]) -> Outliers:
     total = int(gated.sum())
     if not total:
         return Outliers()
-    by_channel = tuple(np.sum([each.out for each in seen], axis=0).astype(int).tolist())
+    by_channel = tuple(np.sum([each.gated for each in seen], axis=0).astype(int).tolist())
     p_value, stretch = clustering(gated, counts)
     return Outliers(
         total, total / float(counts.sum()), by_channel, p_value, tuple(each.number for each in seen[stretch])

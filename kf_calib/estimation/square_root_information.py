@@ -68,17 +68,17 @@ def whiten(
     """
     inside = 3 if noise.walk_mps2_per_sqrt_s else 0
     informative = np.append(np.ones(inside), _units(columns)) if reduced else None
-    out = list[Floats]([np.empty((0, 0))] * len(dwells))
+    all_rows = list[Floats]([np.empty((0, 0))] * len(dwells))
     for places in _batches(dwells, columns[0].shape[-1]):
         batch, stacked = [dwells[k] for k in places], np.array([columns[k] for k in places])
         rows, count = _weighted(batch, stacked, noise, state, about, flicker_mps2)
         if informative is None:
-            found = list(_less(rows, count))
+            whitened = list(_less(rows, count))
         else:
-            found = _informative(triangle(rows)[:, count:, count:], informative)
-        for k, own in zip(places, found, strict=True):
-            out[k] = own
-    return out
+            whitened = _informative(triangle(rows)[:, count:, count:], informative)
+        for k, of_dwell in zip(places, whitened, strict=True):
+            all_rows[k] = of_dwell
+    return all_rows
 
 
 def _batches(dwells: Sequence[DwellFactor], width: int) -> Iterator[list[int]]:
@@ -242,20 +242,22 @@ class MisfitColumns:
 
     def of(self, columns: Floats) -> Floats:
         """G (m, q) of columns at the nodes of all pieces (pieces, K, 3, q)."""
-        out = np.zeros((self.ends[-1], columns.shape[3]))
-        for each in self._groups:
-            own = columns[each.pieces]  # (d, pieces, K, 3, q)
-            many, pieces, width, _, count = own.shape
-            found = each.triangles @ on_basis(own.reshape(many, pieces, width, 3 * count))
-            parts = np.moveaxis(found.reshape(own.shape) / self._sigma[:, None], 3, 1)
+        whitened = np.zeros((self.ends[-1], columns.shape[3]))
+        for group in self._groups:
+            stacked = columns[group.pieces]  # (d, pieces, K, 3, q)
+            many, pieces, width, _, count = stacked.shape
+            on_triangles = group.triangles @ on_basis(stacked.reshape(many, pieces, width, 3 * count))
+            parts = np.moveaxis(on_triangles.reshape(stacked.shape) / self._sigma[:, None], 3, 1)
             parts = parts.reshape(many, 3, pieces * width, count)
-            if each.along is not None:
-                parts = _combined(parts, each.along)
+            if group.along is not None:
+                parts = _combined(parts, group.along)
             size = parts.shape[1] * parts.shape[2]
-            rows = np.zeros((many, each.rows.shape[1], count))
+            rows = np.zeros((many, group.rows.shape[1], count))
             rows[:, :size] = parts.reshape(many, size, count)
-            out[each.rows] = rows - each.nuisances @ (np.swapaxes(each.nuisances[:, :size], 1, 2) @ rows[:, :size])
-        return out
+            whitened[group.rows] = rows - group.nuisances @ (
+                np.swapaxes(group.nuisances[:, :size], 1, 2) @ rows[:, :size]
+            )
+        return whitened
 
 
 def with_frame(rows: list[Floats], model: Model, noise: Noise, first: int = 0) -> list[Floats]:
@@ -263,10 +265,10 @@ def with_frame(rows: list[Floats], model: Model, noise: Noise, first: int = 0) -
     reading of that state times g. They join the rows at index ``first``."""
     if not model.fixed:
         return rows
-    own, inside = np.zeros((len(model.fixed), rows[first].shape[1])), 3 if noise.walk_mps2_per_sqrt_s else 0
+    fixing, inside = np.zeros((len(model.fixed), rows[first].shape[1])), 3 if noise.walk_mps2_per_sqrt_s else 0
     for k, place in enumerate(model.fixed):
-        own[k, inside + place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2[0]
-    return [*rows[:first], np.vstack([own, rows[first]]), *rows[first + 1 :]]
+        fixing[k, inside + place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2[0]
+    return [*rows[:first], np.vstack([fixing, rows[first]]), *rows[first + 1 :]]
 
 
 def _units(columns: Sequence[Floats]) -> Floats:
@@ -360,16 +362,16 @@ def run(
 
     A step's factor is the one after the slew; its innovation is that of the dwell alone.
     """
-    factors, after, told = [first], list[Floats](), list[tuple[float, int]]()
+    factors, after, tests = [first], list[Floats](), list[tuple[float, int]]()
     for dwell_rows, variances, more in zip(rows, walked, following, strict=True):
-        own, nis = update(factors[-1], dwell_rows, variances)
-        after.append(own)
-        told.append((nis, row_rank(dwell_rows)))
-        factors.append(update(own, more)[0] if len(more) else own)
+        updated, nis = update(factors[-1], dwell_rows, variances)
+        after.append(updated)
+        tests.append((nis, row_rank(dwell_rows)))
+        factors.append(update(updated, more)[0] if len(more) else updated)
     gained = ranks(np.array(after)) - ranks(np.array(factors[:-1]))
     return [
         FilterStep(factor, nis, count - new)
-        for factor, (nis, count), new in zip(factors[1:], told, gained.tolist(), strict=True)
+        for factor, (nis, count), new in zip(factors[1:], tests, gained.tolist(), strict=True)
     ]
 
 

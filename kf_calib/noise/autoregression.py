@@ -54,14 +54,14 @@ class Autoregression:
         """Autocovariances at lags 0 ... size - 1: the ``known`` ones up to the order of the model, then by its
         recursion."""
         order = len(self.coefficients)
-        out = np.zeros(size)
-        out[: order + 1] = known[: order + 1]
+        curve = np.zeros(size)
+        curve[: order + 1] = known[: order + 1]
         for lag in range(order + 1, size if order else 0):
-            before = out[lag - order : lag]
-            if np.abs(before).max() < _GONE * out[0]:
+            before = curve[lag - order : lag]
+            if np.abs(before).max() < _GONE * curve[0]:
                 break
-            out[lag] = self.coefficients @ before[::-1]
-        return out
+            curve[lag] = self.coefficients @ before[::-1]
+        return curve
 
 
 def expected_products(gamma: Floats, lags: int) -> Floats:

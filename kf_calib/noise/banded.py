@@ -43,16 +43,16 @@ def inverse(columns: Floats, lower: Floats) -> Floats:
 
       X_d = L_d^-T (I - M' M)^-1 L_d^-1,  M = U_{d+1}^-1 L_{d+1,d};  below it: -X_{d+1} L_{d+1,d} L_d^-1
     """
-    forward, out = _unbanded(lower), np.zeros_like(columns)
+    forward, within_band = _unbanded(lower), np.zeros_like(columns)
     back, beside = np.linalg.inv(forward[:, :3]), forward[:-1, 3:]
-    out[:, :3] = np.swapaxes(back, 1, 2) @ back
+    within_band[:, :3] = np.swapaxes(back, 1, 2) @ back
     if beside.any():
         backward = _unbanded(root(_reversed(columns)))[::-1, 2::-1, ::-1]
         share = np.linalg.solve(backward[1:], beside)
         middle = np.linalg.inv(np.eye(3) - np.swapaxes(share, 1, 2) @ share)
-        out[:-1, :3] = np.swapaxes(back[:-1], 1, 2) @ middle @ back[:-1]
-        out[:-1, 3:] = -out[1:, :3] @ beside @ back[:-1]
-    return out
+        within_band[:-1, :3] = np.swapaxes(back[:-1], 1, 2) @ middle @ back[:-1]
+        within_band[:-1, 3:] = -within_band[1:, :3] @ beside @ back[:-1]
+    return within_band
 
 
 def outer(rows: Floats) -> Floats:
@@ -71,18 +71,18 @@ def products(columns: Floats, vector: Floats) -> Floats:
     """Products (3 D, k) of matrices (k, D, 6, 3) with a vector (3 D,)."""
     blocks = vector.reshape(-1, 3)
     both = columns @ blocks[:, :, None]
-    out = both[:, :, :3, 0]
-    out[:, 1:] += both[:, :-1, 3:, 0]
-    out[:, :-1] += (blocks[1:, None, :] @ columns[:, :-1, 3:])[:, :, 0]
-    return out.reshape(len(columns), vector.size).T
+    sums = both[:, :, :3, 0]
+    sums[:, 1:] += both[:, :-1, 3:, 0]
+    sums[:, :-1] += (blocks[1:, None, :] @ columns[:, :-1, 3:])[:, :, 0]
+    return sums.reshape(len(columns), vector.size).T
 
 
 def _reversed(columns: Floats) -> Floats:
     """Return the matrix with the order of all numbers reversed."""
-    out = np.zeros_like(columns)
-    out[:, :3] = columns[::-1, 2::-1, ::-1]
-    out[:-1, 3:] = np.swapaxes(columns[-2::-1, 3:], 1, 2)[:, ::-1, ::-1]
-    return out
+    turned_round = np.zeros_like(columns)
+    turned_round[:, :3] = columns[::-1, 2::-1, ::-1]
+    turned_round[:-1, 3:] = np.swapaxes(columns[-2::-1, 3:], 1, 2)[:, ::-1, ::-1]
+    return turned_round
 
 
 def _unbanded(lower: Floats) -> Floats:

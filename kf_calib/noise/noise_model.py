@@ -186,12 +186,12 @@ def _sigma_along(dwells: Sequence[DwellFactor], along: Floats, inflation: Floats
 def _walk_products(dwells: Sequence[DwellFactor]) -> Floats:
     """Return what a random walk of intensity q = 1 contributes to the sums of lagged products (L + 1, 1) of all
     dwells."""
-    out = 0.0 * dwells[0].autocovariance.pairs
+    products = 0.0 * dwells[0].autocovariance.pairs
     for dwell in dwells:
         known, period_s = dwell.autocovariance, (dwell.end_s - dwell.start_s) / max(dwell.count - 1, 1)
         if known.blocks:
-            out += walk_path.lagged_products(period_s, max(round(known.count / known.blocks), 1), known.pairs)
-    return out[:, None]
+            products += walk_path.lagged_products(period_s, max(round(known.count / known.blocks), 1), known.pairs)
+    return products[:, None]
 
 
 def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
@@ -259,14 +259,14 @@ def slow_waves(dwells: Sequence[DwellFactor], flicker_mps2: Floats) -> tuple[lis
     if len(dwells) < 4 or not channels.size:
         return [np.zeros((len(dwell.pieces), dwell.width, 3, 0)) for dwell in dwells], np.zeros(0)
     start, span = dwells[0].start_s, dwells[-1].end_s - dwells[0].start_s
-    orders, out = np.arange(1, _WANDER + 1), list[Floats]()
+    orders, columns = np.arange(1, _WANDER + 1), list[Floats]()
     for dwell in dwells:
-        own = np.zeros((len(dwell.pieces), dwell.width, 3, len(channels), _WANDER))
+        waves = np.zeros((len(dwell.pieces), dwell.width, 3, len(channels), _WANDER))
         at = (0.5 * (dwell.start_s + dwell.end_s) - start) / span
-        own[:, :3, channels, np.arange(len(channels))] = np.sqrt(2.0) * np.cos(np.pi * orders * at)
-        out.append(own.reshape(*own.shape[:3], -1))
+        waves[:, :3, channels, np.arange(len(channels))] = np.sqrt(2.0) * np.cos(np.pi * orders * at)
+        columns.append(waves.reshape(*waves.shape[:3], -1))
     sigma = flicker_mps2[channels, None] / np.sqrt(orders)
-    return out, sigma.ravel()
+    return columns, sigma.ravel()
 
 
 def shared_noise(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floats], Floats]:
@@ -294,11 +294,11 @@ def mean_covariances(noise: Noise, means: Means, state: Floats, misfit_mps2: flo
     counts as a sigma_alpha so large that it leaves the size of f alone, also where the noise is not known yet and is to
     be estimated from a misfit of this rms size.
     """
-    own = noise.effective_sigma_mps2**2 / means.counts[:, None] + noise.scatter_mps2**2
+    variances = noise.effective_sigma_mps2**2 / means.counts[:, None] + noise.scatter_mps2**2
     size = np.linalg.norm(means.force_mps2, axis=1).max()
-    unknown_rad = _TURNED * max(float(np.sqrt(own.max())), misfit_mps2) / size
+    unknown_rad = _TURNED * max(float(np.sqrt(variances.max())), misfit_mps2) / size
     setting_rad = unknown_rad if noise.attitude_unknown else noise.setting_rad
-    return own[:, :, None] * np.eye(3) + setting_rad**2 * setting_covariances(means, state)
+    return variances[:, :, None] * np.eye(3) + setting_rad**2 * setting_covariances(means, state)
 
 
 def lift_rounding(covariances: Floats) -> Floats:

@@ -76,11 +76,11 @@ def nuisance_map(dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> 
     ``state``."""
     turning = 0.0 < noise.setting_rad < np.inf
     scattering, count = np.flatnonzero(noise.scatter_mps2 > 0), 3 if turning else 0
-    out = np.zeros((len(dwells), 3, len(REGRESSORS), count + len(scattering)))
+    coefficients = np.zeros((len(dwells), 3, len(REGRESSORS), count + len(scattering)))
     if turning:
         x, y, z = np.moveaxis(sensitivities_of(dwells, state), 2, 0)
         none = np.zeros_like(x)
         crossing = np.array([[none, -z, y], [z, none, -x], [-y, x, none]])  # (f x s) = f^T [s]
-        out[:, :, 1:, :3] = np.moveaxis(crossing, (0, 1), (2, 3))
-    out[:, scattering, 0, count + np.arange(len(scattering))] = 1.0
-    return out
+        coefficients[:, :, 1:, :3] = np.moveaxis(crossing, (0, 1), (2, 3))
+    coefficients[:, scattering, 0, count + np.arange(len(scattering))] = 1.0
+    return coefficients

@@ -56,14 +56,14 @@ def _held(ends_s: Floats, held_s: float) -> Links:
     times tau / 2.
     """
     spans = np.maximum(ends_s[:, 1] - ends_s[:, 0], 1e-6 * held_s) / held_s
-    near = -np.expm1(-spans) / spans
-    own = held_s * (1.0 - near) / spans
-    share = near[1:] / near[:-1] * np.exp(-np.diff(ends_s[:, 0]) / held_s)
+    correlated = -np.expm1(-spans) / spans
+    variances = held_s * (1.0 - correlated) / spans
+    share = correlated[1:] / correlated[:-1] * np.exp(-np.diff(ends_s[:, 0]) / held_s)
     pauses = np.maximum(ends_s[1:, 0] - ends_s[:-1, 1], 0.0) / held_s
-    across = 0.5 * held_s * near[1:] * near[:-1] * np.exp(-pauses)
-    alone = own.copy()
-    alone[1:] += share**2 * own[:-1] - 2.0 * share * across
-    return Links(share, alone, across - share * own[:-1])
+    across = 0.5 * held_s * correlated[1:] * correlated[:-1] * np.exp(-pauses)
+    alone = variances.copy()
+    alone[1:] += share**2 * variances[:-1] - 2.0 * share * across
+    return Links(share, alone, across - share * variances[:-1])
 
 
 def variances(begins_s: Floats, ends_s: Floats, intensity: float) -> Floats:
@@ -96,15 +96,15 @@ def advance(factor: Floats, steps: Floats, rows: Floats) -> tuple[Floats, int]:
     if not count:
         return triangle(np.vstack([factor, rows])), 0
     biases = BIASES
-    out = np.zeros((count + width + len(rows), count + width + 1))
-    out[:count, :count] = np.diag(1.0 / sigma)
-    before = out[count : count + width]
+    joint = np.zeros((count + width + len(rows), count + width + 1))
+    joint[:count, :count] = np.diag(1.0 / sigma)
+    before = joint[count : count + width]
     before[:, count:] = factor
     for first in range(0, count, 3):
         before[:, first : first + 3] = -factor[:, biases]
-    out[count + width :, :inside] = rows[:, :inside]
-    out[count + width :, count:] = rows[:, inside:]
-    return triangle(out), count
+    joint[count + width :, :inside] = rows[:, :inside]
+    joint[count + width :, count:] = rows[:, inside:]
+    return triangle(joint), count
 
 
 def recede(factor: Floats, steps: Floats, rows: Floats) -> Floats:
@@ -114,14 +114,14 @@ def recede(factor: Floats, steps: Floats, rows: Floats) -> Floats:
     """
     width, biases = len(factor), BIASES
     sigma = _sigmas(steps, rows.shape[1] - width - 1)
-    out = np.zeros((len(sigma) + width + len(rows), len(sigma) + width + 1))
-    out[: len(sigma), : len(sigma)] = np.diag(1.0 / sigma)
-    later = out[len(sigma) :]
+    joint = np.zeros((len(sigma) + width + len(rows), len(sigma) + width + 1))
+    joint[: len(sigma), : len(sigma)] = np.diag(1.0 / sigma)
+    later = joint[len(sigma) :]
     later[:, len(sigma) :] = np.vstack([factor, rows[:, -width - 1 :]])
     for first in range(0, len(sigma), 3):
         later[:, first : first + 3] = later[:, len(sigma) :][:, biases]
     later[width:, : rows.shape[1] - width - 1] += rows[:, : -width - 1]
-    return triangle(out)[len(sigma) : len(sigma) + width, len(sigma) :]
+    return triangle(joint)[len(sigma) : len(sigma) + width, len(sigma) :]
 
 
 def _sigmas(steps: Floats, inside: int) -> Floats:
@@ -141,25 +141,25 @@ def whiten_walk(rows: Sequence[Floats], steps: Floats) -> Floats:
     others. Rows that precede those of the dwells have no S and are returned unchanged.
     """
     above, dwells = rows[: len(rows) - len(steps)], rows[len(rows) - len(steps) :]
-    upper, right, out = np.zeros((0, 3)), np.zeros((0, dwells[0].shape[1] - 3)), list(above)
-    for own, (pause, inside) in zip(dwells, steps, strict=True):
+    upper, right, innovations = np.zeros((0, 3)), np.zeros((0, dwells[0].shape[1] - 3)), list(above)
+    for of_dwell, (pause, inside) in zip(dwells, steps, strict=True):
         unknown = ([pause] if pause > 0 and len(upper) else []) + ([inside] if len(upper) else [])
         first, count = 3 * len(unknown), 3 * len(unknown) + len(upper)
-        biases = own[:, 3:][:, BIASES]
-        design = np.zeros((count + len(own) + (0 if len(upper) else 3), first + 3))
+        biases = of_dwell[:, 3:][:, BIASES]
+        design = np.zeros((count + len(of_dwell) + (0 if len(upper) else 3), first + 3))
         design[:first, :first] = np.diag(np.repeat(1.0 / np.sqrt(unknown), 3))
         if len(upper):  # the path before is w less the steps in the pause and in the dwell
             design[first:count] = np.hstack([-upper] * len(unknown) + [upper])
-            design[count:] = np.hstack([np.zeros((len(own), first - 3)), own[:, :3], biases])
+            design[count:] = np.hstack([np.zeros((len(of_dwell), first - 3)), of_dwell[:, :3], biases])
         else:  # in the first dwell the path is the step within it
-            design[:3], design[3:] = np.eye(3) / np.sqrt(inside), own[:, :3] + biases
+            design[:3], design[3:] = np.eye(3) / np.sqrt(inside), of_dwell[:, :3] + biases
         sides = np.zeros((len(design), right.shape[1]))
-        sides[first:count], sides[len(design) - len(own) :] = right, own[:, 3:]
+        sides[first:count], sides[len(design) - len(of_dwell) :] = right, of_dwell[:, 3:]
         turned, triangular = np.linalg.qr(design, mode="complete")
         sides = turned.T @ sides
         upper, right = triangular[first : first + 3, first:], sides[first : first + 3]
-        out.append(sides[first + 3 :])
-    return np.concatenate(out)
+        innovations.append(sides[first + 3 :])
+    return np.concatenate(innovations)
 
 
 def predict(factor: Floats, variance: float) -> Floats:

@@ -91,13 +91,13 @@ class Restricted:
     def curvature(self, sizes: Floats) -> Floats:
         """Second derivatives (k, k) of the cost by the logarithms of the sizes, from differences of the first
         derivatives."""
-        step, out = 1e-3, np.zeros((len(sizes),) * 2)
+        step, second = 1e-3, np.zeros((len(sizes),) * 2)
         for k in range(len(sizes)):
             for sign in (1.0, -1.0):
                 moved = sizes.copy()
                 moved[k] *= np.exp(sign * step)
-                out[k] += sign * moved**2 * self.at(moved**2).slope / step
-        return 0.5 * (out + out.T)
+                second[k] += sign * moved**2 * self.at(moved**2).slope / step
+        return 0.5 * (second + second.T)
 
     def _search(self, sizes: Floats) -> tuple[Floats, Point]:
         """Minimise the cost by Newton's method over the sizes s, in which the cost is an even function, so that zero is
@@ -113,10 +113,10 @@ class Restricted:
             free = (sizes > _LEAST) | (slope < 0.0)
             step = np.zeros_like(sizes)
             step[free] = -np.linalg.solve(curve[np.ix_(free, free)], slope[free])
-            found = self._lower(sizes, step, point) if -0.5 * slope @ step > _ENOUGH else None
-            if found is None:
+            lower = self._lower(sizes, step, point) if -0.5 * slope @ step > _ENOUGH else None
+            if lower is None:
                 break
-            sizes, point = found
+            sizes, point = lower
         return np.where(sizes > _LEAST, sizes, 0.0), point
 
     def _lower(self, sizes: Floats, step: Floats, point: Point) -> tuple[Floats, Point] | None:

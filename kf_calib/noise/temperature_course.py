@@ -109,13 +109,13 @@ def _within_dwells(middles: Floats, levels: Floats, weights: Floats, owners: NDA
     """Return the weighted variance of levels about a parabola in each dwell, and its degrees of freedom."""
     squares, freedom = 0.0, 0
     for number in np.unique(owners):
-        own = owners == number
-        if own.sum() > 3:
-            u, root = middles[own] - middles[own].mean(), np.sqrt(weights[own])
+        inside = owners == number
+        if inside.sum() > 3:
+            u, root = middles[inside] - middles[inside].mean(), np.sqrt(weights[inside])
             basis = np.linalg.qr(np.vander(u / np.abs(u).max(), 3) * root[:, None])[0]
-            left = root * (levels[own] - levels[own].mean())
+            left = root * (levels[inside] - levels[inside].mean())
             squares += float(np.sum((left - basis @ (basis.T @ left)) ** 2))
-            freedom += int(own.sum()) - 3
+            freedom += int(inside.sum()) - 3
     return squares / max(freedom, 1), freedom
 
 
@@ -151,10 +151,10 @@ class _Spline:
         shares, turn = np.linalg.eigh(_between(lower, penalty))
         shares = np.clip(shares, 0.0, 1.0)  # of the penalty in their sum
         back = np.linalg.solve(lower.T, turn)
-        own, total = (back.T @ along) ** 2, float(weights @ away**2)
+        squares, total = (back.T @ along) ** 2, float(weights @ away**2)
         sizes = (1.0 - shares) + _PENALTIES[:, None] * shares
         freedom = len(levels) - _ORDER
-        variances = np.maximum(total - (own / sizes).sum(axis=1), 1e-12 * total) / freedom
+        variances = np.maximum(total - (squares / sizes).sum(axis=1), 1e-12 * total) / freedom
         costs = freedom * np.log(variances) + np.log(sizes).sum(axis=1) - (count - _ORDER) * np.log(_PENALTIES)
         best = int(np.argmin(costs))
         coefficients = back @ ((back.T @ along) / sizes[best])
