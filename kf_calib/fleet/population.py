@@ -104,6 +104,8 @@ class _Misfits:
         ends = math.log(_NARROW * _NARROW), math.log(_WIDE)
         if self._misfit(math.exp(ends[0])) <= misfit:
             return 0.0
+        if self._misfit(math.exp(ends[1])) >= misfit:
+            return math.exp(ends[1])  # units that lie farther apart than anything
         root: Any = brentq(lambda log_spread: self._misfit(math.exp(log_spread)) - misfit, *ends, xtol=1e-4)
         return math.exp(root)
 

@@ -114,6 +114,20 @@ def are_whole(factors: pa.StructArray) -> Mask:
     return right | factors.is_null().to_numpy(zero_copy_only=False)
 
 
+def name_their_parameters(lists: pa.ListArray) -> Mask:
+    """In which rows (n,) every parameter has symbol, unit and nominal value, and no number is absurd; a run that failed
+    has none."""
+    each, lengths = lists.flatten(), np.maximum(_lengths(lists), 0)
+    right = each.is_valid().to_numpy(zero_copy_only=False)
+    for name in ("symbol", "unit", "nominal"):
+        right &= each.field(name).is_valid().to_numpy(zero_copy_only=False)
+    for name in ("value", "sigma", "nominal"):
+        numbers = each.field(name).fill_null(0.0).to_numpy(zero_copy_only=False)
+        right &= np.abs(numbers) < _LARGEST
+    bad = np.concatenate([[0], np.cumsum(~right)])
+    return np.diff(bad[np.concatenate([[0], np.cumsum(lengths)])]) == 0
+
+
 def _lengths(lists: pa.ListArray) -> NDArray[np.int64]:
     """Return the lengths (n,) of lists, -1 where there is none."""
     return lists.value_lengths().fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)

@@ -4,7 +4,8 @@ Rows are appended as small Arrow files, which take a hundredth of the time of Pa
 to time and at the end. Every file is written beside its place and renamed when it is whole: whoever reads the folder,
 at any time and however the writer ended, finds whole files only, and all that was finished. What else lies in the
 folder is somebody's own, and neither read nor removed: files of the table are known by their names and columns. A row
-that does not say of which run it is or when that was evaluated, or whose factor is not whole, counts as not there.
+that does not say of which run it is or when that was evaluated, or whose factor or parameters are not whole, counts as
+not there.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import pyarrow.parquet as pq
 
 from kf_calib.bench.arrays import Mask
 from kf_calib.errors import InputError
-from kf_calib.fleet.run_row import SCHEMA, Row, are_whole
+from kf_calib.fleet.run_row import SCHEMA, Row, are_whole, name_their_parameters
 from kf_calib.support.file_lock import lock, writer
 from kf_calib.support.output_files import whole
 
@@ -99,7 +100,7 @@ class Store:
         if small := self._files(_SMALL):
             self._merge(small)
         large = self._files(_LARGE)
-        if sum(pq.read_metadata(file).num_rows for file in large) > len(self.known()):
+        if sum(batch.num_rows for batch in _all_rows(large, ["run"], _MANY)) > len(self.known()):
             self._merge(large)
 
     def known(self) -> dict[str, Known]:
@@ -107,12 +108,12 @@ class Store:
         return _latest(_rows(self._every, _KNOWN, _MANY))
 
     def checked(self) -> tuple[dict[str, Known], list[str]]:
-        """The same of rows with whole factors, for which all are read, and sentences on what counts as not there."""
+        """The same of whole rows, for which all are read, and sentences on what counts as not there."""
         lost = 0
 
         def whole_rows() -> Iterator[pa.RecordBatch]:
             nonlocal lost
-            for batch in _all_rows(self._every, [*_KNOWN, "factor"], AT_ONCE):
+            for batch in _all_rows(self._every, [*_KNOWN, "date", "parameters", "factor"], AT_ONCE):
                 sound = _sound(batch)
                 lost += batch.num_rows - sound.num_rows
                 yield sound.select(_KNOWN)
@@ -211,7 +212,7 @@ def _together(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
 
 
 def _sound(batch: pa.RecordBatch) -> pa.RecordBatch:
-    """Return the rows of a batch that say of which run they are and when it was evaluated, with whole factors."""
+    """Return the rows of a batch that say of which run they are and when it was evaluated, and are whole."""
     kept = np.ones(batch.num_rows, bool)
     for name in ("run", "evaluated"):
         kept &= batch[name].is_valid().to_numpy(zero_copy_only=False)
@@ -219,6 +220,8 @@ def _sound(batch: pa.RecordBatch) -> pa.RecordBatch:
         kept &= _are_dates(batch[name])
     if "factor" in batch.schema.names:
         kept &= are_whole(batch["factor"])
+    if "parameters" in batch.schema.names:
+        kept &= name_their_parameters(batch["parameters"])
     return batch if kept.all() else batch.filter(pa.array(kept))
 
 

@@ -114,7 +114,7 @@ def _replace(parent: Any, rng: random.Random) -> None:
 def used(folder: Path) -> dict[str, np.ndarray]:
     """Do all that a fleet does with its table; return the factors that it takes for whole."""
     fleet = kf_calib.open_fleet(folder)
-    assert str(fleet) and fleet.rows().num_rows == len(fleet) <= 2 * RUNS
+    assert str(fleet) and fleet.rows().num_rows <= len(fleet) <= 2 * RUNS
     assert len(fleet.failures()) + fleet.parameters(["b1"]).num_rows <= 4 * RUNS
     factors = {factor.run: factor.factor for factor in fleet.factors()}
     fleet.overview()
