@@ -27,7 +27,8 @@ def flicker_within(dwells: Sequence[DwellFactor], columns: Sequence[Floats], sta
     The likeliest h of each accelerometer; one for all three where attitudes are not known. ``columns`` are those of the
     model at the nodes of each dwell, (pieces, nodes, 3, p), ``state`` (p,) its estimate.
     """
-    if not noise.scatter_mps2.any() or noise.walk_mps2_per_sqrt_s or dwells[0].carrier_hz:
+    without = dwells[0].carrier_hz or not any(map(_shows_course, dwells))
+    if without or not noise.scatter_mps2.any() or noise.walk_mps2_per_sqrt_s:
         return np.zeros(3)
     channels = np.eye(3)[None].repeat(len(dwells), axis=0)
     if noise.attitude_unknown:
@@ -39,6 +40,11 @@ def flicker_within(dwells: Sequence[DwellFactor], columns: Sequence[Floats], sta
     ]
     amplitudes, variances = (np.array(values) for values in zip(*pairs, strict=True))  # (D, k, c) each
     return np.broadcast_to([_likeliest(amplitudes[..., i], variances[..., i]) for i in range(channels.shape[1])], 3)
+
+
+def _shows_course(dwell: DwellFactor) -> bool:
+    """Tell whether more than the mean of a dwell is known."""
+    return len(dwell.pieces) > 1 or bool(dwell.pieces[0].triangle[1:3].any())
 
 
 def _amplitudes(dwell: DwellFactor, predicted: Floats, sigma: Floats, weights: Floats) -> tuple[Floats, Floats]:

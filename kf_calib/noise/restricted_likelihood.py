@@ -18,8 +18,9 @@ from kf_calib.noise.noise_model import lift_rounding
 
 _LEAST = 1e-4  # relative to the size at which a search begins; smaller sizes count as zero
 _NEAR = 0.5  # if ln of a size changes by more, the search did not begin near its end
-_ENOUGH = 1e-9  # the search ends when less log-likelihood than this can be gained
-_STEPS, _HALVES = 100, 30
+_ENOUGH = 1e-9  # the search ends when less log-likelihood than this can be gained,
+_ROUNDING = 1e-12  # or less than this share of the cost, which for thousands of dwells is not computed better
+_STEPS, _HALVES = 100, 12
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,23 @@ class Point:
 
 
 @dataclass(frozen=True)
+class _Level:
+    """The likelihood at given variances, and what its derivatives are made from.
+
+    - cost, misfit: as of a point.
+    - covariance (D, 6, 3), lower (6, 3 D): V and its Cholesky factor, in the layouts of ``banded``.
+    - basis (3 D, p), rest (3 D,): of the whitened rows, an orthonormal basis of A and what it leaves of z.
+    """
+
+    cost: float
+    misfit: float
+    covariance: Floats
+    lower: Floats
+    basis: Floats
+    rest: Floats
+
+
+@dataclass(frozen=True)
 class Restricted:
     """The restricted likelihood as a function of the variances.
 
@@ -53,12 +71,11 @@ class Restricted:
     shapes: Floats
 
     def at(self, variances: Floats) -> Point:
-        """The likelihood and its derivatives at ``variances`` (k,).
+        """The likelihood and its derivatives at ``variances`` (k,)."""
+        return self._with_derivatives(self._level(variances))
 
-        With y = P z, the derivatives of the cost are (tr(P K_k) - y' K_k y) / 2 (Searle, Casella and McCulloch, 1992,
-        sec. 6.6), and y' K_k P K_l y / 2 is the average of observed and expected information (Gilmour, Thompson and
-        Cullis, 1995).
-        """
+    def _level(self, variances: Floats) -> _Level:
+        """Return the likelihood at ``variances`` (k,), without its derivatives, which take more time."""
         wider = variances @ self.shapes.reshape(len(variances), self.fixed.size)
         covariance = self.fixed + wider.reshape(self.fixed.shape)
         covariance[:, :3] = lift_rounding(covariance[:, :3])
@@ -67,13 +84,22 @@ class Restricted:
         basis, upper = np.linalg.qr(whitened[:, :-1])
         rest = whitened[:, -1] - basis @ (basis.T @ whitened[:, -1])
         cost = np.log(lower[0]).sum() + np.log(np.abs(np.diag(upper))).sum() + 0.5 * rest @ rest
-        basis, misfit = basis[known:], float(rest @ rest)
-        back = banded.solve(lower, np.column_stack([basis, rest[known:]]), transposed=True)
+        return _Level(float(cost), float(rest @ rest), covariance, lower, basis[known:], rest[known:])
+
+    def _with_derivatives(self, level: _Level) -> Point:
+        """Return the likelihood with its derivatives.
+
+        With y = P z, the derivatives of the cost are (tr(P K_k) - y' K_k y) / 2 (Searle, Casella and McCulloch, 1992,
+        sec. 6.6), and y' K_k P K_l y / 2 is the average of observed and expected information (Gilmour, Thompson and
+        Cullis, 1995).
+        """
+        covariance, lower, basis, rest = level.covariance, level.lower, level.basis, level.rest
+        back = banded.solve(lower, np.column_stack([basis, rest]), transposed=True)
         inner = banded.inverse(covariance, lower) - banded.outer(back)
         moved = banded.solve(lower, banded.products(self.shapes, back[:, -1]))
         within = basis.T @ moved
         information = 0.5 * (moved.T @ moved - within.T @ within)
-        return Point(float(cost), misfit, 0.5 * banded.traces(inner, self.shapes), information)
+        return Point(level.cost, level.misfit, 0.5 * banded.traces(inner, self.shapes), information)
 
     def most_likely(self, start: Floats | None = None) -> tuple[Floats, Point]:
         """The sizes (k,), roots of the variances, at which the likelihood is largest, and the likelihood there.
@@ -113,7 +139,8 @@ class Restricted:
             free = (sizes > _LEAST) | (slope < 0.0)
             step = np.zeros_like(sizes)
             step[free] = -np.linalg.solve(curve[np.ix_(free, free)], slope[free])
-            lower = self._lower(sizes, step, point) if -0.5 * slope @ step > _ENOUGH else None
+            enough = max(_ENOUGH, _ROUNDING * abs(point.cost))
+            lower = self._lower(sizes, step, point) if -0.5 * slope @ step > enough else None
             if lower is None:
                 break
             sizes, point = lower
@@ -123,8 +150,8 @@ class Restricted:
         """Return the sizes and the point after the step, halved until the cost is lower; None if it never is."""
         for _ in range(_HALVES):
             moved = np.maximum(sizes + step, _LEAST)
-            there = self.at(moved**2)
+            there = self._level(moved**2)
             if there.cost < point.cost:
-                return moved, there
+                return moved, self._with_derivatives(there)
             step = 0.5 * step
         return None
