@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from kf_calib.sources.tables.columns import READINGS, Columns
 from kf_calib.sources.tables.grid import Grid, delimiter_of, grid_of
 from kf_calib.sources.tables.numbers import Numbers
 from kf_calib.sources.tables.opening import Opening
-from kf_calib.sources.tables.spreadsheet import sheets_of
+from kf_calib.sources.tables.spreadsheet import sheets_of, workbook_of
 from kf_calib.sources.units import Units
 from kf_calib.support.output_files import write_whole
 
@@ -62,9 +61,7 @@ def apply_to_table(
 
 def _to_excel(path: Path, out: Path, grid: Grid, places: list[int], force: Floats) -> None:
     """Write a copy of a workbook."""
-    import openpyxl
-
-    book: Any = openpyxl.load_workbook(path)
+    book = workbook_of(path)
     sheet = book[next(each.name for each in sheets_of(path) if not each.hidden)]
     head = next(
         k for k in range(grid.numbers[0] - 1, 0, -1)
@@ -76,7 +73,11 @@ def _to_excel(path: Path, out: Path, grid: Grid, places: list[int], force: Float
                 sheet.cell(k, place + 1).value = name if k == head else "m/s^2"
     for number, own in zip(grid.numbers, force.tolist(), strict=True):
         for place, value in zip(places, own, strict=True):
-            sheet.cell(number, place + 1).value = value
+            cell = sheet.cell(number, place + 1)
+            if type(cell).__name__ == "MergedCell":
+                raise InputError(f"{path}: cell {cell.coordinate} is merged with others, so no reading can be written "
+                                 "there: part the cells.")  # fmt: skip
+            cell.value = value
     content = io.BytesIO()
     book.save(content)
     write_whole(out, content.getvalue())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -107,25 +107,41 @@ def are_whole(factors: pa.StructArray) -> Mask:
     right &= (lengths["constants"] >= 0) & (width >= 0) & (width < size)
     for name in ("rows", "noise_estimated"):
         right &= factors.field(name).is_valid().to_numpy(zero_copy_only=False)
-    numbers = factors.field("upper").flatten().to_numpy(zero_copy_only=False)
-    bad = np.concatenate([[0], np.cumsum(~(np.abs(numbers) < _LARGEST))])  # not a number is none of these, too
-    ends = np.concatenate([[0], np.cumsum(np.maximum(lengths["upper"], 0))])
-    right &= np.diff(bad[ends]) == 0
+    for name in ("upper", "nominal"):
+        right &= _in_all(factors.field(name), _are_numbers)
+    right &= _in_all(factors.field("columns"), _are_there)
+    right &= _in_all(
+        factors.field("constants"), lambda each: _have(each, ("effect",)) & _are_numbers(each.field("value"))
+    )
     return right | factors.is_null().to_numpy(zero_copy_only=False)
 
 
 def name_their_parameters(lists: pa.ListArray) -> Mask:
     """In which rows (n,) every parameter has symbol, unit and nominal value, and no number is absurd; a run that failed
     has none."""
-    each, lengths = lists.flatten(), np.maximum(_lengths(lists), 0)
-    right = each.is_valid().to_numpy(zero_copy_only=False)
-    for name in ("symbol", "unit", "nominal"):
-        right &= each.field(name).is_valid().to_numpy(zero_copy_only=False)
-    for name in ("value", "sigma", "nominal"):
-        numbers = each.field(name).fill_null(0.0).to_numpy(zero_copy_only=False)
-        right &= np.abs(numbers) < _LARGEST
-    bad = np.concatenate([[0], np.cumsum(~right)])
-    return np.diff(bad[np.concatenate([[0], np.cumsum(lengths)])]) == 0
+    return _in_all(lists, lambda each: _have(each, ("symbol", "unit", "nominal"))
+                   & _are_numbers(each.field("nominal")) & _are_numbers(each.field("value").fill_null(0.0))
+                   & _are_numbers(each.field("sigma").fill_null(0.0)))  # fmt: skip
+
+
+def _in_all(lists: pa.ListArray, are_right: Callable[[Any], Mask]) -> Mask:
+    """Tell in which lists (n,) all elements are right; no list has none."""
+    ends = np.concatenate([[0], np.cumsum(np.maximum(_lengths(lists), 0))])
+    return np.diff(np.concatenate([[0], np.cumsum(~are_right(lists.flatten()))])[ends]) == 0
+
+
+def _are_there(values: pa.Array) -> Mask:
+    return values.is_valid().to_numpy(zero_copy_only=False)
+
+
+def _have(structures: pa.StructArray, names: Sequence[str]) -> Mask:
+    """Tell which structures (n,) are there and have these fields."""
+    return np.logical_and.reduce([_are_there(structures), *(_are_there(structures.field(name)) for name in names)])
+
+
+def _are_numbers(values: pa.Array) -> Mask:
+    """Tell which values (n,) are numbers that a run may have."""
+    return np.abs(values.to_numpy(zero_copy_only=False)) < _LARGEST  # that of null is not a number
 
 
 def _lengths(lists: pa.ListArray) -> NDArray[np.int64]:

@@ -44,7 +44,7 @@ def flicker_within(dwells: Sequence[DwellFactor], columns: Sequence[Floats], sta
 
 def _shows_course(dwell: DwellFactor) -> bool:
     """Tell whether more than the mean of a dwell is known."""
-    return len(dwell.pieces) > 1 or bool(dwell.pieces[0].triangle[1:3].any())
+    return len(dwell.pieces) > 1 or bool(dwell.triangles[:, 1:3].any())
 
 
 def _amplitudes(dwell: DwellFactor, predicted: Floats, sigma: Floats, weights: Floats) -> tuple[Floats, Floats]:

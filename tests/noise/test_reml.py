@@ -127,13 +127,13 @@ def test_no_other_sizes_are_likelier_wherever_the_search_begins(seed: int) -> No
 
 def test_a_search_that_begins_near_its_end_is_shorter(monkeypatch: pytest.MonkeyPatch) -> None:
     made, points = problem(4, 1.0, 0, count=40), list[Floats]()
-    evaluated = Restricted.at
+    evaluated = Restricted._level
 
-    def at(self: Restricted, variances: Floats) -> object:
+    def level(self: Restricted, variances: Floats) -> object:
         points.append(variances)
         return evaluated(self, variances)
 
-    monkeypatch.setattr(Restricted, "at", at)
+    monkeypatch.setattr(Restricted, "_level", level)
     sizes, _ = made.most_likely()
     cold = len(points)
     made.most_likely(1.001 * sizes)

@@ -6,6 +6,7 @@ has seven. All of it is bounded before and while it is read, and what no program
 
 from __future__ import annotations
 
+import functools
 import itertools
 import re
 import warnings
@@ -35,6 +36,9 @@ _HIDDEN_ROW = re.compile(
     rb'<(?:\w+:)?row\b(?=[^<>]*?\shidden\s*=\s*["\'](?:1|true)["\'])[^<>]*?\sr\s*=\s*["\'](\d{1,9})["\']'
 )
 _LONG_FORMAT = re.compile(rb"formatCode\s*=\s*([\"'])[^\"'<>]{1000}")  # of a number; Excel's have at most 255 letters
+_MERGED = re.compile(
+    rb'<(?:\w+:)?mergeCell\b[^<>]*?\sref\s*=\s*["\']\$?([A-Z]{1,3})\$?(\d{1,9}):\$?([A-Z]{1,3})\$?(\d{1,9})["\']'
+)
 _DECLARED = (b"<!DOCTYPE", b"<!ENTITY", b"<\0!\0D\0", b"\0<\0!\0D")  # in UTF-8, and in both kinds of UTF-16
 
 
@@ -63,10 +67,44 @@ def sheets_of(path: Path) -> list[Sheet]:
                 sheets = [_sheet(sheet, _hidden_rows(file, sheet)) for sheet in book.worksheets]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except Exception as error:  # what openpyxl raises for a damaged file depends on where the damage is
-        said = cut(" ".join(str(error).split()), 80) or type(error).__name__
-        raise InputError(f"{path}: is no Excel file that can be read ({said}): save it again.") from None
+    except Exception as error:
+        raise _unreadable(path, error) from None
     return [sheet for sheet in sheets if sheet.lines]
+
+
+def workbook_of(path: Path) -> Any:
+    """The whole workbook of a file that ``sheets_of`` has read, to be written again. Raises InputError, with the path,
+    where it cannot be read as a whole."""
+    import openpyxl
+
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(_merged(archive.read(part)) for part in archive.infolist() if part.filename.startswith(_SHEETS)) > (
+                _MOST_FILLED
+            ):
+                raise InputError("has more merged cells than any table of orientations: part them.")
+        with warnings.catch_warnings(action="ignore"):
+            return openpyxl.load_workbook(path)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except Exception as error:
+        raise _unreadable(path, error) from None
+
+
+def _merged(content: bytes) -> int:
+    """Return how many cells of a sheet are merged with others: all of them are made when it is read as a whole."""
+    places = [(_column(a), int(b), _column(c), int(d)) for a, b, c, d in _MERGED.findall(content)]
+    return sum((abs(right - left) + 1) * (abs(below - above) + 1) for left, above, right, below in places)
+
+
+def _column(letters: bytes) -> int:
+    return functools.reduce(lambda number, letter: 26 * number + letter - 64, letters, 0)
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    """Return the error for what openpyxl raises for a damaged file, which depends on where the damage is."""
+    said = cut(" ".join(str(error).split()), 80) or type(error).__name__
+    return InputError(f"{path}: is no Excel file that can be read ({said}): save it again.")
 
 
 def _refuse_unfit(file: Any) -> None:

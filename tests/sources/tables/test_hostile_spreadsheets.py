@@ -8,12 +8,14 @@ import zipfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import openpyxl
 import pytest
 from helpers.bounded import bounded
 from helpers.long_runs import slow
+from helpers.paths import ROOT
 
 import kf_calib
 from kf_calib.errors import InputError, KfCalibError
@@ -213,3 +215,19 @@ def test_a_hidden_row_is_not_read(tmp_path: Path) -> None:
     assert [row.mean_mps2.tolist() for row in table.orientations] == [[9.80665, 0, 0], [-9.80665, 0, 0],
                                                                       [0, -9.80665, 0]]  # fmt: skip
     assert any("rows 4, 6 were not read, as hidden rows are no data" in said for said in table.warnings)
+
+
+@pytest.mark.parametrize("merged, says", [
+    (b"A9:XFD1048576", "has more merged cells than any table of orientations"),
+    (b"D2:F3", "cell E2 is merged with others, so no reading can be written there"),
+])  # fmt: skip
+def test_merged_cells_end_no_copy(merged: bytes, says: str, run: Any, tmp_path: Path) -> None:
+    """A table is read as it is; its copy with corrected readings would make every one of the cells."""
+    calibration, path, out = tmp_path / "cal.json", tmp_path / "t.xlsx", tmp_path / "out.xlsx"
+    merges = b'<mergeCells><mergeCell ref="' + merged + b'"/></mergeCells>'
+    content = changed(SHEET, put(b"</sheetData>", b"</sheetData>" + merges))
+    assert len(table_of(content, path).orientations) == len(ROWS)
+    kf_calib.save_calibration(kf_calib.calibrate(ROOT / "recordings" / "mems_faces.mcap"), calibration)
+    with bounded():
+        code, _, err = run("apply", calibration, path, "-o", out, "--axes", "z x", "--gravity", "9.81", "--unchecked")
+    assert code == 2 and says in err and err.count("\n") == 1 and not out.exists()
